@@ -1,0 +1,51 @@
+# Everything a contributor runs. `make install` is a no-op while pyproject.toml and constraints.txt are unchanged.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+EXTRAS := render,train,motions,multi,bench,dev
+DEVICE ?= cpu
+PYTEST_ARGS ?=
+
+.PHONY: help install demo test lint format clean
+
+help:
+	@echo "make install   create $(VENV) and install everything from constraints.txt"
+	@echo "make demo      train PPO on PIAvatar/Reach-v0 on the CPU (ten minutes at most), leaves runs/demo/"
+	@echo "make test      run the whole test suite (DEVICE=cuda for a GPU, PYTEST_ARGS='-k reach' for a part)"
+	@echo "make lint      check style and format; 'make format' mends what can be mended"
+	@echo "make clean     remove $(VENV), caches and build output (not runs/)"
+
+install: $(STAMP)
+
+# The interpreter is checked first, because pip's own message for an old Python names a package, not the cause.
+$(STAMP): pyproject.toml constraints.txt
+	@command -v $(PYTHON) >/dev/null || { echo "error: no $(PYTHON) found; install Python >= 3.10, or say where it is: make install PYTHON=/path/to/python3"; exit 1; }
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 10) else "error: $(PYTHON) is Python %d.%d; this needs >= 3.10: make install PYTHON=/path/to/python3" % v)'
+	@test -x $(BIN)/python || $(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "error: $(PYTHON) cannot create virtual environments; install its venv module (on Debian and Ubuntu: apt install python3-venv)"; exit 1; }
+	@test ! -x $(BIN)/python || $(BIN)/python -c 'import sys, pip; sys.exit(sys.version_info < (3, 10))' 2>/dev/null || { echo "error: $(VENV) is broken or older than Python 3.10; remove it and try again: rm -rf $(VENV)"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt setuptools
+	$(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt --no-build-isolation --editable ".[$(EXTRAS)]"
+	@touch $@
+
+demo: install
+	$(BIN)/python -m agents.demo
+
+# The kernels are compiled once, before the two workers start and would both compile them.
+test: install
+	$(BIN)/python -m piavatar_envs doctor --compile --device $(DEVICE)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal --durations 10 --device $(DEVICE) $(PYTEST_ARGS)
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: install
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -not -path './.*' -prune -exec rm -rf {} +

@@ -1,0 +1,114 @@
+"""Options and fixtures of the whole suite."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """A test that asks for ``env_id`` runs on every registered environment; none has to be listed."""
+    if "env_id" in metafunc.fixturenames:
+        from piavatar_envs.tasks import task_modules
+
+        metafunc.parametrize("env_id", list(task_modules()))
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--device", default="cpu", help="Warp device to test on: cpu (default), cuda, cuda:1, ...")
+
+
+@contextmanager
+def only_one_process(name: str) -> Iterator[None]:
+    """Hold a lock among the test workers of this user; without file locks (Windows), go on without."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    with (Path(tempfile.gettempdir()) / f"piavatar-envs-{name}-{os.getuid()}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+@pytest.fixture(scope="session")
+def device(request: pytest.FixtureRequest) -> str:
+    """The Warp device under test, its kernels compiled.
+
+    Parallel workers would all compile the same kernels at once, and race each other's files: the first one does it,
+    the others wait and find them in the cache.
+    """
+    from piavatar_envs import doctor
+
+    name = request.config.getoption("--device")
+    available = [entry["alias"] for entry in doctor.devices()]
+    if name not in available and not (name == "cuda" and "cuda:0" in available):
+        pytest.exit(f"--device {name}: this machine has {', '.join(available)}", returncode=4)
+    with only_one_process("kernels"):
+        try:
+            doctor.compile_kernels(name, environments=False)
+        except Exception as error:  # a kernel that does not compile fails its own tests, not all that use a device
+            warnings.warn(f"not every kernel compiles for {name}: {error}", stacklevel=1)
+    return name
+
+
+@pytest.fixture(scope="session")
+def make_env(device: str):
+    """A maker of single environments without wrappers, ``make_env(env_id, **settings)``, tiny unless told otherwise.
+
+    The same settings give the same object, because building takes longer than a test: begin with a reset. ``twin=1``
+    gives another one of the same settings.
+    """
+    import gymnasium
+
+    made: dict[tuple, gymnasium.Env] = {}
+
+    def make(env_id: str, twin: int = 0, **settings):
+        key = (env_id, twin, repr(sorted(settings.items())))
+        if key not in made:
+            made[key] = gymnasium.make(env_id, device=device, **{"fidelity": "tiny", **settings}).unwrapped
+        return made[key]
+
+    yield make
+    for env in made.values():
+        env.close()
+
+
+@pytest.fixture(scope="session")
+def make_batch(device: str):
+    """A maker of batches, ``make_batch(env_id, num_envs, **settings)``; the same settings give the same object."""
+    from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.envs.config import load_config
+    from piavatar_envs.tasks import load_task
+
+    made: dict[tuple, BatchEnv] = {}
+
+    def make(env_id: str, num_envs: int = 1, **settings) -> BatchEnv:
+        key = (env_id, num_envs, repr(sorted(settings.items())))
+        if key not in made:
+            task = load_task(env_id)
+            config = load_config(task.Config, None, {"fidelity": "tiny", **settings})
+            made[key] = BatchEnv(task(config), num_envs, device)
+        return made[key]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def equal(device: str):
+    """Comparison of two runs that should be the same: bit for bit on the CPU; a GPU adds in another order each time."""
+
+    def compare(a, b) -> bool:
+        a, b = np.asarray(a), np.asarray(b)
+        if device == "cpu":
+            return a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()
+        return a.shape == b.shape and np.allclose(a, b, rtol=1e-2, atol=2e-3)
+
+    return compare
