@@ -1,0 +1,34 @@
+"""Compressible Neo-Hookean solid: flesh, rubber.
+
+Energy density ``psi = mu/2 (|F|^2 - 3) - mu l(J) + lam/2 l(J)^2`` with ``l = log J`` (Bonet & Wood, "Nonlinear
+Continuum Mechanics for Finite Element Analysis", 2008, eq. 6.27). Below ``J_MIN`` the logarithm goes on along its
+tangent, so that energy and stress stay finite and consistent for squashed and inverted matter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+#: Volume ratio below which the logarithm is continued linearly.
+J_MIN = 0.05
+_J_MIN = wp.constant(J_MIN)
+
+
+def energy(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
+    """Energy density [Pa] of deformation gradients ``F``, shape ``(..., 3, 3)``."""
+    J = np.linalg.det(F)
+    log_j = np.where(J > J_MIN, np.log(np.maximum(J, J_MIN)), np.log(J_MIN) + J / J_MIN - 1.0)
+    return 0.5 * mu * ((F**2).sum((-1, -2)) - 3.0) - mu * log_j + 0.5 * lam * log_j**2
+
+
+@wp.func
+def kirchhoff_stress(F: wp.mat33, mu: float, lam: float):
+    """Kirchhoff stress ``tau = (d psi / d F) F^T`` [Pa]."""
+    J = wp.determinant(F)
+    Jc = wp.max(J, _J_MIN)
+    log_j = wp.log(Jc) + (J - Jc) / Jc
+    pressure = (lam * log_j - mu) * J / Jc
+    return mu * (F * wp.transpose(F)) + wp.diag(wp.vec3(pressure))

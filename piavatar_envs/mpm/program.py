@@ -1,0 +1,82 @@
+"""A fixed sequence of kernel launches, replayed as one: a CUDA graph on a GPU, recorded launches on a CPU.
+
+Nothing is allocated, decided or synchronised when a program runs, so a step costs its kernels and little more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+
+class Program:
+    """Collects launches with :meth:`launch`, then replays them with :meth:`run`.
+
+    Arrays are bound when a launch is recorded: write new values into them, never replace them.
+    """
+
+    def __init__(self, device: str) -> None:
+        self.device = wp.get_device(device)
+        self._launches: list[wp.Launch] = []
+        self._names: list[str] = []
+        self._graph: Any = None
+        self._has_run = False
+
+    def launch(
+        self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any] = ()
+    ) -> None:
+        """Append a launch. Arguments as for ``wp.launch``.
+
+        Raises:
+            RuntimeError: the program has already run.
+        """
+        if self._has_run:
+            raise RuntimeError(f"cannot append {kernel.key} to a program that has run; build a new one")
+        self._launches.append(
+            wp.launch(kernel, dim, inputs=list(inputs), outputs=list(outputs), device=self.device, record_cmd=True)
+        )
+        self._names.append(kernel.key)
+
+    def __len__(self) -> int:
+        return len(self._launches)
+
+    def run(self) -> None:
+        """Replay every launch in order."""
+        self._has_run = True
+        if not self.device.is_cuda:
+            for command in self._launches:
+                command.launch()
+            return
+        if self._graph is None:
+            self._capture()
+        wp.capture_launch(self._graph)
+
+    def run_eager(self) -> None:
+        """Launch one by one without a graph, to compare with :meth:`run`."""
+        for command in self._launches:
+            command.launch()
+
+    def timed(self, repeats: int = 1) -> dict[str, float]:
+        """Seconds spent in each kernel over one run, by name (launches one by one, for profiling).
+
+        The state advances by ``repeats`` runs.
+        """
+        import time
+
+        seconds: dict[str, float] = dict.fromkeys(self._names, 0.0)
+        for _ in range(repeats):
+            for name, command in zip(self._names, self._launches, strict=True):
+                wp.synchronize_device(self.device)
+                start = time.perf_counter()
+                command.launch()
+                wp.synchronize_device(self.device)
+                seconds[name] += (time.perf_counter() - start) / repeats
+        return seconds
+
+    def _capture(self) -> None:
+        with wp.ScopedDevice(self.device), wp.ScopedCapture(self.device) as capture:
+            for command in self._launches:
+                command.launch()
+        self._graph = capture.graph

@@ -1,0 +1,78 @@
+"""The quadratic B-spline and the layout of the grid: the only place that knows either.
+
+A particle touches the 3 x 3 x 3 nodes ``base + (0..2)``. With ``f = (x - x_base) / dx`` in [0.5, 1.5) the weights
+along one axis are those of Jiang et al., "The Material Point Method for Simulating Continuum Materials" (SIGGRAPH
+2016 course), eq. 123.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.types import Grid
+
+wp.set_module_options({"enable_backward": False})
+
+#: Nodes along an edge of a block; blocks are the unit in which the grid is swept.
+BLOCK = 4
+
+
+@wp.func
+def grid_position(grid: Grid, x: wp.vec3):
+    """Position in units of the grid spacing, from the first node."""
+    return (x - grid.origin) * grid.inv_dx
+
+
+@wp.func
+def base_node(xg: wp.vec3):
+    """Lowest node of the stencil around a grid position."""
+    return wp.vec3i(int(wp.floor(xg[0] - 0.5)), int(wp.floor(xg[1] - 0.5)), int(wp.floor(xg[2] - 0.5)))
+
+
+@wp.func
+def stencil_inside(grid: Grid, base: wp.vec3i):
+    """Whether all 27 nodes of the stencil exist; nothing is added to ``base``, which may be the largest integer."""
+    return (
+        base[0] >= 0
+        and base[1] >= 0
+        and base[2] >= 0
+        and base[0] <= grid.nodes[0] - 3
+        and base[1] <= grid.nodes[1] - 3
+        and base[2] <= grid.nodes[2] - 3
+    )
+
+
+@wp.func
+def spline(f: float):
+    """Weights of the three nodes along one axis, ``f`` in [0.5, 1.5) from the first of them."""
+    a = 1.5 - f
+    b = f - 1.0
+    c = f - 0.5
+    return wp.vec3(0.5 * a * a, 0.75 - b * b, 0.5 * c * c)
+
+
+@wp.func
+def node_index(grid: Grid, i: int, j: int, k: int):
+    """Linear index of node ``(i, j, k)``; ``k + 1`` is the next."""
+    return (i * grid.nodes[1] + j) * grid.nodes[2] + k
+
+
+@wp.func
+def node_position(grid: Grid, i: int, j: int, k: int):
+    """World position of node ``(i, j, k)`` [m]."""
+    return grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k))
+
+
+@wp.func
+def block_index(grid: Grid, i: int, j: int, k: int):
+    """Linear index of the block that holds node ``(i, j, k)``."""
+    return ((i >> 2) * grid.blocks[1] + (j >> 2)) * grid.blocks[2] + (k >> 2)
+
+
+@wp.func
+def block_corner(grid: Grid, block: int):
+    """Lowest node of a block."""
+    bk = block % grid.blocks[2]
+    bj = (block // grid.blocks[2]) % grid.blocks[1]
+    bi = block // (grid.blocks[2] * grid.blocks[1])
+    return wp.vec3i(4 * bi, 4 * bj, 4 * bk)

@@ -1,0 +1,152 @@
+"""Data structures of the material point method (MPM).
+
+``Model`` is constant, ``State`` is all that a checkpoint holds, ``Control`` is what a controller writes before a
+substep and ``Scratch`` is rebuilt every substep. Arrays are batched: the leading dimension is the environment.
+Per-particle constants have a leading dimension of 1 (shared) or ``num_envs`` (randomised); :func:`row` picks the one.
+
+Symbols in kernels: ``e`` environment, ``p`` particle, ``i j k`` grid node, ``x`` position [m], ``u`` physical
+velocity [m/s], ``C`` its affine matrix [1/s], ``F`` deformation gradient, ``J`` its determinant, ``tau`` Kirchhoff
+stress [Pa], ``vk`` kinematic (prescribed) velocity [m/s], ``dx`` grid spacing [m], ``dt`` time step [s].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+#: A grid node's record: mass [kg], physical momentum (3), kinematic momentum (3), padding. Eight floats are one
+#: vector register on a CPU and one 32-byte sector on a GPU.
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
+
+# Why an environment failed: bits of ``State.failure``.
+FAILURE_NONFINITE = 1
+FAILURE_OUT_OF_GRID = 2
+FAILURE_CFL = 4
+FAILURE_ACTION = 8
+FAILURE_NAMES: dict[int, str] = {
+    FAILURE_NONFINITE: "nonfinite",
+    FAILURE_OUT_OF_GRID: "out_of_grid",
+    FAILURE_CFL: "cfl",
+    FAILURE_ACTION: "action",
+}
+
+#: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.decouple`).
+DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
+SPLIT = wp.constant(0)
+PAPER = wp.constant(1)
+NO_STRESS = wp.constant(3)
+
+
+def failure_name(bits: int) -> str | None:
+    """Human-readable cause of a failure: ``None`` if there is none, names joined by ``+`` if there are several."""
+    names = [name for bit, name in FAILURE_NAMES.items() if bits & bit]
+    return "+".join(names) or None
+
+
+@wp.struct
+class Grid:
+    """Constants of the background grid; node ``(i, j, k)`` lies at ``origin + dx * (i, j, k)``."""
+
+    origin: wp.vec3
+    dx: float
+    inv_dx: float
+    nodes: wp.vec3i  # nodes along x, y, z
+    blocks: wp.vec3i  # blocks of 4 x 4 x 4 nodes along x, y, z
+
+
+@wp.struct
+class Step:
+    """Constants of the time step."""
+
+    dt: float
+    gravity: wp.vec3
+    decoupling: int
+
+
+@wp.struct
+class Particles:
+    """Per-particle constants, each of shape ``(1 or num_envs, num_particles)``."""
+
+    mass: wp.array2d(dtype=float)  # [kg]
+    volume: wp.array2d(dtype=float)  # rest volume [m^3]
+    mu: wp.array2d(dtype=float)  # shear modulus [Pa]
+    lam: wp.array2d(dtype=float)  # first Lame parameter [Pa]
+    material: wp.array2d(dtype=int)  # index into piavatar_envs.mpm.materials.MATERIALS
+
+
+@wp.struct
+class Boundaries:
+    """Analytic half-spaces that the bodies stay out of: ``dot(normal, x) >= offset``, with Coulomb friction."""
+
+    count: int
+    plane: wp.array(dtype=wp.vec4)  # (normal, offset [m])
+    friction: wp.array(dtype=float)
+
+
+@wp.func
+def row(e: int, rows: int):
+    """Row of a constant for environment ``e``: 0 if it is shared by all environments."""
+    return wp.min(e, rows - 1)
+
+
+@dataclass(frozen=True)
+class Model:
+    """Everything that does not change: grid, step, particle constants and boundaries.
+
+    ``sound_speed`` is the fastest elastic wave of any particle [m/s].
+    """
+
+    num_envs: int
+    num_particles: int
+    device: str
+    grid: Grid
+    step: Step
+    particles: Particles
+    boundaries: Boundaries
+    num_substeps: int
+    control_dt: float
+    sound_speed: float
+
+    @property
+    def num_nodes(self) -> int:
+        """Grid nodes of one environment."""
+        return int(np.prod(np.asarray(self.grid.nodes)))
+
+    @property
+    def num_blocks(self) -> int:
+        """Grid blocks of one environment."""
+        return int(np.prod(np.asarray(self.grid.blocks)))
+
+
+@dataclass
+class State:
+    """What evolves: a checkpoint holds exactly this. Shapes ``(num_envs, num_particles)`` and ``(num_envs,)``."""
+
+    x: wp.array
+    u: wp.array
+    C: wp.array
+    F: wp.array
+    vk: wp.array  # kinematic velocity of the last substep: part of the total velocity u + vk
+    failure: wp.array  # bits FAILURE_*; a failed environment is frozen until it is reset
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """A copy of every array on the host."""
+        return {field.name: getattr(self, field.name).numpy().copy() for field in fields(self)}
+
+
+@dataclass
+class Scratch:
+    """Grid arrays, rebuilt every substep.
+
+    ``node_sum`` and ``node_offset`` are zero between substeps: the grid pass clears what it reads.
+    """
+
+    node_sum: wp.array  # (num_envs, num_nodes) vec8: mass, physical momentum, kinematic momentum
+    node_offset: wp.array  # (num_envs, num_nodes) vec3: sum of w m (x_i - x_p), kept near boundaries only
+    node_velocity: wp.array  # (num_envs, num_nodes) vec8: -, physical velocity, kinematic velocity
+    block_active: wp.array  # (2, num_envs, num_blocks) int8: blocks with mass in even and odd substeps
+    boundary_impulse: wp.array  # (num_envs,) vec3: impulse of the boundaries on the bodies this control step [N s]

@@ -1,0 +1,120 @@
+"""Small bodies of matter for the tests of the material point method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import warp as wp
+
+from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
+from piavatar_envs.mpm.diagnostics import Totals, totals
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.solver import record_substep
+from piavatar_envs.mpm.types import Model, Scratch, State
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def push_particles(
+    keep: wp.array(dtype=float),
+    kick: wp.array(dtype=wp.vec3),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    C: wp.array2d(dtype=wp.mat33),
+):
+    e, p = wp.tid()
+    u[e, p] = keep[0] * u[e, p] + kick[p]
+    C[e, p] = keep[0] * C[e, p]
+
+
+@dataclass
+class Simulation:
+    """A body on a lattice, with the program of one control step."""
+
+    model: Model
+    state: State
+    scratch: Scratch
+    program: Program
+    rest: np.ndarray  # (num_particles, 3) [m]
+    keep: wp.array  # (1,) see push()
+    kick: wp.array  # (num_particles, 3)
+
+    def run(self, control_steps: int = 1) -> Simulation:
+        for _ in range(control_steps):
+            self.program.run()
+        return self
+
+    def set(self, **arrays: np.ndarray) -> Simulation:
+        """Write state arrays, in double precision or not, for all environments or one for each."""
+        for name, value in arrays.items():
+            target = getattr(self.state, name)
+            shape = target.numpy().shape
+            target.assign(np.ascontiguousarray(np.broadcast_to(np.asarray(value, np.float32), shape)))
+        return self
+
+    def push(self, damping: float = 0.0, acceleration: np.ndarray | None = None) -> Simulation:
+        """From now on damp all velocities at a rate [1/s] and push each particle [m/s^2]; needs ``pushed=True``."""
+        dt = self.model.step.dt
+        self.keep.assign(np.array([np.exp(-damping * dt)], np.float32))
+        kick = np.zeros(self.rest.shape) if acceleration is None else dt * acceleration
+        self.kick.assign(kick.astype(np.float32))
+        return self
+
+    def get(self, name: str, env: int = 0) -> np.ndarray:
+        return getattr(self.state, name).numpy()[env].astype(float)
+
+    def totals(self, env: int = 0, **kwargs) -> Totals:
+        return totals(self.model, self.state, env, **kwargs)
+
+    @property
+    def failures(self) -> list[int]:
+        return self.state.failure.numpy().tolist()
+
+
+def lattice(lower: Sequence[float], upper: Sequence[float], spacing: float) -> np.ndarray:
+    """Centres of the cells of edge ``spacing`` [m] that fill a box, shape ``(num_particles, 3)``."""
+    counts = np.round(np.subtract(upper, lower) / spacing).astype(int)
+    axes = [low + spacing * (np.arange(count) + 0.5) for low, count in zip(lower, counts, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@pytest.fixture(scope="session")
+def simulate(device: str) -> Callable[..., Simulation]:
+    """Builds a box of matter; what it does not know goes to ``MaterialPoints.uniform`` or ``build_model``."""
+
+    def build(
+        lower: Sequence[float] = (-0.1, -0.1, -0.1),
+        upper: Sequence[float] = (0.1, 0.1, 0.1),
+        spacing: float = 0.025,
+        dx: float = 0.05,
+        margin: float = 0.5,
+        points: MaterialPoints | None = None,
+        young_modulus: float = 1.0e5,
+        poisson_ratio: float = 0.3,
+        density: float = 1000.0,
+        material: str = "neo_hookean",
+        gravity: Sequence[float] = (0.0, 0.0, 0.0),
+        pushed: bool = False,
+        **kwargs,
+    ) -> Simulation:
+        rest = lattice(lower, upper, spacing)
+        if points is None:
+            volume = np.full(len(rest), spacing**3)
+            points = MaterialPoints.uniform(volume, density, young_modulus, poisson_ratio, material)
+        grid = make_grid(np.subtract(lower, margin), np.add(upper, margin), dx)
+        model = build_model(points, grid, device=device, gravity=gravity, **kwargs)
+        state, scratch = allocate(model)
+        keep = wp.full(1, 1.0, dtype=float, device=device)
+        kick = wp.zeros(len(rest), dtype=wp.vec3, device=device)
+        program = Program(device)
+        for index in range(model.num_substeps):
+            record_substep(program, model, state, scratch, index)
+            if pushed:
+                program.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
+        return Simulation(model, state, scratch, program, rest, keep, kick).set(x=rest)
+
+    return build

@@ -1,0 +1,116 @@
+"""Many environments equal one, each with its own constants; a replayed program equals launches one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from piavatar_envs.mpm.build import MaterialPoints
+from piavatar_envs.mpm.materials import MATERIALS
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.solver import record_substep
+
+ARRAYS = ("x", "u", "C", "F")
+SCENE = {"gravity": (0.0, 0.0, -9.81), "planes": [((0.1, 0.0, 1.0), -0.11, 0.5)], "num_substeps": 25, "margin": 0.3}
+COUNT = 512
+
+
+def start(sim, seeds):
+    """Smooth random velocities, physical and prescribed, from one seed an environment."""
+    draws = [np.random.default_rng(seed).normal(size=(4, 3)) for seed in seeds]
+    u = np.stack([d[0] + np.sin(20.0 * sim.rest) * d[1] for d in draws])
+    vk = np.stack([0.3 * np.cos(15.0 * sim.rest) * d[2] for d in draws])
+    return sim.set(u=u, vk=vk)
+
+
+def assert_same(got, expected, device):
+    for array in ARRAYS:
+        if device == "cpu":
+            assert np.array_equal(got[array], expected[array]), array
+        else:  # the order of atomic additions is not fixed
+            assert np.allclose(got[array], expected[array], atol=2e-3), array
+
+
+def test_three_environments_equal_three_single_ones(simulate, device):
+    batch = start(simulate(num_envs=3, **SCENE), (5, 6, 7)).run(3)
+    assert batch.failures == [0, 0, 0]
+    impulses = batch.scratch.boundary_impulse.numpy()
+    assert np.all(impulses[:, 2] > 0.1)  # each has hit the ground
+    for env, seed in enumerate((5, 6, 7)):
+        single = start(simulate(num_envs=1, **SCENE), (seed,)).run(3)
+        got = {name: batch.state.numpy()[name][env : env + 1] for name in ARRAYS}
+        assert_same(got, single.state.numpy(), device)
+        assert impulses[env] == pytest.approx(single.scratch.boundary_impulse.numpy()[0], rel=1e-5, abs=1e-5)
+
+
+def random_points(rows, seed):
+    rng = np.random.default_rng(seed)
+    shape = (rows, COUNT)
+    return MaterialPoints(
+        volume=0.025**3 * rng.uniform(0.8, 1.2, shape),
+        density=rng.uniform(800.0, 1200.0, shape),
+        young_modulus=rng.uniform(1e4, 1e5, shape),
+        poisson_ratio=rng.uniform(0.1, 0.35, shape),
+        material=rng.integers(0, len(MATERIALS), shape),
+    )
+
+
+def test_each_environment_has_its_own_constants(simulate, device):
+    """Arrays with a row an environment: environment i is the single one with row i."""
+    points = random_points(3, 1)
+    batch = start(simulate(num_envs=3, points=points, **SCENE), (5, 5, 5)).run(3)
+    finals = []
+    for env in range(3):
+        row = MaterialPoints(**{name: value[env : env + 1] for name, value in vars(points).items()})
+        single = start(simulate(points=row, **SCENE), (5,)).run(3)
+        finals.append(single.state.numpy())
+        got = {name: batch.state.numpy()[name][env : env + 1] for name in ARRAYS}
+        assert_same(got, finals[-1], device)
+    assert np.abs(finals[0]["x"] - finals[1]["x"]).max() > 1e-3  # the constants do matter
+
+
+@pytest.mark.parametrize("name", ["volume", "density", "young_modulus", "poisson_ratio", "material"])
+def test_constants_with_one_row_are_shared(simulate, device, name):
+    """One row serves all environments, whichever the array, next to arrays with a row an environment."""
+    points = vars(random_points(3, 2))
+    mixed = MaterialPoints(**(points | {name: points[name][:1]}))
+    spread = MaterialPoints(**(points | {name: np.repeat(points[name][:1], 3, axis=0)}))
+    runs = [start(simulate(num_envs=3, points=p, **SCENE), (5, 6, 7)).run().state.numpy() for p in (mixed, spread)]
+    assert_same(*runs, device)
+
+
+def test_wrong_number_of_rows_is_refused(simulate):
+    with pytest.raises(ValueError, match=r"young_modulus.*2.*1 or 3"):
+        points = vars(random_points(1, 3)) | {"young_modulus": np.full((2, COUNT), 1e5)}
+        simulate(num_envs=3, points=MaterialPoints(**points), **SCENE)
+
+
+def test_program_equals_eager_launches(simulate, device):
+    replayed = start(simulate(num_envs=2, **SCENE), (1, 2)).run(2)
+    eager = start(simulate(num_envs=2, **SCENE), (1, 2))
+    for _ in range(2):
+        eager.program.run_eager()
+    assert_same(replayed.state.numpy(), eager.state.numpy(), device)
+
+
+def test_substeps_equal_control_steps(simulate, device):
+    """25 substeps in one program equal 25 programs of one: the two lists of active blocks take turns in both."""
+    whole = start(simulate(**SCENE), (1,)).run(2)
+    split = start(simulate(**{**SCENE, "num_substeps": 1}, control_dt=whole.model.step.dt), (1,)).run(50)
+    for array in ARRAYS:
+        assert np.allclose(split.state.numpy()[array], whole.state.numpy()[array], atol=1e-3)
+
+
+def test_timed_reports_every_kernel(simulate):
+    sim = simulate(**SCENE)
+    seconds = sim.program.timed(1)
+    assert set(seconds) == {"particles_to_grid", "update_grid", "grid_to_particles"}
+    assert all(value > 0.0 for value in seconds.values())
+    assert len(sim.program) == 3 * 25
+
+
+def test_a_program_that_has_run_is_closed(simulate, device):
+    sim = simulate(**SCENE).run()
+    with pytest.raises(RuntimeError, match=r"particles_to_grid.*has run"):
+        record_substep(sim.program, sim.model, sim.state, sim.scratch, 0)
+    assert len(Program(device)) == 0

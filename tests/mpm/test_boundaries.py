@@ -1,0 +1,157 @@
+"""Analytic boundaries: Coulomb's law on an incline, the weight of a body at rest, and nothing left on the grid."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+GROUND = (0.0, 0.0, 1.0)
+DX = 0.05
+#: A block whose lowest particles are half their spacing above the ground: it touches, and does not fall first.
+BLOCK = {"lower": (-0.1, -0.1, 0.0), "upper": (0.1, 0.1, 0.1), "dx": DX, "spacing": 0.025, "margin": 0.8}
+
+
+def block_on_incline(simulate, slope, friction, normal=GROUND, **kwargs):
+    """The plane stays level, gravity tilts: ``tan(angle) = slope`` along +x.
+
+    The block is loaded slowly, under damping: put down at once it rocks, and rocking bodies creep below the friction
+    angle, as they do in reality.
+    """
+    angle = np.arctan(slope)
+    gravity = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    planes = [(normal, 0.0, friction)]
+    sim = simulate(**{**BLOCK, "lower": (-0.2, -0.1, 0.0)}, gravity=gravity, planes=planes, pushed=True, **kwargs)
+    sim.push(damping=50.0).run(10)
+    return sim.push(damping=0.0).run(4)
+
+
+def mean_velocity(sim):
+    """Along the slope [m/s]."""
+    return sim.get("u")[:, 0].mean()
+
+
+@pytest.mark.parametrize(("slope", "friction"), [(0.3, 0.29), (0.6, 0.5), (0.6, 0.0), (1.2, 0.5)])
+def test_block_slips_with_the_acceleration_of_coulomb(simulate, slope, friction):
+    """``a = g (sin - mu cos)``."""
+    angle = np.arctan(slope)
+    sim = block_on_incline(simulate, slope, friction)
+    start, steps = mean_velocity(sim), 8
+    acceleration = (mean_velocity(sim.run(steps)) - start) / (steps * sim.model.control_dt)
+    assert sim.failures == [0]
+    assert acceleration == pytest.approx(9.81 * (np.sin(angle) - friction * np.cos(angle)), abs=0.002 * 9.81)
+
+
+@pytest.mark.parametrize(("slope", "friction"), [(0.3, 0.31), (0.6, 0.62), (0.8, 0.85)])
+def test_block_stays_below_the_friction_angle(simulate, slope, friction):
+    sim = block_on_incline(simulate, slope, friction)
+    before = sim.get("x")[:, 0].mean()
+    sim.run(15)
+    assert abs(sim.get("x")[:, 0].mean() - before) < 1e-3 * DX  # a slide without friction would have gone 0.35 m
+    assert abs(mean_velocity(sim)) < 1e-4
+
+
+def test_plane_normals_are_normalised(simulate):
+    """A normal of length 3 and its offset say the same plane."""
+    one = block_on_incline(simulate, 0.6, 0.5)
+    three = block_on_incline(simulate, 0.6, 0.5, normal=(0.0, 0.0, 3.0))
+    assert np.abs(one.get("x") - three.get("x")).max() < 1e-6
+
+
+@pytest.mark.parametrize("decoupling", ["split", "paper"])
+def test_impulse_is_the_change_of_momentum(simulate, decoupling):
+    """Newton's third law at every moment of a fall, an oblique impact and the rest after it."""
+    gravity = np.array([0.5, 0.0, -9.81])
+    sim = simulate(**BLOCK, gravity=gravity, planes=[(GROUND, -0.02, 0.4)], decoupling=decoupling)
+    sim.set(u=[1.0, 0.5, -1.0])
+    start, dt = sim.totals(), sim.model.control_dt
+    for n in range(1, 16):
+        now = sim.run().totals()
+        impulse = sim.scratch.boundary_impulse.numpy()[0]  # nobody has cleared it
+        expected = now.momentum - start.momentum - n * dt * now.mass * gravity
+        assert np.abs(impulse - expected).max() < 1e-5 * start.momentum_scale
+    assert impulse[2] > 0.5 * n * dt * now.mass * 9.81
+
+
+def test_ground_bears_the_weight(simulate):
+    sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=[(GROUND, 0.0, 0.5)]).run(30)
+    sim.scratch.boundary_impulse.zero_()
+    steps = 30
+    impulse = sim.run(steps).scratch.boundary_impulse.numpy()[0]
+    weight = sim.totals().mass * 9.81
+    assert impulse[2] == pytest.approx(weight * steps * sim.model.control_dt, rel=2e-3)
+    assert np.abs(impulse[:2]).max() < 2e-3 * impulse[2]
+    assert np.abs(sim.get("u")).max() < 5e-3
+
+
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+@pytest.mark.parametrize("how", ["u", "vk"])
+def test_nothing_passes_a_plane(simulate, how, speed):
+    """A soft block thrown at the ground, or carried at it by its prescribed velocity, stays above it and bounces."""
+    sim = simulate(**BLOCK, planes=[(GROUND, 0.0, 0.5)], young_modulus=2.0e4, num_substeps=15)
+    sim.set(**{how: [0.0, 0.0, -speed]})
+    for _ in range(5):
+        assert sim.run().get("x")[:, 2].min() > -0.6 * DX
+    total = (sim.get("u") + sim.get("vk"))[:, 2].mean()
+    assert sim.failures == [0]
+    assert 0.0 < total < speed  # restitution
+
+
+def test_own_prescribed_motion_meets_the_ground_too(simulate):
+    """Neighbours with opposite ``vk`` cancel on the grid, which sees nothing; none of them may go below."""
+    sim = simulate(**BLOCK, planes=[(GROUND, 0.0, 0.5)], num_substeps=15)
+    row, column, layer = np.round(sim.rest / BLOCK["spacing"] - 0.5).astype(int).T
+    sign = np.where((row + column + layer) % 2, 1.0, -1.0)
+    sim.set(vk=sign[:, None] * [0.0, 0.0, 1.0]).run(3)
+    assert sim.get("x")[:, 2].min() > -0.6 * DX
+    assert sim.get("x")[sign > 0, 2].min() > 0.1  # the others do go up
+
+
+def test_leaving_the_ground_is_free(simulate):
+    """A plane pushes; it does not pull, and has no friction on what leaves."""
+    sim = simulate(**BLOCK, planes=[(GROUND, 0.0, 0.5)])
+    velocity = np.array([0.7, -0.4, 1.0])
+    sim.set(u=velocity).run(2)
+    assert np.abs(sim.get("u") - velocity).max() < 1e-5
+    assert sim.scratch.boundary_impulse.numpy()[0].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_prescribed_motion_meets_the_ground_like_momentum(simulate):
+    """Contact acts on the total velocity: what share of it is prescribed makes no difference."""
+    runs = []
+    for share in (0.0, 0.3, 1.0):
+        sim = simulate(**BLOCK, planes=[(GROUND, 0.0, 0.5)], gravity=(0.0, 0.0, -9.81))
+        velocity = np.array([0.5, 0.0, -1.0])
+        runs.append(sim.set(u=(1.0 - share) * velocity, vk=share * velocity).run(5).get("x"))
+    assert np.abs(runs[1] - runs[0]).max() < 1e-4
+    assert np.abs(runs[2] - runs[0]).max() < 1e-4
+
+
+def test_corner_of_two_planes(simulate):
+    """Pulled into a corner, a block rests on both planes."""
+    gravity = (-5.0, 0.0, -9.81)
+    sim = simulate(**BLOCK, gravity=gravity, planes=[(GROUND, 0.0, 0.0), ((1.0, 0.0, 0.0), -0.1, 0.0)]).run(30)
+    sim.scratch.boundary_impulse.zero_()
+    impulse = sim.run(15).scratch.boundary_impulse.numpy()[0]
+    expected = -np.array(gravity) * sim.totals().mass * 15 * sim.model.control_dt
+    assert impulse == pytest.approx(expected, abs=0.02 * expected[2])
+
+
+def test_no_contact_at_a_distance(simulate):
+    """The grid feels a plane three cells early; matter more than the gate above it falls freely."""
+    planes = [(GROUND, -0.6 * DX, 0.5)]
+    sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=planes, num_substeps=15, control_dt=0.02).run()
+    assert sim.scratch.boundary_impulse.numpy()[0].tolist() == [0.0, 0.0, 0.0]
+    assert np.abs(sim.get("u")[:, 2] + 9.81 * 0.02).max() < 1e-5
+
+
+@pytest.mark.parametrize("planes", [[], [(GROUND, 0.0, 0.5)], [((1.0, 0.2, 1.0), -0.05, 0.5)]])
+@pytest.mark.parametrize("num_substeps", [15, 16])
+def test_scratch_is_clear_between_steps(simulate, planes, num_substeps):
+    """The next substep adds to what it finds: the grid pass must have cleared every node."""
+    sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=planes, num_substeps=num_substeps)
+    sim.set(u=[2.0, 1.0, 0.5])
+    for _ in range(4):
+        sim.run()
+        assert sim.failures == [0]
+        assert not sim.scratch.node_sum.numpy().any()
+        assert not sim.scratch.node_offset.numpy().any()

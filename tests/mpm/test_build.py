@@ -1,0 +1,186 @@
+"""What cannot run is refused with the value, the limit and the remedy; what can is sized by rule."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from piavatar_envs.mpm import build
+from piavatar_envs.mpm.build import (
+    CFL_STABLE,
+    MaterialPoints,
+    allocate,
+    build_model,
+    check_num_substeps,
+    choose_num_substeps,
+    estimate_bytes,
+    make_boundaries,
+    make_grid,
+)
+from piavatar_envs.mpm.materials import MATERIALS, material_index
+
+
+def wave_speed(young_modulus, poisson_ratio, density=1000.0):
+    """P-wave modulus from any table of elastic constants."""
+    modulus = young_modulus * (1.0 - poisson_ratio) / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
+    return np.sqrt(modulus / density)
+
+
+@pytest.mark.parametrize(("poisson_ratio", "expected"), [(0.3, 15), (0.45, 25)])
+def test_substeps_of_the_default_body(poisson_ratio, expected):
+    """E = 1e5 Pa at dx = 5.3 cm: 15 substeps per 1/30 s, 25 near incompressibility."""
+    points = MaterialPoints.uniform(np.ones(3), young_modulus=1e5, poisson_ratio=poisson_ratio)
+    assert points.sound_speed() == pytest.approx(wave_speed(1e5, poisson_ratio), rel=1e-6)
+    assert choose_num_substeps(1.0 / 30.0, 0.053, points.sound_speed()) == expected
+
+
+def test_fastest_particle_rules():
+    points = MaterialPoints.uniform(np.ones(4))
+    points.young_modulus[0, 2], points.density[0, 2] = 4e5, 100.0
+    assert points.sound_speed() == pytest.approx(wave_speed(4e5, 0.3, 100.0), rel=1e-6)
+
+
+@pytest.mark.parametrize("control_dt", [1e-3, 1 / 30, 0.1])
+@pytest.mark.parametrize("speed", [0.1, 11.6, 300.0])
+@pytest.mark.parametrize("cfl", [0.3, 0.5, 0.8])
+def test_chosen_substeps_are_the_fewest(control_dt, speed, cfl):
+    n = choose_num_substeps(control_dt, 0.05, speed, cfl)
+    assert speed * control_dt / n <= cfl * 0.05 * (1.0 + 1e-6)
+    assert n == 1 or speed * control_dt / (n - 1) > cfl * 0.05
+    check_num_substeps(n, control_dt, 0.05, speed)
+
+
+def test_exact_multiples_need_no_extra_substep():
+    assert choose_num_substeps(0.1, 0.05, 10.0, 0.5) == 40
+
+
+def test_unstable_time_step_is_refused():
+    """The remedy in the message is the fewest substeps that are accepted."""
+    speed, dx, control_dt = 11.6, 0.05, 1 / 30
+    fewest = int(np.ceil(control_dt * speed / (CFL_STABLE * dx)))
+    with pytest.raises(ValueError, match=rf"sim_dt=0.0333 s.*CFL limit 0.00362 s.*c=11.6.*num_substeps >= {fewest}"):
+        check_num_substeps(1, control_dt, dx, speed)
+    with pytest.raises(ValueError, match="CFL"):
+        check_num_substeps(fewest - 1, control_dt, dx, speed)
+    check_num_substeps(fewest, control_dt, dx, speed)
+
+
+def test_dust_without_stiffness_has_no_limit():
+    assert choose_num_substeps(1.0, 0.05, 0.0) == 1
+    check_num_substeps(1, 1.0, 0.05, 0.0)
+
+
+@pytest.fixture(scope="module")
+def model_of(device):
+    """``build_model`` of 8 particles in a box of 1 m, with some arguments changed."""
+
+    def build_with(points=None, **kwargs):
+        points = points or MaterialPoints.uniform(np.full(8, 1e-3))
+        return build_model(points, make_grid((0, 0, 0), (1, 1, 1), 0.1), device=device, **kwargs)
+
+    return build_with
+
+
+@pytest.mark.parametrize("num_substeps", [0, -3])
+def test_no_substeps_are_refused(model_of, num_substeps):
+    with pytest.raises(ValueError, match=rf"num_substeps={num_substeps}.*at least 1"):
+        model_of(num_substeps=num_substeps)
+
+
+def test_model_is_what_was_asked_for(model_of):
+    model = model_of(control_dt=0.02, gravity=(0.0, 1.0, -2.0), num_envs=2)
+    assert model.num_substeps == choose_num_substeps(0.02, 0.1, model.sound_speed)
+    assert model.step.dt * model.num_substeps == pytest.approx(0.02)
+    assert list(model.step.gravity) == [0.0, 1.0, -2.0]
+    assert model.particles.mass.numpy() == pytest.approx(np.ones((1, 8)))
+    state, scratch = allocate(model)
+    assert state.x.shape == (2, 8) and scratch.node_sum.shape == (2, model.num_nodes)
+    assert np.array_equal(state.F.numpy(), np.broadcast_to(np.eye(3), (2, 8, 3, 3)))
+
+
+def test_default_step_is_refused_when_too_long(model_of):
+    with pytest.raises(ValueError, match=r"num_substeps >= \d+"):
+        model_of(num_substeps=1, control_dt=0.1)
+
+
+def test_unknown_decoupling(model_of):
+    with pytest.raises(ValueError, match=r"'magic'.*split, paper, none, no_stress"):
+        model_of(decoupling="magic")
+
+
+@pytest.mark.parametrize("poisson_ratio", [0.5, -0.2, np.nan])
+def test_bad_poisson_ratio(model_of, poisson_ratio):
+    with pytest.raises(ValueError, match=rf"poisson_ratio={poisson_ratio}"):
+        model_of(MaterialPoints.uniform(np.full(8, 1e-3), poisson_ratio=poisson_ratio))
+
+
+@pytest.mark.parametrize("name", ["volume", "density"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_matter_has_mass(model_of, name, value):
+    points = MaterialPoints.uniform(np.full(8, 1e-3))
+    getattr(points, name)[0, 3] = value
+    with pytest.raises(ValueError, match=rf"{name}={value:g}.*positive"):
+        model_of(points)
+
+
+def test_unknown_material():
+    with pytest.raises(ValueError, match=r"'jelly'"):
+        MaterialPoints.uniform(np.ones(1), material="jelly")
+    assert [material_index(name) for name in MATERIALS] == list(range(len(MATERIALS)))
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "dx"),
+    [
+        ((0, 0, 0), (1, 1, 0), 0.1),
+        ((0, 0, 0), (1, -1, 1), 0.1),
+        ((0, 0, 0), (1, 1, 1), 0.0),
+        ((0, 0, 0), (1, 1, 1), np.nan),
+        ((0, 0, np.nan), (1, 1, 1), 0.1),
+        ((0, 0, 0), (1, np.inf, 1), 0.1),
+    ],
+)
+def test_empty_domain(lower, upper, dx):
+    with pytest.raises(ValueError, match="empty domain"):
+        make_grid(lower, upper, dx)
+
+
+def test_too_fine_grid():
+    """A node's record is 32 bytes and Warp's strides are 32-bit: 2^31 bytes an environment."""
+    with pytest.raises(ValueError, match=r"nodes exceed 2\^26.*dx larger than 0.001 m"):
+        make_grid((0, 0, 0), (1, 1, 1), 1e-3)
+
+
+def test_domain_lies_inside_its_grid():
+    grid = make_grid((-0.33, 0.1, 2.0), (0.41, 0.75, 2.3), 0.05)
+    top = np.asarray(grid.origin) + 0.05 * (np.asarray(grid.nodes) - 1)
+    assert np.all(np.asarray(grid.origin) <= np.array([-0.33, 0.1, 2.0]) - 1.5 * 0.05)
+    assert np.all(top >= np.array([0.41, 0.75, 2.3]) + 0.99 * 0.05)
+    assert np.all(np.asarray(grid.blocks) * 4 >= np.asarray(grid.nodes))
+
+
+@pytest.mark.parametrize("plane", [((0, 0, 0), 0.0, 0.5), ((0, 0, 1), 0.0, -0.1), ((0, 0, 1), 0.0, np.nan)])
+def test_bad_planes(device, plane):
+    with pytest.raises(ValueError, match="friction"):
+        make_boundaries([plane], device)
+
+
+def test_memory_estimate(model_of):
+    """Close to what the arrays take."""
+    model = model_of(num_envs=3)
+    state, scratch = allocate(model)
+    arrays = [*vars(state).values(), *vars(scratch).values()]
+    taken = sum(array.capacity for array in arrays)
+    assert estimate_bytes(3, model.num_particles, model.num_nodes) == pytest.approx(taken, rel=0.05)
+
+
+def test_batch_that_does_not_fit_is_refused(monkeypatch):
+    class Small:
+        is_cuda, free_memory = True, 2**30
+
+    monkeypatch.setattr(build.wp, "get_device", lambda name: Small())
+    need = estimate_bytes(1, 3000, 50**3)
+    fits = 2**30 // need
+    build.check_memory(fits, 3000, 50**3, "cuda:0")
+    with pytest.raises(ValueError, match=rf"{10 * fits} environments need .* GiB.*num_envs <= {fits}"):
+        build.check_memory(10 * fits, 3000, 50**3, "cuda:0")

@@ -1,0 +1,117 @@
+"""What goes wrong is flagged, stops there, and touches no other environment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from piavatar_envs.mpm.types import (
+    FAILURE_CFL,
+    FAILURE_NONFINITE,
+    FAILURE_OUT_OF_GRID,
+    failure_name,
+)
+
+VICTIM, PARTICLE = 1, 37
+ARRAYS = ("x", "u", "C", "F")
+
+#: What is broken -> (state array, value, failure)
+FAULTS = {
+    "position is not a number": ("x", np.nan, FAILURE_NONFINITE),
+    "position is infinite": ("x", np.inf, FAILURE_NONFINITE),
+    "velocity is not a number": ("u", np.nan, FAILURE_NONFINITE),
+    "prescribed velocity is infinite": ("vk", -np.inf, FAILURE_NONFINITE),
+    "affine matrix is not a number": ("C", np.nan, FAILURE_NONFINITE),
+    "deformation is not a number": ("F", np.nan, FAILURE_NONFINITE),
+    "left below": ("x", -1.5, FAILURE_OUT_OF_GRID),
+    "left above": ("x", 1.5, FAILURE_OUT_OF_GRID),
+    "left for good": ("x", 1e12, FAILURE_OUT_OF_GRID),
+    "absurd speed": ("u", 1e6, FAILURE_CFL),
+    "absurd prescribed speed": ("vk", 1e6, FAILURE_CFL),
+}
+
+
+@pytest.fixture(scope="module")
+def three(simulate):
+    """Three environments in free fall onto the ground, each with another velocity; a fresh start each call."""
+    sim = simulate(num_envs=3, gravity=(0.0, 0.0, -9.81), planes=[((0.0, 0.0, 1.0), -0.11, 0.5)], pushed=True)
+
+    def start():
+        for name in ("vk", "C", "failure"):
+            getattr(sim.state, name).zero_()
+        velocities = np.random.default_rng(0).normal(size=(3, 1, 3))
+        return sim.set(x=sim.rest, F=np.eye(3), u=np.broadcast_to(velocities, (3, *sim.rest.shape)))
+
+    return start
+
+
+def break_particle(sim, name, value):
+    array = getattr(sim.state, name)
+    host = array.numpy()
+    host[VICTIM, PARTICLE] = value
+    array.assign(host)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_is_flagged_and_contained(three, device, fault):
+    name, value, failure = FAULTS[fault]
+    expected = three().run(3).state.numpy()
+    sim = three()
+    break_particle(sim, name, value)
+    got = sim.run(3).state.numpy()
+    assert sim.failures == [0, failure, 0]
+    for array in ARRAYS:
+        for env in (0, 2):
+            if device == "cpu":
+                assert np.array_equal(got[array][env], expected[array][env]), array
+            else:
+                assert np.allclose(got[array][env], expected[array][env], atol=1e-4), array
+
+
+@pytest.mark.parametrize("fault", ["position is not a number", "left above", "absurd speed"])
+def test_failed_environment_is_frozen(three, fault):
+    name, value, failure = FAULTS[fault]
+    sim = three()
+    break_particle(sim, name, value)
+    frozen = sim.run().state.numpy()
+    after = sim.run(3).state.numpy()
+    assert sim.failures == [0, failure, 0]
+    assert np.array_equal(after["x"][VICTIM], frozen["x"][VICTIM], equal_nan=True)
+    assert np.array_equal(after["F"][VICTIM], frozen["F"][VICTIM], equal_nan=True)
+    moved = np.abs(after["x"] - frozen["x"]).max(axis=(1, 2))
+    assert moved[0] > 0.01 and moved[2] > 0.01
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_nothing_of_a_fault_stays_on_the_grid(three, fault):
+    name, value, _ = FAULTS[fault]
+    sim = three()
+    break_particle(sim, name, value)
+    sim.run()
+    assert not sim.scratch.node_sum.numpy().any()
+    assert not sim.scratch.node_offset.numpy().any()
+
+
+def test_environment_runs_again_after_a_reset(three):
+    """Once its state is whole and its flag is down, it does what it would have done."""
+    expected = three().run(2).state.numpy()
+    sim = three()
+    break_particle(sim, "x", np.nan)
+    sim.run(2)
+    again = three().run(2).state.numpy()
+    assert np.abs(again["x"] - expected["x"]).max() < 1e-6
+
+
+def test_healthy_flags_of_other_causes_are_kept(three):
+    """A flag that somebody else has raised freezes the environment, and stays."""
+    sim = three()
+    sim.state.failure.assign(np.array([8, 0, 0], np.int32))
+    sim.run()
+    assert sim.failures == [8, 0, 0]
+    assert np.array_equal(sim.get("x", env=0), sim.rest.astype(np.float32))
+
+
+def test_failure_names():
+    assert failure_name(0) is None
+    assert failure_name(FAILURE_CFL) == "cfl"
+    assert failure_name(FAILURE_NONFINITE | FAILURE_OUT_OF_GRID) == "nonfinite+out_of_grid"

@@ -1,0 +1,202 @@
+"""Constitutive models: the stress in the kernels is the derivative of the energy in NumPy, for every material."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.linalg import polar
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.mpm.materials import (
+    MATERIALS,
+    kirchhoff_stress,
+    lame_parameters,
+    material_index,
+    von_mises_stress,
+)
+from piavatar_envs.mpm.materials.fixed_corotated import polar_rotation
+from piavatar_envs.mpm.materials.neo_hookean import J_MIN
+
+wp.set_module_options({"enable_backward": False})
+
+MU, LAM = (float(value) for value in lame_parameters(1.0e5, 0.3))
+COUNT = 60
+VOLUME_RATIOS = {"squashed": 1.2 * J_MIN, "below J_MIN": 0.6 * J_MIN, "nearly flat": 1e-3, "inverted": -0.3}
+
+pytestmark = pytest.mark.filterwarnings("error")
+each_material = pytest.mark.parametrize("material", MATERIALS)
+
+
+@wp.kernel
+def probe_stress(material: int, mu: float, lam: float, F: wp.array(dtype=wp.mat33), tau: wp.array(dtype=wp.mat33)):
+    p = wp.tid()
+    tau[p] = kirchhoff_stress(material, F[p], mu, lam)
+
+
+@wp.kernel
+def probe_polar(F: wp.array(dtype=wp.mat33), R: wp.array(dtype=wp.mat33)):
+    p = wp.tid()
+    R[p] = polar_rotation(F[p])
+
+
+@wp.kernel
+def probe_von_mises(tau: wp.array(dtype=wp.mat33), J: wp.array(dtype=float), out: wp.array(dtype=float)):
+    p = wp.tid()
+    out[p] = von_mises_stress(tau[p], J[p])
+
+
+@pytest.fixture(scope="module")
+def stress(device):
+    """Kirchhoff stress from the kernel, in double precision, shape (P, 3, 3) [Pa]."""
+
+    def evaluate(material, F, mu=MU, lam=LAM):
+        F = wp.array(np.ascontiguousarray(F, np.float32), dtype=wp.mat33, device=device)
+        tau = wp.zeros_like(F)
+        wp.launch(probe_stress, len(F), inputs=[material_index(material), mu, lam, F, tau], device=device)
+        return tau.numpy().astype(float)
+
+    return evaluate
+
+
+@pytest.fixture(scope="module")
+def rotation_factor(device):
+    def evaluate(F):
+        F = wp.array(np.ascontiguousarray(F, np.float32), dtype=wp.mat33, device=device)
+        R = wp.zeros_like(F)
+        wp.launch(probe_polar, len(F), inputs=[F, R], device=device)
+        return R.numpy().astype(float)
+
+    return evaluate
+
+
+def rotations(count, seed):
+    return Rotation.random(count, random_state=seed).as_matrix()
+
+
+def deformations(kind):
+    """Float32-exact deformation gradients ``U diag(stretches) V^T`` of one kind, shape (COUNT, 3, 3)."""
+    rng = np.random.default_rng(len(kind))
+    if kind == "small":
+        stretches = 1.0 + rng.uniform(-1e-2, 1e-2, (COUNT, 3))
+    elif kind == "moderate":
+        stretches = rng.uniform(0.6, 1.6, (COUNT, 3))
+    elif kind == "large":
+        stretches = np.exp(rng.uniform(-1.5, 1.5, (COUNT, 3)))
+    else:
+        stretches = rng.uniform(0.7, 1.4, (COUNT, 3))
+        stretches[:, 0] = VOLUME_RATIOS[kind] / (stretches[:, 1] * stretches[:, 2])
+    F = rotations(COUNT, 1) @ (stretches[:, :, None] * rotations(COUNT, 2))
+    return F.astype(np.float32).astype(float)
+
+
+def energy_gradient(module, F, step=1e-6):
+    """Central differences of the energy density with respect to F, shape (P, 3, 3) [Pa]."""
+    gradient = np.empty_like(F)
+    for i in range(3):
+        for j in range(3):
+            delta = np.zeros((3, 3))
+            delta[i, j] = step
+            gradient[:, i, j] = (module.energy(F + delta, MU, LAM) - module.energy(F - delta, MU, LAM)) / (2.0 * step)
+    return gradient
+
+
+@each_material
+@pytest.mark.parametrize("kind", ["small", "moderate", "large", *VOLUME_RATIOS])
+def test_stress_is_the_energy_gradient(stress, material, kind):
+    F = deformations(kind)
+    expected = energy_gradient(MATERIALS[material], F) @ np.swapaxes(F, 1, 2)
+    error = np.linalg.norm(stress(material, F) - expected, axis=(1, 2))
+    # what float32 can resolve: terms of size mu |F|^2 cancel in the stress
+    resolution = MU * np.linalg.norm(F, axis=(1, 2)) ** 2 + np.linalg.norm(expected, axis=(1, 2))
+    assert (error / resolution).max() < 1e-5
+
+
+@each_material
+@pytest.mark.parametrize("kind", ["moderate", "large"])
+def test_stress_is_objective_and_isotropic(stress, material, kind):
+    """Turning the body turns the stress with it; turning the matter before it is deformed changes nothing."""
+    F, Q = deformations(kind), rotations(COUNT, 7)
+    tau = stress(material, F)
+    scale = MU * np.linalg.norm(F, axis=(1, 2)) ** 2 + np.linalg.norm(tau, axis=(1, 2))
+    turned = np.abs(stress(material, Q @ F) - Q @ tau @ np.swapaxes(Q, 1, 2)).max(axis=(1, 2))
+    assert (turned / scale).max() < 3e-6
+    assert (np.abs(stress(material, F @ Q) - tau).max(axis=(1, 2)) / scale).max() < 3e-6
+    assert (np.abs(tau - np.swapaxes(tau, 1, 2)).max(axis=(1, 2)) / scale).max() < 1e-6
+
+
+@each_material
+def test_no_stress_in_rotations(stress, material):
+    assert np.abs(stress(material, rotations(COUNT, 3))).max() < 2e-6 * (2.0 * MU + 3.0 * LAM)
+    assert MATERIALS[material].energy(rotations(COUNT, 3), MU, LAM) == pytest.approx(0.0, abs=1e-8)
+
+
+@each_material
+@pytest.mark.parametrize("poisson_ratio", [0.0, 0.3, 0.45])
+def test_small_strains_obey_hooke(stress, material, poisson_ratio):
+    """A bar pulled by ``e`` and thinned by ``nu e`` has the axial stress ``E e`` and no other."""
+    young_modulus, strain = 2.0e5, 1e-3
+    F = np.diag([1.0 + strain, 1.0 - poisson_ratio * strain, 1.0 - poisson_ratio * strain])
+    tau = stress(material, F[None], *map(float, lame_parameters(young_modulus, poisson_ratio)))[0]
+    assert np.abs(tau - np.diag([young_modulus * strain, 0.0, 0.0])).max() < 5.0 * young_modulus * strain**2
+
+
+@each_material
+def test_energy_is_smallest_at_rest(material):
+    energy = MATERIALS[material].energy
+    for kind in ("small", "moderate", "large", "squashed", "inverted"):
+        assert energy(deformations(kind), MU, LAM).min() > 0.0
+
+
+@pytest.mark.parametrize(("spread", "tolerance"), [(1.0, 5e-7), (5.0, 1e-6), (20.0, 1e-5)])
+def test_polar_rotation_against_svd(rotation_factor, spread, tolerance):
+    """Stretches from 1/spread to spread at once: the condition number, up to spread^2, amplifies round-off."""
+    rng = np.random.default_rng(5)
+    stretches = np.exp(rng.uniform(-1.0, 1.0, (200, 3)) * np.log(spread))
+    stretches[:20] = [spread, 1.0 / spread, 1.0]
+    stretches[20:40] = [spread, spread, 1.0 / spread]
+    stretches[40:60] = [spread, 1.0 / spread, 1.0 / spread]
+    F = (rotations(200, 4) @ (stretches[:, :, None] * rotations(200, 5))).astype(np.float32).astype(float)
+    R = rotation_factor(F)
+    expected = np.array([polar(f)[0] for f in F])
+    assert np.abs(R - expected).max() < tolerance
+    assert np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max() < 1e-6
+    assert np.linalg.det(R).min() > 0.0
+
+
+def test_polar_rotation_of_uniform_scale(rotation_factor):
+    for scale in (1e-1, 1e1, 1e3):
+        assert np.abs(rotation_factor(scale * rotations(10, 6)) - rotations(10, 6)).max() < 2e-6
+
+
+def test_polar_rotation_of_singular_matter_is_the_identity(rotation_factor):
+    assert np.array_equal(rotation_factor(np.stack([np.zeros((3, 3)), np.diag([1.0, 1.0, 0.0])])), [np.eye(3)] * 2)
+
+
+def test_von_mises(device):
+    """Uniaxial stress s gives s, shear t gives sqrt(3) t, pressure gives nothing; all of the Cauchy stress tau / J."""
+    shear = np.zeros((3, 3))
+    shear[0, 1] = shear[1, 0] = 1.0
+    Q = rotations(1, 8)[0]
+    cases = [
+        (np.diag([5.0, 0.0, 0.0]), 1.0, 5.0),
+        (np.diag([5.0, 0.0, 0.0]), 2.0, 2.5),
+        (Q @ np.diag([-7.0, 0.0, 0.0]) @ Q.T, 1.0, 7.0),
+        (3.0 * shear, 1.0, 3.0 * np.sqrt(3.0)),
+        (4.0 * np.eye(3), 1.0, 0.0),
+    ]
+    tau = wp.array(np.array([c[0] for c in cases], np.float32), dtype=wp.mat33, device=device)
+    J = wp.array(np.array([c[1] for c in cases], np.float32), dtype=float, device=device)
+    out = wp.zeros_like(J)
+    wp.launch(probe_von_mises, len(cases), inputs=[tau, J, out], device=device)
+    assert out.numpy() == pytest.approx([c[2] for c in cases], abs=1e-5)
+
+
+def test_bad_materials_are_refused():
+    with pytest.raises(ValueError, match=r"'steel'.*neo_hookean"):
+        material_index("steel")
+    for poisson_ratio in (0.5, 0.7, -0.1, np.nan):
+        with pytest.raises(ValueError, match=rf"poisson_ratio={poisson_ratio}.*\[0, 0.5\)"):
+            lame_parameters(1e5, [0.3, poisson_ratio])
+    with pytest.raises(ValueError, match="young_modulus=-1"):
+        lame_parameters([1.0, -1.0], 0.3)
