@@ -1,0 +1,229 @@
+"""DeepMimic clips: files written here for axes and directions, the installed ones for looks."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.motion import Motion, deepmimic, list_motions, load_motion
+from piavatar_envs.avatar.motion.ground import lowest_heights
+from piavatar_envs.avatar.motion.retarget import leg_length
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+
+REST = load_body().joints.astype(np.float64)
+CHANNELS = {"root": 4, "chest": 8, "neck": 12, "right_hip": 16, "right_knee": 20, "right_ankle": 21}
+CHANNELS |= {"right_shoulder": 25, "right_elbow": 29, "left_hip": 30, "left_knee": 34, "left_ankle": 35}
+CHANNELS |= {"left_shoulder": 39, "left_elbow": 43}
+HINGES = {name for name in CHANNELS if name.endswith(("knee", "elbow"))}
+
+installed = pytest.mark.skipif(
+    deepmimic.clip_folder() is None,
+    reason="no pybullet here (its wheels are for Python 3.10 and 3.11): the DeepMimic clips are not tested",
+)
+
+
+def frame(duration: float = 0.1, position: tuple = (0.0, 0.8, 0.0), **joints: object) -> list[float]:
+    """A frame of the zero pose but for named joints: a rotation vector in DeepMimic's axes, or a hinge angle."""
+    values = np.zeros(deepmimic.NUM_CHANNELS)
+    values[0], values[1:4] = duration, position
+    for name, start in CHANNELS.items():
+        if name in HINGES:
+            values[start] = joints.get(name, 0.0)
+        else:
+            turn = Rotation.from_rotvec(joints.get(name, (0.0, 0.0, 0.0)))
+            values[start : start + 4] = turn.as_quat(scalar_first=True)
+    return values.tolist()
+
+
+def write(folder: Path, frames: list, loop: object = "none") -> Path:
+    path = folder / "humanoid3d_test.txt"
+    path.write_text(json.dumps({"Loop": loop, "Frames": frames}))
+    return path
+
+
+def world_joints(motion: Motion) -> dict[str, np.ndarray]:
+    positions = motion.joint_frames(REST)[1]
+    return {name: positions[:, joint] for joint, name in enumerate(JOINT_NAMES)}
+
+
+def direction(joints: dict[str, np.ndarray], start: str, end: str) -> np.ndarray:
+    bone = (joints[end] - joints[start])[0]
+    return bone / np.linalg.norm(bone)
+
+
+def posed(folder: Path, **joints: object) -> dict[str, np.ndarray]:
+    return world_joints(deepmimic.load_file(write(folder, [frame(**joints), frame(**joints)]), REST))
+
+
+def test_in_the_zero_pose_the_limbs_hang_straight_down(tmp_path: Path) -> None:
+    joints = posed(tmp_path)
+    for side in ("left", "right"):
+        for start, end in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle")):
+            np.testing.assert_allclose(direction(joints, f"{side}_{start}", f"{side}_{end}"), [0, 0, -1], atol=1e-9)
+        assert direction(joints, f"{side}_ankle", f"{side}_foot")[1] < -0.9  # toes forward
+    assert joints["left_hip"][0, 0] > 0 > joints["right_hip"][0, 0]
+    assert joints["head"][0, 2] > joints["pelvis"][0, 2]
+
+
+@pytest.mark.parametrize(
+    ("joint", "value", "start", "end", "expected"),
+    [
+        # DeepMimic's axes: forward +x, up +y, right +z; ours: forward -y, up +z, left +x.
+        ("left_knee", -1.5, "left_knee", "left_ankle", [0, np.sin(1.5), -np.cos(1.5)]),  # knees bend backwards
+        ("right_knee", -1.5, "right_knee", "right_ankle", [0, np.sin(1.5), -np.cos(1.5)]),
+        ("left_elbow", 1.2, "left_elbow", "left_wrist", [0, -np.sin(1.2), -np.cos(1.2)]),  # elbows bend forwards
+        ("right_elbow", 1.2, "right_elbow", "right_wrist", [0, -np.sin(1.2), -np.cos(1.2)]),
+        ("right_hip", (0, 0, 1.0), "right_hip", "right_knee", [0, -np.sin(1.0), -np.cos(1.0)]),  # the thigh forward
+        ("left_shoulder", (np.pi / 2, 0, 0), "left_shoulder", "left_elbow", [1, 0, 0]),  # the left arm out to the left
+        ("right_shoulder", (-np.pi / 2, 0, 0), "right_shoulder", "right_elbow", [-1, 0, 0]),
+    ],
+)
+def test_each_limb_turns_the_way_deepmimic_turns_it(tmp_path: Path, joint, value, start, end, expected) -> None:
+    np.testing.assert_allclose(direction(posed(tmp_path, **{joint: value}), start, end), expected, atol=1e-9)
+
+
+def test_the_chest_turn_is_shared_by_the_spine_and_adds_up(tmp_path: Path) -> None:
+    frames = [frame(chest=(0, 0, -0.6))] * 2  # bent forward
+    motion = deepmimic.load_file(write(tmp_path, frames), REST)
+    rotvec = Rotation.from_quat(motion.local_rotations[0], scalar_first=True).as_rotvec()
+    for name in ("spine1", "spine2", "spine3"):
+        np.testing.assert_allclose(rotvec[joint_index(name)], [0.2, 0, 0], atol=1e-9)
+
+
+def test_the_root_walks_and_turns_in_our_axes(tmp_path: Path) -> None:
+    """One metre forward is to -y; a quarter turn about the vertical to the left faces +x; both legs' length scales."""
+    frames = [frame(), frame(position=(1.0, 0.8, 0.5), root=(0, np.pi / 2, 0))]
+    motion = deepmimic.load_file(write(tmp_path, frames), REST)
+    joints = world_joints(motion)
+    hips = 0.5 * (joints["left_hip"] + joints["right_hip"])
+    scale = leg_length(REST) / deepmimic.LEG_LENGTH
+    np.testing.assert_allclose(hips, scale * np.array([[0, 0, 0.8], [-0.5, -1.0, 0.8]]), atol=1e-9)
+    turned = Rotation.from_quat(motion.local_rotations[1, 0], scalar_first=True)
+    np.testing.assert_allclose(turned.apply([0, -1, 0]), [1, 0, 0], atol=1e-9)
+
+
+def test_uneven_frame_times_become_an_even_rate(tmp_path: Path) -> None:
+    """A turn and a path at constant speed stay so, whatever the frames' durations."""
+    durations = [0.1, 0.3, 0.2, 0.2]
+    times = np.concatenate([[0.0], np.cumsum(durations)])
+    frames = [
+        frame(d, (t, 0.8, 0.0), left_hip=(0, 0, t), left_knee=-t) for t, d in zip(times, [*durations, 0.0], strict=True)
+    ]
+    motion = deepmimic.load_file(write(tmp_path, frames), REST)
+    assert motion.fps == pytest.approx(5.0) and motion.duration == pytest.approx(0.8)
+    np.testing.assert_allclose(np.diff(motion.root_position[:, 1], n=2), 0.0, atol=1e-12)
+    knee = Rotation.from_quat(motion.local_rotations[:, joint_index("left_knee")], scalar_first=True)
+    np.testing.assert_allclose((knee[:-1].inv() * knee[1:]).magnitude(), 0.2, atol=1e-9)
+
+
+def test_wrapping_clips_become_closed_loops_that_go_straight_on(tmp_path: Path) -> None:
+    turns = np.linspace(0.0, 0.2, 31)
+    frames = [frame(1 / 30, (t, 0.8, 0.0), root=(0, t, 0), left_shoulder=(0, 0, 2 * t)) for t in turns]
+    motion = deepmimic.load_file(write(tmp_path, frames, "wrap"), REST)
+    assert motion.loop and motion.loop_heading == pytest.approx(0.0, abs=1e-9)
+    _, root = motion.sample(3 * motion.duration)
+    np.testing.assert_allclose(root - motion.root_position[0], 3 * (motion.root_position[-1] - motion.root_position[0]))
+
+
+def test_single_frame_jumps_are_spread_and_steady_turns_are_left_alone() -> None:
+    angle = np.linspace(0.0, 1.0, 41)
+    rotations = np.tile([1.0, 0.0, 0.0, 0.0], (41, NUM_JOINTS, 1))
+    for name, jump in (("left_shoulder", 0.5), ("right_shoulder", 0.0)):
+        turn = angle + jump * (np.arange(41) > 20)
+        rotations[:, joint_index(name)] = Rotation.from_rotvec(turn[:, None] * [0, 1, 0]).as_quat(scalar_first=True)
+    mended = deepmimic.mend_jumps(rotations, 30.0)
+    np.testing.assert_allclose(mended[:, joint_index("right_shoulder")], rotations[:, joint_index("right_shoulder")])
+    shoulder = Rotation.from_quat(mended[:, joint_index("left_shoulder")], scalar_first=True)
+    assert (shoulder[:-1].inv() * shoulder[1:]).magnitude().max() < 0.16  # was 0.525 rad in one frame
+    np.testing.assert_allclose(shoulder[[0, -1]].as_rotvec()[:, 1], [0.0, 1.5], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("not json", "not a DeepMimic clip"),
+        ("[1, 2]", "not a DeepMimic clip"),
+        ({"Frames": [frame(), frame()]}, "not a DeepMimic clip .KeyError"),
+        ({"Loop": "often", "Frames": [frame(), frame()]}, "not a DeepMimic clip .KeyError"),
+        ({"Loop": "none", "Frames": [frame(), frame()[:-1]]}, "not a DeepMimic clip"),
+        ({"Loop": "none", "Frames": [frame()[:-1]] * 2}, r"shape \(2, 43\), expected"),
+        ({"Loop": "none", "Frames": [frame()]}, r"shape \(1, 44\), expected \(at least 2, 44\)"),
+        ({"Loop": "none", "Frames": [frame(0.0), frame()]}, r"frame 0 lasts 0\.0 s, it must be > 0"),
+        ({"Loop": "none", "Frames": [frame(), [float("nan")] * 44]}, "frame 1 holds a value that is not finite"),
+        ({"Loop": "none", "Frames": [frame(), [0.1] + [0.0] * 43]}, "channel 4 of frame 1 has norm 0"),
+    ],
+)
+def test_malformed_files_are_refused(tmp_path: Path, content: object, message: str) -> None:
+    path = tmp_path / "humanoid3d_bad.txt"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(ValueError, match=message):
+        deepmimic.load_file(path, REST)
+
+
+def test_without_pybullet_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(deepmimic.importlib.util, "find_spec", lambda name: None)
+    assert not any(name.startswith("deepmimic:") for name in list_motions())
+    with pytest.raises(ImportError, match=r"pip install 'piavatar-envs\[motions\]'"):
+        load_motion("deepmimic:walk")
+
+
+# The installed clips
+
+
+@pytest.fixture(scope="module", params=deepmimic.list_clips() or ["none installed"])
+def clip(request: pytest.FixtureRequest) -> Motion:
+    return load_motion(f"deepmimic:{request.param}")
+
+
+@installed
+def test_installed_clips_load_without_importing_pybullet(clip: Motion) -> None:
+    assert "pybullet" not in sys.modules
+    assert clip.name in list_motions() and clip.source.startswith("DeepMimic humanoid3d_")
+    assert 0.5 < clip.duration < 10.0
+
+
+@installed
+def test_installed_clips_are_human(clip: Motion) -> None:
+    assert clip.joint_speeds().max() < 35.0  # [rad/s], a punch is about 27
+    assert np.linalg.norm(np.diff(clip.root_position, axis=0), axis=1).max() * clip.fps < 6.0  # [m/s]
+    for side in ("left", "right"):
+        # Knees never bend the wrong way: the shin in the thigh's rest frame does not go forward of straight.
+        knee = Rotation.from_quat(clip.local_rotations[:, joint_index(f"{side}_knee")], scalar_first=True)
+        assert knee.as_rotvec()[:, 0].min() > np.radians(-20.0)
+        assert knee.magnitude().max() < np.radians(160.0)
+
+
+@installed
+def test_installed_clips_stay_on_or_above_the_ground_and_come_down_to_it(clip: Motion) -> None:
+    heights = lowest_heights(clip, load_body())
+    assert heights.min() > -2e-3
+    assert np.sort(heights)[: max(2, len(heights) // 20)].max() < 0.03
+
+
+@installed
+def test_walk_goes_forward_with_a_foot_on_the_ground() -> None:
+    walk = load_motion("deepmimic:walk")
+    assert lowest_heights(walk, load_body()).max() < 0.012
+    assert walk.joint_speeds().max() < 8.0  # [rad/s]; the file jumps at 15 where two halves were spliced
+    velocity = (walk.root_position[-1] - walk.root_position[0]) / walk.duration
+    assert -1.3 < velocity[1] < -0.7 and abs(velocity[0]) < 0.1
+    joints = world_joints(walk)
+    legs = joints["left_ankle"][:, 1] - joints["right_ankle"][:, 1]
+    arms = joints["left_wrist"][:, 1] - joints["right_wrist"][:, 1]
+    assert np.corrcoef(legs, arms)[0, 1] < -0.5  # arms swing against the legs
+
+
+@installed
+def test_getting_up_goes_from_lying_to_standing() -> None:
+    for name, faces_up in (("getup_facedown", False), ("getup_faceup", True)):
+        motion = load_motion(f"deepmimic:{name}")
+        joints = world_joints(motion)
+        assert joints["head"][0, 2] < 0.5 and joints["head"][-1, 2] > 1.3
+        forward = Rotation.from_quat(motion.local_rotations[0, 0], scalar_first=True).apply([0.0, -1.0, 0.0])
+        assert (forward[2] > 0.5) == faces_up and abs(forward[2]) > 0.5
