@@ -1,0 +1,120 @@
+"""From a body in NumPy to the arrays that its drive reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
+from piavatar_envs.avatar.types import Body
+
+#: Entries of one chunk of a bone's particle list: one thread sums one chunk.
+CHUNK = 64
+#: Fewest tracking particles from which a rotation is fitted reliably.
+MIN_TRACKERS = 18
+
+
+@dataclass(frozen=True)
+class BodyPoints:
+    """A body as points in its rest pose (NumPy). ``rows`` is 1, or ``num_envs`` where shapes differ.
+
+    Attributes:
+        rest: rest positions [m], shape ``(rows, num_points, 3)``.
+        mass: masses [kg], shape ``(rows, num_points)``.
+        joints: rest joint positions [m], shape ``(rows, 22, 3)``.
+        skin_joints: bones that move a point, shape ``(num_points, 4)`` int.
+        skin_weights: their weights, descending, rows sum to one, shape ``(num_points, 4)``.
+        bone: joint that a point tracks, -1 for flesh, shape ``(num_points,)``.
+        follow: share of the kinematic velocity a point takes, shape ``(rows, num_points)``.
+    """
+
+    rest: np.ndarray
+    mass: np.ndarray
+    joints: np.ndarray
+    skin_joints: np.ndarray
+    skin_weights: np.ndarray
+    bone: np.ndarray
+    follow: np.ndarray
+
+    @property
+    def num_points(self) -> int:
+        """Number of points."""
+        return self.rest.shape[1]
+
+
+def _bone_lists(
+    points: BodyPoints, skin_weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Chunked lists of the particles that each bone moves: chunk_start, chunk_bone, entry_start, entry, weight."""
+    chunk_start, chunk_bone, entry_start, entries, weights = [0], [], [0], [], []
+    for bone in range(NUM_JOINTS):
+        point, slot = np.nonzero((points.skin_joints == bone) & (skin_weights > 0.0))
+        for begin in range(0, len(point), CHUNK):
+            part = slice(begin, begin + CHUNK)
+            entries.append(point[part])
+            weights.append(skin_weights[point[part], slot[part]])
+            entry_start.append(entry_start[-1] + len(point[part]))
+            chunk_bone.append(bone)
+        chunk_start.append(len(chunk_bone))
+    return (
+        np.array(chunk_start),
+        np.array(chunk_bone),
+        np.array(entry_start),
+        np.concatenate(entries),
+        np.concatenate(weights),
+    )
+
+
+def bone_masses(points: BodyPoints) -> tuple[np.ndarray, np.ndarray]:
+    """Skinning-weighted mass [kg] ``(rows, 22)`` and centre of mass [m] ``(rows, 22, 3)`` of every bone at rest."""
+    dense = np.zeros((points.num_points, NUM_JOINTS))
+    for slot in range(4):
+        np.add.at(dense, (np.arange(points.num_points), points.skin_joints[:, slot]), points.skin_weights[:, slot])
+    weighted = points.mass[:, :, None] * dense
+    mass = weighted.sum(1)
+    center = np.einsum("rpb,rpi->rbi", weighted, points.rest.astype(np.float64))
+    return mass, center / np.maximum(mass, 1e-12)[..., None]
+
+
+def build_body(points: BodyPoints, first: int, device: str) -> Body:
+    """Device arrays of a body whose particles start at ``first``.
+
+    Raises:
+        ValueError: a bone has too few tracking particles, or weights do not sum to one.
+    """
+    sums = points.skin_weights.sum(1)
+    if np.abs(sums - 1.0).max() > 1e-4:
+        raise ValueError(
+            f"skinning weights of point {np.abs(sums - 1).argmax()} sum to {sums[np.abs(sums - 1).argmax()]}"
+        )
+    trackers = [np.nonzero(points.bone == bone)[0] for bone in range(NUM_JOINTS)]
+    fewest = min(range(NUM_JOINTS), key=lambda b: len(trackers[b]))
+    if len(trackers[fewest]) < MIN_TRACKERS:
+        raise ValueError(f"bone {fewest} has {len(trackers[fewest])} tracking particles; {MIN_TRACKERS} are needed")
+    # weights that sum to one in single precision, so that fields blended over bones keep momentum
+    weight = points.skin_weights / sums[:, None]
+    chunk_start, chunk_bone, entry_start, entry, entry_weight = _bone_lists(points, weight)
+    bone_mass, center = bone_masses(points)
+
+    def upload(value, dtype):
+        scalar = np.int32 if dtype in (int, wp.vec4i) else np.float32
+        return wp.array(np.ascontiguousarray(value, scalar), dtype=dtype, device=device)
+
+    body = Body()
+    body.first, body.count = first, points.num_points
+    body.rest = upload(points.rest, wp.vec3)
+    body.joint = upload(points.skin_joints, wp.vec4i)
+    body.weight = upload(weight, wp.vec4)
+    body.follow = upload(points.follow, float)
+    body.rest_joint = upload(points.joints, wp.vec3)
+    body.rest_center = upload(center, wp.vec3)
+    body.bone_mass = upload(bone_mass, float)
+    body.parent = upload(PARENTS, int)
+    body.tracker_start = upload(np.cumsum([0, *map(len, trackers)]), int)
+    body.tracker = upload(np.concatenate(trackers), int)
+    body.chunk_start, body.chunk_bone = upload(chunk_start, int), upload(chunk_bone, int)
+    body.entry_start, body.entry = upload(entry_start, int), upload(entry, int)
+    body.entry_weight = upload(entry_weight, float)
+    return body

@@ -1,0 +1,148 @@
+"""The drive of one avatar: records tracking, control steps and resets as launches of a program.
+
+A control step tracks nothing itself; it starts from the pose tracked at the end of the one before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar import posing
+from piavatar_envs.avatar.body import BodyPoints, build_body
+from piavatar_envs.avatar.kabsch import local_rotations, track_bones
+from piavatar_envs.avatar.settings import DriveSettings
+from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.spawn import place_particles, reset_drive
+from piavatar_envs.avatar.substeps import Groups, record_injected_substeps, record_pose, record_split_substeps
+from piavatar_envs.avatar.types import DriveScratch, DriveState, Tracked, vec12, vec16
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.types import DECOUPLING, Model, Scratch, State
+
+wp.set_module_options({"enable_backward": False})
+
+
+class AvatarDrive:
+    """One avatar in every environment of a batch.
+
+    Attributes:
+        state: what a checkpoint holds.
+        tracked: the bones as Kabsch sees them.
+    """
+
+    def __init__(self, points: BodyPoints, first: int, model: Model, settings: DriveSettings) -> None:
+        self.model, self.settings = model, settings
+        self.body = build_body(points, first, model.device)
+        self.drive = settings.kernel_parameters(model)
+        self.body_mass = wp.array(points.mass.sum(1).astype(np.float32), dtype=float, device=model.device)
+        self.num_points = points.num_points
+        self.num_chunks = self.body.chunk_bone.shape[0]
+        self.state = self._allocate(DriveState)
+        self.tracked = self._allocate(Tracked)
+        self.scratch = self._allocate(DriveScratch)
+        self.groups = Groups(self.scratch, self.state)
+        for rotation in (self.state.command_rotation, self.state.goal_rotation, self.tracked.rotation):
+            rotation.fill_(wp.quat_identity())
+
+    def _allocate(self, cls):
+        """Zeroed arrays for a dataclass of arrays, by the name's ending."""
+        n, bones = self.model.num_envs, (self.model.num_envs, NUM_JOINTS)
+        special = {
+            "let_go": (n, int),
+            "local": (bones, wp.quat),
+            "command_root": (n, wp.vec3),
+            "goal_root": (n, wp.vec3),
+            "root_increment": (n, wp.vec3),
+            "anchor_rotation": (n, wp.quat),
+            "anchor_translation": (n, wp.vec3),
+            "moments": ((n, self.num_chunks), vec16),
+            "corrections": ((n, self.num_chunks), vec12),
+            "bone_inertia": (bones, wp.mat33),
+            "body_inertia": (n, wp.mat33),
+            "bone_from": (bones, wp.mat44),
+            "bone_step": (bones, wp.mat44),
+            "bone_lean": (bones, wp.mat44),
+            "bone_turn": (bones, wp.mat33),
+            "removed_turn": (n, wp.mat33),
+            "pull": ((n, self.num_points), wp.vec3),
+            "lean": ((n, self.num_points), wp.vec3),
+        }
+        per_env = ("body_", "wrench_", "removed_")
+        arrays = {}
+        for field in fields(cls):
+            shape, dtype = special.get(field.name, (n if field.name.startswith(per_env) else bones, None))
+            if dtype is None:
+                dtype = wp.quat if field.name.endswith("rotation") else wp.vec3
+            arrays[field.name] = wp.zeros(shape, dtype=dtype, device=self.model.device)
+        return cls(**arrays)
+
+    def record_tracking(self, program: Program, state: State) -> None:
+        """Append: track the bones of the particles as they are now."""
+        bones = (self.model.num_envs, NUM_JOINTS)
+        t = self.tracked
+        program.launch(
+            track_bones,
+            bones,
+            [self.body, state.x, state.u, state.vk, state.failure],
+            [t.rotation, t.position, t.velocity],
+        )
+        program.launch(local_rotations, bones, [self.body, t.rotation], [t.local])
+
+    def record_reset(self, program: Program, state: State, mask: wp.array) -> None:
+        """Append: put the masked environments into the pose of ``state.command_*``, at rest and unstrained."""
+        n, s, d = self.model.num_envs, self.scratch, self.state
+        program.launch(
+            reset_drive,
+            (n, NUM_JOINTS),
+            [mask, d.command_rotation, d.command_root],
+            [d.goal_rotation, d.goal_root, d.let_go, d.wrench_force, d.wrench_torque],
+        )
+        for increment in (s.command_increment, s.root_increment):
+            program.launch(clear_vectors, increment.size, [increment.flatten()])
+        record_pose(self, program, 0.0, d.command_rotation, d.command_root, s.command_increment, self.groups.pose)
+        program.launch(
+            posing.rest_matrices, (n, NUM_JOINTS), [self.body, s.pose_rotation, s.pose_position], [s.bone_from]
+        )
+        program.launch(
+            place_particles,
+            (n, self.num_points),
+            [mask, self.body, s.bone_from],
+            [state.x, state.u, state.C, state.F, state.vk, state.failure],
+        )
+
+    def record_control_step(self, program: Program, state: State, scratch: Scratch) -> None:
+        """Append one control step: from the tracked pose towards ``state.goal_*`` through all substeps."""
+        s, d, t = self.scratch, self.state, self.tracked
+        program.launch(clear_vectors, d.wrench_force.size, [d.wrench_force])
+        program.launch(clear_vectors, d.wrench_torque.size, [d.wrench_torque])
+        program.launch(
+            posing.begin_control,
+            (self.model.num_envs, NUM_JOINTS),
+            [self.drive, t.local, t.position, d.command_rotation, d.command_root, d.goal_rotation, d.goal_root],
+            [s.increment, s.command_increment, s.root_increment, s.carry_rotation, s.carry_translation],
+        )
+        record_pose(self, program, 0.0, *self.start_pose(), s.increment, self.groups.pose)
+        if self.model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"]):
+            record_injected_substeps(self, program, state, scratch)
+        else:
+            record_split_substeps(self, program, state, scratch)
+        program.launch(
+            posing.end_control,
+            (self.model.num_envs, NUM_JOINTS),
+            [d.goal_rotation, d.goal_root, state.failure],
+            [d.command_rotation, d.command_root],
+        )
+
+    def start_pose(self) -> tuple[wp.array, wp.array]:
+        """Pose that a control step starts from: local rotations and root position."""
+        if self.settings.mode == "reference":
+            return self.state.command_rotation, self.state.command_root
+        return self.tracked.local, self.tracked.position[:, 0]
+
+
+@wp.kernel
+def clear_vectors(v: wp.array(dtype=wp.vec3)):
+    """Zero an array of vectors inside a program."""
+    v[wp.tid()] = wp.vec3(0.0)

@@ -1,0 +1,218 @@
+"""Rigid motion of bones and of the whole body, fitted to the physical velocity.
+
+A fit is mass- and skinning-weighted least squares, so the blended field ``sum_b w_b (V_b + Omega_b x (x - c_b))`` has
+exactly the linear and angular momentum of the velocity it was fitted to, bone by bone. Everything the drive gives back
+or takes away goes through such fields, which is why it keeps momentum.
+
+Sums run over fixed lists of particles in chunks (no atomics): the result does not depend on the schedule.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.types import Body, Drive, RigidFits, vec12, vec16
+from piavatar_envs.mpm.types import Particles, row
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def spin_of(inertia: wp.mat33, angular_momentum: wp.vec3):
+    """Angular velocity ``I^-1 L``; zero where the inertia is singular."""
+    det = wp.determinant(inertia)
+    trace = inertia[0, 0] + inertia[1, 1] + inertia[2, 2]
+    if det <= 1.0e-9 * trace * trace * trace:
+        return wp.vec3(0.0)
+    return wp.inverse(inertia) * angular_momentum
+
+
+@wp.func
+def point_inertia(mass: float, d: wp.vec3):
+    """Inertia of a point mass at ``d``."""
+    return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
+
+
+@wp.kernel
+def sum_moments(
+    body: Body,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    reference: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    # out
+    moments: wp.array2d(dtype=vec16),
+):
+    """Moments of one chunk of a bone's particles about the bone's reference point (small numbers, small round-off)."""
+    e, c = wp.tid()
+    if failure[e] != 0:
+        return
+    origin = reference[e, body.chunk_bone[c]]
+    r = row(e, particles.mass.shape[0])
+    m = float(0.0)
+    mx = wp.vec3()
+    mu = wp.vec3()
+    diag = wp.vec3()
+    off = wp.vec3()
+    spin = wp.vec3()
+    for n in range(body.entry_start[c], body.entry_start[c + 1]):
+        p = body.first + body.entry[n]
+        w = body.entry_weight[n] * particles.mass[r, p]
+        d = x[e, p] - origin
+        v = u[e, p]
+        wd = w * d
+        m += w
+        mx += wd
+        mu += w * v
+        diag += wp.cw_mul(wd, d)
+        off += wp.vec3(wd[1] * d[2], wd[2] * d[0], wd[0] * d[1])
+        spin += wp.cross(wd, v)
+    # fmt: off
+    moments[e, c] = vec16(
+        m, mx[0], mx[1], mx[2], mu[0], mu[1], mu[2],
+        diag[0], diag[1], diag[2], off[0], off[1], off[2],
+        spin[0], spin[1], spin[2],
+    )
+    # fmt: on
+
+
+@wp.kernel
+def fit_bones(
+    body: Body,
+    reference: wp.array2d(dtype=wp.vec3),
+    moments: wp.array2d(dtype=vec16),
+    failure: wp.array(dtype=int),
+    # out
+    center: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+    inertia: wp.array2d(dtype=wp.mat33),
+):
+    """Rigid motion of every bone: centre [m], its velocity [m/s], angular velocity [rad/s], inertia [kg m^2]."""
+    e, b = wp.tid()
+    if failure[e] != 0:
+        return
+    s = vec16()
+    for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
+        s += moments[e, c]
+    m = wp.max(s[0], 1.0e-12)
+    d = wp.vec3(s[1], s[2], s[3]) / m
+    V = wp.vec3(s[4], s[5], s[6]) / m
+    # fmt: off
+    second = wp.mat33(
+        s[7], s[12], s[11],
+        s[12], s[8], s[10],
+        s[11], s[10], s[9],
+    ) - m * wp.outer(d, d)
+    # fmt: on
+    I = wp.diag(wp.vec3(wp.trace(second))) - second
+    L = wp.vec3(s[13], s[14], s[15]) - m * wp.cross(d, V)
+    center[e, b] = reference[e, b] + d
+    velocity[e, b] = V
+    spin[e, b] = spin_of(I, L)
+    inertia[e, b] = I
+
+
+@wp.kernel
+def fit_body(
+    body: Body,
+    bones: RigidFits,
+    failure: wp.array(dtype=int),
+    # out
+    body_center: wp.array(dtype=wp.vec3),
+    body_velocity: wp.array(dtype=wp.vec3),
+    body_spin: wp.array(dtype=wp.vec3),
+    body_inertia: wp.array(dtype=wp.mat33),
+):
+    """Rigid motion of the whole body from those of its bones: their momenta add up to the body's."""
+    e = wp.tid()
+    if failure[e] != 0:
+        return
+    r = row(e, body.bone_mass.shape[0])
+    m = float(0.0)
+    mx = wp.vec3()
+    mv = wp.vec3()
+    for b in range(body.parent.shape[0]):
+        m += body.bone_mass[r, b]
+        mx += body.bone_mass[r, b] * (bones.center[e, b] - bones.center[e, 0])
+        mv += body.bone_mass[r, b] * bones.velocity[e, b]
+    c = bones.center[e, 0] + mx / m
+    I = wp.mat33()
+    L = wp.vec3()
+    for b in range(body.parent.shape[0]):
+        d = bones.center[e, b] - c
+        I += bones.inertia[e, b] + point_inertia(body.bone_mass[r, b], d)
+        L += bones.inertia[e, b] * bones.spin[e, b] + body.bone_mass[r, b] * wp.cross(d, bones.velocity[e, b])
+    body_center[e] = c
+    body_velocity[e] = mv / m
+    body_spin[e] = spin_of(I, L)
+    body_inertia[e] = I
+
+
+@wp.kernel
+def sum_corrections(
+    body: Body,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    center: wp.array2d(dtype=wp.vec3),
+    pull: wp.array2d(dtype=wp.vec3),
+    lean: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    # out
+    corrections: wp.array2d(dtype=vec12),
+):
+    """Momentum and angular momentum, about the bone's centre, of the pull and of the lean in one chunk."""
+    e, c = wp.tid()
+    if failure[e] != 0:
+        return
+    origin = center[e, body.chunk_bone[c]]
+    r = row(e, particles.mass.shape[0])
+    p1 = wp.vec3()
+    l1 = wp.vec3()
+    p2 = wp.vec3()
+    l2 = wp.vec3()
+    for n in range(body.entry_start[c], body.entry_start[c + 1]):
+        p = body.entry[n]
+        w = body.entry_weight[n] * particles.mass[r, body.first + p]
+        d = x[e, body.first + p] - origin
+        a = w * pull[e, p]
+        p1 += a
+        l1 += wp.cross(d, a)
+        a = w * lean[e, p]
+        p2 += a
+        l2 += wp.cross(d, a)
+    corrections[e, c] = vec12(
+        p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2]
+    )  # fmt: skip
+
+
+@wp.kernel
+def sum_motion(
+    body: Body,
+    drive: Drive,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    center: wp.array2d(dtype=wp.vec3),
+    let_go: wp.array(dtype=int),
+    failure: wp.array(dtype=int),
+    # out
+    corrections: wp.array2d(dtype=vec12),
+):
+    """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in one chunk."""
+    e, c = wp.tid()
+    if failure[e] != 0 or (drive.free_motion == 0 and let_go[e] == 0):
+        return
+    origin = center[e, body.chunk_bone[c]]
+    r = row(e, particles.mass.shape[0])
+    P = wp.vec3()
+    K = wp.mat33()
+    for n in range(body.entry_start[c], body.entry_start[c + 1]):
+        p = body.first + body.entry[n]
+        a = (body.entry_weight[n] * particles.mass[r, p]) * vk[e, p]
+        P += a
+        K += wp.outer(x[e, p] - origin, a)
+    corrections[e, c] = vec12(
+        P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2]
+    )  # fmt: skip

@@ -1,0 +1,117 @@
+"""The root: a bounded wrench that stands in for balance in pose control, and the anchor of the commanded pose.
+
+A pose-controlled avatar does not balance itself; a six-degree-of-freedom wrench holds the commanded root instead. It is
+a rigid acceleration field over the whole body (no sag), with gravity fed forward and an implicit critically damped PD
+``a = (w^2 (e - dt V) - 2 w V) / (1 + 2 w dt + w^2 dt^2)``. It is bounded, and it lets go for good (until reset) once
+the body has been knocked too far: pushes are survived or not.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.kabsch import kabsch_rotation
+from piavatar_envs.avatar.rotation import quat_exp, quat_log
+from piavatar_envs.avatar.types import Body, Carry, Command, Drive, Pose, RigidFit
+from piavatar_envs.mpm.types import row
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def critical_pull(rate: float, dt: float, error: wp.vec3, v: wp.vec3):
+    """Acceleration of an implicit critically damped spring of natural frequency ``rate`` [1/s]."""
+    return (rate * rate * (error - dt * v) - 2.0 * rate * v) / (1.0 + 2.0 * rate * dt + rate * rate * dt * dt)
+
+
+@wp.func
+def clamp_length(v: wp.vec3, limit: float):
+    """``v``, shortened to ``limit`` if it is longer."""
+    return v * wp.min(1.0, limit / wp.max(wp.length(v), 1.0e-12))
+
+
+@wp.kernel
+def root_wrench(
+    drive: Drive,
+    fraction: float,
+    command: Command,
+    pose: Pose,
+    carry: Carry,
+    whole: RigidFit,
+    body_mass: wp.array(dtype=float),
+    # in and out
+    let_go: wp.array(dtype=int),
+    wrench_force: wp.array(dtype=wp.vec3),
+    wrench_torque: wp.array(dtype=wp.vec3),
+    # out
+    wrench_linear: wp.array(dtype=wp.vec3),
+    wrench_angular: wp.array(dtype=wp.vec3),
+):
+    """Acceleration of the body by the root wrench in this substep; its mean over the control step is accumulated."""
+    e = wp.tid()
+    wrench_linear[e] = wp.vec3(0.0)
+    wrench_angular[e] = wp.vec3(0.0)
+    if drive.root_rate <= 0.0:
+        return
+    G = carry.rotation[e, 0]
+    q = G * pose.rotation[e, 0]
+    at = wp.quat_rotate(G, pose.position[e, 0]) + carry.translation[e, 0]
+    q_command = command.rotation[e, 0] * quat_exp(fraction * command.increment[e, 0])
+    error = command.root[e] + fraction * (command.goal_root[e] - command.root[e]) - at
+    up = wp.vec3(0.0, 0.0, 1.0)
+    tilt_cos = wp.dot(wp.quat_rotate(q, up), wp.quat_rotate(q_command, up))
+    horizontal = wp.sqrt(error[0] * error[0] + error[1] * error[1])
+    if (
+        tilt_cos < drive.max_tilt_cos
+        or horizontal > drive.max_horizontal_error
+        or wp.abs(error[2]) > drive.max_height_error
+    ):
+        let_go[e] = 1
+    if let_go[e] != 0:
+        return
+    m = body_mass[wp.min(e, body_mass.shape[0] - 1)]
+    I = whole.inertia[e]
+    a = critical_pull(drive.root_rate, drive.dt, error, whole.velocity[e]) - drive.gravity
+    a = clamp_length(a, drive.max_force)
+    torque = I * critical_pull(drive.root_rate, drive.dt, quat_log(q_command * wp.quat_inverse(q)), whole.spin[e])
+    torque = clamp_length(torque, drive.max_torque * m)
+    wrench_linear[e] = a
+    wrench_angular[e] = wp.inverse(I) * torque
+    share = 1.0 / float(drive.num_substeps)
+    wrench_force[e] = wrench_force[e] + share * m * a
+    wrench_torque[e] = wrench_torque[e] + share * torque
+
+
+@wp.kernel
+def lay_command_on_body(
+    body: Body,
+    command: Pose,
+    pose: Pose,
+    # out
+    anchor_rotation: wp.array(dtype=wp.quat),
+    anchor_translation: wp.array(dtype=wp.vec3),
+):
+    """Best rigid motion from the commanded to the tracked pose: Kabsch over the bones' centres of mass."""
+    e = wp.tid()
+    r = row(e, body.bone_mass.shape[0])
+    rj = row(e, body.rest_joint.shape[0])
+    m = float(0.0)
+    mean = wp.vec3()
+    mean_command = wp.vec3()
+    for b in range(body.parent.shape[0]):
+        arm = body.rest_center[r, b] - body.rest_joint[rj, b]
+        w = body.bone_mass[r, b]
+        m += w
+        mean += w * (pose.position[e, b] + wp.quat_rotate(pose.rotation[e, b], arm))
+        mean_command += w * (command.position[e, b] + wp.quat_rotate(command.rotation[e, b], arm))
+    mean = mean / m
+    mean_command = mean_command / m
+    H = wp.mat33()
+    for b in range(body.parent.shape[0]):
+        arm = body.rest_center[r, b] - body.rest_joint[rj, b]
+        at = pose.position[e, b] + wp.quat_rotate(pose.rotation[e, b], arm)
+        at_command = command.position[e, b] + wp.quat_rotate(command.rotation[e, b], arm)
+        H += body.bone_mass[r, b] * wp.outer(at - mean, at_command - mean_command)
+    q = wp.normalize(wp.quat_from_matrix(kabsch_rotation(H)))
+    anchor_rotation[e] = q
+    anchor_translation[e] = mean - wp.quat_rotate(q, mean_command)

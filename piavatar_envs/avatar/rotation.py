@@ -1,0 +1,63 @@
+"""Rotations in kernels: exponential, logarithm, heading. Quaternions are Warp's ``xyzw`` here, ``wxyz`` elsewhere."""
+
+from __future__ import annotations
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def quat_exp(v: wp.vec3):
+    """Quaternion of the rotation vector ``v`` [rad]."""
+    half = 0.5 * wp.length(v)
+    # sin(h)/h by its series where the quotient loses digits
+    s = 0.5 * (1.0 - half * half / 6.0)
+    if half > 1.0e-2:
+        s = 0.5 * wp.sin(half) / half
+    return wp.normalize(wp.quat(v[0] * s, v[1] * s, v[2] * s, wp.cos(half)))
+
+
+@wp.func
+def quat_log(q: wp.quat):
+    """Rotation vector [rad] of the shorter way, length at most pi."""
+    v = wp.vec3(q[0], q[1], q[2])
+    w = q[3]
+    if w < 0.0:
+        v = -v
+        w = -w
+    n = wp.length(v)
+    if n < 1.0e-6:
+        return 2.0 * v
+    return (2.0 * wp.atan2(n, w) / n) * v
+
+
+@wp.func
+def turn_about_z(q: wp.quat):
+    """The part of ``q`` that turns about the vertical (its twist); the identity where that is undefined."""
+    n = wp.sqrt(q[2] * q[2] + q[3] * q[3])
+    if n < 1.0e-4:
+        return wp.quat(0.0, 0.0, 0.0, 1.0)
+    return wp.quat(0.0, 0.0, q[2] / n, q[3] / n)
+
+
+@wp.func
+def rigid_matrix(q: wp.quat, pivot: wp.vec3, image: wp.vec3):
+    """Homogeneous matrix of ``x -> q (x - pivot) + image``."""
+    R = wp.quat_to_matrix(q)
+    t = image - R * pivot
+    # fmt: off
+    return wp.mat44(
+        R[0, 0], R[0, 1], R[0, 2], t[0],
+        R[1, 0], R[1, 1], R[1, 2], t[1],
+        R[2, 0], R[2, 1], R[2, 2], t[2],
+        0.0, 0.0, 0.0, 1.0,
+    )
+    # fmt: on
+
+
+@wp.func
+def apply_point(M: wp.mat44, x: wp.vec3):
+    """First three components of ``M (x, 1)``; ``M`` need not be rigid."""
+    y = M * wp.vec4(x[0], x[1], x[2], 1.0)
+    return wp.vec3(y[0], y[1], y[2])

@@ -1,0 +1,46 @@
+"""Soft tissue: flesh far from the bones follows commanded motion less, lags behind it and jiggles.
+
+The share of the kinematic velocity that a particle takes is ``1 - amount * softness``. The softness is 0 at the bones
+and rises smoothly to 1 at ``FULL_DEPTH`` from the nearest bone particle, for flesh of the trunk, hips and upper legs;
+limbs, head and hands keep to their bones. What the kinematic velocity no longer does, elasticity and shape preservation
+do, later: that is the jiggle.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from piavatar_envs.avatar.skeleton import joint_index
+
+#: Distance from the nearest bone particle at which flesh is fully soft [m].
+FULL_DEPTH = 0.10
+SOFT_JOINTS = ("pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip")
+
+
+def softness(rest: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
+    """Softness of particles in [0, 1].
+
+    Args:
+        rest: rest positions [m], shape ``(P, 3)``.
+        bone: joint a particle tracks, -1 for flesh, shape ``(P,)``.
+        skin_joints: bones that move a particle, shape ``(P, 4)``.
+        skin_weights: their weights, shape ``(P, 4)``.
+    """
+    depth = cKDTree(rest[bone >= 0]).query(rest)[0] / FULL_DEPTH
+    ramp = np.clip(depth, 0.0, 1.0)
+    ramp = ramp * ramp * (3.0 - 2.0 * ramp)
+    soft = np.isin(skin_joints, [joint_index(name) for name in SOFT_JOINTS])
+    share = np.where(soft, skin_weights, 0.0).sum(axis=1)
+    return (ramp * share * (bone < 0)).astype(np.float32)
+
+
+def follow_share(amount: float, soft: np.ndarray) -> np.ndarray:
+    """Share of the kinematic velocity that particles take, for an ``amount`` in [0, 1).
+
+    Raises:
+        ValueError: the amount is outside [0, 1).
+    """
+    if not 0.0 <= amount < 1.0:
+        raise ValueError(f"soft_tissue={amount} is outside [0, 1); at 1 the softest flesh would stay behind")
+    return (1.0 - amount * soft).astype(np.float32)

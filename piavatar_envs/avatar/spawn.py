@@ -1,0 +1,67 @@
+"""Placing bodies: at reset every particle goes to its skinned place, at rest and unstrained."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.rotation import apply_point
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.mpm.types import row
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def reset_drive(
+    mask: wp.array(dtype=wp.bool),
+    command_rotation: wp.array2d(dtype=wp.quat),
+    command_root: wp.array(dtype=wp.vec3),
+    # out
+    goal_rotation: wp.array2d(dtype=wp.quat),
+    goal_root: wp.array(dtype=wp.vec3),
+    let_go: wp.array(dtype=int),
+    wrench_force: wp.array(dtype=wp.vec3),
+    wrench_torque: wp.array(dtype=wp.vec3),
+):
+    """Nothing is commanded yet beyond the pose itself; the root is held."""
+    e, b = wp.tid()
+    if not mask[e]:
+        return
+    goal_rotation[e, b] = command_rotation[e, b]
+    if b == 0:
+        goal_root[e] = command_root[e]
+        let_go[e] = 0
+        wrench_force[e] = wp.vec3(0.0)
+        wrench_torque[e] = wp.vec3(0.0)
+
+
+@wp.kernel
+def place_particles(
+    mask: wp.array(dtype=wp.bool),
+    body: Body,
+    bone_from: wp.array2d(dtype=wp.mat44),
+    # out
+    x: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    C: wp.array2d(dtype=wp.mat33),
+    F: wp.array2d(dtype=wp.mat33),
+    vk: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+):
+    """Particles of the masked environments to their places in the pose ``bone_from``; the failure is forgiven."""
+    e, p = wp.tid()
+    if not mask[e]:
+        return
+    A = wp.mat44()
+    joint = body.joint[p]
+    weight = body.weight[p]
+    for n in range(4):
+        if weight[n] > 0.0:
+            A += weight[n] * bone_from[e, joint[n]]
+    q = body.first + p
+    x[e, q] = apply_point(A, body.rest[row(e, body.rest.shape[0]), p])
+    u[e, q] = wp.vec3(0.0)
+    vk[e, q] = wp.vec3(0.0)
+    C[e, q] = wp.mat33()
+    F[e, q] = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    failure[e] = 0

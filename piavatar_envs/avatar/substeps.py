@@ -1,0 +1,226 @@
+"""The substeps of a control step.
+
+Each substep fits rigid motions to the physical velocity, carries the bones by them, writes the kinematic velocity,
+pulls shape and pose, applies the root wrench, and then runs one MPM substep.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from piavatar_envs.avatar import flesh, posing, rigid_fit
+from piavatar_envs.avatar.injection import inject_velocity
+from piavatar_envs.avatar.root import lay_command_on_body, root_wrench
+from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.types import (
+    BoneChange,
+    BoneMatrices,
+    Carry,
+    Command,
+    DriveScratch,
+    DriveState,
+    Pose,
+    RemovedMotion,
+    RigidFit,
+    RigidFits,
+)
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.solver import record_substep
+from piavatar_envs.mpm.types import Scratch, State
+
+if TYPE_CHECKING:
+    from piavatar_envs.avatar.drive import AvatarDrive
+
+
+def group(struct: wp.Struct, **arrays: wp.array):
+    """Arrays bundled as one kernel argument."""
+    instance = struct()
+    for name, array in arrays.items():
+        setattr(instance, name, array)
+    return instance
+
+
+class Groups:
+    """The scratch arrays of a drive, bundled as kernels take them."""
+
+    def __init__(self, s: DriveScratch, d: DriveState) -> None:
+        self.bones = group(
+            RigidFits, center=s.bone_center, velocity=s.bone_velocity, spin=s.bone_spin, inertia=s.bone_inertia
+        )
+        self.whole = group(
+            RigidFit, center=s.body_center, velocity=s.body_velocity, spin=s.body_spin, inertia=s.body_inertia
+        )
+        self.removed = group(RemovedMotion, velocity=s.removed_velocity, turn=s.removed_turn, center=s.removed_center)
+        # the pose at a substep's start and at its end; they change roles every substep
+        self.pose = group(Pose, rotation=s.pose_rotation, position=s.pose_position)
+        self.next_pose = group(Pose, rotation=s.next_rotation, position=s.next_position)
+        self.command_pose = group(Pose, rotation=s.command_pose_rotation, position=s.command_pose_position)
+        self.carry = group(Carry, rotation=s.carry_rotation, translation=s.carry_translation)
+        self.command = group(
+            Command,
+            rotation=d.command_rotation,
+            increment=s.command_increment,
+            root=d.command_root,
+            goal_root=d.goal_root,
+        )
+        self.matrices = group(BoneMatrices, start=s.bone_from, step=s.bone_step, turn=s.bone_turn, lean=s.bone_lean)
+        self.change = group(BoneChange, velocity=s.change_velocity, spin=s.change_spin)
+
+
+def record_pose(drive: AvatarDrive, program: Program, fraction: float, rotation, root, increment, out: Pose) -> None:
+    """Append: the pose at ``fraction`` of a control step that starts from local ``rotation`` and ``root``."""
+    inputs = [drive.body, fraction, rotation, root, increment, drive.scratch.root_increment]
+    program.launch(posing.pose_body, drive.model.num_envs, inputs, [out.rotation, out.position])
+
+
+def record_split_substeps(drive: AvatarDrive, program: Program, state: State, scratch: Scratch) -> None:
+    """Append all substeps of a control step of the ``"split"`` scheme."""
+    s, d, g = drive.scratch, drive.state, drive.groups
+    n, steps = drive.model.num_envs, drive.model.num_substeps
+    now, after = g.pose, g.next_pose
+    for step in range(steps):
+        record_fit(drive, program, state)
+        if step > 0:
+            _record_carry(drive, program, state)
+        record_pose(drive, program, (step + 1) / steps, *drive.start_pose(), s.increment, after)
+        if drive.settings.tone > 0.0:
+            command = (d.command_rotation, d.command_root, s.command_increment)
+            record_pose(drive, program, step / steps, *command, g.command_pose)
+            if step == 0:
+                anchor = [s.anchor_rotation, s.anchor_translation]
+                program.launch(lay_command_on_body, n, [drive.body, g.command_pose, now], anchor)
+        program.launch(
+            root_wrench,
+            n,
+            [drive.drive, step / steps, g.command, now, g.carry, g.whole, drive.body_mass],
+            [d.let_go, d.wrench_force, d.wrench_torque, s.wrench_linear, s.wrench_angular],
+        )
+        _record_matrices(drive, program, now, after)
+        _record_flesh(drive, program, state)
+        record_substep(program, drive.model, state, scratch, step)
+        now, after = after, now
+
+
+def record_fit(drive: AvatarDrive, program: Program, state: State) -> None:
+    """Rigid motions of bones and body, fitted to the physical velocity."""
+    s, n, bones = drive.scratch, drive.model.num_envs, drive.groups.bones
+    reference = drive.tracked.position
+    program.launch(
+        rigid_fit.sum_moments,
+        (n, drive.num_chunks),
+        [drive.body, drive.model.particles, state.x, state.u, reference, state.failure],
+        [s.moments],
+    )
+    program.launch(
+        rigid_fit.fit_bones,
+        (n, NUM_JOINTS),
+        [drive.body, reference, s.moments, state.failure],
+        [s.bone_center, s.bone_velocity, s.bone_spin, s.bone_inertia],
+    )
+    program.launch(
+        rigid_fit.fit_body,
+        n,
+        [drive.body, bones, state.failure],
+        [s.body_center, s.body_velocity, s.body_spin, s.body_inertia],
+    )
+
+
+def _record_carry(drive: AvatarDrive, program: Program, state: State) -> None:
+    """Advance the carried bones and the laid command by the motion of the substep that has just been."""
+    s, g, n, dt = drive.scratch, drive.groups, drive.model.num_envs, drive.model.step.dt
+    program.launch(
+        posing.carry_bones,
+        (n, NUM_JOINTS),
+        [dt, g.bones, g.removed, state.failure],
+        [s.carry_rotation, s.carry_translation],
+    )
+    program.launch(
+        posing.carry_anchor, n, [dt, g.whole, g.removed, state.failure], [s.anchor_rotation, s.anchor_translation]
+    )
+
+
+def _record_matrices(drive: AvatarDrive, program: Program, now: Pose, after: Pose) -> None:
+    """Skinning matrices of the substep from ``now`` to ``after``."""
+    s, g, bones = drive.scratch, drive.groups, (drive.model.num_envs, NUM_JOINTS)
+    program.launch(
+        posing.bone_matrices,
+        bones,
+        [drive.body, drive.drive, now, after, g.carry],
+        [s.bone_from, s.bone_step, s.bone_turn],
+    )
+    if drive.settings.tone > 0.0:
+        anchor = [s.anchor_rotation, s.anchor_translation]
+        program.launch(posing.lean_matrices, bones, [drive.body, g.command_pose, *anchor, s.bone_from], [s.bone_lean])
+
+
+def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
+    """Kinematic velocity and pulls of every particle."""
+    s, g, n = drive.scratch, drive.groups, drive.model.num_envs
+    points, chunks = (n, drive.num_points), (n, drive.num_chunks)
+    program.launch(
+        flesh.drive_particles,
+        points,
+        [drive.body, drive.drive, state.x, state.u, g.matrices, g.bones, state.failure],
+        [state.vk, s.pull, s.lean],
+    )
+    if drive.drive.free_motion or drive.drive.root_rate > 0.0:  # a root that lets go leaves a free body
+        _record_free_motion(drive, program, state)
+    program.launch(
+        rigid_fit.sum_corrections,
+        chunks,
+        [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure],
+        [s.corrections],
+    )
+    program.launch(
+        flesh.blend_corrections,
+        n,
+        [drive.body, drive.drive, s.corrections, g.bones, g.whole, s.wrench_linear, s.wrench_angular],
+        [s.change_velocity, s.change_spin],
+    )
+    program.launch(
+        flesh.apply_corrections,
+        points,
+        [drive.body, drive.drive, state.x, s.pull, s.lean, g.bones, g.change, g.removed, state.failure],
+        [state.u, state.vk],
+    )
+
+
+def _record_free_motion(drive: AvatarDrive, program: Program, state: State) -> None:
+    """Take the rigid part out of the commanded motion of bodies that nothing supports."""
+    s, g, n, let_go = drive.scratch, drive.groups, drive.model.num_envs, drive.state.let_go
+    program.launch(
+        rigid_fit.sum_motion,
+        (n, drive.num_chunks),
+        [drive.body, drive.drive, drive.model.particles, state.x, state.vk, s.bone_center, let_go, state.failure],
+        [s.corrections],
+    )
+    program.launch(
+        flesh.free_motion,
+        n,
+        [drive.body, drive.drive, s.corrections, g.bones, g.whole, let_go],
+        [s.removed_velocity, s.removed_turn, s.removed_center, s.wrench_angular],
+    )
+
+
+def record_injected_substeps(drive: AvatarDrive, program: Program, state: State, scratch: Scratch) -> None:
+    """Append the paper's drive: one injection of velocity, then plain substeps."""
+    s, g = drive.scratch, drive.groups
+    chord = drive.settings.kernel_parameters(drive.model)
+    chord.dt = drive.model.control_dt
+    record_pose(drive, program, 1.0, *drive.start_pose(), s.increment, g.next_pose)
+    program.launch(
+        posing.bone_matrices,
+        (drive.model.num_envs, NUM_JOINTS),
+        [drive.body, chord, g.pose, g.next_pose, g.carry],
+        [s.bone_from, s.bone_step, s.bone_turn],
+    )
+    program.launch(
+        inject_velocity,
+        (drive.model.num_envs, drive.num_points),
+        [drive.body, drive.drive.kinematic_shape_rate, state.x, s.bone_from, s.bone_step, state.failure],
+        [state.u, state.vk],
+    )
+    for step in range(drive.model.num_substeps):
+        record_substep(program, drive.model, state, scratch, step)

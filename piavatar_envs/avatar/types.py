@@ -1,0 +1,210 @@
+"""Data structures of a driven body: constants, parameters, checkpointed state, scratch.
+
+Symbols in kernels: ``b`` bone, ``c`` chunk of a bone's particle list, ``q`` rotation, ``G`` the motion by which contact
+has carried a bone within this control step. A body occupies particles ``first ... first + count`` of each environment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+#: Partial sums of a chunk: m, m x (3), m u (3), m x x^T (6), m x cross u (3).
+vec16 = wp.types.vector(length=16, dtype=wp.float32)
+#: Partial sums of a chunk's corrections: momentum and angular momentum of the pull (6) and of the lean (6).
+vec12 = wp.types.vector(length=12, dtype=wp.float32)
+
+DRIVE_INCREMENT = wp.constant(0)
+DRIVE_TARGET = wp.constant(1)
+DRIVE_REFERENCE = wp.constant(2)
+
+
+@wp.struct
+class Body:
+    """Constants of one avatar. ``(rows, ...)`` arrays have 1 or ``num_envs`` rows."""
+
+    first: int
+    count: int
+    rest: wp.array2d(dtype=wp.vec3)  # (rows, count) rest positions [m]
+    joint: wp.array(dtype=wp.vec4i)  # (count,) bones that move a particle
+    weight: wp.array(dtype=wp.vec4)  # (count,) skinning weights, descending, sum one
+    follow: wp.array2d(dtype=float)  # (rows, count) share of the kinematic velocity a particle takes; < 1 jiggles
+    rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
+    rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
+    bone_mass: wp.array2d(dtype=float)  # (rows, bones) skinning-weighted mass [kg]
+    parent: wp.array(dtype=int)  # (bones,)
+    # particles that track bone b: tracker[tracker_start[b] : tracker_start[b + 1]]
+    tracker_start: wp.array(dtype=int)
+    tracker: wp.array(dtype=int)
+    # particles moved by bone b, in chunks: bone b owns chunks chunk_start[b] : chunk_start[b + 1], chunk c holds
+    # entries entry_start[c] : entry_start[c + 1]
+    chunk_start: wp.array(dtype=int)
+    chunk_bone: wp.array(dtype=int)
+    entry_start: wp.array(dtype=int)
+    entry: wp.array(dtype=int)
+    entry_weight: wp.array(dtype=float)
+
+
+@wp.struct
+class Drive:
+    """Parameters of the drive. Rates are natural frequencies of critically damped pulls [1/s]."""
+
+    dt: float  # substep [s]
+    control_dt: float  # control step [s]
+    num_substeps: int
+    mode: int  # DRIVE_INCREMENT, DRIVE_TARGET or DRIVE_REFERENCE
+    shape_rate: float  # physical shape preservation, alpha / control_dt
+    kinematic_shape_rate: float  # the paper's shape preservation inside vk; breaks momentum
+    tone_rate: float  # pull towards the commanded pose, 30 tone
+    damping: float  # decay of motion between bones [1/s]
+    free_motion: int  # 1: commanded motion carries no net momentum (0: not until the root wrench has let go)
+    gravity: wp.vec3
+    # root wrench
+    root_rate: float  # 0: none
+    max_force: float  # [m/s^2], a force limit over the mass
+    max_torque: float  # [m^2/s^2], a torque limit over the mass
+    max_tilt_cos: float
+    max_horizontal_error: float  # [m]
+    max_height_error: float  # [m]
+
+
+@wp.struct
+class RigidFits:
+    """Rigid motion of every bone, fitted to the physical velocity; ``(num_envs, bones)``."""
+
+    center: wp.array2d(dtype=wp.vec3)  # skinning-weighted centre of mass [m]
+    velocity: wp.array2d(dtype=wp.vec3)  # of the centre [m/s]
+    spin: wp.array2d(dtype=wp.vec3)  # angular velocity [rad/s]
+    inertia: wp.array2d(dtype=wp.mat33)  # about the centre [kg m^2]
+
+
+@wp.struct
+class RigidFit:
+    """The same of the whole body; ``(num_envs,)``."""
+
+    center: wp.array(dtype=wp.vec3)
+    velocity: wp.array(dtype=wp.vec3)
+    spin: wp.array(dtype=wp.vec3)
+    inertia: wp.array(dtype=wp.mat33)
+
+
+@wp.struct
+class RemovedMotion:
+    """Rigid motion taken out of the kinematic velocity of a body that nothing supports; ``(num_envs,)``."""
+
+    velocity: wp.array(dtype=wp.vec3)
+    turn: wp.array(dtype=wp.mat33)  # (R - I) / dt [1/s]
+    center: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Pose:
+    """World rotations and joint positions of all bones; ``(num_envs, bones)``."""
+
+    rotation: wp.array2d(dtype=wp.quat)
+    position: wp.array2d(dtype=wp.vec3)
+
+
+@wp.struct
+class Carry:
+    """``G``: how far contact has carried each bone in this control step; ``(num_envs, bones)``."""
+
+    rotation: wp.array2d(dtype=wp.quat)
+    translation: wp.array2d(dtype=wp.vec3)
+
+
+@wp.struct
+class Command:
+    """The commanded pose at the start of the control step and what it gains until the end."""
+
+    rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) local
+    increment: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) [rad]
+    root: wp.array(dtype=wp.vec3)  # (num_envs,) [m]
+    goal_root: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class BoneMatrices:
+    """Skinning matrices of a substep; ``(num_envs, bones)``."""
+
+    start: wp.array2d(dtype=wp.mat44)  # rest world to world, at its start
+    step: wp.array2d(dtype=wp.mat44)  # change over it, per second
+    turn: wp.array2d(dtype=wp.mat33)  # rotation over it
+    lean: wp.array2d(dtype=wp.mat44)  # commanded pose laid on the body, minus start
+
+
+@wp.struct
+class BoneChange:
+    """Change of velocity and spin of every bone about its centre; ``(num_envs, bones)``."""
+
+    velocity: wp.array2d(dtype=wp.vec3)
+    spin: wp.array2d(dtype=wp.vec3)
+
+
+@dataclass
+class DriveState:
+    """What a checkpoint holds of a drive. Quaternions are Warp's ``xyzw``; ``[:, 0]`` is the root in the world."""
+
+    command_rotation: wp.array  # (num_envs, bones) local rotations commanded so far
+    command_root: wp.array  # (num_envs,) commanded pelvis position [m]
+    goal_rotation: wp.array  # (num_envs, bones) local rotations to reach at the end of this control step
+    goal_root: wp.array  # (num_envs,) pelvis position to reach [m]
+    let_go: wp.array  # (num_envs,) int: 1 once the root wrench has let go
+    wrench_force: wp.array  # (num_envs,) mean root force of the last control step [N]
+    wrench_torque: wp.array  # (num_envs,) mean root torque of the last control step [N m]
+
+
+@dataclass
+class Tracked:
+    """Kabsch-tracked bones: recomputed from the particles whenever they have moved."""
+
+    rotation: wp.array  # (num_envs, bones) world rotation
+    position: wp.array  # (num_envs, bones) joint position [m]
+    velocity: wp.array  # (num_envs, bones) mean velocity of the bone's tracking particles [m/s]
+    local: wp.array  # (num_envs, bones) rotation relative to the parent bone
+
+
+@dataclass
+class DriveScratch:
+    """Rebuilt every control step."""
+
+    increment: wp.array  # (num_envs, bones) rotation vector the drive adds to the tracked pose [rad]
+    command_increment: wp.array  # (num_envs, bones) rotation vector from command to goal [rad]
+    root_increment: wp.array  # (num_envs,) translation the drive adds [m]
+    pose_rotation: wp.array  # (num_envs, bones) world rotation of the kinematic pose at the current substep
+    pose_position: wp.array  # (num_envs, bones)
+    next_rotation: wp.array  # the same at the next substep
+    next_position: wp.array
+    command_pose_rotation: wp.array  # (num_envs, bones) commanded pose at the current substep, before alignment
+    command_pose_position: wp.array
+    carry_rotation: wp.array  # (num_envs, bones) G
+    carry_translation: wp.array
+    anchor_rotation: wp.array  # (num_envs,) rigid motion that lays the commanded pose on the body
+    anchor_translation: wp.array
+    moments: wp.array  # (num_envs, chunks) vec16
+    bone_center: wp.array  # (num_envs, bones) skinning-weighted centre of mass [m]
+    bone_velocity: wp.array  # (num_envs, bones) rigid fit to u: velocity of the centre
+    bone_spin: wp.array  # (num_envs, bones) rigid fit to u: angular velocity
+    bone_inertia: wp.array  # (num_envs, bones) about the centre
+    body_center: wp.array  # (num_envs,) the same for the whole body
+    body_velocity: wp.array
+    body_spin: wp.array
+    body_inertia: wp.array
+    wrench_linear: wp.array  # (num_envs,) acceleration of the body's centre by the root wrench [m/s^2]
+    wrench_angular: wp.array  # (num_envs,) angular acceleration [rad/s^2]
+    # rigid motion taken out of vk in a substep, where a body moves without support: x -> x + dt (A (x - c - dt V) - V)
+    removed_velocity: wp.array  # (num_envs,) V [m/s]
+    removed_turn: wp.array  # (num_envs,) mat33: A, the finite rotation minus the identity, over dt [1/s]
+    removed_center: wp.array  # (num_envs,) c [m]
+    bone_from: wp.array  # (num_envs, bones) mat44: G T_s, rest world to world
+    bone_step: wp.array  # (num_envs, bones) mat44: (G T_{s+1} - G T_s) / dt
+    bone_turn: wp.array  # (num_envs, bones) mat33: rotation of the bone in this substep
+    bone_lean: wp.array  # (num_envs, bones) mat44: commanded pose laid on the body, minus G T_s
+    pull: wp.array  # (num_envs, count) velocity change by shape preservation [m/s]
+    lean: wp.array  # (num_envs, count) displacement from the carried to the commanded pose [m]
+    corrections: wp.array  # (num_envs, chunks) vec12
+    change_velocity: wp.array  # (num_envs, bones) correction field: velocity at the bone's centre
+    change_spin: wp.array  # (num_envs, bones)

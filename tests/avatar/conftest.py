@@ -1,0 +1,306 @@
+"""A rig: one avatar in empty space or on a floor, driven step by step, and read back in NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.drive import AvatarDrive
+from piavatar_envs.avatar.sampling import morph, sample_particles, spacing_for
+from piavatar_envs.avatar.settings import DriveSettings
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index, skin
+from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
+from piavatar_envs.mpm.diagnostics import Totals, totals
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.types import Model, Scratch, State
+
+DENSITY = 1000.0
+#: Where a ball hits: skin over the breastbone [m].
+CHEST = (0.0, -0.12, 1.28)
+TORSO = [joint_index(n) for n in ("pelvis", "spine1", "spine2", "spine3", "neck", "left_collar", "right_collar")]
+
+
+def mean_rigid_motion(mass, x, v):
+    """Centre, its velocity and angular velocity of the least-squares rigid motion (double precision)."""
+    c = mass @ x / mass.sum()
+    V = mass @ v / mass.sum()
+    d = x - c
+    second = np.einsum("p,pi,pj->ij", mass, d, d)
+    L = mass @ np.cross(d, v - V)
+    return c, V, np.linalg.solve(np.trace(second) * np.eye(3) - second, L)
+
+
+def blended_rigid_part(weights, mass, x, v):
+    """Bone by bone least-squares rigid motions of ``v``, blended by the skinning weights (double precision)."""
+    blended = np.zeros_like(v)
+    for bone in range(weights.shape[1]):
+        c, V, W = mean_rigid_motion(mass * weights[:, bone], x, v)
+        blended += weights[:, bone, None] * (V + np.cross(W, x - c))
+    return blended
+
+
+@dataclass
+class Rig:
+    """One avatar in each environment, with the programs that reset and step it."""
+
+    model: Model
+    state: State
+    scratch: Scratch
+    points: BodyPoints
+    drive: AvatarDrive
+    mask: wp.array
+    reset_program: Program
+    step_program: Program
+
+    # ---- running
+    def reset(self, rotvec=None, root=None, mask=None) -> Rig:
+        """Stand (or pose by local rotation vectors) the masked environments."""
+        n = self.model.num_envs
+        mask = np.ones(n, bool) if mask is None else np.asarray(mask)
+        self.mask.assign(mask)
+        d = self.drive.state
+        rotations, roots = d.command_rotation.numpy(), d.command_root.numpy()
+        rotations[mask] = self.quaternions(np.zeros((NUM_JOINTS, 3)) if rotvec is None else rotvec)[mask]
+        roots[mask] = np.broadcast_to(self.points.joints[:, 0] if root is None else root, (n, 3))[mask]
+        d.command_rotation.assign(rotations)
+        d.command_root.assign(roots)
+        self.reset_program.run()
+        return self
+
+    def run_part_of_step(self, kernel: str, count: int) -> None:
+        """Run a control step up to and with the ``count``-th launch of a kernel."""
+        for launch, name in zip(self.step_program._launches, self.step_program._names, strict=True):
+            launch.launch()
+            count -= name == kernel
+            if count == 0:
+                return
+        raise ValueError(f"a control step has {count} launches of {kernel} fewer than asked for")
+
+    def track(self) -> None:
+        """Track the particles where they are now."""
+        program = Program(self.model.device)
+        self.drive.record_tracking(program, self.state)
+        program.run()
+
+    def command(self, rotvec=None, root=None) -> None:
+        """Set the goal of the next control steps: local rotation vectors ``(22, 3)``, pelvis position."""
+        if rotvec is not None:
+            self.drive.state.goal_rotation.assign(self.quaternions(rotvec))
+        if root is not None:
+            n = self.model.num_envs
+            self.drive.state.goal_root.assign(np.ascontiguousarray(np.broadcast_to(root, (n, 3)), np.float32))
+
+    def step(self, count: int = 1) -> None:
+        for _ in range(count):
+            self.step_program.run()
+
+    def quaternions(self, rotvec) -> np.ndarray:
+        """Warp's quaternions of local rotation vectors, one set an environment."""
+        rotvec = np.array(np.broadcast_to(rotvec, (self.model.num_envs, NUM_JOINTS, 3)))
+        return Rotation.from_rotvec(rotvec.reshape(-1, 3)).as_quat().reshape(-1, NUM_JOINTS, 4).astype(np.float32)
+
+    # ---- reading
+    @property
+    def mass(self) -> np.ndarray:
+        """Mass of every particle of the first environment [kg], double precision."""
+        return self.points.mass[0].astype(float)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Dense skinning weights, shape ``(P, 22)``."""
+        dense = np.zeros((self.points.num_points, NUM_JOINTS))
+        for slot in range(4):
+            rows = np.arange(self.points.num_points)
+            np.add.at(dense, (rows, self.points.skin_joints[:, slot]), self.points.skin_weights[:, slot])
+        return dense
+
+    def read(self, name: str, env: int = 0) -> np.ndarray:
+        """One array of the state, double precision."""
+        return getattr(self.state, name).numpy()[env].astype(float)
+
+    def skinned(self, rotations, root, env: int = 0) -> np.ndarray:
+        """Particles of a pose by NumPy's forward kinematics and skinning."""
+        p, row = self.points, min(env, len(self.points.rest) - 1)
+        joints = p.joints[min(env, len(p.joints) - 1)].astype(float)
+        world, positions = forward_kinematics(rotations, root, joints)
+        return skin(p.rest[row].astype(float), p.skin_joints, p.skin_weights.astype(float), world, positions, joints)
+
+    def target(self, env: int = 0) -> np.ndarray:
+        """Particles of the commanded pose."""
+        d = self.drive.state
+        rotations = Rotation.from_quat(d.goal_rotation.numpy()[env].astype(float)).as_matrix()
+        return self.skinned(rotations, d.goal_root.numpy()[env].astype(float), env)
+
+    def tracked_world(self, env: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Tracked world rotations ``(22, 3, 3)`` and joint positions."""
+        t = self.drive.tracked
+        return Rotation.from_quat(t.rotation.numpy()[env].astype(float)).as_matrix(), t.position.numpy()[env].astype(
+            float
+        )
+
+    def tracked_local(self, env: int = 0) -> np.ndarray:
+        """Tracked local rotations, shape ``(22, 3, 3)``."""
+        world = self.tracked_world(env)[0]
+        return np.stack([world[0], *(world[PARENTS[b]].T @ world[b] for b in range(1, NUM_JOINTS))])
+
+    def joint_errors(self, env: int = 0) -> np.ndarray:
+        """Angle between commanded and tracked local rotation of every joint but the root [rad]."""
+        command = Rotation.from_quat(self.drive.state.command_rotation.numpy()[env].astype(float))
+        return (command.inv() * Rotation.from_matrix(self.tracked_local(env))).magnitude()[1:]
+
+    def shape_error(self, env: int = 0) -> np.ndarray:
+        """Distance of the particles from the skinned tracked pose [m]."""
+        root = self.tracked_world(env)[1][0]
+        return np.linalg.norm(self.read("x", env) - self.skinned(self.tracked_local(env), root, env), axis=1)
+
+    def pose_error(self, env: int = 0) -> np.ndarray:
+        """Distance of the particles from the skinned commanded pose [m]."""
+        return np.linalg.norm(self.read("x", env) - self.target(env), axis=1)
+
+    def everything(self) -> dict[str, np.ndarray]:
+        """All that a checkpoint would hold, and the tracked pose."""
+        drive, tracked = (
+            {field.name: getattr(group, field.name).numpy().copy() for field in fields(group)}
+            for group in (self.drive.state, self.drive.tracked)
+        )
+        return {**self.state.numpy(), **drive, **tracked}
+
+    def totals(self, about=(0.0, 0.0, 0.0), env: int = 0) -> Totals:
+        return totals(self.model, self.state, env, about=about)
+
+    def energy(self) -> float:
+        """Kinetic and elastic energy [J]."""
+        t = self.totals()
+        return t.kinetic + t.elastic
+
+    def rigid_motion(self, total: bool = True):
+        """Centre, velocity, angular velocity of the whole body (of ``u + vk``, or of ``u`` alone)."""
+        v = self.read("u") + (self.read("vk") if total else 0.0)
+        return mean_rigid_motion(self.mass, self.read("x"), v)
+
+    # ---- disturbing
+    def add_velocity(self, dv: np.ndarray, env: int | None = None) -> None:
+        """Add a velocity to the particles, shape ``(P, 3)``, in one environment or all."""
+        u = self.state.u.numpy()
+        u[slice(None) if env is None else env] += dv.astype(np.float32)
+        self.state.u.assign(u)
+
+    def set_rigid_velocity(self, velocity, spin) -> None:
+        """Give the body exactly a rigid motion, with the affine velocity that goes with it."""
+        spin = np.asarray(spin, float)
+        x = self.read("x")
+        center = self.mass @ x / self.mass.sum()
+        self.state.u.assign((np.asarray(velocity) + np.cross(spin, x - center)).astype(np.float32)[None])
+        self.state.C.assign(np.broadcast_to(np.cross(np.eye(3), -spin).T, (1, len(x), 3, 3)).astype(np.float32).copy())
+
+    def strike(self, momentum, at=CHEST, radius: float = 0.16, internal: bool = False) -> None:
+        """Hit the skin near ``at`` with a momentum [N s], spread over the particles of the torso that a ball covers.
+
+        ``internal`` takes the rigid part out again: the body is bent and dented, but neither flies off nor spins.
+        """
+        rest = self.points.rest[0].astype(float)
+        spread = np.exp(-2.0 * ((rest - np.asarray(at)) ** 2).sum(1) / radius**2) * (
+            self.weights[:, TORSO].sum(1) > 0.5
+        )
+        dv = spread[:, None] / (self.mass @ spread) * np.asarray(momentum, float)
+        if internal:
+            x = self.read("x")
+            c, V, W = mean_rigid_motion(self.mass, x, dv)
+            dv -= V + np.cross(W, x - c)
+        self.add_velocity(dv)
+
+    def push(self, force, joint: str = "spine3") -> None:
+        """One control step's worth of a force [N] on the flesh of a bone."""
+        w = self.weights[:, joint_index(joint)]
+        impulse = np.asarray(force, float) * self.model.control_dt
+        self.add_velocity(w[:, None] / (self.mass @ w) * impulse)
+
+
+def build_rig(
+    device: str,
+    *,
+    cells: int = 24,
+    num_envs: int = 1,
+    shapes: Sequence[dict[str, float]] | None = None,
+    gravity: float = 0.0,
+    floor: bool = False,
+    decoupling: str = "split",
+    num_substeps: int | None = None,
+    room: float = 1.3,
+    **settings,
+) -> Rig:
+    """A standing avatar ``cells`` grid spacings tall.
+
+    ``shapes`` are shape parameters by name, one set an environment; ``room`` is the half width of the domain [m].
+    """
+    asset = load_body()
+    dx = float(np.ptp(asset.vertices[:, 2])) / cells
+    particles = sample_particles(asset, spacing_for(dx))
+    if shapes is None:
+        rest, volume, joints = particles.rest_positions[None], particles.volumes[None], asset.joints[None]
+    else:
+        bodies = [asset.shape(asset.parameters(**shape)) for shape in shapes]
+        morphed = [morph(asset, particles, body) for body in bodies]
+        rest, volume = (np.stack([m[k] for m in morphed]) for k in (0, 1))
+        joints = np.stack([body.joints for body in bodies])
+    model = build_model(
+        MaterialPoints.uniform(volume, DENSITY),
+        make_grid((-room, -room, 0.0 if floor else -room), (room, room, 1.2 + room), dx),
+        num_envs=num_envs,
+        device=device,
+        gravity=(0.0, 0.0, -gravity),
+        decoupling=decoupling,
+        num_substeps=num_substeps,
+        planes=[((0.0, 0.0, 1.0), 0.0, 0.8)] if floor else (),
+    )
+    state, scratch = allocate(model)
+    follow = np.ones((1, volume.shape[1]), np.float32)
+    mass = volume * np.float32(DENSITY)
+    points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, follow)
+    drive = AvatarDrive(points, 0, model, DriveSettings(**settings))
+    mask = wp.zeros(num_envs, dtype=wp.bool, device=device)
+    reset_program, step_program = Program(device), Program(device)
+    drive.record_reset(reset_program, state, mask)
+    drive.record_tracking(reset_program, state)
+    drive.record_control_step(step_program, state, scratch)
+    drive.record_tracking(step_program, state)
+    return Rig(model, state, scratch, points, drive, mask, reset_program, step_program).reset()
+
+
+@pytest.fixture(scope="session")
+def make_rig(device: str) -> Callable[..., Rig]:
+    """:func:`build_rig` on the device under test. Every call builds a rig of its own."""
+
+    def make(**options) -> Rig:
+        return build_rig(device, **options)
+
+    return make
+
+
+def random_pose(rng: np.random.Generator, scale: float = 0.6) -> np.ndarray:
+    """Local rotation vectors of a wild pose, shape ``(22, 3)``: limbs up to 1.5 rad, spine and head 0.4 of it."""
+    rotvec = rng.normal(size=(NUM_JOINTS, 3)) * scale
+    rotvec[[joint_index(n) for n in ("spine1", "spine2", "spine3", "neck", "head", "left_collar", "right_collar")]] *= (
+        0.4
+    )
+    length = np.linalg.norm(rotvec, axis=1, keepdims=True)
+    return rotvec * np.minimum(1.0, 1.5 / np.maximum(length, 1e-9))
+
+
+@pytest.fixture(scope="session")
+def wild_pose() -> Callable[..., np.ndarray]:
+    """:func:`random_pose`."""
+    return random_pose
+
+
+@pytest.fixture(scope="session", name="blended_rigid_part")
+def blended_rigid_part_fixture() -> Callable[..., np.ndarray]:
+    """:func:`blended_rigid_part`."""
+    return blended_rigid_part

@@ -1,0 +1,167 @@
+"""The root wrench: it holds a standing body, within its limits, and lets go of one that is knocked down."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+G = 9.81
+
+
+def tilt(rig, env: int = 0) -> float:
+    """Angle between the pelvis' axis and the vertical [deg]."""
+    return float(np.degrees(np.arccos(np.clip(rig.tracked_world(env)[0][0][2, 2], -1.0, 1.0))))
+
+
+def displacement(rig, env: int = 0) -> np.ndarray:
+    """Pelvis joint relative to standing [m]."""
+    return rig.tracked_world(env)[1][0] - rig.points.joints[0, 0]
+
+
+def push(rig, force, steps: int = 15, after: int = 30) -> dict[str, np.ndarray]:
+    """Push the upper chest for ``steps`` control steps, then watch; what happened at every step."""
+    log = {"tilt": [], "let_go": [], "force": [], "torque": [], "shift": []}
+    for k in range(steps + after):
+        if k < steps:
+            rig.push(force)
+        rig.step()
+        log["tilt"].append(tilt(rig))
+        log["let_go"].append(int(rig.drive.state.let_go.numpy()[0]))
+        log["force"].append(np.linalg.norm(rig.drive.state.wrench_force.numpy()[0]))
+        log["torque"].append(np.linalg.norm(rig.drive.state.wrench_torque.numpy()[0]))
+        log["shift"].append(displacement(rig))
+    return {name: np.array(values) for name, values in log.items()}
+
+
+@pytest.mark.parametrize("floor", [False, True])
+def test_standing_does_not_sag_and_costs_the_weight(make_rig, floor):
+    rig = make_rig(gravity=G, floor=floor)
+    rig.step(30)
+    assert np.abs(displacement(rig)).max() < 1e-4
+    assert np.abs(rig.read("x") - rig.target()).max() < 1e-3
+    weight = rig.mass.sum() * G
+    np.testing.assert_allclose(rig.drive.state.wrench_force.numpy()[0], (0.0, 0.0, weight), atol=1e-3 * weight)
+    np.testing.assert_allclose(rig.drive.state.wrench_torque.numpy()[0], 0.0, atol=1e-3 * weight)
+
+
+def test_the_weight_of_every_body_is_its_own(make_rig):
+    rig = make_rig(gravity=G, num_envs=2, shapes=[{"weight": -0.8}, {"weight": 0.8}])
+    rig.step(5)
+    weights = rig.points.mass.astype(float).sum(1) * G
+    assert weights[1] > 1.1 * weights[0]
+    np.testing.assert_allclose(rig.drive.state.wrench_force.numpy()[:, 2], weights, rtol=1e-3)
+
+
+def test_a_push_within_the_limits_is_survived(make_rig):
+    rig = make_rig(gravity=G, floor=True, room=1.6)
+    log = push(rig, (0.0, 1000.0, 0.0))
+    assert 5.0 < log["tilt"].max() < 45.0
+    assert not log["let_go"].any()
+    assert log["tilt"][-1] < 2.0
+    assert np.linalg.norm(log["shift"][-1]) < 0.02
+    # the limits of the wrench, in units of the weight and of a metre
+    weight = rig.mass.sum() * G
+    assert 1.5 * weight < log["force"].max() < 2.001 * weight
+    assert log["torque"].max() < 0.7001 * weight
+
+
+def test_a_push_beyond_the_limits_knocks_down_for_good(make_rig):
+    rig = make_rig(gravity=G, floor=True, room=2.0)
+    log = push(rig, (0.0, 1500.0, 0.0), steps=15, after=10)
+    assert log["let_go"].any()
+    first = log["let_go"].argmax()
+    assert log["let_go"][first:].all()  # latched
+    assert np.all(log["force"][first + 1 :] == 0.0) and np.all(log["torque"][first + 1 :] == 0.0)
+    assert log["torque"].max() == pytest.approx(0.7 * rig.mass.sum() * G, rel=1e-3)  # it did what it could
+    assert log["tilt"][-1] > 45.0
+    rig.reset()
+    assert rig.drive.state.let_go.numpy()[0] == 0
+    rig.step(10)
+    assert rig.drive.state.let_go.numpy()[0] == 0 and tilt(rig) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("error", "limit"), [("tilt", 45.0), ("horizontal", 0.5), ("up", 0.4), ("down", 0.4)], ids=lambda v: str(v)
+)
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_it_lets_go_at_each_limit(make_rig, error, limit, share):
+    """The command is moved off the body at once; only its size decides."""
+    rig = make_rig(gravity=0.0, room=1.6)
+    rotvec, root = np.zeros((22, 3)), rig.points.joints[0, 0].astype(float)
+    if error == "tilt":
+        rotvec[0] = np.radians(share * limit) * np.array([0.6, 0.8, 0.0])
+    else:
+        offset = {"horizontal": (0.6, 0.8, 0.0), "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0)}[error]
+        root = root + share * limit * np.array(offset)
+    rig.drive.state.command_rotation.assign(rig.quaternions(rotvec))
+    rig.drive.state.command_root.assign(root.astype(np.float32)[None])
+    rig.command(rotvec, root)
+    rig.step()
+    assert rig.drive.state.let_go.numpy()[0] == (share > 1.0)
+
+
+def test_turning_in_place_is_not_a_tilt(make_rig):
+    rig = make_rig(gravity=0.0)
+    yaw = np.zeros((22, 3))
+    yaw[0, 2] = 2.0
+    rig.drive.state.command_rotation.assign(rig.quaternions(yaw))
+    rig.command(yaw)
+    rig.step()
+    assert rig.drive.state.let_go.numpy()[0] == 0
+
+
+@pytest.mark.parametrize("commanded", [False, True])
+def test_a_body_let_go_falls_freely(make_rig, commanded):
+    """Not even by moving its limbs, or by a commanded root, can it push itself off the air."""
+    rig = make_rig(gravity=G, room=1.8)
+    rig.drive.state.let_go.fill_(1)
+    swing = np.zeros((22, 3))
+    for k in range(6):
+        if commanded:
+            swing[16, 1] = swing[1, 0] = 0.15 * (k + 1)
+            rig.command(swing, rig.points.joints[0, 0] + [0.0, -0.05 * (k + 1), 0.1 * (k + 1)])
+        rig.step()
+    _, velocity, spin = rig.rigid_motion()
+    np.testing.assert_allclose(velocity, (0.0, 0.0, -G * 0.2), atol=1e-4)
+    np.testing.assert_allclose(spin, 0.0, atol=5e-3)
+    assert not rig.drive.state.wrench_force.numpy().any()
+    if commanded:
+        assert np.degrees(rig.joint_errors().max()) < 0.1  # the limbs did move as commanded
+
+
+def test_a_small_error_decays_critically_damped(make_rig):
+    """Root rate 10/s: ``e(t) = e0 (1 + w t) exp(-w t)`` in translation and rotation."""
+    rig = make_rig(gravity=G, tone=1.0)
+    root, rotvec = rig.points.joints[0, 0] + np.array([0.03, -0.04, 0.02]), np.zeros((22, 3))
+    rotvec[0] = (0.02, -0.05, 0.04)
+    rig.drive.state.command_rotation.assign(rig.quaternions(rotvec))
+    rig.drive.state.command_root.assign(root.astype(np.float32)[None])
+    rig.command(rotvec, root)
+    goal = Rotation.from_rotvec(rotvec[0])
+    turn0 = goal.magnitude()
+    # the wrench turns the body about its centre of mass, which carries the pelvis a little
+    for k in range(1, 11):
+        rig.step()
+        wt = 10.0 * k / 30.0
+        expected = (1.0 + wt) * np.exp(-wt)
+        world, position = rig.tracked_world()
+        turn = (goal.inv() * Rotation.from_matrix(world[0])).magnitude()
+        assert turn / turn0 == pytest.approx(expected, abs=0.05)
+        assert np.linalg.norm(root - position[0]) / 0.0539 == pytest.approx(expected, abs=0.15)
+
+
+def test_a_commanded_walk_is_followed_without_lag(make_rig):
+    """Root commands move through the kinematic velocity: the wrench has nothing to do but carry the weight."""
+    rig = make_rig(gravity=G)
+    for k in range(1, 9):
+        rotvec = np.zeros((22, 3))
+        rotvec[0, 2] = 0.1 * k
+        root = rig.points.joints[0, 0] + [0.0, -0.04 * k, 0.0]
+        rig.command(rotvec, root)
+        rig.step()
+        world, position = rig.tracked_world()
+        np.testing.assert_allclose(position[0], root, atol=1e-4)
+        assert (Rotation.from_rotvec(rotvec[0]).inv() * Rotation.from_matrix(world[0])).magnitude() < 1e-4
+    weight = rig.mass.sum() * G
+    np.testing.assert_allclose(rig.drive.state.wrench_force.numpy()[0], (0.0, 0.0, weight), atol=5e-3 * weight)
