@@ -1,0 +1,22 @@
+"""Pictures and videos (extra ``render``). Importing this needs no graphics library; building a Renderer does."""
+
+from piavatar_envs.render.coloring import strain_magnitude
+from piavatar_envs.render.overlay import label, side_by_side
+from piavatar_envs.render.renderer import Renderer
+from piavatar_envs.render.scene import Arrow, Body, Box, Camera, Sphere
+from piavatar_envs.render.skin import Skin
+from piavatar_envs.render.video import write_video
+
+__all__ = [
+    "Arrow",
+    "Body",
+    "Box",
+    "Camera",
+    "Renderer",
+    "Skin",
+    "Sphere",
+    "label",
+    "side_by_side",
+    "strain_magnitude",
+    "write_video",
+]

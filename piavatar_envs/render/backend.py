@@ -1,0 +1,53 @@
+"""What the two back ends have in common: how they are asked for a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from piavatar_envs.render.geometry import Topology
+from piavatar_envs.render.shadow import GroundShadow
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """Where a picture is taken from.
+
+    Attributes:
+        eye: the camera's position [m], shape ``(3,)``.
+        target: the point looked at [m], shape ``(3,)``.
+        field_of_view: vertical angle [deg].
+        center: the point of the ground about which it fades [m], shape ``(2,)``.
+    """
+
+    eye: np.ndarray
+    target: np.ndarray
+    field_of_view: float
+    center: np.ndarray
+
+
+class Backend(Protocol):
+    """Turns lit vertices into pictures of one size."""
+
+    def draw(
+        self, topology: Topology, vertices: np.ndarray, colors: np.ndarray, shadow: GroundShadow, shot: Shot
+    ) -> np.ndarray:
+        """One picture.
+
+        Args:
+            topology: the triangles; a new object where they changed.
+            vertices: positions [m], shape ``(V, 3)`` float32.
+            colors: lit sRGB colours, shape ``(V, 3)`` uint8.
+            shadow: the shadow on the ground.
+            shot: where the picture is taken from.
+
+        Returns:
+            The picture, shape ``(height, width, 3)`` uint8; the caller's own.
+        """
+        ...
+
+    def close(self) -> None:
+        """Free what it holds."""
+        ...

@@ -1,0 +1,111 @@
+"""Colours: strain of the deformation gradient, a perceptually uniform colour map and its scale."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+_TABLE_SIZE = 256
+#: Anchors (lightness, chroma, hue [deg]) of the strain map in Oklch: pale where unstrained, so that the body still
+#: reads as a body; then orange, crimson and a dark violet, in equal steps of lightness.
+_STRAIN_ANCHORS = np.array(
+    [[0.92, 0.025, 85.0], [0.79, 0.115, 66.0], [0.65, 0.190, 35.0], [0.51, 0.195, 10.0], [0.37, 0.150, -30.0]]
+)
+
+
+def strain_magnitude(deformation_gradient: ArrayLike) -> np.ndarray:
+    """Largest departure of a principal stretch from one: ``max_i |s_i - 1|``, zero for any rotation.
+
+    The principal stretches ``s_i`` are the singular values of ``F``; where ``det F < 0`` (inverted) the smallest is
+    counted as negative. An ``F`` that is not finite gives infinity.
+
+    Args:
+        deformation_gradient: ``F`` of each particle, shape ``(P, 3, 3)``.
+
+    Returns:
+        Strain [1], shape ``(P,)``.
+    """
+    gradient = np.asarray(deformation_gradient, dtype=np.float64)
+    finite = np.isfinite(gradient).all(axis=(-2, -1))
+    safe = np.where(finite[..., None, None], gradient, np.eye(3))
+    squared = np.linalg.eigvalsh(np.swapaxes(safe, -2, -1) @ safe)
+    stretches = np.sqrt(np.maximum(squared, 0.0))
+    stretches[..., 0] *= np.where(np.linalg.det(safe) < 0.0, -1.0, 1.0)
+    return np.where(finite, np.abs(stretches - 1.0).max(axis=-1), np.inf)
+
+
+@lru_cache(maxsize=1)
+def strain_table() -> np.ndarray:
+    """The strain colour map, shape ``(256, 3)`` sRGB in [0, 1]; read-only."""
+    at = np.linspace(0.0, len(_STRAIN_ANCHORS) - 1.0, _TABLE_SIZE)
+    lightness, chroma, hue = (
+        np.interp(at, np.arange(len(_STRAIN_ANCHORS)), _STRAIN_ANCHORS[:, column]) for column in range(3)
+    )
+    angle = np.deg2rad(hue)
+    table = oklab_to_srgb(np.stack([lightness, chroma * np.cos(angle), chroma * np.sin(angle)], axis=-1))
+    table.setflags(write=False)
+    return table
+
+
+def color_by(values: ArrayLike, maximum: float) -> np.ndarray:
+    """Colours of scalars on the fixed range ``[0, maximum]``; values outside, and NaN, take the nearest end's.
+
+    Args:
+        values: scalars, shape ``(N,)``.
+        maximum: the value of the last colour.
+
+    Returns:
+        sRGB in [0, 1], shape ``(N, 3)``.
+
+    Raises:
+        ValueError: the maximum is not positive.
+    """
+    if not maximum > 0.0:
+        raise ValueError(f"maximum={maximum} must be positive: it is the value of the last colour")
+    position = np.nan_to_num(np.asarray(values, dtype=np.float64) / maximum, nan=1.0)
+    return strain_table()[np.rint(np.clip(position, 0.0, 1.0) * (_TABLE_SIZE - 1)).astype(np.int64)]
+
+
+def srgb_to_linear(color: ArrayLike) -> np.ndarray:
+    """Light intensities of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    color = np.asarray(color, dtype=np.float64)
+    return np.where(color <= 0.04045, color / 12.92, ((np.maximum(color, 0.0) + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(light: ArrayLike) -> np.ndarray:
+    """Values in [0, 1] (sRGB) of light intensities; clips what is out of range (IEC 61966-2-1)."""
+    light = np.clip(np.asarray(light, dtype=np.float64), 0.0, 1.0)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+
+
+def to_bytes(light: np.ndarray) -> np.ndarray:
+    """Bytes (sRGB) of light intensities, through a table: quick enough for every vertex of every frame."""
+    table = _byte_table()
+    return table[np.clip(light * np.float32(len(table) - 1), 0.0, len(table) - 1).astype(np.int32)]
+
+
+@lru_cache(maxsize=1)
+def _byte_table() -> np.ndarray:
+    return np.rint(255.0 * linear_to_srgb(np.linspace(0.0, 1.0, 1 << 14))).astype(np.uint8)
+
+
+def oklab_to_srgb(lab: ArrayLike) -> np.ndarray:
+    """Values in [0, 1] (sRGB) of Oklab colours, shape ``(..., 3)`` (B. Ottosson, "A perceptual color space", 2020)."""
+    lab = np.asarray(lab, dtype=np.float64)
+    to_lms = np.array(
+        [
+            [1.0, 0.3963377774, 0.2158037573],
+            [1.0, -0.1055613458, -0.0638541728],
+            [1.0, -0.0894841775, -1.2914855480],
+        ]
+    )
+    to_rgb = np.array(
+        [
+            [4.0767416621, -3.3077115913, 0.2309699292],
+            [-1.2684380046, 2.6097574011, -0.3413193965],
+            [-0.0041960863, -0.7034186147, 1.7076147010],
+        ]
+    )
+    return linear_to_srgb((lab @ to_lms.T) ** 3 @ to_rgb.T)

@@ -1,0 +1,66 @@
+"""Off-screen OpenGL on Linux: whether there is any, and how to have VTK use it quietly."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from functools import lru_cache
+
+_WINDOW_VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
+_EGL_PLATFORM_DEVICE = 0x313F
+_EGL_OPENGL_API = 0x30A2
+
+
+@lru_cache(maxsize=1)
+def opengl_available() -> bool:
+    """Whether VTK can open an off-screen window. It must be known before: without OpenGL, VTK kills the process.
+
+    Elsewhere than on Linux the system brings OpenGL; a user who set ``VTK_DEFAULT_OPENGL_WINDOW`` is trusted.
+    """
+    if not sys.platform.startswith("linux") or _WINDOW_VARIABLE in os.environ:
+        return True
+    try:
+        return _egl_starts(ctypes.CDLL("libEGL.so.1"))
+    except (OSError, AttributeError):  # no library, or one without these functions
+        return False
+
+
+@contextlib.contextmanager
+def off_screen_window() -> Iterator[None]:
+    """Within it VTK opens an EGL window at once on Linux, instead of warning that there is no X server first."""
+    if not sys.platform.startswith("linux") or _WINDOW_VARIABLE in os.environ:
+        yield
+        return
+    os.environ[_WINDOW_VARIABLE] = "vtkEGLRenderWindow"
+    try:
+        yield
+    finally:
+        del os.environ[_WINDOW_VARIABLE]
+
+
+def _egl_starts(egl: ctypes.CDLL) -> bool:
+    """Whether EGL starts on its first device, or else its default display, as VTK will ask it to."""
+    pointer, integer = ctypes.c_void_p, ctypes.c_int
+    egl.eglGetProcAddress.restype, egl.eglGetProcAddress.argtypes = pointer, [ctypes.c_char_p]
+    egl.eglGetDisplay.restype, egl.eglGetDisplay.argtypes = pointer, [pointer]
+    egl.eglInitialize.argtypes = [pointer, ctypes.POINTER(integer), ctypes.POINTER(integer)]
+    egl.eglTerminate.argtypes = [pointer]
+    displays = []
+    query = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
+    platform = egl.eglGetProcAddress(b"eglGetPlatformDisplayEXT")
+    if query and platform:
+        device, count = pointer(), integer(0)
+        prototype = ctypes.CFUNCTYPE(ctypes.c_uint, integer, ctypes.POINTER(pointer), ctypes.POINTER(integer))
+        if prototype(query)(1, ctypes.byref(device), ctypes.byref(count)) and count.value:
+            prototype = ctypes.CFUNCTYPE(pointer, ctypes.c_uint, pointer, pointer)
+            displays.append(prototype(platform)(_EGL_PLATFORM_DEVICE, device, None))
+    displays.append(egl.eglGetDisplay(None))
+    for display in displays:
+        if display and egl.eglInitialize(display, ctypes.byref(integer()), ctypes.byref(integer())):
+            starts = bool(egl.eglBindAPI(_EGL_OPENGL_API))
+            egl.eglTerminate(display)
+            return starts
+    return False

@@ -1,0 +1,160 @@
+"""Pictures of bodies and markers: the one entry point of this package."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import TracebackType
+
+import numpy as np
+
+from piavatar_envs.render import coloring, shading, vtk_backend
+from piavatar_envs.render.backend import Backend, Shot
+from piavatar_envs.render.display import opengl_available
+from piavatar_envs.render.geometry import Topology, topology_key
+from piavatar_envs.render.overlay import draw_scale
+from piavatar_envs.render.scene import Body, Camera, Marker
+from piavatar_envs.render.shadow import ground_shadow
+
+BACKENDS = ("auto", "pyvista", "software")
+_FAR = 50.0
+
+
+class Renderer:
+    """Draws off screen into arrays.
+
+    Example::
+
+        with Renderer(480, 480) as renderer:
+            frame = renderer.render([Body(vertices, faces)], [Sphere(target, 0.05)], follow=root_position)
+    """
+
+    def __init__(
+        self, width: int = 480, height: int = 480, camera: Camera | None = None, backend: str = "auto"
+    ) -> None:
+        """Open the window.
+
+        Args:
+            width: of the picture [px].
+            height: of the picture [px].
+            camera: the view; by default of a standing person, three-quarters from the front.
+            backend: ``"pyvista"`` (OpenGL), ``"software"`` (no graphics driver needed; the CPU) or ``"auto"``: the
+                first where OpenGL works off screen, else the second. They draw the same.
+
+        Raises:
+            ImportError: pyvista is not installed.
+            ValueError: a size outside [16, 8192], or an unknown back end.
+            RuntimeError: ``backend="pyvista"`` where there is no OpenGL.
+        """
+        for name, value in (("width", width), ("height", height)):
+            if not 16 <= value <= 8192:
+                raise ValueError(f"{name}={value} px is outside [16, 8192]")
+        self.width, self.height = int(width), int(height)
+        self.camera = camera or Camera()
+        self._center: np.ndarray | None = None
+        self._topology: Topology | None = None
+        self._backend: Backend | None = _open(backend, self.width, self.height)
+
+    def render(
+        self, bodies: Sequence[Body], markers: Sequence[Marker] = (), follow: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Draw one picture.
+
+        Args:
+            bodies: meshes in world coordinates.
+            markers: spheres, arrows and boxes.
+            follow: the point the camera follows [m], shape ``(3,)``, for example the root; the origin if None.
+
+        Returns:
+            The picture, shape ``(height, width, 3)`` uint8; the caller's own.
+
+        Raises:
+            RuntimeError: the renderer is closed.
+            ValueError: nothing to show, or a body's arrays do not fit together.
+        """
+        if self._backend is None:
+            raise RuntimeError("this Renderer is closed; make a new one")
+        center = self._follow(follow)
+        topology, vertices, colors = self._gather(bodies, markers)
+        offset = np.array([*center, 0.0])
+        shot = Shot(offset + self.camera.position, offset + self.camera.target, self.camera.field_of_view, center)
+        columns = np.ascontiguousarray(vertices.T)
+        casters = shading.Casters(*topology.triangles(columns))
+        light = shading.shade(topology, columns, colors.T, shot.eye, casters)
+        picture = self._backend.draw(topology, vertices, coloring.to_bytes(light.T), ground_shadow(casters), shot)
+        for body in bodies:
+            if body.scalars is not None:
+                draw_scale(picture, body.scalar_max, body.scalar_label)
+                break
+        return picture
+
+    def reset_camera(self) -> None:
+        """Let the next picture's camera start at what it follows, without a glide from where it was."""
+        self._center = None
+
+    def close(self) -> None:
+        """Free the window; closing twice is fine."""
+        if self._backend is not None:
+            self._backend.close()
+            self._backend = None
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _follow(self, point: np.ndarray | None) -> np.ndarray:
+        wanted = np.zeros(2) if point is None else np.asarray(point, dtype=np.float64)[:2]
+        if not np.isfinite(wanted).all():
+            wanted = np.zeros(2) if self._center is None else self._center
+        if self._center is None:
+            self._center = wanted
+        self._center = self._center + self.camera.follow * (wanted - self._center)
+        return self._center
+
+    def _gather(self, bodies: Sequence[Body], markers: Sequence[Marker]) -> tuple[Topology, np.ndarray, np.ndarray]:
+        """Everything shown as one mesh: its triangles, vertices ``(V, 3)`` [m] and own colours ``(V, 3)``."""
+        if not bodies and not markers:
+            raise ValueError("nothing to show: give at least one body or marker")
+        meshes = [(body.vertices, body.faces) for body in bodies] + [marker.mesh() for marker in markers]
+        colors = [_body_colors(body) for body in bodies]
+        colors += [
+            np.broadcast_to(marker.color, (len(mesh[0]), 3))
+            for marker, mesh in zip(markers, meshes[len(bodies) :], strict=True)
+        ]
+        faces, counts = [mesh[1] for mesh in meshes], [len(mesh[0]) for mesh in meshes]
+        if self._topology is None or self._topology.key != topology_key(faces, counts):
+            self._topology = Topology(faces, counts)
+        vertices = np.concatenate([np.asarray(mesh[0], dtype=np.float32) for mesh in meshes])
+        # A simulation that blew up is still worth a picture.
+        vertices = np.clip(np.nan_to_num(vertices, nan=0.0, posinf=_FAR, neginf=-_FAR), -_FAR, _FAR)
+        return self._topology, vertices, np.concatenate(colors)
+
+
+def _open(backend: str, width: int, height: int) -> Backend:
+    if backend not in BACKENDS:
+        raise ValueError(f"unknown backend {backend!r}; use one of {', '.join(BACKENDS)}")
+    # Also without OpenGL, so that a missing extra shows on every machine alike.
+    vtk_backend.import_pyvista()
+    if backend != "software" and opengl_available():
+        return vtk_backend.VtkBackend(width, height)
+    if backend == "pyvista":
+        raise RuntimeError(
+            "backend='pyvista' needs OpenGL, and no EGL driver was found; install one (Debian, Ubuntu: libegl1) or "
+            "use backend='software'"
+        )
+    from piavatar_envs.render.software_backend import SoftwareBackend
+
+    return SoftwareBackend(width, height)
+
+
+def _body_colors(body: Body) -> np.ndarray:
+    if body.scalars is None:
+        return np.broadcast_to(body.color, (len(body.vertices), 3))
+    if np.shape(body.scalars) != (len(body.vertices),):
+        raise ValueError(
+            f"scalars have shape {np.shape(body.scalars)}; give one value a vertex, shape ({len(body.vertices)},)"
+        )
+    return coloring.color_by(body.scalars, body.scalar_max)

@@ -1,0 +1,188 @@
+"""The skin for pictures: linear blend skinning plus the simulated particles' displacement.
+
+The particles fill the body; the skin mesh is not simulated. Each skin vertex therefore follows its bones, and adds
+the displacement ``x - LBS`` of the particles beneath it. Which particles, and with which weights, is baked once.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from piavatar_envs.avatar.skeleton import NUM_JOINTS
+
+NUM_NEIGHBOURS = 8
+#: Particles looked at for each vertex, in turn: more only where too few of the nearest share the vertex's bones.
+_CANDIDATES = (32, 256)
+#: A particle with less than this share of the best candidate's overlap moves with other bones: leave it out.
+_MIN_RELATIVE_OVERLAP = 0.05
+
+
+class SkinnedSurface(Protocol):
+    """What :class:`Skin` needs of an asset: the skinning of its vertices."""
+
+    skin_joints: np.ndarray
+    skin_weights: np.ndarray
+
+
+class RestShape(Protocol):
+    """What :class:`Skin` needs of a shaped body: its rest pose."""
+
+    vertices: np.ndarray
+    joints: np.ndarray
+
+
+class Skin:
+    """Deforms one body's skin mesh with its bones and particles."""
+
+    def __init__(
+        self,
+        asset: SkinnedSurface,
+        body: RestShape,
+        rest_positions: np.ndarray,
+        skin_joints: np.ndarray,
+        skin_weights: np.ndarray,
+    ) -> None:
+        """Bake the weights.
+
+        Args:
+            asset: the skinning of the vertices, ``skin_joints (V, K)`` and ``skin_weights (V, K)``.
+            body: the rest pose of one shape, ``vertices (V, 3)`` [m] and ``joints (22, 3)`` [m].
+            rest_positions: the particles in the rest pose of that same shape [m], shape ``(P, 3)``.
+            skin_joints: joints that move each particle, shape ``(P, K)`` int.
+            skin_weights: their weights, rows sum to one, shape ``(P, K)``.
+
+        Raises:
+            ValueError: there are no particles, or their arrays differ in length.
+        """
+        counts = {len(rest_positions), len(skin_joints), len(skin_weights)}
+        if len(counts) != 1 or 0 in counts:
+            raise ValueError(
+                f"rest_positions, skin_joints and skin_weights have {len(rest_positions)}, {len(skin_joints)} and "
+                f"{len(skin_weights)} rows; give one row a particle, and at least one particle"
+            )
+        vertices = np.asarray(body.vertices, dtype=np.float64)
+        particles = np.asarray(rest_positions, dtype=np.float64)
+        self._rest_joints = np.asarray(body.joints, dtype=np.float64)
+        self._vertex_skinning = _skinning_matrix(vertices, asset.skin_joints, asset.skin_weights)
+        self._particle_skinning = _skinning_matrix(particles, skin_joints, skin_weights)
+        self._interpolation = _interpolation_matrix(
+            vertices,
+            _joint_weights(asset.skin_joints, asset.skin_weights),
+            particles,
+            _joint_weights(skin_joints, skin_weights),
+        )
+
+    @property
+    def num_vertices(self) -> int:
+        """Vertices of the skin mesh."""
+        return self._interpolation.shape[0]
+
+    @property
+    def num_particles(self) -> int:
+        """Particles that move it."""
+        return self._interpolation.shape[1]
+
+    def deform(self, rotations: np.ndarray, positions: np.ndarray, particle_positions: np.ndarray) -> np.ndarray:
+        """Skin vertices of one simulated state.
+
+        Args:
+            rotations: world rotations of the bones, identity in the rest pose, shape ``(22, 3, 3)``.
+            positions: world positions of the joints [m], shape ``(22, 3)``.
+            particle_positions: the simulated particles [m], shape ``(P, 3)``.
+
+        Returns:
+            World positions of the skin vertices [m], shape ``(V, 3)`` float32.
+
+        Raises:
+            ValueError: another number of particles than were baked.
+        """
+        particle_positions = np.asarray(particle_positions, dtype=np.float64)
+        if particle_positions.shape != (self.num_particles, 3):
+            raise ValueError(f"particle_positions has shape {particle_positions.shape}, not ({self.num_particles}, 3)")
+        transforms = self._transforms(rotations, positions)
+        displacement = particle_positions - self._particle_skinning @ transforms
+        return (self._vertex_skinning @ transforms + self._interpolation @ displacement).astype(np.float32)
+
+    def interpolate(self, per_particle: np.ndarray) -> np.ndarray:
+        """Carry a quantity of the particles to the skin, shape ``(P, ...)`` to ``(V, ...)``."""
+        return self._interpolation @ np.asarray(per_particle, dtype=np.float64)
+
+    def _transforms(self, rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """Rest-to-world transforms stacked for the skinning matrices, shape ``(88, 3)``."""
+        rotations = np.asarray(rotations, dtype=np.float64)
+        translations = np.asarray(positions, dtype=np.float64) - np.einsum("bij,bj->bi", rotations, self._rest_joints)
+        stacked = np.concatenate([rotations.transpose(0, 2, 1), translations[:, None, :]], axis=1)
+        return stacked.reshape(4 * NUM_JOINTS, 3)
+
+
+def _skinning_matrix(points: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> sparse.csr_array:
+    """Linear blend skinning as one sparse product: rows ``w_b (x, y, z, 1)``, shape ``(N, 88)``."""
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    joints = np.asarray(joints, dtype=np.int64)
+    values = np.asarray(weights, dtype=np.float64)[:, :, None] * homogeneous[:, None, :]
+    columns = 4 * joints[:, :, None] + np.arange(4)
+    rows = np.broadcast_to(np.arange(len(points))[:, None, None], columns.shape)
+    matrix = sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=(len(points), 4 * NUM_JOINTS))
+    matrix.eliminate_zeros()
+    return matrix
+
+
+def _joint_weights(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Skinning weights as one dense row a point, shape ``(N, 22)``."""
+    dense = np.zeros((len(joints), NUM_JOINTS))
+    np.add.at(dense, (np.arange(len(joints))[:, None], np.asarray(joints, dtype=np.int64)), weights)
+    return dense
+
+
+def _interpolation_matrix(
+    vertices: np.ndarray, vertex_weights: np.ndarray, particles: np.ndarray, particle_weights: np.ndarray
+) -> sparse.csr_array:
+    """Weights of the nearest particles that move with each vertex's own bones, shape ``(V, P)``, rows sum to one.
+
+    The nearest particle to the inside of one thigh may lie in the other: distance alone would glue them together.
+    ``overlap = sum_b w_vertex,b w_particle,b`` is zero between them.
+    """
+    num_neighbours = min(NUM_NEIGHBOURS, len(particles))
+    tree = cKDTree(particles)
+    neighbours = np.zeros((len(vertices), num_neighbours), dtype=np.int64)
+    weights = np.zeros((len(vertices), num_neighbours))
+    todo = np.arange(len(vertices))
+    for count in (*_CANDIDATES, len(particles)):
+        last = count >= len(particles)
+        distance, index = tree.query(vertices[todo], k=np.arange(1, min(count, len(particles)) + 1))
+        overlap = np.einsum("vb,vcb->vc", vertex_weights[todo], particle_weights[index])
+        compatible = overlap > _MIN_RELATIVE_OVERLAP * np.maximum(overlap.max(axis=1, keepdims=True), 0.2)
+        # One more than needed: the kernel falls to zero at the first particle left out, so that weights are smooth.
+        done = (compatible.sum(axis=1) > num_neighbours) | last
+        rows = todo[done]
+        if len(rows):
+            neighbours[rows], weights[rows] = _select(
+                distance[done], index[done], overlap[done], compatible[done], num_neighbours
+            )
+        todo = todo[~done]
+        if last or not len(todo):
+            break
+    rows = np.broadcast_to(np.arange(len(vertices))[:, None], neighbours.shape)
+    return sparse.csr_array(
+        (weights.ravel(), (rows.ravel(), neighbours.ravel())), shape=(len(vertices), len(particles))
+    )
+
+
+def _select(
+    distance: np.ndarray, index: np.ndarray, overlap: np.ndarray, compatible: np.ndarray, num_neighbours: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest compatible candidates of each row and their weights, both ``(rows, num_neighbours)``."""
+    # A vertex that shares bones with nobody takes the nearest particles.
+    compatible = np.where(compatible.any(axis=1, keepdims=True), compatible, True)
+    overlap = np.where(compatible, np.maximum(overlap, 1e-6), 0.0)
+    order = np.argsort(np.where(compatible, distance, np.inf), axis=1, kind="stable")[:, : num_neighbours + 1]
+    distance, index, overlap = (np.take_along_axis(array, order, axis=1) for array in (distance, index, overlap))
+    valid = overlap > 0.0
+    support = np.max(np.where(valid, distance, 0.0), axis=1, keepdims=True) * (1.0 + 1e-6) + 1e-12
+    weights = overlap * (1.0 - np.minimum(distance / support, 1.0) ** 2) ** 2
+    weights, index = weights[:, :num_neighbours], index[:, :num_neighbours]
+    return index, weights / weights.sum(axis=1, keepdims=True)

@@ -1,0 +1,113 @@
+"""Video files from frames: MP4 (imageio-ffmpeg) and GIF (Pillow), chosen by the file's suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+SUFFIXES = (".mp4", ".gif")
+_GIF_COLORS, _GIF_SAMPLES = 128, 12
+
+
+def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> Path:
+    """Write frames to a file.
+
+    MP4 frames are written as they come, so a generator of any length will do. GIF frames are all kept, because they
+    share one palette of 128 colours: meant for short clips.
+
+    Args:
+        path: the file; its suffix, ``.mp4`` or ``.gif``, says how. Missing folders are made.
+        frames: pictures of one size, shape ``(H, W, 3)`` uint8.
+        fps: frames per second; a GIF rounds the time of a frame to whole hundredths of a second.
+
+    Returns:
+        The path.
+
+    Raises:
+        ImportError: the extra ``render`` is not installed.
+        ValueError: an unknown suffix, an ``fps`` that is not positive, no frames, or a frame that is not such a
+            picture or differs in size.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"cannot write {path.name!r}: the suffix {path.suffix!r} is not one of {', '.join(SUFFIXES)}")
+    if not fps > 0.0:
+        raise ValueError(f"fps={fps} must be positive")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() == ".mp4":
+        count = _write_mp4(path, frames, fps)
+    else:
+        count = _write_gif(path, frames, fps)
+    if count == 0:
+        raise ValueError(f"no frames for {path.name!r}: a video needs at least one")
+    return path
+
+
+def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError(
+            'MP4 video needs imageio-ffmpeg, which is not installed; pip install "piavatar-envs[render]"'
+        ) from error
+    writer, shape, count = None, None, 0
+    try:
+        for count, frame in enumerate(frames, start=1):
+            frame = _checked(frame, shape, count)
+            if writer is None:
+                shape = frame.shape
+                even = _even(frame)
+                # H.264 with 4:2:0 colour plays everywhere, and needs even sides.
+                writer = imageio_ffmpeg.write_frames(
+                    str(path), (even.shape[1], even.shape[0]), fps=fps, codec="libx264", pix_fmt_out="yuv420p",
+                    macro_block_size=2, output_params=["-crf", "20", "-preset", "fast", "-movflags", "+faststart"],
+                    ffmpeg_log_level="error",
+                )  # fmt: skip
+                writer.send(None)
+            writer.send(_even(frame).tobytes())
+    finally:
+        if writer is not None:
+            writer.close()
+    return count
+
+
+def _write_gif(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError(
+            'GIF video needs Pillow, which is not installed; pip install "piavatar-envs[render]"'
+        ) from error
+    shape, images = None, []
+    for count, frame in enumerate(frames, start=1):
+        frame = _checked(frame, shape, count)
+        shape = frame.shape
+        images.append(Image.fromarray(frame.copy()))
+    if images:
+        # One palette, from pictures spread over the whole clip, and no dither: what does not move stays equal from
+        # frame to frame, and costs nothing. The octree keeps small bright things, a median cut loses them.
+        chosen = images[:: max(1, len(images) // _GIF_SAMPLES)]
+        strip = Image.fromarray(np.concatenate([np.asarray(image)[::2, ::2] for image in chosen]))
+        palette = strip.quantize(_GIF_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+        duration = 10 * max(2, round(100.0 / fps))  # [ms]; viewers slow down what is quicker than 20 ms
+        images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
+    return len(images)
+
+
+def _checked(frame: np.ndarray, shape: tuple[int, ...] | None, count: int) -> np.ndarray:
+    """The frame as contiguous bytes; refuses what is not a picture of the first one's size."""
+    frame = np.asarray(frame)
+    if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+        raise ValueError(f"frame {count} is {frame.dtype} of shape {frame.shape}; give uint8 (H, W, 3)")
+    if shape is not None and frame.shape != shape:
+        raise ValueError(f"frame {count} has shape {frame.shape}, the first had {shape}; give frames of one size")
+    return np.ascontiguousarray(frame)
+
+
+def _even(frame: np.ndarray) -> np.ndarray:
+    """The frame with its last row or column doubled where a side is odd."""
+    height, width = frame.shape[:2]
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge") if height % 2 or width % 2 else frame

@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from piavatar_envs.render import Arrow, Body, Box, Camera, Renderer, Sphere
+from piavatar_envs.render.display import opengl_available
+
+pytest.importorskip("pyvista", reason='needs pip install "piavatar-envs[render]"')
+
+SIZE = 160
+GREEN = (0.1, 0.9, 0.1)
+FIXED = Camera(follow=0.0)
+BACKENDS = [
+    pytest.param("pyvista", marks=pytest.mark.skipif(not opengl_available(), reason="no OpenGL on this machine")),
+    "software",
+]
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def renderer(request):
+    with Renderer(SIZE, SIZE, camera=FIXED, backend=request.param) as renderer:
+        yield renderer
+
+
+@pytest.fixture
+def body(subject) -> Body:
+    return Body(subject.body.vertices, subject.asset.faces, color=GREEN)
+
+
+def shifted(body: Body, offset) -> Body:
+    return Body(body.vertices + np.asarray(offset, dtype=np.float32), body.faces, color=body.color)
+
+
+def green(frame: np.ndarray) -> np.ndarray:
+    """Pixels that a green thing covers, ``(H, W)`` bool; the ground, its shadow and the sky are grey."""
+    red, greens, blue = np.moveaxis(frame.astype(int), -1, 0)
+    return greens - np.maximum(red, blue) > 25
+
+
+def bounds(mask: np.ndarray) -> np.ndarray:
+    """First and last column and row that are covered, ``(left, right, top, bottom)``."""
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    return np.array([columns[0], columns[-1], rows[0], rows[-1]])
+
+
+def project(points: np.ndarray, camera: Camera = FIXED) -> np.ndarray:
+    """Pixel coordinates of a pinhole camera, ``(N, 2)``: what the picture must agree with."""
+    eye, forward = np.array(camera.position), np.subtract(camera.target, camera.position)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    offset = points - eye
+    depth = offset @ forward
+    focal = 0.5 * SIZE / np.tan(np.deg2rad(camera.field_of_view) / 2.0)
+    return SIZE / 2 + focal * np.stack([offset @ right, -offset @ np.cross(right, forward)], axis=-1) / depth[:, None]
+
+
+def test_a_person_stands_where_the_camera_sees_one(renderer, body):
+    frame = renderer.render([body])
+    assert frame.shape == (SIZE, SIZE, 3) and frame.dtype == np.uint8
+    assert frame.std() > 10.0
+    left, right, top, bottom = bounds(green(frame))
+    assert bottom - top > 1.3 * (right - left), "a standing person is taller than wide"
+    pixels = project(body.vertices.astype(np.float64))
+    expected = [pixels[:, 0].min(), pixels[:, 0].max(), pixels[:, 1].min(), pixels[:, 1].max()]
+    assert np.abs(bounds(green(frame)) + 0.5 - expected).max() < 3.0
+
+
+def test_moving_the_body_moves_its_pixels(renderer, body):
+    step = np.array([0.25, 0.0, 0.1])
+    before, after = (green(renderer.render([b])) for b in (body, shifted(body, step)))
+    center = np.array([[0.0, 0.0, 0.9]])
+    expected = (project(center + step) - project(center))[0]
+    shift = [
+        np.flatnonzero(after.any(axis=axis)).mean() - np.flatnonzero(before.any(axis=axis)).mean() for axis in (0, 1)
+    ]
+    np.testing.assert_allclose(shift, expected, atol=2.5)
+
+
+def test_the_camera_follows(body):
+    with Renderer(SIZE, SIZE, camera=Camera(follow=1.0), backend="software") as renderer:
+        here = green(renderer.render([body], follow=np.zeros(3)))
+        there = green(renderer.render([shifted(body, (3.0, -2.0, 0.0))], follow=np.array([3.0, -2.0, 0.9])))
+        assert (here != there).mean() < 0.003
+    with Renderer(SIZE, SIZE, camera=Camera(follow=0.5), backend="software") as renderer:
+        renderer.render([body], follow=np.zeros(3))
+        lefts = [
+            bounds(green(renderer.render([shifted(body, (0.4, 0, 0))], follow=np.array([0.4, 0, 1]))))[0]
+            for _ in range(6)
+        ]
+        assert lefts[0] > lefts[1] > lefts[2] >= lefts[5], "it glides, and does not jump"
+        renderer.reset_camera()
+        assert abs(int(bounds(green(renderer.render([body], follow=np.zeros(3))))[0]) - int(bounds(here)[0])) <= 1
+
+
+def test_pictures_repeat(renderer, body):
+    markers = [Sphere((0.4, -0.4, 1.2), 0.06), Arrow((0, -1, 1), (0, 0.5, 0)), Box((0.6, 0, 0.2), (0.1, 0.1, 0.2))]
+    first = renderer.render([body], markers)
+    kept = first.copy()
+    renderer.render([shifted(body, (0.2, 0.0, 0.0))])
+    np.testing.assert_array_equal(first, kept, err_msg="a picture belongs to its caller")
+    np.testing.assert_array_equal(renderer.render([body], markers), first)
+
+
+def test_near_things_hide_far_ones(renderer, body):
+    eye, middle = np.array(FIXED.position), np.array([0.0, -0.05, 1.15])
+    toward = (eye - middle) / np.linalg.norm(eye - middle)
+    red = (0.9, 0.1, 0.1)
+    column, row = project(middle[None])[0].astype(int)
+    front = renderer.render([body], [Sphere(middle + 0.6 * toward, 0.08, color=red)])[row, column].astype(int)
+    behind = renderer.render([body], [Sphere(middle - 0.6 * toward, 0.08, color=red)])[row, column].astype(int)
+    assert front[0] > front[1] + 40
+    assert behind[1] > behind[0] + 40
+
+
+def test_the_shadow_lies_behind_and_fades(renderer, body):
+    """The key light comes from the avatar's right front: its left rear darkens, its right front does not."""
+    empty = renderer.render([], [Sphere((0.0, 30.0, 0.5), 0.01)]).astype(float).mean(axis=-1)
+    frame = renderer.render([body])
+    dark = np.where(green(frame), 0.0, empty - frame.astype(float).mean(axis=-1))
+    column, row = project(np.array([[0.3, 0.55, 0.0]]))[0].astype(int)
+    assert dark[row - 3 : row + 4, column - 3 : column + 4].max() > 15.0
+    column, row = project(np.array([[-0.4, -0.7, 0.0]]))[0].astype(int)
+    assert np.abs(dark[row - 3 : row + 4, column - 3 : column + 4]).max() < 3.0
+
+
+def test_strain_colors_and_their_scale(renderer, body, subject):
+    count = len(body.vertices)
+    strained = [Body(body.vertices, body.faces, scalars=np.full(count, s), scalar_max=0.3) for s in (0.0, 0.3)]
+    pale, dark = (renderer.render([b]) for b in strained)
+    mask = green(renderer.render([body]))
+    assert pale[mask].mean() > dark[mask].mean() + 50.0
+    plain = renderer.render([body])
+    corner = (slice(int(0.55 * SIZE), None), slice(int(0.75 * SIZE), None))
+    assert np.abs(pale[corner].astype(int) - plain[corner]).max() > 100, "the scale is in the lower right corner"
+    with pytest.raises(ValueError, match="scalars have shape"):
+        renderer.render([Body(body.vertices, body.faces, scalars=np.zeros(3))])
+
+
+def test_a_body_that_blew_up_is_drawn(renderer, body):
+    vertices = body.vertices.copy()
+    vertices[::50] = np.nan
+    vertices[7] = np.inf
+    assert renderer.render([Body(vertices, body.faces)]).shape == (SIZE, SIZE, 3)
+    assert renderer.render([Body(np.full_like(vertices, np.nan), body.faces)], follow=np.full(3, np.nan)).any()
+
+
+def test_both_back_ends_draw_the_same(subject, body):
+    if not opengl_available():
+        pytest.skip("no OpenGL on this machine")
+    frames = []
+    for backend in ("pyvista", "software"):
+        with Renderer(SIZE, SIZE, backend=backend) as renderer:
+            frames.append(renderer.render([body], [Sphere((0.4, -0.4, 1.2), 0.06)]).astype(int))
+    assert np.abs(frames[0] - frames[1]).mean() < 2.0
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_memory_stays_flat(renderer, body):
+    def resident() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+    def draw(count: int) -> None:
+        for index in range(count):
+            markers = [Sphere((0.4, -0.4, 1.2), 0.06)] * (index % 3)
+            renderer.render([shifted(body, (0.001 * index, 0.0, 0.0))], markers)
+
+    draw(20)
+    before = resident()
+    draw(100)
+    assert resident() - before < 15.0, "MiB in 100 frames"
+
+
+def test_bad_requests_are_refused(body):
+    with pytest.raises(ValueError, match="width=4 px"):
+        Renderer(4, 100)
+    with pytest.raises(ValueError, match="'gl'; use one of auto, pyvista, software"):
+        Renderer(backend="gl")
+    with pytest.raises(ValueError, match="field_of_view=0"):
+        Camera(field_of_view=0)
+    renderer = Renderer(SIZE, SIZE, backend="software")
+    with pytest.raises(ValueError, match="nothing to show"):
+        renderer.render([])
+    renderer.close()
+    renderer.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        renderer.render([body])
+
+
+def test_a_missing_pyvista_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    with pytest.raises(ImportError, match=r'pip install "piavatar-envs\[render\]"'):
+        Renderer()
+
+
+def test_without_opengl_the_software_renderer_steps_in(monkeypatch, body):
+    monkeypatch.setattr("piavatar_envs.render.renderer.opengl_available", lambda: False)
+    with Renderer(SIZE, SIZE) as renderer:
+        assert green(renderer.render([body])).any()
+    with pytest.raises(RuntimeError, match="backend='software'"):
+        Renderer(backend="pyvista")
+
+
+def test_importing_loads_no_graphics_library():
+    code = "import sys, piavatar_envs.render; print([m for m in ('pyvista', 'vtkmodules', 'PIL') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_nothing_is_printed():
+    code = (
+        "from piavatar_envs.render import Renderer, Sphere\n"
+        "with Renderer(64, 64) as renderer: renderer.render([], [Sphere((0, 0, 1), 0.3)])\n"
+    )
+    if not opengl_available():
+        pytest.skip("no OpenGL on this machine")
+    environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")

@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from piavatar_envs.render import Arrow, Box, Sphere
+from piavatar_envs.render.geometry import Topology, topology_key, unit
+
+
+def enclosed_volume(marker) -> float:
+    """Signed volume of a marker's mesh [m^3]; positive if it is closed and its triangles face outward."""
+    vertices, faces = marker.mesh()
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return float(np.einsum("ti,ti->", a, np.cross(b, c)) / 6.0)
+
+
+def test_markers_enclose_their_volume():
+    assert enclosed_volume(Sphere((1.0, 2.0, 3.0), 0.5)) == pytest.approx(4.0 / 3.0 * np.pi * 0.5**3, rel=0.03)
+    assert enclosed_volume(Box((1.0, -2.0, 0.5), (0.1, 0.2, 0.3))) == pytest.approx(8 * 0.1 * 0.2 * 0.3)
+    radius, length, head = 0.02, 0.5, 0.1
+    solid = np.pi * radius**2 * (length - head) + np.pi * (2.4 * radius) ** 2 * head / 3.0
+    assert enclosed_volume(Arrow((1, 1, 1), (0.3, 0.4, 0.0), radius=radius)) == pytest.approx(solid, rel=0.03)
+
+
+def test_an_arrow_points_along_its_vector():
+    vertices, _ = Arrow((1.0, 0.0, 2.0), (0.0, -0.6, 0.8)).mesh()
+    along = (vertices - [1.0, 0.0, 2.0]) @ [0.0, -0.6, 0.8]
+    assert along.min() == pytest.approx(0.0, abs=1e-12) and along.max() == pytest.approx(1.0)
+    assert np.isfinite(Arrow((0, 0, 0), (0, 0, 0)).mesh()[0]).all()
+
+
+def test_a_box_turns():
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    vertices, _ = Box((0, 0, 0), (0.3, 0.1, 0.2), rotation=quarter).mesh()
+    np.testing.assert_allclose(vertices.max(axis=0), [0.1, 0.3, 0.2], atol=1e-12)
+
+
+def test_normals_of_a_sphere_are_radial():
+    vertices, faces = Sphere((0.0, 0.0, 0.0), 1.0).mesh()
+    topology = Topology([faces], [len(vertices)])
+    centers, areas = topology.triangles(np.ascontiguousarray(vertices.T))
+    normals = unit(topology.vertex_areas(areas))
+    away = np.abs(vertices[:, 2]) < 0.9  # the poles have many vertices in one place
+    assert np.einsum("iv,vi->v", normals, vertices)[away].min() > 0.999
+    assert np.linalg.norm(areas, axis=0).sum() == pytest.approx(4.0 * np.pi, rel=0.03)
+    np.testing.assert_allclose(areas.sum(axis=1), 0.0, atol=1e-9)  # a closed surface
+    assert centers.shape == areas.shape
+
+
+def test_joined_meshes_stay_apart():
+    vertices, faces = Sphere((0.0, 0.0, 0.0), 1.0).mesh()
+    topology = Topology([faces, faces], [len(vertices)] * 2)
+    values = np.concatenate([np.zeros(len(vertices)), np.ones(len(vertices))])[:, None]
+    np.testing.assert_allclose(topology.smooth(values, 3), values, atol=1e-6)
+    assert topology.key == topology_key([faces, faces], [len(vertices)] * 2)
+    assert topology.key != topology_key([faces], [len(vertices)])

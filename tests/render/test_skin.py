@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar import skeleton
+from piavatar_envs.render import Skin
+
+REST = np.tile(np.eye(3), (22, 1, 1))
+
+
+def test_the_rest_pose_gives_the_rest_vertices(subject):
+    vertices = subject.skin.deform(REST, subject.body.joints, subject.positions)
+    assert vertices.dtype == np.float32
+    np.testing.assert_allclose(vertices, subject.body.vertices, atol=1e-6)
+
+
+def test_a_rigid_motion_is_exact(subject):
+    rotation = Rotation.from_rotvec([0.7, -1.9, 0.4]).as_matrix()
+    shift = np.array([1.5, -0.7, 2.0])
+    vertices = subject.skin.deform(
+        rotation @ REST, subject.body.joints @ rotation.T + shift, subject.positions @ rotation.T + shift
+    )
+    np.testing.assert_allclose(vertices, subject.body.vertices @ rotation.T + shift, atol=1e-6)
+
+
+def test_particles_at_their_skinned_places_leave_plain_skinning(subject, bent_pose):
+    joints = subject.body.joints
+    rotations, positions = skeleton.forward_kinematics(bent_pose, joints[0], joints)
+    particles = subject.particles
+    skinned = skeleton.skin(
+        subject.positions, particles.skin_joints, particles.skin_weights, rotations, positions, joints
+    )
+    expected = skeleton.skin(
+        subject.body.vertices, subject.asset.skin_joints, subject.asset.skin_weights, rotations, positions, joints
+    )
+    assert np.abs(expected - subject.body.vertices).max() > 0.3
+    np.testing.assert_allclose(subject.skin.deform(rotations, positions, skinned), expected, atol=1e-5)
+
+
+def test_a_uniform_displacement_moves_the_skin_by_it(subject, bent_pose):
+    joints = subject.body.joints
+    rotations, positions = skeleton.forward_kinematics(bent_pose, joints[0], joints)
+    shift = np.array([0.03, -0.02, 0.05])
+    moved = subject.skin.deform(rotations, positions, subject.positions + shift)
+    still = subject.skin.deform(rotations, positions, subject.positions)
+    np.testing.assert_allclose(moved - still, np.broadcast_to(shift, moved.shape), atol=1e-6)
+
+
+def test_a_limb_takes_nothing_from_its_neighbour(subject):
+    """The legs touch, yet what moves the particles of one must leave the skin of the other where it is."""
+    leg = [skeleton.joint_index(f"right_{name}") for name in ("hip", "knee", "ankle", "foot")]
+    share = joint_share(subject.particles.skin_joints, subject.particles.skin_weights, leg)
+    positions = subject.positions.astype(np.float64).copy()
+    positions[share > 0.99] += [0.0, 0.0, 0.1]
+    moved = np.linalg.norm(subject.skin.deform(REST, subject.body.joints, positions) - subject.body.vertices, axis=1)
+    vertex_share = joint_share(subject.asset.skin_joints, subject.asset.skin_weights, leg)
+    assert moved[vertex_share == 0.0].max() < 1e-6
+    assert np.median(moved[vertex_share > 0.99]) == pytest.approx(0.1, abs=1e-3)
+
+
+def test_interpolation_keeps_constants_and_bounds(subject):
+    count = subject.skin.num_particles
+    np.testing.assert_allclose(subject.skin.interpolate(np.full(count, 3.7)), 3.7, atol=1e-12)
+    values = np.random.default_rng(0).uniform(-1.0, 2.0, count)
+    carried = subject.skin.interpolate(values)
+    assert carried.shape == (len(subject.body.vertices),)
+    assert values.min() - 1e-12 <= carried.min() and carried.max() <= values.max() + 1e-12
+
+
+def test_the_skin_follows_a_smooth_displacement(subject):
+    """A bulge of the particles shows on the skin: the height field is reproduced to a fraction of the spacing."""
+
+    def height(points: np.ndarray) -> np.ndarray:
+        return 0.1 * np.sin(2.0 * points[:, 2])
+
+    error = subject.skin.interpolate(height(subject.positions)) - height(subject.body.vertices)
+    # The steepest slope is 0.2; a vertex's particles lie within about two spacings of it.
+    assert np.abs(error).max() < 0.2 * 2.0 * 0.035
+
+
+def test_bad_particles_are_refused(subject):
+    particles = subject.particles
+    with pytest.raises(ValueError, match="one row a particle"):
+        Skin(subject.asset, subject.body, subject.positions[1:], particles.skin_joints, particles.skin_weights)
+    with pytest.raises(ValueError, match="at least one"):
+        Skin(subject.asset, subject.body, np.zeros((0, 3)), particles.skin_joints[:0], particles.skin_weights[:0])
+    with pytest.raises(ValueError, match="particle_positions"):
+        subject.skin.deform(REST, subject.body.joints, subject.positions[1:])
+
+
+def joint_share(joints: np.ndarray, weights: np.ndarray, wanted: list[int]) -> np.ndarray:
+    """Sum of the weights that belong to the wanted joints, shape ``(N,)``."""
+    return np.where(np.isin(joints, wanted), weights, 0.0).sum(axis=1)
