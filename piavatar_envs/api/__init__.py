@@ -1,0 +1,1 @@
+"""Thin views of the batched environment: Gymnasium and its kin."""

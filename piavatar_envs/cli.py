@@ -1,0 +1,115 @@
+"""The command line: ``python -m piavatar_envs list | doctor | play``.
+
+Only what ``--help`` needs is imported here; each command imports its own work, so that help comes at once.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Device = Annotated[str, tyro.conf.arg(help="where to simulate: cpu, cuda, cuda:1, ...")]
+
+
+def list_command() -> None:
+    """List the registered environments, one line each."""
+    ids = registered_ids()
+    width = max(map(len, ids), default=0)
+    for env_id in ids:
+        print(f"{env_id:{width}}  {describe(env_id)}".rstrip())
+
+
+def doctor_command(
+    json: Annotated[bool, tyro.conf.arg(help="print one JSON object, for scripts and bug reports")] = False,
+    compile: Annotated[bool, tyro.conf.arg(help="compile every kernel now, and take the time")] = False,
+    device: Device = "cpu",
+) -> None:
+    """Show what this machine offers: devices, versions, kernel cache, extras, memory of the default environment.
+
+    Args:
+        json: machine-readable output.
+        compile: build the kernels of all environments for the device, so that nothing later waits for them.
+        device: the device to compile for.
+    """
+    from piavatar_envs import doctor
+
+    seconds = doctor.compile_kernels(device) if compile else None
+    report = doctor.examine()
+    if seconds is not None:
+        report["compile"] = {"device": device, "seconds": round(seconds, 1)}
+    doctor.show(report, as_json=json)
+
+
+def play_command(
+    env_id: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="a registered id: see list")],
+    agent: Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the actions come from")] = "random",
+    video: Annotated[Path | None, tyro.conf.arg(help="write an .mp4 or .gif (needs the extra render)")] = None,
+    steps: Annotated[
+        int | None, tyro.conf.arg(help="steps to play, over as many episodes; default one episode")
+    ] = None,
+    seed: Annotated[int, tyro.conf.arg(help="of the first reset and of the random actions")] = 0,
+    device: Device = "cpu",
+    color: Annotated[Literal["skin", "strain"], tyro.conf.arg(help="colour of the body in the video")] = "skin",
+    config: Annotated[
+        tuple[str, ...], tyro.conf.arg(aliases=["-c"], help="settings, e.g. -c fidelity=tiny drive.tone=0")
+    ] = (),
+) -> None:
+    """Play an environment and print its return and metrics; to a video, if asked.
+
+    Args:
+        env_id: the environment, e.g. PIAvatar/Reach-v0.
+        agent: random or zero actions.
+        video: the file to write.
+        steps: number of steps.
+        seed: seed of the run.
+        device: where to simulate.
+        color: skin or strain.
+        config: overrides of the environment's configuration.
+    """
+    from piavatar_envs import doctor, play
+    from piavatar_envs.envs.config import parse_assignments
+
+    if env_id not in registered_ids():
+        raise ValueError(f"no environment {env_id!r}; there are {', '.join(registered_ids()) or 'none'}")
+    overrides = parse_assignments(config)
+    doctor.quiet_warp()
+    play.show(play.play(env_id, agent, video, steps, seed, device, color, overrides), video)
+
+
+def registered_ids() -> list[str]:
+    """The ids of this suite in Gymnasium's registry, sorted."""
+    import gymnasium
+
+    import piavatar_envs  # noqa: F401 - registers the ids
+
+    return sorted(env_id for env_id, spec in gymnasium.registry.items() if spec.namespace == "PIAvatar")
+
+
+def describe(env_id: str) -> str:
+    """First line of the docstring of the task's file, read without importing it; empty if there is none.
+
+    ``PIAvatar/TrackMotion-v0`` is described by ``tasks/track_motion.py``.
+    """
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", env_id.partition("/")[2].partition("-v")[0]).lower()
+    path = Path(__file__).parent / "tasks" / f"{name}.py"
+    if not path.is_file():
+        return ""
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    return docstring.partition("\n")[0]
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run a command; what a user got wrong ends in one line and exit status 2."""
+    commands = {"list": list_command, "doctor": doctor_command, "play": play_command}
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            commands, prog="piavatar-envs", description="Soft human avatars behind reset/step.", args=args
+        )
+    except (ValueError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None

@@ -1,0 +1,165 @@
+"""What this machine offers: devices, versions, the kernel cache, extras, and what an environment will cost."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import json
+import pkgutil
+import platform
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+
+PACKAGES = ("piavatar-envs", "warp-lang", "numpy", "scipy", "gymnasium", "pydantic", "stable-baselines3", "torch")
+
+#: Modules by extra; an extra is present if all of its modules are.
+EXTRAS = {
+    "render": ("pyvista", "imageio", "imageio_ffmpeg", "PIL"),
+    "train": ("stable_baselines3", "torch", "matplotlib"),
+    "motions": ("pybullet_data",),
+    "multi": ("pettingzoo",),
+    "bench": ("mujoco",),
+    "dev": ("pytest", "xdist", "build", "trimesh"),
+}
+
+
+def examine() -> dict[str, Any]:
+    """The whole report, as plain values fit for JSON."""
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "packages": {name: version for name in PACKAGES if (version := package_version(name))},
+        "devices": devices(),
+        "kernel_cache": kernel_cache(),
+        "extras": {name: [m for m in modules if not _found(m)] for name, modules in EXTRAS.items()},
+        "default_env": memory_estimate(),
+    }
+
+
+def package_version(name: str) -> str | None:
+    """Version of an installed distribution, or None."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def devices() -> list[dict[str, Any]]:
+    """Warp's devices: alias, name, kind, and on a GPU its memory [GiB] and architecture."""
+    wp = quiet_warp()
+    found = []
+    for device in wp.get_devices():
+        entry: dict[str, Any] = {"alias": device.alias, "kind": "cuda" if device.is_cuda else "cpu"}
+        entry["name"] = device.name if device.is_cuda else cpu_model()
+        if device.is_cuda:
+            entry |= {"arch": f"sm_{device.arch}", "memory_gib": round(device.total_memory / 2**30, 1)}
+            entry["free_gib"] = round(device.free_memory / 2**30, 1)
+        found.append(entry)
+    return found
+
+
+def cpu_model() -> str:
+    """The CPU's name as its maker calls it, where the system tells."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def kernel_cache() -> dict[str, Any]:
+    """Where compiled kernels are kept, and how much: path, bytes, modules."""
+    wp = quiet_warp()
+    root = Path(wp.config.kernel_cache_dir)
+    sizes = [file.stat().st_size for file in root.rglob("*") if file.is_file()] if root.is_dir() else []
+    modules = sum(1 for folder in root.iterdir() if folder.is_dir()) if root.is_dir() else 0
+    return {"path": str(root), "bytes": sum(sizes), "modules": modules}
+
+
+def memory_estimate() -> dict[str, Any]:
+    """One environment with default settings: particles, grid nodes, substeps a step, bytes of state and grid."""
+    from piavatar_envs.envs.config import EnvConfig
+    from piavatar_envs.envs.simulation import Simulation
+    from piavatar_envs.mpm.build import estimate_bytes
+
+    model = Simulation(EnvConfig(), num_envs=1, device="cpu").model
+    size = {"particles": model.num_particles, "nodes": model.num_nodes, "substeps": model.num_substeps}
+    return {**size, "bytes": estimate_bytes(1, model.num_particles, model.num_nodes)}
+
+
+def compile_kernels(device: str, *, environments: bool = True) -> float:
+    """Compile all kernels for ``device``; returns the seconds it took.
+
+    Args:
+        device: a Warp device.
+        environments: also step each environment once, because some kernels exist only once one asks for them.
+
+    Raises:
+        ValueError: Warp has no such device.
+    """
+    wp = quiet_warp()
+    try:
+        target = wp.get_device(device)
+    except Exception:
+        names = ", ".join(entry.alias for entry in wp.get_devices())
+        raise ValueError(f"no device {device!r} on this machine; there are {names}") from None
+    start = time.perf_counter()
+    for room in ("mpm", "avatar", "envs", "tasks", "render"):
+        package = importlib.import_module(f"piavatar_envs.{room}")
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            importlib.import_module(module.name)
+    wp.force_load(target)
+    for env_id, spec in sorted(gymnasium.registry.items()):
+        if environments and spec.namespace == "PIAvatar":
+            env = gymnasium.make(env_id, device=device, fidelity="tiny")
+            env.reset(seed=0)
+            env.step(env.action_space.sample())
+            env.close()
+    return time.perf_counter() - start
+
+
+def show(report: dict[str, Any], *, as_json: bool = False) -> None:
+    """Print a report, as a table for people or as JSON."""
+    if as_json:
+        print(json.dumps(report, indent=2))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_row("python", f"{report['python']}, {report['platform']}")
+    table.add_row("packages", ", ".join(f"{name} {version}" for name, version in report["packages"].items()))
+    for entry in report["devices"]:
+        memory = f", {entry['free_gib']} of {entry['memory_gib']} GiB free, {entry['arch']}" if "arch" in entry else ""
+        table.add_row(f"device {entry['alias']}", f"{entry['name']}{memory}")
+    cache = report["kernel_cache"]
+    table.add_row("kernel cache", f"{cache['path']}: {cache['modules']} modules, {cache['bytes'] / 2**20:.1f} MiB")
+    for name, missing in report["extras"].items():
+        remedy = f'pip install "piavatar-envs[{name}]"'
+        table.add_row(f"extra {name}", f"missing {', '.join(missing)}: {remedy}" if missing else "present")
+    size = report["default_env"]
+    told = f"{size['particles']} particles, {size['nodes']} grid nodes, {size['substeps']} substeps a step"
+    table.add_row("default env", f"{told}: {size['bytes'] / 2**20:.1f} MiB each")
+    if "compile" in report:
+        table.add_row("compiled", f"for {report['compile']['device']} in {report['compile']['seconds']} s")
+    Console(highlight=False, soft_wrap=True, markup=False).print(table)
+
+
+def quiet_warp() -> ModuleType:
+    """Warp, initialised without its banner, which would spoil the JSON on stdout."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    wp.init()
+    return wp
+
+
+def _found(module: str) -> bool:
+    return importlib.util.find_spec(module) is not None

@@ -1,0 +1,1 @@
+"""The batched environment: simulation, actions, observations, step and reset."""

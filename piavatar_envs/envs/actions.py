@@ -1,0 +1,186 @@
+"""From actions to the pose that the avatar shall reach: scaled increments on a reference, within joint limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.rotation import quat_exp, quat_log, turn_about_z
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.mpm.types import FAILURE_ACTION
+
+wp.set_module_options({"enable_backward": False})
+
+_ACTION = wp.constant(FAILURE_ACTION)
+#: Largest rotation of a joint from its rest pose [rad]. Rotation vectors jump at pi: a joint must not get there.
+MAX_ANGLE = wp.constant(2.6)
+
+
+@wp.struct
+class ActionMap:
+    """How an action vector moves the goal. Increments are per control step."""
+
+    size: int
+    offset: wp.array(dtype=int)  # (22,) first action component of a joint, -1 if it does not act
+    scale: wp.array(dtype=float)  # (22,) increment at action 1 [rad]
+    lower: wp.array(dtype=wp.vec3)  # (22,) bounds of the rotation vectors [rad]
+    upper: wp.array(dtype=wp.vec3)
+    root_offset: int  # first of three components x, y, yaw; -1 if the root does not act
+    root_step: float  # root translation at action 1 [m]
+    root_turn: float  # root turn at action 1 [rad]
+
+
+@dataclass(frozen=True)
+class ActionSpec:
+    """Meaning of an action vector, in order: three rotation increments a joint, then the root's.
+
+    Attributes:
+        joints: names of the acting joints.
+        root: whether x, y and yaw of the root follow.
+        joint_speed: rotation speed at action 1 [rad/s].
+        root_speed: speed of the root at action 1 [m/s].
+        root_turn_speed: turning speed of the root at action 1 [rad/s].
+    """
+
+    joints: tuple[str, ...]
+    root: bool = False
+    joint_speed: float = 4.0
+    root_speed: float = 1.5
+    root_turn_speed: float = 2.0
+
+    @property
+    def size(self) -> int:
+        """Length of the action vector."""
+        return 3 * len(self.joints) + 3 * self.root
+
+    def names(self) -> list[str]:
+        """A name for every component, such as ``left_elbow.x``."""
+        names = [f"{joint}.{axis}" for joint in self.joints for axis in "xyz"]
+        return names + (["root.x", "root.y", "root.yaw"] if self.root else [])
+
+    def upload(self, control_dt: float, limits: tuple[np.ndarray, np.ndarray], device: str) -> ActionMap:
+        """Kernel argument for control steps of ``control_dt`` [s] and joint ``limits`` [rad]."""
+        offset = np.full(NUM_JOINTS, -1, np.int32)
+        for index, joint in enumerate(self.joints):
+            offset[joint_index(joint)] = 3 * index
+        action_map = ActionMap()
+        action_map.size = self.size
+        action_map.offset = wp.array(offset, dtype=int, device=device)
+        scale = np.full(NUM_JOINTS, self.joint_speed * control_dt, np.float32)
+        action_map.scale = wp.array(scale, dtype=float, device=device)
+        lower, upper = (np.ascontiguousarray(bound, np.float32) for bound in limits)
+        action_map.lower = wp.array(lower, dtype=wp.vec3, device=device)
+        action_map.upper = wp.array(upper, dtype=wp.vec3, device=device)
+        action_map.root_offset = 3 * len(self.joints) if self.root else -1
+        action_map.root_step = self.root_speed * control_dt
+        action_map.root_turn = self.root_turn_speed * control_dt
+        return action_map
+
+
+def select_joints(names: Sequence[str] | None) -> tuple[str, ...]:
+    """Acting joints in skeleton order; all but the root if ``names`` is None.
+
+    Raises:
+        ValueError: an unknown or repeated joint, or the root.
+    """
+    if names is None:
+        return JOINT_NAMES[1:]
+    unknown = [name for name in names if name not in JOINT_NAMES[1:]]
+    if unknown or len(set(names)) != len(names) or not names:
+        raise ValueError(
+            f"joints={list(names)}: {unknown[0]!r} is not a joint; use some of {', '.join(JOINT_NAMES[1:])}"
+            if unknown
+            else f"joints={list(names)} must name each joint once and at least one"
+        )
+    return tuple(name for name in JOINT_NAMES if name in names)
+
+
+def check_actions(action: np.ndarray, shape: tuple[int, ...], names: Sequence[str]) -> np.ndarray:
+    """The action as float32, refused before anything changes.
+
+    Raises:
+        ValueError: a wrong shape, or a component that is not finite; its index and name are given.
+    """
+    action = np.asarray(action, dtype=np.float32)
+    if action.shape != shape:
+        raise ValueError(f"action has shape {action.shape}, expected {shape}")
+    if not np.isfinite(action).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])
+        where = index[0] if len(index) == 1 else index
+        raise ValueError(f"action[{where}] ({names[index[-1]]}) is {action[index]}; actions must be finite, in [-1, 1]")
+    return action
+
+
+@wp.func
+def bounded(action: wp.array3d(dtype=float), e: int, agent: int, n: int):
+    """An action component clipped to [-1, 1]; zero if it is not finite."""
+    a = action[e, agent, n]
+    if not wp.isfinite(a):
+        return 0.0
+    return wp.clamp(a, -1.0, 1.0)
+
+
+@wp.func
+def keep_within(goal: wp.quat, lower: wp.vec3, upper: wp.vec3, allowed: wp.vec3):
+    """``goal`` with its rotation vector between limits that are widened as far as ``allowed`` exceeds them [rad]."""
+    v = wp.max(wp.min(allowed, lower), wp.min(quat_log(goal), wp.max(allowed, upper)))
+    return quat_exp(v * wp.min(1.0, MAX_ANGLE / wp.max(wp.length(v), 1.0e-6)))
+
+
+@wp.func
+def within_limits(reference: wp.quat, step: wp.vec3, lower: wp.vec3, upper: wp.vec3):
+    """``reference`` turned by ``step`` [rad], kept between the limits of the joint's rotation vector.
+
+    What the reference itself exceeds (a clip may) is allowed, but actions cannot push further.
+    """
+    before = quat_log(reference)
+    goal = reference * quat_exp(step)
+    if wp.length(before) > MAX_ANGLE + 1.0e-3:
+        # so near to the jump at pi there is no box: an action may only lead away from it
+        if wp.length(quat_log(goal)) > wp.length(before):
+            return reference
+        return goal
+    return keep_within(goal, lower, upper, before)
+
+
+@wp.kernel
+def refuse_nonfinite(action: wp.array3d(dtype=float), agent: int, failure: wp.array(dtype=int)):
+    """End the environment of an action that is not finite; host-side views have refused it before."""
+    e, n = wp.tid()
+    if not wp.isfinite(action[e, agent, n]):
+        wp.atomic_or(failure, e, _ACTION)
+
+
+@wp.kernel
+def apply_actions(
+    action_map: ActionMap,
+    action: wp.array3d(dtype=float),
+    agent: int,
+    reference_rotation: wp.array2d(dtype=wp.quat),
+    reference_root: wp.array(dtype=wp.vec3),
+    tracked_rotation: wp.array2d(dtype=wp.quat),
+    # out
+    goal_rotation: wp.array2d(dtype=wp.quat),
+    goal_root: wp.array(dtype=wp.vec3),
+):
+    """Goal of the control step: the reference pose turned by the action, within the limits of the acting joints."""
+    e, b = wp.tid()
+    goal = reference_rotation[e, b]
+    n = action_map.offset[b]
+    if n >= 0:
+        step = wp.vec3(bounded(action, e, agent, n), bounded(action, e, agent, n + 1), bounded(action, e, agent, n + 2))
+        goal = within_limits(goal, action_map.scale[b] * step, action_map.lower[b], action_map.upper[b])
+    if b == 0:
+        root = reference_root[e]
+        n = action_map.root_offset
+        if n >= 0:
+            # steps are in the avatar's heading: forward is -y
+            step = wp.vec3(bounded(action, e, agent, n), bounded(action, e, agent, n + 1), 0.0)
+            root += action_map.root_step * wp.quat_rotate(turn_about_z(tracked_rotation[e, 0]), step)
+            turn = action_map.root_turn * bounded(action, e, agent, n + 2)
+            goal = quat_exp(wp.vec3(0.0, 0.0, turn)) * goal
+        goal_root[e] = root
+    goal_rotation[e, b] = goal

@@ -1,0 +1,163 @@
+"""What an avatar observes of itself, and where each quantity lies in the flat vector."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_ACTUATED, NUM_JOINTS
+from piavatar_envs.avatar.types import Body, Tracked
+from piavatar_envs.mpm.materials import kirchhoff_stress, von_mises_stress
+from piavatar_envs.mpm.types import Particles, row
+
+wp.set_module_options({"enable_backward": False})
+
+
+@dataclass(frozen=True)
+class ObservationTerm:
+    """A named part of the observation.
+
+    Attributes:
+        name: key in ``obs_mode="dict"``.
+        size: number of components.
+        unit: physical unit, ``"-"`` if it has none.
+        frame: ``"world"``, ``"root"`` (origin at the pelvis, turned with it), ``"parent"`` bone, or ``"-"``.
+        description: one line.
+    """
+
+    name: str
+    size: int
+    unit: str
+    frame: str
+    description: str
+
+
+@dataclass(frozen=True)
+class PlacedTerm(ObservationTerm):
+    """A term with its place in the flat vector."""
+
+    slice: slice
+
+
+#: Terms every avatar observes, in order.
+SELF_TERMS: tuple[ObservationTerm, ...] = (
+    ObservationTerm("root_height", 1, "m", "world", "height of the pelvis joint"),
+    ObservationTerm("root_orientation", 6, "-", "world", "first two columns of the pelvis' rotation matrix"),
+    ObservationTerm(
+        "joint_rotations", 6 * NUM_ACTUATED, "-", "parent", "Kabsch-tracked rotations, two columns a joint"
+    ),
+    ObservationTerm("bone_positions", 3 * NUM_ACTUATED, "m", "root", "joint positions relative to the pelvis"),
+    ObservationTerm("bone_velocities", 3 * NUM_JOINTS, "m/s", "root", "velocities of all bones, the pelvis first"),
+    ObservationTerm("stress", len(BODY_PARTS), "young_modulus", "-", "peak von Mises stress of each body part"),
+)
+
+
+class ObservationLayout(dict[str, PlacedTerm]):
+    """Terms by name, in the order of the flat vector."""
+
+    def __init__(self, terms: Iterable[ObservationTerm]) -> None:
+        start = 0
+        for term in terms:
+            if term.name in self:
+                raise ValueError(f"observation term {term.name!r} occurs twice")
+            self[term.name] = PlacedTerm(**vars(term), slice=slice(start, start + term.size))
+            start += term.size
+        self.size = start
+
+    def split(self, flat: np.ndarray) -> dict[str, np.ndarray]:
+        """A flat observation by name: copies along the last axis."""
+        return {name: flat[..., term.slice].copy() for name, term in self.items()}
+
+
+@wp.func
+def write_rotation(observation: wp.array3d(dtype=float), e: int, agent: int, start: int, q: wp.quat):
+    """Two columns of a rotation matrix: the continuous 6D representation of Zhou et al. (CVPR 2019)."""
+    x = wp.quat_rotate(q, wp.vec3(1.0, 0.0, 0.0))
+    y = wp.quat_rotate(q, wp.vec3(0.0, 1.0, 0.0))
+    for n in range(3):
+        observation[e, agent, start + n] = x[n]
+        observation[e, agent, start + 3 + n] = y[n]
+
+
+@wp.func
+def write_vector(observation: wp.array3d(dtype=float), e: int, agent: int, start: int, v: wp.vec3):
+    """Three components of a vector."""
+    for n in range(3):
+        observation[e, agent, start + n] = v[n]
+
+
+@wp.kernel
+def observe_body(
+    agent: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    local: wp.array2d(dtype=wp.quat),
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """The terms of ``SELF_TERMS`` that come from the tracked bones."""
+    e, b = wp.tid()
+    bones = rotation.shape[1]
+    to_root = wp.quat_inverse(rotation[e, 0])
+    joints_at = 7
+    positions_at = joints_at + 6 * (bones - 1)
+    velocities_at = positions_at + 3 * (bones - 1)
+    if b == 0:
+        observation[e, agent, 0] = position[e, 0][2]
+        write_rotation(observation, e, agent, 1, rotation[e, 0])
+    else:
+        write_rotation(observation, e, agent, joints_at + 6 * (b - 1), local[e, b])
+        offset = wp.quat_rotate(to_root, position[e, b] - position[e, 0])
+        write_vector(observation, e, agent, positions_at + 3 * (b - 1), offset)
+    write_vector(observation, e, agent, velocities_at + 3 * b, wp.quat_rotate(to_root, velocity[e, b]))
+
+
+@wp.kernel
+def clear_stress(agent: int, start: int, observation: wp.array3d(dtype=float)):
+    """Peaks are taken anew every control step."""
+    e, part = wp.tid()
+    observation[e, agent, start + part] = 0.0
+
+
+@wp.kernel
+def observe_stress(
+    body: Body,
+    particles: Particles,
+    F: wp.array2d(dtype=wp.mat33),
+    part: wp.array(dtype=int),
+    agent: int,
+    start: int,
+    inverse_modulus: float,
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Peak von Mises stress of each body part, in units of Young's modulus. A maximum does not depend on its order."""
+    e, p = wp.tid()
+    q = body.first + p
+    G = F[e, q]
+    tau = kirchhoff_stress(
+        particles.material[row(e, particles.material.shape[0]), q],
+        G,
+        particles.mu[row(e, particles.mu.shape[0]), q],
+        particles.lam[row(e, particles.lam.shape[0]), q],
+    )
+    stress = von_mises_stress(tau, wp.determinant(G)) * inverse_modulus
+    if wp.isfinite(stress):
+        wp.atomic_max(observation, e, agent, start + part[p], stress)
+
+
+@wp.kernel
+def clean_observation(observation: wp.array3d(dtype=float)):
+    """A failed environment may hold values that are not finite; what leaves the suite never does."""
+    e, agent, n = wp.tid()
+    if not wp.isfinite(observation[e, agent, n]):
+        observation[e, agent, n] = 0.0
+
+
+def tracked_arrays(tracked: Tracked) -> list[wp.array]:
+    """Inputs of :func:`observe_body` from the tracked bones."""
+    return [tracked.rotation, tracked.position, tracked.velocity, tracked.local]

@@ -1,0 +1,60 @@
+"""Disturbances: impulses from random directions on random bones."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.envs.draws import STREAM_DISTURBANCE, generator
+from piavatar_envs.mpm.types import row
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def draw_impulse(
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    interval: int,
+    magnitude: float,
+    bones: wp.array(dtype=int),
+    # out
+    impulse: wp.array(dtype=wp.vec3),
+    struck: wp.array(dtype=int),
+):
+    """Every ``interval`` steps, at a moment of the episode's own, an impulse [N s] on one of ``bones``; else none."""
+    e = wp.tid()
+    impulse[e] = wp.vec3(0.0)
+    struck[e] = bones[0]
+    start = generator(seed[e], episode[e], STREAM_DISTURBANCE, 0)
+    step = step_count[e] + wp.randi(start, 0, interval)
+    if magnitude <= 0.0 or step % interval != interval - 1:
+        return
+    random = generator(seed[e], episode[e], STREAM_DISTURBANCE, 1 + step)
+    direction = wp.sample_unit_sphere_surface(random)
+    impulse[e] = magnitude * wp.randf(random, 0.3, 1.0) * direction
+    struck[e] = bones[wp.randi(random, 0, bones.shape[0])]
+
+
+@wp.kernel
+def apply_impulse(
+    body: Body,
+    impulse: wp.array(dtype=wp.vec3),
+    struck: wp.array(dtype=int),
+    failure: wp.array(dtype=int),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+):
+    """Spread an impulse over the particles of the struck bone by their skinning weights; its sum is exact."""
+    e, p = wp.tid()
+    if failure[e] != 0:
+        return
+    b = struck[e]
+    share = float(0.0)
+    for n in range(4):
+        if body.joint[p][n] == b:
+            share += body.weight[p][n]
+    if share > 0.0:
+        mass = body.bone_mass[row(e, body.bone_mass.shape[0]), b]
+        u[e, body.first + p] = u[e, body.first + p] + (share / mass) * impulse[e]

@@ -1,0 +1,244 @@
+"""TrackMotion: follow a clip while impulses from random directions disturb the body."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+from pydantic import Field
+
+from piavatar_envs.avatar.motion import load_motion
+from piavatar_envs.avatar.posing import pose_body
+from piavatar_envs.avatar.rotation import quat_log
+from piavatar_envs.avatar.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
+from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.config import EnvConfig
+from piavatar_envs.envs.observations import ObservationTerm, write_rotation, write_vector
+from piavatar_envs.envs.simulation import Domain
+from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.clip import Clip, advance_reference, draw_start, read_clip
+from piavatar_envs.tasks.disturb import apply_impulse, draw_impulse
+from piavatar_envs.tasks.rewards import mean_square_action, tolerance
+
+wp.set_module_options({"enable_backward": False})
+
+#: Bones that impulses strike: heavy enough that a few N s push instead of tearing.
+STRUCK = ("pelvis", "spine2", "spine3", "head", "left_shoulder", "right_shoulder", "left_hip", "right_hip", "left_knee")
+
+
+class TrackMotionConfig(EnvConfig):
+    """Settings of TrackMotion."""
+
+    motion: str = Field("step", description="name of a clip, or the path of an AMASS .npz file")
+    random_start: bool = Field(True, description="begin anywhere in a clip that loops")
+    root_action: bool = Field(True, description="whether x, y and yaw of the root act too")
+    impulse: float = Field(20.0, ge=0.0, le=1000.0, description="greatest impulse on the body, 0 for none [N s]")
+    impulse_interval: float = Field(1.0, gt=0.0, description="time between impulses [s]")
+    success_distance: float = Field(0.1, gt=0.0, description="MPJPE up to which the motion counts as followed [m]")
+    fail_distance: float = Field(0.5, gt=0.0, description="MPJPE at which the episode ends [m]")
+    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+
+
+@wp.kernel
+def judge(
+    clip: Clip,
+    local: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    clip_rotation: wp.array2d(dtype=wp.quat),
+    clip_position: wp.array2d(dtype=wp.vec3),
+    impulse: wp.array(dtype=wp.vec3),
+    action: wp.array3d(dtype=float),
+    # out
+    terms: wp.array2d(dtype=float),
+    metrics: wp.array2d(dtype=float),
+    success: wp.array(dtype=wp.bool),
+    terminated: wp.array(dtype=wp.bool),
+):
+    """Reward of following in position and rotation, and its cost."""
+    e = wp.tid()
+    bones = local.shape[1]
+    distance = float(0.0)
+    angle = float(0.0)
+    for b in range(bones):
+        distance += wp.length(position[e, b] - clip_position[e, b]) / float(bones)
+        angle += wp.length(quat_log(wp.quat_inverse(clip_rotation[e, b]) * local[e, b])) / float(bones)
+    terms[e, 0] = 0.6 * tolerance(distance, 0.01, 0.3)
+    terms[e, 1] = 0.4 * tolerance(angle, 0.01, 0.5)
+    terms[e, 2] = -clip.control_cost * mean_square_action(action, e, 0)
+    metrics[e, 0] = distance
+    metrics[e, 1] = wp.degrees(angle)
+    metrics[e, 2] = wp.length(position[e, 0] - clip_position[e, 0])
+    metrics[e, 3] = wp.length(impulse[e])
+    success[e] = distance <= clip.success
+    terminated[e] = distance > clip.fail
+
+
+@wp.kernel
+def observe(
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    local: wp.array2d(dtype=wp.quat),
+    clip_rotation: wp.array2d(dtype=wp.quat),
+    clip_world: wp.array2d(dtype=wp.quat),
+    clip_position: wp.array2d(dtype=wp.vec3),
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Terms of ``TrackMotionTask.observation_terms``."""
+    e, b = wp.tid()
+    bones = rotation.shape[1]
+    to_root = wp.quat_inverse(rotation[e, 0])
+    error = wp.quat_rotate(to_root, clip_position[e, b] - position[e, b])
+    write_vector(observation, e, agent, start + 3 * b, error)
+    turn_at = start + 3 * bones
+    if b == 0:
+        write_rotation(observation, e, agent, turn_at, to_root * clip_world[e, 0])
+    else:
+        step = quat_log(wp.quat_inverse(local[e, b]) * clip_rotation[e, b])
+        write_vector(observation, e, agent, turn_at + 6 + 3 * (b - 1), step)
+
+
+class TrackMotionTask(Task):
+    """Follow a clip; actions are added to its increments."""
+
+    Config = TrackMotionConfig
+    description = "follow a clip while impulses from random directions disturb the body"
+    observation_terms = (
+        ObservationTerm("reference_positions", 3 * NUM_JOINTS, "m", "root", "the clip's next joints from one's own"),
+        ObservationTerm("reference_root", 6, "-", "root", "the clip's next pelvis orientation, two columns"),
+        ObservationTerm("reference_turns", 3 * NUM_ACTUATED, "rad", "bone", "rotation vectors to the clip's next pose"),
+    )
+    reward_terms = ("position", "rotation", "control")
+    metrics = ("mpjpe", "rotation_error_deg", "root_error", "impulse")
+
+    config: TrackMotionConfig
+
+    def __init__(self, config: TrackMotionConfig) -> None:
+        super().__init__(config)
+        dt = config.physics.control_dt
+        motion = load_motion(config.motion)
+        steps = max(1, round(config.episode_seconds / dt))
+        period = max(1, round(motion.duration / dt))
+        self.starts = period if config.random_start and motion.loop else 1
+        frames = self.starts + steps + 2 if motion.loop else min(period, steps) + 2
+        self.rotations, self.roots = motion.sample(np.arange(frames) * dt)
+
+    def action_spec(self) -> ActionSpec:
+        return ActionSpec(
+            select_joints(None), root=self.config.root_action, joint_speed=self.config.drive.joint_speed_limit
+        )
+
+    def domain(self) -> Domain:
+        """The default box, moved along the clip."""
+        ways = [
+            self.roots[s : s + len(self.roots) - self.starts + 1, :2] - self.roots[s, :2] for s in range(self.starts)
+        ]
+        way = np.concatenate(ways)
+        box = Domain()
+        lower = (*(np.asarray(box.lower[:2]) + way.min(0)).tolist(), box.lower[2])
+        upper = (*(np.asarray(box.upper[:2]) + way.max(0)).tolist(), max(box.upper[2], self.roots[:, 2].max() + 1.3))
+        return Domain(lower, upper)
+
+    def allocate(self, env) -> None:
+        n, device = env.num_envs, env.device
+
+        def zeros(shape, dtype):
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        clip = Clip()
+        xyzw = np.ascontiguousarray(self.rotations[..., [1, 2, 3, 0]], np.float32)
+        clip.rotation = wp.array(xyzw, dtype=wp.quat, device=device)
+        clip.root = wp.array(self.roots.astype(np.float32), dtype=wp.vec3, device=device)
+        clip.starts, clip.success, clip.fail = self.starts, self.config.success_distance, self.config.fail_distance
+        clip.control_cost = self.config.control_cost
+        self.clip = clip
+        self.start, self.origin = zeros(n, int), zeros(n, wp.vec3)
+        self.reference_rotation, self.reference_root = zeros((n, NUM_JOINTS), wp.quat), zeros(n, wp.vec3)
+        self.clip_rotation, self.clip_root = zeros((n, NUM_JOINTS), wp.quat), zeros(n, wp.vec3)
+        self.clip_world, self.clip_position = zeros((n, NUM_JOINTS), wp.quat), zeros((n, NUM_JOINTS), wp.vec3)
+        self.still = zeros((n, NUM_JOINTS), wp.vec3)
+        self.impulse, self.struck = zeros(n, wp.vec3), zeros(n, int)
+        self.bones = wp.array([joint_index(name) for name in STRUCK], dtype=int, device=device)
+
+    def arrays(self) -> dict[str, wp.array]:
+        return {"start": self.start, "origin": self.origin}
+
+    def record_reset(self, env, program) -> None:
+        drive = env.simulation.avatar.state
+        program.launch(
+            draw_start,
+            (env.num_envs, NUM_JOINTS),
+            [env.mask, env.seed, env.episode, self.clip],
+            [self.start, self.origin, drive.command_rotation, drive.command_root],
+        )
+
+    def record_reference(self, env, program) -> tuple[wp.array, wp.array]:
+        drive, config = env.simulation.avatar.state, self.config
+        program.launch(
+            advance_reference,
+            (env.num_envs, NUM_JOINTS),
+            [self.clip, env.action_map, self.start, env.step_count, drive.command_rotation, drive.command_root],
+            [self.reference_rotation, self.reference_root],
+        )
+        interval = max(1, round(config.impulse_interval / config.physics.control_dt))
+        program.launch(
+            draw_impulse,
+            env.num_envs,
+            [env.seed, env.episode, env.step_count, interval, config.impulse, self.bones],
+            [self.impulse, self.struck],
+        )
+        avatar = env.simulation.avatar
+        program.launch(
+            apply_impulse,
+            (env.num_envs, avatar.num_points),
+            [avatar.body, self.impulse, self.struck, env.failure],
+            [env.simulation.state.u],
+        )
+        return self.reference_rotation, self.reference_root
+
+    def _record_clip(self, env, program) -> None:
+        """Append: the clip's pose one step ahead of the counter, in the world."""
+        n = env.num_envs
+        program.launch(
+            read_clip,
+            (n, NUM_JOINTS),
+            [self.clip, self.start, self.origin, env.step_count],
+            [self.clip_rotation, self.clip_root],
+        )
+        body = env.simulation.avatar.body
+        program.launch(
+            pose_body,
+            n,
+            [body, 0.0, self.clip_rotation, self.clip_root, self.still, self.still[:, 0]],
+            [self.clip_world, self.clip_position],
+        )
+
+    def record_outcome(self, env, program) -> None:
+        self._record_clip(env, program)
+        tracked = env.simulation.avatar.tracked
+        program.launch(
+            judge,
+            env.num_envs,
+            [
+                self.clip, tracked.local, tracked.position, self.clip_rotation, self.clip_position, self.impulse,
+                env.action,
+            ],
+            [env.terms, env.metrics, env.success, env.terminated],
+        )  # fmt: skip
+
+    def record_observe(self, env, program, agent: int, start: int) -> None:
+        self._record_clip(env, program)
+        tracked = env.simulation.avatar.tracked
+        program.launch(
+            observe,
+            (env.num_envs, NUM_JOINTS),
+            [
+                agent, start, tracked.rotation, tracked.position, tracked.local,
+                self.clip_rotation, self.clip_world, self.clip_position,
+            ],
+            [env.observation],
+        )  # fmt: skip
+
+
+TASK = TrackMotionTask

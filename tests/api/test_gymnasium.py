@@ -1,0 +1,139 @@
+"""The single-environment view: what it takes, what it refuses and how, what it returns."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+from piavatar_envs.api.gymnasium import AvatarEnv
+
+
+def refusal(env_id: str, settings: dict) -> str:
+    with pytest.raises(ValueError) as caught:
+        gymnasium.make(env_id, **settings)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"bogus": 1}, ["bogus is no setting of", "obs_mode"]),
+        ({"fidelty": "tiny"}, ["fidelty is no setting of", "physics.fidelity"]),
+        ({"fidelity": "ultra"}, ["physics.fidelity='ultra'", "'tiny'", "'coarse'"]),
+        ({"obs_mode": "pixels"}, ["obs_mode='pixels'", "'flat'", "'dict'"]),
+        ({"drive.tone": 2.0}, ["drive.tone=2.0", "<= 1"]),
+        ({"config": {"drive": {"tune": 1}}}, ["drive.tune is no setting of", "drive.tone"]),
+        ({"config": "no/such/file.yaml"}, ["no/such/file.yaml"]),
+        ({"device": "cuda:99"}, ["device='cuda:99'", "cpu"]),
+        ({"device": "tpu"}, ["device='tpu'", "cpu"]),
+        ({"task": "Fly-v0"}, ["'Fly-v0'", "PIAvatar/Reach-v0", "PIAvatar/TrackMotion-v0"]),
+        ({"shape.parameters": {"tallness": 0.5}}, ["'tallness'", "height"]),
+        ({"young_modulus": 1e9, "num_substeps": 4}, ["CFL limit", "num_substeps >= "]),
+    ],
+)
+def test_bad_settings_are_refused_in_one_line_with_what_is_allowed(device, env_id, settings, told):
+    message = refusal(env_id, {"device": device, "fidelity": "tiny", **settings})
+    assert all(part in message for part in told), message
+
+
+def test_unknown_render_mode_is_refused(device, env_id):
+    with pytest.raises(ValueError, match=r"render_mode='human' is not known; use None or rgb_array"):
+        AvatarEnv(env_id, render_mode="human", device=device, fidelity="tiny")
+
+
+def test_a_yaml_file_and_keywords_configure(tmp_path, device, env_id):
+    path = tmp_path / "run.yaml"
+    path.write_text("episode_seconds: 0.5\nphysics: {fidelity: tiny}\ndrive: {tone: 0.25, alpha: 0.1}\n")
+    env = gymnasium.make(env_id, device=device, config=path, alpha=0.2).unwrapped
+    assert env.config.drive.tone == 0.25 and env.config.drive.alpha == 0.2
+    assert env.batch.max_steps == 15
+
+
+def test_control_rate_is_in_the_metadata(device, env_id):
+    env = gymnasium.make(env_id, device=device, fidelity="tiny", control_dt=0.02).unwrapped
+    assert env.metadata["render_fps"] == 50 and AvatarEnv.metadata["render_fps"] == 30
+
+
+def test_nothing_goes_before_the_first_reset(device, env_id):
+    env = AvatarEnv(env_id, render_mode="rgb_array", device=device, fidelity="tiny")
+    for call in (lambda: env.step(env.action_space.sample()), env.render):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            call()
+
+
+@pytest.mark.parametrize("options", [{"pose": 1}, {"shape": "tall", "pose": 1}])
+def test_unknown_reset_options_are_refused_before_anything_changes(make_env, env_id, equal, options):
+    env = make_env(env_id)
+    env.reset(seed=0)
+    before = env.get_state()
+    with pytest.raises(ValueError, match=r"pose.*there are none"):
+        env.reset(seed=1, options=options)
+    after = env.get_state()
+    assert all(before[name].tobytes() == after[name].tobytes() for name in before)
+    env.reset(seed=0, options={})
+
+
+@pytest.mark.parametrize("seed", [0, 2**31 - 1, 2**31, 2**32 - 1])
+def test_every_seed_of_gymnasium_and_stable_baselines3_is_taken(make_env, env_id, equal, seed):
+    env = make_env(env_id)
+    first, again = env.reset(seed=seed)[0], env.reset(seed=seed)[0]
+    assert equal(first, again)
+    assert np.abs(env.reset(seed=(seed + 1) % 2**32)[0] - first).max() > 1e-4
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, "one"])
+def test_other_seeds_are_refused(make_env, env_id, seed):
+    with pytest.raises((ValueError, gymnasium.error.Error)):
+        make_env(env_id).reset(seed=seed)
+
+
+def test_dictionary_is_the_flat_vector_by_name(make_env, env_id, equal):
+    flat, named = make_env(env_id), make_env(env_id, obs_mode="dict")
+    assert set(named.observation_space) == set(flat.observation_layout)
+    pairs = [(flat.reset(seed=8)[0], named.reset(seed=8)[0])]
+    rng = np.random.default_rng(8)
+    for _ in range(5):
+        action = rng.uniform(-1.0, 1.0, flat.action_space.shape)
+        pairs.append((flat.step(action)[0], named.step(action)[0]))
+    for vector, terms in pairs:
+        assert named.observation_space.contains(terms)
+        for name, term in flat.observation_layout.items():
+            assert equal(terms[name], vector[term.slice]), name
+            assert not np.shares_memory(terms[name], named.batch.observation.numpy())
+
+
+def test_info_says_what_held_the_body(make_env, env_id):
+    env = make_env(env_id)
+    env.reset(seed=0)
+    infos = [env.step(np.zeros(env.action_space.shape))[4] for _ in range(20)]
+    weight = 9.81 * float(env.batch.simulation.points.mass.sum())
+    for info in infos:
+        assert info["failure"] is None and info["root_let_go"] is False and type(info["success"]) is bool
+        assert info["root_force"].shape == info["root_torque"].shape == (3,)
+    assert np.mean([info["root_force"][2] for info in infos]) == pytest.approx(weight, rel=0.2)
+
+
+def test_pictures(device, env_id):
+    pytest.importorskip("pyvista")
+    env = gymnasium.make(env_id, device=device, fidelity="tiny", render_mode="rgb_array", width=64, height=48).unwrapped
+    env.reset(seed=0)
+    before = env.get_state()
+    frames = [env.render()]
+    assert all(before[name].tobytes() == value.tobytes() for name, value in env.get_state().items())
+    for _ in range(5):
+        env.step(np.ones(env.action_space.shape))
+    frames.append(env.render())
+    assert all(frame.shape == (48, 64, 3) and frame.dtype == np.uint8 and np.ptp(frame) > 50 for frame in frames)
+    assert not np.array_equal(*frames)
+    env.close()
+    env.close()
+
+
+def test_no_picture_without_a_render_mode(make_env, env_id):
+    env = make_env(env_id)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None

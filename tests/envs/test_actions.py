@@ -1,0 +1,254 @@
+"""From actions to motion: what is refused, what is clipped, what turns and how far, and where it ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.limits import joint_limits
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS
+from piavatar_envs.envs.actions import ActionSpec, check_actions, select_joints
+from piavatar_envs.mpm.types import FAILURE_ACTION
+
+
+def tracked_local(env, index: int = 0) -> Rotation:
+    """Tracked joint rotations relative to their parents."""
+    batch = getattr(env, "batch", env)
+    return Rotation.from_quat(batch.simulation.avatar.tracked.local.numpy()[index].astype(float))
+
+
+def tracked_root(env) -> tuple[np.ndarray, float]:
+    """Tracked pelvis position [m] and heading [rad]."""
+    position = env.batch.simulation.avatar.tracked.position.numpy()[0, 0].astype(float)
+    left = tracked_local(env)[0].apply([1.0, 0.0, 0.0])
+    return position, float(np.arctan2(left[1], left[0]))
+
+
+def command(env) -> np.ndarray:
+    """Rotation vectors commanded so far [rad], shape ``(22, 3)``."""
+    return Rotation.from_quat(env.batch.get_state()["drive.command_rotation"][0].astype(float)).as_rotvec()
+
+
+def clip_pose(env) -> np.ndarray:
+    """Rotation vectors of the clip at the last step [rad], shape ``(22, 3)``; zeros without a clip."""
+    clip, state = getattr(env.batch.task, "clip", None), env.batch.get_state()
+    if clip is None:
+        return np.zeros((NUM_JOINTS, 3))
+    frame = int(state["task.start"][0] + state["env.step_count"][0])
+    return Rotation.from_quat(clip.rotation.numpy()[frame].astype(float)).as_rotvec()
+
+
+def bad_actions(size: int) -> dict[str, tuple[object, str]]:
+    """Name -> (action, what the error must say with ``{name}`` for the component's name)."""
+
+    def at(index, value):
+        action = np.zeros(size, np.float32)
+        action[index] = value
+        return action
+
+    return {
+        "too long": (np.zeros(size + 1), rf"shape \({size + 1},\), expected \({size},\)"),
+        "too short": (np.zeros(size - 1), rf"shape \({size - 1},\), expected \({size},\)"),
+        "a row": (np.zeros((1, size)), rf"shape \(1, {size}\), expected \({size},\)"),
+        "a number": (0.5, rf"shape \(\), expected \({size},\)"),
+        "not a number": (at(7, np.nan), r"action\[7\] \({7}\) is nan.*finite"),
+        "infinite": (at(size - 1, np.inf), rf"action\[{size - 1}\] \({{{size - 1}}}\) is inf.*finite"),
+        "minus infinity": (at(0, -np.inf), r"action\[0\] \({0}\) is -inf.*finite"),
+    }
+
+
+@pytest.mark.parametrize("case", bad_actions(9))
+def test_bad_actions_are_refused_before_anything_changes(make_env, env_id, case):
+    env = make_env(env_id)
+    env.reset(seed=0)
+    env.step(np.full(env.action_space.shape, 0.3))
+    action, told = bad_actions(env.action_space.shape[0])[case]
+    before, observation = env.get_state(), env.batch.observation.numpy().copy()
+    pattern = told if "expected" in told else told.format(*env.action_names)
+    with pytest.raises(ValueError, match=pattern):
+        env.step(action)
+    after = env.get_state()
+    assert all(before[name].tobytes() == after[name].tobytes() for name in before)
+    assert np.array_equal(env.batch.observation.numpy(), observation)
+    assert env.step(np.zeros(env.action_space.shape))[4]["failure"] is None
+
+
+def test_a_batch_ends_the_environment_of_a_nonfinite_action_only(make_batch, env_id, equal):
+    """On the device nothing can be refused without waiting for it: such an action counts as zero and is a failure."""
+    batch = make_batch(env_id, 3)
+    batch.reset(seeds=[0, 1, 2])
+    batch.step()
+    action = np.full(batch.action.shape, 0.5, np.float32)
+    batch.action.assign(action)
+    state = batch.get_state()
+    batch.step()
+    expected = batch.observation.numpy().copy()
+    batch.set_state(state)
+    action[1, 0, 4] = np.nan
+    batch.action.assign(action)
+    batch.step()
+    assert batch.failure.numpy().tolist() == [0, FAILURE_ACTION, 0]
+    assert batch.terminated.numpy().tolist() == [False, True, False]
+    got = batch.observation.numpy()
+    assert np.isfinite(got).all() and np.isfinite(batch.reward.numpy()).all()
+    assert equal(got[[0, 2]], expected[[0, 2]])
+    batch.action.zero_()
+
+
+def test_actions_beyond_one_are_clipped(make_env, env_id, equal):
+    env = make_env(env_id)
+    rng = np.random.default_rng(0)
+    wild = rng.uniform(-50.0, 50.0, (4, *env.action_space.shape))
+    runs = []
+    for actions in (wild, np.clip(wild, -1.0, 1.0)):
+        env.reset(seed=0)
+        runs.append([env.step(action)[:2] for action in actions])
+    assert all(equal(a[0], b[0]) and equal(a[1], b[1]) for a, b in zip(*runs, strict=True))
+
+
+def test_integers_and_lists_are_actions_too(make_env, env_id, equal):
+    env = make_env(env_id)
+    size, results = env.action_space.shape[0], []
+    for action in (np.ones(size, np.float32), np.ones(size, np.int64), [1] * size, np.ones(2 * size)[::2]):
+        env.reset(seed=0)
+        results.append(env.step(action)[0])
+    assert all(equal(results[0], other) for other in results[1:])
+
+
+@pytest.mark.parametrize(
+    "component",
+    [
+        "left_elbow.z",
+        "right_shoulder.x",
+        "left_wrist.y",
+        "neck.y",
+        "head.z",
+        "spine2.x",
+        "right_collar.z",
+        "left_hip.z",
+    ],
+)
+@pytest.mark.parametrize("sign", [1.0, -0.5])
+def test_a_named_component_turns_its_joint_and_no_other(make_env, component, sign):
+    """By speed times time about the joint's own axis; tracked, not commanded. No foot presses on the ground here."""
+    env = make_env("PIAvatar/Reach-v0", gravity=0.0, pose_noise=0.0)
+    joint, axis = component.split(".")
+    index = JOINT_NAMES.index(joint)
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape))
+    before = tracked_local(env)
+    action = np.zeros(env.action_space.shape)
+    action[env.action_names.index(component)] = sign
+    env.step(action)
+    expected = np.zeros((NUM_JOINTS, 3))
+    expected[index, "xyz".index(axis)] = sign * env.config.drive.joint_speed_limit * env.config.physics.control_dt
+    turned = (before.inv() * tracked_local(env)).as_rotvec()
+    assert np.degrees(np.abs(turned - expected).max()) < 0.01
+
+
+def test_increments_are_composed_on_the_right(make_env):
+    """The second turn is about the axis that the first has turned, not about the one of the rest pose."""
+    env = make_env("PIAvatar/Reach-v0", gravity=0.0, pose_noise=0.0)
+    env.reset(seed=0)
+    step = env.config.drive.joint_speed_limit * env.config.physics.control_dt
+    for component in ["left_shoulder.x"] * 5 + ["left_shoulder.z"] * 5:
+        action = np.zeros(env.action_space.shape)
+        action[env.action_names.index(component)] = 1.0
+        env.step(action)
+    expected = Rotation.from_rotvec([5 * step, 0, 0]) * Rotation.from_rotvec([0, 0, 5 * step])
+    wrong = Rotation.from_rotvec([0, 0, 5 * step]) * Rotation.from_rotvec([5 * step, 0, 0])
+    got = tracked_local(env)[JOINT_NAMES.index("left_shoulder")]
+    assert np.degrees((expected.inv() * got).magnitude()) < 0.2 < np.degrees((expected.inv() * wrong).magnitude())
+
+
+def test_held_actions_end_at_the_joint_limits(make_env, env_id):
+    """Rotation vectors that are commanded stay in their box under every corner of the action space."""
+    env = make_env(env_id)
+    lower, upper = (bound[1:] for bound in joint_limits())
+    rng = np.random.default_rng(1)
+    reached = np.zeros((NUM_JOINTS - 1, 3), bool)
+    for episode in range(3):
+        env.reset(seed=episode)
+        corner = rng.choice([-1.0, 1.0], env.action_space.shape)
+        corner[3 * (NUM_JOINTS - 1) :] = 0.0
+        for step in range(40):
+            env.step(corner)
+            v, own = command(env)[1:], clip_pose(env)[1:]
+            low, high = np.minimum(lower, own) - 1e-4, np.maximum(upper, own) + 1e-4
+            wrong = np.argwhere((v < low) | (v > high))
+            told = ", ".join(f"{JOINT_NAMES[1 + b]}.{'xyz'[a]} {v[b, a]:.3f} rad" for b, a in wrong)
+            assert not told, f"episode {episode}, step {step}: {told}"
+        reached |= (v < lower + 1e-3) | (v > upper - 1e-3)
+    assert reached.mean() > 0.3, "the case must run into the limits"
+
+
+def test_the_tracked_joints_respect_the_limits(make_env):
+    """The body follows the command into its limits and stays there."""
+    env = make_env("PIAvatar/Reach-v0")
+    lower, _ = joint_limits()
+    index = JOINT_NAMES.index("left_elbow")
+    action = np.zeros(env.action_space.shape)
+    action[env.action_names.index("left_elbow.z")] = -1.0
+    env.reset(seed=0)
+    angles = []
+    for _ in range(30):
+        env.step(action)
+        angles.append(np.degrees(tracked_local(env)[index].as_rotvec()[2]))
+    assert angles[5] < angles[0] - 20.0
+    assert np.degrees(lower[index, 2]) - 2.0 < angles[-1] < np.degrees(lower[index, 2]) + 5.0
+
+
+@pytest.mark.parametrize(
+    ("component", "moves", "turns"), [("root.x", (1, 0), 0), ("root.y", (0, 1), 0), ("root.yaw", (0, 0), 1)]
+)
+def test_root_actions_move_the_root(make_env, component, moves, turns):
+    """At the root's speed, in the body's heading: after a quarter turn, x of the body is y of the world."""
+    env = make_env("PIAvatar/TrackMotion-v0", motion="idle", impulse=0.0, fail_distance=10.0, gravity=0.0)
+    spec, dt = env.batch.action_spec, env.config.physics.control_dt
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape)
+    action[env.action_names.index("root.yaw")] = 1.0
+    for _ in range(8):
+        env.step(action)
+    env.step(np.zeros(env.action_space.shape))
+    start, heading = tracked_root(env)
+    assert heading > 0.4, "the case must have turned"
+    action[:] = 0.0
+    action[env.action_names.index(component)] = 1.0
+    for _ in range(3):
+        env.step(action)
+    end, after = tracked_root(env)
+    c, s = np.cos(heading), np.sin(heading)
+    expected = 3 * dt * spec.root_speed * np.array([[c, -s], [s, c]]) @ moves
+    assert end[:2] - start[:2] == pytest.approx(expected, abs=0.02)
+    assert end[2] == pytest.approx(start[2], abs=0.02)
+    assert after - heading == pytest.approx(3 * dt * spec.root_turn_speed * turns, abs=0.02)
+
+
+def test_without_root_action_the_vector_is_shorter(make_env):
+    assert make_env("PIAvatar/TrackMotion-v0", root_action=False).action_space.shape == (63,)
+    assert make_env("PIAvatar/TrackMotion-v0").action_names[-3:] == ("root.x", "root.y", "root.yaw")
+
+
+def test_acting_joints_can_be_chosen(make_env):
+    env = make_env("PIAvatar/Reach-v0", joints=["right_elbow", "left_shoulder"])
+    assert env.action_names == tuple(f"{joint}.{axis}" for joint in ("left_shoulder", "right_elbow") for axis in "xyz")
+    env.reset(seed=0)
+    before = command(env)
+    env.step(np.ones(6))
+    moved = np.flatnonzero(np.abs(command(env) - before).max(1) > 0.05)
+    assert [JOINT_NAMES[b] for b in moved] == ["left_shoulder", "right_elbow"]
+
+
+@pytest.mark.parametrize("names", [["pelvis"], ["left_tail"], ["neck", "neck"], []])
+def test_bad_joints_are_refused(names):
+    with pytest.raises(ValueError, match="joints="):
+        select_joints(names)
+
+
+def test_names_and_sizes_agree():
+    spec = ActionSpec(("neck", "head"), root=True)
+    assert spec.size == len(spec.names()) == 9
+    with pytest.raises(ValueError, match=r"action\[\(0, 4\)\] \(head.y\) is nan"):
+        check_actions(np.where(np.arange(9) == 4, np.nan, 0.0)[None], (1, 9), spec.names())

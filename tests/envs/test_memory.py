@@ -1,0 +1,84 @@
+"""Steps allocate nothing that stays: neither Warp's arrays, nor Python objects, nor pages of the process."""
+
+from __future__ import annotations
+
+import gc
+import os
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+
+
+def resident_bytes() -> int:
+    """Memory of this process that is in RAM."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def steps(env, count: int, actions: np.ndarray) -> None:
+    for n in range(count):
+        env.step(actions[n % len(actions)])
+
+
+@pytest.fixture
+def warmed_up(make_env, env_id):
+    env = make_env(env_id, episode_seconds=3600.0)
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (8, *env.action_space.shape))
+    env.reset(seed=0)
+    steps(env, 10, actions)
+    return env, actions
+
+
+def test_a_step_makes_no_array_on_the_device(warmed_up, monkeypatch):
+    """Every allocation of Warp goes through its device's allocator."""
+    env, actions = warmed_up
+    device = wp.get_device(env.batch.device)
+    allocator, made = device.get_allocator(), []
+
+    class Counting:
+        def __getattr__(self, name):
+            return getattr(allocator, name)
+
+        def allocate(self, size):
+            made.append(size)
+            return allocator.allocate(size)
+
+    monkeypatch.setattr(device, "get_allocator", lambda *args, **kwargs: Counting())
+    wp.zeros(7, dtype=float, device=device)
+    assert made == [28], "the count must see allocations"
+    made.clear()
+    env.batch.step()
+    env.batch.step()
+    assert not made
+    steps(env, 5, actions)
+    # an action on its way to a GPU may be staged; nothing else is made
+    assert len(made) <= (0 if device.is_cpu else 5)
+
+
+def test_python_objects_do_not_pile_up(warmed_up):
+    env, actions = warmed_up
+    tracemalloc.start()
+    try:
+        steps(env, 50, actions)
+        gc.collect()
+        before = tracemalloc.get_traced_memory()[0]
+        steps(env, 200, actions)
+        gc.collect()
+        grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    # a leak of one observation a step would be 200 x 1 kB
+    assert grown < 20_000, f"{grown} bytes in 200 steps"
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc: the process' memory is not watched here")
+def test_the_process_does_not_grow(warmed_up):
+    env, actions = warmed_up
+    steps(env, 50, actions)
+    before = resident_bytes()
+    for _ in range(4):
+        env.reset()
+        steps(env, 50, actions)
+    assert resident_bytes() - before < 4 * 2**20

@@ -1,0 +1,206 @@
+"""TrackMotion: clips are followed without being told how, disturbances recovered from, the numbers are right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.motion import deepmimic, load_motion
+from piavatar_envs.avatar.motion.library import list_embedded
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, forward_kinematics, joint_index
+
+TRACK = "PIAvatar/TrackMotion-v0"
+
+
+def follow(env, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
+    """Metrics at every step of zero actions."""
+    env.reset(seed=seed)
+    rows = []
+    for _ in range(round(seconds / env.config.physics.control_dt)):
+        _, reward, terminated, _, info = env.step(np.zeros(env.action_space.shape))
+        assert not terminated and info["failure"] is None
+        rows.append({**{name: info[name] for name in env.batch.task.metrics}, "reward": reward})
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def clip_frame(env, ahead: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The clip ``ahead`` steps from now: local and world rotations ``(22, 3, 3)``, joints ``(22, 3)`` in the world."""
+    state, dt = env.get_state(), env.config.physics.control_dt
+    start, now = int(state["task.start"][0]), int(state["env.step_count"][0])
+    motion = load_motion(env.config.motion)
+    quaternions, root = motion.sample((start + now + ahead) * dt)
+    origin = motion.sample(start * dt)[1] * [1.0, 1.0, 0.0]
+    local = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+    joints = env.batch.simulation.rest_joints[0].astype(float)
+    world, positions = forward_kinematics(local, root - origin, joints)
+    return local, world, positions
+
+
+def tracked(env) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Local and world rotations ``(22, 3, 3)`` and joints ``(22, 3)`` of the body."""
+    bones = env.batch.simulation.avatar.tracked
+    local, world = (Rotation.from_quat(q.numpy()[0].astype(float)).as_matrix() for q in (bones.local, bones.rotation))
+    return local, world, bones.position.numpy()[0].astype(float)
+
+
+@pytest.mark.parametrize("motion", list_embedded())
+def test_clips_are_followed_without_actions(make_env, motion):
+    """At the coarsest body; feet that press on a ground of 14 cm cells are what is left of the error."""
+    log = follow(
+        make_env(TRACK, motion=motion, impulse=0.0, random_start=False), min(load_motion(motion).duration, 3.0)
+    )
+    assert log["mpjpe"].mean() < 0.012 and log["rotation_error_deg"].mean() < 2.5
+    assert log["reward"].min() > 0.98 and not log["impulse"].any()
+
+
+@pytest.mark.parametrize("motion", ["squat", "kick"])
+def test_clips_are_followed_closely_at_the_default_resolution(make_env, motion):
+    log = follow(make_env(TRACK, fidelity="coarse", motion=motion, impulse=0.0, random_start=False), 2.0)
+    assert log["mpjpe"].mean() < 0.005 and log["rotation_error_deg"].mean() < 1.0
+    assert log["mpjpe"].max() < 0.01
+
+
+@pytest.mark.skipif(
+    deepmimic.clip_folder() is None,
+    reason="no pybullet here (its wheels are for Python 3.10 and 3.11): the DeepMimic clips are not tested",
+)
+def test_a_deepmimic_clip_walks_on(make_env):
+    env = make_env(TRACK, motion="deepmimic:walk", impulse=0.0, random_start=False)
+    log = follow(env, 2.4)
+    assert log["mpjpe"].mean() < 0.02 and log["root_error"].max() < 0.02
+    walked = np.linalg.norm(tracked(env)[2][0, :2])
+    assert walked == pytest.approx(np.linalg.norm(clip_frame(env, 0)[2][0, :2]), abs=0.02) and walked > 1.5
+
+
+def write_amass(path, frames: int = 121, rate: float = 60.0) -> float:
+    """An AMASS file of an elbow that swings up by ``0.5 (1 - cos)`` rad within two seconds; returns its amplitude."""
+    poses, angle = np.zeros((frames, 156)), 0.5 * (1.0 - np.cos(np.linspace(0.0, 2.0 * np.pi, frames)))
+    poses[:, 0] = np.pi / 2  # stands SMPL's y-up body up
+    elbow = joint_index("left_elbow")
+    poses[:, 3 * elbow + 1] = -angle
+    np.savez(path, poses=poses, trans=np.zeros((frames, 3)), mocap_framerate=np.array(rate), gender=np.array("neutral"))
+    return float(angle.max())
+
+
+def test_an_amass_file_is_followed_by_its_path(make_env, tmp_path):
+    amplitude = write_amass(tmp_path / "swing.npz")
+    env = make_env(TRACK, motion=str(tmp_path / "swing.npz"), impulse=0.0)
+    env.reset(seed=0)
+    elbow, start = joint_index("left_elbow"), tracked(env)[0]
+    turned, errors = [], []
+    for _ in range(75):  # the clip is over after 60: its last pose is held
+        info = env.step(np.zeros(env.action_space.shape))[4]
+        turned.append(np.linalg.norm(Rotation.from_matrix(start[elbow].T @ tracked(env)[0][elbow]).as_rotvec()))
+        errors.append(info["mpjpe"])
+    assert max(turned) == pytest.approx(amplitude, abs=0.02) and np.argmax(turned) == pytest.approx(29, abs=1)
+    assert turned[-1] == pytest.approx(0.0, abs=0.02) and max(errors) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("motion", "error", "told"),
+    [
+        ("moonwalk", KeyError, "moonwalk.*arm_wave.*squat.*AMASS"),
+        ("/no/such/clip.npz", FileNotFoundError, "/no/such/clip.npz"),
+        ("deepmimic:moonwalk", (KeyError, ImportError), "moonwalk|motions"),
+    ],
+)
+def test_unknown_motions_are_refused(make_env, motion, error, told):
+    with pytest.raises(error, match=told):
+        make_env(TRACK, motion=motion)
+
+
+def test_impulses_push_the_body_and_it_recovers(make_env):
+    env = make_env(TRACK, motion="idle", impulse=40.0, impulse_interval=1.5)
+    log = follow(env, 3.6, seed=1)
+    strikes = np.flatnonzero(log["impulse"])
+    assert len(strikes) == 2 and (np.diff(strikes) == 45).all()
+    assert ((log["impulse"][strikes] > 0.3 * 40.0) & (log["impulse"][strikes] <= 40.0 + 1e-4)).all()
+    for at in strikes:
+        peak = log["mpjpe"][at : at + 6].max()
+        assert log["mpjpe"][at - 1] < 0.001 and 0.005 < peak < 0.2
+        later = log["mpjpe"][at + 15 : at + 16]
+        assert (later < 0.15 * peak).all()
+    assert log["reward"][strikes].max() < log["reward"].max()
+    undisturbed = follow(make_env(TRACK, motion="idle", impulse=0.0), 0.5, seed=1)
+    assert undisturbed["mpjpe"].max() < 0.001
+
+
+def test_metrics_are_those_of_numpy(make_env):
+    """Against the clip sampled, posed and compared in NumPy, under random actions."""
+    env = make_env(TRACK, motion="kick", impulse=30.0)
+    config = env.config
+    for seed in range(3):
+        env.reset(seed=seed)
+        rng = np.random.default_rng(seed)
+        for _ in range(8):
+            info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))[4]
+            (local, _, joints), (clip_local, _, clip_joints) = tracked(env), clip_frame(env, 0)
+            distance = np.linalg.norm(joints - clip_joints, axis=1)
+            turns = Rotation.from_matrix(clip_local.transpose(0, 2, 1) @ local).magnitude()
+            assert info["mpjpe"] == pytest.approx(distance.mean(), abs=2e-5)
+            assert info["root_error"] == pytest.approx(distance[0], abs=2e-5)
+            assert info["rotation_error_deg"] == pytest.approx(np.degrees(turns.mean()), abs=5e-3)
+            assert info["success"] == (distance.mean() <= config.success_distance)
+            expected = {
+                "position": 0.6 * 10.0 ** (-((max(distance.mean() - 0.01, 0.0) / 0.3) ** 2)),
+                "rotation": 0.4 * 10.0 ** (-((max(turns.mean() - 0.01, 0.0) / 0.5) ** 2)),
+            }
+            assert {name: info["reward_terms"][name] for name in expected} == pytest.approx(expected, abs=2e-4)
+
+
+def test_the_observed_reference_is_the_clips_next_pose(make_env):
+    env = make_env(TRACK, motion="kick", impulse=30.0)
+    observation, _ = env.reset(seed=4)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        seen = env.observation_layout.split(observation.astype(float))
+        (local, world, joints), (clip_local, clip_world, clip_joints) = tracked(env), clip_frame(env, 1)
+        error = seen["reference_positions"].reshape(NUM_JOINTS, 3) @ world[0].T
+        assert error == pytest.approx(clip_joints - joints, abs=2e-5)
+        columns = seen["reference_root"].reshape(2, 3).T
+        assert columns == pytest.approx((world[0].T @ clip_world[0])[:, :2], abs=2e-5)
+        turns = Rotation.from_matrix(local.transpose(0, 2, 1) @ clip_local).as_rotvec()[1:]
+        assert seen["reference_turns"].reshape(-1, 3) == pytest.approx(turns, abs=1e-4)
+        observation, *_ = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
+
+
+def test_straying_too_far_terminates(make_env):
+    env = make_env(TRACK, motion="idle", impulse=0.0, fail_distance=0.06)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape)
+    action[env.action_names.index("root.x")] = 1.0
+    rows = [env.step(action) for _ in range(6)]
+    errors, ended = [row[4]["mpjpe"] for row in rows], [row[2] for row in rows]
+    assert ended == [error > 0.06 for error in errors] and ended[-1] and not ended[0]
+    assert rows[-1][4]["failure"] is None and not rows[-1][4]["root_let_go"]
+
+
+def test_episodes_begin_anywhere_in_a_clip_that_loops(make_env):
+    starts = {True: [], False: []}
+    for random_start, found in starts.items():
+        env = make_env(TRACK, motion="kick", random_start=random_start)
+        for seed in range(12):
+            env.reset(seed=seed)
+            found.append(int(env.get_state()["task.start"][0]))
+            _, _, clip_joints = clip_frame(env, 0)
+            assert tracked(env)[2] == pytest.approx(clip_joints, abs=1e-4)
+    assert starts[False] == [0] * 12 and len(set(starts[True])) > 6
+    assert min(starts[True]) >= 0 and max(starts[True]) < round(load_motion("kick").duration * 30)
+
+
+def test_zero_actions_hold_the_clip_and_actions_leave_it(make_env):
+    env = make_env(TRACK, motion="arm_wave", impulse=0.0, random_start=False)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape)
+    action[env.action_names.index("left_elbow.z")] = -1.0
+    for _ in range(3):
+        env.step(action)
+    elbow = joint_index("left_elbow")
+    offset = Rotation.from_matrix(clip_frame(env, 0)[0][elbow].T @ tracked(env)[0][elbow]).magnitude()
+    step = env.config.drive.joint_speed_limit * env.config.physics.control_dt
+    assert offset == pytest.approx(3 * step, abs=0.02)
+    for _ in range(3):
+        env.step(-action)
+    offset = Rotation.from_matrix(clip_frame(env, 0)[0][elbow].T @ tracked(env)[0][elbow]).magnitude()
+    assert offset == pytest.approx(0.0, abs=0.02)

@@ -1,0 +1,186 @@
+"""Configurations: what is refused and how, what is merged, and that nothing is lost on the way."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import yaml
+from pydantic import BaseModel, Field, ValidationError
+
+from piavatar_envs.envs.config import ConfigError, EnvConfig, dump_yaml, load_config, parse_assignments, replace
+from piavatar_envs.envs.config_io import setting_keys
+
+
+class Task(EnvConfig):
+    """A task's configuration, as tasks/ writes them: one level below EnvConfig."""
+
+    target_radius: float = Field(0.1, gt=0.0, le=1.0, description="radius of the target [m]")
+    span: tuple[float, float] = Field((0.3, 0.9), description="nearest and farthest target [m]")
+
+
+def refusal(source=None, overrides=None, cls=Task) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_config(cls, source, overrides)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_defaults_are_those_of_the_design():
+    config = load_config(EnvConfig)
+    assert config.physics.young_modulus == 1e5 and config.physics.control_dt == pytest.approx(1 / 30)
+    assert config.physics.num_substeps is None and config.physics.decoupling == "split"
+    assert config.drive.max_force_weight == 2.0 and config.drive.let_go_tilt == pytest.approx(np.pi / 4)
+    assert config == EnvConfig()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        ({"drive.tone": 1.5}, "drive.tone=1.5 must be <= 1"),
+        ({"drive": {"tone": -0.1}}, "drive.tone=-0.1 must be >= 0"),
+        ({"physics.control_dt": 0}, "physics.control_dt=0 must be > 0 [s]"),
+        ({"physics.poisson_ratio": 0.5}, "physics.poisson_ratio=0.5 must be < 0.5"),
+        ({"fidelity": "ultra"}, "physics.fidelity='ultra' must be one of 'tiny', 'coarse', 'medium' or 'fine'"),
+        ({"young_modulus": "soft"}, "physics.young_modulus='soft' must be a number [Pa]"),
+        ({"young_modulus": "100000"}, "physics.young_modulus='100000' must be a number [Pa]"),
+        ({"tone": True}, "drive.tone=True must be a number"),
+        ({"num_substeps": 1.5}, "physics.num_substeps=1.5 must be a whole number"),
+        ({"free_motion": 1}, "drive.free_motion=1 must be true or false"),
+        ({"tone": float("nan")}, "drive.tone=nan must be a finite number"),
+        ({"density": float("inf")}, "physics.density=inf must be a finite number [kg/m^3]"),
+        ({"shape.parameters.age": 2}, "shape.parameters.age=2 must be <= 1"),
+        ({"physics": 3}, "physics=3 must be a section, with its settings below it"),
+        ({"target_radius": 2.0}, "target_radius=2.0 must be <= 1 [m]"),
+        ({"width": 8}, "render.width=8 must be >= 16 [pixel]"),
+        ({"drive.ton": 1}, "drive.ton is no setting of Task; did you mean drive.tone?"),
+        ({"drive.young_modulus": 1}, "drive.young_modulus is no setting of Task; did you mean physics.young_modulus?"),
+        ({"physcs": {"fidelity": "tiny"}}, "physcs is no setting of Task; did you mean physics?"),
+        ({"target_radius.x": 1}, "target_radius={'x': 1} must be a number [m]"),
+        ({"drive": {"tone": 0.1}, "tone": 0.2}, "drive.tone is given twice, last as {'tone': 0.2}; give it once"),
+    ],
+)
+def test_a_refusal_names_key_value_and_limit(overrides, told):
+    assert refusal(None, overrides) == told
+
+
+def test_an_unlike_key_is_answered_with_what_there_is():
+    message = refusal(None, {"physics.qqqq": 1})
+    assert message.startswith("physics.qqqq is no setting of Task; there are physics.fidelity, ")
+
+
+def test_all_errors_come_in_one_line_with_their_file(tmp_path):
+    path = tmp_path / "bad.yaml"
+    path.write_text("physics:\n  density: -1\nobs_mode: both\n")
+    message = refusal(path, {"tone": 7})
+    assert f"{path}: physics.density=-1 must be > 0 [kg/m^3]" in message
+    assert f"{path}: obs_mode='both' must be one of 'flat' or 'dict'" in message
+    assert "; drive.tone=7 must be <= 1; " in message  # not the file's fault
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    assert "cannot read the configuration" in refusal(tmp_path / "none.yaml")
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("physics: [1,\n")
+    assert f"{broken} is not YAML" in refusal(broken)
+    broken.write_text("- a\n- b\n")
+    assert "holds a list, not settings" in refusal(broken)
+    broken.write_text("drive:\n  tone: 0.1\n  tone: 0.2\n")
+    assert "'tone' is given twice" in refusal(broken)
+    broken.write_text("drive: !!python/object/apply:os.getcwd []\n")
+    assert "is not YAML" in refusal(broken)
+
+
+def test_file_then_keywords(tmp_path):
+    path = tmp_path / "some.yaml"
+    path.write_text("physics:\n  young_modulus: 1e6\n  fidelity: tiny\ndrive:\nshape.parameters.age: 0.5\n")
+    config = load_config(Task, path, {"fidelity": "medium", "shape": {"parameters": {"weight": -0.5}}})
+    assert config.physics.young_modulus == 1e6  # YAML 1.1 would call this a string
+    assert config.physics.fidelity == "medium"
+    assert config.shape.parameters == {"age": 0.5, "weight": -0.5}
+    assert config.drive == Task().drive  # an empty section is one with defaults
+
+
+def test_a_name_shared_with_its_section_means_the_setting():
+    assert load_config(Task, None, {"drive": "target"}).drive.drive == "target"
+
+
+def test_an_ambiguous_name_is_refused():
+    class Left(BaseModel):
+        same: int = 0
+
+    class Two(BaseModel):
+        left: Left = Left()
+        right: Left = Left()
+
+    assert refusal(None, {"same": 1}, Two) == "same is ambiguous in Two; say which: left.same or right.same"
+
+
+def test_numpy_and_tuples_are_welcome():
+    config = load_config(
+        Task, None, {"tone": np.float32(0.5), "span": np.array([0.1, 0.2]), "num_substeps": np.int64(9)}
+    )
+    assert config.drive.tone == 0.5 and config.span == (0.1, 0.2) and config.physics.num_substeps == 9
+    assert "a setting is a number" in refusal(None, {"tone": object()})
+
+
+def test_printed_and_read_back_is_the_same(tmp_path):
+    overrides = {"tone": 0.2, "shape.parameters": {"age": 0.25}, "span": [0.5, 0.6], "density": 985.123456789}
+    config = load_config(Task, None, overrides)
+    path = tmp_path / "resolved.yaml"
+    path.write_text(dump_yaml(config))
+    assert load_config(Task, path) == config
+    assert set(yaml.safe_load(path.read_text())) == set(Task.model_fields)
+
+
+def test_frozen_all_through_hashable_and_copied():
+    config = load_config(Task, None, {"shape.parameters.age": 0.3})
+    with pytest.raises(ValidationError):
+        config.obs_mode = "dict"
+    with pytest.raises(ValidationError):
+        config.drive.tone = 0.0
+    for change in (lambda d: d.update(age=1), lambda d: d.pop("age"), lambda d: d.__setitem__("age", 1)):
+        with pytest.raises(TypeError, match="frozen"):
+            change(config.shape.parameters)
+    assert hash(config) == hash(load_config(Task, None, {"shape.parameters.age": 0.3}))
+    assert pickle.loads(pickle.dumps(config)) == config == copy.deepcopy(config)
+
+
+def test_replace_changes_a_copy_and_validates():
+    config = Task()
+    changed = replace(config, {"drive.alpha": 0}, tone=0.7)
+    assert (changed.drive.alpha, changed.drive.tone) == (0.0, 0.7)
+    assert config == Task() and type(changed) is Task
+    with pytest.raises(ConfigError, match=r"drive\.tone=2 must be <= 1"):
+        replace(config, tone=2)
+
+
+def test_assignments_of_a_command_line():
+    parsed = parse_assignments(["drive.tone=0.3", "young_modulus=1e5", "fidelity=tiny", "span=[1, 2]", "num_substeps="])
+    assert parsed == {
+        "drive.tone": 0.3,
+        "young_modulus": 1e5,
+        "fidelity": "tiny",
+        "span": [1, 2],
+        "num_substeps": None,
+    }
+    for wrong in (["tone"], ["=1"], ["a=[1"], ["a=1", "a=2"]):
+        with pytest.raises(ConfigError):
+            parse_assignments(wrong)
+
+
+def test_every_setting_is_described_with_its_unit():
+    def fields(cls, prefix=""):
+        for name, field in cls.model_fields.items():
+            yield f"{prefix}{name}", field
+            if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+                yield from fields(field.annotation, f"{prefix}{name}.")
+
+    undescribed = [name for name, field in fields(EnvConfig) if not field.description]
+    unitless = [name for name, field in fields(EnvConfig) if field.annotation is float and "[" not in field.description]
+    assert not undescribed and not unitless
+    bare = [name.rpartition(".")[2] for name in setting_keys(EnvConfig)]
+    assert len(bare) == len(set(bare)), "a bare name would be ambiguous as a keyword of gym.make"

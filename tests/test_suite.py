@@ -1,0 +1,166 @@
+"""What every registered environment promises: the API checkers, determinism, observations, rewards."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+
+from piavatar_envs.tasks import NAMESPACE, task_modules
+
+#: The one complaint of Gymnasium's checker that is wanted: these observations have no honest limits.
+UNBOUNDED = r".*A Box observation space (minimum|maximum) value is -?infinity.*"
+
+#: Terms that may stay nearly the same, and the components that do. The pelvis hangs in the root wrench, so that the
+#: cosines of its small tilts stay near one, and three joints are fixed to it by bone.
+ALMOST_CONSTANT = {"root_orientation": (0, 4), "bone_positions": range(9)}
+
+
+def rollout(env, steps: int, seed: int | None = None, actions: int = 0, episodes: int = 1) -> list[tuple]:
+    """What the environment returned at every reset and step under random actions."""
+    rng, log = np.random.default_rng(actions), []
+    for episode in range(episodes):
+        observation, info = env.reset(seed=seed if episode == 0 else None)
+        log.append((observation, 0.0, False, False, info))
+        log += [env.step(rng.uniform(-1.0, 1.0, env.action_space.shape)) for _ in range(steps)]
+    return log
+
+
+def flat_info(info: dict, prefix: str = "") -> dict[str, np.ndarray]:
+    """Numbers of ``info`` by dotted name; a failure by its name."""
+    found = {}
+    for name, value in info.items():
+        if isinstance(value, dict):
+            found |= flat_info(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = np.asarray(str(value) if name == "failure" else value)
+    return found
+
+
+def test_every_task_file_is_registered():
+    registered = {env_id for env_id, spec in gymnasium.registry.items() if spec.namespace == NAMESPACE}
+    assert registered == set(task_modules()) >= {"PIAvatar/Reach-v0", "PIAvatar/TrackMotion-v0"}
+    # a TimeLimit wrapper would escape get_state
+    assert all(gymnasium.spec(env_id).max_episode_steps is None for env_id in registered)
+
+
+@pytest.mark.parametrize("obs_mode", ["flat", "dict"])
+@pytest.mark.parametrize("checker", ["gymnasium.utils.env_checker", "stable_baselines3.common.env_checker"])
+def test_checkers_are_content(make_env, env_id, obs_mode, checker):
+    module = pytest.importorskip(checker)
+    env = make_env(env_id, obs_mode=obs_mode)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", UNBOUNDED)
+        # pictures have tests of their own
+        module.check_env(env, skip_render_check=True)
+
+
+def test_same_seed_and_actions_give_the_same_run(make_env, env_id, equal):
+    env = make_env(env_id)
+    first = rollout(env, 30, seed=11, episodes=2)
+    again = rollout(env, 30, seed=11, episodes=2)
+    for a, b in zip(first, again, strict=True):
+        assert equal(a[0], b[0]) and equal(a[1], b[1]) and a[2:4] == b[2:4]
+        infos = flat_info(a[4]), flat_info(b[4])
+        assert infos[0].keys() == infos[1].keys()
+        for name, value in infos[0].items():
+            assert value == infos[1][name] if value.dtype.kind == "U" else equal(value, infos[1][name]), name
+
+
+def test_a_fresh_environment_repeats_an_old_one(make_env, env_id, equal):
+    old, fresh = make_env(env_id), gymnasium.make(env_id, fidelity="tiny", device=make_env(env_id).batch.device)
+    rollout(old, 7, seed=3)
+    for a, b in zip(rollout(old, 10, seed=5), rollout(fresh, 10, seed=5), strict=True):
+        assert equal(a[0], b[0]) and equal(a[1], b[1])
+
+
+def test_seeds_and_episodes_differ(make_env, env_id, equal):
+    env = make_env(env_id)
+    starts = {f"seed {seed}": env.reset(seed=seed)[0] for seed in (0, 1, 2)}
+    starts |= {f"episode {n} of seed 2": env.reset()[0] for n in (1, 2)}
+    ends = {f"seed {seed}": rollout(env, 35, seed)[-1][0] for seed in (0, 1, 2)}
+    for observations in (starts, ends):
+        names = list(observations)
+        for i, a in enumerate(names):
+            for b in names[:i]:
+                assert np.abs(observations[a] - observations[b]).max() > 1e-4, f"{a} is {b}"
+
+
+def test_seeding_again_starts_over(make_env, env_id, equal):
+    env = make_env(env_id)
+    first = [env.reset(seed=4)[0], env.reset()[0], env.reset()[0]]
+    env.reset(seed=9)
+    again = [env.reset(seed=4)[0], env.reset()[0], env.reset()[0]]
+    assert all(equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_never_seeded_environments_differ(device, env_id):
+    starts = [gymnasium.make(env_id, fidelity="tiny", device=device).reset()[0] for _ in range(2)]
+    assert np.abs(starts[0] - starts[1]).max() > 1e-4
+
+
+def test_observations_are_finite_and_none_is_constant(make_env, env_id):
+    env = make_env(env_id)
+    seen = np.array([row[0] for row in rollout(env, 25, seed=0, episodes=4)])
+    assert seen.dtype == np.float32 and np.isfinite(seen).all()
+    assert all(env.observation_space.contains(row) for row in seen)
+    for name, term in env.observation_layout.items():
+        spread = np.ptp(seen[:, term.slice], axis=0)
+        assert (spread > 0.0).all(), f"{name}{np.flatnonzero(spread == 0.0)} never changes"
+        small = set(np.flatnonzero(spread < 1e-3)) - set(ALMOST_CONSTANT.get(name, ()))
+        assert not small, f"{name}{sorted(small)} hardly changes: {spread[sorted(small)]}"
+
+
+def test_returned_arrays_are_the_callers(make_env, env_id):
+    """Writing into what an environment returned changes neither it nor what it returns later."""
+    env = make_env(env_id)
+    internal = [array.numpy() for array in (*env.batch.arrays().values(), env.batch.observation)]
+    rows = rollout(env, 3, seed=1, episodes=2)
+    returned = [array for row in rows for array in (row[0], *flat_info(row[4]).values()) if np.ndim(array)]
+    for i, a in enumerate(returned):
+        assert not any(np.shares_memory(a, b) for b in returned[:i])
+        assert not any(np.shares_memory(a, b) for b in internal)
+        assert a.flags.writeable
+    untouched = [row[0] for row in rollout(env, 5, seed=1)]
+    env.reset(seed=1)
+    rng = np.random.default_rng(0)
+    for expected in untouched[1:]:
+        observation, _, _, _, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
+        assert np.allclose(observation, expected, atol=0.0 if env.batch.device == "cpu" else 2e-3)
+        observation[:] = np.nan
+        for value in info.values():
+            if isinstance(value, np.ndarray):
+                value[:] = np.nan
+
+
+def test_an_action_is_not_written_to(make_env, env_id):
+    env = make_env(env_id)
+    env.reset(seed=0)
+    action = np.full(env.action_space.shape, 3.0, np.float32)
+    env.step(action)
+    assert (action == 3.0).all()
+
+
+def test_reward_is_the_sum_of_its_terms(make_env, env_id):
+    env = make_env(env_id)
+    task = env.batch.task
+    for _, reward, terminated, truncated, info in rollout(env, 30, seed=2)[1:]:
+        assert type(reward) is float and type(terminated) is bool and type(truncated) is bool
+        terms = info["reward_terms"]
+        assert tuple(terms) == task.reward_terms and np.isfinite(list(terms.values())).all()
+        assert reward == pytest.approx(sum(terms.values()), abs=1e-6)
+        assert set(task.metrics) <= set(info) and all(np.isfinite(info[name]) for name in task.metrics)
+        # the shaping is at most one; what an action costs is all that is negative
+        assert -env.config.control_cost <= reward <= 1.0
+
+
+def test_costs_of_actions_are_as_configured(make_env, env_id):
+    env = make_env(env_id)
+    for scale in (0.0, 0.5, 1.0, 7.0):
+        env.reset(seed=0)
+        info = env.step(np.full(env.action_space.shape, scale, np.float32))[4]
+        expected = -env.config.control_cost * min(scale, 1.0) ** 2
+        assert info["reward_terms"]["control"] == pytest.approx(expected, rel=1e-5, abs=1e-9)
