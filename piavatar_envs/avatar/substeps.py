@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import warp as wp
-
 from piavatar_envs.avatar import flesh, posing, rigid_fit
 from piavatar_envs.avatar.injection import inject_velocity
 from piavatar_envs.avatar.root import lay_command_on_body, root_wrench
@@ -28,18 +26,10 @@ from piavatar_envs.avatar.types import (
 )
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_substep
-from piavatar_envs.mpm.types import Scratch, State
+from piavatar_envs.mpm.types import Scratch, State, group
 
 if TYPE_CHECKING:
     from piavatar_envs.avatar.drive import AvatarDrive
-
-
-def group(struct: wp.Struct, **arrays: wp.array):
-    """Arrays bundled as one kernel argument."""
-    instance = struct()
-    for name, array in arrays.items():
-        setattr(instance, name, array)
-    return instance
 
 
 class Groups:

@@ -10,9 +10,6 @@ from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Boundaries, Grid, Step, ve
 
 wp.set_module_options({"enable_backward": False})
 
-#: A block is swept by this many threads, one slab of 4 x 4 nodes each.
-SLABS = BLOCK
-
 #: Nodes lighter than this [kg] carry nothing but round-off.
 _MASS_MIN = wp.constant(1.0e-15)
 
@@ -27,11 +24,17 @@ def slab_is_near(boundaries: Boundaries, grid: Grid, i: int, j: int, k: int):
     return False
 
 
+def threads_per_block(device: str) -> int:
+    """Threads that share the four slabs of a block: on a CPU an idle thread costs as much as a slab of nodes."""
+    return BLOCK if wp.get_device(device).is_cuda else 1
+
+
 @wp.kernel
 def update_grid(
     grid: Grid,
     step: Step,
     boundaries: Boundaries,
+    slabs: int,
     active: wp.array2d(dtype=wp.int8),
     # in and out: read, then cleared
     node_sum: wp.array2d(dtype=vec8),
@@ -43,7 +46,8 @@ def update_grid(
 ):
     """Velocity of every node with mass. Contact acts on the total velocity ``v = u + vk``; the rest is physical.
 
-    ``boundary_impulse`` gathers the impulse [N s] that the boundaries gave the bodies of an environment.
+    ``boundary_impulse`` gathers the impulse [N s] that the boundaries gave the bodies of an environment. ``slabs``
+    threads share a block; each takes every ``slabs``-th slab of 4 x 4 nodes.
     """
     e, block, slab = wp.tid()
     if slab == 0:
@@ -51,32 +55,30 @@ def update_grid(
     if active[e, block] == wp.int8(0):
         return
     corner = block_corner(grid, block)
-    i = corner[0] + slab
-    if i >= grid.nodes[0]:
-        return
-    near = slab_is_near(boundaries, grid, i, corner[1], corner[2])
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    for j in range(corner[1], wp.min(corner[1] + 4, grid.nodes[1])):
-        for k in range(corner[2], wp.min(corner[2] + 4, grid.nodes[2])):
-            n = node_index(grid, i, j, k)
-            s = node_sum[e, n]
-            m = s[0]
-            out = vec8()
-            if m > _MASS_MIN:
-                vk = wp.vec3(s[4], s[5], s[6]) / m
-                v = wp.vec3(s[1], s[2], s[3]) / m + step.dt * step.gravity
-                if split:
-                    v += vk
+    for i in range(corner[0] + slab, wp.min(corner[0] + 4, grid.nodes[0]), slabs):
+        near = slab_is_near(boundaries, grid, i, corner[1], corner[2])
+        for j in range(corner[1], wp.min(corner[1] + 4, grid.nodes[1])):
+            for k in range(corner[2], wp.min(corner[2] + 4, grid.nodes[2])):
+                n = node_index(grid, i, j, k)
+                s = node_sum[e, n]
+                m = s[0]
+                out = vec8()
+                if m > _MASS_MIN:
+                    vk = wp.vec3(s[4], s[5], s[6]) / m
+                    v = wp.vec3(s[1], s[2], s[3]) / m + step.dt * step.gravity
+                    if split:
+                        v += vk
+                    if near:
+                        matter = node_position(grid, i, j, k) - node_offset[e, n] / m
+                        after = boundary_contact(boundaries, matter, v, CONTACT_GATE * grid.dx)
+                        if wp.length_sq(after - v) > 0.0:
+                            wp.atomic_add(boundary_impulse, e, m * (after - v))
+                        v = after
+                    if split:
+                        v -= vk
+                    out = vec8(0.0, v[0], v[1], v[2], vk[0], vk[1], vk[2], 0.0)
+                node_velocity[e, n] = out
+                node_sum[e, n] = vec8()
                 if near:
-                    matter = node_position(grid, i, j, k) - node_offset[e, n] / m
-                    after = boundary_contact(boundaries, matter, v, CONTACT_GATE * grid.dx)
-                    if wp.length_sq(after - v) > 0.0:
-                        wp.atomic_add(boundary_impulse, e, m * (after - v))
-                    v = after
-                if split:
-                    v -= vk
-                out = vec8(0.0, v[0], v[1], v[2], vk[0], vk[1], vk[2], 0.0)
-            node_velocity[e, n] = out
-            node_sum[e, n] = vec8()
-            if near:
-                node_offset[e, n] = wp.vec3(0.0)
+                    node_offset[e, n] = wp.vec3(0.0)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from piavatar_envs.mpm.grid import SLABS, update_grid
+from piavatar_envs.mpm.grid import threads_per_block, update_grid
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.transfer import grid_to_particles, particles_to_grid
-from piavatar_envs.mpm.types import Model, Scratch, State
+from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 
 def record_substep(program: Program, model: Model, state: State, scratch: Scratch, index: int) -> None:
@@ -20,13 +20,14 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     program.launch(
         particles_to_grid,
         particles,
-        [m.grid, m.step, m.particles, m.boundaries, s.x, s.u, s.C, s.F, s.vk],
+        [m.grid, m.step, m.particles, m.boundaries, group(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk)],
         [scratch.node_sum, scratch.node_offset, active, s.failure],
     )
+    slabs = threads_per_block(m.device)
     program.launch(
         update_grid,
-        (m.num_envs, m.num_blocks, SLABS),
-        [m.grid, m.step, m.boundaries, active],
+        (m.num_envs, m.num_blocks, slabs),
+        [m.grid, m.step, m.boundaries, slabs, active],
         [scratch.node_sum, scratch.node_offset, scratch.node_velocity, next_active, scratch.boundary_impulse],
     )
     program.launch(

@@ -27,13 +27,15 @@ from piavatar_envs.mpm.types import (
     SPLIT,
     Boundaries,
     Grid,
+    Moving,
     Particles,
     Step,
     row,
     vec8,
 )
 
-wp.set_module_options({"enable_backward": False})
+# Warp's own unrolling hides the loops over the stencil from the C++ compiler, which turns them into vector code
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
@@ -55,11 +57,7 @@ def particles_to_grid(
     step: Step,
     particles: Particles,
     boundaries: Boundaries,
-    x: wp.array2d(dtype=wp.vec3),
-    u: wp.array2d(dtype=wp.vec3),
-    C: wp.array2d(dtype=wp.mat33),
-    F: wp.array2d(dtype=wp.mat33),
-    vk: wp.array2d(dtype=wp.vec3),
+    moving: Moving,
     # out
     node_sum: wp.array2d(dtype=vec8),
     node_offset: wp.array2d(dtype=wp.vec3),
@@ -73,10 +71,10 @@ def particles_to_grid(
     e, p = wp.tid()
     if failure[e] != 0:
         return
-    if not (wp.isfinite(x[e, p]) and wp.isfinite(u[e, p]) and wp.isfinite(vk[e, p])):
+    if not wp.isfinite(wp.length_sq(moving.x[e, p]) + wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p])):
         wp.atomic_or(failure, e, _NONFINITE)
         return
-    xg = grid_position(grid, x[e, p])
+    xg = grid_position(grid, moving.x[e, p])
     base = base_node(xg)
     if not stencil_inside(grid, base):
         wp.atomic_or(failure, e, _OUT_OF_GRID)
@@ -84,20 +82,20 @@ def particles_to_grid(
     f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
     r = row(e, particles.mass.shape[0])
     m = particles.mass[r, p]
-    affine = m * C[e, p]
+    affine = m * moving.C[e, p]
     if step.decoupling != NO_STRESS:
         tau = kirchhoff_stress(
             particles.material[row(e, particles.material.shape[0]), p],
-            F[e, p],
+            moving.F[e, p],
             particles.mu[row(e, particles.mu.shape[0]), p],
             particles.lam[row(e, particles.lam.shape[0]), p],
         )
         volume = particles.volume[row(e, particles.volume.shape[0]), p]
         affine -= (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
-    # momentum is linear over the stencil: m u + affine (x_i - x_p), one vector register a node
+    # momentum is linear over the stencil, m u + affine (x_i - x_p): one vector register a node
     A = grid.dx * affine
-    q = m * u[e, p] - A * f
-    k = m * vk[e, p]
+    q = m * moving.u[e, p] - A * f
+    k = m * moving.vk[e, p]
     at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
     along_x = vec8(0.0, A[0, 0], A[1, 0], A[2, 0], 0.0, 0.0, 0.0, 0.0)
     along_y = vec8(0.0, A[0, 1], A[1, 1], A[2, 1], 0.0, 0.0, 0.0, 0.0)
@@ -105,15 +103,20 @@ def particles_to_grid(
     wx = spline(f[0])
     wy = spline(f[1])
     wz = spline(f[2])
+    at_i = at_base
     for i in range(3):
-        at_i = at_base + float(i) * along_x
+        at_j = wx[i] * at_i
         for j in range(3):
-            at_j = at_i + float(j) * along_y
             first = node_index(grid, base[0] + i, base[1] + j, base[2])
-            for l in range(3):
-                wp.atomic_add(node_sum, e, first + l, (wx[i] * wy[j] * wz[l]) * (at_j + float(l) * along_z))
+            line = wy[j] * at_j
+            step_z = (wx[i] * wy[j]) * along_z
+            wp.atomic_add(node_sum, e, first, wz[0] * line)
+            wp.atomic_add(node_sum, e, first + 1, wz[1] * (line + step_z))
+            wp.atomic_add(node_sum, e, first + 2, wz[2] * (line + 2.0 * step_z))
+            at_j += wx[i] * along_y
+        at_i += along_x
     mark_blocks(grid, base, e, active)
-    if nearest_boundary(boundaries, x[e, p]) < NEAR_PARTICLE * grid.dx:
+    if nearest_boundary(boundaries, moving.x[e, p]) < NEAR_PARTICLE * grid.dx:
         for i in range(3):
             for j in range(3):
                 first = node_index(grid, base[0] + i, base[1] + j, base[2])
@@ -155,16 +158,18 @@ def grid_to_particles(
     moment_y = vec8()
     moment_z = vec8()
     for i in range(3):
+        plane = vec8()
         for j in range(3):
             first = node_index(grid, base[0] + i, base[1] + j, base[2])
-            line = vec8()
-            for l in range(3):
-                node = (wx[i] * wy[j] * wz[l]) * node_velocity[e, first + l]
-                line += node
-                moment_z += float(l) * node
-            mean += line
-            moment_x += float(i) * line
+            w = wx[i] * wy[j]
+            second = (w * wz[1]) * node_velocity[e, first + 1]
+            third = (w * wz[2]) * node_velocity[e, first + 2]
+            line = (w * wz[0]) * node_velocity[e, first] + second + third
+            plane += line
             moment_y += float(j) * line
+            moment_z += second + 2.0 * third
+        mean += plane
+        moment_x += float(i) * plane
     # gradient of quadratic-spline APIC: (4 / dx^2) sum w v (x_i - x_p)^T
     scale = 4.0 * grid.inv_dx
     gx = scale * (moment_x - f[0] * mean)
@@ -181,7 +186,7 @@ def grid_to_particles(
     F_next = advance_deformation(
         F[e, p], grad_v, grad_vk, step.dt, wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
     )
-    if not wp.isfinite(F_next):
+    if not wp.isfinite(wp.ddot(F_next, F_next)):
         wp.atomic_or(failure, e, _NONFINITE)
         return
     if step.dt * wp.length(advection) > grid.dx:

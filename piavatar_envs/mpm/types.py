@@ -87,6 +87,25 @@ class Boundaries:
     friction: wp.array(dtype=float)
 
 
+@wp.struct
+class Moving:
+    """Particle state as the scatter reads it, each of shape ``(num_envs, num_particles)``; see :class:`State`."""
+
+    x: wp.array2d(dtype=wp.vec3)
+    u: wp.array2d(dtype=wp.vec3)
+    C: wp.array2d(dtype=wp.mat33)
+    F: wp.array2d(dtype=wp.mat33)
+    vk: wp.array2d(dtype=wp.vec3)
+
+
+def group(struct: wp.Struct, **arrays: wp.array):
+    """Arrays bundled as one kernel argument."""
+    instance = struct()
+    for name, array in arrays.items():
+        setattr(instance, name, array)
+    return instance
+
+
 @wp.func
 def row(e: int, rows: int):
     """Row of a constant for environment ``e``: 0 if it is shared by all environments."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.rotation import quat_log, turn_about_z
+from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.actions import MAX_ANGLE, ActionMap, keep_within
 from piavatar_envs.envs.draws import STREAM_TASK, generator
+from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,6 +19,7 @@ class Clip:
 
     rotation: wp.array2d(dtype=wp.quat)  # (frames, 22) local
     root: wp.array(dtype=wp.vec3)  # (frames,) [m]
+    pelvis_height: float  # of the body that the clip was loaded for, at rest [m]
     starts: int  # an episode begins at a frame below this
     success: float
     fail: float
@@ -29,12 +32,20 @@ def frame_of(clip: Clip, start: int, step: int):
     return wp.min(start + step, clip.root.shape[0] - 1)
 
 
+@wp.func
+def root_of(clip: Clip, body: Body, e: int, frame: int):
+    """The clip's root for the body of an environment: legs of another length scale its path, so that all stand."""
+    height = body.rest_joint[row(e, body.rest_joint.shape[0]), 0][2]
+    return (height / clip.pelvis_height) * clip.root[frame]
+
+
 @wp.kernel
 def draw_start(
     mask: wp.array(dtype=wp.bool),
     seed: wp.array(dtype=int),
     episode: wp.array(dtype=int),
     clip: Clip,
+    body: Body,
     # out
     start: wp.array(dtype=int),
     origin: wp.array(dtype=wp.vec3),
@@ -50,7 +61,7 @@ def draw_start(
     command_rotation[e, b] = clip.rotation[first, b]
     if b == 0:
         start[e] = first
-        at = clip.root[first]
+        at = root_of(clip, body, e, first)
         origin[e] = wp.vec3(at[0], at[1], 0.0)
         command_root[e] = wp.vec3(0.0, 0.0, at[2])
 
@@ -58,6 +69,7 @@ def draw_start(
 @wp.kernel
 def advance_reference(
     clip: Clip,
+    body: Body,
     action_map: ActionMap,
     start: wp.array(dtype=int),
     step_count: wp.array(dtype=int),
@@ -83,12 +95,14 @@ def advance_reference(
     reference_rotation[e, b] = q
     if b == 0:
         turn = turn_about_z(command_rotation[e, 0] * wp.quat_inverse(clip.rotation[now, 0]))
-        reference_root[e] = command_root[e] + wp.quat_rotate(turn, clip.root[after] - clip.root[now])
+        way = root_of(clip, body, e, after) - root_of(clip, body, e, now)
+        reference_root[e] = command_root[e] + wp.quat_rotate(turn, way)
 
 
 @wp.kernel
 def read_clip(
     clip: Clip,
+    body: Body,
     start: wp.array(dtype=int),
     origin: wp.array(dtype=wp.vec3),
     step_count: wp.array(dtype=int),
@@ -101,4 +115,4 @@ def read_clip(
     frame = frame_of(clip, start[e], step_count[e] + 1)
     rotation[e, b] = clip.rotation[frame, b]
     if b == 0:
-        root[e] = clip.root[frame] - origin[e]
+        root[e] = root_of(clip, body, e, frame) - origin[e]

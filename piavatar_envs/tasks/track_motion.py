@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
+from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.motion import load_motion
 from piavatar_envs.avatar.posing import pose_body
 from piavatar_envs.avatar.rotation import quat_log
@@ -23,6 +24,10 @@ wp.set_module_options({"enable_backward": False})
 
 #: Bones that impulses strike: heavy enough that a few N s push instead of tearing.
 STRUCK = ("pelvis", "spine2", "spine3", "head", "left_shoulder", "right_shoulder", "left_hip", "right_hip", "left_knee")
+
+
+#: Legs of the longest-legged random body, over those of the mean one.
+LONGEST_LEGS = 1.3
 
 
 class TrackMotionConfig(EnvConfig):
@@ -117,7 +122,10 @@ class TrackMotionTask(Task):
     def __init__(self, config: TrackMotionConfig) -> None:
         super().__init__(config)
         dt = config.physics.control_dt
-        motion = load_motion(config.motion)
+        asset = load_body()
+        body = asset.shape(asset.parameters(**config.shape.parameters))
+        self.pelvis_height = float(body.joints[0, 2])
+        motion = load_motion(config.motion, asset, body)
         steps = max(1, round(config.episode_seconds / dt))
         period = max(1, round(motion.duration / dt))
         self.starts = period if config.random_start and motion.loop else 1
@@ -130,11 +138,11 @@ class TrackMotionTask(Task):
         )
 
     def domain(self) -> Domain:
-        """The default box, moved along the clip."""
+        """The default box, moved along the clip; random bodies may take longer steps than the one it was loaded for."""
         ways = [
             self.roots[s : s + len(self.roots) - self.starts + 1, :2] - self.roots[s, :2] for s in range(self.starts)
         ]
-        way = np.concatenate(ways)
+        way = np.concatenate(ways) * (LONGEST_LEGS if self.config.shape.randomize else 1.0)
         box = Domain()
         lower = (*(np.asarray(box.lower[:2]) + way.min(0)).tolist(), box.lower[2])
         upper = (*(np.asarray(box.upper[:2]) + way.max(0)).tolist(), max(box.upper[2], self.roots[:, 2].max() + 1.3))
@@ -150,6 +158,7 @@ class TrackMotionTask(Task):
         xyzw = np.ascontiguousarray(self.rotations[..., [1, 2, 3, 0]], np.float32)
         clip.rotation = wp.array(xyzw, dtype=wp.quat, device=device)
         clip.root = wp.array(self.roots.astype(np.float32), dtype=wp.vec3, device=device)
+        clip.pelvis_height = self.pelvis_height
         clip.starts, clip.success, clip.fail = self.starts, self.config.success_distance, self.config.fail_distance
         clip.control_cost = self.config.control_cost
         self.clip = clip
@@ -169,7 +178,7 @@ class TrackMotionTask(Task):
         program.launch(
             draw_start,
             (env.num_envs, NUM_JOINTS),
-            [env.mask, env.seed, env.episode, self.clip],
+            [env.mask, env.seed, env.episode, self.clip, env.simulation.avatar.body],
             [self.start, self.origin, drive.command_rotation, drive.command_root],
         )
 
@@ -178,9 +187,12 @@ class TrackMotionTask(Task):
         program.launch(
             advance_reference,
             (env.num_envs, NUM_JOINTS),
-            [self.clip, env.action_map, self.start, env.step_count, drive.command_rotation, drive.command_root],
+            [
+                self.clip, env.simulation.avatar.body, env.action_map, self.start, env.step_count,
+                drive.command_rotation, drive.command_root,
+            ],
             [self.reference_rotation, self.reference_root],
-        )
+        )  # fmt: skip
         interval = max(1, round(config.impulse_interval / config.physics.control_dt))
         program.launch(
             draw_impulse,
@@ -203,7 +215,7 @@ class TrackMotionTask(Task):
         program.launch(
             read_clip,
             (n, NUM_JOINTS),
-            [self.clip, self.start, self.origin, env.step_count],
+            [self.clip, env.simulation.avatar.body, self.start, self.origin, env.step_count],
             [self.clip_rotation, self.clip_root],
         )
         body = env.simulation.avatar.body

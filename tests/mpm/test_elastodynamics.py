@@ -107,9 +107,9 @@ def cantilever_error(simulate, cells):
 
 def test_cantilever_bends_as_timoshenko_says(simulate):
     coarse, fine = cantilever_error(simulate, 2), cantilever_error(simulate, 4)
-    assert abs(coarse) < 0.2
-    assert abs(fine) < 0.1
-    assert abs(fine) < 0.6 * abs(coarse)
+    assert abs(coarse) < 0.05
+    assert abs(fine) < 0.01
+    assert abs(fine) < 0.4 * abs(coarse)
 
 
 def energy_history(simulate, courant, poisson_ratio, steps=12):

@@ -73,6 +73,18 @@ def test_a_deepmimic_clip_walks_on(make_env):
     assert walked == pytest.approx(np.linalg.norm(clip_frame(env, 0)[2][0, :2]), abs=0.02) and walked > 1.5
 
 
+@pytest.mark.parametrize("settings", [{"shape.parameters": {"legs": -0.9, "height": -0.5}}, {"shape.randomize": True}])
+def test_every_body_stands_on_the_ground_and_follows(make_env, settings):
+    """Short legs take short steps: nobody starts in the air or in the floor."""
+    env = make_env(TRACK, motion="step", impulse=0.0, random_start=False, **settings)
+    for seed in range(4):
+        env.reset(seed=seed)
+        lowest = env.batch.simulation.state.x.numpy()[0, :, 2].min()
+        assert 0.0 <= lowest < 0.5 * env.batch.simulation.dx, f"seed {seed}: {lowest} m"
+        infos = [env.step(np.zeros(env.action_space.shape))[4] for _ in range(30)]
+        assert np.mean([info["mpjpe"] for info in infos]) < 0.015
+
+
 def write_amass(path, frames: int = 121, rate: float = 60.0) -> float:
     """An AMASS file of an elbow that swings up by ``0.5 (1 - cos)`` rad within two seconds; returns its amplitude."""
     poses, angle = np.zeros((frames, 156)), 0.5 * (1.0 - np.cos(np.linspace(0.0, 2.0 * np.pi, frames)))

@@ -29,6 +29,7 @@ def kirchhoff_stress(F: wp.mat33, mu: float, lam: float):
     """Kirchhoff stress ``tau = (d psi / d F) F^T`` [Pa]."""
     J = wp.determinant(F)
     Jc = wp.max(J, _J_MIN)
-    log_j = wp.log(Jc) + (J - Jc) / Jc
-    pressure = (lam * log_j - mu) * J / Jc
+    ratio = J / Jc  # one where the logarithm holds
+    log_j = wp.log(Jc) + ratio - 1.0
+    pressure = (lam * log_j - mu) * ratio
     return mu * (F * wp.transpose(F)) + wp.diag(wp.vec3(pressure))
