@@ -75,6 +75,8 @@ def root_wrench(
     a = clamp_length(a, drive.max_force)
     torque = I * critical_pull(drive.root_rate, drive.dt, quat_log(q_command * wp.quat_inverse(q)), whole.spin[e])
     torque = clamp_length(torque, drive.max_torque * m)
+    if not (wp.isfinite(a) and wp.isfinite(torque)):
+        return  # the body has blown up; the substep will say so
     wrench_linear[e] = a
     wrench_angular[e] = wp.inverse(I) * torque
     share = 1.0 / float(drive.num_substeps)

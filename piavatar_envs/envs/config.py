@@ -110,7 +110,7 @@ class DriveConfig(BaseModel):
         0.0,
         ge=0.0,
         lt=1.0,
-        description="share of commanded motion that the softest flesh leaves out, so that it jiggles",
+        description="share of commanded motion that the softest flesh leaves out, so that it jiggles [-]",
     )
     joint_speed_limit: float = Field(
         4.0, gt=0.0, le=50.0, description="fastest rotation an action of 1 commands about a joint's axis [rad/s]"

@@ -79,13 +79,14 @@ def test_the_bodys_fit_is_direct_least_squares(noisy):
     np.testing.assert_allclose(c, noisy.mass @ x / noisy.mass.sum(), atol=1e-6)
 
 
-def test_a_rigid_velocity_is_recovered_exactly(noisy):
+def test_a_rigid_velocity_is_recovered_exactly(noisy, device):
     velocity, spin = np.array([1.0, -2.0, 0.5]), np.array([0.5, 3.0, -1.0])
     noisy.set_rigid_velocity(velocity, spin)
     (c, V, W), body = run_fit(noisy)
     np.testing.assert_allclose(body[2], spin, atol=1e-5)
     np.testing.assert_allclose(body[1], velocity, atol=1e-5)
-    np.testing.assert_allclose(W, np.broadcast_to(spin, W.shape), atol=1e-4)
+    # a GPU contracts products and sums: thin bones lose another digit
+    np.testing.assert_allclose(W, np.broadcast_to(spin, W.shape), atol=1e-4 if device == "cpu" else 5e-4)
     np.testing.assert_allclose(V, velocity + np.cross(spin, c - body[0]), atol=1e-5)
 
 
@@ -94,7 +95,7 @@ def test_a_rigid_velocity_is_recovered_exactly(noisy):
 
 @pytest.mark.parametrize("tone", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("alpha", [0.0, 0.3])
-def test_a_blow_keeps_its_momentum_and_only_loses_energy(make_rig, tone, alpha):
+def test_a_blow_keeps_its_momentum_and_only_loses_energy(make_rig, tone, alpha, device):
     rig = make_rig(root="free", tone=tone, alpha=alpha)
     rig.strike((5.0, 20.0, -3.0), at=(0.1, -0.1, 1.3))
     about, before = rig.rigid_motion()[0], rig.totals()
@@ -105,9 +106,10 @@ def test_a_blow_keeps_its_momentum_and_only_loses_energy(make_rig, tone, alpha):
         energy.append(rig.energy())
     after, center = rig.totals(), rig.rigid_motion()[0]
     assert scale > 20.0 and energy[-1] < 0.5 * energy[0]
-    np.testing.assert_allclose(after.momentum, before.momentum, atol=1e-6 * scale)
+    tolerance = 1e-6 if device == "cpu" else 4e-6  # atomic sums in any order
+    np.testing.assert_allclose(after.momentum, before.momentum, atol=tolerance * scale)
     # scale [kg m/s] times the half height [m]
-    np.testing.assert_allclose(rig.totals(about=center).angular_momentum, turn, atol=1e-6 * scale * 0.85)
+    np.testing.assert_allclose(rig.totals(about=center).angular_momentum, turn, atol=tolerance * scale * 0.85)
     assert np.diff(energy).max() < 1e-5 * energy[0]
 
 
