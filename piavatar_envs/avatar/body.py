@@ -27,7 +27,7 @@ class BodyPoints:
         skin_joints: bones that move a point, shape ``(num_points, 4)`` int.
         skin_weights: their weights, descending, rows sum to one, shape ``(num_points, 4)``.
         bone: joint that a point tracks, -1 for flesh, shape ``(num_points,)``.
-        follow: share of the kinematic velocity a point takes, shape ``(rows, num_points)``.
+        inert: share of a change of commanded motion that a point misses (it jiggles), shape ``(rows, num_points)``.
     """
 
     rest: np.ndarray
@@ -36,7 +36,7 @@ class BodyPoints:
     skin_joints: np.ndarray
     skin_weights: np.ndarray
     bone: np.ndarray
-    follow: np.ndarray
+    inert: np.ndarray
 
     @property
     def num_points(self) -> int:
@@ -107,7 +107,7 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.rest = upload(points.rest, wp.vec3)
     body.joint = upload(points.skin_joints, wp.vec4i)
     body.weight = upload(weight, wp.vec4)
-    body.follow = upload(points.follow, float)
+    body.inert = upload(points.inert, float)
     body.rest_joint = upload(points.joints, wp.vec3)
     body.rest_center = upload(center, wp.vec3)
     body.bone_mass = upload(bone_mass, float)

@@ -52,6 +52,7 @@ class AvatarDrive:
         special = {
             "let_go": (n, int),
             "local": (bones, wp.quat),
+            "motion": ((n, self.num_points), wp.vec3),
             "command_root": (n, wp.vec3),
             "goal_root": (n, wp.vec3),
             "root_increment": (n, wp.vec3),
@@ -109,7 +110,7 @@ class AvatarDrive:
             place_particles,
             (n, self.num_points),
             [mask, self.body, s.bone_from],
-            [state.x, state.u, state.C, state.F, state.vk, state.failure],
+            [state.x, state.u, state.C, state.F, state.vk, d.motion, state.failure],
         )
 
     def record_control_step(self, program: Program, state: State, scratch: Scratch) -> None:

@@ -31,10 +31,13 @@ def drive_particles(
     body: Body,
     drive: Drive,
     x: wp.array2d(dtype=wp.vec3),
-    u: wp.array2d(dtype=wp.vec3),
     matrices: BoneMatrices,
     bones: RigidFits,
+    let_go: wp.array(dtype=int),
     failure: wp.array(dtype=int),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    motion: wp.array2d(dtype=wp.vec3),
     # out
     vk: wp.array2d(dtype=wp.vec3),
     pull: wp.array2d(dtype=wp.vec3),
@@ -43,7 +46,7 @@ def drive_particles(
     """Kinematic velocity of a particle, its shape pull [m/s] and its way to the commanded pose [m].
 
     ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
-    that contact has caused along with the bone.
+    that contact has caused along with the bone. Inert flesh misses its share of every change of that velocity.
     """
     e, p = wp.tid()
     if failure[e] != 0:
@@ -72,9 +75,14 @@ def drive_particles(
     k = apply_point(step, rest) + (turn * displacement - displacement) / drive.dt
     # the paper's shape preservation is part of the prescribed velocity
     k -= drive.kinematic_shape_rate * displacement
-    vk[e, body.first + p] = body.follow[row(e, body.follow.shape[0]), p] * k
+    vk[e, body.first + p] = k
+    change = k - motion[e, p]
+    motion[e, p] = k
     relative = u[e, body.first + p] - carried
     pull[e, p] = implicit_velocity(drive.shape_rate, drive.dt, -displacement, relative) - relative
+    if drive.free_motion == 0 and let_go[e] == 0:
+        # a body that nothing supports could not take the reaction
+        u[e, body.first + p] = u[e, body.first + p] - body.inert[row(e, body.inert.shape[0]), p] * change
     lean[e, p] = apply_point(toward, rest)
 
 

@@ -41,6 +41,6 @@ def inject_velocity(
             step += weight[n] * bone_step[e, joint[n]]
     rest = body.rest[row(e, body.rest.shape[0]), p]
     k = apply_point(step, rest) - kinematic_shape_rate * (x[e, body.first + p] - apply_point(A, rest))
-    k = body.follow[row(e, body.follow.shape[0]), p] * k
-    u[e, body.first + p] = u[e, body.first + p] + k - vk[e, body.first + p]
+    share = 1.0 - body.inert[row(e, body.inert.shape[0]), p]
+    u[e, body.first + p] = u[e, body.first + p] + share * (k - vk[e, body.first + p])
     vk[e, body.first + p] = k

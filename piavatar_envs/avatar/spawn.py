@@ -46,6 +46,7 @@ def place_particles(
     C: wp.array2d(dtype=wp.mat33),
     F: wp.array2d(dtype=wp.mat33),
     vk: wp.array2d(dtype=wp.vec3),
+    motion: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
 ):
     """Particles of the masked environments to their places in the pose ``bone_from``; the failure is forgiven."""
@@ -62,6 +63,7 @@ def place_particles(
     x[e, q] = apply_point(A, body.rest[row(e, body.rest.shape[0]), p])
     u[e, q] = wp.vec3(0.0)
     vk[e, q] = wp.vec3(0.0)
+    motion[e, p] = wp.vec3(0.0)
     C[e, q] = wp.mat33()
     F[e, q] = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     failure[e] = 0

@@ -152,8 +152,8 @@ def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
     program.launch(
         flesh.drive_particles,
         points,
-        [drive.body, drive.drive, state.x, state.u, g.matrices, g.bones, state.failure],
-        [state.vk, s.pull, s.lean],
+        [drive.body, drive.drive, state.x, g.matrices, g.bones, drive.state.let_go, state.failure],
+        [state.u, drive.state.motion, state.vk, s.pull, s.lean],
     )
     if drive.drive.free_motion or drive.drive.root_rate > 0.0:  # a root that lets go leaves a free body
         _record_free_motion(drive, program, state)

@@ -31,7 +31,7 @@ class Body:
     rest: wp.array2d(dtype=wp.vec3)  # (rows, count) rest positions [m]
     joint: wp.array(dtype=wp.vec4i)  # (count,) bones that move a particle
     weight: wp.array(dtype=wp.vec4)  # (count,) skinning weights, descending, sum one
-    follow: wp.array2d(dtype=float)  # (rows, count) share of the kinematic velocity a particle takes; < 1 jiggles
+    inert: wp.array2d(dtype=float)  # (rows, count) share of a change of commanded motion that a particle misses
     rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
     bone_mass: wp.array2d(dtype=float)  # (rows, bones) skinning-weighted mass [kg]
@@ -153,6 +153,7 @@ class DriveState:
     goal_rotation: wp.array  # (num_envs, bones) local rotations to reach at the end of this control step
     goal_root: wp.array  # (num_envs,) pelvis position to reach [m]
     let_go: wp.array  # (num_envs,) int: 1 once the root wrench has let go
+    motion: wp.array  # (num_envs, count) kinematic velocity of the last substep, before any rigid part came off
     wrench_force: wp.array  # (num_envs,) mean root force of the last control step [N]
     wrench_torque: wp.array  # (num_envs,) mean root torque of the last control step [N m]
 

@@ -79,6 +79,11 @@ class PhysicsConfig(BaseModel):
         "neo_hookean", description="elastic energy of the flesh"
     )
     young_modulus: float = Field(1.0e5, gt=0.0, description="Young's modulus of the flesh [Pa]")
+    soft_young_modulus: float | None = Field(
+        None,
+        gt=0.0,
+        description="Young's modulus of the softest flesh of trunk and thighs; null as the rest [Pa]",
+    )
     poisson_ratio: float = Field(0.3, ge=0.0, lt=0.5, description="Poisson's ratio of the flesh [-]")
     density: float = Field(1000.0, gt=0.0, description="density of the flesh [kg/m^3]")
     decoupling: Literal["split", "paper", "none", "no_stress"] = Field(
@@ -107,10 +112,7 @@ class DriveConfig(BaseModel):
         description="physical (a momentum-keeping pull of the flesh) or kinematic (the paper's term in the velocity)",
     )
     soft_tissue: float = Field(
-        0.0,
-        ge=0.0,
-        lt=1.0,
-        description="share of commanded motion that the softest flesh leaves out, so that it jiggles [-]",
+        0.0, ge=0.0, le=1.0, description="share of a change of commanded motion that the softest flesh misses [-]"
     )
     joint_speed_limit: float = Field(
         4.0, gt=0.0, le=50.0, description="fastest rotation an action of 1 commands about a joint's axis [rad/s]"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import warp as wp
@@ -13,7 +13,7 @@ from piavatar_envs.avatar.body import BodyPoints, bone_masses
 from piavatar_envs.avatar.drive import AvatarDrive, clear_vectors
 from piavatar_envs.avatar.sampling import ParticleSet, morph, sample_particles, spacing_for
 from piavatar_envs.avatar.settings import DriveSettings
-from piavatar_envs.avatar.soft_tissue import follow_share, softness
+from piavatar_envs.avatar.soft_tissue import inert_share, softness
 from piavatar_envs.envs.config import EnvConfig
 from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
 from piavatar_envs.mpm.program import Program
@@ -95,6 +95,10 @@ class Simulation:
         matter = MaterialPoints.uniform(
             volume, physics.density, physics.young_modulus, physics.poisson_ratio, physics.material
         )
+        if physics.soft_young_modulus is not None:
+            # geometric between the two: stiffness varies over decades
+            ratio = (physics.soft_young_modulus / physics.young_modulus) ** self._softness(points.rest[0])[None]
+            matter = replace(matter, young_modulus=(matter.young_modulus * ratio).astype(np.float32))
         domain = domain or Domain()
         self.model = build_model(
             matter,
@@ -121,7 +125,6 @@ class Simulation:
         shaped = self.asset.shape(parameters)
         rest, volume = morph(self.asset, self.particles, shaped)
         sampled = self.particles
-        soft = softness(rest, sampled.bone, sampled.skin_joints, sampled.skin_weights)
         points = BodyPoints(
             rest=rest[None],
             mass=(self.config.physics.density * volume[None]).astype(np.float32),
@@ -129,9 +132,14 @@ class Simulation:
             skin_joints=sampled.skin_joints,
             skin_weights=sampled.skin_weights,
             bone=sampled.bone,
-            follow=follow_share(self.config.drive.soft_tissue, soft)[None],
+            inert=inert_share(self.config.drive.soft_tissue, self._softness(rest))[None],
         )
         return points, volume[None]
+
+    def _softness(self, rest: np.ndarray) -> np.ndarray:
+        """How soft the flesh is at every particle, in [0, 1]."""
+        sampled = self.particles
+        return softness(rest, sampled.bone, sampled.skin_joints, sampled.skin_weights)
 
     def set_shape(self, env: int, parameters: np.ndarray) -> None:
         """Give environment ``env`` another body; takes effect when it is placed again.
@@ -148,7 +156,7 @@ class Simulation:
             (body.rest, points.rest),
             (body.rest_joint, points.joints),
             (body.rest_center, center),
-            (body.follow, points.follow),
+            (body.inert, points.inert),
             (body.bone_mass, mass),
             (particles.mass, points.mass),
             (particles.volume, volume),
@@ -192,7 +200,7 @@ class Simulation:
         if self.config.shape.randomize:
             body, particles = self.avatar.body, self.model.particles
             found |= {
-                f"body.{n}": getattr(body, n) for n in ("rest", "rest_joint", "rest_center", "bone_mass", "follow")
+                f"body.{n}": getattr(body, n) for n in ("rest", "rest_joint", "rest_center", "bone_mass", "inert")
             }
             found |= {f"matter.{n}": getattr(particles, n) for n in ("mass", "volume")}
             found["body.body_mass"] = self.avatar.body_mass
@@ -214,5 +222,5 @@ def check_device(device: str) -> str:
 
 def _repeat(points: BodyPoints, rows: int) -> BodyPoints:
     """The same points with a writable row for each environment."""
-    repeated = {name: np.repeat(getattr(points, name), rows, 0) for name in ("rest", "mass", "joints", "follow")}
+    repeated = {name: np.repeat(getattr(points, name), rows, 0) for name in ("rest", "mass", "joints", "inert")}
     return BodyPoints(**repeated, skin_joints=points.skin_joints, skin_weights=points.skin_weights, bone=points.bone)

@@ -261,9 +261,9 @@ def build_rig(
         planes=[((0.0, 0.0, 1.0), 0.0, 0.8)] if floor else (),
     )
     state, scratch = allocate(model)
-    follow = np.ones((1, volume.shape[1]), np.float32)
+    inert = np.zeros((1, volume.shape[1]), np.float32)
     mass = volume * np.float32(DENSITY)
-    points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, follow)
+    points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, inert)
     drive = AvatarDrive(points, 0, model, DriveSettings(**settings))
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)
     reset_program, step_program = Program(device), Program(device)

@@ -142,15 +142,16 @@ def test_the_papers_decoupling_is_worse_but_no_decoupling_is_worst(make_rig, wil
     assert means["split"] < 1e-4 < 1e-3 < means["paper"] < 0.8 * means["none"]
 
 
-def test_particles_may_follow_only_a_share_of_the_motion(make_rig):
-    """``follow`` < 1: that share of the kinematic velocity; the rest is left to elasticity (tissue that jiggles)."""
-    rig = make_rig(num_substeps=15)
-    rig.drive.body.follow.fill_(0.5)
-    pose = np.zeros((22, 3))
-    pose[joint_index("left_shoulder"), 0] = 0.2
-    rig.command(pose)
+@pytest.mark.parametrize("inert", [0.0, 0.4, 1.0])
+def test_inert_flesh_misses_its_share_of_commanded_momentum(make_rig, inert):
+    """A root commanded to move at v gives the body the momentum ``(1 - inert) M v``; inert flesh stays behind."""
+    rig = make_rig(root="free", tone=0.0, alpha=0.0)
+    rig.drive.body.inert.fill_(inert)
+    velocity = np.array([0.3, -0.2, 0.0])
+    rig.command(root=rig.points.joints[0, 0] + velocity * rig.model.control_dt)
     rig.step()
-    assert 0.02 < rig.joint_errors()[joint_index("left_shoulder") - 1] < 0.18
+    expected = (1.0 - inert) * rig.mass.sum() * velocity
+    np.testing.assert_allclose(rig.totals().momentum, expected, atol=1e-4 * rig.mass.sum())
 
 
 # ---- free flight
