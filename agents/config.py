@@ -1,0 +1,78 @@
+"""Configuration of a training run: which environment, which algorithm, how long, from which seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, Field
+
+from agents.ppo import PPOSettings
+from piavatar_envs.envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
+from piavatar_envs.tasks import load_task
+
+
+class EvaluationSettings(BaseModel):
+    """How agents are compared: every agent plays the same episodes, which no agent was trained on."""
+
+    model_config = FROZEN
+
+    episodes: int = Field(20, ge=2, description="episodes an agent plays")
+    first_seed: int = Field(
+        1_000_000, ge=0, lt=2**30, description="seed of the first episode; each episode has its own, counted upwards"
+    )
+
+
+class TrainingConfig(BaseModel):
+    """Everything that a training run depends on."""
+
+    model_config = FROZEN
+
+    env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
+    env: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
+        default_factory=dict, description="settings of the environment that differ from its defaults"
+    )
+    observe: tuple[str, ...] | None = Field(
+        None, description="terms of the observation that the networks see; null for all of it"
+    )
+    total_steps: int = Field(100_000, ge=1, description="control steps to train for, over all workers")
+    num_workers: int = Field(4, ge=1, le=256, description="environments, each in a process of its own")
+    seed: int = Field(0, ge=0, lt=1000, description="of the networks, the actions and the training episodes")
+    checkpoint_every: int = Field(50_000, ge=1, description="control steps between two checkpoints")
+    ppo: PPOSettings = Field(default_factory=PPOSettings, description="the algorithm")
+    evaluation: EvaluationSettings = Field(default_factory=EvaluationSettings, description="how agents are compared")
+
+
+def load_training(
+    source: Mapping[str, Any] | str | Path | None = None, overrides: Mapping[str, Any] | None = None
+) -> TrainingConfig:
+    """A resolved configuration: what ``env`` left to the task's defaults is filled in.
+
+    Args:
+        source: a YAML file or a mapping.
+        overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
+
+    Raises:
+        ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment.
+    """
+    overrides = dict(overrides or {})
+    for_env = {key[len("env.") :]: overrides.pop(key) for key in list(overrides) if key.startswith("env.")}
+    config = load_config(TrainingConfig, source, overrides)
+    try:
+        env = load_config(load_task(config.env_id).Config, config.env, for_env)
+    except ValueError as error:
+        raise ConfigError(f"env: {error}" if isinstance(error, ConfigError) else f"env_id: {error}") from None
+    if env.obs_mode != "flat":
+        raise ConfigError(f"env: obs_mode={env.obs_mode!r} must be 'flat' to train; choose terms with observe")
+    batch, rollout = config.ppo.batch_size, config.num_workers * config.ppo.rollout_steps
+    if batch > rollout:
+        raise ConfigError(
+            f"ppo.batch_size={batch} must be <= {rollout}, the steps of a rollout (num_workers * ppo.rollout_steps)"
+        )
+    return config.model_copy(update={"env": FrozenDict(env.model_dump(mode="json"))})
+
+
+def env_config(config: TrainingConfig) -> EnvConfig:
+    """The environment's part of a resolved configuration."""
+    return load_config(load_task(config.env_id).Config, config.env)

@@ -1,0 +1,96 @@
+"""Proximal Policy Optimization (Schulman et al., 2017) by stable-baselines3: settings and construction.
+
+Observations are not normalised by running statistics: they are metres, radians and metres a second of order one
+already, while some (the height of a root that is held up) hardly vary, and dividing by their spread makes them noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import gymnasium as gym
+import torch
+from pydantic import BaseModel, Field
+from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecEnv
+
+from piavatar_envs.envs.config import FROZEN
+
+_EPISODE_SEEDS = 1000  # seeds of training episodes that belong to a run's seed
+
+
+class PPOSettings(BaseModel):
+    """Hyper-parameters of PPO."""
+
+    model_config = FROZEN
+
+    rollout_steps: int = Field(512, ge=2, description="steps a worker plays between two updates")
+    batch_size: int = Field(128, ge=2, description="steps in a minibatch")
+    epochs: int = Field(10, ge=1, description="passes over a rollout")
+    learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's learning rate [-]")
+    discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
+    gae_lambda: float = Field(0.8, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
+    clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
+    entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
+    log_std: float = Field(-0.5, ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")
+    hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of both networks")
+
+
+class SelectTerms(BaseFeaturesExtractor):
+    """Shows the networks some components of the observation, so that the policy takes the environment's as it is."""
+
+    def __init__(self, observation_space: gym.Space, components: Sequence[int]) -> None:
+        super().__init__(observation_space, len(components))
+        self.register_buffer("components", torch.as_tensor(list(components), dtype=torch.long))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Shape ``(n, observation_size)`` to ``(n, len(components))``."""
+        return observations[:, self.components]
+
+
+def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: int) -> PPO:
+    """An untrained agent on the CPU.
+
+    Args:
+        settings: hyper-parameters.
+        venv: environments to train in.
+        components: of the flat observation, those that the networks see.
+        seed: of the networks and of the actions.
+    """
+    model = PPO(
+        "MlpPolicy",
+        venv,
+        n_steps=settings.rollout_steps,
+        batch_size=settings.batch_size,
+        n_epochs=settings.epochs,
+        learning_rate=settings.learning_rate,
+        gamma=settings.discount,
+        gae_lambda=settings.gae_lambda,
+        clip_range=settings.clip_range,
+        ent_coef=settings.entropy_weight,
+        policy_kwargs={
+            "net_arch": list(settings.hidden),
+            "activation_fn": torch.nn.Tanh,
+            "log_std_init": settings.log_std,
+            "features_extractor_class": SelectTerms,
+            "features_extractor_kwargs": {"components": list(components)},
+        },
+        seed=seed,
+        device="cpu",
+    )
+    venv.seed(_EPISODE_SEEDS * seed)  # worker i plays the episodes of this seed plus i: no two runs share any
+    return model
+
+
+def resume(path: str | Path, venv: VecEnv) -> PPO:
+    """A saved agent with its optimizer's state, to be trained on.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it was trained with another observation or action space.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no checkpoint {path}; give the .zip that a run has left")
+    return PPO.load(path, env=venv, device="cpu")

@@ -1,0 +1,84 @@
+"""What a training leaves for people: table, learning curve, JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from agents.evaluate import Evaluation
+from benchmarks.runner import Estimate, describe_run, plain, write_json
+
+_COLORS = ("tab:blue", "tab:green", "tab:purple", "tab:orange")
+_SMOOTH = 20  # episodes in the moving mean of a learning curve
+
+
+def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
+    """Print the agents beside each other."""
+    count = len(evaluations[0].episodes)
+    table = Table(title=f"{count} fresh episodes each, the same for all", title_justify="left", caption_justify="left")
+    table.caption = "once, at end, of time: target reached in the episode, in its last step, share of all steps"
+    table.add_column("agent", no_wrap=True)
+    for column in ("return", "95 % interval", "once", "at end", "of time", "distance"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for evaluation in evaluations:
+        row = evaluation.row()
+        low, high = row["return_interval"]
+        distance = row["mean_distance_m"]
+        table.add_row(
+            row["case"],
+            f"{row['return_mean']:.1f}",
+            f"{low:.1f} to {high:.1f}",
+            f"{row['success_once']:.0%}",
+            f"{row['success_at_end']:.0%}",
+            f"{row['success_share_of_steps']:.0%}",
+            "" if distance is None else f"{distance:.2f} m",
+        )
+    console.print(table)
+
+
+def draw_curve(
+    path: Path, steps: Sequence[int], returns: Sequence[float], references: Mapping[str, Estimate], title: str
+) -> None:
+    """Draw the learning curve.
+
+    Args:
+        path: the PNG to write.
+        steps: control steps at the ends of the training episodes.
+        returns: their returns.
+        references: returns of other agents, drawn as bands.
+        title: of the picture.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(steps, returns, ".", color="0.75", markersize=4, label="training episode")
+    window = min(_SMOOTH, len(returns))
+    if window > 1:
+        mean = np.convolve(returns, np.full(window, 1.0 / window), mode="valid")
+        axes.plot(steps[window - 1 :], mean, color="tab:red", label=f"mean of {window}")
+    for index, (name, estimate) in enumerate(references.items()):
+        color = _COLORS[index % len(_COLORS)]
+        axes.axhline(estimate.mean, color=color, linewidth=1.2, label=name)
+        axes.axhspan(estimate.low, estimate.high, color=color, alpha=0.12, linewidth=0)
+    axes.set(xlabel="control steps", ylabel="return of an episode", title=title)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+def versions(name: str, device: str) -> dict[str, Any]:
+    """Commit, versions, device and date, as in every benchmark's JSON."""
+    return describe_run(name, device)
+
+
+def write_results(
+    path: Path, run: Mapping[str, Any], evaluations: Sequence[Evaluation], extra: Mapping[str, Any]
+) -> None:
+    """Write the evaluations as JSON, in the schema of the benchmarks."""
+    rows = [evaluation.row() for evaluation in evaluations]
+    write_json(path, plain({**run, **extra, "results": rows}, "results"))

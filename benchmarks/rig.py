@@ -1,0 +1,233 @@
+"""A batch of avatars without a task: posed, driven, struck and measured. What the physics benchmarks stand on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.drive import AvatarDrive
+from piavatar_envs.avatar.sampling import morph, sample_particles, spacing_for
+from piavatar_envs.avatar.settings import DriveSettings
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
+from piavatar_envs.envs.simulation import GRID_PER_HEIGHT
+from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.tasks.disturb import apply_impulse
+
+DENSITY = 1000.0
+LOWER, UPPER = (-1.6, -1.6, -0.7), (1.6, 1.6, 2.6)  # room enough for bodies that come apart
+
+
+@dataclass(frozen=True)
+class World:
+    """Everything about a batch but its bodies and its drive.
+
+    Attributes:
+        fidelity: resolution, as in the environments.
+        decoupling: one of the four variants of :mod:`piavatar_envs.mpm.decouple`.
+        num_substeps: a control step; None chooses them from the CFL limit.
+        gravity: along -z [m/s^2].
+        ground: a floor at z = 0.
+        bone_rings: rings of five bone particles along every bone.
+        device: Warp device.
+    """
+
+    fidelity: str = "coarse"
+    decoupling: str = "split"
+    num_substeps: int | None = 100
+    gravity: float = 0.0
+    ground: bool = False
+    bone_rings: int = 4
+    device: str = "cpu"
+
+
+class Rig:
+    """``num_envs`` bodies of given shapes, at rest in the rest pose.
+
+    Attributes:
+        points: the particles (NumPy), a row a body.
+        flesh: particles that track no bone, shape ``(P,)`` bool.
+    """
+
+    def __init__(self, world: World, drive: DriveSettings, shapes: np.ndarray) -> None:
+        """Build a body for each row of ``shapes`` (shape parameters, ``(num_envs, S)``) and place them."""
+        self.world, self.num_envs = world, len(shapes)
+        asset = self.asset = load_body()
+        self.dx = float(np.ptp(asset.mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[world.fidelity]
+        particles = sample_particles(asset, spacing_for(self.dx), bone_rings=world.bone_rings)
+        self.shaped = [asset.shape(parameters) for parameters in shapes]
+        morphed = [_morphed(tuple(map(float, row)), spacing_for(self.dx), world.bone_rings) for row in shapes]
+        volume = np.array([volumes for _, volumes in morphed])
+        self.points = BodyPoints(
+            rest=np.array([rest for rest, _ in morphed]),
+            mass=(DENSITY * volume).astype(np.float32),
+            joints=np.array([shaped.joints for shaped in self.shaped]),
+            skin_joints=particles.skin_joints,
+            skin_weights=particles.skin_weights,
+            bone=particles.bone,
+            inert=np.zeros((1, len(particles)), np.float32),
+        )
+        self.flesh = particles.bone < 0
+        self.model = build_model(
+            MaterialPoints.uniform(volume, DENSITY),
+            make_grid(LOWER, UPPER, self.dx),
+            num_envs=self.num_envs,
+            device=world.device,
+            num_substeps=world.num_substeps,
+            gravity=(0.0, 0.0, -world.gravity),
+            decoupling=world.decoupling,
+            planes=[((0.0, 0.0, 1.0), 0.0, 0.8)] if world.ground else [],
+        )
+        self.state, self.scratch = allocate(self.model)
+        self.avatar = AvatarDrive(self.points, 0, self.model, drive)
+        self._record()
+        self.reset()
+
+    def _record(self) -> None:
+        n, device = self.num_envs, self.model.device
+        self._placed = wp.zeros(n, dtype=wp.bool, device=device)
+        self._impulse = wp.zeros(n, dtype=wp.vec3, device=device)
+        self._struck = wp.zeros(n, dtype=int, device=device)
+        self._reset, self._step, self._strike = Program(device), Program(device), Program(device)
+        self.avatar.record_reset(self._reset, self.state, self._placed)
+        self.avatar.record_tracking(self._reset, self.state)
+        self.avatar.record_control_step(self._step, self.state, self.scratch)
+        self.avatar.record_tracking(self._step, self.state)
+        self._strike.launch(
+            apply_impulse,
+            (n, self.points.num_points),
+            [self.avatar.body, self._impulse, self._struck, self.state.failure],
+            [self.state.u],
+        )
+        self._strike.launch(clear_impulse, n, [], [self._impulse])
+
+    def reset(
+        self, rotations: np.ndarray | None = None, shifts: np.ndarray | None = None, bodies: np.ndarray | None = None
+    ) -> None:
+        """Put ``bodies`` (all, or those of a mask) at rest and unstrained into a pose, by default the rest pose.
+
+        Rotation vectors ``(num_envs, 22, 3)`` [rad], root shifts ``(num_envs, 3)`` [m].
+        """
+        mask = np.ones(self.num_envs, bool) if bodies is None else bodies
+        rotations = np.zeros((self.num_envs, NUM_JOINTS, 3)) if rotations is None else rotations
+        shifts = np.zeros((self.num_envs, 3)) if shifts is None else shifts
+        drive = self.avatar.state
+        for array, pose in (
+            (drive.command_rotation, _quaternions(rotations)),
+            (drive.command_root, (self.points.joints[:, 0] + shifts).astype(np.float32)),
+        ):
+            value = array.numpy()
+            value[mask] = pose[mask]
+            array.assign(value)
+        self._placed.assign(mask)
+        self._reset.run()
+
+    def step(self, rotations: np.ndarray | None = None, shifts: np.ndarray | None = None) -> None:
+        """One control step towards a pose: rotation vectors ``(num_envs, 22, 3)`` [rad], root shifts ``(num_envs, 3)``.
+
+        Without a pose, towards the one before.
+        """
+        drive = self.avatar.state
+        if rotations is not None:
+            drive.goal_rotation.assign(_quaternions(rotations))
+            shifts = np.zeros((self.num_envs, 3)) if shifts is None else shifts
+            drive.goal_root.assign((self.points.joints[:, 0] + shifts).astype(np.float32))
+        self._step.run()
+
+    def strike(self, bone: Sequence[int] | np.ndarray, impulse: np.ndarray) -> None:
+        """Give a bone of every body an impulse ``(num_envs, 3)`` [N s], spread over its flesh."""
+        self._struck.assign(np.asarray(bone, np.int32))
+        self._impulse.assign(np.asarray(impulse, np.float32))
+        self._strike.run()
+
+    @property
+    def alive(self) -> np.ndarray:
+        """Bodies whose simulation has not failed, shape ``(num_envs,)`` bool."""
+        return self.state.failure.numpy() == 0
+
+    def distances(self) -> np.ndarray:
+        """Distance of every flesh particle to the skinned commanded pose [m], shape ``(num_envs, flesh)``."""
+        drive = self.avatar.state
+        local = Rotation.from_quat(drive.goal_rotation.numpy().reshape(-1, 4)).as_matrix()
+        local, root = local.reshape(self.num_envs, NUM_JOINTS, 3, 3), drive.goal_root.numpy()
+        return self._distances_to(local, root)
+
+    def shape_errors(self) -> np.ndarray:
+        """Distance of every flesh particle to the skinned *tracked* pose [m], shape ``(num_envs, flesh)``."""
+        tracked = self.avatar.tracked
+        local = Rotation.from_quat(tracked.local.numpy().reshape(-1, 4)).as_matrix()
+        return self._distances_to(local.reshape(self.num_envs, NUM_JOINTS, 3, 3), tracked.position.numpy()[:, 0])
+
+    def _distances_to(self, local: np.ndarray, root: np.ndarray) -> np.ndarray:
+        x, points = self.state.x.numpy(), self.points
+        found = np.empty((self.num_envs, int(self.flesh.sum())))
+        for env in range(self.num_envs):
+            rotations, positions = forward_kinematics(local[env], root[env], points.joints[env])
+            skinned = skin(
+                points.rest[env][self.flesh],
+                points.skin_joints[self.flesh],
+                points.skin_weights[self.flesh],
+                rotations,
+                positions,
+                points.joints[env],
+            )
+            found[env] = np.linalg.norm(x[env][self.flesh] - skinned, axis=1)
+        return found
+
+    def pose_errors(self) -> dict[str, np.ndarray]:
+        """Tracked against commanded pose, by Kabsch.
+
+        ``root_rotation`` [rad] and ``root_translation`` [m] of shape ``(num_envs,)``; ``relative_rotation`` [rad] and
+        ``relative_translation`` [m] of every joint in its parent's frame, shape ``(num_envs, 21)``.
+        """
+        tracked, drive, n = self.avatar.tracked, self.avatar.state, self.num_envs
+
+        def rotation(array: wp.array) -> Rotation:
+            return Rotation.from_quat(array.numpy().reshape(-1, 4).astype(float))
+
+        error = (rotation(tracked.local).inv() * rotation(drive.goal_rotation)).magnitude().reshape(n, NUM_JOINTS)
+        world = rotation(tracked.rotation).as_matrix().reshape(n, NUM_JOINTS, 3, 3)
+        position, parents = tracked.position.numpy().astype(float), np.asarray(PARENTS)[1:]
+        # where a joint sits in its parent's frame, against the fixed offset of the skeleton
+        offset = np.einsum("ebji,ebj->ebi", world[:, parents], position[:, 1:] - position[:, parents])
+        rest = self.points.joints[:, 1:] - self.points.joints[:, parents]
+        return {
+            "root_rotation": error[:, 0],
+            "root_translation": np.linalg.norm(position[:, 0] - drive.goal_root.numpy(), axis=1),
+            "relative_rotation": error[:, 1:],
+            "relative_translation": np.linalg.norm(offset - rest, axis=2),
+        }
+
+    def strain(self) -> np.ndarray:
+        """Mean distance of the deformation gradient to the nearest rotation, shape ``(num_envs,)``.
+
+        ``|F - R|`` rather than ``|F - I|``: a free body that is struck turns, and a turn is no strain.
+        """
+        F = self.state.F.numpy().astype(float)
+        squared = np.linalg.eigvalsh(np.swapaxes(F, 2, 3) @ F)
+        return np.linalg.norm(np.sqrt(np.maximum(squared, 0.0)) - 1.0, axis=2).mean(1)
+
+
+@lru_cache(maxsize=64)
+def _morphed(parameters: tuple[float, ...], spacing: float, bone_rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rest positions [m] and volumes [m^3] of the particles of a shape; the variants all use the same bodies."""
+    asset = load_body()
+    return morph(asset, sample_particles(asset, spacing, bone_rings=bone_rings), asset.shape(parameters))
+
+
+@wp.kernel
+def clear_impulse(impulse: wp.array(dtype=wp.vec3)):
+    """An impulse acts once."""
+    impulse[wp.tid()] = wp.vec3(0.0)
+
+
+def _quaternions(rotations: np.ndarray) -> np.ndarray:
+    """Warp's ``xyzw`` quaternions ``(..., 4)`` of rotation vectors ``(..., 3)``."""
+    return Rotation.from_rotvec(rotations.reshape(-1, 3)).as_quat().astype(np.float32).reshape(*rotations.shape[:-1], 4)

@@ -1,0 +1,132 @@
+"""Training end to end on the tiny body: files, resuming, deadlines, the demo."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import numpy as np
+import pytest
+from rich.console import Console
+from stable_baselines3 import PPO
+
+from agents import demo, train
+from agents.config import load_training
+from agents.evaluate import evaluate, policy_agent
+from agents.workers import factory, prepare, start_workers
+from piavatar_envs.envs.config import dump_yaml
+
+
+@pytest.fixture
+def workers(tiny, device):
+    """One environment of the tiny configuration, in this process."""
+    venv = start_workers(factory(tiny), 1)
+    yield venv
+    venv.close()
+
+
+@pytest.fixture
+def facts(tiny, device):
+    return prepare(factory(tiny))
+
+
+def test_the_saved_policy_is_the_trained_one_and_needs_no_wrapper(tiny, workers, facts, tmp_path):
+    model, curve = train.train(tiny, workers, facts, tmp_path)
+    assert model.num_timesteps == tiny.total_steps
+    # episodes of 15 steps: four ended within 64 steps
+    assert curve.steps == [15, 30, 45, 60]
+    assert len((tmp_path / "curve.csv").read_text().splitlines()) == 5
+    env = factory(tiny)()
+    observation, _ = env.reset(seed=5)
+    loaded = PPO.load(tmp_path / "policy.zip", device="cpu")
+    np.testing.assert_array_equal(
+        loaded.predict(observation, deterministic=True)[0], model.predict(observation, deterministic=True)[0]
+    )
+    env.close()
+
+
+def test_training_repeats_and_depends_on_its_seed(tiny, workers, facts, tmp_path):
+    weights = []
+    for seed in (0, 0, 1):
+        config = tiny.model_copy(update={"seed": seed})
+        model, _ = train.train(config, workers, facts, tmp_path)
+        weights.append(np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()]))
+    np.testing.assert_array_equal(weights[0], weights[1])
+    assert not np.allclose(weights[0], weights[2])
+
+
+def test_networks_see_only_the_chosen_terms(workers, facts, tmp_path):
+    config = load_training(
+        {
+            "env": {"fidelity": "tiny", "episode_seconds": 0.5},
+            "observe": ["target_position"],
+            "total_steps": 32,
+            "num_workers": 1,
+            "ppo": {"rollout_steps": 32, "batch_size": 16, "epochs": 1, "hidden": [8]},
+        }
+    )
+    model, _ = train.train(config, workers, facts, tmp_path)
+    rng = np.random.default_rng(0)
+    observation = rng.normal(size=facts.layout.size).astype(np.float32)
+    changed = rng.normal(size=facts.layout.size).astype(np.float32)
+    seen = facts.layout["target_position"].slice
+    changed[seen] = observation[seen]
+    act = policy_agent(model)
+    np.testing.assert_array_equal(act(observation[None]), act(changed[None]))
+    changed[seen] += 0.5
+    assert not np.array_equal(act(observation[None]), act(changed[None]))
+
+
+def test_resuming_goes_on_to_the_total_and_not_beyond(tiny, workers, facts, tmp_path):
+    train.train(tiny, workers, facts, tmp_path)
+    longer = tiny.model_copy(update={"total_steps": 128})
+    model, curve = train.train(longer, workers, facts, tmp_path, resume=tmp_path / "policy.zip")
+    assert model.num_timesteps == 128
+    assert min(curve.steps) > 64  # the first half is not played again
+    with pytest.raises(ValueError, match="has had 128 steps, total_steps=128"):
+        train.train(longer, workers, facts, tmp_path, resume=tmp_path / "policy.zip")
+    with pytest.raises(FileNotFoundError, match=r"no checkpoint .*nowhere\.zip"):
+        train.train(longer, workers, facts, tmp_path, resume=tmp_path / "nowhere.zip")
+
+
+def test_checkpoints_come_at_their_steps(tiny, workers, facts, tmp_path):
+    train.train(tiny.model_copy(update={"checkpoint_every": 20}), workers, facts, tmp_path)
+    names = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert names == [f"rl_model_{steps}_steps.zip" for steps in (20, 40, 60)]
+
+
+def test_a_deadline_ends_the_training_with_a_policy(tiny, workers, facts, tmp_path):
+    endless = tiny.model_copy(update={"total_steps": 10_000_000})
+    model, _ = train.train(endless, workers, facts, tmp_path, deadline=time.monotonic() + 1.0)
+    assert model.num_timesteps < 10_000_000
+    assert (tmp_path / "policy.zip").is_file()
+    assert np.isfinite(evaluate("x", policy_agent(model), workers, 2, 0, progress=False).returns).all()
+
+
+def test_the_command_line_trains_and_refuses(tiny, device, tmp_path, capsys):
+    path = tmp_path / "short.yaml"
+    path.write_text(dump_yaml(tiny))
+    train.main([str(path), "total_steps=32", "--out", str(tmp_path / "run")])
+    left = {entry.name for entry in (tmp_path / "run").iterdir()}
+    assert {"policy.zip", "curve.png", "curve.csv", "config.yaml", "results.json"} <= left
+    assert load_training(tmp_path / "run" / "config.yaml").total_steps == 32
+    with pytest.raises(SystemExit) as refused:
+        train.main([str(path), "ppo.epoch=3", "--out", str(tmp_path / "run")])
+    assert str(refused.value) == "error: ppo.epoch is no setting of TrainingConfig; did you mean ppo.epochs?"
+
+
+def test_the_demo_leaves_what_it_promises(device, tmp_path):
+    settings = (
+        "env.fidelity=tiny", "env.episode_seconds=0.3", "total_steps=64", "num_workers=2", "ppo.rollout_steps=16",
+        "ppo.batch_size=16", "evaluation.episodes=2", "env.render.width=64", "env.render.height=64",
+    )  # fmt: skip
+    outcome = demo.run(demo.Options(settings=settings, out=tmp_path, seed=4), Console(quiet=True))
+    assert [e.agent for e in outcome.evaluations] == ["zero", "random", "scripted IK", "trained"]
+    assert len({tuple(e.seed for e in evaluation.episodes) for evaluation in outcome.evaluations}) == 1
+    for name in ("policy.zip", "curve.png", "before_after.mp4", "config.yaml", "results.json"):
+        assert (tmp_path / name).stat().st_size > 0, name
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["benchmark"] == "demo"
+    assert {"commit", "device", "versions", "date", "results", "train_steps_per_s", "total_s"} <= set(results)
+    assert [row["case"] for row in results["results"]] == ["zero", "random", "scripted IK", "trained"]
+    assert load_training(tmp_path / "config.yaml").seed == 4
