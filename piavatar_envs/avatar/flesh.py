@@ -54,25 +54,24 @@ def drive_particles(
     joint = body.joint[p]
     weight = body.weight[p]
     at = x[e, body.first + p]
-    A = wp.mat44()
-    step = wp.mat44()
-    turn = wp.mat33()
-    toward = wp.mat44()
+    rest = body.rest[row(e, body.rest.shape[0]), p]
+    place = wp.vec3()
+    step = wp.vec3()
+    toward = wp.vec3()
     carried = wp.vec3()
+    turn = wp.mat33()
     for n in range(4):
         w = weight[n]
         if w > 0.0:
             b = joint[n]
-            A += w * matrices.start[e, b]
-            step += w * matrices.step[e, b]
+            place += w * apply_point(matrices.start[e, b], rest)
+            step += w * apply_point(matrices.step[e, b], rest)
             turn += w * matrices.turn[e, b]
             carried += w * (bones.velocity[e, b] + wp.cross(bones.spin[e, b], at - bones.center[e, b]))
             if drive.tone_rate > 0.0:
-                toward += w * matrices.lean[e, b]
-    rest = body.rest[row(e, body.rest.shape[0]), p]
-    place = apply_point(A, rest)
+                toward += w * apply_point(matrices.lean[e, b], rest)
     displacement = at - place
-    k = apply_point(step, rest) + (turn * displacement - displacement) / drive.dt
+    k = step + (turn * displacement - displacement) / drive.dt
     # the paper's shape preservation is part of the prescribed velocity
     k -= drive.kinematic_shape_rate * displacement
     vk[e, body.first + p] = k
@@ -83,7 +82,7 @@ def drive_particles(
     if drive.free_motion == 0 and let_go[e] == 0:
         # a body that nothing supports could not take the reaction
         u[e, body.first + p] = u[e, body.first + p] - body.inert[row(e, body.inert.shape[0]), p] * change
-    lean[e, p] = apply_point(toward, rest)
+    lean[e, p] = toward
 
 
 @wp.func
