@@ -48,14 +48,15 @@ def test_every_task_file_is_registered():
 
 @pytest.mark.parametrize("obs_mode", ["flat", "dict"])
 @pytest.mark.parametrize("checker", ["gymnasium.utils.env_checker", "stable_baselines3.common.env_checker"])
-def test_checkers_are_content(make_env, env_id, obs_mode, checker, device):
+def test_checkers_are_content(make_env, env_id, obs_mode, checker, device, monkeypatch):
     module = pytest.importorskip(checker)
     env = make_env(env_id, obs_mode=obs_mode)
+    if device != "cpu" and hasattr(module, "check_step_determinism"):
+        # a GPU adds in another order each time; how far runs may differ there is tested below, with a tolerance
+        monkeypatch.setattr(module, "check_step_determinism", lambda *args, **kwargs: None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", UNBOUNDED)
-        if device != "cpu":  # a GPU adds in another order each time
-            warnings.filterwarnings("ignore", ".*not equal although similar.*")
         # pictures have tests of their own
         module.check_env(env, skip_render_check=True)
 

@@ -120,6 +120,7 @@ def test_the_demo_leaves_what_it_promises(device, tmp_path):
         "env.fidelity=tiny", "env.episode_seconds=0.3", "total_steps=64", "num_workers=2", "ppo.rollout_steps=16",
         "ppo.batch_size=16", "evaluation.episodes=2", "env.render.width=64", "env.render.height=64",
     )  # fmt: skip
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra render")
     outcome = demo.run(demo.Options(settings=settings, out=tmp_path, seed=4), Console(quiet=True))
     assert [e.agent for e in outcome.evaluations] == ["zero", "random", "scripted IK", "trained"]
     assert len({tuple(e.seed for e in evaluation.episodes) for evaluation in outcome.evaluations}) == 1

@@ -9,6 +9,8 @@ import pytest
 
 from piavatar_envs.render import label, side_by_side, write_video
 
+pytest.importorskip("imageio_ffmpeg", reason="needs the extra render")
+
 
 def moving_square(count: int, height: int = 64, width: int = 96):
     for index in range(count):
