@@ -3,7 +3,7 @@
 A configuration is an :class:`EnvConfig` (or a task's subclass of it, one level deep) with one section for each room of
 the simulation. Every field has a default, so a YAML file or a keyword of ``gym.make`` only says what differs::
 
-    config = load_config(ReachConfig, "configs/reach_ppo.yaml", {"drive.tone": 0.3, "fidelity": "tiny"})
+    config = load_config(ReachConfig, "overrides.yaml", {"drive.tone": 0.3, "fidelity": "tiny"})
     print(dump_yaml(config))
 
 Keys are nested (``drive: {tone: 0.3}``) or dotted (``drive.tone``); where only one section has a setting of that name,
