@@ -24,10 +24,13 @@ GRID_PER_HEIGHT: dict[str, float] = {"tiny": 12.0, "coarse": 32.0, "medium": 64.
 
 @dataclass(frozen=True)
 class Domain:
-    """Box in which particles may move [m]; leaving it is a failure."""
+    """Box in which particles may move [m]; leaving it is a failure.
 
-    lower: tuple[float, float, float] = (-1.15, -1.15, -0.3)
-    upper: tuple[float, float, float] = (1.15, 1.15, 2.3)
+    The default holds a body with outstretched limbs wherever its root may be before it lets go.
+    """
+
+    lower: tuple[float, float, float] = (-1.6, -1.6, -0.3)
+    upper: tuple[float, float, float] = (1.6, 1.6, 2.6)
 
 
 def drive_settings(config: EnvConfig) -> DriveSettings:
