@@ -12,18 +12,13 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
 from piavatar_envs.avatar.rotation import apply_point
 from piavatar_envs.avatar.types import Body, BoneChange, BoneMatrices, Drive, RemovedMotion, RigidFit, RigidFits, vec12
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def implicit_velocity(rate: float, dt: float, displacement: wp.vec3, v: wp.vec3):
-    """Velocity after ``dt`` of an implicit critically damped pull of natural frequency ``rate`` [1/s]."""
-    return (v + dt * rate * rate * displacement) / (1.0 + 2.0 * rate * dt + rate * rate * dt * dt)
 
 
 @wp.kernel
@@ -114,9 +109,8 @@ def blend_corrections(
     e = wp.tid()
     r = row(e, body.bone_mass.shape[0])
     dt = drive.dt
-    denominator = 1.0 + 2.0 * drive.tone_rate * dt + drive.tone_rate * drive.tone_rate * dt * dt
-    gain = dt * drive.tone_rate * drive.tone_rate / denominator
-    keep = 1.0 / denominator - 1.0 + (wp.exp(-drive.damping * dt) - 1.0)
+    gain = pull_gain(drive.tone_rate, dt)
+    keep = 1.0 / pull_denominator(drive.tone_rate, dt) - 1.0 + (wp.exp(-drive.damping * dt) - 1.0)
     m = float(0.0)
     P = wp.vec3()
     L = wp.vec3()
@@ -234,9 +228,7 @@ def apply_corrections(
     if failure[e] != 0:
         return
     at = x[e, body.first + p]
-    gain = drive.dt * drive.tone_rate * drive.tone_rate
-    gain = gain / (1.0 + 2.0 * drive.tone_rate * drive.dt + drive.tone_rate * drive.tone_rate * drive.dt * drive.dt)
-    du = pull[e, p] + gain * lean[e, p]
+    du = pull[e, p] + pull_gain(drive.tone_rate, drive.dt) * lean[e, p]
     joint = body.joint[p]
     weight = body.weight[p]
     for n in range(4):

@@ -11,17 +11,12 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.kabsch import kabsch_rotation
+from piavatar_envs.avatar.pulls import critical_pull
 from piavatar_envs.avatar.rotation import quat_exp, quat_log
 from piavatar_envs.avatar.types import Body, Carry, Command, Drive, Pose, RigidFit
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def critical_pull(rate: float, dt: float, error: wp.vec3, v: wp.vec3):
-    """Acceleration of an implicit critically damped spring of natural frequency ``rate`` [1/s]."""
-    return (rate * rate * (error - dt * v) - 2.0 * rate * v) / (1.0 + 2.0 * rate * dt + rate * rate * dt * dt)
 
 
 @wp.func
