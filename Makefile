@@ -4,17 +4,18 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-EXTRAS := render,train,motions,multi,bench,dev
+EXTRAS := render,train,motions,multi,props,bench,dev
 DEVICE ?= cpu
 PYTEST_ARGS ?=
 
-.PHONY: help install demo test lint format clean
+.PHONY: help install demo test lint format docs clean
 
 help:
 	@echo "make install   create $(VENV) and install everything from constraints.txt"
 	@echo "make demo      train PPO on PIAvatar/Reach-v0 on the CPU (ten minutes at most), leaves runs/demo/"
 	@echo "make test      run the whole test suite (DEVICE=cuda for a GPU, PYTEST_ARGS='-k reach' for a part)"
 	@echo "make lint      check style and format; 'make format' mends what can be mended"
+	@echo "make docs      write docs/envs/*.md from the code (PICTURES=1 draws their pictures, too)"
 	@echo "make clean     remove $(VENV), caches and build output (not runs/)"
 
 install: $(STAMP)
@@ -45,6 +46,9 @@ lint: install
 format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: install
+	$(BIN)/python -m scripts.env_pages $(if $(PICTURES),--pictures)
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache

@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.drive import AvatarDrive
+from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
 from piavatar_envs.avatar.sampling import morph, sample_particles, spacing_for
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
 from piavatar_envs.envs.simulation import GRID_PER_HEIGHT
+from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.tasks.disturb import apply_impulse
@@ -83,7 +84,7 @@ class Rig:
             num_substeps=world.num_substeps,
             gravity=(0.0, 0.0, -world.gravity),
             decoupling=world.decoupling,
-            planes=[((0.0, 0.0, 1.0), 0.0, 0.8)] if world.ground else [],
+            colliders=[Collider.plane((0.0, 0.0, 1.0), 0.0, 0.8)] if world.ground else [],
         )
         self.state, self.scratch = allocate(self.model)
         self.avatar = AvatarDrive(self.points, 0, self.model, drive)
@@ -98,7 +99,7 @@ class Rig:
         self._reset, self._step, self._strike = Program(device), Program(device), Program(device)
         self.avatar.record_reset(self._reset, self.state, self._placed)
         self.avatar.record_tracking(self._reset, self.state)
-        self.avatar.record_control_step(self._step, self.state, self.scratch)
+        record_control_step(self._step, [self.avatar], self.model, self.state, self.scratch)
         self.avatar.record_tracking(self._step, self.state)
         self._strike.launch(
             apply_impulse,

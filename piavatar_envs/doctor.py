@@ -22,9 +22,10 @@ EXTRAS = {
     "render": ("pyvista", "imageio", "imageio_ffmpeg", "PIL"),
     "train": ("stable_baselines3", "torch", "matplotlib"),
     "motions": ("pybullet_data",),
+    "props": ("trimesh",),
     "multi": ("pettingzoo",),
     "bench": ("mujoco",),
-    "dev": ("pytest", "xdist", "build", "trimesh"),
+    "dev": ("pytest", "xdist", "build"),
 }
 
 
@@ -111,7 +112,8 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
         names = ", ".join(entry.alias for entry in wp.get_devices())
         raise ValueError(f"no device {device!r} on this machine; there are {names}") from None
     start = time.perf_counter()
-    for room in ("mpm", "avatar", "envs", "tasks", "render"):
+    rooms = ("mpm", "avatar", "props", "envs", "tasks", "render") + (("multi",) if _found("pettingzoo") else ())
+    for room in rooms:
         package = importlib.import_module(f"piavatar_envs.{room}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)

@@ -1,10 +1,11 @@
-"""The drive of one avatar: records tracking, control steps and resets as launches of a program.
+"""The drive of an avatar: records tracking, control steps and resets as launches of a program.
 
 A control step tracks nothing itself; it starts from the pose tracked at the end of the one before.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -16,9 +17,10 @@ from piavatar_envs.avatar.kabsch import local_rotations, track_bones
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.spawn import place_particles, reset_drive
-from piavatar_envs.avatar.substeps import Groups, record_injected_substeps, record_pose, record_split_substeps
+from piavatar_envs.avatar.substeps import Groups, record_drive, record_injection, record_pose
 from piavatar_envs.avatar.types import DriveScratch, DriveState, Tracked, vec12, vec16
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import DECOUPLING, Model, Scratch, State
 
 wp.set_module_options({"enable_backward": False})
@@ -113,8 +115,8 @@ class AvatarDrive:
             [state.x, state.u, state.C, state.F, state.vk, d.motion, state.failure],
         )
 
-    def record_control_step(self, program: Program, state: State, scratch: Scratch) -> None:
-        """Append one control step: from the tracked pose towards ``state.goal_*`` through all substeps."""
+    def record_begin(self, program: Program) -> None:
+        """Append what begins a control step: from the tracked pose towards ``state.goal_*``."""
         s, d, t = self.scratch, self.state, self.tracked
         program.launch(clear_vectors, d.wrench_force.size, [d.wrench_force])
         program.launch(clear_vectors, d.wrench_torque.size, [d.wrench_torque])
@@ -125,10 +127,10 @@ class AvatarDrive:
             [s.increment, s.command_increment, s.root_increment, s.carry_rotation, s.carry_translation],
         )
         record_pose(self, program, 0.0, *self.start_pose(), s.increment, self.groups.pose)
-        if self.model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"]):
-            record_injected_substeps(self, program, state, scratch)
-        else:
-            record_split_substeps(self, program, state, scratch)
+
+    def record_end(self, program: Program, state: State) -> None:
+        """Append what ends a control step: the goal has been commanded."""
+        d = self.state
         program.launch(
             posing.end_control,
             (self.model.num_envs, NUM_JOINTS),
@@ -141,6 +143,26 @@ class AvatarDrive:
         if self.settings.mode == "reference":
             return self.state.command_rotation, self.state.command_root
         return self.tracked.local, self.tracked.position[:, 0]
+
+
+def record_control_step(
+    program: Program, avatars: Sequence[AvatarDrive], model: Model, state: State, scratch: Scratch
+) -> None:
+    """Append one control step of all ``avatars`` of a world through all substeps."""
+    record_begin(program, model, state, scratch)
+    for avatar in avatars:
+        avatar.record_begin(program)
+    injected = model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"])
+    if injected:
+        for avatar in avatars:
+            record_injection(avatar, program, state)
+    for step in range(model.num_substeps):
+        for avatar in () if injected else avatars:
+            record_drive(avatar, program, state, step)
+        record_substep(program, model, state, scratch, step)
+    record_end(program, model, state, scratch)
+    for avatar in avatars:
+        avatar.record_end(program, state)
 
 
 @wp.kernel

@@ -20,6 +20,16 @@ FULL_DEPTH = 0.10
 SOFT_JOINTS = ("pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip")
 
 
+def bone_distance(rest: np.ndarray, bone: np.ndarray) -> np.ndarray:
+    """Distance of particles from the nearest bone particle [m], shape ``(P,)``.
+
+    Args:
+        rest: rest positions [m], shape ``(P, 3)``.
+        bone: joint a particle tracks, -1 for flesh, shape ``(P,)``.
+    """
+    return cKDTree(rest[bone >= 0]).query(rest)[0]
+
+
 def softness(rest: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
     """Softness of particles in [0, 1], shape ``(P,)`` float32.
 
@@ -29,8 +39,7 @@ def softness(rest: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_w
         skin_joints: bones that move a particle, shape ``(P, 4)``.
         skin_weights: their weights, shape ``(P, 4)``.
     """
-    depth = cKDTree(rest[bone >= 0]).query(rest)[0] / FULL_DEPTH
-    ramp = np.clip(depth, 0.0, 1.0)
+    ramp = np.clip(bone_distance(rest, bone) / FULL_DEPTH, 0.0, 1.0)
     ramp = ramp * ramp * (3.0 - 2.0 * ramp)
     soft = np.isin(skin_joints, [joint_index(name) for name in SOFT_JOINTS])
     share = np.where(soft, skin_weights, 0.0).sum(axis=1)

@@ -1,7 +1,7 @@
-"""The substeps of a control step.
+"""What a drive does before every MPM substep.
 
-Each substep fits rigid motions to the physical velocity, carries the bones by them, writes the kinematic velocity,
-pulls shape and pose, applies the root wrench, and then runs one MPM substep.
+It fits rigid motions to the physical velocity, carries the bones by them, writes the kinematic velocity, pulls shape
+and pose, and applies the root wrench.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from piavatar_envs.avatar.types import (
     RigidFits,
 )
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_substep
-from piavatar_envs.mpm.types import Scratch, State, group
+from piavatar_envs.mpm.types import State, group
 
 if TYPE_CHECKING:
     from piavatar_envs.avatar.drive import AvatarDrive
@@ -65,32 +64,29 @@ def record_pose(drive: AvatarDrive, program: Program, fraction: float, rotation,
     program.launch(posing.pose_body, drive.model.num_envs, inputs, [out.rotation, out.position])
 
 
-def record_split_substeps(drive: AvatarDrive, program: Program, state: State, scratch: Scratch) -> None:
-    """Append all substeps of a control step of the ``"split"`` scheme."""
+def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) -> None:
+    """Append what an avatar does before substep ``step`` of a control step of the ``"split"`` scheme."""
     s, d, g = drive.scratch, drive.state, drive.groups
     n, steps = drive.model.num_envs, drive.model.num_substeps
-    now, after = g.pose, g.next_pose
-    for step in range(steps):
-        record_fit(drive, program, state)
-        if step > 0:
-            _record_carry(drive, program, state)
-        record_pose(drive, program, (step + 1) / steps, *drive.start_pose(), s.increment, after)
-        if drive.settings.tone > 0.0:
-            command = (d.command_rotation, d.command_root, s.command_increment)
-            record_pose(drive, program, step / steps, *command, g.command_pose)
-            if step == 0:
-                anchor = [s.anchor_rotation, s.anchor_translation]
-                program.launch(lay_command_on_body, n, [drive.body, g.command_pose, now], anchor)
-        program.launch(
-            root_wrench,
-            n,
-            [drive.drive, step / steps, g.command, now, g.carry, g.whole, drive.body_mass],
-            [d.let_go, d.wrench_force, d.wrench_torque, s.wrench_linear, s.wrench_angular],
-        )
-        _record_matrices(drive, program, now, after)
-        _record_flesh(drive, program, state)
-        record_substep(program, drive.model, state, scratch, step)
-        now, after = after, now
+    now, after = (g.pose, g.next_pose) if step % 2 == 0 else (g.next_pose, g.pose)
+    record_fit(drive, program, state)
+    if step > 0:
+        _record_carry(drive, program, state)
+    record_pose(drive, program, (step + 1) / steps, *drive.start_pose(), s.increment, after)
+    if drive.settings.tone > 0.0:
+        command = (d.command_rotation, d.command_root, s.command_increment)
+        record_pose(drive, program, step / steps, *command, g.command_pose)
+        if step == 0:
+            anchor = [s.anchor_rotation, s.anchor_translation]
+            program.launch(lay_command_on_body, n, [drive.body, g.command_pose, now], anchor)
+    program.launch(
+        root_wrench,
+        n,
+        [drive.drive, step / steps, g.command, now, g.carry, g.whole, drive.body_mass],
+        [d.let_go, d.wrench_force, d.wrench_torque, s.wrench_linear, s.wrench_angular],
+    )
+    _record_matrices(drive, program, now, after)
+    _record_flesh(drive, program, state)
 
 
 def record_fit(drive: AvatarDrive, program: Program, state: State) -> None:
@@ -194,8 +190,8 @@ def _record_free_motion(drive: AvatarDrive, program: Program, state: State) -> N
     )
 
 
-def record_injected_substeps(drive: AvatarDrive, program: Program, state: State, scratch: Scratch) -> None:
-    """Append the paper's drive: one injection of velocity, then plain substeps."""
+def record_injection(drive: AvatarDrive, program: Program, state: State) -> None:
+    """Append the paper's drive: one injection of velocity, before the plain substeps of a control step."""
     s, g = drive.scratch, drive.groups
     chord = drive.settings.kernel_parameters(drive.model)
     chord.dt = drive.model.control_dt
@@ -212,5 +208,3 @@ def record_injected_substeps(drive: AvatarDrive, program: Program, state: State,
         [drive.body, drive.drive.kinematic_shape_rate, state.x, s.bone_from, s.bone_step, state.failure],
         [state.u, state.vk],
     )
-    for step in range(drive.model.num_substeps):
-        record_substep(program, drive.model, state, scratch, step)

@@ -147,10 +147,12 @@ def within_limits(reference: wp.quat, step: wp.vec3, lower: wp.vec3, upper: wp.v
 
 
 @wp.kernel
-def refuse_nonfinite(action: wp.array3d(dtype=float), agent: int, failure: wp.array(dtype=int)):
+def refuse_nonfinite(
+    action: wp.array3d(dtype=float), agent: int, alive: wp.array2d(dtype=wp.bool), failure: wp.array(dtype=int)
+):
     """End the environment of an action that is not finite; host-side views have refused it before."""
     e, n = wp.tid()
-    if not wp.isfinite(action[e, agent, n]):
+    if alive[e, agent] and not wp.isfinite(action[e, agent, n]):
         wp.atomic_or(failure, e, _ACTION)
 
 
@@ -159,6 +161,7 @@ def apply_actions(
     action_map: ActionMap,
     action: wp.array3d(dtype=float),
     agent: int,
+    alive: wp.array2d(dtype=wp.bool),
     reference_rotation: wp.array2d(dtype=wp.quat),
     reference_root: wp.array(dtype=wp.vec3),
     tracked_rotation: wp.array2d(dtype=wp.quat),
@@ -166,17 +169,21 @@ def apply_actions(
     goal_rotation: wp.array2d(dtype=wp.quat),
     goal_root: wp.array(dtype=wp.vec3),
 ):
-    """Goal of the control step: the reference pose turned by the action, within the limits of the acting joints."""
+    """Goal of the control step: the reference pose turned by the action, within the limits of the acting joints.
+
+    An agent that is out does not act.
+    """
     e, b = wp.tid()
     goal = reference_rotation[e, b]
+    acts = alive[e, agent]
     n = action_map.offset[b]
-    if n >= 0:
+    if n >= 0 and acts:
         step = wp.vec3(bounded(action, e, agent, n), bounded(action, e, agent, n + 1), bounded(action, e, agent, n + 2))
         goal = within_limits(goal, action_map.scale[b] * step, action_map.lower[b], action_map.upper[b])
     if b == 0:
         root = reference_root[e]
         n = action_map.root_offset
-        if n >= 0:
+        if n >= 0 and acts:
             # steps are in the avatar's heading: forward is -y
             step = wp.vec3(bounded(action, e, agent, n), bounded(action, e, agent, n + 1), 0.0)
             root += action_map.root_step * wp.quat_rotate(turn_about_z(tracked_rotation[e, 0]), step)

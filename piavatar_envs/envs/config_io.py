@@ -183,7 +183,9 @@ def _flat_keys(nested: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def _plain(value: Any) -> Any:
-    """JSON form of what Python callers pass: NumPy numbers and arrays, and paths."""
+    """JSON form of what Python callers pass: NumPy numbers and arrays, paths, and models in a list."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
     if isinstance(value, (np.generic, np.ndarray)):
         return value.tolist()
     if isinstance(value, Path):

@@ -13,6 +13,7 @@ wp.set_module_options({"enable_backward": False})
 STREAM_POSE = wp.constant(0)
 STREAM_TASK = wp.constant(1)
 STREAM_DISTURBANCE = wp.constant(2)
+STREAM_BALL = wp.constant(3)
 
 
 @wp.func

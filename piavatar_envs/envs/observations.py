@@ -11,9 +11,11 @@ import warp as wp
 from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_ACTUATED, NUM_JOINTS
 from piavatar_envs.avatar.types import Body, Tracked
 from piavatar_envs.mpm.materials import kirchhoff_stress, von_mises_stress
-from piavatar_envs.mpm.types import Particles, row
+from piavatar_envs.mpm.types import Particles, Sensors, row
 
 wp.set_module_options({"enable_backward": False})
+
+_NUM_PARTS = wp.constant(len(BODY_PARTS))
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,11 @@ SELF_TERMS: tuple[ObservationTerm, ...] = (
     ObservationTerm("bone_positions", 3 * NUM_ACTUATED, "m", "root", "joint positions relative to the pelvis"),
     ObservationTerm("bone_velocities", 3 * NUM_JOINTS, "m/s", "root", "velocities of all bones, the pelvis first"),
     ObservationTerm("stress", len(BODY_PARTS), "young_modulus", "-", "peak von Mises stress of each body part"),
+)
+
+#: What tasks with contact add: impulses of the last control step by all that is not oneself.
+CONTACT_TERMS: tuple[ObservationTerm, ...] = (
+    ObservationTerm("contact_impulse", 3 * len(BODY_PARTS), "N s", "root", "impulse of other bodies on each body part"),
 )
 
 
@@ -148,6 +155,24 @@ def observe_stress(
     stress = von_mises_stress(tau, wp.determinant(G)) * inverse_modulus
     if wp.isfinite(stress):
         wp.atomic_max(observation, e, agent, start + part[p], stress)
+
+
+@wp.kernel
+def observe_contact(
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    sensors: Sensors,
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Impulse on each body part by all subjects but the avatar itself; ``agent`` is its subject."""
+    e, part = wp.tid()
+    total = wp.vec3()
+    for s in range(sensors.part_impulse.shape[2]):
+        if s != agent:
+            total += sensors.part_impulse[e, agent * _NUM_PARTS + part, s]
+    write_vector(observation, e, agent, start + 3 * part, wp.quat_rotate(wp.quat_inverse(rotation[e, 0]), total))
 
 
 @wp.kernel

@@ -1,22 +1,25 @@
-"""The physical world of an environment: bodies, grid and drive for a whole batch, without tasks or rewards."""
+"""The physical world of an environment: bodies, props, grid and drives for a whole batch, without tasks or rewards."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.asset import AvatarAsset, load_body
-from piavatar_envs.avatar.body import BodyPoints, bone_masses
-from piavatar_envs.avatar.drive import AvatarDrive, clear_vectors
-from piavatar_envs.avatar.sampling import ParticleSet, morph, sample_particles, spacing_for
-from piavatar_envs.avatar.settings import DriveSettings
-from piavatar_envs.avatar.soft_tissue import inert_share, softness
-from piavatar_envs.envs.config import EnvConfig
-from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
+from piavatar_envs.avatar.body import bone_masses
+from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
+from piavatar_envs.avatar.sampling import sample_particles, spacing_for
+from piavatar_envs.envs.config import AvatarConfig, EnvConfig, SceneConfig
+from piavatar_envs.envs.flesh import Flesh, drive_settings
+from piavatar_envs.envs.props import PropSet
+from piavatar_envs.envs.subjects import assemble, prop_matter, prop_points
+from piavatar_envs.mpm.boundaries import Collider, make_boundaries, place_colliders
+from piavatar_envs.mpm.build import allocate, build_model, make_grid
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.sensing import clear_masked_sensors
 
 #: Grid spacings in a standing mean body, by fidelity; "fine" is the paper's scale, about 1 cm.
 GRID_PER_HEIGHT: dict[str, float] = {"tiny": 12.0, "coarse": 32.0, "medium": 64.0, "fine": 166.0}
@@ -32,33 +35,37 @@ class Domain:
     lower: tuple[float, float, float] = (-1.6, -1.6, -0.3)
     upper: tuple[float, float, float] = (1.6, 1.6, 2.6)
 
+    def around(self, places: Sequence[Sequence[float]]) -> Domain:
+        """The box moved to every one of ``places`` (x, y) [m], and what holds them all."""
+        at = np.array([(*place[:2], 0.0) for place in places])
+        lower, upper = np.array(self.lower) + at.min(0), np.array(self.upper) + at.max(0)
+        return Domain(tuple(lower.tolist()), tuple(upper.tolist()))
 
-def drive_settings(config: EnvConfig) -> DriveSettings:
-    """The drive's parameters of a configuration."""
-    d = config.drive
-    return DriveSettings(
-        mode=d.drive,
-        tone=d.tone,
-        alpha=d.alpha,
-        shape_preservation=d.shape_preservation,
-        root=d.root,
-        free_motion=d.free_motion,
-        max_force=d.max_force_weight,
-        max_torque=d.max_torque_weight,
-        max_tilt=d.let_go_tilt,
-        max_horizontal_error=d.let_go_distance,
-        max_height_error=d.let_go_height,
-    )
+    def including(self, *points: Sequence[float]) -> Domain:
+        """The smallest box that holds this one and ``points`` [m]."""
+        every = np.array([self.lower, self.upper, *points])
+        return Domain(tuple(every.min(0).tolist()), tuple(every.max(0).tolist()))
+
+    def walls(self) -> tuple[Collider, ...]:
+        """Smooth planes at the sides and the top of the box."""
+        walls = []
+        for axis in range(3):
+            normal = np.eye(3)[axis]
+            walls += [Collider.plane(normal, self.lower[axis])] if axis < 2 else []
+            walls += [Collider.plane(-normal, -self.upper[axis])]
+        return tuple(walls)
 
 
 class Simulation:
-    """One avatar in each of ``num_envs`` worlds.
+    """Avatars and props in each of ``num_envs`` worlds.
 
     Attributes:
         model: constants of the continuum.
-        state: particles; scratch: grid.
-        avatar: the drive.
-        shape_parameters: of every environment, shape ``(num_envs, S)``.
+        state: particles; scratch: grid; sensors: contact of the last control step.
+        flesh: matter of every avatar (NumPy); avatars: their drives.
+        props: the soft props.
+        collider_spawn: poses and velocities that a reset gives the colliders.
+        subjects: names and particles of both, avatars first.
     """
 
     def __init__(
@@ -67,7 +74,8 @@ class Simulation:
         num_envs: int = 1,
         device: str = "cpu",
         domain: Domain | None = None,
-        planes: Sequence[tuple[Sequence[float], float, float]] | None = None,
+        scene: SceneConfig | None = None,
+        avatar_names: Sequence[str] | None = None,
         asset: AvatarAsset | None = None,
     ) -> None:
         """Build and allocate; nothing is placed until the first reset.
@@ -77,34 +85,33 @@ class Simulation:
             num_envs: worlds in the batch.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             domain: where particles may go.
-            planes: boundaries as ``(normal, offset [m], friction)``; the ground if not given.
+            scene: what is in the world; the configuration's own if not given.
+            avatar_names: of the avatars; ``agent_0`` ... if not given.
             asset: the body; the embedded one if not given.
 
         Raises:
+            ConfigError: a scene that cannot be.
             ValueError: an unknown device, an unstable time step, a batch that does not fit.
         """
         self.config, self.num_envs, self.device = config, num_envs, check_device(device)
+        self.scene = scene or config.scene
         self.asset = asset or load_body()
-        self.mean_body = self.asset.mean_body()
         physics = config.physics
-        self.dx = float(np.ptp(self.mean_body.vertices[:, 2])) / GRID_PER_HEIGHT[physics.fidelity]
-        self.particles: ParticleSet = sample_particles(self.asset, spacing_for(self.dx))
-        self.base_parameters = self.asset.parameters(**config.shape.parameters)
-        self.shape_parameters = np.tile(self.base_parameters, (num_envs, 1))
-        points, volume = self._points(self.base_parameters)
-        if config.shape.randomize:
-            points, volume = _repeat(points, num_envs), np.repeat(volume, num_envs, 0)
-        self.points = points
-        matter = MaterialPoints.uniform(
-            volume, physics.density, physics.young_modulus, physics.poisson_ratio, physics.material
-        )
-        if physics.soft_young_modulus is not None:
-            # geometric between the two: stiffness varies over decades
-            ratio = (physics.soft_young_modulus / physics.young_modulus) ** self._softness(points.rest[0])[None]
-            matter = replace(matter, young_modulus=(matter.young_modulus * ratio).astype(np.float32))
-        domain = domain or Domain()
+        self.dx = float(np.ptp(self.asset.mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[physics.fidelity]
+        spacing = spacing_for(self.dx)
+        sampled = sample_particles(self.asset, spacing)
+        avatars = self.scene.avatars or (AvatarConfig(),)
+        names = avatar_names or [f"agent_{index}" for index in range(len(avatars))]
+        self.flesh = [Flesh(config, avatar, self.asset, sampled, num_envs) for avatar in avatars]
+        solids = [prop_points(prop, spacing) for prop in self.scene.props]
+        matter = [prop_matter(p, points, physics) for p, points in zip(self.scene.props, solids, strict=True)]
+        own_rows = bool(solids) or any(flesh.shape.randomize for flesh in self.flesh)
+        rows = num_envs if own_rows else 1
+        domain = domain or Domain().around([avatar.position for avatar in avatars])
+        walls = domain.walls() if (solids or len(avatars) > 1) and self.scene.walls else ()
+        self.subjects = assemble(self.scene, physics, names, self.flesh, matter, walls, rows)
         self.model = build_model(
-            matter,
+            self.subjects.matter,
             make_grid(domain.lower, domain.upper, self.dx),
             num_envs=num_envs,
             device=self.device,
@@ -113,101 +120,101 @@ class Simulation:
             cfl=physics.cfl,
             gravity=(0.0, 0.0, -physics.gravity),
             decoupling=physics.decoupling,
-            planes=[((0.0, 0.0, 1.0), 0.0, physics.friction)] if planes is None else planes,
+            colliders=self.subjects.colliders,
+            fields=self.subjects.fields,
         )
         self.state, self.scratch = allocate(self.model)
-        self.avatar = AvatarDrive(points, 0, self.model, drive_settings(config))
+        self.sensors = self.scratch.sensors
+        rows = self.model.contact.num_fields, num_envs
+        self.collider_spawn = make_boundaries(self.subjects.colliders, *rows, self.device)
+        first, count = self.subjects.first, len(self.flesh)
+        self.avatars = [
+            AvatarDrive(flesh.points, first[index], self.model, drive_settings(flesh.drive))
+            for index, flesh in enumerate(self.flesh)
+        ]
+        columns = [self.subjects.fields.subject.index(count + index) for index in range(len(solids))]
+        self.props = PropSet(self.scene.props, solids, matter, first[count:-1], columns, self.model)
 
     @property
-    def rest_joints(self) -> np.ndarray:
-        """Rest joint positions [m], shape ``(1 or num_envs, 22, 3)``."""
-        return self.points.joints
+    def avatar(self) -> AvatarDrive:
+        """The first avatar's drive."""
+        return self.avatars[0]
 
-    def _points(self, parameters: np.ndarray) -> tuple[BodyPoints, np.ndarray]:
-        """Points and volumes [m^3] of one shape."""
-        shaped = self.asset.shape(parameters)
-        rest, volume = morph(self.asset, self.particles, shaped)
-        sampled = self.particles
-        points = BodyPoints(
-            rest=rest[None],
-            mass=(self.config.physics.density * volume[None]).astype(np.float32),
-            joints=shaped.joints[None],
-            skin_joints=sampled.skin_joints,
-            skin_weights=sampled.skin_weights,
-            bone=sampled.bone,
-            inert=inert_share(self.config.drive.soft_tissue, self._softness(rest))[None],
-        )
-        return points, volume[None]
-
-    def _softness(self, rest: np.ndarray) -> np.ndarray:
-        """How soft the flesh is at every particle, in [0, 1]."""
-        sampled = self.particles
-        return softness(rest, sampled.bone, sampled.skin_joints, sampled.skin_weights)
-
-    def set_shape(self, env: int, parameters: np.ndarray) -> None:
-        """Give environment ``env`` another body; takes effect when it is placed again.
+    def set_shape(self, env: int, parameters: np.ndarray, avatar: int = 0) -> None:
+        """Give an avatar of environment ``env`` another body; takes effect when it is placed again.
 
         Raises:
             ValueError: the configuration has one shape for all environments, or a parameter is out of range.
         """
-        if not self.config.shape.randomize:
+        flesh, drive = self.flesh[avatar], self.avatars[avatar]
+        if not flesh.shape.randomize:
             raise ValueError("all environments share one body; set shape.randomize=True to give each its own")
-        points, volume = self._points(parameters)
+        points, volume = flesh.shaped(parameters)
         mass, center = bone_masses(points)
-        body, particles = self.avatar.body, self.model.particles
+        body, particles = drive.body, self.model.particles
+        own = slice(body.first, body.first + body.count)
         rows = [
-            (body.rest, points.rest),
-            (body.rest_joint, points.joints),
-            (body.rest_center, center),
-            (body.inert, points.inert),
-            (body.bone_mass, mass),
-            (particles.mass, points.mass),
-            (particles.volume, volume),
+            (body.rest[env], points.rest),
+            (body.rest_joint[env], points.joints),
+            (body.rest_center[env], center),
+            (body.inert[env], points.inert),
+            (body.bone_mass[env], mass),
+            (particles.mass[env][own], points.mass),
+            (particles.volume[env][own], volume),
         ]
         for array, value in rows:
-            array[env].assign(np.ascontiguousarray(value[0], np.float32))
-        self.avatar.body_mass[env : env + 1].assign(points.mass.sum(1).astype(np.float32))
-        self.points.rest[env], self.points.mass[env], self.points.joints[env] = (
-            points.rest[0],
-            points.mass[0],
-            points.joints[0],
-        )
-        self.shape_parameters[env] = parameters
+            array.assign(np.ascontiguousarray(value[0], np.float32))
+        drive.body_mass[env : env + 1].assign(points.mass.sum(1).astype(np.float32))
+        for name in ("rest", "mass", "joints"):
+            getattr(flesh.points, name)[env] = getattr(points, name)[0]
+        flesh.shape_parameters[env] = parameters
 
-    def adopt_shapes(self, parameters: np.ndarray) -> None:
+    def adopt_shapes(self, avatar: int, parameters: np.ndarray) -> None:
         """Make the host's copy follow bodies whose arrays were restored on the device, with their shape parameters."""
-        body, particles = self.avatar.body, self.model.particles
-        self.points.rest[:], self.points.joints[:] = body.rest.numpy(), body.rest_joint.numpy()
-        self.points.mass[:] = particles.mass.numpy()
-        self.shape_parameters[:] = parameters
+        flesh, body = self.flesh[avatar], self.avatars[avatar].body
+        flesh.points.rest[:], flesh.points.joints[:] = body.rest.numpy(), body.rest_joint.numpy()
+        flesh.points.mass[:] = self.model.particles.mass.numpy()[:, body.first : body.first + body.count]
+        flesh.shape_parameters[:] = parameters
 
     def record_reset(self, program: Program, mask: wp.array) -> None:
-        """Append: place the masked environments in their commanded pose and track them."""
-        self.avatar.record_reset(program, self.state, mask)
-        self.avatar.record_tracking(program, self.state)
+        """Append: place the masked environments' avatars in their commanded poses and their props, and track them."""
+        for avatar in self.avatars:
+            avatar.record_reset(program, self.state, mask)
+        self.props.record_reset(program, self.state, mask)
+        program.launch(clear_masked_sensors, self.num_envs, [mask], [self.sensors])
+        if self.model.moving_boundaries:
+            boundaries = self.model.boundaries
+            program.launch(place_colliders, boundaries.position.shape, [mask, self.collider_spawn], [boundaries])
+        self._record_tracking(program)
 
     def record_control_step(self, program: Program) -> None:
-        """Append: one control step towards the avatar's goal, then track."""
-        program.launch(clear_vectors, self.num_envs, [self.scratch.boundary_impulse])
-        self.avatar.record_control_step(program, self.state, self.scratch)
-        self.avatar.record_tracking(program, self.state)
+        """Append: one control step towards the avatars' goals, then track."""
+        record_control_step(program, self.avatars, self.model, self.state, self.scratch)
+        self._record_tracking(program)
+
+    def _record_tracking(self, program: Program) -> None:
+        for avatar in self.avatars:
+            avatar.record_tracking(program, self.state)
+        self.props.record_tracking(program, self.state)
 
     def arrays(self) -> dict[str, wp.array]:
         """Every array of a checkpoint, by name."""
-        groups = {"particles": self.state, "drive": self.avatar.state, "tracked": self.avatar.tracked}
-        found = {
-            f"{group}.{field.name}": getattr(value, field.name)
-            for group, value in groups.items()
-            for field in fields(value)
-        }
-        if self.config.shape.randomize:
-            body, particles = self.avatar.body, self.model.particles
-            found |= {
-                f"body.{n}": getattr(body, n) for n in ("rest", "rest_joint", "rest_center", "bone_mass", "inert")
-            }
-            found |= {f"matter.{n}": getattr(particles, n) for n in ("mass", "volume")}
-            found["body.body_mass"] = self.avatar.body_mass
-        return found
+        found = {f"particles.{field.name}": getattr(self.state, field.name) for field in fields(self.state)}
+        for index, (avatar, flesh) in enumerate(zip(self.avatars, self.flesh, strict=True)):
+            for group, value in (("drive", avatar.state), ("tracked", avatar.tracked)):
+                found |= {f"{group}_{index}.{f.name}": getattr(value, f.name) for f in fields(value)}
+            if flesh.shape.randomize:
+                names = ("rest", "rest_joint", "rest_center", "bone_mass", "inert")
+                found |= {f"body_{index}.{name}": getattr(avatar.body, name) for name in names}
+                found[f"body_{index}.body_mass"] = avatar.body_mass
+        if any(flesh.shape.randomize for flesh in self.flesh):
+            found |= {f"matter.{name}": getattr(self.model.particles, name) for name in ("mass", "volume")}
+        if self.model.moving_boundaries:
+            names = ("position", "rotation", "velocity", "spin")
+            found |= {f"colliders.{name}": getattr(self.model.boundaries, name) for name in names}
+        sensors = ("boundary_impulse", "pair_impulse", "part_impulse", "penetration")
+        found |= {f"sensors.{name}": getattr(self.sensors, name) for name in sensors}
+        return found | self.props.arrays()
 
 
 def check_device(device: str) -> str:
@@ -221,9 +228,3 @@ def check_device(device: str) -> str:
     except (ValueError, RuntimeError) as error:
         available = ", ".join(d.alias for d in wp.get_devices())
         raise ValueError(f"device={device!r} is not available ({error}); use one of {available}") from None
-
-
-def _repeat(points: BodyPoints, rows: int) -> BodyPoints:
-    """The same points with a writable row for each environment."""
-    repeated = {name: np.repeat(getattr(points, name), rows, 0) for name in ("rest", "mass", "joints", "inert")}
-    return BodyPoints(**repeated, skin_joints=points.skin_joints, skin_weights=points.skin_weights, bone=points.bone)

@@ -9,9 +9,23 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from piavatar_envs.mpm.boundaries import Collider, make_boundaries
+from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.materials import lame_parameters, material_index
 from piavatar_envs.mpm.stencil import BLOCK
-from piavatar_envs.mpm.types import DECOUPLING, Boundaries, Grid, Model, Particles, Scratch, State, Step, vec8
+from piavatar_envs.mpm.types import (
+    DECOUPLING,
+    Grid,
+    Model,
+    Nodes,
+    Particles,
+    Scratch,
+    Sensors,
+    State,
+    Step,
+    group,
+    vec8,
+)
 
 #: Largest stable ``c dt / dx`` that was measured (0.84 to 1.04, less near incompressibility).
 CFL_STABLE = 0.84
@@ -19,7 +33,7 @@ CFL_STABLE = 0.84
 
 @dataclass(frozen=True)
 class MaterialPoints:
-    """Matter to simulate, in NumPy. Every array has shape ``(1 or num_envs, num_particles)``.
+    """Matter to simulate, in NumPy. Arrays have shape ``(1 or num_envs, num_particles)`` unless said otherwise.
 
     Attributes:
         volume: rest volume [m^3].
@@ -27,6 +41,9 @@ class MaterialPoints:
         young_modulus: Young's modulus [Pa].
         poisson_ratio: Poisson's ratio.
         material: index of the constitutive model, see :func:`piavatar_envs.mpm.materials.material_index`.
+        field: velocity field, shape ``(num_particles,)`` int; the first for all if not given.
+        seam: 1 where fields of a subject grow together, shape ``(num_particles,)``; nowhere if not given.
+        sensor: row of the contact sensor, -1 for none, shape ``(num_particles,)`` int; none if not given.
     """
 
     volume: np.ndarray
@@ -34,6 +51,9 @@ class MaterialPoints:
     young_modulus: np.ndarray
     poisson_ratio: np.ndarray
     material: np.ndarray
+    field: np.ndarray | None = None
+    seam: np.ndarray | None = None
+    sensor: np.ndarray | None = None
 
     @classmethod
     def uniform(
@@ -49,6 +69,11 @@ class MaterialPoints:
         one = np.ones((1, volume.shape[1]), np.float32)
         index = np.full(one.shape, material_index(material), np.int32)
         return cls(volume, density * one, young_modulus * one, poisson_ratio * one, index)
+
+    @property
+    def num_particles(self) -> int:
+        """Particles of one environment."""
+        return self.volume.shape[1]
 
     def sound_speed(self) -> float:
         """Fastest elastic wave ``sqrt((lam + 2 mu) / rho)`` [m/s]."""
@@ -95,36 +120,21 @@ def make_grid(lower: Sequence[float], upper: Sequence[float], dx: float) -> Grid
     grid.dx, grid.inv_dx = dx, 1.0 / dx
     grid.nodes = wp.vec3i(*nodes.tolist())
     grid.blocks = wp.vec3i(*(-(-nodes // BLOCK)).tolist())
+    grid.num_nodes = int(nodes.prod())
     return grid
 
 
-def make_boundaries(planes: Sequence[tuple[Sequence[float], float, float]], device: str) -> Boundaries:
-    """Half-spaces ``dot(normal, x) >= offset`` from ``(normal, offset [m], friction)``.
-
-    Raises:
-        ValueError: a normal is zero or a friction coefficient negative.
-    """
-    rows, frictions = [], []
-    for normal, offset, friction in planes:
-        length = float(np.linalg.norm(normal))
-        if not (length > 0.0 and friction >= 0.0):
-            raise ValueError(f"bad boundary: normal={normal} must not be zero, friction={friction} not negative")
-        rows.append([*(np.asarray(normal) / length), offset / length])
-        frictions.append(friction)
-    boundaries = Boundaries()
-    boundaries.count = len(rows)
-    boundaries.plane = wp.array(np.array(rows or [[0.0, 0.0, 1.0, -1e6]], np.float32), dtype=wp.vec4, device=device)
-    boundaries.friction = wp.array(np.array(frictions or [0.0], np.float32), dtype=float, device=device)
-    return boundaries
-
-
-def check_points(points: MaterialPoints, num_envs: int) -> None:
+def check_points(points: MaterialPoints, num_envs: int, fields: Fields) -> None:
     """Refuse matter without mass and arrays that fit no environment.
 
     Raises:
-        ValueError: a volume or density is not positive, or an array has neither one row nor one an environment.
+        ValueError: a volume or density is not positive, an array has neither one row nor one an environment, or a
+            particle is of a velocity field that there is not.
     """
-    for name, array in vars(points).items():
+    if points.field is not None and not (points.field.min() >= 0 and points.field.max() < fields.num_fields):
+        raise ValueError(f"field={points.field.max()} of a particle: there are {fields.num_fields} velocity fields")
+    for name in ("volume", "density", "young_modulus", "poisson_ratio", "material"):
+        array = getattr(points, name)
         if len(array) not in (1, num_envs):
             raise ValueError(f"{name} has {len(array)} rows; give it 1 or {num_envs}, one an environment")
     for name, array in (("volume", points.volume), ("density", points.density)):
@@ -144,52 +154,69 @@ def build_model(
     cfl: float = 0.5,
     gravity: Sequence[float] = (0.0, 0.0, -9.81),
     decoupling: str = "split",
-    planes: Sequence[tuple[Sequence[float], float, float]] = (),
+    colliders: Sequence[Collider] = (),
+    fields: Fields | None = None,
+    sound_speed: float | None = None,
 ) -> Model:
     """Constants of a simulation on ``device``.
 
-    ``num_substeps`` is chosen from the CFL limit unless given.
+    ``num_substeps`` is chosen from the CFL limit unless given; the limit comes from the points, or from
+    ``sound_speed`` [m/s] where parameters will be randomised.
 
     Raises:
         ValueError: bad material, unstable time step, or more memory than the device has.
     """
     if decoupling not in DECOUPLING:
         raise ValueError(f"unknown decoupling {decoupling!r}; use one of {', '.join(DECOUPLING)}")
-    check_points(points, num_envs)
-    sound_speed = points.sound_speed()
+    fields = fields or Fields()
+    check_points(points, num_envs, fields)
+    sound_speed = max(points.sound_speed(), sound_speed or 0.0)
     if num_substeps is None:
         num_substeps = choose_num_substeps(control_dt, grid.dx, sound_speed, cfl)
     check_num_substeps(num_substeps, control_dt, grid.dx, sound_speed)
     mu, lam = lame_parameters(points.young_modulus, points.poisson_ratio)
-    num_particles = points.volume.shape[1]
-    nodes = int(np.prod(np.asarray(grid.nodes)))
-    check_memory(num_envs, num_particles, nodes, device)
-
-    particles = Particles()
-    for name, value in (("mass", points.volume * points.density), ("volume", points.volume), ("mu", mu), ("lam", lam)):
-        setattr(particles, name, wp.array(np.ascontiguousarray(value, np.float32), dtype=float, device=device))
-    particles.material = wp.array(np.ascontiguousarray(points.material, np.int32), dtype=int, device=device)
+    check_memory(num_envs, points.num_particles, fields.num_fields * grid.num_nodes, device)
     step = Step()
     step.dt = control_dt / num_substeps
     step.gravity = wp.vec3(*gravity)
     step.decoupling = DECOUPLING[decoupling]
     return Model(
         num_envs=num_envs,
-        num_particles=num_particles,
+        num_particles=points.num_particles,
         device=device,
         grid=grid,
         step=step,
-        particles=particles,
-        boundaries=make_boundaries(planes, device),
+        particles=upload_points(points, mu, lam, device),
+        boundaries=make_boundaries(colliders, fields.num_fields, num_envs, device),
+        contact=fields.upload(grid.dx, num_envs, device),
         num_substeps=num_substeps,
         control_dt=control_dt,
         sound_speed=sound_speed,
+        moving_boundaries=any(collider.moves or collider.kinematic for collider in colliders),
+        num_sensors=fields.num_sensors,
     )
 
 
+def upload_points(points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, device: str) -> Particles:
+    """Per-particle constants on the device."""
+    particles, count = Particles(), points.num_particles
+
+    def upload(value, dtype):
+        scalar = np.int32 if dtype is int else np.float32
+        return wp.array(np.ascontiguousarray(value, scalar), dtype=dtype, device=device)
+
+    particles.mass = upload(points.volume * points.density, float)
+    particles.volume, particles.mu, particles.lam = upload(points.volume, float), upload(mu, float), upload(lam, float)
+    particles.material = upload(points.material, int)
+    particles.field = upload(np.zeros(count) if points.field is None else points.field, int)
+    particles.seam = upload(np.zeros(count) if points.seam is None else points.seam, float)
+    particles.sensor = upload(np.full(count, -1) if points.sensor is None else points.sensor, int)
+    return particles
+
+
 def estimate_bytes(num_envs: int, num_particles: int, num_nodes: int) -> int:
-    """Device memory of state and scratch [bytes]: 108 B a particle, 78 B a node."""
-    return num_envs * (num_particles * (3 * 12 + 2 * 36) + num_nodes * (2 * 32 + 12 + 2))
+    """Device memory of state and scratch [bytes]: 108 B a particle, 93 B a node of every velocity field."""
+    return num_envs * (num_particles * (3 * 12 + 2 * 36) + num_nodes * (2 * 32 + 12 + 16 + 1))
 
 
 def check_memory(num_envs: int, num_particles: int, num_nodes: int, device: str) -> None:
@@ -212,7 +239,8 @@ def check_memory(num_envs: int, num_particles: int, num_nodes: int, device: str)
 
 def allocate(model: Model) -> tuple[State, Scratch]:
     """Zeroed state (identity deformation) and scratch."""
-    particles, nodes = (model.num_envs, model.num_particles), (model.num_envs, model.num_nodes)
+    particles = (model.num_envs, model.num_particles)
+    nodes = (model.num_envs, model.contact.num_fields * model.num_nodes)
 
     def zeros(shape, dtype):
         return wp.zeros(shape, dtype=dtype, device=model.device)
@@ -227,10 +255,29 @@ def allocate(model: Model) -> tuple[State, Scratch]:
         failure=zeros(model.num_envs, int),
     )
     scratch = Scratch(
-        node_sum=zeros(nodes, vec8),
-        node_offset=zeros(nodes, wp.vec3),
-        node_velocity=zeros(nodes, vec8),
-        block_active=zeros((2, model.num_envs, model.num_blocks), wp.int8),
-        boundary_impulse=zeros(model.num_envs, wp.vec3),
+        nodes=Nodes(
+            sum=zeros(nodes, vec8),
+            offset=zeros(nodes, wp.vec3),
+            velocity=zeros(nodes, vec8),
+            contact=zeros(nodes if model.contact.num_fields > 1 else (1, 1), wp.vec4),
+        ),
+        block_fields=zeros((2, model.num_envs, model.num_blocks), int),
+        sensors=allocate_sensors(model),
     )
     return state, scratch
+
+
+def allocate_sensors(model: Model) -> Sensors:
+    """Zeroed contact sensors."""
+    n, subjects = model.num_envs, model.contact.num_subjects
+
+    def zeros(shape, dtype):
+        return wp.zeros(shape, dtype=dtype, device=model.device)
+
+    return group(
+        Sensors,
+        boundary_impulse=zeros((n, subjects), wp.vec3),
+        pair_impulse=zeros((n, subjects * subjects), wp.vec3),
+        part_impulse=zeros((n, max(1, model.num_sensors), subjects), wp.vec3),
+        penetration=zeros((n, subjects), float),
+    )

@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_SLAB, boundary_contact, plane_distance
+from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_SLAB, boundary_contact, nearest_boundary
+from piavatar_envs.mpm.contact import (
+    GROWN_TOGETHER,
+    MASS_MIN,
+    end_of_fields,
+    has_field,
+    lowest_field,
+    merge_limbs,
+    touch_all,
+)
 from piavatar_envs.mpm.stencil import BLOCK, block_corner, node_index, node_position
-from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Boundaries, Grid, Step, vec8
+from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Boundaries, Contact, Grid, Sensors, Step, vec8
 
 wp.set_module_options({"enable_backward": False})
-
-#: Nodes lighter than this [kg] carry nothing but round-off.
-_MASS_MIN = wp.constant(1.0e-15)
-
-
-@wp.func
-def slab_is_near(boundaries: Boundaries, grid: Grid, i: int, j: int, k: int):
-    """Whether a slab of nodes may touch a boundary; most do not, and skip all contact work."""
-    center = node_position(grid, i, j, k) + grid.dx * wp.vec3(0.0, 1.5, 1.5)
-    for b in range(boundaries.count):
-        if plane_distance(boundaries.plane[b], center) < NEAR_SLAB * grid.dx:
-            return True
-    return False
 
 
 def threads_per_block(device: str) -> int:
@@ -29,56 +25,152 @@ def threads_per_block(device: str) -> int:
     return BLOCK if wp.get_device(device).is_cuda else 1
 
 
+@wp.func
+def total_velocity(step: Step, split: bool, s: vec8):
+    """Mass, velocity that contact acts on, and kinematic velocity of a node, from its sums."""
+    m = s[0]
+    if m <= MASS_MIN:
+        return vec8(m, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    vk = wp.vec3(s[4], s[5], s[6]) / m
+    v = wp.vec3(s[1], s[2], s[3]) / m + step.dt * step.gravity
+    if split:
+        v += vk
+    return vec8(m, v[0], v[1], v[2], vk[0], vk[1], vk[2], 0.0)
+
+
+@wp.func
+def meet_boundaries(
+    boundaries: Boundaries,
+    contact: Contact,
+    e: int,
+    f: int,
+    matter: wp.vec3,
+    gate: float,
+    total: vec8,
+    sensors: Sensors,
+):
+    """Total velocity of a field's matter at ``matter`` after contact with the boundaries; their impulse is sensed."""
+    v = wp.vec3(total[1], total[2], total[3])
+    dv = boundary_contact(boundaries, e, f, matter, v, gate) - v
+    if wp.length_sq(dv) > 0.0:
+        wp.atomic_add(sensors.boundary_impulse, e, contact.subject[f], total[0] * dv)
+    return total + vec8(0.0, dv[0], dv[1], dv[2], 0.0, 0.0, 0.0, 0.0)
+
+
+@wp.func
+def physical_velocity(split: bool, near: bool, total: vec8):
+    """Mass, physical and kinematic velocity from mass, total and kinematic velocity; whether a boundary is near."""
+    if total[0] <= MASS_MIN:
+        return vec8()
+    flag = wp.where(near, 1.0, 0.0)
+    if split:
+        return total - vec8(0.0, total[4], total[5], total[6], 0.0, 0.0, 0.0, -flag)
+    return total + vec8(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, flag)
+
+
+@wp.func
+def solve_shared_node(
+    step: Step,
+    boundaries: Boundaries,
+    contact: Contact,
+    num_nodes: int,
+    mask: int,
+    e: int,
+    n: int,
+    split: bool,
+    near: bool,
+    at: wp.vec3,
+    gate: float,
+    node_sum: wp.array2d(dtype=vec8),
+    node_offset: wp.array2d(dtype=wp.vec3),
+    node_velocity: wp.array2d(dtype=vec8),
+    node_contact: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
+):
+    """A node of a block with several fields: limbs grow together, bodies touch, boundaries are met."""
+    first = lowest_field(mask, contact.num_fields)
+    end = end_of_fields(mask, contact.num_fields)
+    merge_limbs(contact, num_nodes, mask, e, n, node_sum, node_offset)
+    for f in range(first, end):
+        r = f * num_nodes + n
+        if has_field(mask, f):
+            node_velocity[e, r] = total_velocity(step, split, node_sum[e, r])
+            node_contact[e, r] = wp.vec4(0.0)
+    touch_all(contact, num_nodes, mask, e, n, node_offset, node_velocity, node_contact, sensors)
+    for f in range(first, end):
+        r = f * num_nodes + n
+        if has_field(mask, f):
+            total = node_velocity[e, r]
+            if total[0] == GROWN_TOGETHER:
+                # the trunk comes first: its velocity is final
+                t = contact.trunk[f] * num_nodes + n
+                v = node_velocity[e, t]
+                node_velocity[e, r] = vec8(0.0, v[1], v[2], v[3], v[4], v[5], v[6], v[7])
+                node_contact[e, r] = node_contact[e, t]
+            else:
+                if near and total[0] > MASS_MIN:
+                    matter = at - node_offset[e, r] / total[0]
+                    total = meet_boundaries(boundaries, contact, e, f, matter, gate, total, sensors)
+                node_velocity[e, r] = physical_velocity(split, near, total)
+            node_sum[e, r] = vec8()
+            node_offset[e, r] = wp.vec3(0.0)
+
+
 @wp.kernel
 def update_grid(
     grid: Grid,
     step: Step,
     boundaries: Boundaries,
+    contact: Contact,
     slabs: int,
-    active: wp.array2d(dtype=wp.int8),
+    active: wp.array2d(dtype=int),
     # in and out: read, then cleared
     node_sum: wp.array2d(dtype=vec8),
     node_offset: wp.array2d(dtype=wp.vec3),
     # out
     node_velocity: wp.array2d(dtype=vec8),
-    next_active: wp.array2d(dtype=wp.int8),
-    boundary_impulse: wp.array(dtype=wp.vec3),
+    node_contact: wp.array2d(dtype=wp.vec4),
+    next_active: wp.array2d(dtype=int),
+    sensors: Sensors,
 ):
     """Velocity of every node with mass. Contact acts on the total velocity ``v = u + vk``; the rest is physical.
 
-    ``boundary_impulse`` gathers the impulse [N s] that the boundaries gave the bodies of an environment. ``slabs``
-    threads share a block; each takes every ``slabs``-th slab of 4 x 4 nodes.
+    ``slabs`` threads share a block; each takes every ``slabs``-th slab of 4 x 4 nodes. Only the fields that have mass
+    in a block cost anything there.
     """
     e, block, slab = wp.tid()
     if slab == 0:
-        next_active[e, block] = wp.int8(0)
-    if active[e, block] == wp.int8(0):
+        next_active[e, block] = 0
+    mask = active[e, block]
+    if mask == 0:
         return
+    f = lowest_field(mask, contact.num_fields)
+    shared = mask != (1 << f)
+    of_field = f * grid.num_nodes
     corner = block_corner(grid, block)
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    gate = CONTACT_GATE * grid.dx
     for i in range(corner[0] + slab, wp.min(corner[0] + 4, grid.nodes[0]), slabs):
-        near = slab_is_near(boundaries, grid, i, corner[1], corner[2])
+        center = node_position(grid, i, corner[1], corner[2]) + grid.dx * wp.vec3(0.0, 1.5, 1.5)
+        # most slabs are far from any boundary, and skip all of its work
+        near = nearest_boundary(boundaries, e, center) < NEAR_SLAB * grid.dx
         for j in range(corner[1], wp.min(corner[1] + 4, grid.nodes[1])):
             for k in range(corner[2], wp.min(corner[2] + 4, grid.nodes[2])):
                 n = node_index(grid, i, j, k)
-                s = node_sum[e, n]
-                m = s[0]
-                out = vec8()
-                if m > _MASS_MIN:
-                    vk = wp.vec3(s[4], s[5], s[6]) / m
-                    v = wp.vec3(s[1], s[2], s[3]) / m + step.dt * step.gravity
-                    if split:
-                        v += vk
-                    if near:
-                        matter = node_position(grid, i, j, k) - node_offset[e, n] / m
-                        after = boundary_contact(boundaries, matter, v, CONTACT_GATE * grid.dx)
-                        if wp.length_sq(after - v) > 0.0:
-                            wp.atomic_add(boundary_impulse, e, m * (after - v))
-                        v = after
-                    if split:
-                        v -= vk
-                    out = vec8(0.0, v[0], v[1], v[2], vk[0], vk[1], vk[2], 0.0)
-                node_velocity[e, n] = out
-                node_sum[e, n] = vec8()
-                if near:
-                    node_offset[e, n] = wp.vec3(0.0)
+                at = node_position(grid, i, j, k)
+                if shared:
+                    solve_shared_node(
+                        step, boundaries, contact, grid.num_nodes, mask, e, n, split, near, at, gate,
+                        node_sum, node_offset, node_velocity, node_contact, sensors,
+                    )  # fmt: skip
+                else:
+                    r = of_field + n
+                    total = total_velocity(step, split, node_sum[e, r])
+                    if near and total[0] > MASS_MIN:
+                        matter = at - node_offset[e, r] / total[0]
+                        total = meet_boundaries(boundaries, contact, e, f, matter, gate, total, sensors)
+                    node_velocity[e, r] = physical_velocity(split, near, total)
+                    node_sum[e, r] = vec8()
+                    # particles next to another field's block have left their offsets here, too
+                    if near or contact.num_fields > 1:
+                        node_offset[e, r] = wp.vec3(0.0)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.grid import threads_per_block, update_grid
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.transfer import grid_to_particles, particles_to_grid
+from piavatar_envs.mpm.sensing import clear_sensors, sense_contact, sense_penetration
+from piavatar_envs.mpm.transfer import grid_to_particles, mark_particles, particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 
@@ -12,27 +14,65 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     """Append substep ``index`` of a control step to ``program``.
 
     The physical velocity, position and deformation in ``state`` advance by ``model.step.dt`` under the kinematic
-    velocity ``state.vk``.
+    velocity ``state.vk``; contact is added to the sensors.
     """
-    m, s = model, state
+    m, s, nodes = model, state, scratch.nodes
     particles = (m.num_envs, m.num_particles)
-    active, next_active = scratch.block_active[index % 2], scratch.block_active[(index + 1) % 2]
+    active, next_active = scratch.block_fields[index % 2], scratch.block_fields[(index + 1) % 2]
+    moving = group(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk)
     program.launch(
         particles_to_grid,
         particles,
-        [m.grid, m.step, m.particles, m.boundaries, group(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk)],
-        [scratch.node_sum, scratch.node_offset, active, s.failure],
+        [m.grid, m.step, m.particles, m.boundaries, m.contact, moving, active, s.failure],
+        [nodes.sum, nodes.offset],
     )
     slabs = threads_per_block(m.device)
     program.launch(
         update_grid,
         (m.num_envs, m.num_blocks, slabs),
-        [m.grid, m.step, m.boundaries, slabs, active],
-        [scratch.node_sum, scratch.node_offset, scratch.node_velocity, next_active, scratch.boundary_impulse],
+        [m.grid, m.step, m.boundaries, m.contact, slabs, active],
+        [nodes.sum, nodes.offset, nodes.velocity, nodes.contact, next_active, scratch.sensors],
     )
+    if m.contact.num_fields > 1:
+        program.launch(
+            sense_contact,
+            particles,
+            [m.grid, m.particles, m.contact, s.x, active, nodes.contact, s.failure],
+            [scratch.sensors.part_impulse],
+        )
     program.launch(
         grid_to_particles,
         particles,
-        [m.grid, m.step, m.boundaries, scratch.node_velocity, s.vk],
-        [s.x, s.u, s.C, s.F, s.failure],
+        [m.grid, m.step, m.particles, m.boundaries, nodes.velocity, s.vk],
+        [s.x, s.u, s.C, s.F, next_active, s.failure],
     )
+    if m.moving_boundaries:
+        program.launch(move_colliders, m.boundaries.position.shape, [m.step.dt], [m.boundaries])
+
+
+def record_begin(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """Append what comes before the first substep of a control step: sensors forget, blocks with matter are marked."""
+    program.launch(clear_sensors, model.num_envs, [], [scratch.sensors])
+    record_marks(program, model, state, scratch)
+
+
+def record_marks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """Append: mark the blocks of all particles for the first substep; every substep marks those of the next."""
+    program.launch(
+        mark_particles,
+        state.x.shape,
+        [model.grid, model.particles, state.x],
+        [scratch.block_fields[0], state.failure],
+    )
+
+
+def record_end(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """Append what comes after the last substep of a control step: what is sensed once a step."""
+    if model.contact.num_subjects > 1:
+        last = scratch.block_fields[(model.num_substeps - 1) % 2]
+        program.launch(
+            sense_penetration,
+            state.x.shape,
+            [model.grid, model.particles, model.contact, state.x, last, scratch.nodes.velocity, state.failure],
+            [scratch.sensors.penetration],
+        )

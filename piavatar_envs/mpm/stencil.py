@@ -53,7 +53,7 @@ def spline(f: float):
 
 @wp.func
 def node_index(grid: Grid, i: int, j: int, k: int):
-    """Linear index of node ``(i, j, k)``; ``k + 1`` is the next."""
+    """Linear index of node ``(i, j, k)`` within its velocity field; ``k + 1`` is the next."""
     return (i * grid.nodes[1] + j) * grid.nodes[2] + k
 
 
@@ -67,6 +67,12 @@ def node_position(grid: Grid, i: int, j: int, k: int):
 def block_index(grid: Grid, i: int, j: int, k: int):
     """Linear index of the block that holds node ``(i, j, k)``."""
     return ((i >> 2) * grid.blocks[1] + (j >> 2)) * grid.blocks[2] + (k >> 2)
+
+
+@wp.func
+def blocks_touched(base: wp.vec3i):
+    """Blocks along each axis that the stencil at ``base`` lies in, 1 or 2; the second holds ``base + 2``."""
+    return wp.vec3i(1 + ((base[0] & 3) >> 1), 1 + ((base[1] & 3) >> 1), 1 + ((base[2] & 3) >> 1))
 
 
 @wp.func

@@ -9,11 +9,13 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_PARTICLE, nearest_boundary, remove_approach
+from piavatar_envs.mpm.contact import fields_around
 from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.stencil import (
     base_node,
     block_index,
+    blocks_touched,
     grid_position,
     node_index,
     spline,
@@ -26,6 +28,7 @@ from piavatar_envs.mpm.types import (
     NO_STRESS,
     SPLIT,
     Boundaries,
+    Contact,
     Grid,
     Moving,
     Particles,
@@ -43,12 +46,39 @@ _CFL = wp.constant(FAILURE_CFL)
 
 
 @wp.func
-def mark_blocks(grid: Grid, base: wp.vec3i, e: int, active: wp.array2d(dtype=wp.int8)):
-    """Mark the up to eight blocks that a stencil touches. Every thread writes the same value."""
-    for i in range(2):
-        for j in range(2):
-            for k in range(2):
-                active[e, block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)] = wp.int8(1)
+def mark_blocks(grid: Grid, base: wp.vec3i, field: int, e: int, active: wp.array2d(dtype=int)):
+    """Mark the blocks that a stencil touches with the field's bit."""
+    bit = 1 << field
+    blocks = blocks_touched(base)
+    for i in range(blocks[0]):
+        for j in range(blocks[1]):
+            for k in range(blocks[2]):
+                block = block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)
+                if (active[e, block] & bit) == 0:
+                    wp.atomic_or(active, e, block, bit)
+
+
+@wp.kernel
+def mark_particles(
+    grid: Grid,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    # in and out
+    active: wp.array2d(dtype=int),
+    failure: wp.array(dtype=int),
+):
+    """Mark the blocks of all particles, wherever they have been put; one outside the grid flags its environment."""
+    e, p = wp.tid()
+    if failure[e] != 0:
+        return
+    if not wp.isfinite(wp.length_sq(x[e, p])):
+        wp.atomic_or(failure, e, _NONFINITE)
+        return
+    base = base_node(grid_position(grid, x[e, p]))
+    if not stencil_inside(grid, base):
+        wp.atomic_or(failure, e, _OUT_OF_GRID)
+        return
+    mark_blocks(grid, base, particles.field[p], e, active)
 
 
 @wp.kernel
@@ -57,28 +87,27 @@ def particles_to_grid(
     step: Step,
     particles: Particles,
     boundaries: Boundaries,
+    contact: Contact,
     moving: Moving,
+    active: wp.array2d(dtype=int),
+    # in and out
+    failure: wp.array(dtype=int),
     # out
     node_sum: wp.array2d(dtype=vec8),
     node_offset: wp.array2d(dtype=wp.vec3),
-    active: wp.array2d(dtype=wp.int8),
-    failure: wp.array(dtype=int),
 ):
-    """Sum mass, physical momentum with the stress impulse, and kinematic momentum on the nodes.
+    """Sum mass, physical momentum with the stress impulse, and kinematic momentum on the nodes of a field.
 
-    A particle that is not finite or has left the grid flags its environment and is left out.
+    A particle that is not finite flags its environment and is left out.
     """
     e, p = wp.tid()
     if failure[e] != 0:
         return
-    if not wp.isfinite(wp.length_sq(moving.x[e, p]) + wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p])):
+    if not wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p])):
         wp.atomic_or(failure, e, _NONFINITE)
         return
     xg = grid_position(grid, moving.x[e, p])
     base = base_node(xg)
-    if not stencil_inside(grid, base):
-        wp.atomic_or(failure, e, _OUT_OF_GRID)
-        return
     f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
     r = row(e, particles.mass.shape[0])
     m = particles.mass[r, p]
@@ -96,18 +125,20 @@ def particles_to_grid(
     A = grid.dx * affine
     q = m * moving.u[e, p] - A * f
     k = m * moving.vk[e, p]
-    at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
+    at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], m * particles.seam[p])
     along_x = vec8(0.0, A[0, 0], A[1, 0], A[2, 0], 0.0, 0.0, 0.0, 0.0)
     along_y = vec8(0.0, A[0, 1], A[1, 1], A[2, 1], 0.0, 0.0, 0.0, 0.0)
     along_z = vec8(0.0, A[0, 2], A[1, 2], A[2, 2], 0.0, 0.0, 0.0, 0.0)
     wx = spline(f[0])
     wy = spline(f[1])
     wz = spline(f[2])
+    field = particles.field[p]
+    of_field = field * grid.num_nodes
     at_i = at_base
     for i in range(3):
         at_j = wx[i] * at_i
         for j in range(3):
-            first = node_index(grid, base[0] + i, base[1] + j, base[2])
+            first = of_field + node_index(grid, base[0] + i, base[1] + j, base[2])
             line = wy[j] * at_j
             step_z = (wx[i] * wy[j]) * along_z
             wp.atomic_add(node_sum, e, first, wz[0] * line)
@@ -115,20 +146,33 @@ def particles_to_grid(
             wp.atomic_add(node_sum, e, first + 2, wz[2] * (line + 2.0 * step_z))
             at_j += wx[i] * along_y
         at_i += along_x
-    mark_blocks(grid, base, e, active)
-    if nearest_boundary(boundaries, moving.x[e, p]) < NEAR_PARTICLE * grid.dx:
+    shared = contact.num_fields > 1 and fields_around(grid, base, e, active) != (1 << field)
+    if shared or nearest_boundary(boundaries, e, moving.x[e, p]) < NEAR_PARTICLE * grid.dx:
         for i in range(3):
             for j in range(3):
-                first = node_index(grid, base[0] + i, base[1] + j, base[2])
+                first = of_field + node_index(grid, base[0] + i, base[1] + j, base[2])
                 for l in range(3):
                     d = grid.dx * (wp.vec3(float(i), float(j), float(l)) - f)
                     wp.atomic_add(node_offset, e, first + l, (wx[i] * wy[j] * wz[l] * m) * d)
+
+
+@wp.func
+def fault_of(grid: Grid, step: Step, F: wp.mat33, advection: wp.vec3, at: wp.vec3):
+    """Why a particle cannot go on to ``at`` with deformation ``F``: bits ``FAILURE_*``, 0 if it can."""
+    if not wp.isfinite(wp.ddot(F, F)):
+        return _NONFINITE
+    if step.dt * wp.length(advection) > grid.dx:
+        return _CFL
+    if not stencil_inside(grid, base_node(grid_position(grid, at))):
+        return _OUT_OF_GRID
+    return 0
 
 
 @wp.kernel
 def grid_to_particles(
     grid: Grid,
     step: Step,
+    particles: Particles,
     boundaries: Boundaries,
     node_velocity: wp.array2d(dtype=vec8),
     vk: wp.array2d(dtype=wp.vec3),
@@ -137,9 +181,10 @@ def grid_to_particles(
     u: wp.array2d(dtype=wp.vec3),
     C: wp.array2d(dtype=wp.mat33),
     F: wp.array2d(dtype=wp.mat33),
+    next_active: wp.array2d(dtype=int),
     failure: wp.array(dtype=int),
 ):
-    """Gather velocities and their gradients, then advance position and deformation.
+    """Gather velocities and gradients; advance position and deformation; mark blocks for the next substep.
 
     A particle is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking
     exact (1e-5 m against 1e-2 m). What the grid did not see is projected out of the boundaries.
@@ -153,6 +198,7 @@ def grid_to_particles(
     wx = spline(f[0])
     wy = spline(f[1])
     wz = spline(f[2])
+    of_field = particles.field[p] * grid.num_nodes
     mean = vec8()
     moment_x = vec8()
     moment_y = vec8()
@@ -160,7 +206,7 @@ def grid_to_particles(
     for i in range(3):
         plane = vec8()
         for j in range(3):
-            first = node_index(grid, base[0] + i, base[1] + j, base[2])
+            first = of_field + node_index(grid, base[0] + i, base[1] + j, base[2])
             w = wx[i] * wy[j]
             second = (w * wz[1]) * node_velocity[e, first + 1]
             third = (w * wz[2]) * node_velocity[e, first + 2]
@@ -182,17 +228,19 @@ def grid_to_particles(
     if step.decoupling == SPLIT or step.decoupling == NO_STRESS:
         unseen = vk[e, p] - wp.vec3(mean[4], mean[5], mean[6])
         seen = velocity + wp.vec3(mean[4], mean[5], mean[6])
-        advection = seen + remove_approach(boundaries, x[e, p], unseen, CONTACT_GATE * grid.dx)
+        if mean[7] > 0.0:
+            unseen = remove_approach(boundaries, e, x[e, p], unseen, CONTACT_GATE * grid.dx)
+        advection = seen + unseen
     F_next = advance_deformation(
         F[e, p], grad_v, grad_vk, step.dt, wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
     )
-    if not wp.isfinite(wp.ddot(F_next, F_next)):
-        wp.atomic_or(failure, e, _NONFINITE)
+    at = x[e, p] + step.dt * advection
+    fault = fault_of(grid, step, F_next, advection, at)
+    if fault != 0:
+        wp.atomic_or(failure, e, fault)
         return
-    if step.dt * wp.length(advection) > grid.dx:
-        wp.atomic_or(failure, e, _CFL)
-        return
-    x[e, p] = x[e, p] + step.dt * advection
+    mark_blocks(grid, base_node(grid_position(grid, at)), particles.field[p], e, next_active)
+    x[e, p] = at
     u[e, p] = velocity
     C[e, p] = grad_v
     F[e, p] = F_next

@@ -56,6 +56,7 @@ class Grid:
     inv_dx: float
     nodes: wp.vec3i  # nodes along x, y, z
     blocks: wp.vec3i  # blocks of 4 x 4 x 4 nodes along x, y, z
+    num_nodes: int  # of one velocity field
 
 
 @wp.struct
@@ -76,15 +77,51 @@ class Particles:
     mu: wp.array2d(dtype=float)  # shear modulus [Pa]
     lam: wp.array2d(dtype=float)  # first Lame parameter [Pa]
     material: wp.array2d(dtype=int)  # index into piavatar_envs.mpm.materials.MATERIALS
+    field: wp.array(dtype=int)  # (num_particles,) velocity field
+    seam: wp.array(dtype=float)  # (num_particles,) 1 where two fields of a subject grow together, else 0
+    sensor: wp.array(dtype=int)  # (num_particles,) row of the contact sensor, -1 for none
+
+
+@wp.struct
+class Contact:
+    """Velocity fields and how they touch; see :mod:`piavatar_envs.mpm.contact`. ``S`` subjects own ``F`` fields."""
+
+    num_fields: int
+    num_subjects: int
+    own_normals: int  # 1: the paper's rule, each field with its own normal
+    gate: float  # largest distance of two fields' matter at a node that is contact [m]; 0: any
+    subject: wp.array(dtype=int)  # (F,) subject of a field
+    trunk: wp.array(dtype=int)  # (F,) first field of the same subject, with which seams grow together
+    friction: wp.array2d(dtype=float)  # (rows, F * F) Coulomb coefficient of a pair
+    density: wp.array2d(dtype=float)  # (rows, F) reference density, mass to volume fraction [kg/m^3]
+
+
+@wp.struct
+class Sensors:
+    """What contact did in this control step."""
+
+    boundary_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S) impulse of the colliders on a subject [N s]
+    pair_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S * S) on a by b, only a < b [N s]
+    part_impulse: wp.array3d(dtype=wp.vec3)  # (num_envs, sensors, S) on the particles of a sensor, by subject [N s]
+    penetration: wp.array2d(dtype=float)  # (num_envs, S) deepest particle of a subject inside another [m]
 
 
 @wp.struct
 class Boundaries:
-    """Analytic half-spaces that the bodies stay out of: ``dot(normal, x) >= offset``, with Coulomb friction."""
+    """Analytic solids that the bodies stay out of, resting or moving as told, with Coulomb friction.
+
+    ``B`` colliders; ``(rows, ...)`` arrays have 1 or ``num_envs`` rows. The kinds and what ``size`` means for each are
+    in :mod:`piavatar_envs.mpm.colliders`. An empty array still holds one entry; ``count`` says how many count.
+    """
 
     count: int
-    plane: wp.array(dtype=wp.vec4)  # (normal, offset [m])
-    friction: wp.array(dtype=float)
+    kind: wp.array(dtype=int)  # (B,)
+    size: wp.array(dtype=wp.vec3)  # (B,) [m]
+    position: wp.array2d(dtype=wp.vec3)  # (rows, B) [m]
+    rotation: wp.array2d(dtype=wp.quat)  # (rows, B) local to world
+    velocity: wp.array2d(dtype=wp.vec3)  # (rows, B) of the solid's origin [m/s]
+    spin: wp.array2d(dtype=wp.vec3)  # (rows, B) angular velocity [rad/s]
+    friction: wp.array2d(dtype=float)  # (rows, fields * B), that of field f on collider b at f * B + b
 
 
 @wp.struct
@@ -116,7 +153,8 @@ def row(e: int, rows: int):
 class Model:
     """Everything that does not change: grid, step, particle constants and boundaries.
 
-    ``sound_speed`` is the fastest elastic wave of any particle [m/s].
+    ``sound_speed`` is the fastest elastic wave of any particle [m/s]; ``moving_boundaries`` says whether any boundary
+    may have a velocity; ``num_sensors`` counts the rows of the contact sensor.
     """
 
     num_envs: int
@@ -126,14 +164,17 @@ class Model:
     step: Step
     particles: Particles
     boundaries: Boundaries
+    contact: Contact
     num_substeps: int
     control_dt: float
     sound_speed: float
+    moving_boundaries: bool
+    num_sensors: int
 
     @property
     def num_nodes(self) -> int:
-        """Grid nodes of one environment."""
-        return int(np.prod(np.asarray(self.grid.nodes)))
+        """Grid nodes of one velocity field of one environment."""
+        return int(self.grid.num_nodes)
 
     @property
     def num_blocks(self) -> int:
@@ -158,14 +199,34 @@ class State:
 
 
 @dataclass
-class Scratch:
-    """Grid arrays, rebuilt every substep.
+class Nodes:
+    """Grid arrays, ``(num_envs, num_fields * num_nodes)``, rebuilt every substep.
 
-    ``node_sum`` and ``node_offset`` are zero between substeps: the grid pass clears what it reads.
+    Attributes:
+        sum: vec8: mass, physical momentum, kinematic momentum, mass of seams. Zero between substeps.
+        offset: vec3: sum of ``w m (x_i - x_p)``, kept near boundaries and other fields only: minus the mass gradient,
+            up to a factor, and where the matter at a node is. Zero between substeps.
+        velocity: vec8: mass, physical velocity, kinematic velocity, 1 near boundaries.
+        contact: vec4: change of velocity by other subjects, and the index of the one that did most of it; of blocks
+            with several fields only.
     """
 
-    node_sum: wp.array  # (num_envs, num_nodes) vec8: mass, physical momentum, kinematic momentum
-    node_offset: wp.array  # (num_envs, num_nodes) vec3: sum of w m (x_i - x_p), kept near boundaries only
-    node_velocity: wp.array  # (num_envs, num_nodes) vec8: -, physical velocity, kinematic velocity
-    block_active: wp.array  # (2, num_envs, num_blocks) int8: blocks with mass in even and odd substeps
-    boundary_impulse: wp.array  # (num_envs,) vec3: impulse of the boundaries on the bodies this control step [N s]
+    sum: wp.array
+    offset: wp.array
+    velocity: wp.array
+    contact: wp.array
+
+
+@dataclass
+class Scratch:
+    """Grid arrays, rebuilt every substep, and contact sensors.
+
+    Attributes:
+        nodes: records of the nodes.
+        block_fields: ``(2, num_envs, num_blocks)`` int32, bit ``f`` for mass of field ``f``, in even and odd substeps.
+        sensors: what contact did in this control step.
+    """
+
+    nodes: Nodes
+    block_fields: wp.array
+    sensors: Sensors

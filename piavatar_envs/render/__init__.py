@@ -3,17 +3,23 @@
 from piavatar_envs.render.coloring import strain_magnitude
 from piavatar_envs.render.overlay import label, side_by_side
 from piavatar_envs.render.renderer import Renderer
-from piavatar_envs.render.scene import Arrow, Body, Box, Camera, Sphere
+from piavatar_envs.render.scene import PALETTE, PROP, Arrow, Body, Box, Camera, Capsule, Ring, Sphere
 from piavatar_envs.render.skin import Skin
+from piavatar_envs.render.solid import SolidSurface
 from piavatar_envs.render.video import write_video
 
 __all__ = [
+    "PALETTE",
+    "PROP",
     "Arrow",
     "Body",
     "Box",
     "Camera",
+    "Capsule",
     "Renderer",
+    "Ring",
     "Skin",
+    "SolidSurface",
     "Sphere",
     "label",
     "side_by_side",

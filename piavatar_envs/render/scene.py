@@ -18,6 +18,7 @@ PROP: Color = (0.55, 0.60, 0.66)
 _SPHERE_RINGS, _SPHERE_SEGMENTS = 20, 32
 _ARROW_SEGMENTS = 24
 _BOX_CELLS = 6
+_RING_SEGMENTS, _WIRE_SEGMENTS = 48, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,55 @@ class Box:
         return np.asarray(self.position, dtype=np.float64) + local @ np.asarray(self.rotation).T, faces
 
 
-Marker = Sphere | Arrow | Box
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """A capsule about its local z axis: radius and half length of the axis [m]; ``rotation`` its world rotation."""
+
+    position: np.ndarray
+    radius: float
+    half_length: float
+    color: Color = PROP
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """World vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
+        vertices, faces = _UNIT_SPHERE
+        local = self.radius * vertices
+        local[:, 2] += np.where(vertices[:, 2] >= 0.0, self.half_length, -self.half_length)
+        return np.asarray(self.position, dtype=np.float64) + local @ np.asarray(self.rotation).T, faces
+
+
+@dataclass(frozen=True, eq=False)
+class Ring:
+    """A ring of wire: a gate, a hoop. Centre, unit normal of its plane, radius and that of the wire [m].
+
+    Attributes:
+        lowest: height below which the ring is left out [m]: where it stands in the ground.
+    """
+
+    position: np.ndarray
+    normal: np.ndarray
+    radius: float
+    wire: float = 0.02
+    color: Color = TARGET
+    lowest: float = 0.0
+
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """World vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
+        position, normal = np.asarray(self.position, dtype=np.float64), np.asarray(self.normal, dtype=np.float64)
+        up = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+        up -= (up @ normal) * normal
+        up /= np.linalg.norm(up)
+        sine = np.clip((self.lowest - position[2]) / max(self.radius * up[2], 1e-9), -1.0, 1.0)
+        # from where the ring leaves the ground on one side, over its top, to the other
+        angle = np.linspace(np.arcsin(sine), np.pi - np.arcsin(sine), _RING_SEGMENTS + 1)[:, None, None]
+        around = np.linspace(0.0, 2.0 * np.pi, _WIRE_SEGMENTS, endpoint=False)[None, :, None]
+        out = np.cos(angle) * np.cross(up, normal) + np.sin(angle) * up
+        surface = (self.radius + self.wire * np.cos(around)) * out + self.wire * np.sin(around) * normal
+        return position + surface.reshape(-1, 3), _RING_FACES
+
+
+Marker = Sphere | Arrow | Box | Capsule | Ring
 
 
 @dataclass(frozen=True)
@@ -177,3 +226,4 @@ def _unit_box() -> tuple[np.ndarray, np.ndarray]:
 _UNIT_SPHERE = _unit_sphere()
 _UNIT_BOX = _unit_box()
 _ARROW_FACES = _ring_faces(10, _ARROW_SEGMENTS)
+_RING_FACES = _ring_faces(_RING_SEGMENTS + 1, _WIRE_SEGMENTS)

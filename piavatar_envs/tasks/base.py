@@ -6,20 +6,22 @@ single environments, and nothing it does leaves the device.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.limits import joint_limits
 from piavatar_envs.envs.actions import ActionSpec, select_joints
-from piavatar_envs.envs.config import EnvConfig
+from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.simulation import Domain
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
     from piavatar_envs.mpm.program import Program
+    from piavatar_envs.render.scene import Marker
 
 
 class Task:
@@ -31,6 +33,20 @@ class Task:
         observation_terms: what the task adds to the observation.
         reward_terms: names of the reward's terms; the reward is their sum.
         metrics: names of other numbers reported in ``info``.
+        observes_contact: whether agents feel the impulses of other bodies on their body parts.
+        observes_others: whether agents see each other.
+        camera_position, camera_target: the eye and what it looks at [m], from the ground below the agents' middle, or
+            from the origin if the camera does not follow them (``camera_follows``).
+        cost_terms: names of what is summed in ``info["cost"]``, for constrained learning; not part of the reward.
+
+    Class attributes for the task's page in ``docs/envs`` (Markdown; ``python -m scripts.env_pages`` writes it):
+        summary: a paragraph: what happens, and what a good agent does.
+        reward_docs, metric_docs, cost_docs: what each of the names above means, with its unit and its settings.
+        success_doc: when ``info["success"]`` is True.
+        termination_doc: what else terminates an episode than a root that lets go and a failure; empty for nothing.
+        history: version and what was new in it, the newest first.
+        picture_seconds: moment of the picture [s]; picture_actions: how the avatars acted until then: ``"zero"``,
+            ``"random"`` or constant actions by component name; picture_settings: settings other than the defaults.
     """
 
     Config: ClassVar[type[EnvConfig]] = EnvConfig
@@ -38,9 +54,53 @@ class Task:
     observation_terms: ClassVar[tuple[ObservationTerm, ...]] = ()
     reward_terms: ClassVar[tuple[str, ...]] = ()
     metrics: ClassVar[tuple[str, ...]] = ()
+    cost_terms: ClassVar[tuple[str, ...]] = ()
+
+    observes_contact: ClassVar[bool] = False
+    observes_others: ClassVar[bool] = False
+
+    camera_position: ClassVar[tuple[float, float, float]] = (1.75, -3.75, 1.62)
+    camera_target: ClassVar[tuple[float, float, float]] = (0.0, -0.04, 0.86)
+    camera_follows: ClassVar[bool] = True
+
+    summary: ClassVar[str] = ""
+    reward_docs: ClassVar[Mapping[str, str]] = {}
+    metric_docs: ClassVar[Mapping[str, str]] = {}
+    cost_docs: ClassVar[Mapping[str, str]] = {}
+    success_doc: ClassVar[str] = ""
+    termination_doc: ClassVar[str] = ""
+    history: ClassVar[tuple[tuple[str, str], ...]] = (("v0", "first version"),)
+    picture_seconds: ClassVar[float] = 2.0
+    picture_actions: ClassVar[str | Mapping[str, float]] = "random"
+    picture_settings: ClassVar[Mapping[str, Any]] = {}
 
     def __init__(self, config: EnvConfig) -> None:
         self.config = config
+        self.scene = self.build_scene()
+
+    def build_scene(self) -> SceneConfig:
+        """What is in the world: the configured scene and what the task adds to it.
+
+        Raises:
+            ConfigError: the configured scene does not fit the task.
+        """
+        scene = self.config.scene
+        if len(scene.avatars) > 1:
+            raise ConfigError(f"scene.avatars has {len(scene.avatars)} entries; this task has one avatar")
+        return scene if scene.avatars else replace(scene, avatars=[AvatarConfig()])
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """Names of the agents, one an avatar."""
+        return tuple(f"agent_{index}" for index in range(len(self.scene.avatars)))
+
+    def terms(self) -> tuple[ObservationTerm, ...]:
+        """What the task adds to the observation."""
+        return self.observation_terms
+
+    def observed_props(self) -> tuple[str, ...]:
+        """Names of the props that agents see."""
+        return tuple(prop.name for prop in self.scene.props)
 
     def action_spec(self) -> ActionSpec:
         """Joints that act, and whether the root does."""
@@ -52,7 +112,7 @@ class Task:
 
     def domain(self) -> Domain:
         """Where particles may go."""
-        return Domain()
+        return Domain().around([avatar.position for avatar in self.scene.avatars])
 
     def allocate(self, env: BatchEnv) -> None:
         """Create the task's arrays."""
@@ -62,21 +122,33 @@ class Task:
         return {}
 
     def record_reset(self, env: BatchEnv, program: Program) -> None:
-        """Append: for environments of ``env.mask``, write the avatar's first commanded pose and draw the task."""
+        """Append: for environments of ``env.mask``, write the avatars' first commanded poses and draw the task.
+
+        Props and colliders start where the scene says, unless this writes other places into
+        ``env.simulation.props.spawn`` (and ``.density``) or ``env.simulation.collider_spawn``.
+        """
         raise NotImplementedError
 
-    def record_reference(self, env: BatchEnv, program: Program) -> tuple[wp.array, wp.array]:
-        """Append what comes before the physics; return the pose that actions are added to: rotations and root."""
-        drive = env.simulation.avatar.state
-        return drive.command_rotation, drive.command_root
+    def record_references(self, env: BatchEnv, program: Program) -> list[tuple[wp.array, wp.array]]:
+        """Append what comes before the physics; return the pose that actions are added to, of every avatar.
+
+        A pose is its local rotations and its root; by default what was commanded last.
+        """
+        states = [avatar.state for avatar in env.simulation.avatars]
+        return [(state.command_rotation, state.command_root) for state in states]
 
     def record_outcome(self, env: BatchEnv, program: Program) -> None:
-        """Append, after the physics: write reward terms, metrics, success and termination."""
+        """Append, after the physics: write reward and cost terms, metrics, success and termination of every agent."""
         raise NotImplementedError
 
     def record_observe(self, env: BatchEnv, program: Program, agent: int, start: int) -> None:
         """Append: write the task's observation terms from component ``start``. Must not change any state."""
 
-    def markers(self, env: BatchEnv, index: int) -> list[tuple[np.ndarray, float, tuple[float, float, float]]]:
-        """Things to draw for environment ``index``: ``(position [m], radius [m], rgb)`` spheres."""
+    def markers(
+        self, env: BatchEnv, index: int
+    ) -> Sequence[tuple[np.ndarray, float, tuple[float, float, float]] | Marker]:
+        """Things to draw for environment ``index``: ``(position [m], radius [m], rgb)`` spheres, or what renders them.
+
+        Whoever draws has the renderer; a task imports it here and nowhere else.
+        """
         return []

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import EnvConfig
@@ -15,7 +18,7 @@ from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
-from piavatar_envs.tasks.spawn import spawn_standing
+from piavatar_envs.tasks.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
 
@@ -123,21 +126,21 @@ def judge(
     hands: wp.array2d(dtype=wp.vec3),
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array2d(dtype=float),
-    metrics: wp.array2d(dtype=float),
-    success: wp.array(dtype=wp.bool),
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
 ):
     """Reward of being near with either hand, and its cost."""
     e = wp.tid()
     left = wp.length(hands[e, 0] - goal[e])
     right = wp.length(hands[e, 1] - goal[e])
     distance = wp.min(left, right)
-    terms[e, 0] = tolerance(distance, target.reached, target.margin)
-    terms[e, 1] = -target.control_cost * mean_square_action(action, e, 0)
-    metrics[e, 0] = distance
-    metrics[e, 1] = left
-    metrics[e, 2] = right
-    success[e] = distance <= target.reached
+    terms[e, 0, 0] = tolerance(distance, target.reached, target.margin)
+    terms[e, 0, 1] = -target.control_cost * mean_square_action(action, e, 0)
+    metrics[e, 0, 0] = distance
+    metrics[e, 0, 1] = left
+    metrics[e, 0, 2] = right
+    success[e, 0] = distance <= target.reached
 
 
 @wp.kernel
@@ -175,6 +178,25 @@ class ReachTask(Task):
     reward_terms = ("reach", "control")
     metrics = ("distance", "left_distance", "right_distance")
 
+    summary = """A target hovers at `radius` from the chest, in front of the body or beside it, and swings there at up
+to `target_speed`. The avatar stands upright, its joints a little bent at random (`pose_noise`), and shall bring the
+middle of either hand to the target and stay with it."""
+    reward_docs: ClassVar[Mapping[str, str]] = {
+        "reach": "1 while the nearer hand is within `target_radius` of the target; beyond it a Gaussian that has "
+        "fallen to 0.1 at `target_radius + margin`",
+        "control": "`-control_cost` times the mean of the squared action components",
+    }
+    metric_docs: ClassVar[Mapping[str, str]] = {
+        "distance": "from the middle of the nearer hand to the target [m]",
+        "left_distance": "from the middle of the left hand to the target [m]",
+        "right_distance": "from the middle of the right hand to the target [m]",
+    }
+    success_doc = "the nearer hand is within `target_radius` of the target"
+    picture_seconds = 1.0
+    picture_actions: ClassVar[Mapping[str, float]] = {
+        "left_shoulder.z": -0.3, "left_elbow.x": -0.4, "left_elbow.z": 0.3, "spine3.z": -0.3,
+    }  # fmt: skip
+
     config: ReachConfig
 
     def __init__(self, config: ReachConfig) -> None:
@@ -200,16 +222,7 @@ class ReachTask(Task):
         return {"course": self.course, "phase": self.phase}
 
     def record_reset(self, env, program) -> None:
-        avatar = env.simulation.avatar
-        program.launch(
-            spawn_standing,
-            (env.num_envs, NUM_JOINTS),
-            [
-                env.mask, env.seed, env.episode, avatar.body, env.action_map.lower, env.action_map.upper,
-                self.config.pose_noise,
-            ],
-            [avatar.state.command_rotation, avatar.state.command_root],
-        )  # fmt: skip
+        record_standing(env, program, self.config.pose_noise)
         program.launch(draw_target, env.num_envs, [env.mask, env.seed, env.episode], [self.course, self.phase])
 
     def _record_locate(self, env, program, steps_ahead: int) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
 import numpy as np
 import warp as wp
 from pydantic import Field
@@ -53,10 +56,10 @@ def judge(
     impulse: wp.array(dtype=wp.vec3),
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array2d(dtype=float),
-    metrics: wp.array2d(dtype=float),
-    success: wp.array(dtype=wp.bool),
-    terminated: wp.array(dtype=wp.bool),
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
+    terminated: wp.array2d(dtype=wp.bool),
 ):
     """Reward of following in position and rotation, and its cost."""
     e = wp.tid()
@@ -66,15 +69,15 @@ def judge(
     for b in range(bones):
         distance += wp.length(position[e, b] - clip_position[e, b]) / float(bones)
         angle += wp.length(quat_log(wp.quat_inverse(clip_rotation[e, b]) * local[e, b])) / float(bones)
-    terms[e, 0] = 0.6 * tolerance(distance, 0.01, 0.3)
-    terms[e, 1] = 0.4 * tolerance(angle, 0.01, 0.5)
-    terms[e, 2] = -clip.control_cost * mean_square_action(action, e, 0)
-    metrics[e, 0] = distance
-    metrics[e, 1] = wp.degrees(angle)
-    metrics[e, 2] = wp.length(position[e, 0] - clip_position[e, 0])
-    metrics[e, 3] = wp.length(impulse[e])
-    success[e] = distance <= clip.success
-    terminated[e] = distance > clip.fail
+    terms[e, 0, 0] = 0.6 * tolerance(distance, 0.01, 0.3)
+    terms[e, 0, 1] = 0.4 * tolerance(angle, 0.01, 0.5)
+    terms[e, 0, 2] = -clip.control_cost * mean_square_action(action, e, 0)
+    metrics[e, 0, 0] = distance
+    metrics[e, 0, 1] = wp.degrees(angle)
+    metrics[e, 0, 2] = wp.length(position[e, 0] - clip_position[e, 0])
+    metrics[e, 0, 3] = wp.length(impulse[e])
+    success[e, 0] = distance <= clip.success
+    terminated[e, 0] = distance > clip.fail
 
 
 @wp.kernel
@@ -116,6 +119,28 @@ class TrackMotionTask(Task):
     )
     reward_terms = ("position", "rotation", "control")
     metrics = ("mpjpe", "rotation_error_deg", "root_error", "impulse")
+
+    summary = """The avatar moves as a clip does, and every `impulse_interval` an impulse of 0.3 to 1 times `impulse`
+and of random direction strikes its trunk, head, shoulders, hips or left knee. Actions are added to the clip's own
+increments: with zero actions the commanded pose is the clip's, and what an impulse disturbs comes back only as firmly
+as `tone` and the root wrench pull. A good agent steers against the disturbance and stays on the clip."""
+    reward_docs: ClassVar[Mapping[str, str]] = {
+        "position": "0.6 while `mpjpe` is at most 0.01 m; beyond it a Gaussian that has fallen to 0.06 at 0.31 m",
+        "rotation": "0.4 while the mean rotation error of the joints is at most 0.01 rad; beyond it a Gaussian that "
+        "has fallen to 0.04 at 0.51 rad",
+        "control": "`-control_cost` times the mean of the squared action components",
+    }
+    metric_docs: ClassVar[Mapping[str, str]] = {
+        "mpjpe": "mean distance of the joints from the clip's, in the world [m]",
+        "rotation_error_deg": "mean angle between the joints' local rotations and the clip's [deg]",
+        "root_error": "distance of the pelvis from the clip's [m]",
+        "impulse": "impulse that struck the body in this step, 0 for none [N s]",
+    }
+    success_doc = "`mpjpe` is at most `success_distance`"
+    termination_doc = "`mpjpe` exceeds `fail_distance`"
+    picture_seconds = 1.5
+    picture_actions = "zero"
+    picture_settings: ClassVar[Mapping[str, Any]] = {"motion": "kick", "random_start": False}
 
     config: TrackMotionConfig
 
@@ -182,7 +207,7 @@ class TrackMotionTask(Task):
             [self.start, self.origin, drive.command_rotation, drive.command_root],
         )
 
-    def record_reference(self, env, program) -> tuple[wp.array, wp.array]:
+    def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
         drive, config = env.simulation.avatar.state, self.config
         program.launch(
             advance_reference,
@@ -207,7 +232,7 @@ class TrackMotionTask(Task):
             [avatar.body, self.impulse, self.struck, env.failure],
             [env.simulation.state.u],
         )
-        return self.reference_rotation, self.reference_root
+        return [(self.reference_rotation, self.reference_root)]
 
     def _record_clip(self, env, program) -> None:
         """Append: the clip's pose one step ahead of the counter, in the world."""

@@ -123,7 +123,7 @@ def spoil(state, how):
     elif how == "double precision":
         state["particles.u"] = state["particles.u"].astype(np.float64)
     elif how == "text":
-        state["tracked.rotation"] = state["tracked.rotation"].astype(str)
+        state["tracked_0.rotation"] = state["tracked_0.rotation"].astype(str)
     elif how == "nothing":
         state = {}
     return state
@@ -137,7 +137,7 @@ def spoil(state, how):
         ("fewer particles", "particles.x.*shape.*expected"),
         ("one environment more", r"env.step_count.*\(2,\).*\(1,\)"),
         ("double precision", "particles.u.*float64.*float32"),
-        ("text", "tracked.rotation"),
+        ("text", "tracked_0.rotation"),
         ("nothing", "missing"),
     ],
 )

@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.drive import AvatarDrive
+from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
 from piavatar_envs.avatar.sampling import morph, sample_particles, spacing_for
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index, skin
+from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.program import Program
@@ -258,7 +259,7 @@ def build_rig(
         gravity=(0.0, 0.0, -gravity),
         decoupling=decoupling,
         num_substeps=num_substeps,
-        planes=[((0.0, 0.0, 1.0), 0.0, 0.8)] if floor else (),
+        colliders=[Collider.plane((0.0, 0.0, 1.0), 0.0, 0.8)] if floor else (),
     )
     state, scratch = allocate(model)
     inert = np.zeros((1, volume.shape[1]), np.float32)
@@ -269,7 +270,7 @@ def build_rig(
     reset_program, step_program = Program(device), Program(device)
     drive.record_reset(reset_program, state, mask)
     drive.record_tracking(reset_program, state)
-    drive.record_control_step(step_program, state, scratch)
+    record_control_step(step_program, [drive], model, state, scratch)
     drive.record_tracking(step_program, state)
     return Rig(model, state, scratch, points, drive, mask, reset_program, step_program).reset()
 

@@ -41,7 +41,7 @@ def lag(device: str, amount: float) -> np.ndarray:
     env = BatchEnv(task(load_config(task.Config, None, settings)), 1, device)
     env.reset(seeds=[0])
     simulation, course = env.simulation, []
-    points, particles, tracked = simulation.points, simulation.particles, simulation.avatar.tracked
+    points, particles, tracked = simulation.flesh[0].points, simulation.flesh[0].sampled, simulation.avatar.tracked
     soft = softness(points.rest[0], particles.bone, particles.skin_joints, particles.skin_weights) > 0.5
     for _ in range(60):
         env.step()

@@ -27,7 +27,7 @@ def tracked_root(env) -> tuple[np.ndarray, float]:
 
 def command(env) -> np.ndarray:
     """Rotation vectors commanded so far [rad], shape ``(22, 3)``."""
-    return Rotation.from_quat(env.batch.get_state()["drive.command_rotation"][0].astype(float)).as_rotvec()
+    return Rotation.from_quat(env.batch.get_state()["drive_0.command_rotation"][0].astype(float)).as_rotvec()
 
 
 def clip_pose(env) -> np.ndarray:
@@ -89,7 +89,7 @@ def test_a_batch_ends_the_environment_of_a_nonfinite_action_only(make_batch, env
     batch.action.assign(action)
     batch.step()
     assert batch.failure.numpy().tolist() == [0, FAILURE_ACTION, 0]
-    assert batch.terminated.numpy().tolist() == [False, True, False]
+    assert batch.terminated.numpy().tolist() == [[False], [True], [False]]
     got = batch.observation.numpy()
     assert np.isfinite(got).all() and np.isfinite(batch.reward.numpy()).all()
     assert equal(got[[0, 2]], expected[[0, 2]])

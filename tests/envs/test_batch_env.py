@@ -41,10 +41,10 @@ def test_environment_i_is_the_single_environment_of_seed_plus_i(make_env, make_b
                 where = f"environment {i}, episode {episode}, step {step}"
                 assert equal(observation, outcome["observation"][i, 0]), where
                 assert equal(np.float32(reward), outcome["reward"][i, 0]), where
-                assert (terminated, truncated) == (outcome["terminated"][i], outcome["truncated"][i]), where
-                assert info["success"] == outcome["success"][i]
+                assert (terminated, truncated) == (outcome["terminated"][i, 0], outcome["truncated"][i]), where
+                assert info["success"] == outcome["success"][i, 0]
                 metrics = [info[name] for name in batch.task.metrics]
-                assert equal(np.float32(metrics), outcome["metrics"][i]), where
+                assert equal(np.float32(metrics), outcome["metrics"][i, 0]), where
     batch.action.zero_()
 
 
@@ -156,4 +156,4 @@ def test_the_programs_are_recorded_once(make_batch, env_id):
     batch.reset(seeds=[0, 1, 2])
     batch.step()
     with pytest.raises(RuntimeError, match="has run"):
-        batch.step_program.launch(clear_vectors, 3, [batch.simulation.scratch.boundary_impulse])
+        batch.step_program.launch(clear_vectors, 3, [batch.simulation.avatar.state.wrench_force])

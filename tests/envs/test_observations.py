@@ -38,7 +38,7 @@ class Bones:
 
 def bones_of(batch, env: int = 0) -> Bones:
     simulation = batch.simulation
-    points, state = simulation.points, {k: v[env].astype(float) for k, v in simulation.state.numpy().items()}
+    points, state = simulation.flesh[0].points, {k: v[env].astype(float) for k, v in simulation.state.numpy().items()}
     rest, joints = (a[min(env, len(a) - 1)].astype(float) for a in (points.rest, points.joints))
     found = []
     for b in range(NUM_JOINTS):
@@ -57,7 +57,7 @@ def observed(batch, env: int = 0) -> dict[str, np.ndarray]:
     stress = von_mises(
         batch.simulation.state.F.numpy()[env].astype(float), physics.young_modulus, physics.poisson_ratio
     )
-    owner = [JOINT_NAMES[j] for j in batch.simulation.points.skin_joints[:, 0]]
+    owner = [JOINT_NAMES[j] for j in batch.simulation.flesh[0].points.skin_joints[:, 0]]
     return {
         "root_height": bones.position[0, 2:],
         "root_orientation": bones.rotation[0, :, :2].T.ravel(),

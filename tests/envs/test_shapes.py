@@ -16,7 +16,7 @@ def body_of(env, index: int = 0) -> dict[str, float | np.ndarray]:
     return {
         "height": float(np.ptp(x[:, 2])),
         "mass": float(simulation.model.particles.mass.numpy()[index].sum()),
-        "parameters": simulation.shape_parameters[index].copy(),
+        "parameters": simulation.flesh[0].shape_parameters[index].copy(),
     }
 
 
@@ -48,7 +48,7 @@ def test_the_body_is_the_one_of_its_parameters(make_env):
     simulation = env.batch.simulation
     for seed in (3, 4):
         env.reset(seed=seed)
-        shaped = simulation.asset.shape(simulation.shape_parameters[0])
+        shaped = simulation.asset.shape(simulation.flesh[0].shape_parameters[0])
         a, b, c = (shaped.vertices[simulation.asset.faces[:, n]].astype(float) for n in range(3))
         volume = np.einsum("fi,fi->", a, np.cross(b, c)) / 6.0
         assert body_of(env)["mass"] == pytest.approx(env.config.physics.density * volume, rel=0.01)
@@ -104,16 +104,16 @@ def test_a_fixed_shape_is_the_same_in_every_episode(make_env):
 def test_without_randomize_no_other_body_is_taken(make_env):
     env = make_env("PIAvatar/Reach-v0")
     with pytest.raises(ValueError, match=r"shape\.randomize=True"):
-        env.batch.simulation.set_shape(0, env.batch.simulation.base_parameters)
+        env.batch.simulation.set_shape(0, env.batch.simulation.flesh[0].base_parameters)
 
 
 def test_a_restored_state_brings_its_body_back(make_env, env_id):
     """Also to what lives on the host: pictures are drawn from it."""
     env, other = (make_env(env_id, twin=twin, **{"shape.randomize": True}) for twin in (0, 1))
     env.reset(seed=1)
-    state, expected = env.get_state(), env.batch.simulation
+    state, expected = env.get_state(), env.batch.simulation.flesh[0]
     other.reset(seed=2)
-    got = other.batch.simulation
+    got = other.batch.simulation.flesh[0]
     assert not np.allclose(got.shape_parameters, expected.shape_parameters)
     other.set_state(state)
     assert np.array_equal(got.shape_parameters, expected.shape_parameters)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import warp as wp
 
+from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
 from piavatar_envs.mpm.diagnostics import Totals, totals
+from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_substep
+from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
 
 wp.set_module_options({"enable_backward": False})
@@ -70,6 +72,10 @@ class Simulation:
     def totals(self, env: int = 0, **kwargs) -> Totals:
         return totals(self.model, self.state, env, **kwargs)
 
+    def of(self, field: int) -> np.ndarray:
+        """Mask of a velocity field's particles."""
+        return self.model.particles.field.numpy() == field
+
     @property
     def failures(self) -> list[int]:
         return self.state.failure.numpy().tolist()
@@ -84,7 +90,10 @@ def lattice(lower: Sequence[float], upper: Sequence[float], spacing: float) -> n
 
 @pytest.fixture(scope="session")
 def simulate(device: str) -> Callable[..., Simulation]:
-    """Builds a box of matter; what it does not know goes to ``MaterialPoints.uniform`` or ``build_model``."""
+    """Builds a box of matter, or the points ``rest`` in it; what it does not know goes to ``build_model``.
+
+    With velocity fields, the contact sensors tell of one control step.
+    """
 
     def build(
         lower: Sequence[float] = (-0.1, -0.1, -0.1),
@@ -92,6 +101,7 @@ def simulate(device: str) -> Callable[..., Simulation]:
         spacing: float = 0.025,
         dx: float = 0.05,
         margin: float = 0.5,
+        rest: np.ndarray | None = None,
         points: MaterialPoints | None = None,
         young_modulus: float = 1.0e5,
         poisson_ratio: float = 0.3,
@@ -99,22 +109,76 @@ def simulate(device: str) -> Callable[..., Simulation]:
         material: str = "neo_hookean",
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         pushed: bool = False,
+        planes: Sequence[tuple[Sequence[float], float, float]] = (),
         **kwargs,
     ) -> Simulation:
-        rest = lattice(lower, upper, spacing)
+        if rest is None:
+            rest = lattice(lower, upper, spacing)
         if points is None:
             volume = np.full(len(rest), spacing**3)
             points = MaterialPoints.uniform(volume, density, young_modulus, poisson_ratio, material)
         grid = make_grid(np.subtract(lower, margin), np.add(upper, margin), dx)
-        model = build_model(points, grid, device=device, gravity=gravity, **kwargs)
+        colliders = [Collider.plane(*plane) for plane in planes]
+        model = build_model(points, grid, device=device, gravity=gravity, colliders=colliders, **kwargs)
         state, scratch = allocate(model)
         keep = wp.full(1, 1.0, dtype=float, device=device)
         kick = wp.zeros(len(rest), dtype=wp.vec3, device=device)
         program = Program(device)
+        if "fields" in kwargs:
+            record_begin(program, model, state, scratch)
+        else:  # sensors add up over control steps
+            record_marks(program, model, state, scratch)
         for index in range(model.num_substeps):
             record_substep(program, model, state, scratch, index)
             if pushed:
                 program.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
+        if "fields" in kwargs:
+            record_end(program, model, state, scratch)
         return Simulation(model, state, scratch, program, rest, keep, kick).set(x=rest)
+
+    return build
+
+
+def ball(center: Sequence[float], radius: float, spacing: float) -> np.ndarray:
+    """Points of a lattice in a ball, those of a mirrored centre mirrored."""
+    reach = spacing * np.ceil(radius / spacing)
+    points = lattice([-reach] * 3, [reach] * 3, spacing)
+    return points[np.linalg.norm(points, axis=1) < radius] + center
+
+
+@pytest.fixture(scope="session")
+def meet(simulate) -> Callable[..., Simulation]:
+    """Builds boxes and balls with velocities, each a subject and a row of the contact sensor of its own.
+
+    A body is ``{"box": (lower, upper)}`` or ``{"ball": (center, radius)}`` and may have a ``velocity`` [m/s] and a
+    ``density`` [kg/m^3]; its Young's modulus is ``stiffness * density``, so that all have the same speed of sound.
+    """
+
+    def build(
+        bodies: Sequence[dict],
+        friction: np.ndarray | float = 0.0,
+        gate: float = 1.2,
+        normals: str = "shared",
+        spacing: float = 0.025,
+        stiffness: float = 100.0,
+        domain: Sequence[Sequence[float]] = ((-1.0, -0.8, -0.8), (1.0, 0.8, 0.8)),
+        **kwargs,
+    ) -> Simulation:
+        parts = [lattice(*b["box"], spacing) if "box" in b else ball(*b["ball"], spacing) for b in bodies]
+        counts = [len(part) for part in parts]
+        density = np.array([body.get("density", 1000.0) for body in bodies])
+        fields = Fields(tuple(range(len(bodies))), friction, density, gate, normals, len(bodies))
+        field = np.repeat(np.arange(len(bodies)), counts)
+        points = replace(
+            MaterialPoints.uniform(np.full(len(field), spacing**3)),
+            density=density[None, field],
+            young_modulus=stiffness * density[None, field],
+            field=field,
+            sensor=field,
+        )
+        scene = {"rest": np.concatenate(parts), "points": points, "fields": fields, "margin": 0.0}
+        sim = simulate(*domain, **scene, **kwargs)
+        velocity = np.array([body.get("velocity", (0.0, 0.0, 0.0)) for body in bodies])
+        return sim.set(u=velocity[field])
 
     return build

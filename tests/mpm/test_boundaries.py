@@ -65,7 +65,7 @@ def test_impulse_is_the_change_of_momentum(simulate, decoupling):
     start, dt = sim.totals(), sim.model.control_dt
     for n in range(1, 16):
         now = sim.run().totals()
-        impulse = sim.scratch.boundary_impulse.numpy()[0]  # nobody has cleared it
+        impulse = sim.scratch.sensors.boundary_impulse.numpy()[0, 0]  # nobody has cleared it
         expected = now.momentum - start.momentum - n * dt * now.mass * gravity
         assert np.abs(impulse - expected).max() < 1e-5 * start.momentum_scale
     assert impulse[2] > 0.5 * n * dt * now.mass * 9.81
@@ -73,9 +73,9 @@ def test_impulse_is_the_change_of_momentum(simulate, decoupling):
 
 def test_ground_bears_the_weight(simulate):
     sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=[(GROUND, 0.0, 0.5)]).run(30)
-    sim.scratch.boundary_impulse.zero_()
+    sim.scratch.sensors.boundary_impulse.zero_()
     steps = 30
-    impulse = sim.run(steps).scratch.boundary_impulse.numpy()[0]
+    impulse = sim.run(steps).scratch.sensors.boundary_impulse.numpy()[0, 0]
     weight = sim.totals().mass * 9.81
     assert impulse[2] == pytest.approx(weight * steps * sim.model.control_dt, rel=2e-3)
     assert np.abs(impulse[:2]).max() < 2e-3 * impulse[2]
@@ -112,7 +112,7 @@ def test_leaving_the_ground_is_free(simulate):
     velocity = np.array([0.7, -0.4, 1.0])
     sim.set(u=velocity).run(2)
     assert np.abs(sim.get("u") - velocity).max() < 1e-5
-    assert sim.scratch.boundary_impulse.numpy()[0].tolist() == [0.0, 0.0, 0.0]
+    assert sim.scratch.sensors.boundary_impulse.numpy()[0, 0].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_prescribed_motion_meets_the_ground_like_momentum(simulate):
@@ -130,8 +130,8 @@ def test_corner_of_two_planes(simulate):
     """Pulled into a corner, a block rests on both planes."""
     gravity = (-5.0, 0.0, -9.81)
     sim = simulate(**BLOCK, gravity=gravity, planes=[(GROUND, 0.0, 0.0), ((1.0, 0.0, 0.0), -0.1, 0.0)]).run(30)
-    sim.scratch.boundary_impulse.zero_()
-    impulse = sim.run(15).scratch.boundary_impulse.numpy()[0]
+    sim.scratch.sensors.boundary_impulse.zero_()
+    impulse = sim.run(15).scratch.sensors.boundary_impulse.numpy()[0, 0]
     expected = -np.array(gravity) * sim.totals().mass * 15 * sim.model.control_dt
     assert impulse == pytest.approx(expected, abs=0.02 * expected[2])
 
@@ -140,7 +140,7 @@ def test_no_contact_at_a_distance(simulate):
     """The grid feels a plane three cells early; matter more than the gate above it falls freely."""
     planes = [(GROUND, -0.6 * DX, 0.5)]
     sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=planes, num_substeps=15, control_dt=0.02).run()
-    assert sim.scratch.boundary_impulse.numpy()[0].tolist() == [0.0, 0.0, 0.0]
+    assert sim.scratch.sensors.boundary_impulse.numpy()[0, 0].tolist() == [0.0, 0.0, 0.0]
     assert np.abs(sim.get("u")[:, 2] + 9.81 * 0.02).max() < 1e-5
 
 
@@ -153,5 +153,5 @@ def test_scratch_is_clear_between_steps(simulate, planes, num_substeps):
     for _ in range(4):
         sim.run()
         assert sim.failures == [0]
-        assert not sim.scratch.node_sum.numpy().any()
-        assert not sim.scratch.node_offset.numpy().any()
+        assert not sim.scratch.nodes.sum.numpy().any()
+        assert not sim.scratch.nodes.offset.numpy().any()

@@ -88,8 +88,8 @@ def test_nothing_of_a_fault_stays_on_the_grid(three, fault):
     sim = three()
     break_particle(sim, name, value)
     sim.run()
-    assert not sim.scratch.node_sum.numpy().any()
-    assert not sim.scratch.node_offset.numpy().any()
+    assert not sim.scratch.nodes.sum.numpy().any()
+    assert not sim.scratch.nodes.offset.numpy().any()
 
 
 def test_environment_runs_again_after_a_reset(three):

@@ -22,7 +22,7 @@ def target(env) -> np.ndarray:
 def hands(env) -> np.ndarray:
     """Middles of the hands in the world ``(2, 3)`` [m]: rest centres of mass, carried by Kabsch in NumPy."""
     simulation = env.batch.simulation
-    points, x = simulation.points, simulation.state.x.numpy()[0].astype(float)
+    points, x = simulation.flesh[0].points, simulation.state.x.numpy()[0].astype(float)
     rest, mass = points.rest[0].astype(float), points.mass[0].astype(float)
     found = []
     for name in HANDS:
@@ -45,7 +45,7 @@ def test_target_stays_on_its_sphere_below_its_greatest_speed(make_env):
     speeds = []
     for seed in range(8):
         env.reset(seed=seed)
-        center = env.batch.simulation.rest_joints[0, joint_index("spine3")]
+        center = env.batch.simulation.flesh[0].points.joints[0, joint_index("spine3")]
         path = [target(env)]
         for _ in range(45):
             env.step(np.zeros(env.action_space.shape))
@@ -61,7 +61,7 @@ def test_target_stays_on_its_sphere_below_its_greatest_speed(make_env):
 def test_targets_are_before_the_body_and_spread(make_env):
     """Azimuths to both sides, elevations above and below: no constant answer reaches them all."""
     env = make_env(REACH)
-    center = env.batch.simulation.rest_joints[0, joint_index("spine3")]
+    center = env.batch.simulation.flesh[0].points.joints[0, joint_index("spine3")]
     ways = []
     for seed in range(60):
         env.reset(seed=seed)
@@ -125,14 +125,14 @@ def test_the_first_pose_is_noisy_within_its_bound(make_env):
     angles = []
     for seed in range(12):
         env.reset(seed=seed)
-        quaternions = env.get_state()["drive.command_rotation"][0].astype(float)
+        quaternions = env.get_state()["drive_0.command_rotation"][0].astype(float)
         angles.append(Rotation.from_quat(quaternions).as_rotvec())
     angles = np.array(angles)
     assert np.abs(angles).max() <= 0.2 + 1e-5 and np.abs(angles[:, 1:]).max(2).min() > 0.0
     assert not angles[:, 0].any(), "the root starts upright"
     assert angles[:, 1:].std(0).max() > 0.05
     still.reset(seed=0)
-    assert np.abs(Rotation.from_quat(still.get_state()["drive.command_rotation"][0]).as_rotvec()).max() < 1e-6
+    assert np.abs(Rotation.from_quat(still.get_state()["drive_0.command_rotation"][0]).as_rotvec()).max() < 1e-6
 
 
 def test_a_hand_can_be_brought_to_the_target(make_env):

@@ -32,7 +32,7 @@ def clip_frame(env, ahead: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     quaternions, root = motion.sample((start + now + ahead) * dt)
     origin = motion.sample(start * dt)[1] * [1.0, 1.0, 0.0]
     local = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
-    joints = env.batch.simulation.rest_joints[0].astype(float)
+    joints = env.batch.simulation.flesh[0].points.joints[0].astype(float)
     world, positions = forward_kinematics(local, root - origin, joints)
     return local, world, positions
 

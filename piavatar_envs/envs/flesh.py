@@ -1,0 +1,154 @@
+"""The flesh of one avatar of a world: its settings, its particles and its shapes, in NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from piavatar_envs.avatar.asset import AvatarAsset
+from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.sampling import ParticleSet, morph
+from piavatar_envs.avatar.settings import DriveSettings
+from piavatar_envs.avatar.skeleton import BODY_PARTS, body_part_of_joint, joint_index
+from piavatar_envs.avatar.soft_tissue import bone_distance, inert_share, softness
+from piavatar_envs.envs.config import AvatarConfig, ConfigError, DriveConfig, EnvConfig, RegionConfig
+from piavatar_envs.envs.config import replace as changed
+from piavatar_envs.mpm.build import MaterialPoints
+from piavatar_envs.mpm.materials import material_index
+
+#: Settings of the section ``physics`` that an avatar may have of its own.
+OF_FLESH = ("material", "young_modulus", "soft_young_modulus", "poisson_ratio", "density")
+NUM_PARTS = len(BODY_PARTS)
+
+
+def drive_settings(d: DriveConfig) -> DriveSettings:
+    """The drive's parameters of a configuration."""
+    return DriveSettings(
+        mode=d.drive,
+        tone=d.tone,
+        alpha=d.alpha,
+        shape_preservation=d.shape_preservation,
+        root=d.root,
+        free_motion=d.free_motion,
+        max_force=d.max_force_weight,
+        max_torque=d.max_torque_weight,
+        max_tilt=d.let_go_tilt,
+        max_horizontal_error=d.let_go_distance,
+        max_height_error=d.let_go_height,
+    )
+
+
+class Flesh:
+    """One avatar's matter in every environment of a batch.
+
+    Attributes:
+        physics, drive, shape: the environment's sections with the avatar's own settings laid over them.
+        asset, sampled: the body, and its particles in the mean shape.
+        points: its particles in its shapes; a row an environment where shapes are random.
+        shape_parameters: of every environment, shape ``(num_envs, S)``.
+        part: index into ``BODY_PARTS`` of every particle, shape ``(P,)`` int32.
+    """
+
+    def __init__(
+        self, config: EnvConfig, avatar: AvatarConfig, asset: AvatarAsset, sampled: ParticleSet, num_envs: int
+    ) -> None:
+        """Shape the body.
+
+        Raises:
+            ConfigError: an avatar's own setting is unknown or out of range.
+        """
+        strange = [name for name in avatar.physics if name not in OF_FLESH]
+        if strange:
+            raise ConfigError(
+                f"scene.avatars: physics.{strange[0]} cannot differ between avatars; only {', '.join(OF_FLESH)}"
+            )
+        self.physics = changed(config.physics, avatar.physics)
+        self.drive = changed(config.drive, avatar.drive)
+        self.shape = changed(config.shape, avatar.shape)
+        self.avatar, self.asset, self.sampled, self.num_envs = avatar, asset, sampled, num_envs
+        self.base_parameters = asset.parameters(**self.shape.parameters)
+        self.shape_parameters = np.tile(self.base_parameters, (num_envs, 1))
+        self.part = body_part_of_joint()[sampled.skin_joints[:, 0]].astype(np.int32)
+        self.points, self._volume = self.shaped(self.base_parameters)
+        if self.shape.randomize:
+            self.points, self._volume = _repeat(self.points, num_envs), np.repeat(self._volume, num_envs, 0)
+
+    def shaped(self, parameters: np.ndarray) -> tuple[BodyPoints, np.ndarray]:
+        """Points and volumes [m^3] of one shape."""
+        body, sampled = self.asset.shape(parameters), self.sampled
+        rest, volume = morph(self.asset, sampled, body)
+        density = self._region_values("density", np.full(len(rest), self.physics.density, np.float32))
+        points = BodyPoints(
+            rest=rest[None],
+            mass=(density * volume)[None].astype(np.float32),
+            joints=body.joints[None],
+            skin_joints=sampled.skin_joints,
+            skin_weights=sampled.skin_weights,
+            bone=sampled.bone,
+            inert=inert_share(self.drive.soft_tissue, self._softness(rest))[None],
+        )
+        return points, volume[None]
+
+    def matter(self) -> MaterialPoints:
+        """Its particles as matter; velocity fields and sensors are the world's business."""
+        physics = self.physics
+        matter = MaterialPoints.uniform(
+            self._volume, physics.density, physics.young_modulus, physics.poisson_ratio, physics.material
+        )
+        young = matter.young_modulus[0]
+        if physics.soft_young_modulus is not None:
+            # geometric between the two: stiffness varies over decades
+            young = young * (physics.soft_young_modulus / physics.young_modulus) ** self._softness(self.points.rest[0])
+        return replace(
+            matter,
+            young_modulus=self._region_values("young_modulus", young.astype(np.float32))[None],
+            poisson_ratio=self._region_values("poisson_ratio", matter.poisson_ratio[0])[None],
+            density=self._region_values("density", matter.density[0])[None],
+            material=self._region_values("material", matter.material[0])[None],
+        )
+
+    def draw_parameters(self, rng: np.random.Generator) -> np.ndarray:
+        """A random shape; parameters named in the configuration are kept."""
+        parameters = self.asset.sample_parameters(rng, scale=self.shape.scale)
+        for name, value in self.shape.parameters.items():
+            parameters[self.asset.shape_names.index(name)] = value
+        return parameters
+
+    def _softness(self, rest: np.ndarray) -> np.ndarray:
+        """How soft the flesh is at every particle, in [0, 1]."""
+        sampled = self.sampled
+        return softness(rest, sampled.bone, sampled.skin_joints, sampled.skin_weights)
+
+    def _region_values(self, name: str, values: np.ndarray) -> np.ndarray:
+        """``values`` with those of the regions of other material written into them, shape ``(P,)``."""
+        values = values.copy()
+        for region in self.avatar.regions:
+            value = getattr(region, name)
+            if value is not None:
+                values[self.in_region(region)] = material_index(value) if name == "material" else value
+        return values
+
+    def in_region(self, region: RegionConfig) -> np.ndarray:
+        """Which particles a region holds, shape ``(P,)`` bool.
+
+        Raises:
+            ConfigError: a joint is unknown, or no particle lies in the region.
+        """
+        try:
+            joints = [joint_index(name) for name in region.joints]
+        except KeyError as error:
+            raise ConfigError(f"scene.avatars: region of {error.args[0]}") from None
+        sampled = self.sampled
+        inside = np.isin(sampled.skin_joints[:, 0], joints)
+        if region.beyond > 0.0:
+            inside &= bone_distance(sampled.rest_positions, sampled.bone) > region.beyond
+        if not inside.any():
+            raise ConfigError(f"scene.avatars: no flesh of {region.joints} is {region.beyond} m from the bones")
+        return inside
+
+
+def _repeat(points: BodyPoints, rows: int) -> BodyPoints:
+    """The same points with a writable row for each environment."""
+    repeated = {name: np.repeat(getattr(points, name), rows, 0) for name in ("rest", "mass", "joints", "inert")}
+    return BodyPoints(**repeated, skin_joints=points.skin_joints, skin_weights=points.skin_weights, bone=points.bone)

@@ -1,0 +1,107 @@
+"""What the agents of a world observe, term by term, and the launches that write it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_JOINTS
+from piavatar_envs.envs.observations import (
+    CONTACT_TERMS,
+    SELF_TERMS,
+    ObservationLayout,
+    clean_observation,
+    clear_stress,
+    observe_body,
+    observe_contact,
+    observe_stress,
+    tracked_arrays,
+)
+from piavatar_envs.envs.others import observe_other, observe_prop, other_terms, prop_terms
+from piavatar_envs.envs.simulation import Simulation
+from piavatar_envs.mpm.program import Program
+
+if TYPE_CHECKING:
+    from piavatar_envs.tasks.base import Task
+
+
+class Observer:
+    """Layout of the observation, and how it comes about.
+
+    Every agent observes itself, then (where the task says so) contact, props and the other agents, then the task's own
+    terms. The others are counted on from oneself, so that all agents see the world alike.
+
+    Attributes:
+        layout: of the flat observation.
+        task_start: first component of the task's terms.
+    """
+
+    def __init__(self, simulation: Simulation, task: Task) -> None:
+        self.simulation, self.task = simulation, task
+        others = len(simulation.avatars) - 1 if task.observes_others else 0
+        terms = [*SELF_TERMS]
+        if task.observes_contact:
+            terms += CONTACT_TERMS
+        self._first_prop = sum(term.size for term in terms)
+        for name in task.observed_props():
+            terms += prop_terms(name)
+        self._first_other = sum(term.size for term in terms)
+        for index in range(others):
+            terms += other_terms(index)
+        self.task_start = sum(term.size for term in terms)
+        self._num_others = others
+        self.layout = ObservationLayout((*terms, *task.terms()))
+        device = simulation.device
+        self._part = [wp.array(flesh.part, dtype=int, device=device) for flesh in simulation.flesh]
+
+    def record(self, program: Program, agent: int, observation: wp.array) -> None:
+        """Append: write all but the task's terms of ``agent``. Changes nothing else."""
+        sim = self.simulation
+        n, avatar = sim.num_envs, sim.avatars[agent]
+        start = self.layout["stress"].slice.start
+        program.launch(observe_body, (n, NUM_JOINTS), [agent, *tracked_arrays(avatar.tracked)], [observation])
+        program.launch(clear_stress, (n, len(BODY_PARTS)), [agent, start], [observation])
+        modulus = 1.0 / sim.flesh[agent].physics.young_modulus
+        program.launch(
+            observe_stress,
+            (n, avatar.num_points),
+            [avatar.body, sim.model.particles, sim.state.F, self._part[agent], agent, start, modulus],
+            [observation],
+        )
+        if self.task.observes_contact:
+            at = self.layout[CONTACT_TERMS[0].name].slice.start
+            program.launch(
+                observe_contact, (n, len(BODY_PARTS)), [agent, at, avatar.tracked.rotation, sim.sensors], [observation]
+            )
+        self._record_others(program, agent, observation)
+
+    def _record_others(self, program: Program, agent: int, observation: wp.array) -> None:
+        sim = self.simulation
+        tracked, state = sim.avatars[agent].tracked, sim.props.state
+        at, size = self._first_prop, sum(term.size for term in prop_terms("a prop"))
+        for name in self.task.observed_props():
+            program.launch(
+                observe_prop,
+                sim.num_envs,
+                [
+                    agent, at, sim.props.index(name), tracked.rotation, tracked.position,
+                    state.position, state.rotation, state.velocity, state.spin, state.deformation,
+                ],
+                [observation],
+            )  # fmt: skip
+            at += size
+        at, size = self._first_other, sum(term.size for term in other_terms(0))
+        for index in range(self._num_others):
+            other = sim.avatars[(agent + 1 + index) % len(sim.avatars)].tracked
+            program.launch(
+                observe_other,
+                sim.num_envs,
+                [agent, at, tracked.rotation, tracked.position, other.rotation, other.position, other.velocity],
+                [observation],
+            )
+            at += size
+
+    def record_clean(self, program: Program, observation: wp.array) -> None:
+        """Append: numbers that are not finite, of an environment that has failed, become zero."""
+        program.launch(clean_observation, observation.shape, [], [observation])

@@ -1,0 +1,152 @@
+"""The soft props of a world: where they start, how heavy they are, where they are now."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.envs.config import PropConfig
+from piavatar_envs.mpm.build import MaterialPoints
+from piavatar_envs.mpm.materials import lame_parameters
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.types import Model, State
+from piavatar_envs.props.body import Prop, PropMatter, PropState, place_prop, scale_density, track_prop
+from piavatar_envs.props.geometry import PropPoints
+
+wp.set_module_options({"enable_backward": False})
+
+
+class PropSet:
+    """Props of every environment; arrays are ``(num_envs, num_props)``, quaternions Warp's ``xyzw``.
+
+    Attributes:
+        names: of the props.
+        points: their particles (NumPy).
+        state: where they are, as Kabsch sees them; recomputed whenever particles have moved.
+        spawn: where a reset puts them; the scene's poses, until a task's reset writes others for masked environments.
+        density: that a reset gives them [kg/m^3], likewise.
+        mass: of each at its density in the scene [kg].
+    """
+
+    def __init__(
+        self,
+        configs: Sequence[PropConfig],
+        points: Sequence[PropPoints],
+        matter: Sequence[MaterialPoints],
+        first: Sequence[int],
+        fields_of: Sequence[int],
+        model: Model,
+    ) -> None:
+        """Upload.
+
+        Args:
+            configs: of the props.
+            points: their particles.
+            matter: their material.
+            first: first particle of each.
+            fields_of: velocity field of each.
+            model: constants of the world.
+        """
+        self.names = tuple(config.name for config in configs)
+        self.points, self.model, self.fields_of = tuple(points), model, tuple(fields_of)
+        n, device = model.num_envs, model.device
+        self.state = PropState.allocate(n, max(1, len(configs)), device)
+        self.spawn = PropState.allocate(n, max(1, len(configs)), device)
+        self.props: list[Prop] = []
+        self.matter: list[PropMatter] = []
+        for index in range(len(configs)):
+            prop = Prop()
+            prop.first, prop.count = int(first[index]), len(points[index].rest)
+            prop.rest = wp.array(points[index].rest, dtype=wp.vec3, device=device)
+            self.props.append(prop)
+            nominal = PropMatter()
+            nominal.density = float(matter[index].density[0, 0])
+            mu, lam = lame_parameters(matter[index].young_modulus[0, 0], matter[index].poisson_ratio[0, 0])
+            nominal.mu, nominal.lam = float(mu), float(lam)
+            self.matter.append(nominal)
+        self.mass = np.array([m.density * p.volume.sum() for m, p in zip(self.matter, points, strict=True)])
+        self.volume = np.array([float(p.volume.sum()) for p in points])
+        density = np.array([[m.density for m in self.matter] or [1.0]], np.float32)
+        self.density = wp.array(np.repeat(density, n, 0), dtype=float, device=device)
+        for name, pad in (("position", 0.0), ("velocity", 0.0), ("spin", 0.0)):
+            rows = np.array([getattr(config, name) for config in configs] or [[pad] * 3], np.float32)
+            getattr(self.spawn, name).assign(np.repeat(rows[None], n, 0))
+        turns = np.array([config.rotation for config in configs] or [[1.0, 0.0, 0.0, 0.0]], np.float64)
+        turns = np.roll(turns / np.linalg.norm(turns, axis=1, keepdims=True), -1, axis=1).astype(np.float32)
+        self.spawn.rotation.assign(np.repeat(turns[None], n, 0))
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def index(self, name: str) -> int:
+        """Column of the prop ``name``.
+
+        Raises:
+            ValueError: there is no such prop.
+        """
+        if name not in self.names:
+            raise ValueError(f"there is no prop {name!r}; there are {', '.join(self.names) or 'none'}")
+        return self.names.index(name)
+
+    def record_reset(self, program: Program, state: State, mask: wp.array) -> None:
+        """Append: give the props of the masked environments their density, and put them where ``spawn`` says."""
+        particles, n = self.model.particles, self.model.num_envs
+        for index, (prop, matter) in enumerate(zip(self.props, self.matter, strict=True)):
+            program.launch(
+                scale_density,
+                (n, prop.count),
+                [mask, prop, self.density[:, index], matter, particles.volume],
+                [particles.mass, particles.mu, particles.lam],
+            )
+            column = self.fields_of[index]
+            program.launch(copy_masked, n, [mask, self.density[:, index]], [self.model.contact.density[:, column]])
+            self.record_place(program, state, mask, index)
+
+    def record_place(self, program: Program, state: State, mask: wp.array, index: int) -> None:
+        """Append: put prop ``index`` of the masked environments where ``spawn`` says, unstrained; its matter stays.
+
+        In the middle of an episode, before the physics of a step, this throws or takes away a prop.
+        """
+        prop, spawn = self.props[index], self.spawn
+        program.launch(
+            place_prop,
+            (self.model.num_envs, prop.count),
+            [mask, prop, index, spawn.position, spawn.rotation, spawn.velocity, spawn.spin],
+            [state.x, state.u, state.C, state.F, state.vk],
+        )
+
+    def record_tracking(self, program: Program, state: State) -> None:
+        """Append: track the props as their particles are now."""
+        s = self.state
+        for index, prop in enumerate(self.props):
+            program.launch(
+                track_prop,
+                self.model.num_envs,
+                [prop, index, self.model.particles, state.x, state.u, state.vk, state.failure],
+                [s.position, s.rotation, s.velocity, s.spin, s.deformation],
+            )
+
+    def arrays(self) -> dict[str, wp.array]:
+        """Arrays of a checkpoint, by name; none without props."""
+        if not self.names:
+            return {}
+        found = {f"props.{field.name}": getattr(self.state, field.name) for field in fields(self.state)}
+        found["props.density"] = self.density
+        found["contact.density"] = self.model.contact.density
+        return found | {f"matter.{name}": getattr(self.model.particles, name) for name in ("mass", "mu", "lam")}
+
+
+@wp.kernel
+def copy_masked(
+    mask: wp.array(dtype=wp.bool),
+    value: wp.array(dtype=float),
+    # out
+    target: wp.array(dtype=float),
+):
+    """Copy the masked environments' values."""
+    e = wp.tid()
+    if mask[e]:
+        target[e] = value[e]

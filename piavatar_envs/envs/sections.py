@@ -1,0 +1,132 @@
+"""Sections of a configuration: the continuum, the drive, the body's shape, pictures."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+#: Shared by every model. Strict, because a number in quotes is a mistake; ``.inf`` and ``.nan`` are never a setting.
+FROZEN = ConfigDict(
+    frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
+)
+
+
+class FrozenDict(dict):
+    """A read-only, hashable ``dict``, so that a configuration that holds one is frozen all through."""
+
+    def _refuse(self, *_args: Any, **_kwargs: Any) -> None:
+        raise TypeError("the configuration is frozen; make a changed copy with replace(config, {...})")
+
+    __setitem__ = __delitem__ = __ior__ = update = pop = popitem = setdefault = clear = _refuse  # type: ignore[assignment]
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(frozenset(self.items()))
+
+    def __reduce__(self) -> tuple:
+        # dict's own protocol refills an empty copy item by item, which a frozen one refuses.
+        return FrozenDict, (dict(self),)
+
+
+ShapeValue = Annotated[float, Field(ge=-1.0, le=1.0)]
+
+
+class PhysicsConfig(BaseModel):
+    """The continuum: resolution, material, coupling and time step."""
+
+    model_config = FROZEN
+
+    fidelity: Literal["tiny", "coarse", "medium", "fine"] = Field(
+        "coarse",
+        description="resolution of the body: tiny (some 400 particles, for tests), coarse (grid spacing height/32, "
+        "2,500-3,000 particles), medium (height/64), fine (grid spacing about 1 cm)",
+    )
+    control_dt: float = Field(1.0 / 30.0, gt=0.0, le=0.2, description="time between two actions [s]")
+    num_substeps: int | None = Field(
+        None, ge=1, le=10_000, description="substeps a control step; null chooses them from the CFL limit"
+    )
+    cfl: float = Field(
+        0.5, gt=0.0, le=1.0, description="largest c dt / dx a substep may have, c the P-wave speed (stable to 0.84) [-]"
+    )
+    material: Literal["neo_hookean", "fixed_corotated"] = Field(
+        "neo_hookean", description="elastic energy of the flesh"
+    )
+    young_modulus: float = Field(1.0e5, gt=0.0, description="Young's modulus of the flesh [Pa]")
+    soft_young_modulus: float | None = Field(
+        None,
+        gt=0.0,
+        description="Young's modulus of the softest flesh of trunk and thighs; null as the rest [Pa]",
+    )
+    poisson_ratio: float = Field(0.3, ge=0.0, lt=0.5, description="Poisson's ratio of the flesh [-]")
+    density: float = Field(1000.0, gt=0.0, description="density of the flesh [kg/m^3]")
+    decoupling: Literal["split", "paper", "none", "no_stress"] = Field(
+        "split",
+        description="how commanded motion is kept out of the strain: split (two velocities, the default), paper (its "
+        "deformation-gradient decoupling), none (velocity injected, strain and all), no_stress (no elasticity)",
+    )
+    gravity: float = Field(9.81, ge=0.0, le=100.0, description="gravitational acceleration, along -z [m/s^2]")
+    friction: float = Field(0.8, ge=0.0, le=10.0, description="Coulomb coefficient of the ground and the walls [-]")
+
+
+class DriveConfig(BaseModel):
+    """How commanded poses move the body, and what holds it up."""
+
+    model_config = FROZEN
+
+    drive: Literal["increment", "target"] = Field(
+        "increment",
+        description="increment (the tracked pose plus the command's change) or target (to the command's absolute pose; "
+        "only for undisturbed reproduction)",
+    )
+    tone: float = Field(1.0, ge=0.0, le=1.0, description="resistance of the pose to contact: 0 limp, 1 tensed [-]")
+    alpha: float = Field(0.3, ge=0.0, le=1.0, description="shape preservation, as a share of a control step [-]")
+    shape_preservation: Literal["physical", "kinematic"] = Field(
+        "physical",
+        description="physical (a momentum-keeping pull of the flesh) or kinematic (the paper's term in the velocity)",
+    )
+    soft_tissue: float = Field(
+        0.0, ge=0.0, le=1.0, description="share of a change of commanded motion that the softest flesh misses [-]"
+    )
+    joint_speed_limit: float = Field(
+        4.0, gt=0.0, le=50.0, description="fastest rotation an action of 1 commands about a joint's axis [rad/s]"
+    )
+    root: Literal["wrench", "free"] = Field(
+        "wrench", description="wrench (a bounded force and torque hold the commanded root) or free (nothing does)"
+    )
+    free_motion: bool = Field(
+        False, description="take the rigid part out of commanded motion, so that it carries no unreacted momentum"
+    )
+    max_force_weight: float = Field(2.0, ge=0.0, description="largest root force, in body weights [m g]")
+    max_torque_weight: float = Field(0.7, ge=0.0, description="largest root torque, in metres of body weight [m * m g]")
+    let_go_tilt: float = Field(
+        math.radians(45.0), gt=0.0, le=math.pi, description="tilt error at which the root wrench lets go [rad]"
+    )
+    let_go_distance: float = Field(
+        0.5, gt=0.0, description="horizontal error at which the root wrench lets go, until the next reset [m]"
+    )
+    let_go_height: float = Field(0.4, gt=0.0, description="height error at which the root wrench lets go [m]")
+
+
+class ShapeConfig(BaseModel):
+    """The body's shape: fixed parameters, or a random shape at each reset."""
+
+    model_config = FROZEN
+
+    randomize: bool = Field(False, description="draw a random shape at each reset")
+    parameters: Annotated[dict[str, ShapeValue], AfterValidator(FrozenDict)] = Field(
+        default_factory=dict, description="shape parameters by name, each in [-1, 1], 0 the mean; kept when randomizing"
+    )
+    scale: float = Field(
+        1.0, ge=0.0, le=1.0, description="width of the random shapes: 0 the mean shape, 1 the full range [-]"
+    )
+
+
+class RenderConfig(BaseModel):
+    """Pictures of the scene; used only with a ``render_mode``."""
+
+    model_config = FROZEN
+
+    width: int = Field(480, ge=16, le=7680, description="width of a frame [pixel]")
+    height: int = Field(480, ge=16, le=4320, description="height of a frame [pixel]")
+    color: Literal["skin", "strain"] = Field("skin", description="colour of the body: its skin, or its deformation")

@@ -1,0 +1,183 @@
+"""All matter of a world in one list: avatars first, then props; their velocity fields, friction and sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from piavatar_envs.avatar.limbs import LIMB_GROUPS, limb_groups
+from piavatar_envs.envs.config import ConfigError, PhysicsConfig, PropConfig, SceneConfig
+from piavatar_envs.envs.flesh import NUM_PARTS, Flesh
+from piavatar_envs.mpm.boundaries import Collider
+from piavatar_envs.mpm.build import MaterialPoints
+from piavatar_envs.mpm.fields import Fields
+from piavatar_envs.props import geometry
+from piavatar_envs.props.geometry import PropPoints
+
+GROUND = "ground"
+
+
+@dataclass(frozen=True)
+class Subjects:
+    """The matter of a world.
+
+    Attributes:
+        names: of the subjects, avatars first.
+        first: first particle of every subject, and one past the last.
+        matter: all particles.
+        fields: velocity fields, friction between them, sensors (``NUM_PARTS`` rows an avatar).
+        colliders: the ground, the scene's own, with their friction for every field, and the walls.
+        collider_names: of those but the walls.
+    """
+
+    names: tuple[str, ...]
+    first: tuple[int, ...]
+    matter: MaterialPoints
+    fields: Fields
+    colliders: tuple[Collider, ...]
+    collider_names: tuple[str, ...]
+
+
+def prop_points(prop: PropConfig, spacing: float) -> PropPoints:
+    """Particles of a prop.
+
+    Raises:
+        ConfigError: the size does not fit the shape, a mesh has no file, or the solid is too thin.
+    """
+    sizes = {"sphere": 1, "box": 3, "capsule": 2, "mesh": 1}
+    if len(prop.size) != sizes[prop.shape]:
+        raise ConfigError(f"prop {prop.name}: size={list(prop.size)} of a {prop.shape} has {sizes[prop.shape]} numbers")
+    try:
+        if prop.shape == "mesh":
+            if prop.file is None:
+                raise ValueError("shape='mesh' needs a file")
+            return geometry.mesh(prop.file, spacing, scale=prop.size[0])
+        if prop.shape == "box":
+            return geometry.box(prop.size, spacing)
+        return getattr(geometry, prop.shape)(*prop.size, spacing)
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"prop {prop.name}: {error}") from None
+
+
+def prop_matter(prop: PropConfig, points: PropPoints, physics: PhysicsConfig) -> MaterialPoints:
+    """A prop as matter. Without a modulus of its own its waves are as fast as the flesh's."""
+    volume = float(points.volume.sum())
+    density = prop.density if prop.mass is None else prop.mass / volume
+    young = prop.young_modulus
+    if young is None:
+        # the P-wave modulus over the density is the flesh's
+        young = physics.young_modulus * density / physics.density
+        young *= _wave_factor(physics.poisson_ratio) / _wave_factor(prop.poisson_ratio)
+    return MaterialPoints.uniform(points.volume, density, young, prop.poisson_ratio, prop.material)
+
+
+def _wave_factor(poisson_ratio: float) -> float:
+    """P-wave modulus over Young's modulus."""
+    return (1.0 - poisson_ratio) / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
+
+
+def assemble(
+    scene: SceneConfig,
+    physics: PhysicsConfig,
+    avatar_names: Sequence[str],
+    flesh: Sequence[Flesh],
+    props: Sequence[MaterialPoints],
+    walls: Sequence[Collider],
+    rows: int,
+) -> Subjects:
+    """Put all matter together.
+
+    Args:
+        scene: props and colliders in the order of ``props``.
+        physics: friction of the flesh on the ground.
+        avatar_names: names of the avatars.
+        flesh: their matter.
+        props: matter of the scene's props.
+        walls: solids besides the scene's, without friction.
+        rows: rows of the arrays of matter, 1 or ``num_envs``.
+
+    Raises:
+        ConfigError: a name is given twice, or a pair names what is not there.
+    """
+    names = (*avatar_names, *(prop.name for prop in scene.props))
+    solids = ((GROUND,) if scene.ground else ()) + tuple(collider.name for collider in scene.colliders)
+    everything = names + solids
+    twice = [name for name in everything if everything.count(name) > 1]
+    if twice:
+        raise ConfigError(f"scene: the name {twice[0]!r} is given twice; avatars, props and colliders need their own")
+    parts = [body.matter() for body in flesh] + list(props)
+    first = np.cumsum([0, *(part.num_particles for part in parts)])
+    owner, local, seam = [], [], []  # subject of every field; field within the subject and seam of every particle
+    for subject, part in enumerate(parts):
+        if subject < len(flesh) and scene.self_contact:
+            sampled = flesh[subject].sampled
+            group, grown = limb_groups(sampled.skin_joints, sampled.skin_weights)
+            owner += [subject] * len(LIMB_GROUPS)
+        else:
+            group, grown = np.zeros(part.num_particles, np.int32), np.zeros(part.num_particles, np.float32)
+            owner += [subject]
+        local.append(owner.index(subject) + group)
+        seam.append(grown)
+    sensor = np.full(first[-1], -1)
+    for index, body in enumerate(flesh):
+        sensor[first[index] : first[index + 1]] = index * NUM_PARTS + body.part
+    density = [float((p.density[0] * p.volume[0]).sum() / p.volume[0].sum()) for p in parts]
+    pairs = _frictions(scene, physics, names, solids)
+    owner_index = np.array(owner)
+    fields = Fields(
+        subject=tuple(owner),
+        friction=pairs[: len(names), : len(names)][np.ix_(owner_index, owner_index)],
+        density=np.array(density)[owner_index],
+        gate=scene.contact_gate,
+        normals=scene.contact_normals,
+        num_sensors=len(flesh) * NUM_PARTS,
+    )
+    colliders = (*_colliders(scene, pairs[: len(names), len(names) :][owner_index]), *walls)
+    matter = _join(parts, rows, np.concatenate(local), np.concatenate(seam), sensor)
+    return Subjects(names, tuple(int(i) for i in first), matter, fields, colliders, solids)
+
+
+def _frictions(scene: SceneConfig, physics: PhysicsConfig, names: Sequence[str], solids: Sequence[str]) -> np.ndarray:
+    """Coulomb coefficients of subjects (rows) on subjects and solids (columns)."""
+    everything = [*names, *solids]
+    table = np.full((len(names), len(everything)), scene.body_friction)
+    for column, name in enumerate(solids, start=len(names)):
+        table[:, column] = next((c.friction for c in scene.colliders if c.name == name), physics.friction)
+    for prop in scene.props:
+        # two surfaces rub as much as the smoother of them
+        row = names.index(prop.name)
+        table[row, len(names) :] = np.minimum(table[row, len(names) :], prop.friction)
+    for pair in scene.pair_friction:
+        for name in (pair.a, pair.b):
+            if name not in everything:
+                raise ConfigError(f"scene.pair_friction: there is no {name!r}; there are {', '.join(everything)}")
+        a, b = everything.index(pair.a), everything.index(pair.b)
+        for row, column in ((a, b), (b, a)):
+            if row < len(names):
+                table[row, column] = pair.friction
+    return table
+
+
+def _colliders(scene: SceneConfig, frictions: np.ndarray) -> tuple[Collider, ...]:
+    """The ground and the scene's solids, ``frictions`` of shape ``(fields, solids)``."""
+    ground = [Collider.plane((0.0, 0.0, 1.0), 0.0, tuple(frictions[:, 0]))] if scene.ground else []
+    others = [
+        Collider(c.kind, c.size, c.position, c.rotation, c.velocity, c.spin, tuple(frictions[:, column]), True)
+        for column, c in enumerate(scene.colliders, start=len(ground))
+    ]
+    return (*ground, *others)
+
+
+def _join(
+    parts: Sequence[MaterialPoints], rows: int, field: np.ndarray, seam: np.ndarray, sensor: np.ndarray
+) -> MaterialPoints:
+    """Matter of several subjects side by side."""
+
+    def side_by_side(name: str) -> np.ndarray:
+        arrays = [getattr(part, name) for part in parts]
+        return np.concatenate([np.broadcast_to(a, (max(rows, len(a)), a.shape[1])) for a in arrays], axis=1)
+
+    names = ("volume", "density", "young_modulus", "poisson_ratio", "material")
+    return MaterialPoints(**{name: side_by_side(name) for name in names}, field=field, seam=seam, sensor=sensor)

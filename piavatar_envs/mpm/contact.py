@@ -1,0 +1,244 @@
+"""Contact between velocity fields: bodies that meet at a grid node push each other, and slide with friction.
+
+Every subject has a velocity field of its own (an avatar may have one for each limb), so that what meets at a node can
+separate again. Fields are compared in pairs, in a fixed order. A pair has *one* normal ``n``, from the difference of
+the gradients of its two volumes, and exchanges one impulse along it (free slip, no tension) and one against the
+sliding (Coulomb)::
+
+    j = m_a m_b / (m_a + m_b) max(0, (v_a - v_b) . n),    friction at most mu j
+
+What ``a`` loses, ``b`` gains, at the same point: linear and angular momentum are kept to round-off. After Bardenhagen
+et al., "The Material-Point Method for Granular Materials" (2000) and, for the common normal, Huang et al., "Contact
+Algorithms for the Material Point Method in Impact and Penetration Simulation" (2011).
+
+PIAvatar (Han et al., arXiv 2606.21162) projects each field with a normal of its own towards the common velocity; the
+impulses of a node then do not add up to zero, and momentum is lost. It can be selected for comparison
+(``own_normals``); the sensors of pairs then stay empty.
+
+Fields meet long before their matter does, a grid spacing apart. A gate on the distance of the matter at a node,
+``n . (x_b - x_a) < gate``, lets bodies come closer.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.stencil import (
+    block_index,
+    blocks_touched,
+)
+from piavatar_envs.mpm.types import Contact, Grid, Sensors, row, vec8
+
+wp.set_module_options({"enable_backward": False})
+
+#: Nodes lighter than this [kg] carry nothing but round-off.
+MASS_MIN = wp.constant(1.0e-15)
+#: Mass of a record whose field has grown together with its subject's trunk at a node.
+GROWN_TOGETHER = wp.constant(-1.0)
+
+
+@wp.func
+def has_field(mask: int, f: int):
+    """Whether bit ``f`` of a block's mask is set."""
+    return ((mask >> f) & 1) != 0
+
+
+@wp.func
+def lowest_field(mask: int, num_fields: int):
+    """First field of a mask; ``num_fields`` if it is empty."""
+    f = int(0)
+    while f < num_fields and not has_field(mask, f):
+        f += 1
+    return f
+
+
+@wp.func
+def end_of_fields(mask: int, num_fields: int):
+    """One more than the last field of a mask; 0 if it is empty."""
+    f = num_fields
+    while f > 0 and not has_field(mask, f - 1):
+        f -= 1
+    return f
+
+
+@wp.func
+def merge_limbs(
+    contact: Contact,
+    num_nodes: int,
+    mask: int,
+    e: int,
+    n: int,
+    node_sum: wp.array2d(dtype=vec8),
+    node_offset: wp.array2d(dtype=wp.vec3),
+):
+    """Join limbs to their trunk at a node where both have seam particles, those that are skinned to both.
+
+    Mass, momentum *and* kinematic momentum are summed, or the shoulders would tear. Without the condition a hand
+    would grow to the belly.
+    """
+    for f in range(contact.num_fields):
+        t = contact.trunk[f]
+        if t != f and has_field(mask, f) and has_field(mask, t):
+            limb = node_sum[e, f * num_nodes + n]
+            trunk = node_sum[e, t * num_nodes + n]
+            if limb[7] > 0.0 and trunk[7] > 0.0:
+                node_sum[e, t * num_nodes + n] = trunk + limb
+                node_offset[e, t * num_nodes + n] += node_offset[e, f * num_nodes + n]
+                node_sum[e, f * num_nodes + n] = vec8(GROWN_TOGETHER, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@wp.func
+def coulomb(m_a: float, m_b: float, approach: wp.vec3, n: wp.vec3, friction: float):
+    """Impulse [N s] that stops the approach ``v_a - v_b`` of two masses along ``n`` and slows their sliding."""
+    vn = wp.dot(approach, n)
+    if vn <= 0.0:
+        return wp.vec3(0.0)
+    reduced = m_a * m_b / (m_a + m_b)
+    vt = approach - vn * n
+    speed = wp.length(vt)
+    if speed <= friction * vn:
+        return reduced * approach
+    return (reduced * vn) * n + (reduced * friction * vn / speed) * vt
+
+
+@wp.func
+def book_contact(
+    contact: Contact, e: int, r: int, other: int, change: wp.vec3, node_contact: wp.array2d(dtype=wp.vec4)
+):
+    """Add a change of velocity [m/s] to a node's record, and keep the subject that has done most of it."""
+    before = node_contact[e, r]
+    so_far = wp.vec3(before[0], before[1], before[2])
+    subject = wp.where(wp.length_sq(change) >= wp.length_sq(so_far), float(contact.subject[other]), before[3])
+    after = so_far + change
+    node_contact[e, r] = wp.vec4(after[0], after[1], after[2], subject)
+
+
+@wp.func
+def touch(
+    contact: Contact,
+    num_nodes: int,
+    e: int,
+    n: int,
+    a: int,
+    b: int,
+    node_offset: wp.array2d(dtype=wp.vec3),
+    node_velocity: wp.array2d(dtype=vec8),
+    node_contact: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
+):
+    """Contact of the fields ``a < b`` at a node: equal and opposite impulses along one normal."""
+    ra = a * num_nodes + n
+    rb = b * num_nodes + n
+    va = node_velocity[e, ra]
+    vb = node_velocity[e, rb]
+    if va[0] <= MASS_MIN or vb[0] <= MASS_MIN:
+        return
+    fields = row(e, contact.density.shape[0])
+    # minus the gradients of the volumes: they point out of the bodies
+    out_a = node_offset[e, ra] / contact.density[fields, a]
+    out_b = node_offset[e, rb] / contact.density[fields, b]
+    n_ab = wp.normalize(out_a - out_b)
+    gap = wp.dot(n_ab, node_offset[e, ra] / va[0] - node_offset[e, rb] / vb[0])
+    if contact.gate > 0.0 and gap >= contact.gate:
+        return
+    approach = wp.vec3(va[1] - vb[1], va[2] - vb[2], va[3] - vb[3])
+    pairs = row(e, contact.friction.shape[0])
+    J = coulomb(va[0], vb[0], approach, n_ab, contact.friction[pairs, a * contact.num_fields + b])
+    if wp.length_sq(J) <= 0.0:
+        return
+    node_velocity[e, ra] = va - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / va[0]
+    node_velocity[e, rb] = vb + vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / vb[0]
+    book_contact(contact, e, ra, b, -J / va[0], node_contact)
+    book_contact(contact, e, rb, a, J / vb[0], node_contact)
+    first = contact.subject[a]
+    second = contact.subject[b]
+    if first != second:
+        wp.atomic_add(sensors.pair_impulse, e, first * contact.num_subjects + second, -J)
+
+
+@wp.func
+def project_alone(
+    contact: Contact,
+    num_nodes: int,
+    mask: int,
+    e: int,
+    n: int,
+    node_offset: wp.array2d(dtype=wp.vec3),
+    node_velocity: wp.array2d(dtype=vec8),
+    node_contact: wp.array2d(dtype=wp.vec4),
+):
+    """The paper's rule: each field loses its approach to the common velocity along its own normal."""
+    m = float(0.0)
+    p = wp.vec3()
+    heaviest = int(0)
+    most = float(0.0)
+    for f in range(contact.num_fields):
+        v = node_velocity[e, f * num_nodes + n]
+        if has_field(mask, f) and v[0] > MASS_MIN:
+            m += v[0]
+            p += v[0] * wp.vec3(v[1], v[2], v[3])
+            if v[0] > most:
+                most = v[0]
+                heaviest = f
+    if m - most <= MASS_MIN:
+        return
+    common = p / m
+    for f in range(contact.num_fields):
+        if has_field(mask, f):
+            r = f * num_nodes + n
+            v = node_velocity[e, r]
+            if v[0] > MASS_MIN:
+                out = wp.normalize(node_offset[e, r])
+                other = wp.where(f == heaviest, lowest_other(mask, f, contact.num_fields), heaviest)
+                mu = contact.friction[row(e, contact.friction.shape[0]), f * contact.num_fields + other]
+                # against a wall that moves with the common velocity
+                J = coulomb(1.0, 1.0, 2.0 * (wp.vec3(v[1], v[2], v[3]) - common), out, mu)
+                node_velocity[e, r] = v - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0)
+                book_contact(contact, e, r, other, -J, node_contact)
+
+
+@wp.func
+def lowest_other(mask: int, f: int, num_fields: int):
+    """First field of a mask that is not ``f``."""
+    other = lowest_field(mask, num_fields)
+    if other == f:
+        other = f + 1
+        while other < num_fields - 1 and not has_field(mask, other):
+            other += 1
+    return other
+
+
+@wp.func
+def touch_all(
+    contact: Contact,
+    num_nodes: int,
+    mask: int,
+    e: int,
+    n: int,
+    node_offset: wp.array2d(dtype=wp.vec3),
+    node_velocity: wp.array2d(dtype=vec8),
+    node_contact: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
+):
+    """Contact of all fields at a node."""
+    if contact.own_normals != 0:
+        project_alone(contact, num_nodes, mask, e, n, node_offset, node_velocity, node_contact)
+        return
+    end = end_of_fields(mask, contact.num_fields)
+    for a in range(lowest_field(mask, contact.num_fields), end - 1):
+        if has_field(mask, a):
+            for b in range(a + 1, end):
+                if has_field(mask, b):
+                    touch(contact, num_nodes, e, n, a, b, node_offset, node_velocity, node_contact, sensors)
+
+
+@wp.func
+def fields_around(grid: Grid, base: wp.vec3i, e: int, active: wp.array2d(dtype=int)):
+    """Fields that have mass in any block of a stencil."""
+    mask = int(0)
+    blocks = blocks_touched(base)
+    for i in range(blocks[0]):
+        for j in range(blocks[1]):
+            for k in range(blocks[2]):
+                mask = mask | active[e, block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)]
+    return mask
