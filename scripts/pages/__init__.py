@@ -1,0 +1,1 @@
+"""What the pages of ``docs/envs`` are made of: entries, facts, settings, text, pictures."""

@@ -1,0 +1,115 @@
+"""What has a page: the registered Gymnasium ids and the PettingZoo modules, and what is read off them.
+
+Sizes, names and the keys of ``info`` come from an environment that was built and stepped once, so that a page cannot
+promise what the code does not do. Its resolution does not matter for them; pages state the default settings.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import piavatar_envs  # noqa: F401 - registers the ids
+from piavatar_envs.envs.config import EnvConfig
+from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.tasks import load_task, task_modules
+from piavatar_envs.tasks.base import Task
+
+ROOT = Path(__file__).resolve().parents[2]
+MULTI = "piavatar_envs.multi"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An environment that users make.
+
+    Attributes:
+        name: of its page and its picture.
+        title: the Gymnasium id, or the dotted name of the PettingZoo module.
+        task: its task class.
+        multi: whether it is a PettingZoo environment.
+    """
+
+    name: str
+    title: str
+    task: type[Task]
+    multi: bool = False
+
+    @property
+    def source(self) -> Path:
+        """File of the task class, from the root of the checkout."""
+        return Path(inspect.getfile(self.task)).resolve().relative_to(ROOT)
+
+    def make(self, **settings: Any) -> Any:
+        """Build the environment: a ``gymnasium.Env`` without wrappers, or a ``pettingzoo.ParallelEnv``."""
+        if self.multi:
+            return importlib.import_module(self.title).parallel_env(**settings)
+        return gymnasium.make(self.title, **settings).unwrapped
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a page states about an environment.
+
+    Attributes:
+        task: the task at its default settings.
+        layout: of the flat observation.
+        agents: names of the agents; empty for a Gymnasium environment.
+        reset_info, info: what an agent's ``info`` held after a reset, and after a step.
+    """
+
+    task: Task
+    layout: ObservationLayout
+    agents: tuple[str, ...]
+    reset_info: Mapping[str, Any]
+    info: Mapping[str, Any]
+
+    @property
+    def config(self) -> EnvConfig:
+        """The default settings."""
+        return self.task.config
+
+
+def single_entries() -> list[Entry]:
+    """One for each registered Gymnasium id."""
+    return [Entry(name, env_id, load_task(env_id)) for env_id, name in task_modules().items()]
+
+
+def multi_entries() -> list[Entry]:
+    """One for each PettingZoo module; none where the package is missing."""
+    if importlib.util.find_spec(MULTI) is None:
+        return []
+    package = importlib.import_module(MULTI)
+    names = sorted(m.name for m in pkgutil.iter_modules(package.__path__) if "_v" in m.name)
+    return [Entry(name, f"{MULTI}.{name}", importlib.import_module(f"{MULTI}.{name}").TASK, True) for name in names]
+
+
+def entries() -> list[Entry]:
+    """Everything that has a page."""
+    return single_entries() + multi_entries()
+
+
+def gather(entry: Entry, env: Any) -> Facts:
+    """Facts of an environment that ``entry`` made, whatever its resolution; it is reset and stepped once."""
+    _, reset_info = env.reset(seed=0)
+    _, _, _, _, info = step(env, np.zeros(env.batch.action_spec.size, np.float32))
+    agents = tuple(env.possible_agents) if entry.multi else ()
+    if agents:
+        reset_info, info = reset_info[agents[0]], info[agents[0]]
+    return Facts(entry.task(entry.task.Config()), env.batch.layout, agents, reset_info, info)
+
+
+def step(env: Any, action: np.ndarray) -> tuple:
+    """A step of either kind of environment; every agent takes the same action."""
+    if isinstance(env, gymnasium.Env):
+        return env.step(action)
+    return env.step({agent: action for agent in env.agents})

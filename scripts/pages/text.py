@@ -1,0 +1,279 @@
+"""The text of a page, section by section."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES, joint_index
+from piavatar_envs.envs.actions import ActionSpec
+from piavatar_envs.mpm.types import FAILURE_NAMES
+from scripts.pages.entries import ROOT, Entry, Facts
+from scripts.pages.markdown import code, listed, number, page, sentence, table
+from scripts.pages.scene import scene_section
+from scripts.pages.settings import Section, Setting, sections_of
+
+FOLDER = ROOT / "docs" / "envs"
+PICTURES = ROOT / "docs" / "images" / "envs"
+NOTE = "<!-- Written from the code by `make docs`: edit {source}, not this page. -->"
+
+#: Meaning of ``ObservationTerm.frame``.
+FRAMES = {
+    "world": "the axes of the world, z up",
+    "root": "the axes of the pelvis, positions relative to it",
+    "parent": "the axes of the parent bone",
+    "bone": "the axes of the bone itself",
+    "-": "",
+}
+#: What the views put into ``info``, beside the task's metrics.
+INFO_DOCS = {
+    "success": "whether the state is a success, see above",
+    "failure": "why the simulation gave up; `None` while it has not",
+    "root_force": "force of the root wrench on the body, its mean over the step, in the world [N]",
+    "root_torque": "its torque about the body's centre of mass [N m]",
+    "root_let_go": "whether the root wrench has let go; it does not take hold again in the episode",
+    "reward_terms": "the terms of the reward by name",
+    "cost": "sum of the cost terms",
+    "cost_terms": "the cost terms by name",
+}
+FAILURE_DOCS = {
+    "nonfinite": "a velocity or a deformation is not finite",
+    "out_of_grid": "the body has left the domain",
+    "cfl": "flesh moves too fast for the time step",
+    "action": "an action was not finite",
+}
+USAGE = """```python
+import gymnasium as gym
+import piavatar_envs
+
+env = gym.make("{title}", render_mode="rgb_array")
+observation, info = env.reset(seed=0)
+```"""
+MULTI_USAGE = """```python
+from {package} import {name}
+
+env = {name}.parallel_env(render_mode="rgb_array")
+observations, infos = env.reset(seed=0)
+```"""
+
+
+def entry_page(entry: Entry, facts: Facts) -> str:
+    """The page of an environment."""
+    task = entry.task
+    return page(
+        [
+            NOTE.format(source=entry.source.as_posix()),
+            f"# {entry.title}",
+            sentence(task.description),
+            f"![{entry.title}]({_relative(PICTURES / f'{entry.name}.png')})",
+            _caption(entry),
+            task.summary,
+            _usage(entry),
+            _overview(entry, facts),
+            _agents(facts),
+            scene_section(facts.task.scene, facts.task.agent_names),
+            _actions(facts),
+            _observations(facts),
+            _reward(entry),
+            _costs(entry),
+            _episode(entry, facts),
+            _info(entry, facts),
+            _arguments(entry, facts),
+            "## Versions\n\n" + "\n".join(f"- {version}: {text}" for version, text in task.history),
+        ]
+    )
+
+
+def _relative(path: os.PathLike[str]) -> str:
+    return os.path.relpath(path, FOLDER).replace(os.sep, "/")
+
+
+def _caption(entry: Entry) -> str:
+    """What a user must set to see the picture."""
+    settings = entry.task.picture_settings
+    return f"*In the picture: {listed(f'{key}={value!r}' for key, value in settings.items())}.*" if settings else ""
+
+
+def _usage(entry: Entry) -> str:
+    package, _, name = entry.title.rpartition(".")
+    return MULTI_USAGE.format(package=package, name=name) if entry.multi else USAGE.format(title=entry.title)
+
+
+def _duration(seconds: float) -> str:
+    """A time step, as a fraction where it is one."""
+    rate = round(1.0 / seconds)
+    return f"1/{rate} s" if rate > 1 and abs(rate * seconds - 1.0) < 1e-9 else f"{number(seconds)} s"
+
+
+def _overview(entry: Entry, facts: Facts) -> str:
+    dt, seconds = facts.config.physics.control_dt, facts.config.episode_seconds
+    rows = [
+        ("action", code(f"Box(-1, 1, ({facts.task.action_spec().size},), float32)")),
+        (
+            "observation",
+            f'{code(f"Box(-inf, inf, ({facts.layout.size},), float32)")}, or a `Dict` with `obs_mode="dict"`',
+        ),
+        ("control step", f"{_duration(dt)}, {round(seconds / dt)} of them in an episode of {number(seconds)} s"),
+        ("source", f"[{entry.source.as_posix()}]({_relative(ROOT / entry.source)})"),
+    ]
+    return table(("", "by default" + (", for each agent" if facts.agents else "")), rows)
+
+
+def _agents(facts: Facts) -> str:
+    if not facts.agents:
+        return ""
+    text = (
+        f"{listed(facts.agents)}: each is one avatar, and their spaces are the same. An agent that terminates leaves "
+        "`env.agents`; its avatar stays in the scene, no longer held up by its root wrench, and the others go on."
+    )
+    return page(["## Agents", text])
+
+
+def _actions(facts: Facts) -> str:
+    spec, dt = facts.task.action_spec(), facts.config.physics.control_dt
+    lower, upper = np.degrees(facts.task.limits())
+    joints, root = [], []
+    for n, joint in enumerate(spec.joints):
+        b = joint_index(joint)
+        ranges = [f"{number(lower[b, axis])} to {number(upper[b, axis])}" for axis in range(3)]
+        joints.append(
+            (code(f"{3 * n}:{3 * n + 3}"), code(f"{joint}.x .y .z"), f"{number(spec.joint_speed * dt)} rad", *ranges)
+        )
+    for n, (name, limit, text) in enumerate(_root_components(spec, dt) if spec.root else (), 3 * len(joints)):
+        root.append((code(f"{n}:{n + 1}"), code(name), limit, text))
+    text = (
+        "Components are clipped to [-1, 1]. Each joint has three: the rotation vector by which its local rotation is "
+        "turned in the step, in the bone's own axes. In the rest pose these are the world's: the avatar faces -y, its "
+        "left is +x. `joint_speed_limit` scales them, and the joint's whole rotation vector is kept within its range."
+    )
+    return page(
+        [
+            "## Actions",
+            text,
+            table(("slice", "components", "at 1, a step", "range of x [deg]", "of y [deg]", "of z [deg]"), joints),
+            "The commanded root moves, too:" if root else "",
+            table(("slice", "component", "at 1, a step", "direction"), root) if root else "",
+        ]
+    )
+
+
+def _root_components(spec: ActionSpec, dt: float) -> list[tuple[str, str, str]]:
+    way, turn = f"{number(spec.root_speed * dt)} m", f"{number(spec.root_turn_speed * dt)} rad"
+    directions = ("to the avatar's left", "to its back: forward is negative", "turn about the vertical, to the left")
+    return list(zip(spec.names()[-3:], (way, way, turn), directions, strict=True))
+
+
+def _observations(facts: Facts) -> str:
+    terms = list(facts.layout.values())
+    rows = [
+        (code(f"{t.slice.start}:{t.slice.stop}"), code(t.name), str(t.size), t.unit, t.frame, t.description)
+        for t in terms
+    ]
+    frames = dict.fromkeys(t.frame for t in terms if FRAMES[t.frame])
+    return page(
+        [
+            "## Observations",
+            table(("slice", "term", "size", "unit", "frame", "meaning"), rows),
+            "Frames: " + "; ".join(f"*{frame}*, {FRAMES[frame]}" for frame in frames) + ".",
+            f"The order of joints is {listed(JOINT_NAMES[1:])}, with `pelvis` before them where all bones are meant; "
+            f"that of body parts is {listed(BODY_PARTS)}.",
+        ]
+    )
+
+
+def _named(docs: Mapping[str, str], names: Sequence[str]) -> list[tuple[str, str]]:
+    return [(code(name), docs.get(name, "")) for name in names]
+
+
+def _reward(entry: Entry) -> str:
+    rows = _named(entry.task.reward_docs, entry.task.reward_terms)
+    return page(["## Reward", "The sum of", table(("term", "value"), rows)])
+
+
+def _costs(entry: Entry) -> str:
+    task = entry.task
+    if not task.cost_terms:
+        return ""
+    text = '`info["cost"]`, for constrained learning and not part of the reward, is the sum of'
+    return page(["## Costs", text, table(("term", "value"), _named(task.cost_docs, task.cost_terms))])
+
+
+def _episode(entry: Entry, facts: Facts) -> str:
+    task, config = entry.task, facts.config
+    drive = config.drive
+    ends = [task.termination_doc] if task.termination_doc else []
+    if drive.root == "wrench":
+        ends.append(
+            f"the root wrench lets go: the pelvis is off its commanded pose by {number(np.degrees(drive.let_go_tilt))} "
+            f"degrees of tilt (`let_go_tilt`), {number(drive.let_go_distance)} m horizontally (`let_go_distance`) or "
+            f"{number(drive.let_go_height)} m in height (`let_go_height`)"
+        )
+    failures = ", ".join(f"{code(name)} ({FAILURE_DOCS[name]})" for name in FAILURE_NAMES.values())
+    ends.append(f'the simulation gives up; `info["failure"]` says why: {failures}')
+    return page(
+        [
+            "## Episode",
+            f'**Success**: `info["success"]` is True when {task.success_doc}.',
+            "**Terminated** when\n\n" + "\n".join(f"- {end};" for end in ends[:-1]) + f"\n- {ends[-1]}.",
+            f"**Truncated** after `episode_seconds`, {number(config.episode_seconds)} s.",
+        ]
+    )
+
+
+def info_docs(entry: Entry) -> dict[str, str]:
+    """Meaning of every key of ``info`` that is known."""
+    return INFO_DOCS | dict(entry.task.metric_docs)
+
+
+def _info(entry: Entry, facts: Facts) -> str:
+    docs = info_docs(entry)
+    rows = [
+        (code(key), _type_name(value), docs.get(key, ""), "" if key in facts.reset_info else "after a step")
+        for key, value in facts.info.items()
+    ]
+    return page(["## Info", table(("key", "type", "meaning", "present"), rows)])
+
+
+def _type_name(value: object) -> str:
+    if value is None:
+        return "str or None"
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype} {value.shape}"
+    return type(value).__name__
+
+
+def _arguments(entry: Entry, facts: Facts) -> str:
+    sections = sections_of(facts.config)
+    own = [setting for section in sections for setting in section.settings if setting.own]
+    shared = [replace(s, settings=tuple(row for row in s.settings if not row.own)) for s in sections]
+    maker, more = ("parallel_env", "`max_cycles` (steps until truncation), ") if entry.multi else ("gym.make", "")
+    text = (
+        f'{code(maker)} takes `render_mode` (`None` or `"rgb_array"`), `device` (of Warp: `"cpu"` or `"cuda:0"`), '
+        f"{more}`config` (a mapping or a YAML file, where `None` is `null`) and, by keyword, every setting below: its "
+        'last name will do, as in `tone=0.3`; the whole one can be given as `**{"drive.tone": 0.3}`. The unit `-` is '
+        "that of a pure number."
+    )
+    return page(
+        [
+            "## Arguments",
+            text,
+            "Settings of this task, and those of all environments that it gives another default:" if own else "",
+            _settings_table(own) if own else "",
+            "Settings of all environments:",
+            *[_folded(section) for section in shared if section.settings],
+        ]
+    )
+
+
+def _settings_table(settings: Sequence[Setting]) -> str:
+    rows = [(code(s.key), s.default, s.unit, s.allowed, s.description) for s in settings]
+    return table(("setting", "default", "unit", "allowed", "meaning"), rows)
+
+
+def _folded(section: Section) -> str:
+    """A table that opens on a click: most readers look for the task's own."""
+    name = f"<code>{section.name}</code>: {section.description}" if section.name else "top level"
+    return f"<details>\n<summary>{name}</summary>\n\n{_settings_table(section.settings)}\n\n</details>"
