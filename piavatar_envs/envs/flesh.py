@@ -56,7 +56,7 @@ class Flesh:
         """Shape the body.
 
         Raises:
-            ConfigError: an avatar's own setting is unknown or out of range.
+            ConfigError: an avatar's own setting is unknown or out of range, or a region holds nothing.
         """
         strange = [name for name in avatar.physics if name not in OF_FLESH]
         if strange:
@@ -69,6 +69,8 @@ class Flesh:
         self.avatar, self.asset, self.sampled, self.num_envs = avatar, asset, sampled, num_envs
         self.base_parameters = asset.parameters(**self.shape.parameters)
         self.shape_parameters = np.tile(self.base_parameters, (num_envs, 1))
+        for region in avatar.regions:
+            self.in_region(region)
         self.part = body_part_of_joint()[sampled.skin_joints[:, 0]].astype(np.int32)
         self.points, self._volume = self.shaped(self.base_parameters)
         if self.shape.randomize:

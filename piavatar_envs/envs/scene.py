@@ -119,5 +119,5 @@ class SceneConfig(BaseModel):
         "shared", description="shared (one normal a pair: keeps momentum) or own (the paper's rule, which does not)"
     )
     contact_gate: float = Field(
-        1.2, ge=0.0, le=3.0, description="distance of two bodies' matter below which they touch; 0: any [grid spacings]"
+        0.15, ge=0.0, le=3.0, description="gap between two bodies' surfaces below which they touch [grid spacings]"
     )

@@ -1,8 +1,8 @@
 """Contact between velocity fields: bodies that meet at a grid node push each other, and slide with friction.
 
 Every subject has a velocity field of its own (an avatar may have one for each limb), so that what meets at a node can
-separate again. Fields are compared in pairs, in a fixed order. A pair has *one* normal ``n``, from the difference of
-the gradients of its two volumes, and exchanges one impulse along it (free slip, no tension) and one against the
+separate again. Fields are compared in pairs, in a fixed order. A pair has *one* normal ``n``, which
+:mod:`piavatar_envs.mpm.normals` finds, and exchanges one impulse along it (free slip, no tension) and one against the
 sliding (Coulomb)::
 
     j = m_a m_b / (m_a + m_b) max(0, (v_a - v_b) . n),    friction at most mu j
@@ -15,76 +15,20 @@ PIAvatar (Han et al., arXiv 2606.21162) projects each field with a normal of its
 impulses of a node then do not add up to zero, and momentum is lost. It can be selected for comparison
 (``own_normals``); the sensors of pairs then stay empty.
 
-Fields meet long before their matter does, a grid spacing apart. A gate on the distance of the matter at a node,
-``n . (x_b - x_a) < gate``, lets bodies come closer.
+Fields meet long before their matter does, a grid spacing apart. A gate on the gap between their surfaces lets bodies
+come closer.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.stencil import (
-    block_index,
-    blocks_touched,
-)
+from piavatar_envs.mpm.masks import end_of_fields, has_field, lowest_field, lowest_other
+from piavatar_envs.mpm.normals import MASS_MIN, shared_normal, surface_gap, volume_at
+from piavatar_envs.mpm.stencil import node_of
 from piavatar_envs.mpm.types import Contact, Grid, Sensors, row, vec8
 
 wp.set_module_options({"enable_backward": False})
-
-#: Nodes lighter than this [kg] carry nothing but round-off.
-MASS_MIN = wp.constant(1.0e-15)
-#: Mass of a record whose field has grown together with its subject's trunk at a node.
-GROWN_TOGETHER = wp.constant(-1.0)
-
-
-@wp.func
-def has_field(mask: int, f: int):
-    """Whether bit ``f`` of a block's mask is set."""
-    return ((mask >> f) & 1) != 0
-
-
-@wp.func
-def lowest_field(mask: int, num_fields: int):
-    """First field of a mask; ``num_fields`` if it is empty."""
-    f = int(0)
-    while f < num_fields and not has_field(mask, f):
-        f += 1
-    return f
-
-
-@wp.func
-def end_of_fields(mask: int, num_fields: int):
-    """One more than the last field of a mask; 0 if it is empty."""
-    f = num_fields
-    while f > 0 and not has_field(mask, f - 1):
-        f -= 1
-    return f
-
-
-@wp.func
-def merge_limbs(
-    contact: Contact,
-    num_nodes: int,
-    mask: int,
-    e: int,
-    n: int,
-    node_sum: wp.array2d(dtype=vec8),
-    node_offset: wp.array2d(dtype=wp.vec3),
-):
-    """Join limbs to their trunk at a node where both have seam particles, those that are skinned to both.
-
-    Mass, momentum *and* kinematic momentum are summed, or the shoulders would tear. Without the condition a hand
-    would grow to the belly.
-    """
-    for f in range(contact.num_fields):
-        t = contact.trunk[f]
-        if t != f and has_field(mask, f) and has_field(mask, t):
-            limb = node_sum[e, f * num_nodes + n]
-            trunk = node_sum[e, t * num_nodes + n]
-            if limb[7] > 0.0 and trunk[7] > 0.0:
-                node_sum[e, t * num_nodes + n] = trunk + limb
-                node_offset[e, t * num_nodes + n] += node_offset[e, f * num_nodes + n]
-                node_sum[e, f * num_nodes + n] = vec8(GROWN_TOGETHER, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @wp.func
@@ -115,31 +59,31 @@ def book_contact(
 
 @wp.func
 def touch(
+    grid: Grid,
     contact: Contact,
-    num_nodes: int,
     e: int,
     n: int,
     a: int,
     b: int,
+    active: wp.array2d(dtype=int),
+    node_facing: wp.array2d(dtype=wp.vec3),
     node_offset: wp.array2d(dtype=wp.vec3),
     node_velocity: wp.array2d(dtype=vec8),
     node_contact: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """Contact of the fields ``a < b`` at a node: equal and opposite impulses along one normal."""
-    ra = a * num_nodes + n
-    rb = b * num_nodes + n
+    ra = a * grid.num_nodes + n
+    rb = b * grid.num_nodes + n
     va = node_velocity[e, ra]
     vb = node_velocity[e, rb]
     if va[0] <= MASS_MIN or vb[0] <= MASS_MIN:
         return
-    fields = row(e, contact.density.shape[0])
-    # minus the gradients of the volumes: they point out of the bodies
-    out_a = node_offset[e, ra] / contact.density[fields, a]
-    out_b = node_offset[e, rb] / contact.density[fields, b]
-    n_ab = wp.normalize(out_a - out_b)
-    gap = wp.dot(n_ab, node_offset[e, ra] / va[0] - node_offset[e, rb] / vb[0])
-    if contact.gate > 0.0 and gap >= contact.gate:
+    n_ab = shared_normal(grid, e, node_of(grid, n), a, b, active, node_facing)
+    distance = wp.dot(n_ab, node_offset[e, ra] / va[0] - node_offset[e, rb] / vb[0])
+    V_a = volume_at(grid, contact, e, a, va[0])
+    V_b = volume_at(grid, contact, e, b, vb[0])
+    if surface_gap(grid, V_a, V_b, distance) >= contact.gate:
         return
     approach = wp.vec3(va[1] - vb[1], va[2] - vb[2], va[3] - vb[3])
     pairs = row(e, contact.friction.shape[0])
@@ -198,23 +142,14 @@ def project_alone(
 
 
 @wp.func
-def lowest_other(mask: int, f: int, num_fields: int):
-    """First field of a mask that is not ``f``."""
-    other = lowest_field(mask, num_fields)
-    if other == f:
-        other = f + 1
-        while other < num_fields - 1 and not has_field(mask, other):
-            other += 1
-    return other
-
-
-@wp.func
 def touch_all(
+    grid: Grid,
     contact: Contact,
-    num_nodes: int,
     mask: int,
     e: int,
     n: int,
+    active: wp.array2d(dtype=int),
+    node_facing: wp.array2d(dtype=wp.vec3),
     node_offset: wp.array2d(dtype=wp.vec3),
     node_velocity: wp.array2d(dtype=vec8),
     node_contact: wp.array2d(dtype=wp.vec4),
@@ -222,23 +157,14 @@ def touch_all(
 ):
     """Contact of all fields at a node."""
     if contact.own_normals != 0:
-        project_alone(contact, num_nodes, mask, e, n, node_offset, node_velocity, node_contact)
+        project_alone(contact, grid.num_nodes, mask, e, n, node_offset, node_velocity, node_contact)
         return
     end = end_of_fields(mask, contact.num_fields)
     for a in range(lowest_field(mask, contact.num_fields), end - 1):
         if has_field(mask, a):
             for b in range(a + 1, end):
                 if has_field(mask, b):
-                    touch(contact, num_nodes, e, n, a, b, node_offset, node_velocity, node_contact, sensors)
-
-
-@wp.func
-def fields_around(grid: Grid, base: wp.vec3i, e: int, active: wp.array2d(dtype=int)):
-    """Fields that have mass in any block of a stencil."""
-    mask = int(0)
-    blocks = blocks_touched(base)
-    for i in range(blocks[0]):
-        for j in range(blocks[1]):
-            for k in range(blocks[2]):
-                mask = mask | active[e, block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)]
-    return mask
+                    touch(
+                        grid, contact, e, n, a, b, active,
+                        node_facing, node_offset, node_velocity, node_contact, sensors,
+                    )  # fmt: skip

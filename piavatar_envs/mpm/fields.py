@@ -12,8 +12,8 @@ from piavatar_envs.mpm.types import Contact
 
 #: One bit of an int32 a field; the sign is left alone.
 MAX_FIELDS = 31
-#: Distance of two bodies' matter at a node below which they touch [grid spacings]: leaves a visible gap of a third.
-CONTACT_GATE = 1.2
+#: Gap between two bodies' surfaces below which they touch [grid spacings].
+CONTACT_GATE = 0.15
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Fields:
         subject: subject of each field, counted from 0, the fields of a subject next to each other, its trunk first.
         friction: Coulomb coefficient of every pair of fields, shape ``(F, F)`` or one number.
         density: reference density of each field's matter [kg/m^3], shape ``(F,)`` or one number.
-        gate: distance of the matter of two fields at a node below which they touch [grid spacings]; 0 for any.
+        gate: gap between the surfaces of two fields below which they touch [grid spacings]; from 3 on any.
         normals: ``"shared"`` (one normal a pair) or ``"own"`` (the paper's rule, which loses momentum).
         num_sensors: rows of the contact sensor that particles refer to.
     """
@@ -64,7 +64,7 @@ class Fields:
         if self.normals not in ("shared", "own"):
             raise ValueError(f"normals={self.normals!r} must be 'shared' or 'own'")
         if not (np.isfinite(self.gate) and self.gate >= 0.0):
-            raise ValueError(f"gate={self.gate} must be 0 (none) or a number of grid spacings")
+            raise ValueError(f"gate={self.gate} must be a gap of at least 0 grid spacings")
 
     def upload(self, dx: float, rows: int, device: str) -> Contact:
         """Kernel argument; ``rows`` (1 or ``num_envs``) copies of the densities and coefficients.

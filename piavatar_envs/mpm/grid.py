@@ -5,15 +5,9 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_SLAB, boundary_contact, nearest_boundary
-from piavatar_envs.mpm.contact import (
-    GROWN_TOGETHER,
-    MASS_MIN,
-    end_of_fields,
-    has_field,
-    lowest_field,
-    merge_limbs,
-    touch_all,
-)
+from piavatar_envs.mpm.contact import touch_all
+from piavatar_envs.mpm.masks import end_of_fields, has_field, lowest_field
+from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN
 from piavatar_envs.mpm.stencil import BLOCK, block_corner, node_index, node_position
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Boundaries, Contact, Grid, Sensors, Step, vec8
 
@@ -70,10 +64,10 @@ def physical_velocity(split: bool, near: bool, total: vec8):
 
 @wp.func
 def solve_shared_node(
+    grid: Grid,
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
-    num_nodes: int,
     mask: int,
     e: int,
     n: int,
@@ -81,22 +75,24 @@ def solve_shared_node(
     near: bool,
     at: wp.vec3,
     gate: float,
+    active: wp.array2d(dtype=int),
+    node_facing: wp.array2d(dtype=wp.vec3),
     node_sum: wp.array2d(dtype=vec8),
     node_offset: wp.array2d(dtype=wp.vec3),
     node_velocity: wp.array2d(dtype=vec8),
     node_contact: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """A node of a block with several fields: limbs grow together, bodies touch, boundaries are met."""
+    """A node of a block with several fields: bodies touch, boundaries are met."""
+    num_nodes = grid.num_nodes
     first = lowest_field(mask, contact.num_fields)
     end = end_of_fields(mask, contact.num_fields)
-    merge_limbs(contact, num_nodes, mask, e, n, node_sum, node_offset)
     for f in range(first, end):
         r = f * num_nodes + n
         if has_field(mask, f):
             node_velocity[e, r] = total_velocity(step, split, node_sum[e, r])
             node_contact[e, r] = wp.vec4(0.0)
-    touch_all(contact, num_nodes, mask, e, n, node_offset, node_velocity, node_contact, sensors)
+    touch_all(grid, contact, mask, e, n, active, node_facing, node_offset, node_velocity, node_contact, sensors)
     for f in range(first, end):
         r = f * num_nodes + n
         if has_field(mask, f):
@@ -124,6 +120,7 @@ def update_grid(
     contact: Contact,
     slabs: int,
     active: wp.array2d(dtype=int),
+    node_facing: wp.array2d(dtype=wp.vec3),
     # in and out: read, then cleared
     node_sum: wp.array2d(dtype=vec8),
     node_offset: wp.array2d(dtype=wp.vec3),
@@ -160,8 +157,8 @@ def update_grid(
                 at = node_position(grid, i, j, k)
                 if shared:
                     solve_shared_node(
-                        step, boundaries, contact, grid.num_nodes, mask, e, n, split, near, at, gate,
-                        node_sum, node_offset, node_velocity, node_contact, sensors,
+                        grid, step, boundaries, contact, mask, e, n, split, near, at, gate,
+                        active, node_facing, node_sum, node_offset, node_velocity, node_contact, sensors,
                     )  # fmt: skip
                 else:
                     r = of_field + n

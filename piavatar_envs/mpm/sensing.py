@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.contact import fields_around, has_field
+from piavatar_envs.mpm.masks import fields_around, has_field
 from piavatar_envs.mpm.stencil import base_node, block_index, grid_position, node_index, spline, stencil_inside
 from piavatar_envs.mpm.types import Contact, Grid, Particles, Sensors, row, vec8
 
@@ -48,6 +48,9 @@ def sense_contact(
     wy = spline(f[1])
     wz = spline(f[2])
     m = particles.mass[row(e, particles.mass.shape[0]), p]
+    # summed up before it is added to what may be a thousand times as large
+    impulse = wp.vec3()
+    giver = int(0)
     for i in range(3):
         for j in range(3):
             for k in range(3):
@@ -57,7 +60,14 @@ def sense_contact(
                     change = node_contact[e, own * grid.num_nodes + n]
                     dv = wp.vec3(change[0], change[1], change[2])
                     if wp.length_sq(dv) > 0.0:
-                        wp.atomic_add(part_impulse, e, sensor, int(change[3]), (m * wx[i] * wy[j] * wz[k]) * dv)
+                        if int(change[3]) != giver:
+                            if wp.length_sq(impulse) > 0.0:
+                                wp.atomic_add(part_impulse, e, sensor, giver, impulse)
+                            impulse = wp.vec3()
+                            giver = int(change[3])
+                        impulse += (m * wx[i] * wy[j] * wz[k]) * dv
+    if wp.length_sq(impulse) > 0.0:
+        wp.atomic_add(part_impulse, e, sensor, giver, impulse)
 
 
 @wp.kernel

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.grid import threads_per_block, update_grid
+from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.sensing import clear_sensors, sense_contact, sense_penetration
 from piavatar_envs.mpm.transfer import grid_to_particles, mark_particles, particles_to_grid
@@ -27,10 +28,13 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
         [nodes.sum, nodes.offset],
     )
     slabs = threads_per_block(m.device)
+    blocks = (m.num_envs, m.num_blocks, slabs)
+    if m.contact.num_fields > 1:
+        program.launch(find_facing, blocks, [m.grid, m.contact, slabs, active], [nodes.sum, nodes.offset, nodes.facing])
     program.launch(
         update_grid,
-        (m.num_envs, m.num_blocks, slabs),
-        [m.grid, m.step, m.boundaries, m.contact, slabs, active],
+        blocks,
+        [m.grid, m.step, m.boundaries, m.contact, slabs, active, nodes.facing],
         [nodes.sum, nodes.offset, nodes.velocity, nodes.contact, next_active, scratch.sensors],
     )
     if m.contact.num_fields > 1:

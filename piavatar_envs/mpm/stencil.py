@@ -58,6 +58,13 @@ def node_index(grid: Grid, i: int, j: int, k: int):
 
 
 @wp.func
+def node_of(grid: Grid, n: int):
+    """Node of a linear index within its velocity field."""
+    ij = n // grid.nodes[2]
+    return wp.vec3i(ij // grid.nodes[1], ij % grid.nodes[1], n % grid.nodes[2])
+
+
+@wp.func
 def node_position(grid: Grid, i: int, j: int, k: int):
     """World position of node ``(i, j, k)`` [m]."""
     return grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k))

@@ -9,8 +9,8 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_PARTICLE, nearest_boundary, remove_approach
-from piavatar_envs.mpm.contact import fields_around
 from piavatar_envs.mpm.decouple import advance_deformation
+from piavatar_envs.mpm.masks import fields_around
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.stencil import (
     base_node,

@@ -89,7 +89,7 @@ class Contact:
     num_fields: int
     num_subjects: int
     own_normals: int  # 1: the paper's rule, each field with its own normal
-    gate: float  # largest distance of two fields' matter at a node that is contact [m]; 0: any
+    gate: float  # largest gap between the surfaces of two fields that is contact [m]
     subject: wp.array(dtype=int)  # (F,) subject of a field
     trunk: wp.array(dtype=int)  # (F,) first field of the same subject, with which seams grow together
     friction: wp.array2d(dtype=float)  # (rows, F * F) Coulomb coefficient of a pair
@@ -209,12 +209,15 @@ class Nodes:
         velocity: vec8: mass, physical velocity, kinematic velocity, 1 near boundaries.
         contact: vec4: change of velocity by other subjects, and the index of the one that did most of it; of blocks
             with several fields only.
+        facing: vec3: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`; of blocks with
+            several fields only.
     """
 
     sum: wp.array
     offset: wp.array
     velocity: wp.array
     contact: wp.array
+    facing: wp.array
 
 
 @dataclass

@@ -20,8 +20,8 @@ PARTICLE = 123
 
 
 def every_number(observation, reward, info) -> np.ndarray:
-    values = [observation, [reward], list(info["reward_terms"].values())]
-    values += [np.ravel(value) for name, value in info.items() if name not in ("failure", "reward_terms")]
+    values = [observation, [reward], list(info["reward_terms"].values()), list(info.get("cost_terms", {}).values())]
+    values += [np.ravel(info[name]) for name in info if name not in ("failure", "reward_terms", "cost_terms")]
     return np.concatenate([np.ravel(np.asarray(value, float)) for value in values])
 
 

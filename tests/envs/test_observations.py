@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS
-from piavatar_envs.envs.observations import SELF_TERMS, ObservationLayout, ObservationTerm
+from piavatar_envs.envs.observations import CONTACT_TERMS, SELF_TERMS, ObservationLayout, ObservationTerm
+from piavatar_envs.envs.others import prop_terms
 
 
 def kabsch(x: np.ndarray, x0: np.ndarray) -> np.ndarray:
@@ -38,7 +39,9 @@ class Bones:
 
 def bones_of(batch, env: int = 0) -> Bones:
     simulation = batch.simulation
-    points, state = simulation.flesh[0].points, {k: v[env].astype(float) for k, v in simulation.state.numpy().items()}
+    points = simulation.flesh[0].points
+    own = slice(0, points.num_points)  # props come after the avatar
+    state = {k: v[env].astype(float)[own] for k, v in simulation.state.numpy().items() if v.ndim > 1}
     rest, joints = (a[min(env, len(a) - 1)].astype(float) for a in (points.rest, points.joints))
     found = []
     for b in range(NUM_JOINTS):
@@ -54,9 +57,8 @@ def observed(batch, env: int = 0) -> dict[str, np.ndarray]:
     bones, physics = bones_of(batch, env), batch.config.physics
     to_root = bones.rotation[0].T
     local = [bones.rotation[PARENTS[b]].T @ bones.rotation[b] for b in range(1, NUM_JOINTS)]
-    stress = von_mises(
-        batch.simulation.state.F.numpy()[env].astype(float), physics.young_modulus, physics.poisson_ratio
-    )
+    F = batch.simulation.state.F.numpy()[env, : batch.simulation.avatar.num_points].astype(float)
+    stress = von_mises(F, physics.young_modulus, physics.poisson_ratio)
     owner = [JOINT_NAMES[j] for j in batch.simulation.flesh[0].points.skin_joints[:, 0]]
     return {
         "root_height": bones.position[0, 2:],
@@ -121,7 +123,10 @@ def test_layout_tiles_the_vector_and_explains_it(make_env, env_id):
         at += term.size
     assert at == layout.size == env.observation_space.shape[0] == env.reset(seed=0)[0].size
     assert list(layout)[: len(SELF_TERMS)] == [term.name for term in SELF_TERMS]
-    assert list(layout)[len(SELF_TERMS) :] == [term.name for term in env.batch.task.observation_terms]
+    task = env.batch.task
+    seen = [term.name for term in CONTACT_TERMS] if task.observes_contact else []
+    seen += [term.name for prop in task.observed_props() for term in prop_terms(prop)]
+    assert list(layout)[len(SELF_TERMS) :] == seen + [term.name for term in task.terms()]
 
 
 def test_splitting_copies_along_the_last_axis():

@@ -12,7 +12,7 @@ import warp as wp
 from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
 from piavatar_envs.mpm.diagnostics import Totals, totals
-from piavatar_envs.mpm.fields import Fields
+from piavatar_envs.mpm.fields import CONTACT_GATE, Fields
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
@@ -157,7 +157,7 @@ def meet(simulate) -> Callable[..., Simulation]:
     def build(
         bodies: Sequence[dict],
         friction: np.ndarray | float = 0.0,
-        gate: float = 1.2,
+        gate: float = CONTACT_GATE,
         normals: str = "shared",
         spacing: float = 0.025,
         stiffness: float = 100.0,

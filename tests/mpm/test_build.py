@@ -171,10 +171,9 @@ def test_memory_estimate(model_of, fields):
     """Close to what the arrays take."""
     model = model_of(num_envs=3, fields=Fields(tuple(range(fields))))
     state, scratch = allocate(model)
-    nodes = scratch.nodes
-    arrays = [*vars(state).values(), scratch.block_fields, nodes.sum, nodes.offset, nodes.velocity, nodes.contact]
+    arrays = [*vars(state).values(), scratch.block_fields, *vars(scratch.nodes).values()]
     taken = sum(array.capacity for array in arrays)
-    estimate = estimate_bytes(3, model.num_particles, fields * model.num_nodes)
+    estimate = estimate_bytes(3, model.num_particles, model.num_nodes, fields)
     assert taken <= estimate <= 1.25 * taken
 
 

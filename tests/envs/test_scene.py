@@ -1,0 +1,197 @@
+"""What is in a world: avatars with settings of their own, props, colliders, friction by name, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from piavatar_envs.avatar.limbs import LIMB_GROUPS
+from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES
+from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.envs.simulation import Domain, Simulation
+from piavatar_envs.mpm.materials import MATERIALS
+
+BALL = {"name": "ball", "mass": 0.5, "position": [0.0, -1.0, 1.0]}
+
+
+def world(device, num_envs=1, **scene) -> Simulation:
+    """A world of tiny bodies."""
+    return Simulation(load_config(EnvConfig, None, {"fidelity": "tiny", "scene": scene}), num_envs, device)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_as_many_avatars_as_the_scene_says(device, count):
+    avatars = [{"position": [0.8 * index, 0.0], "yaw": 0.5 * index} for index in range(count)]
+    simulation = world(device, avatars=avatars)
+    single = world(device)
+    assert len(simulation.avatars) == len(simulation.flesh) == count
+    assert simulation.model.num_particles == count * single.model.num_particles
+    assert simulation.subjects.names == tuple(f"agent_{index}" for index in range(count))
+    assert simulation.model.contact.num_fields == count
+    field, first = simulation.model.particles.field.numpy(), simulation.subjects.first
+    for index in range(count):
+        assert (field[first[index] : first[index + 1]] == index).all()
+    upper = np.asarray(simulation.model.grid.origin) + simulation.dx * (np.asarray(simulation.model.grid.nodes) - 2)
+    assert upper[0] >= Domain().upper[0] + 0.8 * (count - 1) - 1e-3
+
+
+def test_avatars_have_settings_of_their_own(device):
+    avatars = [
+        {},
+        {
+            "position": [1.0, 0.0],
+            "drive": {"tone": 0.25, "alpha": 0.1, "max_force_weight": 0.5},
+            "physics": {"young_modulus": 5.0e4, "density": 900.0, "material": "fixed_corotated"},
+            "shape": {"parameters": {"height": 0.8}},
+        },
+    ]
+    simulation = world(device, avatars=avatars)
+    a, b = simulation.avatars
+    assert (a.settings.tone, b.settings.tone) == (1.0, 0.25)
+    assert (a.settings.max_force, b.settings.max_force) == (2.0, 0.5)
+    assert b.settings.alpha == 0.1 and a.settings.alpha == 0.3
+    own = slice(simulation.subjects.first[1], simulation.subjects.first[2])
+    particles = simulation.model.particles
+    assert np.unique(particles.material.numpy()[0, own]).tolist() == [list(MATERIALS).index("fixed_corotated")]
+    assert (particles.mu.numpy()[0, own] == np.float32(5.0e4 / 2.6)).all()
+    assert particles.mass.numpy()[0, own].sum() == pytest.approx(900.0 * simulation.flesh[1]._volume.sum(), rel=1e-4)
+    heights = [np.ptp(flesh.points.rest[0][:, 2]) for flesh in simulation.flesh]
+    assert heights[1] > heights[0] + 0.05
+
+
+def test_the_softest_avatar_does_not_set_the_time_step(device):
+    stiff = world(device, avatars=[{"physics": {"young_modulus": 4.0e5}}, {"position": [1.0, 0.0]}])
+    assert stiff.model.num_substeps == pytest.approx(2.0 * world(device).model.num_substeps, abs=1)
+
+
+def test_regions_are_of_another_material(device):
+    regions = [
+        {"joints": ["head"], "material": "fixed_corotated", "young_modulus": 5.0e3},
+        {"joints": ["left_ankle", "right_ankle"], "young_modulus": 2.0e5, "density": 1200.0},
+    ]
+    simulation = world(device, avatars=[{"regions": regions}])
+    owner = np.array([JOINT_NAMES[j] for j in simulation.flesh[0].sampled.skin_joints[:, 0]])
+    particles = simulation.model.particles
+    young = particles.mu.numpy()[0] * 2.6
+    head, ankle = owner == "head", np.isin(owner, ("left_ankle", "right_ankle"))
+    assert head.any() and ankle.any()
+    assert young[head] == pytest.approx(5.0e3, rel=1e-5) and young[ankle] == pytest.approx(2.0e5, rel=1e-5)
+    assert young[~head & ~ankle] == pytest.approx(1.0e5, rel=1e-5)
+    assert (particles.material.numpy()[0] == head).all()
+    density = particles.mass.numpy()[0] / particles.volume.numpy()[0]
+    assert density[ankle] == pytest.approx(1200.0, rel=1e-4) and density[~ankle] == pytest.approx(1000.0, rel=1e-4)
+
+
+def test_limbs_are_fields_of_their_own(device):
+    simulation = world(device, self_contact=True, avatars=[{}, {"position": [1.0, 0.0]}], props=[BALL])
+    fields = simulation.subjects.fields
+    assert fields.subject == (0,) * len(LIMB_GROUPS) + (1,) * len(LIMB_GROUPS) + (2,)
+    assert np.unique(simulation.model.particles.field.numpy()).tolist() == list(range(11))
+    trunk = simulation.model.contact.trunk.numpy()
+    assert trunk.tolist() == [0] * 5 + [5] * 5 + [10]
+
+
+def test_props_have_their_mass_and_the_fleshs_wave_speed(device):
+    props = [BALL, {"name": "brick", "shape": "box", "size": [0.2, 0.2, 0.2], "density": 300.0, "young_modulus": 2e4}]
+    simulation = world(device, num_envs=2, props=props)
+    assert simulation.props.mass[0] == pytest.approx(0.5, rel=1e-6)
+    particles, first = simulation.model.particles, simulation.subjects.first
+    ball, brick = slice(first[1], first[2]), slice(first[2], first[3])
+    assert particles.mass.numpy().shape[0] == 2
+    assert particles.mass.numpy()[0, ball].sum() == pytest.approx(0.5, rel=1e-5)
+    assert particles.mass.numpy()[0, brick].sum() == pytest.approx(300.0 * 0.4**3, rel=1e-4)
+    density = particles.mass.numpy()[0, ball] / particles.volume.numpy()[0, ball]
+    waves = (particles.lam.numpy()[0, ball] + 2.0 * particles.mu.numpy()[0, ball]) / density
+    flesh = (particles.lam.numpy()[0, 0] + 2.0 * particles.mu.numpy()[0, 0]) / 1000.0
+    assert waves == pytest.approx(flesh, rel=1e-4)
+    assert simulation.model.num_substeps == world(device).model.num_substeps
+
+
+def test_friction_of_pairs(device):
+    simulation = world(
+        device,
+        avatars=[{}, {"position": [1.0, 0.0]}],
+        props=[BALL | {"friction": 0.1}],
+        colliders=[{"name": "wall", "size": [0.1, 1.0, 1.0], "position": [-1.2, 0.0, 1.0], "friction": 0.4}],
+        body_friction=0.6,
+        pair_friction=[
+            {"a": "ball", "b": "agent_1", "friction": 0.0},
+            {"a": "ground", "b": "agent_0", "friction": 1.5},
+        ],
+    )
+    table = simulation.model.contact.friction.numpy()[0].reshape(3, 3)
+    assert table[0, 1] == table[1, 0] == np.float32(0.6)
+    assert table[0, 2] == np.float32(0.6) and table[1, 2] == table[2, 1] == 0.0
+    count = simulation.model.boundaries.count
+    on_solids = simulation.model.boundaries.friction.numpy()[0].reshape(3, count)
+    assert on_solids[:, :2] == pytest.approx(np.array([[1.5, 0.4], [0.8, 0.4], [0.1, 0.1]]))
+    assert not on_solids[:, 2:].any()  # the walls around the domain are smooth
+
+
+@pytest.mark.parametrize(
+    ("scene", "told"),
+    [
+        ({"props": [BALL, BALL]}, "'ball' is given twice"),
+        ({"props": [BALL | {"name": "ground"}]}, "'ground' is given twice"),
+        ({"props": [BALL | {"size": [0.1, 0.2]}]}, "prop ball: size.*1 numbers"),
+        ({"props": [BALL | {"shape": "mesh", "size": [1.0]}]}, "prop ball: .*needs a file"),
+        ({"props": [BALL | {"mass": -1.0}]}, "mass=-1.0 must be > 0"),
+        ({"props": [{"shape": "sphere"}]}, "name is missing"),
+        ({"pair_friction": [{"a": "ball", "b": "agent_0", "friction": 0.1}]}, "there is no 'ball'"),
+        ({"avatars": [{"drive": {"tone": 2.0}}]}, "tone=2.0 must be <= 1"),
+        ({"avatars": [{"drive": {"tune": 0.2}}]}, "tune is no setting of DriveConfig"),
+        ({"avatars": [{"physics": {"fidelity": "fine"}}]}, "fidelity cannot differ between avatars"),
+        ({"avatars": [{"regions": [{"joints": ["tail"]}]}]}, "unknown joint 'tail'"),
+        ({"avatars": [{"regions": [{"joints": ["head"], "beyond": 3.0}]}]}, "3.0 m from the bones"),
+        ({"avatars": [{"position": [float(k), 0.0]} for k in range(7)], "self_contact": True}, "35 velocity fields"),
+        ({"colliders": [{"name": "post", "kind": "capsule", "size": [0.1]}]}, "capsule must be 2 positive"),
+    ],
+)
+def test_what_cannot_be_is_refused(device, scene, told):
+    with pytest.raises((ConfigError, ValueError), match=told):
+        world(device, **scene)
+
+
+def test_a_task_with_one_avatar_takes_no_second(make_env):
+    with pytest.raises(ConfigError, match=r"scene\.avatars has 2 entries"):
+        make_env("PIAvatar/Reach-v0", scene={"avatars": [{}, {"position": [1.0, 0.0]}]})
+
+
+def test_any_task_takes_more_props_and_colliders(make_env):
+    """A ball dropped beside the avatar falls freely, then rests on the floor; a kinematic box goes its way."""
+    scene = {
+        "props": [BALL | {"position": [0.9, 0.0, 1.0], "size": [0.2]}],
+        "colliders": [{"name": "lift", "size": [0.1, 0.1, 0.1], "position": [-1.2, 0.0, 0.5], "velocity": [0, 0, 0.3]}],
+    }
+    env = make_env("PIAvatar/Reach-v0", scene=scene)
+    env.reset(seed=0)
+    state, boundaries = env.batch.simulation.props.state, env.batch.simulation.model.boundaries
+    for _ in range(6):
+        env.step(np.zeros(env.action_space.shape))
+    assert 1.0 - state.position.numpy()[0, 0, 2] == pytest.approx(0.5 * 9.81 * 0.2**2, rel=0.05)
+    assert boundaries.position.numpy()[0, 1, 2] == pytest.approx(0.5 + 0.3 * 0.2, abs=1e-5)
+    for _ in range(54):
+        info = env.step(np.zeros(env.action_space.shape))[4]
+    assert info["failure"] is None
+    assert state.position.numpy()[0, 0, 2] == pytest.approx(0.2, abs=0.05)
+    assert np.abs(state.velocity.numpy()[0, 0]).max() < 0.3
+    env.reset(seed=0)
+    assert boundaries.position.numpy()[0, 1, 2] == pytest.approx(0.5)
+    assert state.position.numpy()[0, 0] == pytest.approx([0.9, 0.0, 1.0], abs=1e-5)
+
+
+def test_a_ball_that_hits_is_felt_where_it_hits(make_env):
+    """Thrown at the chest: what the torso feels is what the ball has lost, and it is in the saved state."""
+    ball = {"name": "ball", "mass": 2.0, "size": [0.2], "position": [0.0, -0.8, 1.2], "velocity": [0.0, 6.0, 0.0]}
+    env = make_env("PIAvatar/Reach-v0", pose_noise=0.0, scene={"props": [ball]}, gravity=0.0)
+    env.reset(seed=0)
+    simulation = env.batch.simulation
+    felt, before = np.zeros((len(BODY_PARTS), 3)), simulation.props.state.velocity.numpy()[0, 0].copy()
+    for _ in range(12):
+        env.step(np.zeros(env.action_space.shape))
+        felt += simulation.sensors.part_impulse.numpy()[0, :, 1]
+    lost = 2.0 * (before - simulation.props.state.velocity.numpy()[0, 0])
+    assert lost[1] > 6.0  # it has hit
+    assert felt.sum(0) == pytest.approx(lost, abs=0.02 * float(np.abs(lost).max()))
+    parts = dict(zip(BODY_PARTS, np.linalg.norm(felt, axis=1), strict=True))
+    assert parts["torso"] > 0.8 * sum(parts.values())

@@ -1,0 +1,150 @@
+"""Normals and gaps of two fields: right where bodies are flat, and little off at their edges, so that blocks slide."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.mpm.grid import threads_per_block
+from piavatar_envs.mpm.normals import find_facing, shared_normal, surface_gap, volume_at
+from piavatar_envs.mpm.stencil import node_of
+from piavatar_envs.mpm.transfer import mark_particles, particles_to_grid
+from piavatar_envs.mpm.types import Contact, Grid, Moving, group, vec8
+
+DX = 0.05
+#: Two bodies that touch in the plane z = 0: first halves of a cube, then a block on a table.
+HALVES = ((-0.2, -0.2, 0.0), (0.2, 0.2, 0.2)), ((-0.2, -0.2, -0.2), (0.2, 0.2, 0.0))
+BLOCK, TABLE = ((-0.1, -0.1, 0.0), (0.1, 0.1, 0.2)), ((-0.3, -0.25, -0.15), (0.3, 0.25, 0.0))
+
+
+@wp.kernel
+def look_at_nodes(
+    grid: Grid,
+    contact: Contact,
+    active: wp.array2d(dtype=int),
+    node_sum: wp.array2d(dtype=vec8),
+    node_offset: wp.array2d(dtype=wp.vec3),
+    node_facing: wp.array2d(dtype=wp.vec3),
+    # out
+    volume: wp.array2d(dtype=float),
+    normal: wp.array(dtype=wp.vec3),
+    gap: wp.array(dtype=float),
+):
+    n = wp.tid()
+    m_a = node_sum[0, n][0]
+    m_b = node_sum[0, grid.num_nodes + n][0]
+    if m_a > 0.0 and m_b > 0.0:
+        volume[0, n] = volume_at(grid, contact, 0, 0, m_a)
+        volume[1, n] = volume_at(grid, contact, 0, 1, m_b)
+        n_ab = shared_normal(grid, 0, node_of(grid, n), 0, 1, active, node_facing)
+        distance = wp.dot(n_ab, node_offset[0, n] / m_a - node_offset[0, grid.num_nodes + n] / m_b)
+        normal[n] = n_ab
+        gap[n] = surface_gap(grid, volume[0, n], volume[1, n], distance)
+
+
+class Look:
+    """What the nodes that two bodies share see: normals, gaps [m], reduced volumes, positions, and local normals."""
+
+    def __init__(self, sim) -> None:
+        model, state, nodes, active = sim.model, sim.state, sim.scratch.nodes, sim.scratch.block_fields[0]
+        device, count = model.device, model.num_nodes
+        moving = group(Moving, x=state.x, u=state.u, C=state.C, F=state.F, vk=state.vk)
+        marks, matter = [model.grid, model.particles, state.x], [model.grid, model.step, model.particles]
+        wp.launch(mark_particles, state.x.shape, marks, [active, state.failure], device=device)
+        matter += [model.boundaries, model.contact, moving, active, state.failure]
+        wp.launch(particles_to_grid, state.x.shape, matter, [nodes.sum, nodes.offset], device=device)
+        slabs = threads_per_block(device)
+        fields = [model.grid, model.contact, slabs, active]
+        found = [nodes.sum, nodes.offset, nodes.facing]
+        wp.launch(find_facing, (1, model.num_blocks, slabs), fields, found, device=device)
+        volume = wp.zeros((2, count), dtype=float, device=device)
+        normal, gap = wp.zeros(count, dtype=wp.vec3, device=device), wp.zeros(count, dtype=float, device=device)
+        wp.launch(
+            look_at_nodes, count, [model.grid, model.contact, active, *found], [volume, normal, gap], device=device
+        )
+        a, b = volume.numpy()
+        shared = (a > 1e-4) & (b > 1e-4)
+        self.weight = (a * b / np.maximum(a + b, 1e-12))[shared]
+        self.normal, self.gap = normal.numpy()[shared], gap.numpy()[shared]
+        index = np.array(np.unravel_index(np.flatnonzero(shared), model.grid.nodes)).T
+        self.position = np.asarray(model.grid.origin) + model.grid.dx * index
+        alone = nodes.offset.numpy()[0].reshape(2, count, 3)
+        alone = (alone[0] - alone[1])[shared]
+        self.alone = alone / np.linalg.norm(alone, axis=1, keepdims=True)
+
+    def tilt(self, normals: np.ndarray, true: np.ndarray) -> float:
+        """Mean angle [deg] to the true normal, each node's as its share of an impulse."""
+        angle = np.degrees(np.arccos(np.clip(normals @ true, -1.0, 1.0)))
+        return float((self.weight * angle).sum() / self.weight.sum())
+
+
+def placed(meet, boxes, gap=0.0, turn=None, **kwargs):
+    """Two boxes, the upper lifted by ``gap`` [grid spacings], turned against the grid and off its nodes."""
+    upper = tuple(tuple(np.add(corner, (0.0, 0.0, gap * DX))) for corner in boxes[0])
+    sim = meet([{"box": upper}, {"box": boxes[1]}], spacing=0.5 * DX, dx=DX, **kwargs)
+    turn = turn or Rotation.identity()
+    return sim.set(x=turn.apply(sim.rest) + (0.013, 0.007, 0.004))
+
+
+@pytest.mark.parametrize("gap", [-0.2, 0.0, 0.3, 0.6])
+@pytest.mark.parametrize("density", [1.0, 8.0])
+def test_gap_of_flat_faces(meet, gap, density):
+    """Every node far from the faces' edges sees the same gap, wherever it lies, whatever the bodies weigh."""
+    upper = tuple(tuple(np.add(corner, (0.0, 0.0, gap * DX))) for corner in HALVES[0])
+    look = Look(meet([{"box": upper, "density": 100.0 * density}, {"box": HALVES[1]}]))
+    inner = (np.abs(look.position[:, :2]) < 0.06).all(1)
+    assert inner.sum() >= 8 and np.ptp(look.position[inner, 2]) > 0.9 * DX
+    np.testing.assert_allclose(look.normal[inner], np.tile([0.0, 0.0, -1.0], (inner.sum(), 1)), atol=1e-3)
+    heavy = look.weight[inner] > 0.02
+    seen = look.gap[inner][heavy] / DX
+    if gap < 0.0:
+        assert (seen < 0.05).all() and (seen > 1.5 * gap).all()
+    else:
+        np.testing.assert_allclose(seen, gap, atol=0.1)
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.0, 0.0, 0.6), (0.4, -0.3, 0.2)])
+def test_normals_tilt_little_at_edges(meet, angles):
+    """Less than two thirds of what the gradients of single nodes give."""
+    turn = Rotation.from_euler("xyz", angles)
+    look = Look(placed(meet, (BLOCK, TABLE), turn=turn))
+    true = turn.apply([0.0, 0.0, -1.0])
+    alone = look.tilt(look.alone, true)
+    assert 12.0 < alone < 25.0
+    assert look.tilt(look.normal, true) < 0.66 * alone
+    np.testing.assert_allclose(np.linalg.norm(look.normal, axis=1), 1.0, atol=1e-5)
+
+
+def test_normals_are_antisymmetric(meet):
+    """The order of the bodies does not matter."""
+    one, other = Look(placed(meet, (BLOCK, TABLE))), Look(placed(meet, (TABLE, BLOCK)))
+    key = [np.lexsort(look.position.T) for look in (one, other)]
+    np.testing.assert_allclose(one.normal[key[0]], -other.normal[key[1]], atol=1e-4)
+
+
+@pytest.mark.parametrize(("friction", "pull"), [(0.0, 3.0), (0.2, 4.0)])
+def test_a_block_slides_on_a_table(meet, friction, pull):
+    """Pulled along x [m/s^2]. With normals of single nodes its front edge ploughs, like another friction of 0.15."""
+    plane = {"planes": [((0.0, 0.0, 1.0), -0.15, 5.0)], "gravity": (0.0, 0.0, -9.81), "control_dt": 0.01}
+    sim = meet([{"box": BLOCK}, {"box": TABLE}], friction=friction, stiffness=200.0, pushed=True, **plane)
+    sim.push(damping=40.0).run(20)
+    sim.push(acceleration=sim.of(0)[:, None] * [pull, 0.0, 0.0]).run(8)
+    start, steps = sim.get("u")[sim.of(0), 0].mean(), 16
+    acceleration = (sim.run(steps).get("u")[sim.of(0), 0].mean() - start) / (0.01 * steps)
+    brake = (pull - acceleration) / 9.81
+    assert sim.failures == [0]
+    assert friction - 0.01 < brake < friction + 0.04
+    assert sim.get("x")[sim.of(0), 2].min() > -0.4 * DX
+
+
+def test_a_block_rests_on_a_table(meet):
+    """Pulled with less than friction holds, it does not creep."""
+    plane = {"planes": [((0.0, 0.0, 1.0), -0.15, 5.0)], "gravity": (0.0, 0.0, -9.81), "control_dt": 0.01}
+    sim = meet([{"box": BLOCK}, {"box": TABLE}], friction=0.5, stiffness=200.0, pushed=True, **plane)
+    sim.push(damping=40.0).run(20)
+    sim.push(damping=40.0, acceleration=sim.of(0)[:, None] * [3.0, 0.0, 0.0]).run(20)
+    before = sim.get("x")[sim.of(0), 0].mean()
+    sim.push(acceleration=sim.of(0)[:, None] * [3.0, 0.0, 0.0]).run(30)
+    assert abs(sim.get("x")[sim.of(0), 0].mean() - before) < 0.01 * DX  # a slide without friction would go 0.13 m

@@ -1,0 +1,107 @@
+"""Fields of one subject: they grow together where both have seam particles, and only there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from piavatar_envs.mpm.build import MaterialPoints
+from piavatar_envs.mpm.fields import Fields
+
+DX, SPACING = 0.05, 0.025
+BAR = {"lower": (-0.3, -0.05, -0.05), "upper": (0.3, 0.05, 0.05), "dx": DX, "spacing": SPACING, "margin": 0.4}
+
+
+def bar(simulate, cut=None, seam=0.5 * DX, subjects=1, **kwargs):
+    """A bar along x, of one field, or cut at ``cut`` [m] in two; ``seam`` is half the width of the seam [m]."""
+    x = simulate(**BAR).rest[:, 0]
+    points = MaterialPoints.uniform(np.full(len(x), SPACING**3))
+    if cut is None:
+        return simulate(**BAR, points=points, pushed=True, fields=Fields(), **kwargs)
+    field = (x > cut).astype(int)
+    points = replace(points, field=field, seam=(np.abs(x - cut) < seam).astype(np.float32), sensor=field)
+    fields = Fields((0, 0) if subjects == 1 else (0, 1), num_sensors=2)
+    return simulate(**BAR, points=points, pushed=True, fields=fields, **kwargs)
+
+
+def load(sim, how):
+    """Accelerations [m/s^2] that sum to nothing."""
+    x, zero = sim.rest[:, 0], np.zeros(len(sim.rest))
+    if how == "tension":
+        return np.stack([30.0 * np.sign(x), zero, zero], 1)
+    if how == "bending":
+        return np.stack([zero, zero, 20.0 * (np.abs(x) / 0.15 - 1.0)], 1)
+    return np.stack([zero, -200.0 * np.sign(x) * sim.rest[:, 2], 200.0 * np.sign(x) * sim.rest[:, 1]], 1)  # torsion
+
+
+@pytest.mark.parametrize("how", ["tension", "bending", "torsion"])
+@pytest.mark.parametrize("cut", [0.0, 0.025])
+def test_halves_with_a_seam_are_one_bar(simulate, how, cut):
+    """Wherever the cut lies on the grid, to round-off; the seam needs no more particles than those next to it."""
+    one, two = bar(simulate), bar(simulate, cut)
+    for sim in (one, two):
+        sim.push(damping=5.0, acceleration=load(sim, how)).run(5)
+    assert two.failures == [0]
+    assert np.abs(one.get("x") - one.rest).max() > 0.1 * DX  # they are loaded
+    assert np.abs(two.get("x") - one.get("x")).max() < 1e-3 * DX
+    assert np.abs(two.get("u") - one.get("u")).max() < 2e-3
+    assert not two.scratch.sensors.pair_impulse.numpy().any()
+    assert not two.scratch.sensors.part_impulse.numpy().any()
+
+
+@pytest.mark.parametrize(("seam", "subjects"), [(0.0, 1), (0.5 * DX, 2)])
+def test_halves_part_without_a_seam_and_between_subjects(simulate, seam, subjects):
+    sim = bar(simulate, 0.0, seam, subjects)
+    sim.push(acceleration=load(sim, "tension")).run(5)
+    x = sim.get("x")[:, 0]
+    assert x[sim.of(1)].min() - x[sim.of(0)].max() > 2.0 * DX
+
+
+def test_halves_without_a_seam_push_each_other(simulate):
+    """Limbs of one subject touch like bodies, on the sensors of their parts, but not as a pair of subjects."""
+    sim = bar(simulate, 0.0, 0.0)
+    velocity = np.where(sim.of(1)[:, None], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+    sim.set(u=velocity).run()
+    parts = sim.scratch.sensors.part_impulse.numpy()[0]
+    half = 0.5 * sim.totals().mass
+    assert parts[1, 0, 0] > 0.5 * half and parts[0, 0, 0] == pytest.approx(-parts[1, 0, 0], rel=1e-4)
+    assert not sim.scratch.sensors.pair_impulse.numpy().any()
+    x = sim.get("x")[:, 0]
+    assert x[sim.of(1)].min() - x[sim.of(0)].max() > 0.2 * SPACING  # neither in the other
+
+
+def test_prescribed_motion_grows_together_too(simulate):
+    """Kinematic momentum is summed like the physical one: a bar bent by its prescribed velocity does not tear."""
+    runs = []
+    for sim in (bar(simulate), bar(simulate, 0.0)):
+        x = sim.rest[:, 0]
+        sim.set(vk=np.stack([0.5 * np.abs(x), 0 * x, 2.0 * x * np.abs(x)], 1), u=np.stack([0 * x, x, 0 * x], 1)).run(3)
+        runs.append(sim.get("x"))
+    assert np.abs(runs[1] - runs[0]).max() < 1e-3 * DX
+    assert np.abs(runs[0] - sim.rest).max() > 0.1 * DX
+
+
+def test_trunk_is_the_first_field_of_a_subject():
+    contact = Fields((0, 0, 0, 1, 2, 2), density=500.0).upload(0.1, 2, "cpu")
+    assert contact.trunk.numpy().tolist() == [0, 0, 0, 3, 4, 4]
+    assert contact.num_subjects == 3 and contact.gate == pytest.approx(0.015)
+    assert contact.density.numpy().tolist() == [[500.0] * 6] * 2
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (Fields(subject=(0, 2)), "in order"),
+        (Fields(subject=(1,)), "in order"),
+        (Fields(subject=tuple(range(32))), "32 velocity fields exceed 31"),
+        (Fields(friction=-0.1), "-0.1"),
+        (Fields(normals="mine"), "'mine'"),
+        (Fields(gate=-1.0), "gate=-1"),
+        (Fields(gate=np.nan), "gate=nan"),
+    ],
+)
+def test_fields_that_cannot_be(fields, message):
+    with pytest.raises(ValueError, match=message):
+        fields.check()

@@ -1,0 +1,113 @@
+"""Contact sensors tell what contact did; batches, failures and the scratch of worlds with several bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from piavatar_envs.mpm.types import FAILURE_OUT_OF_GRID
+
+DX = 0.05
+ARRAYS = ("x", "u", "C", "F")
+BLOCK = {"box": ((-0.15, -0.1, -0.1), (0.05, 0.1, 0.1))}
+BALL = {"ball": ((0.16, 0.04, 0.03), 0.1), "velocity": (-4.0, 0.5, 0.0)}
+CUBE = {"box": ((-0.2, -0.1, -0.1), (0.0, 0.1, 0.1))}
+
+
+@pytest.mark.parametrize("normals", ["shared", "own"])
+def test_impulses_are_the_changes_of_momentum(meet, normals):
+    """On the pair, on the parts by subject, and on each body: Newton's third law at every moment."""
+    sim = meet([BLOCK, BALL], normals=normals, friction=0.3, control_dt=1.0 / 240.0)
+    sensors, scale = sim.scratch.sensors, sim.totals().momentum_scale
+    before, most = [sim.totals(select=sim.of(body)).momentum for body in range(2)], 0.0
+    for _ in range(12):
+        sim.run()
+        after = [sim.totals(select=sim.of(body)).momentum for body in range(2)]
+        change = np.subtract(after, before)
+        parts = sensors.part_impulse.numpy()[0]
+        assert np.abs(parts[0, 1] - change[0]).max() < 1e-5 * scale
+        assert np.abs(parts[1, 0] - change[1]).max() < 1e-5 * scale
+        assert not parts[0, 0].any() and not parts[1, 1].any()
+        if normals == "shared":
+            pairs = sensors.pair_impulse.numpy()[0].reshape(2, 2, 3)
+            assert np.abs(pairs[0, 1] - change[0]).max() < 1e-5 * scale
+            assert not pairs[1, 0].any()  # only a < b is kept
+        before, most = after, max(most, np.abs(change).max())
+    assert most > 0.05 * scale
+
+
+@pytest.mark.parametrize("overlap", [-0.5, 0.1, 0.4, 0.8])
+@pytest.mark.parametrize("density", [500.0, 2000.0])
+def test_penetration_of_a_known_overlap(meet, overlap, density):
+    """The centre of the deepest particle, a quarter of a spacing inside its body; the bodies are at rest."""
+    into = {"box": ((-overlap * DX, -0.1, -0.1), (0.2 - overlap * DX, 0.1, 0.1)), "density": density}
+    sim = meet([CUBE, into], num_substeps=1, control_dt=1e-4).run()
+    expected = max(0.0, overlap - 0.25) * DX
+    found = sim.scratch.sensors.penetration.numpy()[0]
+    np.testing.assert_allclose(found, expected, atol=0.15 * DX)
+    assert overlap > 0.0 or not found.any()
+    assert overlap < 0.2 or found.all()
+
+
+def test_sensors_forget(meet):
+    """They tell of one control step."""
+    sim = meet([BLOCK, BALL], control_dt=1.0 / 60.0).run(2)
+    sensors = sim.scratch.sensors
+    assert sensors.pair_impulse.numpy().any() and sensors.part_impulse.numpy().any()
+    sim.set(x=sim.rest, u=0.0, C=0.0, F=np.eye(3)).run()
+    for name in ("pair_impulse", "part_impulse", "penetration", "boundary_impulse"):
+        assert not getattr(sensors, name).numpy().any(), name
+
+
+def sensed(sim, env=0):
+    names = ("pair_impulse", "part_impulse", "penetration")
+    return {name: getattr(sim.scratch.sensors, name).numpy()[env] for name in names}
+
+
+def test_three_environments_equal_three_single_ones(meet, equal):
+    """Each with another ball speed."""
+    scene = {"friction": 0.4, "num_substeps": 16}
+    batch, speeds = meet([BLOCK, BALL], num_envs=3, **scene), (1.0, 0.5, 2.0)
+    velocities = np.stack([speed * batch.get("u") for speed in speeds])
+    batch.set(u=velocities).run(3)
+    for env in range(3):
+        single = meet([BLOCK, BALL], **scene).set(u=velocities[env]).run(3)
+        for array in ARRAYS:
+            assert equal(batch.get(array, env), single.get(array)), array
+        found, expected = sensed(batch, env), sensed(single)
+        assert all(equal(found[name], expected[name]) for name in expected)
+    assert np.abs(batch.get("x", 0) - batch.get("x", 1)).max() > 0.1 * DX
+
+
+def test_a_failed_environment_is_frozen_and_senses_nothing(meet):
+    """Its neighbour goes on."""
+    sim = meet([BLOCK, BALL], num_envs=2)
+    sim.state.failure.assign(np.array([FAILURE_OUT_OF_GRID, 0], np.int32))
+    before = sim.state.numpy()
+    sim.run()
+    assert all(np.array_equal(sim.get(name), before[name][0].astype(float)) for name in ARRAYS)
+    assert not any(array.any() for array in sensed(sim).values())
+    assert all(array.any() for name, array in sensed(sim, 1).items() if name != "penetration")
+
+
+def test_a_failure_in_contact_leaves_the_grid_clear(meet):
+    """A particle that is lost in the middle of a collision takes nothing with it."""
+    sim = meet([BLOCK, BALL], num_envs=2).run()
+    u = sim.state.u.numpy()
+    u[0, 3] = np.inf
+    sim.state.u.assign(u)
+    sim.run(2)
+    assert sim.failures[0] != 0 and sim.failures[1] == 0
+    assert not sim.scratch.nodes.sum.numpy().any() and not sim.scratch.nodes.offset.numpy().any()
+
+
+@pytest.mark.parametrize("normals", ["shared", "own"])
+@pytest.mark.parametrize("num_substeps", [15, 16])
+def test_scratch_is_clear_between_steps(meet, normals, num_substeps):
+    plane = [((0.0, 0.0, 1.0), -0.11, 0.5)]
+    sim = meet([BLOCK, BALL], normals=normals, num_substeps=num_substeps, planes=plane, gravity=(0.0, 0.0, -9.81))
+    for _ in range(3):
+        sim.run()
+        assert sim.failures == [0]
+        assert not sim.scratch.nodes.sum.numpy().any()
+        assert not sim.scratch.nodes.offset.numpy().any()
