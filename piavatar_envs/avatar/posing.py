@@ -223,12 +223,30 @@ def lean_matrices(
     anchor_rotation: wp.array(dtype=wp.quat),
     anchor_translation: wp.array(dtype=wp.vec3),
     bone_from: wp.array2d(dtype=wp.mat44),
+    carry: Carry,
+    gap: wp.array2d(dtype=wp.vec3),
     # out
     bone_lean: wp.array2d(dtype=wp.mat44),
 ):
-    """From the carried to the commanded bone: the commanded pose is laid on the body by the anchor."""
+    """From the carried to the commanded bone: the commanded pose is laid on the body by the anchor.
+
+    A bone that contact has torn off its parent is carried where the parent would have it; its way back is added.
+    """
     e, b = wp.tid()
     rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
     q = anchor_rotation[e] * command.rotation[e, b]
     at = wp.quat_rotate(anchor_rotation[e], command.position[e, b]) + anchor_translation[e]
-    bone_lean[e, b] = rigid_matrix(q, rest, at) - bone_from[e, b]
+    back = wp.quat_rotate(carry.rotation[e, b], gap[e, b])
+    bone_lean[e, b] = rigid_matrix(q, rest, at - back) - bone_from[e, b]
+
+
+@wp.kernel
+def find_gaps(
+    tracked_position: wp.array2d(dtype=wp.vec3),
+    pose: Pose,
+    # out
+    gap: wp.array2d(dtype=wp.vec3),
+):
+    """How far bones are from where fixed offsets would put them, at the start of a control step."""
+    e, b = wp.tid()
+    gap[e, b] = tracked_position[e, b] - pose.position[e, b]

@@ -79,6 +79,7 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         if step == 0:
             anchor = [s.anchor_rotation, s.anchor_translation]
             program.launch(lay_command_on_body, n, [drive.body, g.command_pose, now], anchor)
+            program.launch(posing.find_gaps, (n, NUM_JOINTS), [drive.tracked.position, now], [s.gap])
     program.launch(
         root_wrench,
         n,
@@ -138,7 +139,8 @@ def _record_matrices(drive: AvatarDrive, program: Program, now: Pose, after: Pos
     )
     if drive.settings.tone > 0.0:
         anchor = [s.anchor_rotation, s.anchor_translation]
-        program.launch(posing.lean_matrices, bones, [drive.body, g.command_pose, *anchor, s.bone_from], [s.bone_lean])
+        lean = [drive.body, g.command_pose, *anchor, s.bone_from, g.carry, s.gap]
+        program.launch(posing.lean_matrices, bones, lean, [s.bone_lean])
 
 
 def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:

@@ -181,6 +181,7 @@ class DriveScratch:
     next_position: wp.array
     command_pose_rotation: wp.array  # (num_envs, bones) commanded pose at the current substep, before alignment
     command_pose_position: wp.array
+    gap: wp.array  # (num_envs, bones) from where fixed offsets would put a bone to where it is tracked [m]
     carry_rotation: wp.array  # (num_envs, bones) G
     carry_translation: wp.array
     anchor_rotation: wp.array  # (num_envs,) rigid motion that lays the commanded pose on the body

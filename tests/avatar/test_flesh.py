@@ -255,6 +255,26 @@ def test_a_body_without_tone_stays_bent(recoils):
     assert settled[0.0] > 5.0 * settled[0.3] > 5.0 * settled[1.0]
 
 
+def test_tone_brings_a_torn_bone_back(make_rig):
+    """A hand moved off its forearm without strain: elasticity does not know, and rotations do not show it."""
+    rig = make_rig(root="free", decoupling="no_stress", tone=1.0)
+    hand, elbow = joint_index("left_wrist"), joint_index("left_elbow")
+
+    def gap() -> float:
+        rotations, positions = rig.tracked_world()
+        arm = rig.points.joints[0, hand] - rig.points.joints[0, elbow]
+        return float(np.linalg.norm(positions[hand] - positions[elbow] - rotations[elbow] @ arm))
+
+    rig.state.x.assign((rig.read("x") + 0.2 * rig.weights[:, hand, None] * [1.0, 0.0, 0.0])[None].astype(np.float32))
+    rig.track()
+    assert gap() > 0.15
+    rig.step(15)
+    assert gap() < 0.02
+    # it was an internal matter
+    still = rig.totals()
+    np.testing.assert_allclose(still.momentum, 0.0, atol=1e-5 * rig.mass.sum())
+
+
 @pytest.mark.parametrize("tone", [0.5, 1.0])
 def test_tone_pulls_at_its_natural_frequency(make_rig, tone):
     """A pose error without velocity closes like an oscillator of frequency ``w = 30 tone`` with damping ``2 w + 3``.
