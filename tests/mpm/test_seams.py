@@ -73,14 +73,45 @@ def test_halves_without_a_seam_push_each_other(simulate):
 
 
 def test_prescribed_motion_grows_together_too(simulate):
-    """Kinematic momentum is summed like the physical one: a bar bent by its prescribed velocity does not tear."""
+    """Kinematic momentum is summed like the physical one: a strained bar that is told to turn does not tear."""
     runs = []
     for sim in (bar(simulate), bar(simulate, 0.0)):
-        x = sim.rest[:, 0]
-        sim.set(vk=np.stack([0.5 * np.abs(x), 0 * x, 2.0 * x * np.abs(x)], 1), u=np.stack([0 * x, x, 0 * x], 1)).run(3)
-        runs.append(sim.get("x"))
-    assert np.abs(runs[1] - runs[0]).max() < 1e-3 * DX
-    assert np.abs(runs[0] - sim.rest).max() > 0.1 * DX
+        turning = np.cross([0.0, 3.0, 0.0], sim.rest)
+        sim.set(vk=turning, F=np.diag([1.1, 0.95, 1.0])).run(3)
+        runs.append({name: sim.get(name) for name in ("x", "u", "F")})
+    assert np.abs(runs[1]["x"] - runs[0]["x"]).max() < 1e-3 * DX
+    assert np.abs(runs[1]["u"] - runs[0]["u"]).max() < 1e-3
+    assert np.abs(runs[1]["F"] - runs[0]["F"]).max() < 1e-3
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_seam_needs_both_sides(simulate, side):
+    """Flesh of the shoulder does not grow to whatever of the belly comes near it."""
+    sim = bar(simulate, 0.0)
+    seam = sim.model.particles.seam.numpy()
+    assert 0.0 < seam[sim.of(side)].mean() < 0.2
+    sim.model.particles.seam.assign(np.where(sim.of(side), seam, 0.0).astype(np.float32))
+    sim.push(acceleration=load(sim, "tension")).run(5)
+    x = sim.get("x")[:, 0]
+    assert x[sim.of(1)].min() - x[sim.of(0)].max() > 2.0 * DX
+
+
+def test_impulse_on_a_seam_is_sensed_by_the_parts(simulate):
+    """A second bar falls on the seam of the first: what its halves sense adds up to what they gain."""
+    lower = simulate(**BAR)
+    rest = np.concatenate([lower.rest, lower.rest @ np.diag([0.3, 1.0, 1.0]) + [0.0, 0.0, 0.1]])
+    field = np.concatenate([(lower.rest[:, 0] > 0.0).astype(int), np.full(len(lower.rest), 2)])
+    points = MaterialPoints.uniform(np.full(len(rest), SPACING**3))
+    seam = ((np.abs(rest[:, 0]) < 0.5 * DX) & (field < 2)).astype(np.float32)
+    points = replace(points, field=field, seam=seam, sensor=field)
+    sim = simulate(**BAR, rest=rest, points=points, fields=Fields((0, 0, 1), 0.3, num_sensors=3))
+    sim.set(u=(field == 2)[:, None] * [0.3, 0.0, -2.0]).run()
+    gained = sim.totals(select=field < 2).momentum
+    parts = sim.scratch.sensors.part_impulse.numpy()[0]
+    assert -gained[2] > 1.0 and sim.failures == [0]
+    np.testing.assert_allclose(parts[0, 1] + parts[1, 1], gained, atol=1e-4 * sim.totals().momentum_scale)
+    assert not parts[:2, 0].any() and not parts[2, 1].any()
+    np.testing.assert_allclose(sim.scratch.sensors.pair_impulse.numpy()[0, 1], gained, rtol=1e-4, atol=1e-3)
 
 
 def test_trunk_is_the_first_field_of_a_subject():
