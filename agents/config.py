@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, Field
 
 from agents.ppo import PPOSettings
+from agents.selfplay import SelfPlaySettings
 from piavatar_envs.envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
+from piavatar_envs.multi import multi_modules
 from piavatar_envs.tasks import load_task
+
+_MULTI_ID = re.compile(r"\w+_v\d+")
 
 
 class EvaluationSettings(BaseModel):
@@ -29,19 +36,46 @@ class TrainingConfig(BaseModel):
 
     model_config = FROZEN
 
-    env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
+    env_id: str = Field(
+        "PIAvatar/Reach-v0", description="registered id, or a PettingZoo module of piavatar_envs.multi such as sumo_v0"
+    )
     env: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
         default_factory=dict, description="settings of the environment that differ from its defaults"
     )
     observe: tuple[str, ...] | None = Field(
         None, description="terms of the observation that the networks see; null for all of it"
     )
-    total_steps: int = Field(100_000, ge=1, description="control steps to train for, over all workers")
+    total_steps: int = Field(
+        100_000, ge=1, description="control steps to train for, over all workers and their learning agents"
+    )
     num_workers: int = Field(4, ge=1, le=256, description="environments, each in a process of its own")
     seed: int = Field(0, ge=0, lt=1000, description="of the networks, the actions and the training episodes")
     checkpoint_every: int = Field(50_000, ge=1, description="control steps between two checkpoints")
     ppo: PPOSettings = Field(default_factory=PPOSettings, description="the algorithm")
+    selfplay: SelfPlaySettings | None = Field(
+        None, description="agents compete, also with earlier policies; null where there is one, or they have one aim"
+    )
     evaluation: EvaluationSettings = Field(default_factory=EvaluationSettings, description="how agents are compared")
+
+    @property
+    def is_multi(self) -> bool:
+        """Whether the environment is a world of several agents."""
+        return _MULTI_ID.fullmatch(self.env_id) is not None
+
+
+def multi_module(env_id: str) -> ModuleType:
+    """The PettingZoo module of an id.
+
+    Raises:
+        ValueError: there is no such module, or PettingZoo is not installed.
+    """
+    modules = {name.rpartition(".")[2]: name for name in multi_modules()}
+    if env_id not in modules:
+        raise ValueError(f"unknown world {env_id!r}; there are {', '.join(modules)}")
+    try:
+        return importlib.import_module(modules[env_id])
+    except ImportError as error:
+        raise ValueError(f"{env_id} is not importable: {error}") from error
 
 
 def load_training(
@@ -60,11 +94,13 @@ def load_training(
     for_env = {key[len("env.") :]: overrides.pop(key) for key in list(overrides) if key.startswith("env.")}
     config = load_config(TrainingConfig, source, overrides)
     try:
-        env = load_config(load_task(config.env_id).Config, config.env, for_env)
+        env = load_config(_env_class(config), config.env, for_env)
     except ValueError as error:
         raise ConfigError(f"env: {error}" if isinstance(error, ConfigError) else f"env_id: {error}") from None
     if env.obs_mode != "flat":
         raise ConfigError(f"env: obs_mode={env.obs_mode!r} must be 'flat' to train; choose terms with observe")
+    if config.selfplay and not config.is_multi:
+        raise ConfigError(f"selfplay is given, but env_id={config.env_id!r} has one agent; use a world such as sumo_v0")
     batch, rollout = config.ppo.batch_size, config.num_workers * config.ppo.rollout_steps
     if batch > rollout:
         raise ConfigError(
@@ -75,4 +111,9 @@ def load_training(
 
 def env_config(config: TrainingConfig) -> EnvConfig:
     """The environment's part of a resolved configuration."""
-    return load_config(load_task(config.env_id).Config, config.env)
+    return load_config(_env_class(config), config.env)
+
+
+def _env_class(config: TrainingConfig) -> type[EnvConfig]:
+    task = multi_module(config.env_id).TASK if config.is_multi else load_task(config.env_id)
+    return task.Config

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy import stats
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
@@ -31,6 +32,8 @@ class Episode:
         success_at_end: whether it was in the last step.
         distance: mean over the steps of the task's ``distance`` [m], where it has one.
         failure: why the simulation gave up, or None.
+        agent_totals: undiscounted return of every agent of a world, shape ``(agents,)``; None where there is one.
+        agent_success: whether each had fulfilled its task in its last step, shape ``(agents,)``, or None.
     """
 
     seed: int
@@ -40,6 +43,8 @@ class Episode:
     success_at_end: bool = False
     distance: float = 0.0
     failure: str | None = None
+    agent_totals: np.ndarray | None = None
+    agent_success: np.ndarray | None = None
 
     def book(self, reward: float, info: dict[str, Any]) -> None:
         """Add a step."""
@@ -49,6 +54,9 @@ class Episode:
         self.successes += self.success_at_end
         self.distance += (float(info.get("distance", np.nan)) - self.distance) / self.steps
         self.failure = info.get("failure")
+        if "rewards" in info:
+            self.agent_totals = info["rewards"] + (0.0 if self.agent_totals is None else self.agent_totals)
+            self.agent_success = info["successes"]
 
 
 @dataclass
@@ -74,19 +82,32 @@ class Evaluation:
     def row(self) -> dict[str, Any]:
         """The figures for a table or a JSON file."""
         estimate, distance = self.estimate(), self.share(lambda e: e.distance)
-        return {
+        row = {
             "case": self.agent,
             "return_mean": estimate.mean,
             "return_interval": [estimate.low, estimate.high],
             "return_std": float(self.returns.std(ddof=1)),
             "success_once": self.share(lambda e: e.successes > 0),
+            "success_once_interval": share_interval([e.successes > 0 for e in self.episodes]),
             "success_at_end": self.share(lambda e: e.success_at_end),
+            "success_at_end_interval": share_interval([e.success_at_end for e in self.episodes]),
             "success_share_of_steps": self.share(lambda e: e.successes / e.steps),
             "mean_distance_m": distance if np.isfinite(distance) else None,
             "failures": sum(episode.failure is not None for episode in self.episodes),
             "episodes": len(self.episodes),
             "first_seed": self.episodes[0].seed,
         }
+        if self.episodes[0].agent_totals is not None:
+            of_agents = [mean_and_interval(totals) for totals in np.transpose([e.agent_totals for e in self.episodes])]
+            row["agent_return_mean"] = [one.mean for one in of_agents]
+            row["agent_return_interval"] = [[one.low, one.high] for one in of_agents]
+        return row
+
+
+def share_interval(outcomes: Sequence[bool]) -> list[float]:
+    """Wilson's 95 % interval of the share of episodes with an outcome: not empty where all or none had it."""
+    found = stats.binomtest(int(np.sum(outcomes)), len(outcomes)).proportion_ci(0.95, method="wilson")
+    return [float(found.low), float(found.high)]
 
 
 def evaluate(

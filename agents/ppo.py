@@ -10,12 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import torch
 from pydantic import BaseModel, Field
 from stable_baselines3 import PPO
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.rollouts import PlayedBuffer
 from piavatar_envs.envs.config import FROZEN
 
 _EPISODE_SEEDS = 1000  # seeds of training episodes that belong to a run's seed
@@ -69,6 +71,7 @@ def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: 
         gamma=settings.discount,
         gae_lambda=settings.gae_lambda,
         clip_range=settings.clip_range,
+        rollout_buffer_class=PlayedBuffer,
         ent_coef=settings.entropy_weight,
         policy_kwargs={
             "net_arch": list(settings.hidden),
@@ -84,8 +87,13 @@ def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: 
     return model
 
 
-def resume(path: str | Path, venv: VecEnv) -> PPO:
+def resume(path: str | Path, venv: VecEnv, seed: int) -> PPO:
     """A saved agent with its optimizer's state, to be trained on.
+
+    Args:
+        path: the checkpoint.
+        venv: environments to train in.
+        seed: of the run; with the steps had it says which episodes come next, none of them played before.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -93,4 +101,7 @@ def resume(path: str | Path, venv: VecEnv) -> PPO:
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"no checkpoint {path}; give the .zip that a run has left")
-    return PPO.load(path, env=venv, device="cpu")
+    model = PPO.load(path, env=venv, device="cpu", rollout_buffer_class=PlayedBuffer)
+    drawn = np.random.SeedSequence((seed, model.num_timesteps)).generate_state(1)[0]
+    venv.seed(2**30 + int(drawn) % 2**30)  # above those of training and of evaluation
+    return model

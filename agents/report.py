@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from agents.evaluate import Evaluation
+from agents.matches import Match
 from benchmarks.runner import Estimate, describe_run, plain, write_json
 
 _COLORS = ("tab:blue", "tab:green", "tab:purple", "tab:orange")
@@ -21,7 +22,7 @@ def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
     """Print the agents beside each other."""
     count = len(evaluations[0].episodes)
     table = Table(title=f"{count} fresh episodes each, the same for all", title_justify="left", caption_justify="left")
-    table.caption = "once, at end, of time: target reached in the episode, in its last step, share of all steps"
+    table.caption = "once, at end, of time: task fulfilled in the episode, in its last step, share of all steps"
     table.add_column("agent", no_wrap=True)
     for column in ("return", "95 % interval", "once", "at end", "of time", "distance"):
         table.add_column(column, justify="right", no_wrap=True)
@@ -37,6 +38,28 @@ def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
             f"{row['success_at_end']:.0%}",
             f"{row['success_share_of_steps']:.0%}",
             "" if distance is None else f"{distance:.2f} m",
+        )
+    console.print(table)
+
+
+def show_matches(matches: Sequence[Match], console: Console) -> None:
+    """Print who won against whom."""
+    table = Table(title=f"{len(matches[0].games)} fresh games each", title_justify="left", caption_justify="left")
+    table.caption = "the first sits in every seat equally often; 95 % interval; theirs: the others' return, each"
+    table.add_column("game", no_wrap=True)
+    for column in ("won", "interval", "lost", "drawn", "return", "theirs"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for match in matches:
+        row = match.row()
+        low, high = row["win_interval"]
+        table.add_row(
+            row["case"],
+            f"{row['win_rate']:.0%}",
+            f"{low:.0%} to {high:.0%}",
+            f"{row['loss_rate']:.0%}",
+            f"{row['draw_rate']:.0%}",
+            f"{row['return_mean']:.1f}",
+            f"{row['opponent_return_mean']:.1f}",
         )
     console.print(table)
 
@@ -77,7 +100,7 @@ def versions(name: str, device: str) -> dict[str, Any]:
 
 
 def write_results(
-    path: Path, run: Mapping[str, Any], evaluations: Sequence[Evaluation], extra: Mapping[str, Any]
+    path: Path, run: Mapping[str, Any], evaluations: Sequence[Evaluation | Match], extra: Mapping[str, Any]
 ) -> None:
     """Write the evaluations as JSON, in the schema of the benchmarks."""
     rows = [evaluation.row() for evaluation in evaluations]

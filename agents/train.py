@@ -1,83 +1,32 @@
-"""Train an agent as a configuration says: ``python -m agents.train configs/reach_ppo.yaml --out runs/reach``.
+"""Train agents as a configuration says: ``python -m agents.train configs/reach_ppo.yaml --out runs/reach``.
 
-Leaves in the folder: the resolved configuration, checkpoints, the policy, and every training episode's return.
+The environment is one agent's, or a world of several: then all its learning agents share one policy, and with a section
+``selfplay`` they compete, also with snapshots of earlier policies. Leaves in the folder: the resolved configuration,
+checkpoints, the policy, every training episode's return, the evaluation, and the snapshots.
 """
 
 from __future__ import annotations
 
 import sys
-import time
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import tyro
 from rich.console import Console
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor
-from tqdm import tqdm
+from stable_baselines3.common.vec_env import VecEnv
 
-from agents import ppo
+from agents import matches, selfplay
 from agents.config import TrainingConfig, load_training
-from agents.evaluate import evaluate, policy_agent
-from agents.report import draw_curve, show_table, versions, write_results
+from agents.evaluate import Evaluation, evaluate, policy_agent
+from agents.learning import Curve, begin, learn
+from agents.parallel import AgentVecEnv
+from agents.report import draw_curve, show_matches, show_table, versions, write_results
 from agents.workers import EnvFacts, components, factory, prepare, start_workers
 from piavatar_envs.envs.config import ConfigError, dump_yaml, parse_assignments
 
-
-@dataclass
-class Curve:
-    """Returns of the training episodes, as they ended.
-
-    Attributes:
-        steps: control steps taken by then, over all workers.
-        returns: undiscounted returns, of actions that were drawn at random from the policy.
-        seconds: time that the training took [s].
-    """
-
-    steps: list[int] = field(default_factory=list)
-    returns: list[float] = field(default_factory=list)
-    seconds: float = 0.0
-
-    def save(self, path: Path) -> None:
-        """Write it as CSV."""
-        rows = [f"{step},{value:.6g}" for step, value in zip(self.steps, self.returns, strict=True)]
-        path.write_text("\n".join(["step,return", *rows]) + "\n", encoding="utf-8")
-
-
-class Progress(BaseCallback):
-    """Books the episodes, shows a bar, and ends the training when its time is over."""
-
-    def __init__(self, curve: Curve, total_steps: int, deadline: float | None) -> None:
-        """Watch a training.
-
-        Args:
-            curve: where to book.
-            total_steps: at which the bar is full.
-            deadline: by ``time.monotonic()``, or None.
-        """
-        super().__init__()
-        self.curve, self.total_steps, self.deadline = curve, total_steps, deadline
-
-    def _on_training_start(self) -> None:
-        # where nobody watches, a line now and then will do
-        interval = 0.5 if sys.stderr.isatty() else 30.0
-        self.bar = tqdm(
-            total=self.total_steps, initial=self.num_timesteps, desc="train", unit="step", mininterval=interval
-        )
-
-    def _on_step(self) -> bool:
-        for info in self.locals["infos"]:
-            if "episode" in info:
-                self.curve.steps.append(self.num_timesteps)
-                self.curve.returns.append(float(info["episode"]["r"]))
-                self.bar.set_postfix({"return": f"{np.mean(self.curve.returns[-20:]):.1f}"}, refresh=False)
-        self.bar.update(self.num_timesteps - self.bar.n)
-        return self.deadline is None or time.monotonic() < self.deadline
-
-    def _on_training_end(self) -> None:
-        self.bar.close()
+Results = Sequence[Evaluation] | Sequence[matches.Match]
 
 
 def train(
@@ -92,7 +41,7 @@ def train(
 
     Args:
         config: resolved.
-        venv: the workers.
+        venv: the workers, or the learning agents of their worlds.
         facts: of their environment.
         folder: where to write; exists.
         resume: a checkpoint to go on from, up to the same total number of steps.
@@ -100,31 +49,43 @@ def train(
 
     Raises:
         ValueError: the checkpoint has had all its steps already.
+        FileNotFoundError: there is no such checkpoint.
     """
-    monitored = VecMonitor(venv)
-    if resume is None:
-        seen = components(facts.layout, config.observe)
-        model = ppo.build(config.ppo, monitored, seen, config.seed)
-    else:
-        model = ppo.resume(resume, monitored)
-    left = config.total_steps - model.num_timesteps
-    if left <= 0:
-        raise ValueError(
-            f"{resume} has had {model.num_timesteps} steps, total_steps={config.total_steps}; ask for more of them"
-        )
-    curve, start = Curve(), time.monotonic()
-    checkpoints = CheckpointCallback(max(1, config.checkpoint_every // venv.num_envs), str(folder / "checkpoints"))
-    watch = CallbackList([checkpoints, Progress(curve, config.total_steps, deadline)])
-    model.learn(left, callback=watch, reset_num_timesteps=False)
-    curve.seconds = time.monotonic() - start
-    model.save(folder / "policy.zip")
-    curve.save(folder / "curve.csv")
-    return model, curve
+    model = begin(config, venv, facts, resume)
+    return model, learn(config, model, folder, deadline)
+
+
+def train_single(
+    config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, resume: Path | None
+) -> tuple[Curve, Results]:
+    """One agent: train and evaluate it."""
+    model, curve = train(config, workers, facts, folder, resume)
+    episodes, first_seed = config.evaluation.episodes, config.evaluation.first_seed
+    return curve, [evaluate("trained", policy_agent(model), workers, episodes, first_seed)]
+
+
+def train_together(
+    config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, resume: Path | None
+) -> tuple[Curve, Results]:
+    """Agents with one aim: one policy for all, which all learn."""
+    model, curve = train(config, AgentVecEnv(workers), facts, folder, resume)
+    return curve, matches.play_together(config, model, workers)
+
+
+def train_selfplay(
+    config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, resume: Path | None
+) -> tuple[Curve, Results]:
+    """Agents that compete: one policy for all, against itself and its snapshots."""
+    venv = AgentVecEnv(workers, config.selfplay.num_duels(workers.num_envs))
+    model = begin(config, venv, facts, resume)
+    snapshots = selfplay.enter(config.selfplay, venv, model, folder, resume)
+    curve = learn(config, model, folder, watchers=[snapshots])
+    return curve, matches.play_matches(config, model, snapshots.pool, workers)
 
 
 @dataclass(frozen=True)
 class Options:
-    """Train an agent and evaluate it."""
+    """Train agents and evaluate them."""
 
     #: YAML file with what differs from the defaults
     config: tyro.conf.Positional[Path]
@@ -152,20 +113,22 @@ def main(args: list[str] | None = None) -> None:
         components(facts.layout, config.observe)
     except ConfigError as error:
         sys.exit(f"error: {error}")
-    venv = start_workers(make, config.num_workers)
+    workers = start_workers(make, config.num_workers)
+    run = train_selfplay if config.selfplay else train_together if config.is_multi else train_single
     try:
-        model, curve = train(config, venv, facts, folder, options.resume)
-        result = evaluate(
-            "trained", policy_agent(model), venv, config.evaluation.episodes, config.evaluation.first_seed
-        )
+        curve, results = run(config, workers, facts, folder, options.resume)
     except (ValueError, FileNotFoundError) as error:
         sys.exit(f"error: {error}")
     finally:
-        venv.close()
-    draw_curve(folder / "curve.png", curve.steps, curve.returns, {}, config.env_id)
-    write_results(folder / "results.json", versions("train", options.device), [result], {"training_s": curve.seconds})
-    show_table([result], console)
-    console.print(f"in {folder}: policy.zip, curve.png, curve.csv, config.yaml, results.json, checkpoints/")
+        workers.close()
+    bands = {result.agent: result.estimate() for result in results if isinstance(result, Evaluation)}
+    # one agent's curve stands alone: what it is compared with is the demo's affair
+    draw_curve(folder / "curve.png", curve.steps, curve.returns, bands if config.is_multi else {}, config.env_id)
+    about = versions("train", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
+    write_results(folder / "results.json", about, results, {"training_s": curve.seconds, "agents": facts.agents})
+    (show_matches if config.selfplay else show_table)(results, console)
+    files = "policy.zip, curve.png, curve.csv, config.yaml, results.json, checkpoints/"
+    console.print(f"in {folder}: {files}{', pool/' if config.selfplay else ''}")
 
 
 if __name__ == "__main__":

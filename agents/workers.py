@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from agents.config import TrainingConfig
+from agents.config import TrainingConfig, multi_module
+from agents.parallel import World, WorldFactory
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.envs.observations import ObservationLayout
@@ -40,8 +41,10 @@ class EnvFactory:
         )
 
 
-def factory(config: TrainingConfig, device: str = "cpu") -> EnvFactory:
-    """What makes the environments of a training run."""
+def factory(config: TrainingConfig, device: str = "cpu") -> EnvFactory | WorldFactory:
+    """What makes the environments of a training run: worlds, where there are several agents."""
+    if config.is_multi:
+        return WorldFactory(multi_module(config.env_id).__name__, dict(config.env), device)
     return EnvFactory(config.env_id, dict(config.env), device)
 
 
@@ -54,15 +57,17 @@ class EnvFacts:
         action_names: of every component of an action.
         action_step: rotation that an action of 1 commands in a control step [rad].
         control_dt: time of a control step [s].
+        agents: names, where there are several.
     """
 
     layout: ObservationLayout
     action_names: tuple[str, ...]
     action_step: float
     control_dt: float
+    agents: tuple[str, ...] = ()
 
 
-def prepare(make: EnvFactory) -> EnvFacts:
+def prepare(make: EnvFactory | WorldFactory) -> EnvFacts:
     """Compile the kernels, once and before the workers start: side by side they would race each other's files."""
     env = make()
     try:
@@ -71,12 +76,13 @@ def prepare(make: EnvFactory) -> EnvFacts:
         bare = env.unwrapped
         control_dt = bare.config.physics.control_dt
         step = bare.config.drive.joint_speed_limit * control_dt
-        return EnvFacts(bare.observation_layout, bare.action_names, step, control_dt)
+        agents = bare.names if isinstance(bare, World) else ()
+        return EnvFacts(bare.observation_layout, bare.action_names, step, control_dt, agents)
     finally:
         env.close()
 
 
-def start_workers(make: EnvFactory, num_workers: int) -> VecEnv:
+def start_workers(make: EnvFactory | WorldFactory, num_workers: int) -> VecEnv:
     """``num_workers`` environments; a single one stays in this process."""
     torch.set_num_threads(1)  # the workers have the cores; the networks are small
     if num_workers == 1:

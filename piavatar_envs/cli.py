@@ -46,7 +46,7 @@ def doctor_command(
 
 
 def play_command(
-    env_id: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="a registered id: see list")],
+    env_id: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="an id or a module: see list")],
     agent: Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the actions come from")] = "random",
     video: Annotated[Path | None, tyro.conf.arg(help="write an .mp4 or .gif (needs the extra render)")] = None,
     steps: Annotated[
@@ -82,21 +82,25 @@ def play_command(
 
 
 def registered_ids() -> list[str]:
-    """The ids of this suite in Gymnasium's registry, sorted."""
+    """The ids of this suite in Gymnasium's registry, sorted, then the modules of several agents."""
     import gymnasium
 
-    import piavatar_envs  # noqa: F401 - registers the ids
+    from piavatar_envs.multi import multi_modules  # importing the package registers the ids
 
-    return sorted(env_id for env_id, spec in gymnasium.registry.items() if spec.namespace == "PIAvatar")
+    ids = sorted(env_id for env_id, spec in gymnasium.registry.items() if spec.namespace == "PIAvatar")
+    return ids + [path.rpartition(".")[2] for path in multi_modules()]
 
 
 def describe(env_id: str) -> str:
     """First line of the docstring of the task's file, read without importing it; empty if there is none.
 
-    ``PIAvatar/TrackMotion-v0`` is described by ``tasks/track_motion.py``.
+    ``PIAvatar/TrackMotion-v0`` is described by ``tasks/track_motion.py``, ``sumo_v0`` by ``multi/sumo_v0.py``.
     """
-    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", env_id.partition("/")[2].partition("-v")[0]).lower()
-    path = Path(__file__).parent / "tasks" / f"{name}.py"
+    if "/" in env_id:
+        name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", env_id.partition("/")[2].partition("-v")[0]).lower()
+        path = Path(__file__).parent / "tasks" / f"{name}.py"
+    else:
+        path = Path(__file__).parent / "multi" / f"{env_id}.py"
     if not path.is_file():
         return ""
     docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""

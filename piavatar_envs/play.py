@@ -1,7 +1,8 @@
-"""A rollout of any registered environment: return, metrics and, if asked, a video."""
+"""A rollout of any environment, of one agent or several: return, metrics and, if asked, a video."""
 
 from __future__ import annotations
 
+import importlib
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 import piavatar_envs  # noqa: F401 - registers the ids
+from piavatar_envs.multi import multi_modules
 from piavatar_envs.render.video import SUFFIXES, write_video
 
 
@@ -46,7 +48,7 @@ def play(
     """Play ``env_id`` for some steps, beginning a new episode whenever one ends; without ``steps``, one episode.
 
     Args:
-        env_id: a registered id.
+        env_id: a registered id, or the name of a module of several agents such as ``sumo_v0``.
         agent: "random" (uniform in the action space) or "zero".
         video: the .mp4 or .gif to write, or None.
         steps: number of steps.
@@ -56,7 +58,7 @@ def play(
         overrides: settings of the environment's configuration.
 
     Raises:
-        ValueError: an unknown agent, a number of steps below 1, an unknown suffix, a setting out of range.
+        ValueError: an unknown module, an unknown agent, a number of steps below 1, an unknown suffix, a setting out of range.
     """
     if agent not in ("random", "zero"):
         raise ValueError(f"no agent {agent!r}; there are random and zero")
@@ -67,7 +69,7 @@ def play(
     settings = {"device": device, **(overrides or {})}
     if video is not None:
         settings = {"render_mode": "rgb_array", "color": color, **settings}
-    env = gymnasium.make(env_id, **settings)
+    env = gymnasium.make(env_id, **settings) if "/" in env_id else Together(env_id, settings)
     rollout = Rollout()
     try:
         frames = _frames(env, agent, steps, seed, rollout)
@@ -80,12 +82,54 @@ def play(
     return rollout
 
 
-def _frames(env: gymnasium.Env, agent: str, steps: int | None, seed: int, rollout: Rollout) -> Iterator[Any]:
+class Together:
+    """Several agents played as one: the reward is their sum, actions are theirs side by side."""
+
+    def __init__(self, name: str, settings: Mapping[str, Any]) -> None:
+        """Build the module ``name`` of :mod:`piavatar_envs.multi`.
+
+        Raises:
+            ValueError: there is no such module.
+            ImportError: PettingZoo is not installed.
+        """
+        modules = {path.rpartition(".")[2]: path for path in multi_modules()}
+        if name not in modules:
+            raise ValueError(f"unknown module {name!r}; there are {', '.join(modules)}")
+        self.env = importlib.import_module(modules[name]).parallel_env(**settings)
+        self.name, self.metadata, self.render_mode = name, self.env.metadata, self.env.render_mode
+        first = self.env.action_space(self.env.possible_agents[0])
+        self.action_space = gymnasium.vector.utils.batch_space(first, len(self.env.possible_agents))
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begin an episode."""
+        self.env.reset(seed=seed)
+
+    def step(self, actions: np.ndarray) -> tuple[None, float, bool, bool, dict[str, Any]]:
+        """Advance those who are still in; ``info`` is by agent."""
+        index = {name: row for row, name in enumerate(self.env.possible_agents)}
+        chosen = {name: actions[index[name]] for name in self.env.agents}
+        _, rewards, _, truncations, infos = self.env.step(chosen)
+        failures = [info["failure"] for info in infos.values() if info.get("failure")]
+        info = {**infos, "failure": failures[0] if failures else None}
+        over = not self.env.agents
+        return None, sum(rewards.values()), over and not any(truncations.values()), over, info
+
+    def render(self) -> np.ndarray | None:
+        """The scene."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Free what was opened."""
+        self.env.close()
+
+
+def _frames(env: gymnasium.Env | Together, agent: str, steps: int | None, seed: int, rollout: Rollout) -> Iterator[Any]:
     """Play, book into ``rollout``, and yield a picture of each state (None without a render mode)."""
     env.action_space.seed(seed)
     still = np.zeros(env.action_space.shape, dtype=env.action_space.dtype)
     finished = True
-    with tqdm(total=steps, desc=env.spec.id, unit="step", disable=None) as bar:
+    name = env.name if isinstance(env, Together) else env.spec.id
+    with tqdm(total=steps, desc=name, unit="step", disable=None) as bar:
         while steps is None or rollout.steps < steps:
             if finished:
                 env.reset(seed=seed if rollout.steps == 0 else None)

@@ -169,3 +169,11 @@ def test_real_video_is_coloured_by_strain(device, tmp_path):
     play.play("PIAvatar/Reach-v0", "random", tmp_path / "a.mp4", 2, 0, device, "strain", settings)
     frames = np.stack(list(imageio.imiter(tmp_path / "a.mp4")))
     assert frames.shape == (3, 96, 96, 3) and frames.std() > 5.0
+
+
+def test_modules_of_several_agents_are_played_too(tmp_path):
+    rollout = play.play("sumo_v0", agent="zero", steps=3, overrides={"fidelity": "tiny"})
+    assert rollout.steps == 3 and len(rollout.returns) == 1 and not rollout.failures
+    assert {"agent_0.success", "agent_1.reward_terms.control"} <= set(rollout.metrics)
+    with pytest.raises(ValueError, match=r"unknown module 'sumo_v9'.*sumo_v0"):
+        play.play("sumo_v9", steps=1)

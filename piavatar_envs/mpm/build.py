@@ -261,17 +261,16 @@ def allocate(model: Model) -> tuple[State, Scratch]:
             sum=zeros(nodes, vec8),
             offset=zeros(nodes, wp.vec3),
             velocity=zeros(nodes, vec8),
-            contact=zeros(shared, wp.vec4),
             facing=zeros(shared, wp.vec3),
         ),
         block_fields=zeros((2, model.num_envs, model.num_blocks), int),
-        sensors=allocate_sensors(model),
+        sensors=allocate_sensors(model, zeros(shared, wp.vec4)),
     )
     return state, scratch
 
 
-def allocate_sensors(model: Model) -> Sensors:
-    """Zeroed contact sensors."""
+def allocate_sensors(model: Model, node: wp.array) -> Sensors:
+    """Zeroed contact sensors; ``node`` are their records at the nodes."""
     n, subjects = model.num_envs, model.contact.num_subjects
 
     def zeros(shape, dtype):
@@ -282,5 +281,6 @@ def allocate_sensors(model: Model) -> Sensors:
         boundary_impulse=zeros((n, subjects), wp.vec3),
         pair_impulse=zeros((n, subjects * subjects), wp.vec3),
         part_impulse=zeros((n, max(1, model.num_sensors), subjects), wp.vec3),
+        node=node,
         penetration=zeros((n, subjects), float),
     )

@@ -46,15 +46,13 @@ def coulomb(m_a: float, m_b: float, approach: wp.vec3, n: wp.vec3, friction: flo
 
 
 @wp.func
-def book_contact(
-    contact: Contact, e: int, r: int, other: int, change: wp.vec3, node_contact: wp.array2d(dtype=wp.vec4)
-):
+def book_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, sensors: Sensors):
     """Add a change of velocity [m/s] to a node's record, and keep the subject that has done most of it."""
-    before = node_contact[e, r]
+    before = sensors.node[e, r]
     so_far = wp.vec3(before[0], before[1], before[2])
     subject = wp.where(wp.length_sq(change) >= wp.length_sq(so_far), float(contact.subject[other]), before[3])
     after = so_far + change
-    node_contact[e, r] = wp.vec4(after[0], after[1], after[2], subject)
+    sensors.node[e, r] = wp.vec4(after[0], after[1], after[2], subject)
 
 
 @wp.func
@@ -69,7 +67,6 @@ def touch(
     node_facing: wp.array2d(dtype=wp.vec3),
     node_offset: wp.array2d(dtype=wp.vec3),
     node_velocity: wp.array2d(dtype=vec8),
-    node_contact: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """Contact of the fields ``a < b`` at a node: equal and opposite impulses along one normal."""
@@ -92,8 +89,8 @@ def touch(
         return
     node_velocity[e, ra] = va - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / va[0]
     node_velocity[e, rb] = vb + vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / vb[0]
-    book_contact(contact, e, ra, b, -J / va[0], node_contact)
-    book_contact(contact, e, rb, a, J / vb[0], node_contact)
+    book_contact(contact, e, ra, b, -J / va[0], sensors)
+    book_contact(contact, e, rb, a, J / vb[0], sensors)
     first = contact.subject[a]
     second = contact.subject[b]
     if first != second:
@@ -109,7 +106,7 @@ def project_alone(
     n: int,
     node_offset: wp.array2d(dtype=wp.vec3),
     node_velocity: wp.array2d(dtype=vec8),
-    node_contact: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
 ):
     """The paper's rule: each field loses its approach to the common velocity along its own normal."""
     m = float(0.0)
@@ -138,7 +135,7 @@ def project_alone(
                 # against a wall that moves with the common velocity
                 J = coulomb(1.0, 1.0, 2.0 * (wp.vec3(v[1], v[2], v[3]) - common), out, mu)
                 node_velocity[e, r] = v - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0)
-                book_contact(contact, e, r, other, -J, node_contact)
+                book_contact(contact, e, r, other, -J, sensors)
 
 
 @wp.func
@@ -152,12 +149,11 @@ def touch_all(
     node_facing: wp.array2d(dtype=wp.vec3),
     node_offset: wp.array2d(dtype=wp.vec3),
     node_velocity: wp.array2d(dtype=vec8),
-    node_contact: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """Contact of all fields at a node."""
     if contact.own_normals != 0:
-        project_alone(contact, grid.num_nodes, mask, e, n, node_offset, node_velocity, node_contact)
+        project_alone(contact, grid.num_nodes, mask, e, n, node_offset, node_velocity, sensors)
         return
     end = end_of_fields(mask, contact.num_fields)
     for a in range(lowest_field(mask, contact.num_fields), end - 1):
@@ -166,5 +162,5 @@ def touch_all(
                 if has_field(mask, b):
                     touch(
                         grid, contact, e, n, a, b, active,
-                        node_facing, node_offset, node_velocity, node_contact, sensors,
+                        node_facing, node_offset, node_velocity, sensors,
                     )  # fmt: skip

@@ -80,7 +80,6 @@ def solve_shared_node(
     node_sum: wp.array2d(dtype=vec8),
     node_offset: wp.array2d(dtype=wp.vec3),
     node_velocity: wp.array2d(dtype=vec8),
-    node_contact: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """A node of a block with several fields: bodies touch, boundaries are met."""
@@ -91,8 +90,8 @@ def solve_shared_node(
         r = f * num_nodes + n
         if has_field(mask, f):
             node_velocity[e, r] = total_velocity(step, split, node_sum[e, r])
-            node_contact[e, r] = wp.vec4(0.0)
-    touch_all(grid, contact, mask, e, n, active, node_facing, node_offset, node_velocity, node_contact, sensors)
+            sensors.node[e, r] = wp.vec4(0.0)
+    touch_all(grid, contact, mask, e, n, active, node_facing, node_offset, node_velocity, sensors)
     for f in range(first, end):
         r = f * num_nodes + n
         if has_field(mask, f):
@@ -102,7 +101,7 @@ def solve_shared_node(
                 t = contact.trunk[f] * num_nodes + n
                 v = node_velocity[e, t]
                 node_velocity[e, r] = vec8(0.0, v[1], v[2], v[3], v[4], v[5], v[6], v[7])
-                node_contact[e, r] = node_contact[e, t]
+                sensors.node[e, r] = sensors.node[e, t]
             else:
                 if near and total[0] > MASS_MIN:
                     matter = at - node_offset[e, r] / total[0]
@@ -126,7 +125,6 @@ def update_grid(
     node_offset: wp.array2d(dtype=wp.vec3),
     # out
     node_velocity: wp.array2d(dtype=vec8),
-    node_contact: wp.array2d(dtype=wp.vec4),
     next_active: wp.array2d(dtype=int),
     sensors: Sensors,
 ):
@@ -158,7 +156,7 @@ def update_grid(
                 if shared:
                     solve_shared_node(
                         grid, step, boundaries, contact, mask, e, n, split, near, at, gate,
-                        active, node_facing, node_sum, node_offset, node_velocity, node_contact, sensors,
+                        active, node_facing, node_sum, node_offset, node_velocity, sensors,
                     )  # fmt: skip
                 else:
                     r = of_field + n

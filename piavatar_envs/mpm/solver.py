@@ -7,7 +7,7 @@ from piavatar_envs.mpm.grid import threads_per_block, update_grid
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.sensing import clear_sensors, sense_contact, sense_penetration
-from piavatar_envs.mpm.transfer import grid_to_particles, mark_particles, particles_to_grid
+from piavatar_envs.mpm.transfer import clear_marks, grid_to_particles, mark_particles, particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 
@@ -35,13 +35,13 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
         update_grid,
         blocks,
         [m.grid, m.step, m.boundaries, m.contact, slabs, active, nodes.facing],
-        [nodes.sum, nodes.offset, nodes.velocity, nodes.contact, next_active, scratch.sensors],
+        [nodes.sum, nodes.offset, nodes.velocity, next_active, scratch.sensors],
     )
     if m.contact.num_fields > 1:
         program.launch(
             sense_contact,
             particles,
-            [m.grid, m.particles, m.contact, s.x, active, nodes.contact, s.failure],
+            [m.grid, m.particles, m.contact, s.x, active, scratch.sensors.node, s.failure],
             [scratch.sensors.part_impulse],
         )
     program.launch(
@@ -61,7 +61,12 @@ def record_begin(program: Program, model: Model, state: State, scratch: Scratch)
 
 
 def record_marks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
-    """Append: mark the blocks of all particles for the first substep; every substep marks those of the next."""
+    """Append: mark the blocks of all particles for the first substep; every substep marks those of the next.
+
+    What the last control step left is forgotten first: a reset may have put the particles elsewhere, and a block that
+    is marked for nothing costs time and, in its rounding, the equality of runs.
+    """
+    program.launch(clear_marks, (model.num_envs, model.num_blocks), [], [scratch.block_fields[0]])
     program.launch(
         mark_particles,
         state.x.shape,

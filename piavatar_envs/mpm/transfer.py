@@ -59,6 +59,13 @@ def mark_blocks(grid: Grid, base: wp.vec3i, field: int, e: int, active: wp.array
 
 
 @wp.kernel
+def clear_marks(active: wp.array2d(dtype=int)):
+    """Forget the fields of all blocks."""
+    e, block = wp.tid()
+    active[e, block] = 0
+
+
+@wp.kernel
 def mark_particles(
     grid: Grid,
     particles: Particles,

@@ -98,11 +98,13 @@ class Contact:
 
 @wp.struct
 class Sensors:
-    """What contact did in this control step."""
+    """What contact did in this control step, and at the nodes in this substep."""
 
     boundary_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S) impulse of the colliders on a subject [N s]
     pair_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S * S) on a by b, only a < b [N s]
     part_impulse: wp.array3d(dtype=wp.vec3)  # (num_envs, sensors, S) on the particles of a sensor, by subject [N s]
+    # (num_envs, F * num_nodes) change of velocity by other subjects and the one that did most of it; of shared blocks
+    node: wp.array2d(dtype=wp.vec4)
     penetration: wp.array2d(dtype=float)  # (num_envs, S) deepest particle of a subject inside another [m]
 
 
@@ -207,8 +209,6 @@ class Nodes:
         offset: vec3: sum of ``w m (x_i - x_p)``, kept near boundaries and other fields only: minus the mass gradient,
             up to a factor, and where the matter at a node is. Zero between substeps.
         velocity: vec8: mass, physical velocity, kinematic velocity, 1 near boundaries.
-        contact: vec4: change of velocity by other subjects, and the index of the one that did most of it; of blocks
-            with several fields only.
         facing: vec3: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`; of blocks with
             several fields only.
     """
@@ -216,7 +216,6 @@ class Nodes:
     sum: wp.array
     offset: wp.array
     velocity: wp.array
-    contact: wp.array
     facing: wp.array
 
 

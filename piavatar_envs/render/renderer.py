@@ -61,7 +61,7 @@ class Renderer:
 
         Args:
             bodies: meshes in world coordinates.
-            markers: spheres, arrows and boxes.
+            markers: spheres, arrows, boxes, capsules and rings.
             follow: the point the camera follows [m], shape ``(3,)``, for example the root; the origin if None.
 
         Returns:

@@ -142,7 +142,7 @@ class Ring:
         angle = np.linspace(np.arcsin(sine), np.pi - np.arcsin(sine), _RING_SEGMENTS + 1)[:, None, None]
         around = np.linspace(0.0, 2.0 * np.pi, _WIRE_SEGMENTS, endpoint=False)[None, :, None]
         out = np.cos(angle) * np.cross(up, normal) + np.sin(angle) * up
-        surface = (self.radius + self.wire * np.cos(around)) * out + self.wire * np.sin(around) * normal
+        surface = (self.radius + self.wire * np.cos(around)) * out - self.wire * np.sin(around) * normal
         return position + surface.reshape(-1, 3), _RING_FACES
 
 

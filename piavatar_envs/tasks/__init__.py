@@ -9,7 +9,20 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from piavatar_envs.tasks.base import Task
 
-_NOT_TASKS = {"base", "clip", "disturb", "rewards", "spawn"}
+_NOT_TASKS = {
+    "base",
+    "clip",
+    "disturb",
+    "gate",
+    "goal",
+    "hits",
+    "leash",
+    "pushing",
+    "ranges",
+    "rewards",
+    "spawn",
+    "throws",
+}
 NAMESPACE = "PIAvatar"
 
 

@@ -51,3 +51,10 @@ def countdown() -> type[Countdown]:
 def tiny() -> TrainingConfig:
     """A training of seconds."""
     return load_training(TINY)
+
+
+@pytest.fixture
+def games(monkeypatch) -> None:
+    """Let the toy worlds in ``games/`` be those that a configuration may name."""
+    names = tuple(f"tests.agents.games.{name}_v0" for name in ("auction", "ledger", "rendezvous"))
+    monkeypatch.setattr("agents.config.multi_modules", lambda: names)

@@ -8,16 +8,20 @@ import pytest
 import yaml
 
 from agents.config import env_config, load_training
-from agents.workers import components
+from agents.workers import components, factory
 from piavatar_envs.envs.config import ConfigError, dump_yaml
 from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
 
-CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*_ppo.yaml"))
+CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
-def test_published_configurations_load(path):
-    assert load_training(path).total_steps > 0
+def test_published_configurations_load_and_observe_what_there_is(path, device):
+    config = load_training(path, {"env.fidelity": "tiny"})
+    env = factory(config, device)()
+    seen = components(env.unwrapped.observation_layout, config.observe)
+    assert 0 < len(seen) == len(set(seen)) <= env.observation_space.shape[-1]
+    env.close()
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,11 @@ SHORTEST, TALLEST, LIGHTEST, HEAVIEST = 1.2, 2.1, 25.0, 160.0
 def body_of(env, index: int = 0) -> dict[str, float | np.ndarray]:
     """What one sees of a body at rest: height [m], mass [kg], parameters."""
     simulation = env.batch.simulation
-    x = simulation.state.x.numpy()[index]
+    own = slice(0, simulation.avatar.num_points)  # props come after the avatar
+    x = simulation.state.x.numpy()[index, own]
     return {
         "height": float(np.ptp(x[:, 2])),
-        "mass": float(simulation.model.particles.mass.numpy()[index].sum()),
+        "mass": float(simulation.model.particles.mass.numpy()[index, own].sum()),
         "parameters": simulation.flesh[0].shape_parameters[index].copy(),
     }
 

@@ -105,9 +105,9 @@ def test_substeps_equal_control_steps(simulate, device):
 def test_timed_reports_every_kernel(simulate):
     sim = simulate(**SCENE)
     seconds = sim.program.timed(1)
-    assert set(seconds) == {"particles_to_grid", "update_grid", "grid_to_particles", "mark_particles"}
+    assert set(seconds) == {"particles_to_grid", "update_grid", "grid_to_particles", "clear_marks", "mark_particles"}
     assert all(value > 0.0 for value in seconds.values())
-    assert len(sim.program) == 1 + 3 * 25
+    assert len(sim.program) == 2 + 3 * 25
 
 
 def test_a_program_that_has_run_is_closed(simulate, device):

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.render import Arrow, Box, Sphere
+from piavatar_envs.render import Arrow, Box, Ring, Sphere
 from piavatar_envs.render.geometry import Topology, topology_key, unit
 
 
@@ -20,6 +20,25 @@ def test_markers_enclose_their_volume():
     radius, length, head = 0.02, 0.5, 0.1
     solid = np.pi * radius**2 * (length - head) + np.pi * (2.4 * radius) ** 2 * head / 3.0
     assert enclosed_volume(Arrow((1, 1, 1), (0.3, 0.4, 0.0), radius=radius)) == pytest.approx(solid, rel=0.03)
+
+
+@pytest.mark.parametrize("normal", [(0.6, -0.8, 0.0), (0.0, 0.0, 1.0)])
+def test_a_ring_lies_in_its_plane_about_its_centre(normal):
+    center, normal = np.array([0.3, -2.0, 0.8]), np.array(normal)
+    ring = Ring(center, normal, 0.5, wire=0.03)
+    offset = ring.mesh()[0] - center
+    along = offset @ normal
+    away = np.linalg.norm(offset - along[:, None] * normal, axis=1)
+    assert np.hypot(away - 0.5, along) == pytest.approx(0.03)
+    assert enclosed_volume(ring) == pytest.approx(2.0 * np.pi**2 * 0.5 * 0.03**2, rel=0.06)
+
+
+def test_a_ring_leaves_out_what_is_in_the_ground():
+    standing = Ring((0.0, -1.0, 0.25), (0.0, -1.0, 0.0), 0.4).mesh()[0]
+    assert standing[:, 2].min() == pytest.approx(0.0, abs=0.02) and standing[:, 2].max() == pytest.approx(0.67)
+    # where the circle cuts the ground
+    assert np.abs(standing[standing[:, 2] < 0.03, 0]).min() == pytest.approx(np.sqrt(0.4**2 - 0.25**2), abs=0.03)
+    assert Ring((0.0, -1.0, 0.25), (0.0, -1.0, 0.0), 0.4, lowest=-1.0).mesh()[0][:, 2].min() == pytest.approx(-0.17)
 
 
 def test_an_arrow_points_along_its_vector():

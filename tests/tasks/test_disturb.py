@@ -80,7 +80,9 @@ def test_the_momentum_that_arrives_is_the_impulse(make_batch, name):
     )
     du, mass = velocity.numpy().astype(float), simulation.model.particles.mass.numpy().astype(float)
     assert np.einsum("ep,epi->ei", mass, du) == pytest.approx(J, rel=2e-6)
-    weight = (simulation.flesh[0].points.skin_weights * (simulation.flesh[0].points.skin_joints == joint_index(name))).sum(1)
+    weight = (
+        simulation.flesh[0].points.skin_weights * (simulation.flesh[0].points.skin_joints == joint_index(name))
+    ).sum(1)
     assert np.array_equal(np.abs(du).max((0, 2)) > 0.0, weight > 0.0)
     # heavy enough that the flesh is not torn
     assert np.linalg.norm(du, axis=2).max() / np.linalg.norm(J, axis=1).max() < 1.0

@@ -1,0 +1,199 @@
+"""The view of several agents: ``pettingzoo.ParallelEnv`` over a batch of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
+from piavatar_envs.envs.config import load_config, replace
+from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.tasks.base import Task
+
+try:
+    from pettingzoo import ParallelEnv
+except ImportError as error:
+    raise ImportError("several agents need PettingZoo; install it with: pip install 'piavatar-envs[multi]'") from error
+
+
+class AvatarParallelEnv(ParallelEnv):
+    """Several soft avatars and a task; each avatar is an agent.
+
+    Observations and actions are as those of :class:`~piavatar_envs.api.gymnasium.AvatarEnv`, by agent, and so is
+    ``info``. An agent that is terminated leaves ``agents``; its avatar stays in the world as a passive body. All leave
+    when the clock has run out, and when the simulation gave up (``failure``).
+
+    Attributes:
+        possible_agents: names of all agents.
+        agents: names of those that act in the next step.
+        observation_spaces, action_spaces: by agent.
+        state_space: of :meth:`state`.
+        action_names: of every component of an agent's action.
+        config: the settings.
+        batch: the environment on the device.
+    """
+
+    def __init__(
+        self,
+        task_class: type[Task],
+        render_mode: str | None = None,
+        device: str = "cpu",
+        config: Settings = None,
+        max_cycles: int | None = None,
+        **overrides: Any,
+    ) -> None:
+        """Build the environment.
+
+        Args:
+            task_class: the task.
+            render_mode: None or ``"rgb_array"``.
+            device: Warp device, ``"cpu"`` or ``"cuda:0"``.
+            config: settings as a mapping, a YAML file or a configuration.
+            max_cycles: control steps until truncation; wins over ``episode_seconds``.
+            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+
+        Raises:
+            ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ValueError: an unknown render mode or device, or no time at all.
+        """
+        self.config = load_config(task_class.Config, config, overrides)
+        if max_cycles is not None:
+            if max_cycles < 1:
+                raise ValueError(f"max_cycles={max_cycles} must be at least 1, or None for episode_seconds")
+            self.config = replace(self.config, episode_seconds=max_cycles * self.config.physics.control_dt)
+        self._episode = Episode(task_class(self.config), render_mode, device)
+        self.batch, self.render_mode = self._episode.batch, render_mode
+        self.metadata: dict[str, Any] = {
+            "name": task_class.__module__.rpartition(".")[2],
+            "render_modes": list(RENDER_MODES),
+            "render_fps": self._episode.frame_rate,
+            "is_parallelizable": True,
+        }
+        self.possible_agents = list(self.batch.task.agent_names)
+        self.agents: list[str] = []
+        self._index = {name: index for index, name in enumerate(self.possible_agents)}
+        self.action_names = self._episode.action_names
+        self.action_spaces = {name: self._episode.action_space() for name in self.possible_agents}
+        self.observation_spaces = {name: self._episode.observation_space() for name in self.possible_agents}
+        self.state_space = self._episode.state_space()
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """Name, slice, unit and frame of everything in an agent's flat observation."""
+        return self.batch.layout
+
+    def observation_space(self, agent: str) -> gym.Space:
+        """Space of what ``agent`` sees: always the same object."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gym.Space:
+        """Space of what ``agent`` does: always the same object."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Begin an episode with all agents.
+
+        Args:
+            seed: of this and all following episodes. Without one, the next episode of the seed before.
+            options: none are known; ignored, as PettingZoo's own test asks.
+
+        Returns:
+            Observations and infos by agent.
+
+        Raises:
+            ValueError: a seed outside [0, 2^32).
+            gymnasium.error.Error: what is no seed.
+        """
+        self._episode.begin(seed)
+        self.agents = self._playing()
+        return self._observations(), {name: self._episode.info(self._index[name]) for name in self.agents}
+
+    def step(
+        self, actions: Mapping[str, np.ndarray]
+    ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """Advance by one control step.
+
+        Args:
+            actions: of every agent in ``agents``, and of no other.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos of those who acted.
+
+        Raises:
+            ValueError: an action that is missing, of an agent that does not play, of the wrong shape or not finite;
+                nothing has changed then.
+            gymnasium.error.ResetNeeded: before the first reset, or all agents have left.
+        """
+        episode = self._episode
+        episode.check_ready("step")
+        if not self.agents:
+            raise gym.error.ResetNeeded("all agents have left; call reset() before step()")
+        episode.advance(self._checked(actions))
+        acted, truncated = self.agents, episode.truncated()
+        outcome = {name: self._index[name] for name in acted}
+        terminations = {name: episode.terminated(agent) for name, agent in outcome.items()}
+        truncations = {name: truncated and not terminations[name] for name in acted}
+        observations = self._observations()
+        rewards = {name: episode.reward(agent) for name, agent in outcome.items()}
+        infos = {name: episode.step_info(agent) for name, agent in outcome.items()}
+        self.agents = self._playing()
+        return observations, rewards, terminations, truncations, infos
+
+    def _checked(self, actions: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Actions ``(agents, action_size)``, zero for those who have left."""
+        missing = [name for name in self.agents if name not in actions]
+        strange = [name for name in actions if name not in self.agents]
+        if missing or strange:
+            what = f"no action for {', '.join(missing)}" if missing else f"an action for {', '.join(map(str, strange))}"
+            raise ValueError(f"{what}; those who act are {', '.join(self.agents)}")
+        rows = np.zeros((len(self.possible_agents), self.batch.action_spec.size), np.float32)
+        for name in self.agents:
+            try:
+                rows[self._index[name]] = self._episode.check_action(actions[name])
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from None
+        return rows
+
+    def _playing(self) -> list[str]:
+        """Who acts in the next step."""
+        alive = self.batch.alive.numpy()[0] & ~self.batch.truncated.numpy()[0]
+        return [name for name, index in self._index.items() if alive[index]]
+
+    def _observations(self) -> dict[str, Any]:
+        return {name: self._episode.observation(self._index[name]) for name in self.agents}
+
+    def state(self) -> np.ndarray:
+        """The flat observations of all agents one after the other, also of those who have left, for central critics."""
+        return self._episode.flat_observations()
+
+    def render(self) -> np.ndarray | None:
+        """The scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``, else None.
+
+        Raises:
+            ImportError: the extra ``render`` is not installed.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        return self._episode.render()
+
+    def close(self) -> None:
+        """Free the renderer's window."""
+        self._episode.close()
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that the future depends on; :meth:`set_state` restores it, bit for bit on the CPU."""
+        return self.batch.get_state()
+
+    def set_state(self, state: dict[str, np.ndarray]) -> dict[str, Any]:
+        """Restore what :meth:`get_state` returned, and who plays; returns the observations of these.
+
+        Raises:
+            ValueError: the state is of another environment; nothing has changed then.
+        """
+        self._episode.restore(state)
+        self.agents = self._playing()
+        return self._observations()

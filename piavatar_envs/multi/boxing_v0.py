@@ -1,0 +1,263 @@
+"""Boxing: strike the other's head and trunk with the arms, and keep one's own out of the way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+from pettingzoo import AECEnv
+from pettingzoo.utils.conversions import parallel_to_aec
+from pydantic import Field
+
+from piavatar_envs.api.pettingzoo import AvatarParallelEnv
+from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key
+from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.config import ConfigError, DriveConfig, EnvConfig, SceneConfig
+from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.envs.simulation import Domain
+from piavatar_envs.multi.blows import Scale, Tally, begin_bout, count_points, leads
+from piavatar_envs.multi.versus import (
+    RING_CENTRE,
+    Referee,
+    Stance,
+    circle_radius,
+    has_won,
+    on_circle,
+    others_in,
+    others_in_terms,
+    record_centre,
+    record_others_in,
+)
+from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.leash import record_leash
+from piavatar_envs.tasks.rewards import mean_square_action
+
+wp.set_module_options({"enable_backward": False})
+
+JOINTS = ("spine2", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow")
+STANCE = Key(
+    0.0,
+    pelvis=(0.0, 0.0, -0.06),
+    turns={"spine1": (5.0, 0.0, 0.0), "spine2": (5.0, 0.0, 0.0), "neck": (-4.0, 0.0, 0.0)},
+    left_foot=Foot((0.04, -0.22, 0.0)),
+    right_foot=Foot((-0.06, 0.20, 0.0)),
+    left_arm=Arm((0.35, -0.62, -0.70), (-0.10, -0.72, 0.69)),
+    right_arm=Arm((0.35, -0.50, -0.80), (-0.08, -0.70, 0.71)),
+)
+#: Room that a boxer takes up beside the pelvis, to the ropes [m].
+ROOM = 0.4
+
+
+class BoxingConfig(EnvConfig):
+    """Settings of Boxing."""
+
+    # spine, shoulder, elbow and root add up: with a second spinal joint as fast as this, full actions could move a fist
+    # by more than a grid spacing a substep
+    drive: DriveConfig = Field(
+        default_factory=lambda: DriveConfig(joint_speed_limit=6.0), description="how poses move the body"
+    )
+    episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until the gong [s]")
+    num_agents: int = Field(2, ge=1, le=8, description="number of avatars")
+    ring_size: float = Field(3.2, ge=1.6, le=10.0, description="side of the square ring [m]")
+    start_distance: float = Field(1.0, ge=0.6, le=5.0, description="between neighbours at the start [m]")
+    joints: tuple[str, ...] | None = Field(JOINTS, description="joints that act, besides the root; null for all 21")
+    root_speed: float = Field(1.0, gt=0.0, le=5.0, description="speed of the root at action 1 [m/s]")
+    leash: float = Field(0.08, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body [m]")
+    leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning [rad]")
+    blow_impulse: float = Field(
+        1.0,
+        gt=0.0,
+        description="impulse on a target up to which a blow counts for nothing; twice that is a full blow [N s]",
+    )
+    head_points: float = Field(1.0, ge=0.0, description="points of a full blow on the head [-]")
+    torso_points: float = Field(0.4, ge=0.0, description="points of a full blow on the trunk [-]")
+    taken_weight: float = Field(0.8, ge=0.0, description="cost of the points that others score on oneself [-]")
+    win_reward: float = Field(5.0, ge=0.0, description="reward of the last one on the feet [-]")
+    down_cost: float = Field(5.0, ge=0.0, description="what it costs to be knocked down [-]")
+    control_cost: float = Field(0.01, ge=0.0, description="weight of the mean squared action [-]")
+    pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle off the first stance [rad]")
+    place_noise: float = Field(0.05, ge=0.0, le=0.3, description="greatest displacement along x and y at the start [m]")
+
+
+@wp.struct
+class Rules:
+    """Constants of the bout."""
+
+    taken_weight: float
+    win_reward: float
+    down_cost: float
+    control_cost: float
+    max_steps: int
+
+
+@wp.kernel
+def judge(
+    rules: Rules,
+    tally: Tally,
+    out: wp.array2d(dtype=wp.bool),
+    alive: wp.array2d(dtype=wp.bool),
+    failure: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    action: wp.array3d(dtype=float),
+    # out
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
+    terminated: wp.array2d(dtype=wp.bool),
+):
+    """What blows, a fall and a win are worth."""
+    e, agent = wp.tid()
+    others = others_in(e, agent, alive, out)
+    won = has_won(e, agent, others, out, failure)
+    hit = float(0.0)
+    taken = float(0.0)
+    given_impulse = float(0.0)
+    taken_impulse = float(0.0)
+    for other in range(alive.shape[1]):
+        hit += tally.points[e, agent, other]
+        taken += tally.points[e, other, agent]
+        given_impulse = wp.max(given_impulse, wp.max(tally.impulse[e, agent, other]))
+        taken_impulse = wp.max(taken_impulse, wp.max(tally.impulse[e, other, agent]))
+    terms[e, agent, 0] = hit
+    terms[e, agent, 1] = -rules.taken_weight * taken
+    terms[e, agent, 2] = wp.where(won, rules.win_reward, 0.0)
+    terms[e, agent, 3] = wp.where(out[e, agent] and failure[e] == 0, -rules.down_cost, 0.0)
+    terms[e, agent, 4] = -rules.control_cost * mean_square_action(action, e, agent)
+    metrics[e, agent, 0] = tally.score[e, agent]
+    metrics[e, agent, 1] = given_impulse
+    metrics[e, agent, 2] = taken_impulse
+    # the step counter has not moved yet
+    gong = step_count[e] + 1 >= rules.max_steps and failure[e] == 0 and not out[e, agent]
+    success[e, agent] = won or (gong and leads(e, agent, alive, tally.score))
+    terminated[e, agent] = won or out[e, agent]
+
+
+class BoxingTask(Task):
+    """Strike, and do not get struck."""
+
+    Config = BoxingConfig
+    description = "strike the other's head and trunk with the arms, and keep one's own out of the way"
+    observation_terms = (RING_CENTRE,)
+    reward_terms = ("hit", "taken", "win", "down", "control")
+    metrics = ("score", "given_impulse", "taken_impulse")
+    observes_contact = True
+    observes_others = True
+    camera_position = (3.7, -1.5, 1.8)
+    camera_target = (0.0, 0.0, 0.85)
+    camera_follows = False
+
+    summary = """`num_agents` avatars stand on guard, `start_distance` apart around the centre of a square ring of
+`ring_size`, each displaced by up to `place_noise`; smooth walls stand in for the ropes. The trunk, the arms and the
+root act. A blow is an impulse on the other's head or trunk, in one control step, that one's own arms have felt as well.
+It is worth nothing up to `blow_impulse` and `head_points` or `torso_points` from twice that on. A contact counts once,
+by its strongest step, and is over when the impulse has fallen below half of `blow_impulse`: leaning scores nothing
+more. Who is knocked down is out, and its body stays where it fell; the last one on the feet has won. A good agent
+strikes fast, at the head, and withdraws."""
+    reward_docs: ClassVar[Mapping[str, str]] = {
+        "hit": "the points of this step's blows, at most `head_points + torso_points` for each other agent",
+        "taken": "`-taken_weight` times the points that others have scored on oneself",
+        "win": "`win_reward` for the last one on the feet, once",
+        "down": "`-down_cost` when one is knocked down, once",
+        "control": "`-control_cost` times the mean of the squared action components",
+    }
+    metric_docs: ClassVar[Mapping[str, str]] = {
+        "score": "points of this bout so far [-]",
+        "given_impulse": "greatest impulse of one's own arms on a head or trunk in this step [N s]",
+        "taken_impulse": "greatest impulse of another's arms on one's own head or trunk in this step [N s]",
+    }
+    success_doc = "all others are down, or the clock has run out and nobody else on the feet has as many points"
+    termination_doc = "all others are down"
+    picture_seconds = 0.33
+    picture_actions: ClassVar[Mapping[str, float]] = {
+        "right_shoulder.y": 0.42, "right_shoulder.z": 0.85, "right_elbow.x": 0.65, "right_elbow.z": -0.58,
+        "spine2.z": 0.2, "root.y": -0.5,
+    }  # fmt: skip
+    picture_settings: ClassVar[Mapping[str, Any]] = {"place_noise": 0.0}
+
+    config: BoxingConfig
+
+    def __init__(self, config: BoxingConfig) -> None:
+        super().__init__(config)
+        need = 2.0 * (circle_radius(config.num_agents, config.start_distance) + ROOM)
+        if need > config.ring_size:
+            raise ConfigError(
+                f"num_agents={config.num_agents} at start_distance={config.start_distance} m need a ring of "
+                f"{need:.3g} m, more than ring_size={config.ring_size} m; use ring_size >= {need + 0.05:.2g}"
+            )
+        self.joints, self.stance = select_joints(config.joints), Stance(STANCE)
+
+    def build_scene(self) -> SceneConfig:
+        return on_circle(self.config.scene, self.config.num_agents, self.config.start_distance)
+
+    def terms(self) -> tuple[ObservationTerm, ...]:
+        return (*self.observation_terms, *others_in_terms(self.config.num_agents))
+
+    def action_spec(self) -> ActionSpec:
+        speed = self.config.drive.joint_speed_limit
+        return ActionSpec(self.joints, root=True, joint_speed=speed, root_speed=self.config.root_speed)
+
+    def domain(self) -> Domain:
+        """The ring; the walls of the domain are the ropes."""
+        side, box = 0.5 * self.config.ring_size, Domain()
+        return Domain((-side, -side, box.lower[2]), (side, side, box.upper[2]))
+
+    def allocate(self, env) -> None:
+        config, scale, rules, tally = self.config, Scale(), Rules(), Tally()
+        scale.least, scale.points = config.blow_impulse, wp.vec2(config.head_points, config.torso_points)
+        rules.taken_weight, rules.win_reward = config.taken_weight, config.win_reward
+        rules.down_cost, rules.control_cost, rules.max_steps = config.down_cost, config.control_cost, env.max_steps
+        pairs = env.num_envs, env.num_agents, env.num_agents
+        tally.impulse, tally.peak = (wp.zeros(pairs, dtype=wp.vec2, device=env.device) for _ in range(2))
+        tally.points = wp.zeros(pairs, dtype=float, device=env.device)
+        tally.score = wp.zeros(pairs[:2], dtype=float, device=env.device)
+        self.scale, self.rules, self.tally, self.referee = scale, rules, tally, Referee(env)
+
+    def arrays(self) -> dict[str, wp.array]:
+        return {"peak": self.tally.peak, "score": self.tally.score}
+
+    def record_reset(self, env, program) -> None:
+        self.stance.record(env, program, self.config.pose_noise, self.config.place_noise)
+        program.launch(begin_bout, (env.num_envs, env.num_agents), [env.mask], [self.tally.peak, self.tally.score])
+
+    def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
+        return record_leash(env, program, self.config.leash, self.config.leash_turn)
+
+    def record_outcome(self, env, program) -> None:
+        agents = env.num_envs, env.num_agents
+        self.referee.record(env, program)
+        program.launch(
+            count_points,
+            agents,
+            [self.scale, env.alive, env.failure, env.simulation.sensors],
+            [self.tally.peak, self.tally.score, self.tally.impulse, self.tally.points],
+        )
+        program.launch(
+            judge,
+            agents,
+            [self.rules, self.tally, self.referee.out, env.alive, env.failure, env.step_count, env.action],
+            [env.terms, env.metrics, env.success, env.terminated],
+        )
+
+    def record_observe(self, env, program, agent: int, start: int) -> None:
+        record_centre(env, program, agent)
+        record_others_in(env, program, agent)
+
+    def markers(self, env, index: int) -> list[tuple[np.ndarray, float, tuple[float, float, float]]]:
+        side = 0.5 * self.config.ring_size
+        corners = [(x, y, z) for x in (-side, side) for y in (-side, side) for z in (0.0, 0.45, 0.9, 1.35)]
+        return [(np.array(corner), 0.03, (0.75, 0.20, 0.20)) for corner in corners]
+
+
+TASK = BoxingTask
+
+
+def parallel_env(**settings: Any) -> AvatarParallelEnv:
+    """The world; for the settings see :class:`~piavatar_envs.api.pettingzoo.AvatarParallelEnv`."""
+    return AvatarParallelEnv(TASK, **settings)
+
+
+def env(**settings: Any) -> AECEnv:
+    """The same world, one agent after the other."""
+    return parallel_to_aec(parallel_env(**settings))

@@ -1,0 +1,253 @@
+"""Header: head a falling ball through a gate that hangs in front."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import warp as wp
+from pydantic import Field
+
+from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.config import DriveConfig, EnvConfig, SceneConfig, replace
+from piavatar_envs.envs.draws import STREAM_BALL, generator
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.simulation import Domain
+from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS
+from piavatar_envs.tasks.goal import (
+    METRIC_DOCS,
+    REWARD_DOCS,
+    SUCCESS_DOC,
+    TERMINATION_DOC,
+    Goal,
+    ball_config,
+    check_range,
+    gate_domain,
+)
+from piavatar_envs.tasks.reach import hand_position
+from piavatar_envs.tasks.spawn import record_standing
+
+wp.set_module_options({"enable_backward": False})
+
+#: Joints that act by default.
+HEADING = ("left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "spine3", "neck", "head")
+#: Height of the ball's centre when it touches the head of a standing mean body [m].
+TOUCH_HEIGHT = 1.75
+#: Of the sphere that a head nearly is [m].
+HEAD_RADIUS = wp.constant(0.1)
+
+_HEAD = wp.constant(joint_index("head"))
+
+
+class HeaderConfig(EnvConfig):
+    """Settings of Header."""
+
+    drive: DriveConfig = Field(
+        default_factory=lambda: DriveConfig(joint_speed_limit=5.0), description="how poses move the body"
+    )
+    episode_seconds: float = Field(2.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
+    joints: tuple[str, ...] | None = Field(HEADING, description="joints that act; null for all 21")
+    ball_mass: tuple[float, float] = Field((0.2, 0.6), description="range of the ball's mass, uniform in its log [kg]")
+    ball_radius: float = Field(0.11, ge=0.06, le=0.3, description="radius of the ball [m]")
+    ball_height: tuple[float, float] = Field((2.5, 2.7), description="range of the height it falls from [m]")
+    ball_place: tuple[float, float] = Field(
+        (0.0, -0.1), description="middle of where it comes down to the head, x and y [m]"
+    )
+    ball_jitter: float = Field(0.05, ge=0.0, le=0.2, description="greatest offset from there along x and y [m]")
+    ball_speed: float = Field(0.3, ge=0.0, le=2.0, description="greatest speed of the ball along x and y [m/s]")
+    target_distance: tuple[float, float] = Field((1.5, 2.2), description="range of its distance from the ball [m]")
+    target_angle: float = Field(0.3, ge=0.0, le=1.0, description="its greatest angle from straight ahead [rad]")
+    target_height: float = Field(1.0, ge=0.0, le=2.0, description="height of the gate's centre [m]")
+    target_radius: float = Field(0.5, gt=0.0, le=1.0, description="radius of the gate's opening [m]")
+    control_cost: float = Field(0.002, ge=0.0, description="weight of the mean squared action [-]")
+    pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
+
+
+@wp.struct
+class Fall:
+    """Constants of where the ball comes from, and how heavy it is."""
+
+    prop: int
+    place: wp.vec3  # middle of where it comes down, at the height of the head [m]
+    jitter: float  # along x and y [m]
+    speed: float  # greatest along x and y [m/s]
+    low: float  # range of its first height [m]
+    high: float
+    gravity: float  # downward [m/s^2]
+    light: float  # natural logarithm of the least density in kg/m^3
+    heavy: float  # and of the greatest
+
+
+@wp.kernel
+def throw_ball(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    fall: Fall,
+    # out
+    position: wp.array2d(dtype=wp.vec3),
+    rotation: wp.array2d(dtype=wp.quat),
+    velocity: wp.array2d(dtype=wp.vec3),
+    density: wp.array2d(dtype=float),
+):
+    """A ball in the masked environments that comes down by its place with a little speed to the side."""
+    e = wp.tid()
+    if not mask[e]:
+        return
+    random = generator(seed[e], episode[e], STREAM_BALL, 0)
+    offset = wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
+    drift = fall.speed * wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
+    height = wp.randf(random, fall.low, fall.high)
+    # at most a second, for want of gravity
+    time = wp.min(wp.sqrt(2.0 * wp.max(height - fall.place[2], 0.0) / wp.max(fall.gravity, 0.1)), 1.0)
+    start = fall.place + fall.jitter * offset - time * drift
+    start[2] = height
+    position[e, fall.prop] = start
+    velocity[e, fall.prop] = drift
+    axis = wp.sample_unit_sphere_surface(random)
+    rotation[e, fall.prop] = wp.quat_from_axis_angle(axis, wp.randf(random, 0.0, 3.0))
+    density[e, fall.prop] = wp.exp(wp.randf(random, fall.light, fall.heavy))
+
+
+@wp.kernel
+def find_head(
+    body: Body,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    ball: wp.array(dtype=wp.vec3),
+    ball_radius: float,
+    # out
+    head: wp.array(dtype=wp.vec3),
+    gap: wp.array(dtype=float),
+):
+    """Middle of the head [m], and how far the ball's surface is from its [m]."""
+    e = wp.tid()
+    middle = hand_position(body, e, _HEAD, rotation[e, _HEAD], position[e, _HEAD])
+    head[e] = middle
+    gap[e] = wp.length(ball[e] - middle) - ball_radius - HEAD_RADIUS
+
+
+@wp.kernel
+def observe_head(
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    head: wp.array(dtype=wp.vec3),
+    ball: wp.array(dtype=wp.vec3),
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """The ball from the head, from component ``start``."""
+    e = wp.tid()
+    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(rotation[e, 0]), ball[e] - head[e]))
+
+
+class HeaderTask(Task):
+    """Head the ball through the gate."""
+
+    Config = HeaderConfig
+    description = "head a falling ball through a gate in front"
+    observation_terms = (
+        *GATE_TERMS,
+        ObservationTerm("ball_from_head", 3, "m", "root", "the ball from the middle of the head"),
+    )
+    reward_terms = REWARD_TERMS
+    metrics = METRICS
+
+    camera_position = (-3.9, 0.4, 1.9)
+    camera_target = (0.0, -0.9, 1.2)
+    camera_follows = False
+
+    summary = """A soft ball of 0.2 to 0.6 kg falls from a height in the range `ball_height`, with a speed of up to
+`ball_speed` to the side, and comes down about `ball_jitter` from `ball_place`: on the forehead of an avatar that
+stands upright, its joints a little bent at random (`pose_noise`), its root held where it is. A gate hangs in front,
+at a `target_distance` from where the ball began to fall and up to `target_angle` to either side. Left alone, the ball
+drops off the head; a good agent leans back and aside, lets trunk and neck snap forward when the ball arrives, and
+meets it off its centre to steer it.
+
+What can be earned by shaping is earned once: the terms pay only for being better than ever before in the episode, so
+that all of them but the control cost add up to at most 1, half of it for the goal."""
+    reward_docs: ClassVar[Mapping[str, str]] = REWARD_DOCS
+    metric_docs: ClassVar[Mapping[str, str]] = METRIC_DOCS
+    success_doc = SUCCESS_DOC
+    termination_doc = TERMINATION_DOC
+
+    config: HeaderConfig
+
+    def __init__(self, config: HeaderConfig) -> None:
+        super().__init__(config)
+        self.joints = select_joints(config.joints)
+
+    def build_scene(self) -> SceneConfig:
+        scene, config = super().build_scene(), self.config
+        height = check_range("ball_height", config.ball_height)[1]
+        return replace(scene, props=[ball_config(config, (*config.ball_place, height)), *scene.props])
+
+    def action_spec(self) -> ActionSpec:
+        return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)
+
+    def domain(self) -> Domain:
+        return gate_domain(self.config, self.scene, self.config.ball_height[1])
+
+    def allocate(self, env) -> None:
+        config = self.config
+        self.goal = Goal(env, config)
+        fall = Fall()
+        fall.prop, fall.jitter, fall.speed = self.goal.index, config.ball_jitter, config.ball_speed
+        fall.place = wp.vec3(*config.ball_place, TOUCH_HEIGHT)
+        fall.gravity = config.physics.gravity
+        fall.low, fall.high = config.ball_height
+        fall.light, fall.heavy = self.goal.log_density
+        self.fall = fall
+        self.head = wp.zeros(env.num_envs, dtype=wp.vec3, device=env.device)
+
+    def arrays(self) -> dict[str, wp.array]:
+        return self.goal.arrays()
+
+    def record_reset(self, env, program) -> None:
+        record_standing(env, program, self.config.pose_noise)
+        props = env.simulation.props
+        program.launch(
+            throw_ball,
+            env.num_envs,
+            [env.mask, env.seed, env.episode, self.fall],
+            [props.spawn.position, props.spawn.rotation, props.spawn.velocity, props.density],
+        )
+        self.goal.record_reset(program)
+
+    def _record_find(self, env, program) -> None:
+        avatar = env.simulation.avatar
+        program.launch(
+            find_head,
+            env.num_envs,
+            [
+                avatar.body, avatar.tracked.rotation, avatar.tracked.position, self.goal.column("position"),
+                self.config.ball_radius,
+            ],
+            [self.head, self.goal.gap],
+        )  # fmt: skip
+
+    def record_outcome(self, env, program) -> None:
+        self._record_find(env, program)
+        self.goal.record_outcome(program)
+
+    def record_observe(self, env, program, agent: int, start: int) -> None:
+        self.goal.record_observe(program, agent, start)
+        self._record_find(env, program)
+        at = start + sum(term.size for term in GATE_TERMS)
+        rotation = env.simulation.avatars[agent].tracked.rotation
+        program.launch(
+            observe_head,
+            env.num_envs,
+            [agent, at, rotation, self.head, self.goal.column("position")],
+            [env.observation],
+        )
+
+    def markers(self, env, index: int) -> list:
+        return self.goal.markers(index)
+
+
+TASK = HeaderTask

@@ -1,0 +1,219 @@
+"""Balls that are thrown at an avatar one after another, caught where they have flown past, and thrown again.
+
+A throw depends on the episode's seed, its number and where the body is then; nothing has to be remembered for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.rotation import quat_exp
+from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.envs.draws import STREAM_BALL, generator
+
+if TYPE_CHECKING:
+    from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.tasks.dodge import DodgeConfig
+
+wp.set_module_options({"enable_backward": False})
+
+#: Heights that balls are thrown from [m].
+HEIGHT = (1.0, 1.5)
+#: A ball that moves outwards faster than this beyond the catching radius is caught [m/s]; a slower one may lie there.
+OUTWARDS = wp.constant(0.2)
+#: Greatest angular velocity of a throw about each axis [rad/s].
+MAX_SPIN = wp.constant(6.0)
+#: Distance from every joint that a ball keeps where it is thrown: a hand's or a foot's length and its own radius [m].
+CLEARANCE = wp.constant(0.4)
+#: Draw 0 of the stream is the time of the first throw; then come the balls' masses, one a ball, then the throws.
+_MASSES = wp.constant(1)
+_CHEST, _HEAD = wp.constant(joint_index("spine3")), wp.constant(joint_index("head"))
+
+
+@wp.struct
+class Throws:
+    """Constants of the throws. Ranges are a lower and an upper bound."""
+
+    num_balls: int  # they are props 0 ... num_balls - 1
+    interval: int  # control steps between two throws
+    place: wp.vec3  # where the avatar belongs: x, y [m] and yaw [rad]
+    distance: wp.vec2  # of the origins from there [m]
+    height: wp.vec2  # of the origins [m]
+    angle: float  # greatest azimuth of the origins from the front [rad]
+    speed: wp.vec2  # distance to the aim over the time of flight [m/s]
+    spread: float  # greatest distance of the aim from the line between chest and head, along each axis [m]
+    gravity: float  # [m/s^2]
+    mass: wp.vec2  # [kg]
+    volume: float  # of a ball [m^3]
+    reach: float  # distance from the place beyond which balls are caught [m]
+    rest: wp.array(dtype=wp.vec3)  # (num_balls,) where balls wait [m]
+
+
+def catching_distance(config: DodgeConfig) -> float:
+    """Distance from the avatar's place beyond which a ball that flies on is caught [m]."""
+    return config.throw_distance[1] + 0.1
+
+
+def waiting_places(place: Sequence[float], config: DodgeConfig) -> np.ndarray:
+    """Where balls wait: on the floor behind the avatar, side by side, shape ``(num_balls, 3)`` [m].
+
+    Args:
+        place: of the avatar, x, y [m] and yaw [rad].
+        config: how many balls of which size, and where they are caught.
+    """
+    distance = catching_distance(config) + 0.1
+    index = np.arange(config.num_balls) - 0.5 * (config.num_balls - 1)
+    angle = place[2] + 3.0 * config.ball_radius / distance * index
+    away = distance * np.stack([-np.sin(angle), np.cos(angle), np.zeros_like(angle)], axis=1)
+    return away + np.array([place[0], place[1], config.ball_radius])
+
+
+def make_throws(config: DodgeConfig, place: Sequence[float], waiting: np.ndarray, env: BatchEnv) -> Throws:
+    """Kernel argument; the balls are the first props of ``env``."""
+    throws = Throws()
+    throws.num_balls = config.num_balls
+    throws.interval = max(1, round(config.throw_interval / config.physics.control_dt))
+    throws.place = wp.vec3(*place)
+    throws.distance, throws.height = wp.vec2(*config.throw_distance), wp.vec2(*HEIGHT)
+    throws.angle, throws.spread = config.throw_angle, config.aim_spread
+    throws.speed, throws.gravity = wp.vec2(*config.throw_speed), config.physics.gravity
+    throws.mass, throws.volume = wp.vec2(*config.ball_mass), float(env.simulation.props.volume[0])
+    throws.reach = catching_distance(config)
+    throws.rest = wp.array(waiting.astype(np.float32), dtype=wp.vec3, device=env.device)
+    return throws
+
+
+@wp.func
+def first_throw(throws: Throws, seed: int, episode: int):
+    """Control step of an episode's first throw, in the first half of an interval."""
+    random = generator(seed, episode, STREAM_BALL, 0)
+    return wp.randi(random, 1, throws.interval // 2 + 2)
+
+
+@wp.func
+def steps_to_throw(throws: Throws, first: int, step: int, ball: int):
+    """Control steps from ``step`` to the next throw of a ball; 0 if it is thrown in this one."""
+    period = throws.interval * throws.num_balls
+    wait = (first + ball * throws.interval - step) % period
+    return wp.where(wait < 0, wait + period, wait)
+
+
+@wp.func
+def launch_velocity(start: wp.vec3, aim: wp.vec3, speed: float, gravity: float):
+    """Velocity [m/s] of a free body from ``start`` to ``aim`` in the time of a straight way at ``speed``."""
+    way = aim - start
+    time = wp.length(way) / speed
+    return way / time + wp.vec3(0.0, 0.0, 0.5 * gravity * time)
+
+
+@wp.func
+def out_of_the_body(joints: wp.array2d(dtype=wp.vec3), e: int, start: wp.vec3, outwards: wp.vec3):
+    """``start``, moved on along the unit vector ``outwards`` until no limb reaches so far."""
+    further = float(0.0)
+    for b in range(joints.shape[1]):
+        way = joints[e, b] - start
+        along = wp.dot(way, outwards)
+        inside = CLEARANCE * CLEARANCE - wp.length_sq(way - along * outwards)
+        if inside > 0.0:
+            further = wp.max(further, along + wp.sqrt(inside))
+    return start + further * outwards
+
+
+@wp.kernel
+def draw_balls(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    throws: Throws,
+    # out
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+    density: wp.array2d(dtype=float),
+):
+    """At reset every ball is given its mass, and waits."""
+    e, ball = wp.tid()
+    if not mask[e]:
+        return
+    random = generator(seed[e], episode[e], STREAM_BALL, _MASSES + ball)
+    density[e, ball] = wp.randf(random, throws.mass[0], throws.mass[1]) / throws.volume
+    position[e, ball] = throws.rest[ball]
+    velocity[e, ball] = wp.vec3(0.0)
+    spin[e, ball] = wp.vec3(0.0)
+
+
+@wp.kernel
+def throw_balls(
+    throws: Throws,
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    failure: wp.array(dtype=int),
+    joints: wp.array2d(dtype=wp.vec3),
+    ball_position: wp.array2d(dtype=wp.vec3),
+    ball_velocity: wp.array2d(dtype=wp.vec3),
+    # out
+    placed: wp.array2d(dtype=wp.bool),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+):
+    """Which balls are placed anew before this step, and how; over ``(E, num_balls)``.
+
+    One whose time has come is thrown from before the avatar at where its chest and head are now. One that has flown
+    past is caught, and waits.
+    """
+    e, ball = wp.tid()
+    placed[e, ball] = False
+    if failure[e] != 0:
+        return
+    first = first_throw(throws, seed[e], episode[e])
+    if steps_to_throw(throws, first, step_count[e], ball) == 0:
+        placed[e, ball] = True
+        number = (step_count[e] - first) // throws.interval
+        random = generator(seed[e], episode[e], STREAM_BALL, _MASSES + throws.num_balls + number)
+        turn = quat_exp(wp.vec3(0.0, 0.0, throws.place[2] + wp.randf(random, -throws.angle, throws.angle)))
+        away = wp.quat_rotate(turn, wp.vec3(0.0, -1.0, 0.0))
+        start = wp.vec3(throws.place[0], throws.place[1], wp.randf(random, throws.height[0], throws.height[1]))
+        start += wp.randf(random, throws.distance[0], throws.distance[1]) * away
+        start = out_of_the_body(joints, e, start, away)
+        aim = wp.lerp(joints[e, _CHEST], joints[e, _HEAD], wp.randf(random))
+        aim += 2.0 * throws.spread * wp.sample_unit_cube(random)
+        speed = wp.randf(random, throws.speed[0], throws.speed[1])
+        position[e, ball] = start
+        velocity[e, ball] = launch_velocity(start, aim, speed, throws.gravity)
+        spin[e, ball] = 2.0 * MAX_SPIN * wp.sample_unit_cube(random)
+        return
+    out = ball_position[e, ball] - wp.vec3(throws.place[0], throws.place[1], 0.0)
+    out[2] = 0.0
+    distance = wp.length(out)
+    if distance > throws.reach and wp.dot(ball_velocity[e, ball], out) > OUTWARDS * distance:
+        placed[e, ball] = True
+        position[e, ball] = throws.rest[ball]
+        velocity[e, ball] = wp.vec3(0.0)
+        spin[e, ball] = wp.vec3(0.0)
+
+
+@wp.kernel
+def observe_throws(
+    throws: Throws,
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    density: wp.array2d(dtype=float),
+    control_dt: float,
+    agent: int,
+    start: int,
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Time to the next throw of every ball [s], then their masses [kg]; over ``(E, num_balls)``."""
+    e, ball = wp.tid()
+    first = first_throw(throws, seed[e], episode[e])
+    steps = steps_to_throw(throws, first, step_count[e], ball)
+    observation[e, agent, start + ball] = control_dt * float(steps)
+    observation[e, agent, start + throws.num_balls + ball] = throws.volume * density[e, ball]

@@ -1,0 +1,299 @@
+"""Folding: every slot is one agent and gets what is its own, and whoever has left does not poison the learner."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from agents import ppo
+from agents.config import load_training
+from agents.evaluate import evaluate, zero_agent
+from agents.matches import seated
+from agents.parallel import WAITING, AgentVecEnv, World, WorldFactory
+from agents.ppo import PPOSettings
+from agents.rollouts import MarkPlayed, PlayedBuffer
+from agents.train import train
+from agents.workers import factory, prepare, start_workers
+from piavatar_envs.envs.config import ConfigError
+from tests.agents.games.auction_v0 import Auction
+from tests.agents.games.ledger_v0 import LEAVES, TERMINATED, Ledger
+
+LEDGER = WorldFactory("tests.agents.games.ledger_v0", {})
+AUCTION = WorldFactory("tests.agents.games.auction_v0", {})
+NAMES = Ledger.names
+LAST = max(LEAVES.values())
+SEED = 7000  # of the first training episode of a run with seed 7
+
+
+@pytest.fixture
+def folded() -> AgentVecEnv:
+    """Six slots: two worlds of three agents."""
+    venv = AgentVecEnv(DummyVecEnv([LEDGER] * 2))
+    venv.seed(40)
+    return venv
+
+
+class Opponents:
+    """Always bid the same, and remember what they saw."""
+
+    def __init__(self, action: float) -> None:
+        self.action, self.seen, self.draws = action, [], []
+
+    def draw(self, world, rng):
+        self.draws.append(world)
+
+    def act(self, world, observation):
+        self.seen.append((world, observation.copy()))
+        return np.full((len(observation), 1), self.action, np.float32)
+
+
+def test_observation_action_and_reward_are_those_of_the_slots_agent(folded):
+    assert folded.num_envs == 6
+    observation = folded.reset()
+    seeds, agents = [40] * 3 + [41] * 3, [0, 1, 2] * 2
+    np.testing.assert_array_equal(observation, np.transpose([seeds, [0] * 6, agents, [0] * 6]))
+    actions = np.linspace(-1.0, 1.0, 6, dtype=np.float32)
+    observation, rewards, dones, infos = folded.step(actions[:, None])
+    np.testing.assert_array_equal(observation, np.transpose([seeds, [0] * 6, agents, [1] * 6]))
+    np.testing.assert_allclose(rewards, 100.0 * np.array(agents) + 10.0 + actions, rtol=1e-6)
+    assert not dones.any()
+    assert [info["name"] for info in infos] == list(NAMES) * 2
+
+
+def test_slots_of_agents_that_left_wait_for_their_world(folded):
+    folded.reset()
+    for episode in range(2):
+        for time in range(1, LAST + 1):
+            observation, rewards, dones, infos = folded.step(np.zeros((6, 1), np.float32))
+            for slot, info in enumerate(infos):
+                agent, leaves = slot % 3, LEAVES[NAMES[slot % 3]]
+                assert dones[slot] == (time >= leaves)
+                if time > leaves:
+                    assert info == {WAITING: True}
+                    assert rewards[slot] == 0.0
+                    continue
+                assert WAITING not in info
+                assert info["TimeLimit.truncated"] == (time == leaves and NAMES[agent] != TERMINATED)
+                assert ("terminal_observation" in info) == (time == leaves)
+                if time == leaves:
+                    np.testing.assert_array_equal(info["terminal_observation"], [40 + slot // 3, episode, agent, time])
+        # all worlds were reset in the step that ended them
+        np.testing.assert_array_equal(observation[:, 1], episode + 1)
+        np.testing.assert_array_equal(observation[:, 3], 0)
+
+
+class Peek(BaseCallback):
+    """Keeps a rollout, and the policy that played it, from before the update."""
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.buffer, self.policy = copy.deepcopy((self.model.rollout_buffer, self.model.policy))
+
+
+@pytest.fixture
+def peek(folded) -> Peek:
+    """Two whole episodes of both worlds, as the buffer has them, and their policy."""
+    settings = PPOSettings(rollout_steps=2 * LAST, batch_size=10, epochs=1, hidden=(8,), discount=0.9, gae_lambda=0.8)
+    model = ppo.build(settings, folded, range(4), seed=7)
+    peek = Peek()
+    model.learn(2 * LAST * 6, callback=CallbackList([MarkPlayed(), peek]))
+    return peek
+
+
+def test_only_what_was_played_reaches_the_loss(peek):
+    time = np.arange(2 * LAST)[:, None] % LAST
+    leaves = np.array([LEAVES[name] for name in NAMES] * 2)
+    np.testing.assert_array_equal(peek.buffer.played, time < leaves)
+    batches = [batch.observations.numpy() for batch in copy.deepcopy(peek.buffer).get(7)]
+    seen = np.concatenate(batches)
+    expected = sorted(
+        (SEED + world, episode, agent, step)
+        for world in range(2)
+        for episode in range(2)
+        for agent, name in enumerate(NAMES)
+        for step in range(LEAVES[name])  # an agent acts upon all observations but its last
+    )
+    assert sorted(map(tuple, seen)) == expected
+    assert all(4 <= len(batch) <= 7 for batch in batches)  # of nearly equal sizes
+
+
+def test_advantages_are_those_of_each_agents_own_episodes(peek):
+    """Generalised advantage estimation, Schulman et al. (2016), eq. 16, of every agent's episode taken by itself."""
+    discount, decay = 0.9, 0.8
+    for slot in range(6):
+        world, agent = divmod(slot, 3)
+        length = LEAVES[NAMES[agent]]
+        for episode in range(2):
+            observed = [(SEED + world, episode, agent, time) for time in range(length + 1)]
+            with torch.no_grad():
+                values = peek.policy.predict_values(torch.as_tensor(observed, dtype=torch.float32))[:, 0].numpy()
+            if NAMES[agent] == TERMINATED:
+                values[-1] = 0.0  # nothing comes after; truncation alone bootstraps
+            first = episode * LAST
+            actions = np.clip(peek.buffer.actions[first : first + length, slot, 0], -1.0, 1.0)
+            rewards = 100.0 * agent + 10.0 * np.arange(1, length + 1) + actions
+            advantage, expected = 0.0, np.zeros(length)
+            for t in reversed(range(length)):
+                advantage = rewards[t] + discount * values[t + 1] - values[t] + discount * decay * advantage
+                expected[t] = advantage
+            found = peek.buffer.advantages[first : first + length, slot]
+            np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("batch_size", [4, 12, None])
+def test_where_all_play_the_minibatches_are_the_usual_ones(folded, batch_size):
+    spaces = folded.observation_space, folded.action_space
+    usual, mine = (kind(4, *spaces, device="cpu", n_envs=6) for kind in (RolloutBuffer, PlayedBuffer))
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        step = [rng.normal(size=(6, n)).astype(np.float32) for n in (4, 1)]
+        rest = [rng.normal(size=6).astype(np.float32) for _ in range(2)]
+        more = [torch.as_tensor(rng.normal(size=6)) for _ in range(2)]
+        for buffer in (usual, mine):
+            buffer.add(*step, *rest, *more)
+    mine.played[:] = True
+    batches = []
+    for buffer in (usual, mine):
+        np.random.seed(3)
+        batches.append(list(buffer.get(batch_size)))
+    assert len(batches[0]) == len(batches[1])
+    for a, b in zip(*batches, strict=True):
+        assert all(torch.equal(x, y) for x, y in zip(a[:6], b[:6], strict=True))
+
+
+def test_a_buffer_that_nobody_marks_says_so(folded):
+    model = ppo.build(PPOSettings(rollout_steps=8, batch_size=8, epochs=1, hidden=(8,)), folded, range(4), seed=0)
+    with pytest.raises(RuntimeError, match="8 of 8 steps, 0 of them marked as played"):
+        model.learn(48)
+
+
+def test_worlds_in_processes_play_as_those_in_this_one():
+    traces = []
+    for workers in (DummyVecEnv([LEDGER] * 2), start_workers(LEDGER, 2)):
+        venv = AgentVecEnv(workers)
+        try:
+            venv.seed(7)
+            trace = [venv.reset()]
+            for step in range(LAST + 2):
+                actions = np.linspace(-1.0, 1.0, 6, dtype=np.float32)[:, None] / (step + 1)
+                observation, rewards, dones, infos = venv.step(actions)
+                trace += [observation, rewards, dones, [WAITING in info for info in infos]]
+        finally:
+            venv.close()
+        traces.append(trace)
+    for a, b in zip(*traces, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_opponents_act_for_those_who_do_not_learn():
+    venv = AgentVecEnv(DummyVecEnv([AUCTION] * 3), num_duels=2)
+    assert venv.num_envs == 2 + 1 + 1
+    venv.opponents = Opponents(action=0.0)
+    venv.seed(0)
+    venv.reset()
+    for bid, won in ((0.5, 1.0), (-0.5, 0.0)):
+        _, rewards, _, infos = venv.step(np.full((4, 1), bid, np.float32))
+        cost = 0.1 * (1.0 + bid) / 2.0
+        np.testing.assert_allclose(rewards, [0.5 - cost] * 2 + [won - cost] * 2, rtol=1e-6)
+        assert not any(WAITING in info for info in infos)
+    # after the first round the learners led, and their opponents saw it from their side
+    assert [world for world, _ in venv.opponents.seen] == [1, 2, 1, 2]
+    np.testing.assert_allclose(venv.opponents.seen[2][1], [[0.25, -1.0]])
+
+
+def test_a_duel_ends_with_its_learner_and_seats_are_drawn():
+    venv = AgentVecEnv(DummyVecEnv([LEDGER]), num_duels=1)
+    venv.opponents = Opponents(action=0.0)
+    venv.seed(5)
+    observation = venv.reset()
+    seats = []
+    for episode in range(30):
+        seat = int(observation[0, 2])
+        seats.append(seat)
+        for time in range(1, LEAVES[NAMES[seat]] + 1):
+            # the others that still play are seen by the opponents, the learner is not
+            others = len(NAMES) - 1
+            observation, _, dones, infos = venv.step(np.zeros((1, 1), np.float32))
+            world, seen = venv.opponents.seen[-1]
+            assert world == 0
+            assert seen.shape[0] == others and seat not in seen[:, 2]
+            assert dones[0] == (time == LEAVES[NAMES[seat]])
+        np.testing.assert_array_equal(infos[0]["terminal_observation"], [5, episode, seat, time])
+        assert observation[0, 1] == episode + 1  # the next episode, though others would have played on
+    assert set(seats) == {0, 1, 2}
+    assert venv.opponents.draws == [0] * 31
+
+
+def test_duels_need_opponents_and_two_agents(folded):
+    venv = AgentVecEnv(DummyVecEnv([LEDGER]), num_duels=1)
+    with pytest.raises(RuntimeError, match="1 worlds wait for opponents"):
+        venv.reset()
+    with pytest.raises(ValueError, match="2 duels in 1 worlds of 3 agents"):
+        AgentVecEnv(DummyVecEnv([LEDGER]), num_duels=2)
+
+
+def test_agents_of_different_kinds_are_refused(monkeypatch):
+    spaces = {name: Auction.action_space(None, name) for name in Auction.names}
+    spaces["right"] = type(spaces["right"])(-2.0, 2.0, (1,))
+    monkeypatch.setattr(Auction, "action_space", lambda self, agent: spaces[agent])
+    with pytest.raises(ConfigError, match=r"right has Box\(-2.*left has Box\(-1.*must be alike"):
+        World(Auction())
+
+
+def test_an_evaluation_books_every_agent_until_it_leaves():
+    worlds = DummyVecEnv([LEDGER] * 2)
+    result = evaluate("zero", seated([zero_agent(1)] * 3), worlds, episodes=3, first_seed=9, progress=False)
+    times = {name: np.arange(1, last + 1) for name, last in LEAVES.items()}
+    totals = [(100.0 * agent + 10.0 * times[name]).sum() for agent, name in enumerate(NAMES)]
+    for episode, seed in zip(result.episodes, (9, 10, 11), strict=True):
+        assert (episode.seed, episode.steps, episode.failure) == (seed, LAST, None)
+        np.testing.assert_allclose(episode.agent_totals, totals)
+        np.testing.assert_array_equal(episode.agent_success, [False, False, True])  # of c's last step, long ago
+        assert episode.total == pytest.approx(np.mean(totals))
+        assert not episode.success_at_end  # not all had it
+    np.testing.assert_allclose(result.row()["agent_return_mean"], totals)
+
+
+def test_a_failed_world_says_why(monkeypatch):
+    def play(self, actions):
+        over = dict.fromkeys(actions, True)
+        return (
+            dict.fromkeys(actions, 0.0),
+            over,
+            over,
+            {name: {"failure": "particles", "distance": float(i)} for i, name in enumerate(actions)},
+        )
+
+    monkeypatch.setattr(Ledger, "play", play)
+    world = World(Ledger())
+    world.reset(seed=0)
+    _, _, terminated, truncated, info = world.step(np.zeros((3, 1), np.float32))
+    assert (terminated, truncated, info["failure"], info["distance"]) == (True, False, "particles", 1.0)
+
+
+def test_the_curve_has_every_agents_episodes_and_no_others(games, tmp_path):
+    settings = {"rollout_steps": 2 * LAST, "batch_size": 10, "epochs": 1, "hidden": [8]}
+    config = load_training({"env_id": "ledger_v0", "total_steps": 2 * LAST * 3, "num_workers": 1, "ppo": settings})
+    make = factory(config)
+    _, curve = train(config, AgentVecEnv(DummyVecEnv([make])), prepare(make), tmp_path)
+    # b, c and a leave, in this order, and each has three slots' steps behind it
+    assert curve.steps == [3 * (episode * LAST + time) for episode in range(2) for time in sorted(LEAVES.values())]
+    for value, agent in zip(curve.returns, (1, 2, 0) * 2, strict=True):
+        times = np.arange(1, LEAVES[NAMES[agent]] + 1)
+        assert abs(value - (100.0 * agent + 10.0 * times).sum()) <= len(times)  # its actions
+
+
+def test_a_configured_world_is_made_with_its_settings(games):
+    config = load_training({"env_id": "auction_v0", "env": {"rounds": 2}})
+    facts = prepare(factory(config))
+    assert facts.agents == ("left", "right")
+    assert tuple(facts.layout) == ("played", "lead")
+    assert factory(config)().config.rounds == 2

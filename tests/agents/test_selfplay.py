@@ -1,0 +1,301 @@
+"""Self-play: the pool, who is drawn from it, and trainings of seconds that beat where they began."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from agents import matches, ppo, selfplay, train
+from agents.config import TrainingConfig, load_training
+from agents.evaluate import Episode, random_agent, zero_agent
+from agents.learning import begin, learn
+from agents.parallel import AgentVecEnv, WorldFactory
+from agents.selfplay import Opponents, Pool, SelfPlaySettings
+from agents.workers import factory, prepare
+from piavatar_envs.envs.config import ConfigError, dump_yaml
+
+AUCTION = {
+    "env_id": "auction_v0",
+    "total_steps": 4 * 192,
+    "num_workers": 2,
+    "seed": 3,
+    "selfplay": {"duel_share": 0.5, "snapshot_every": 192, "evaluate_against": ["random", "first"]},
+    "ppo": {"rollout_steps": 64, "batch_size": 48, "epochs": 5, "hidden": [16], "learning_rate": 5e-3},
+    "evaluation": {"episodes": 20},
+}
+
+
+@pytest.fixture
+def auction(games) -> TrainingConfig:
+    """A training of a second or two."""
+    return load_training(AUCTION)
+
+
+def play(config: TrainingConfig, folder, resume=None, watcher: BaseCallback | None = None):
+    """What ``train.train_selfplay`` does before it evaluates, with all worlds in this process."""
+    make = factory(config)
+    folder.mkdir(parents=True, exist_ok=True)
+    venv = AgentVecEnv(DummyVecEnv([make] * config.num_workers), config.selfplay.num_duels(config.num_workers))
+    model = begin(config, venv, prepare(make), resume)
+    snapshots = selfplay.enter(config.selfplay, venv, model, folder, resume)
+    curve = learn(config, model, folder, watchers=[snapshots, *([watcher] if watcher else [])])
+    return model, snapshots.pool, curve
+
+
+def weights(model) -> np.ndarray:
+    return np.concatenate([value.detach().numpy().ravel() for value in model.policy.parameters()])
+
+
+@pytest.fixture
+def policy():
+    """Of an untrained agent of the auction."""
+    venv = AgentVecEnv(DummyVecEnv([WorldFactory("tests.agents.games.auction_v0", {})]))
+    return ppo.build(ppo.PPOSettings(hidden=(4,)), venv, range(2), seed=0).policy
+
+
+def always(policy, action: float):
+    """Let it take this action, whatever it sees."""
+    with torch.no_grad():
+        for value in policy.parameters():
+            value.fill_(0.0)
+        policy.action_net.bias.fill_(action)
+        policy.log_std.fill_(-10.0)
+    return policy
+
+
+def test_a_snapshot_is_the_policy_of_its_time(policy, tmp_path):
+    pool = Pool(tmp_path / "pool")
+    for steps in (0, 100):
+        pool.add(always(policy, steps / 200.0), steps)
+    always(policy, 0.9)
+    for steps in (100, 0):
+        pool.load(policy, steps)
+        assert policy.action_net.bias.item() == steps / 200.0
+    # plain tensors: reading one runs no code
+    assert (
+        torch.load(tmp_path / "pool" / "snapshot_100_steps.pt", weights_only=True).keys() == policy.state_dict().keys()
+    )
+
+
+def test_a_pool_is_resumed_as_it_was_and_begins_empty(policy, tmp_path):
+    pool = Pool(tmp_path / "old" / "pool")
+    for steps in (0, 100, 1000):
+        pool.add(policy, steps)
+    for checkpoint in ("old/policy.zip", "old/checkpoints/x.zip"):
+        again = Pool.resumed(tmp_path / "new" / "pool", tmp_path / checkpoint, 500)
+        assert again.steps == [0, 100]
+        again.load(policy, 100)
+    assert len(list((tmp_path / "old" / "pool").iterdir())) == 3
+    # in its own folder it forgets what came after the checkpoint
+    assert Pool.resumed(pool.folder, tmp_path / "old" / "policy.zip", 500).steps == [0, 100]
+    assert sorted(path.name for path in pool.folder.iterdir()) == ["snapshot_0_steps.pt", "snapshot_100_steps.pt"]
+    assert Pool(pool.folder).steps == []
+    assert not list(pool.folder.iterdir())
+    with pytest.raises(FileNotFoundError, match="no snapshots in"):
+        Pool.resumed(tmp_path / "new" / "pool", tmp_path / "nowhere" / "checkpoints" / "x.zip", 500)
+
+
+def test_opponents_act_as_the_drawn_snapshot_and_all_are_drawn(policy, tmp_path):
+    pool = Pool(tmp_path)
+    for steps in (0, 10, 20):
+        pool.add(always(policy, steps / 50.0), steps)
+    opponents = Opponents(pool, always(policy, 0.9), worlds=(4, 5))
+    rng = np.random.default_rng(0)
+    observation = np.array([[0.5, 0.5]], np.float32)
+    drawn = []
+    for _ in range(40):
+        for world in (4, 5):
+            opponents.draw(world, rng)
+        for world in (4, 5):
+            action = opponents.act(world, observation)
+            assert action.shape == (1, 1)
+            assert action[0, 0] == pytest.approx(opponents.drawn[world] / 50.0, abs=1e-3)
+            drawn.append((world, opponents.drawn[world]))
+    assert set(drawn) == {(world, steps) for world in (4, 5) for steps in pool.steps}
+
+
+class Watch(BaseCallback):
+    """Which snapshots have played, and in the episodes of which seeds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.drawn: list[tuple[int, int]] = []
+        self.seeds: set[int] = set()
+
+    def _on_step(self) -> bool:
+        venv = self.training_env.unwrapped
+        self.drawn.append((self.num_timesteps, venv.opponents.drawn[venv.duels[0]]))
+        self.seeds |= {world.env.seed for world in venv.worlds.envs}
+        return True
+
+
+def test_snapshots_join_the_pool_between_rollouts_and_play(auction, tmp_path):
+    watch = Watch()
+    _, pool, curve = play(auction, tmp_path, watcher=watch)
+    assert pool.steps == [0, 192, 384, 576]
+    assert {steps for _, steps in watch.drawn} == set(pool.steps)
+    assert all(snapshot < now for now, snapshot in watch.drawn)  # nobody plays before it exists
+    # three slots, four rounds a game: two games and a duel end at a time
+    assert curve.steps == [3 * step for step in range(4, 257, 4) for _ in range(3)]
+    assert watch.seeds == {3000, 3001}
+
+
+def test_snapshots_wait_for_the_first_rollout_after_their_time(auction, tmp_path):
+    rare = SelfPlaySettings(snapshot_every=300, evaluate_against=("random",))
+    config = auction.model_copy(update={"selfplay": rare})
+    model, pool, _ = play(config, tmp_path)
+    assert pool.steps == [0, 384]  # rollouts begin at 0, 192, 384 and 576
+    # and every match is played in all seats, each game with a seed of its own
+    worlds = DummyVecEnv([factory(config)] * 2)
+    for match in matches.play_matches(config, model, pool, worlds):
+        assert match.opponent == "random" and match.player in ("zero", "trained")
+        assert match.seats == (0,) * 10 + (1,) * 10
+        first = config.evaluation.first_seed
+        assert [game.seed for game in match.games] == list(range(first, first + 20))
+
+
+def test_a_run_repeats_and_depends_on_its_seed(auction, tmp_path):
+    runs = []
+    for seed in (3, 3, 4):
+        watch = Watch()
+        model, _, curve = play(auction.model_copy(update={"seed": seed}), tmp_path / "run", watcher=watch)
+        runs.append((weights(model), watch.drawn, curve.returns))
+    np.testing.assert_array_equal(runs[0][0], runs[1][0])
+    assert runs[0][1:] == runs[1][1:]
+    assert not np.allclose(runs[0][0], runs[2][0])
+    assert runs[0][1] != runs[2][1]
+
+
+def test_resuming_goes_on_with_the_pool(auction, tmp_path):
+    half = auction.model_copy(update={"total_steps": 384})
+    play(half, tmp_path / "run")
+    shutil.copytree(tmp_path / "run", tmp_path / "copy")
+    runs = []
+    for folder in ("run", "copy"):
+        watch = Watch()
+        model, pool, curve = play(auction, tmp_path / folder, tmp_path / folder / "policy.zip", watch)
+        assert model.num_timesteps == auction.total_steps
+        assert pool.steps == [0, 192, 384, 576]
+        assert min(curve.steps) > 384
+        assert {0, 192} & {steps for _, steps in watch.drawn}  # the old ones play on
+        assert min(watch.seeds) >= 2**30  # in episodes that were not played before
+        runs.append((weights(model), watch.drawn))
+    np.testing.assert_array_equal(runs[0][0], runs[1][0])  # a resumed run repeats as well
+    assert runs[0][1] == runs[1][1]
+    with pytest.raises(FileNotFoundError, match="no snapshots in"):
+        (tmp_path / "alone").mkdir()
+        shutil.copy(tmp_path / "run" / "policy.zip", tmp_path / "alone")
+        longer = auction.model_copy(update={"total_steps": 10_000})
+        play(longer, tmp_path / "else", tmp_path / "alone" / "policy.zip")
+
+
+def test_self_play_beats_where_it_began(games, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(train, "start_workers", lambda make, num_workers: DummyVecEnv([make] * num_workers))
+    path = tmp_path / "auction.yaml"
+    path.write_text(dump_yaml(load_training(AUCTION)))
+    settings = ["total_steps=2304", "selfplay.snapshot_every=576", "checkpoint_every=1000"]
+    train.main([str(path), *settings, "--out", str(tmp_path / "run")])
+    left = {entry.name for entry in (tmp_path / "run").iterdir()}
+    assert left == {"policy.zip", "curve.png", "curve.csv", "config.yaml", "results.json", "pool", "checkpoints"}
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert results["agents"] == ["left", "right"]
+    rows = {row["case"]: row for row in results["results"]}
+    assert list(rows) == [
+        "zero against random", "trained against random", "zero against first", "random against first",
+        "trained against first",
+    ]  # fmt: skip
+    for opponent in ("random", "first"):
+        trained, zero = rows[f"trained against {opponent}"], rows[f"zero against {opponent}"]
+        assert trained["win_interval"][0] > 0.5
+        assert trained["win_interval"][0] > zero["win_interval"][1]
+        assert trained["return_interval"][0] > trained["opponent_return_interval"][1]
+        assert trained["episodes"] == 20
+    assert load_training(tmp_path / "run" / "config.yaml").selfplay.snapshot_every == 576
+    assert "trained against first" in capsys.readouterr().out
+
+
+def test_cooperation_learns_to_meet(games, tmp_path):
+    config = load_training(
+        {
+            "env_id": "rendezvous_v0",
+            "total_steps": 8192,
+            "num_workers": 4,
+            "ppo": {"rollout_steps": 128, "batch_size": 128, "epochs": 8, "hidden": [32], "learning_rate": 3e-3},
+            "evaluation": {"episodes": 20},
+        }
+    )
+    make = factory(config)
+    workers = DummyVecEnv([make] * 4)
+    curve, results = train.train_together(config, workers, prepare(make), tmp_path, None)
+    assert len(curve.returns) > 100
+    rows = {result.agent: result.row() for result in results}
+    assert list(rows) == ["zero", "random", "trained"]
+    for other in ("zero", "random"):
+        assert rows["trained"]["return_interval"][0] > rows[other]["return_interval"][1]
+        assert rows["trained"]["success_at_end_interval"][0] > rows[other]["success_at_end_interval"][1]
+    # both are paid the same, and an episode's return is their mean
+    assert rows["zero"]["agent_return_mean"][0] == rows["zero"]["agent_return_mean"][1]
+    assert rows["zero"]["return_mean"] == pytest.approx(rows["zero"]["agent_return_mean"][0])
+
+
+def game(totals, success, steps=3):
+    return Episode(5, steps=steps, agent_totals=np.array(totals, float), agent_success=np.array(success), failure=None)
+
+
+def test_a_match_counts_from_the_players_seat():
+    games = (
+        game([3.0, 1.0], [True, False]), game([2.0, 0.0], [True, False]), game([0.0, 4.0], [False, True]),
+        game([1.0, 1.0], [True, True]),
+    )  # fmt: skip
+    row = matches.Match("a", "b", (0, 1, 1, 0), games).row()
+    assert row["case"] == "a against b"
+    assert (row["win_rate"], row["loss_rate"], row["draw_rate"]) == (0.5, 0.25, 0.25)
+    assert row["return_mean"] == (3.0 + 0.0 + 4.0 + 1.0) / 4
+    assert row["opponent_return_mean"] == (1.0 + 2.0 + 0.0 + 1.0) / 4
+    # Wilson (1927): (p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4 n^2)) / (1 + z^2 / n)
+    z, n, p = 1.959964, 4, 0.5
+    half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    np.testing.assert_allclose(
+        row["win_interval"], [(p + z**2 / (2 * n) + s * half) / (1 + z**2 / n) for s in (-1, 1)], rtol=1e-5
+    )
+
+
+def test_every_seat_is_acted_for_by_its_own_agent():
+    observation = np.arange(12.0).reshape(2, 3, 2)
+    agent = matches.seated([lambda seen: seen[:, :1], zero_agent(1), lambda seen: -seen[:, 1:]])
+    np.testing.assert_array_equal(agent(observation)[..., 0], [[0, 0, -5], [6, 0, -11]])
+    both = matches.seated([random_agent(1, 0)] * 2)(observation[:, :2])
+    assert both.shape == (2, 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("share", "worlds", "duels"), [(0.5, 4, 2), (0.0, 4, 0), (1.0, 4, 4), (0.1, 2, 1), (0.5, 1, 1)]
+)
+def test_a_share_of_the_worlds_are_duels(share, worlds, duels):
+    assert SelfPlaySettings(duel_share=share).num_duels(worlds) == duels
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"env_id": "PIAvatar/Reach-v0", "selfplay": {}}, ["selfplay", "PIAvatar/Reach-v0", "one agent"]),
+        ({"env_id": "chess_v0"}, ["env_id", "chess_v0", "auction_v0, ledger_v0, rendezvous_v0"]),
+        ({"env_id": "os.path_v0"}, ["env_id", "os.path_v0"]),
+        ({"env_id": "auction_v0", "env": {"round": 3}}, ["env:", "round", "did you mean rounds"]),
+        ({"env_id": "auction_v0", "selfplay": {"duel_share": 1.5}}, ["selfplay.duel_share=1.5", "<= 1"]),
+        ({"env_id": "auction_v0", "selfplay.evaluate_against": ["best"]}, ["evaluate_against", "'best'", "'latest'"]),
+        ({"env_id": "auction_v0", "selfplay": {"dual_share": 0.5}}, ["selfplay.dual_share", "no setting"]),
+    ],
+)
+def test_wrong_settings_are_refused_in_one_line(games, settings, words):
+    with pytest.raises(ConfigError) as caught:
+        load_training(settings)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(word in message for word in words), message

@@ -1,0 +1,94 @@
+"""Fixtures for worlds of several agents: tests run over every module in ``piavatar_envs.multi``; none is listed."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+
+import numpy as np
+import pytest
+
+from piavatar_envs.multi import multi_modules
+from tests.conftest import only_one_process
+
+if importlib.util.find_spec("pettingzoo") is None:
+    collect_ignore_glob = ["test_*.py"]  # the extra `multi` is not installed
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """A test that asks for ``module_name`` runs on every world."""
+    if "module_name" in metafunc.fixturenames:
+        names = multi_modules()
+        metafunc.parametrize("module_name", names, ids=[name.rpartition(".")[2] for name in names])
+
+
+@pytest.fixture(scope="session")
+def worlds(device):
+    """The modules, by name, their kernels compiled; parallel workers would race each other's files."""
+    import warp as wp
+
+    with only_one_process("kernels"):
+        modules = {name: importlib.import_module(name) for name in multi_modules()}
+        wp.force_load(device)
+    return modules
+
+
+@pytest.fixture(scope="session")
+def make_world(device, worlds):
+    """A maker of parallel worlds, ``make_world(module_name, **settings)``, tiny unless told otherwise.
+
+    The same settings give the same object, because building takes longer than a test: begin with a reset. ``twin=1``
+    gives another one of the same settings.
+    """
+    made = {}
+
+    def make(module_name: str, twin: int = 0, **settings):
+        key = (module_name, twin, repr(sorted(settings.items())))
+        if key not in made:
+            made[key] = worlds[module_name].parallel_env(device=device, **{"fidelity": "tiny", **settings})
+        return made[key]
+
+    yield make
+    for world in made.values():
+        world.close()
+
+
+@pytest.fixture(scope="session")
+def play():
+    """``play(world, steps, rng, **constant)``: what the world returned at every step.
+
+    Actions are random in [-1, 1] (zero without ``rng``); ``constant`` holds components, for all agents:
+    ``**{"root.y": -1.0}``. Ends with the last agent.
+    """
+
+    def run(world, steps: int, rng: np.random.Generator | None = None, **constant: float) -> list[tuple]:
+        log = []
+        for _ in range(steps):
+            if not world.agents:
+                break
+            actions = {}
+            for name in world.agents:
+                size = world.action_space(name).shape
+                actions[name] = np.zeros(size) if rng is None else rng.uniform(-1.0, 1.0, size)
+                for component, value in constant.items():
+                    actions[name][world.action_names.index(component)] = value
+            log.append(world.step(actions))
+        return log
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def same(equal):
+    """Whether two results of ``reset`` or ``step`` are the same: bit for bit on the CPU, within round-off elsewhere."""
+
+    def compare(a, b) -> bool:
+        if isinstance(a, dict):
+            return a.keys() == b.keys() and all(compare(value, b[name]) for name, value in a.items())
+        if isinstance(a, (tuple, list)):
+            return len(a) == len(b) and all(compare(x, y) for x, y in zip(a, b, strict=True))
+        if isinstance(a, str) or a is None:
+            return a == b
+        return type(a) is type(b) and equal(a, b)
+
+    return compare

@@ -1,0 +1,247 @@
+"""Boxing: what a blow is worth, whose it is, and who has won."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.skeleton import BODY_PARTS, joint_index
+from piavatar_envs.mpm.types import Sensors
+
+BOXING = "piavatar_envs.multi.boxing_v0"
+PARTS = tuple(BODY_PARTS)
+LEAST, POINTS = 1.5, (1.0, 0.4)
+
+
+class Scorer:
+    """The kernel that counts points, over made-up impulses of one environment of ``agents``."""
+
+    def __init__(self, device: str, agents: int = 2) -> None:
+        from piavatar_envs.multi.blows import Scale, Tally, count_points
+
+        self.device, self.agents, self.kernel = device, agents, count_points
+        self.scale, self.tally = Scale(), Tally()
+        self.scale.least, self.scale.points = LEAST, wp.vec2(*POINTS)
+        pairs = 1, agents, agents
+        self.tally.impulse = wp.full(pairs, wp.vec2(np.nan, np.nan), dtype=wp.vec2, device=device)
+        self.tally.points = wp.full(pairs, np.nan, dtype=float, device=device)
+        self.tally.peak = wp.zeros(pairs, dtype=wp.vec2, device=device)
+        self.tally.score = wp.zeros(pairs[:2], dtype=float, device=device)
+        self.alive = np.ones((1, agents), bool)
+        self.failure = 0
+
+    def count(self, touches: dict[tuple[int, str, int], tuple[float, float, float]]) -> np.ndarray:
+        """Points ``(agents, agents)`` for impulses [N s] by (agent, its body part, by whom)."""
+        part_impulse = np.zeros((1, self.agents * len(PARTS), self.agents, 3), np.float32)
+        for (agent, part, by), impulse in touches.items():
+            part_impulse[0, agent * len(PARTS) + PARTS.index(part), by] = impulse
+        sensors = Sensors()
+        sensors.part_impulse = wp.array(part_impulse, dtype=wp.vec3, device=self.device)
+        alive = wp.array(self.alive, dtype=wp.bool, device=self.device)
+        failure = wp.array([self.failure], dtype=int, device=self.device)
+        tally = self.tally
+        outputs = [tally.peak, tally.score, tally.impulse, tally.points]
+        wp.launch(self.kernel, (1, self.agents), [self.scale, alive, failure, sensors, *outputs], device=self.device)
+        return tally.points.numpy()[0]
+
+    def blow(self, strength: float, target: str = "head", arm: str = "right_arm", felt: float | None = None) -> float:
+        """Points for agent 0 of one step in which it strikes agent 1."""
+        felt = strength if felt is None else felt
+        points = self.count({(1, target, 0): (0.0, strength, 0.0), (0, arm, 1): (0.0, -felt, 0.0)})
+        assert points[1, 0] == points[0, 0] == points[1, 1] == 0.0
+        return float(points[0, 1])
+
+
+def expected(strength: float, full: float) -> float:
+    return full * min(max(strength / LEAST - 1.0, 0.0), 1.0)
+
+
+@pytest.mark.parametrize("strength", [0.5, 1.5, 2.0, 2.9, 3.0, 30.0])
+@pytest.mark.parametrize(("target", "full"), [("head", POINTS[0]), ("torso", POINTS[1]), ("left_leg", 0.0)])
+def test_a_blow_is_worth_what_it_strikes_and_how_hard(worlds, device, strength, target, full):
+    for arm in ("left_arm", "right_arm"):
+        assert Scorer(device).blow(strength, target, arm) == pytest.approx(expected(strength, full), abs=1e-6)
+
+
+def test_only_what_the_arms_have_felt_counts(worlds, device):
+    assert Scorer(device).blow(9.0, felt=2.0) == pytest.approx(expected(2.0, 1.0), abs=1e-6)
+    assert Scorer(device).blow(9.0, arm="left_leg") == 0.0
+    assert Scorer(device).blow(9.0, arm="head") == 0.0
+
+
+def test_a_contact_counts_once_by_its_strongest_step(worlds, device):
+    scorer = Scorer(device)
+    strengths = [2.0, 2.6, 2.2, 1.0, 2.4, 2.8, 0.7, 2.3, 0.0, 3.5]
+    gained = [scorer.blow(strength) for strength in strengths]
+    value = [expected(strength, 1.0) for strength in strengths]
+    # 2.0 to 2.8 are one contact (it never falls below 0.75); 2.3 and 3.5 are new ones
+    first = [value[0], value[1] - value[0], 0.0, 0.0, 0.0, value[5] - value[1]]
+    assert gained == pytest.approx([*first, 0.0, value[7], 0.0, 1.0], abs=1e-6)
+    assert scorer.tally.score.numpy()[0] == pytest.approx([sum(gained), 0.0], abs=1e-6)
+
+
+def test_leaning_scores_once(worlds, device):
+    scorer = Scorer(device)
+    assert sum(scorer.blow(2.5) for _ in range(30)) == pytest.approx(expected(2.5, 1.0), abs=1e-6)
+
+
+def test_a_blow_belongs_to_who_struck_it(worlds, device):
+    scorer = Scorer(device, agents=3)
+    points = scorer.count({
+        (2, "head", 0): (3.0, 0.0, 0.0), (0, "left_arm", 2): (-3.0, 0.0, 0.0),
+        (0, "torso", 1): (0.0, 0.0, 9.0), (1, "right_arm", 0): (0.0, 0.0, -9.0),
+        (1, "head", 2): (9.0, 0.0, 0.0),  # not by the arms of 2
+    })  # fmt: skip
+    wanted = np.zeros((3, 3))
+    wanted[0, 2], wanted[1, 0] = 1.0, POINTS[1]
+    assert points == pytest.approx(wanted, abs=1e-6)
+
+
+def test_nobody_scores_who_is_out_or_on_who_is_out(worlds, device):
+    for out in (0, 1):
+        scorer = Scorer(device)
+        scorer.alive[0, out] = False
+        assert scorer.blow(9.0) == 0.0 and not scorer.tally.score.numpy().any()
+    scorer = Scorer(device)
+    scorer.failure = 1
+    assert scorer.blow(9.0) == 0.0
+
+
+def straight_right() -> tuple[np.ndarray, np.ndarray]:
+    """Local rotations on guard and at the end of a straight right at the head, wxyz ``(22, 4)``."""
+    from piavatar_envs.avatar.motion.keyframes import Arm
+    from piavatar_envs.multi.boxing_v0 import STANCE
+    from piavatar_envs.multi.versus import Stance
+
+    turns = {**STANCE.turns, "spine2": (5.0, 0.0, 14.0), "spine3": (0.0, 0.0, 14.0)}
+    struck = replace(STANCE, turns=turns, right_arm=Arm((-0.15, -0.88, 0.42), (-0.22, -0.88, 0.42)))
+    return tuple(Stance(key).local_rotations for key in (STANCE, struck))
+
+
+def strike(world, steps: int = 20) -> list[tuple]:
+    """Agent 0 steps in, throws a straight right and draws it back; agent 1 keeps its guard."""
+    poses, log = [Rotation.from_quat(pose, scalar_first=True) for pose in straight_right()], []
+    step = world.config.drive.joint_speed_limit * world.config.physics.control_dt
+    for _ in range(steps):
+        k = int(world.batch.step_count.numpy()[0])
+        actions = {name: np.zeros(world.action_space(name).shape) for name in world.agents}
+        now = Rotation.from_quat(world.batch.simulation.avatars[0].state.command_rotation.numpy()[0])
+        way = (now.inv() * poses[4 <= k < 15]).as_rotvec() / step
+        for n, joint in enumerate(world.batch.task.joints):
+            actions["agent_0"][3 * n : 3 * n + 3] = np.clip(way[joint_index(joint)], -1.0, 1.0)
+        actions["agent_0"][world.action_names.index("root.y")] = -1.0 if k < 8 else 0.0
+        log.append(world.step(actions))
+    return log
+
+
+#: Here any touch by the arms is nearly a full blow: these tests are about the bout, not about how hard bodies are.
+SOFT = {"pose_noise": 0.0, "place_noise": 0.0, "blow_impulse": 0.12}
+
+
+def test_a_straight_right_scores(make_world):
+    world = make_world(BOXING, **SOFT)
+    world.reset(seed=0)
+    log = strike(world)
+    hits = [row[4]["agent_0"]["reward_terms"]["hit"] for row in log]
+    taken = [row[4]["agent_1"]["reward_terms"]["taken"] for row in log]
+    assert sum(hits) > 0.4 and log[-1][4]["agent_0"]["score"] == pytest.approx(sum(hits), abs=1e-5)
+    assert taken == pytest.approx([-world.config.taken_weight * hit for hit in hits], abs=1e-6)
+    for row in log:
+        assert row[4]["agent_0"]["given_impulse"] == row[4]["agent_1"]["taken_impulse"]
+    assert sum(hits) > log[-1][4]["agent_1"]["score"]
+    world.reset()
+    assert not world.batch.task.tally.score.numpy().any() and not world.batch.task.tally.peak.numpy().any()
+
+
+def test_a_bout_is_taken_up_again_in_mid_blow(make_world, same):
+    world, other = (make_world(BOXING, twin=n, **SOFT) for n in (0, 1))
+    world.reset(seed=0)
+    impulses = [row[4]["agent_0"]["given_impulse"] for row in strike(world)]
+    # a moment in touch, and still in touch a step later: another blow, to who forgets the first
+    full = 2.0 * SOFT["blow_impulse"]
+    moment = next(k for k, two in enumerate(pairwise(impulses)) if min(two) > full)
+    world.reset(seed=0)
+    strike(world, moment + 1)
+    state = world.get_state()
+    wanted = strike(world, 10)
+    assert wanted[0][4]["agent_0"]["given_impulse"] > full
+    assert wanted[0][4]["agent_0"]["reward_terms"]["hit"] < 0.4, "the head has been counted"
+    other.reset(seed=5)
+    for target in (other, world):
+        target.set_state(state)
+        assert same(strike(target, 10), wanted)
+
+
+@pytest.mark.parametrize(
+    ("score", "winner"), [((2.0, 1.0), 0), ((0.0, 0.5), 1), ((1.0, 1.0), None), ((0.0, 0.0), None)]
+)
+def test_points_decide_when_the_clock_runs_out(make_world, play, score, winner):
+    world = make_world(BOXING, max_cycles=3)
+    world.reset(seed=0)
+    state = world.get_state()
+    state["task.score"][0] = score
+    world.set_state(state)
+    rows = play(world, 5)
+    assert len(rows) == 3 and all(rows[-1][3].values()) and not any(rows[-1][2].values())
+    assert not any(info["success"] for row in rows[:-1] for info in row[4].values())
+    assert [info["success"] for info in rows[-1][4].values()] == [winner == 0, winner == 1]
+
+
+def test_a_knock_down_ends_the_bout(make_world, play):
+    world = make_world(BOXING)
+    world.reset(seed=0)
+    state = world.get_state()
+    state["task.score"][0] = (3.0, 0.0)  # points do not help who is down
+    state["drive_0.let_go"][:] = 1
+    world.set_state(state)
+    [(_, _, terminations, _, infos)] = play(world, 1)
+    assert all(terminations.values()) and not world.agents
+    assert [info["success"] for info in infos.values()] == [False, True]
+    assert infos["agent_0"]["reward_terms"]["down"] == -world.config.down_cost
+    assert infos["agent_1"]["reward_terms"]["win"] == world.config.win_reward
+    assert infos["agent_0"]["reward_terms"]["win"] == infos["agent_1"]["reward_terms"]["down"] == 0.0
+
+
+def test_points_do_not_help_who_is_down_at_the_gong(make_world, play):
+    world = make_world(BOXING, max_cycles=1)
+    world.reset(seed=0)
+    state = world.get_state()
+    state["task.score"][0] = (3.0, 0.0)
+    for agent in (0, 1):
+        state[f"drive_{agent}.let_go"][:] = 1
+    world.set_state(state)
+    [(_, _, terminations, truncations, infos)] = play(world, 1)
+    assert all(terminations.values()) and not any(truncations.values())
+    assert not any(info["success"] for info in infos.values())
+
+
+def test_among_three_the_bout_goes_on(make_world, play):
+    world = make_world(BOXING, num_agents=3)
+    world.reset(seed=0)
+    state = world.get_state()
+    state["drive_0.let_go"][:] = 1
+    world.set_state(state)
+    [(_, _, terminations, _, infos)] = play(world, 1)
+    assert list(terminations.values()) == [True, False, False] and world.agents == ["agent_1", "agent_2"]
+    assert not any(info["success"] for info in infos.values())
+
+
+def test_the_ropes_hold(make_world, play):
+    """Walking backwards for as long as it takes: nobody leaves the ring, nobody falls, nothing fails."""
+    world = make_world(BOXING, ring_size=2.2)
+    world.reset(seed=0)
+    rows = play(world, 40, **{"root.y": 1.0})
+    assert len(world.agents) == 2 and rows[-1][4]["agent_0"]["failure"] is None
+    x = world.batch.simulation.state.x.numpy()[0]
+    dx = world.batch.simulation.dx
+    assert 1.1 - dx < np.abs(x[:, 1]).max() < 1.1 + 0.5 * dx
+
+
+def test_impossible_rings_are_refused(make_world):
+    with pytest.raises(ValueError, match=r"num_agents=8 .* need a ring of .* use ring_size >= 3.5"):
+        make_world(BOXING, num_agents=8)

@@ -1,0 +1,279 @@
+"""PassBall: the serve, whose turn it is, what counts as a pass, and that a ball which is kicked on arrives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.multi import pass_ball_v0, passing
+from tests.multi.kicker import Kicker
+
+PASS = "piavatar_envs.multi.pass_ball_v0"
+
+
+def flat(a: np.ndarray, b: np.ndarray) -> float:
+    """Horizontal distance [m]."""
+    return float(np.linalg.norm(np.asarray(a, float)[:2] - np.asarray(b, float)[:2]))
+
+
+def ball_of(batch: BatchEnv, env: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Place and velocity of the ball's centre of mass, from its particles."""
+    state, mass = batch.simulation.state, batch.simulation.model.particles.mass.numpy()
+    own = slice(batch.simulation.subjects.first[-2], batch.simulation.subjects.first[-1])
+    weight = mass[min(env, len(mass) - 1), own].astype(float)
+    total = state.u.numpy()[env, own].astype(float) + state.vk.numpy()[env, own]
+    return weight @ state.x.numpy()[env, own] / weight.sum(), weight @ total / weight.sum()
+
+
+def pelvises(batch: BatchEnv, env: int = 0) -> np.ndarray:
+    return np.array([avatar.tracked.position.numpy()[env, 0] for avatar in batch.simulation.avatars], float)
+
+
+def put_ball(world, at: tuple[float, float, float], velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+    """Move the ball of a world without turning it."""
+    state, first = world.get_state(), world.batch.simulation.subjects.first[-2]
+    state["particles.x"][0, first:] += (np.array(at) - ball_of(world.batch)[0]).astype(np.float32)
+    state["particles.u"][0, first:] = velocity
+    state["particles.C"][0, first:] = 0.0
+    world.set_state(state)
+
+
+class Scorer:
+    """The rules once more, in NumPy, for one environment."""
+
+    def __init__(self, batch: BatchEnv, env: int) -> None:
+        self.batch, self.env, self.config = batch, env, batch.config
+        way = ball_of(batch, env)[1]
+        places = [avatar.position for avatar in batch.task.scene.avatars]
+        self.passer = int(np.argmax([np.dot(way[:2], place) for place in places]))
+        self.touched, self.passes, self.gap = False, 0, None
+        self.agents = len(places)
+        self.contact, self.touches = np.zeros(self.agents, bool), np.zeros(self.agents, int)
+
+    def goal(self) -> int:
+        return (self.passer + self.touched) % self.agents
+
+    def step(self) -> dict[str, float]:
+        ball, at = ball_of(self.batch, self.env)[0], pelvises(self.batch, self.env)
+        names, sensors = self.batch.simulation.subjects.names, self.batch.simulation.sensors
+        pairs = sensors.pair_impulse.numpy()[self.env].reshape(len(names), len(names), 3)
+        contact = np.linalg.norm(pairs[: self.agents, names.index("ball")], axis=1) > 1e-3
+        self.touches += contact & ~self.contact
+        self.contact = contact
+        progress = 0.0 if self.gap is None else self.gap - flat(ball, at[self.goal()])
+        self.touched |= bool(contact[self.passer])
+        after = (self.passer + 1) % self.agents
+        passed = self.touched and (flat(ball, at[after]) <= self.config.reach or bool(contact[after]))
+        if passed:
+            self.passes, self.passer, self.touched = self.passes + 1, after, bool(contact[after])
+        self.gap = flat(ball, at[self.goal()])
+        return {"progress": progress, "passed": passed}
+
+
+@pytest.fixture(scope="module")
+def circle(device, worlds):
+    """Four worlds at once, in which a single pass is a success."""
+    config = load_config(pass_ball_v0.TASK.Config, None, {"fidelity": "tiny", "goal_passes": 1, "progress_weight": 3.0})
+    return BatchEnv(pass_ball_v0.TASK(config), 4, device)
+
+
+def test_a_ball_that_is_kicked_on_arrives_and_all_is_booked(circle):
+    """Metrics, rewards, success and the observed turn follow the rules in NumPy, before and after the first pass."""
+    circle.reset(seeds=range(4))
+    policy, scorers, over = Kicker(circle), [Scorer(circle, env) for env in range(4)], np.zeros(4, bool)
+    for _ in range(45):
+        circle.action.assign(policy(circle.observation.numpy()))
+        circle.step()
+        terms, metrics, success = (array.numpy() for array in (circle.terms, circle.metrics, circle.success))
+        action = circle.action.numpy().astype(float)
+        for env, scorer in enumerate(scorers):
+            if over[env]:
+                continue
+            booked, speed = scorer.step(), np.linalg.norm(ball_of(circle, env)[1])
+            for agent in range(3):
+                expected = [scorer.passes, scorer.touches[agent], scorer.gap, speed]
+                assert metrics[env, agent] == pytest.approx(expected, abs=2e-4)
+                expected = [3.0 * booked["progress"], 2.0 * booked["passed"], -0.01 * np.mean(action[env, agent] ** 2)]
+                assert terms[env, agent] == pytest.approx(expected, abs=1e-3)
+                assert success[env, agent] == (scorer.passes >= 1)
+                seen = circle.layout.split(circle.observation.numpy()[env, agent])
+                assert np.argmax(seen["turn"]) == (scorer.passer - agent) % 3 and seen["turn"].sum() == 1.0
+                assert seen["touched"] == scorer.touched
+        over |= circle.terminated.numpy().any(1)
+    assert sum(scorer.passes >= 1 for scorer in scorers) >= 3, "the script must get it across"
+    assert sum(scorer.touches.sum() for scorer in scorers) >= 4
+
+
+def test_the_serve_rolls_to_one_of_them(circle):
+    """Without slip, from the middle, at a speed and with a mass in their ranges; everybody is served to at times."""
+    config, first, masses, speeds = circle.config, set(), [], []
+    places = np.array([avatar.position for avatar in circle.task.scene.avatars])
+    for start in range(0, 24, 4):
+        circle.reset(seeds=range(start, start + 4))
+        state, props = circle.simulation.props.state, circle.simulation.props
+        for env in range(4):
+            position, velocity, spin = (getattr(state, n).numpy()[env, 0] for n in ("position", "velocity", "spin"))
+            assert position == pytest.approx([0.0, 0.0, config.ball_radius], abs=1e-3)
+            passer = int(circle.task.play.passer.numpy()[env])
+            speed, to = np.linalg.norm(velocity), places[passer] / np.linalg.norm(places[passer])
+            assert velocity[:2] @ to >= speed * np.cos(config.serve_angle) - 1e-3 and abs(velocity[2]) < 1e-3
+            # the point on the ground is at rest
+            assert velocity + np.cross(spin, [0.0, 0.0, -config.ball_radius]) == pytest.approx(np.zeros(3), abs=5e-3)
+            first.add(passer)
+            masses.append(float(props.density.numpy()[env, 0] * props.volume[0]))
+            speeds.append(speed)
+    assert first == {0, 1, 2}
+    for values, (low, high) in ((masses, config.ball_mass), (speeds, config.serve_speed)):
+        assert low - 1e-3 <= min(values) and max(values) <= high + 1e-3 and np.ptp(values) > 0.6 * (high - low)
+
+
+def test_observed_is_where_the_ball_shall_go(circle):
+    circle.reset(seeds=range(4))
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        circle.action.assign(rng.uniform(-1.0, 1.0, circle.action.shape).astype(np.float32))
+        circle.step()
+    for env in range(4):
+        at, ball = pelvises(circle, env), ball_of(circle, env)[0]
+        passer, play = int(circle.task.play.passer.numpy()[env]), circle.task.play
+        to = at[(passer + int(play.touched.numpy()[env])) % 3]
+        mass = circle.simulation.props.density.numpy()[env, 0] * circle.simulation.props.volume[0]
+        for agent, avatar in enumerate(circle.simulation.avatars):
+            seen = circle.layout.split(circle.observation.numpy()[env, agent].astype(float))
+            turn = Rotation.from_quat(avatar.tracked.rotation.numpy()[env, 0])
+            place = np.array([*circle.task.scene.avatars[agent].position, 0.0])
+            assert turn.apply(seen["receiver"]) == pytest.approx(to - at[agent], abs=1e-4)
+            assert turn.apply(seen["receiver_from_ball"]) == pytest.approx(to - ball, abs=1e-3)
+            assert turn.apply(seen["place"]) == pytest.approx((place - at[agent]) * [1, 1, 0], abs=1e-4)
+            assert seen["ball_mass"] == pytest.approx([np.log10(mass)], abs=1e-4)
+            foot = avatar.tracked.position.numpy()[env, joint_index("right_foot")]
+            assert turn.apply(seen["ball_from_right_foot"]) == pytest.approx(ball - foot, abs=1e-3)
+
+
+#: Where three stand in the made-up games below.
+STANDING = ((0.0, 1.0, 1.0), (-1.0, 0.0, 1.0), (1.0, 0.0, 1.0))
+
+
+#: The first of them has kicked it: where the ball is, who touches it, and then whose turn it is, whether they have
+#: touched it, the passes, and how often the first two have touched it.
+KICKED = ((0.0, 0.8), (0,), (0, 1, 0, 1, 0))
+
+
+@pytest.mark.parametrize(
+    ("story", "steps"),
+    [
+        ("no pass without a touch", [((-0.9, 0.0), (), (0, 0, 0, 0, 0)), ((-0.9, 0.0), (1,), (0, 0, 0, 0, 1))]),
+        ("near the next", [KICKED, ((-0.5, 0.4), (), (0, 1, 0, 1, 0)), ((-0.8, 0.1), (), (1, 0, 1, 1, 0))]),
+        ("a touch by the next, far from the pelvis", [KICKED, ((-0.4, 0.3), (1,), (1, 1, 1, 1, 1))]),
+        ("the third does not count", [KICKED, ((0.9, 0.1), (2,), (0, 1, 0, 1, 0))]),
+        ("a touch that lasts is one", [KICKED] * 3),
+    ],
+)
+def test_whose_turn_it_is(device, story, steps):
+    """The rules alone, on made-up balls and touches."""
+
+    def array(shape, dtype=float):
+        return wp.zeros(shape, dtype=dtype, device=device)
+
+    rule, play, sensors = passing.PassRule(), passing.Play(), Sensors()
+    rule.subject, rule.reach, rule.fetch, rule.rim, rule.goal_passes = 3, 0.3, 9.0, 9.0, 1
+    rule.progress_weight, rule.pass_bonus = 1.0, 5.0
+    play.passer, play.touched, play.passes, play.gap = *(array(1, int) for _ in range(3)), array(1)
+    play.gap.fill_(-1.0)
+    play.contact, play.touches = array((1, 3), int), array((1, 3), int)
+    sensors.pair_impulse, sensors.boundary_impulse = array((1, 16), wp.vec3), array((1, 4), wp.vec3)
+    pelvis = wp.array(np.array([STANDING], np.float32), dtype=wp.vec3, device=device)
+    terms, metrics, success, over = array((1, 3, 3)), array((1, 3, 4)), array((1, 3), wp.bool), array((1, 3), wp.bool)
+    passes, gap = 0, None
+    for at, touching, expected in steps:
+        impulses = np.zeros((1, 4, 4, 3), np.float32)
+        impulses[0, list(touching), 3, 2] = 0.5
+        sensors.pair_impulse.assign(impulses.reshape(1, 16, 3))
+        ball = wp.array([(*at, 0.1)], dtype=wp.vec3, device=device)
+        inputs = [rule, ball, array(1, wp.vec3), pelvis, sensors, array((1, 3, 2))]
+        wp.launch(passing.judge, 1, inputs, [play, terms, metrics, success, over], device=device)
+        state = [int(field.numpy()[0]) for field in (play.passer, play.touched, play.passes)]
+        assert (*state, *play.touches.numpy()[0, :2]) == expected, story
+        bonus = 5.0 * (expected[2] - passes)
+        assert terms.numpy()[0, :, 1] == pytest.approx(np.full(3, bonus))
+        goal = (expected[0] + expected[1]) % 3
+        assert metrics.numpy()[0, :, 2] == pytest.approx(np.full(3, flat(at, STANDING[goal])), abs=1e-6)
+        if gap is None:
+            assert not terms.numpy()[0, :, 0].any()
+        passes, gap = expected[2], flat(at, STANDING[goal])
+        assert success.numpy().all() == success.numpy().any() == (passes >= 1)
+
+
+@pytest.mark.parametrize(
+    ("where", "velocity", "over"),
+    [
+        ((0.0, 0.0, 0.11), (0.0, 0.0, 0.0), True),  # at rest in the middle, where nobody reaches it
+        ((0.0, 0.0, 0.11), (0.5, 0.0, 0.0), False),  # it may still roll to somebody
+        ((0.0, 0.5, 0.11), (0.0, 0.0, 0.0), False),  # at rest before the first of them
+        ((0.5, 1.4, 0.11), (0.5, 0.5, 0.0), True),  # out
+        ((0.5, 1.2, 0.11), (0.5, 0.5, 0.0), False),  # not yet
+    ],
+)
+def test_a_ball_that_nobody_can_play_ends_it_for_all(make_world, play, where, velocity, over):
+    world = make_world(PASS)
+    assert world.batch.task.rim == pytest.approx(0.8 / np.sin(np.pi / 3) + 0.5)
+    world.reset(seed=0)
+    put_ball(world, where, velocity)
+    [(_, _, terminations, _, infos)] = play(world, 1)
+    assert set(terminations.values()) == {over} and (not world.agents) == over
+    assert all(info["failure"] is None and not info["root_let_go"] for info in infos.values())
+
+
+def test_roots_stay_near_their_places(make_world, play):
+    """However long they are sent forwards, or to the side; and they come back."""
+    world = make_world(PASS, roam=0.25, dead_speed=1e-6)
+    places = np.array([avatar.position for avatar in world.batch.task.scene.avatars])
+    for command in ({"root.y": -1.0}, {"root.x": 1.0}):
+        world.reset(seed=1)
+        put_ball(world, (0.0, 0.0, 0.11))  # out of the way
+        play(world, 20, **command)
+        assert len(world.agents) == 3
+        off = np.linalg.norm(pelvises(world.batch)[:, :2] - places, axis=1)
+        assert off == pytest.approx(np.full(3, 0.25), abs=0.05), "1 m, were it not for the limit"
+        play(world, 6, **{name: -value for name, value in command.items()})
+        assert (np.linalg.norm(pelvises(world.batch)[:, :2] - places, axis=1) < 0.15).all()
+
+
+@pytest.mark.parametrize("agents", [2, 4])
+def test_any_number_stands_around_the_circle(make_world, play, agents):
+    world = make_world(PASS, num_agents=agents, spacing=1.4)
+    world.reset(seed=0)
+    at = pelvises(world.batch)
+    neighbours = np.linalg.norm(at - np.roll(at, -1, axis=0), axis=1)
+    assert len(world.possible_agents) == agents and neighbours == pytest.approx(np.full(agents, 1.4), abs=0.15)
+    seen = world.observation_layout.split(world.batch.observation.numpy()[0, 0])
+    assert seen["turn"].shape == (agents,)
+    for at_agent, avatar in zip(at, world.batch.simulation.avatars, strict=True):
+        facing = Rotation.from_quat(avatar.tracked.rotation.numpy()[0, 0]).apply([0.0, -1.0, 0.0])
+        assert facing @ (-at_agent * [1, 1, 0]) / np.linalg.norm(at_agent[:2]) > 0.99
+    # the next one is to the right of who faces the middle
+    if agents > 2:
+        assert np.cross(-at[0] * [1, 1, 0], at[1] - at[0])[2] < 0.0
+    assert len(play(world, 3)) == 3
+
+
+def test_when_one_falls_it_is_over_for_all(make_world, play):
+    world = make_world(PASS)
+    world.reset(seed=0)
+    state = world.get_state()
+    state["drive_2.let_go"][:] = 1
+    world.set_state(state)
+    [(_, _, terminations, _, infos)] = play(world, 1)
+    assert all(terminations.values()) and [info["root_let_go"] for info in infos.values()] == [False, False, True]
+
+
+@pytest.mark.parametrize("settings", [{"ball_mass": (0.0, 1.0)}, {"serve_speed": (2.0, 1.0)}])
+def test_ranges_that_cannot_be_are_refused(settings):
+    with pytest.raises(ConfigError, match="must be positive and not fall; give the lower bound first"):
+        pass_ball_v0.TASK(load_config(pass_ball_v0.TASK.Config, None, settings))
