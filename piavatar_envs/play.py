@@ -58,7 +58,7 @@ def play(
         overrides: settings of the environment's configuration.
 
     Raises:
-        ValueError: an unknown module, an unknown agent, a number of steps below 1, an unknown suffix, a setting out of range.
+        ValueError: an unknown module, agent or suffix, a number of steps below 1, a setting out of range.
     """
     if agent not in ("random", "zero"):
         raise ValueError(f"no agent {agent!r}; there are random and zero")
