@@ -161,7 +161,7 @@ def device_info(device: str) -> dict[str, Any]:
 def git_commit(root: Path = ROOT) -> tuple[str, bool | None]:
     """Commit of a checkout, and whether its files differ from it; ("unknown", None) outside of one.
 
-    ``PIAVATAR_COMMIT`` names the commit of a copy that left its history behind. Results do not count as a difference,
+    ``PIAVATAR_COMMIT`` names the commit of a copy whose history stayed behind or is another. Results do not count as a difference,
     or writing one benchmark would taint the next.
     """
 
@@ -169,11 +169,13 @@ def git_commit(root: Path = ROOT) -> tuple[str, bool | None]:
         run = subprocess.run(["git", *command], cwd=root, capture_output=True, text=True, timeout=30, check=True)
         return run.stdout.strip()
 
+    if named := os.environ.get("PIAVATAR_COMMIT"):
+        return named, None
     try:
         commit = git("rev-parse", "HEAD")
         return commit, bool(git("status", "--porcelain", "--", ".", ":(exclude)benchmarks/results"))
     except (OSError, subprocess.SubprocessError):
-        return os.environ.get("PIAVATAR_COMMIT", "unknown"), None
+        return "unknown", None
 
 
 def plain(value: Any, where: str) -> Any:

@@ -116,6 +116,8 @@ def test_commit_and_whether_the_checkout_differs(tmp_path, monkeypatch):
     assert runner.git_commit(tmp_path) == ("unknown", None)
     monkeypatch.setenv("PIAVATAR_COMMIT", "abc")
     assert runner.git_commit(tmp_path) == ("abc", None)
+    assert runner.git_commit() == ("abc", None)  # also where another history came along with the copy
+    monkeypatch.delenv("PIAVATAR_COMMIT")
     git("init", "--quiet")
     (tmp_path / "code.py").write_text("a = 1\n")
     git("add", "code.py")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING
 
@@ -78,11 +79,11 @@ class Stance:
         """Pose the mean body.
 
         Args:
-            key: the pose at its time 0.
+            key: the pose, at any time.
         """
         joints = load_body().mean_body().joints
-        motion = animate("stance", [key, Key(1.0, **{k: v for k, v in vars(key).items() if k != "time"})], joints)
-        self.local_rotations = motion.local_rotations[0]
+        keys = [dataclasses.replace(key, time=time) for time in (0.0, 1.0)]
+        self.local_rotations = animate("stance", keys, joints).local_rotations[0]
 
     def record(self, env: BatchEnv, program: Program, pose_noise: float, place_noise: float) -> None:
         """Append, at a reset: all avatars take the stance where the scene puts them.
@@ -96,13 +97,13 @@ class Stance:
         record_standing(env, program, pose_noise)
         record_shift(env, program, place_noise)
         xyzw = np.ascontiguousarray(np.roll(self.local_rotations, -1, axis=-1), np.float32)
-        stance = wp.array(xyzw, dtype=wp.quat, device=env.device)
+        self._stance = wp.array(xyzw, dtype=wp.quat, device=env.device)  # a program keeps its address only
         for avatar in env.simulation.avatars:
             state = avatar.state
             program.launch(
                 take_stance,
                 (env.num_envs, NUM_JOINTS),
-                [env.mask, avatar.body, stance],
+                [env.mask, avatar.body, self._stance],
                 [state.command_rotation, state.command_root],
             )
 

@@ -157,8 +157,8 @@ class HeaderTask(Task):
     reward_terms = REWARD_TERMS
     metrics = METRICS
 
-    camera_position = (-3.9, 0.4, 1.9)
-    camera_target = (0.0, -0.9, 1.2)
+    camera_position = (-4.7, 0.1, 2.0)
+    camera_target = (0.0, -0.85, 1.05)
     camera_follows = False
 
     summary = """A soft ball of 0.2 to 0.6 kg falls from a height in the range `ball_height`, with a speed of up to
@@ -174,6 +174,8 @@ that all of them but the control cost add up to at most 1, half of it for the go
     metric_docs: ClassVar[Mapping[str, str]] = METRIC_DOCS
     success_doc = SUCCESS_DOC
     termination_doc = TERMINATION_DOC
+    picture_seconds = 0.43
+    picture_actions: ClassVar[Mapping[str, float]] = {"spine2.x": -0.05, "neck.x": -0.1, "head.x": -0.1}
 
     config: HeaderConfig
 

@@ -154,6 +154,8 @@ that all of them but the control cost add up to at most 1, half of it for the go
     metric_docs: ClassVar[Mapping[str, str]] = METRIC_DOCS
     success_doc = SUCCESS_DOC
     termination_doc = TERMINATION_DOC
+    picture_seconds = 0.17
+    picture_actions: ClassVar[Mapping[str, float]] = {"right_hip.x": -0.8, "right_ankle.x": 0.2}
 
     config: KickBallConfig
 

@@ -126,6 +126,8 @@ def test_the_ball_in_the_gate_ends_the_episode(make_env, aside, through):
     first = ended.index(True)
     assert 0 < first < 4 and rewards == [0.5 if step == first else 0.0 for step in range(5)]
     assert all(row[4]["success"] for row in outcomes[first:]) and not outcomes[first - 1][4]["success"]
+    put_ball(env, center - 0.05 * forward + height, 4.0 * forward)
+    assert env.step(np.zeros(env.action_space.shape))[4]["reward_terms"]["goal"] == 0.0, "a goal counts once"
     env.reset(seed=1)
     assert not env.step(np.zeros(env.action_space.shape))[4]["success"], "the next episode begins anew"
 
@@ -141,7 +143,7 @@ def test_a_ball_back_through_the_gate_does_not_count(make_env):
 
 
 def test_reward_and_metrics_are_those_of_numpy(make_env):
-    """A ball that has been given a push towards the gate, feet that move at random."""
+    """A ball that comes before the other foot and is pushed towards the gate, feet that move at random."""
     env = make_env(KICK)
     env.reset(seed=5)
     center, forward = gate(env)
@@ -151,7 +153,7 @@ def test_reward_and_metrics_are_those_of_numpy(make_env):
     earned = []
     for step in range(14):
         if step == 4:
-            put_ball(env, ball(env.batch)[0], 2.0 * forward + [0.3, 0.0, 1.0])
+            put_ball(env, [0.2, -0.3, 0.15], 2.0 * forward + [-0.3, 0.0, 1.0])  # nearer to the left foot
         action = rng.uniform(-1.0, 1.0, env.action_space.shape)
         info = env.step(action)[4]
         (x, v), terms = ball(env.batch), info["reward_terms"]
