@@ -161,8 +161,8 @@ def device_info(device: str) -> dict[str, Any]:
 def git_commit(root: Path = ROOT) -> tuple[str, bool | None]:
     """Commit of a checkout, and whether its files differ from it; ("unknown", None) outside of one.
 
-    ``PIAVATAR_COMMIT`` names the commit of a copy whose history stayed behind or is another. Results do not count as a difference,
-    or writing one benchmark would taint the next.
+    ``PIAVATAR_COMMIT`` names the commit of a copy whose history stayed behind or is another. Results do not count as
+    a difference, or writing one benchmark would taint the next.
     """
 
     def git(*command: str) -> str:
