@@ -14,9 +14,10 @@ from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.envs.simulation import GRID_PER_HEIGHT
 from piavatar_envs.mpm.boundaries import Collider
-from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
+from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.fields import Fields
+from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.props import geometry
@@ -188,8 +189,8 @@ def collide(
     for name in ("free", "damped"):
         program = world.programs[name] = Program(device)
         record_begin(program, model, state, scratch)
-        for index in range(model.num_substeps):
-            record_substep(program, model, state, scratch, index)
+        for _ in range(model.num_substeps):
+            record_substep(program, model, state, scratch)
             if name == "damped":
                 program.launch(damp, state.x.shape, [float(np.exp(-50.0 * model.step.dt)), state.u, state.C])
         record_end(program, model, state, scratch)

@@ -18,7 +18,8 @@ from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
 from piavatar_envs.envs.simulation import GRID_PER_HEIGHT
 from piavatar_envs.mpm.boundaries import Collider
-from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
+from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
+from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.tasks.disturb import apply_impulse
 

@@ -15,6 +15,7 @@ for _env_id in task_modules():
     register(
         id=_env_id,
         entry_point="piavatar_envs.api.gymnasium:AvatarEnv",
+        vector_entry_point="piavatar_envs.api.vector:AvatarVectorEnv",
         # the time limit lives inside, so that a saved state holds it
         max_episode_steps=None,
         kwargs={"task": _env_id},

@@ -24,6 +24,8 @@ EXTRAS = {
     "motions": ("pybullet_data",),
     "props": ("trimesh",),
     "multi": ("pettingzoo",),
+    "skrl": ("skrl", "torch"),
+    "rsl": ("rsl_rl", "tensordict", "torch"),
     "bench": ("mujoco",),
     "dev": ("pytest", "xdist", "build"),
 }
@@ -88,11 +90,13 @@ def memory_estimate() -> dict[str, Any]:
     """One environment with default settings: particles, grid nodes, substeps a step, bytes of state and grid."""
     from piavatar_envs.envs.config import EnvConfig
     from piavatar_envs.envs.simulation import Simulation
-    from piavatar_envs.mpm.build import estimate_bytes
+    from piavatar_envs.mpm.memory import estimate_bytes
+    from piavatar_envs.mpm.stencil import BLOCK_NODES
 
     model = Simulation(EnvConfig(), num_envs=1, device="cpu").model
-    size = {"particles": model.num_particles, "nodes": model.num_nodes, "substeps": model.num_substeps}
-    return {**size, "bytes": estimate_bytes(1, model.num_particles, model.num_nodes)}
+    nodes = int(BLOCK_NODES) * model.max_slots
+    size = {"particles": model.num_particles, "nodes": nodes, "substeps": model.num_substeps}
+    return {**size, "bytes": estimate_bytes(1, model.num_particles, model.max_slots, num_blocks=model.num_blocks)}
 
 
 def compile_kernels(device: str, *, environments: bool = True) -> float:

@@ -141,6 +141,18 @@ def test_tables_tell_what_the_environment_returns(made, name):
 
 
 @pytest.mark.parametrize("name", ENTRIES)
+def test_what_a_task_draws_is_told_with_its_range(made, name):
+    _, facts = made(name)
+    told = {row[0].strip("`"): row[2] for row in rows(entry_page(ENTRIES[name], facts), "Parameters")}
+    drawn = {p.name: p for p in facts.task.drawn() if p.low < p.high}
+    assert told.keys() == drawn.keys()
+    for parameter, text in told.items():
+        low, high = text.removesuffix(", logarithmic").split(" to ")
+        assert [float(low), float(high)] == pytest.approx([drawn[parameter].low, drawn[parameter].high], rel=1e-3)
+        assert text.endswith(", logarithmic") == drawn[parameter].log
+
+
+@pytest.mark.parametrize("name", ENTRIES)
 def test_the_lines_of_usage_work(made, name, device):
     text = entry_page(ENTRIES[name], made(name)[1])
     block = re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import warp as wp
 from gymnasium.utils import seeding
 
-from piavatar_envs.api.picture import Picture
+from piavatar_envs.api import spaces
+from piavatar_envs.api.arrays import NumpyArrays
+from piavatar_envs.api.infos import failure_names, outcome, standing
+from piavatar_envs.api.picture import Pictures
 from piavatar_envs.envs.actions import check_actions
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import EnvConfig
-from piavatar_envs.mpm.types import failure_name
 from piavatar_envs.tasks.base import Task
 
 #: How settings may be given.
@@ -40,14 +43,12 @@ class Episode:
             ConfigError: a scene that cannot be.
             ValueError: an unknown render mode or device.
         """
-        if render_mode is not None and render_mode not in RENDER_MODES:
-            modes = ", ".join(RENDER_MODES)
-            raise ValueError(f"render_mode={render_mode!r} is not known; use None or {modes}")
-        self.config, self.render_mode = task.config, render_mode
+        self.config, self.render_mode = task.config, check_render_mode(render_mode)
         self.batch = BatchEnv(task, 1, device)
         self.action_names: tuple[str, ...] = tuple(self.batch.action_spec.names())
         self.ready = False
-        self._picture: Picture | None = None
+        self._arrays = NumpyArrays()
+        self._pictures = Pictures(lambda env: (self.batch, env), self.config.render)
 
     @property
     def frame_rate(self) -> int:
@@ -56,18 +57,15 @@ class Episode:
 
     def action_space(self) -> gym.spaces.Box:
         """A new space for the actions of an agent."""
-        return gym.spaces.Box(-1.0, 1.0, (self.batch.action_spec.size,), np.float32)
+        return spaces.action_space(self.batch)
 
     def observation_space(self) -> gym.Space:
         """A new space for the observations of an agent. They have no honest limits."""
-        layout = self.batch.layout
-        if self.config.obs_mode == "dict":
-            return gym.spaces.Dict({name: _unbounded(term.size) for name, term in layout.items()})
-        return _unbounded(layout.size)
+        return spaces.observation_space(self.batch)
 
     def state_space(self) -> gym.spaces.Box:
         """A new space for :meth:`flat_observations`."""
-        return _unbounded(self.batch.num_agents * self.batch.layout.size)
+        return spaces.state_space(self.batch)
 
     def begin(self, seed: int | None) -> None:
         """Reset: an episode of ``seed``, or the next one of the seed before.
@@ -83,8 +81,6 @@ class Episode:
             seed = int(rng.integers(2**32))
         self.batch.reset(seeds=None if seed is None else [seed])
         self.ready = True
-        if self._picture:
-            self._picture.cut()
 
     def check_ready(self, call: str) -> None:
         """Refuse ``call`` before the first reset.
@@ -131,26 +127,14 @@ class Episode:
 
     def info(self, agent: int) -> dict[str, Any]:
         """What is known of an agent at any time."""
-        batch = self.batch
-        drive = batch.simulation.avatars[agent].state
-        return {
-            "success": bool(batch.success.numpy()[0, agent]),
-            "failure": failure_name(int(batch.failure.numpy()[0])),
-            # a failed environment may hold values that are not finite; what leaves the suite never does
-            "root_force": np.nan_to_num(drive.wrench_force.numpy()[0], posinf=0.0, neginf=0.0),
-            "root_torque": np.nan_to_num(drive.wrench_torque.numpy()[0], posinf=0.0, neginf=0.0),
-            "root_let_go": bool(drive.let_go.numpy()[0]),
-        }
+        return _of_host(standing(self._read, self._arrays, agent))
 
     def step_info(self, agent: int) -> dict[str, Any]:
         """:meth:`info` and what the last step was worth: the task's metrics, the terms of reward and cost."""
-        batch, task = self.batch, self.batch.task
-        info = self.info(agent) | _row(task.metrics, batch.metrics, agent)
-        info["reward_terms"] = _row(task.reward_terms, batch.terms, agent)
-        if task.cost_terms:
-            info["cost"] = float(batch.cost.numpy()[0, agent])
-            info["cost_terms"] = _row(task.cost_terms, batch.cost_terms, agent)
-        return info
+        return self.info(agent) | _of_host(outcome(self._read, self.batch.task, agent))
+
+    def _read(self, array_of: Callable[[BatchEnv], wp.array]) -> np.ndarray:
+        return self._arrays.read([array_of(self.batch)])
 
     def render(self) -> np.ndarray | None:
         """The scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``, else None.
@@ -163,15 +147,11 @@ class Episode:
             gym.logger.warn('render() needs an environment made with render_mode="rgb_array"')
             return None
         self.check_ready("render")
-        if self._picture is None:
-            self._picture = Picture(self.batch, self.config.render)
-        return self._picture.frame(0)
+        return self._pictures.frame(0)
 
     def close(self) -> None:
         """Free the renderer's window."""
-        if self._picture:
-            self._picture.close()
-            self._picture = None
+        self._pictures.close()
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go on from what ``batch.get_state()`` returned.
@@ -183,10 +163,25 @@ class Episode:
         self.ready = True
 
 
-def _unbounded(size: int) -> gym.spaces.Box:
-    return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+def check_render_mode(render_mode: str | None) -> str | None:
+    """The mode itself.
+
+    Raises:
+        ValueError: an unknown one.
+    """
+    if render_mode is not None and render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode={render_mode!r} is not known; use None or {', '.join(RENDER_MODES)}")
+    return render_mode
 
 
-def _row(names: tuple[str, ...], array: Any, agent: int) -> dict[str, float]:
-    """An agent's numbers by name; without names there is a column that means nothing."""
-    return {name: float(value) for name, value in zip(names, array.numpy()[0, agent], strict=False)}
+def _of_host(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The only environment's values as Python's numbers, vectors as arrays."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            found[name] = _of_host(value)
+        elif name == "failure":
+            found[name] = failure_names(value)[0]
+        else:
+            found[name] = value[0] if value.ndim > 1 else value[0].item()
+    return found

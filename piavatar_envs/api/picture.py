@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from piavatar_envs.envs.batch_env import BatchEnv
@@ -106,3 +108,41 @@ class Picture:
     def close(self) -> None:
         """Close the renderer."""
         self.renderer.close()
+
+
+class Pictures:
+    """Pictures of any environments, each with a camera of its own, opened when it is first drawn."""
+
+    def __init__(self, place: Callable[[int], tuple[BatchEnv, int]], config: RenderConfig) -> None:
+        """Nothing is opened yet.
+
+        Args:
+            place: the batch in which an environment lives, and its number there.
+            config: size and colours.
+        """
+        self._place, self._config = place, config
+        self._opened: dict[int, Picture] = {}
+        self._seen: dict[int, tuple[int, int, int]] = {}
+
+    def frame(self, env: int) -> np.ndarray:
+        """The scene of environment ``env``, ``(height, width, 3)`` uint8.
+
+        Raises:
+            ImportError: the extra ``render`` is not installed.
+        """
+        batch, own = self._place(env)
+        if env not in self._opened:
+            self._opened[env] = Picture(batch, self._config)
+        now = tuple(int(array.numpy()[own]) for array in (batch.seed, batch.episode, batch.step_count))
+        before = self._seen.get(env, now)
+        if now[:2] != before[:2] or now[2] < before[2]:
+            # another episode: the camera jumps instead of gliding
+            self._opened[env].cut()
+        self._seen[env] = now
+        return self._opened[env].frame(own)
+
+    def close(self) -> None:
+        """Close what was opened."""
+        for picture in self._opened.values():
+            picture.close()
+        self._opened.clear()

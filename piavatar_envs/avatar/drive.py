@@ -12,13 +12,14 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar import posing
+from piavatar_envs.avatar.blending import threads_per_chunk
 from piavatar_envs.avatar.body import BodyPoints, build_body
 from piavatar_envs.avatar.kabsch import local_rotations, track_bones
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.spawn import place_particles, reset_drive
 from piavatar_envs.avatar.substeps import Groups, record_drive, record_injection, record_pose
-from piavatar_envs.avatar.types import DriveScratch, DriveState, Tracked, vec12, vec16
+from piavatar_envs.avatar.types import DriveScratch, DriveState, Tracked, vec12, vec16, vec52
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import DECOUPLING, Model, Scratch, State
@@ -41,6 +42,7 @@ class AvatarDrive:
         self.body_mass = wp.array(points.mass.sum(1).astype(np.float32), dtype=float, device=model.device)
         self.num_points = points.num_points
         self.num_chunks = self.body.chunk_bone.shape[0]
+        self.chunk_threads = threads_per_chunk(model.device)
         self.state = self._allocate(DriveState)
         self.tracked = self._allocate(Tracked)
         self.scratch = self._allocate(DriveScratch)
@@ -68,6 +70,7 @@ class AvatarDrive:
             "bone_step": (bones, wp.mat44),
             "bone_lean": (bones, wp.mat44),
             "bone_turn": (bones, wp.mat33),
+            "bone_record": (bones, vec52),
             "removed_turn": (n, wp.mat33),
             "pull": ((n, self.num_points), wp.vec3),
             "lean": ((n, self.num_points), wp.vec3),
@@ -159,7 +162,7 @@ def record_control_step(
     for step in range(model.num_substeps):
         for avatar in () if injected else avatars:
             record_drive(avatar, program, state, step)
-        record_substep(program, model, state, scratch, step)
+        record_substep(program, model, state, scratch)
     record_end(program, model, state, scratch)
     for avatar in avatars:
         avatar.record_end(program, state)

@@ -12,10 +12,19 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.blending import (
+    LEAN,
+    PLACE,
+    STEP,
+    blend_records,
+    blended_point,
+    blended_turn,
+    blended_velocity,
+)
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
-from piavatar_envs.avatar.rotation import apply_point
-from piavatar_envs.avatar.types import Body, BoneChange, BoneMatrices, Drive, RemovedMotion, RigidFit, RigidFits, vec12
+from piavatar_envs.avatar.types import Body, BoneChange, Drive, RemovedMotion, RigidFit, RigidFits, vec12, vec52
+from piavatar_envs.mpm.stores import store_vector
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False})
@@ -26,7 +35,7 @@ def drive_particles(
     body: Body,
     drive: Drive,
     x: wp.array2d(dtype=wp.vec3),
-    matrices: BoneMatrices,
+    record: wp.array2d(dtype=vec52),
     bones: RigidFits,
     let_go: wp.array(dtype=int),
     failure: wp.array(dtype=int),
@@ -46,38 +55,28 @@ def drive_particles(
     e, p = wp.tid()
     if failure[e] != 0:
         return
-    joint = body.joint[p]
-    weight = body.weight[p]
     at = x[e, body.first + p]
     rest = body.rest[row(e, body.rest.shape[0]), p]
-    place = wp.vec3()
-    step = wp.vec3()
-    toward = wp.vec3()
-    carried = wp.vec3()
-    turn = wp.mat33()
-    for n in range(4):
-        w = weight[n]
-        if w > 0.0:
-            b = joint[n]
-            place += w * apply_point(matrices.start[e, b], rest)
-            step += w * apply_point(matrices.step[e, b], rest)
-            turn += w * matrices.turn[e, b]
-            carried += w * (bones.velocity[e, b] + wp.cross(bones.spin[e, b], at - bones.center[e, b]))
-            if drive.tone_rate > 0.0:
-                toward += w * apply_point(matrices.lean[e, b], rest)
+    s = blend_records(record, e, body.joint[p], body.weight[p])
+    place = blended_point(s, PLACE, rest)
+    step = blended_point(s, STEP, rest)
+    turn = blended_turn(s)
+    carried = blended_velocity(s, at - bones.center[e, 0])
     displacement = at - place
     k = step + (turn * displacement - displacement) / drive.dt
     # the paper's shape preservation is part of the prescribed velocity
     k -= drive.kinematic_shape_rate * displacement
-    vk[e, body.first + p] = k
     change = k - motion[e, p]
-    motion[e, p] = k
-    relative = u[e, body.first + p] - carried
-    pull[e, p] = implicit_velocity(drive.shape_rate, drive.dt, -displacement, relative) - relative
-    if drive.free_motion == 0 and let_go[e] == 0:
-        # a body that nothing supports could not take the reaction
-        u[e, body.first + p] = u[e, body.first + p] - body.inert[row(e, body.inert.shape[0]), p] * change
-    lean[e, p] = toward
+    before = u[e, body.first + p]
+    relative = before - carried
+    # a body that nothing supports could not take the reaction
+    reacts = drive.free_motion == 0 and let_go[e] == 0
+    missed = body.inert[row(e, body.inert.shape[0]), p] * change
+    store_vector(u, e, body.first + p, before - missed, reacts)
+    store_vector(vk, e, body.first + p, k, True)
+    store_vector(motion, e, p, k, True)
+    store_vector(pull, e, p, implicit_velocity(drive.shape_rate, drive.dt, -displacement, relative) - relative, True)
+    store_vector(lean, e, p, blended_point(s, LEAN, rest), drive.tone_rate > 0.0)
 
 
 @wp.func
@@ -179,6 +178,7 @@ def free_motion(
     e = wp.tid()
     removed_velocity[e] = wp.vec3(0.0)
     removed_turn[e] = wp.mat33()
+    removed_center[e] = wp.vec3(0.0)  # one left over from before would enter the carry by its round-off
     if drive.free_motion == 0 and let_go[e] == 0:
         return
     r = row(e, body.bone_mass.shape[0])
@@ -236,7 +236,7 @@ def apply_corrections(
         if w > 0.0:
             b = joint[n]
             du += w * (change.velocity[e, b] + wp.cross(change.spin[e, b], at - bones.center[e, b]))
-    u[e, body.first + p] = u[e, body.first + p] + du
+    store_vector(u, e, body.first + p, u[e, body.first + p] + du, True)
     V = removed.velocity[e]
     A = removed.turn[e]
     if wp.length_sq(V) + wp.ddot(A, A) > 0.0:

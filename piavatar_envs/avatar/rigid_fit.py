@@ -4,13 +4,15 @@ A fit is mass- and skinning-weighted least squares, so the blended field ``sum_b
 exactly the linear and angular momentum of the velocity it was fitted to, bone by bone. Everything the drive gives back
 or takes away goes through such fields, which is why it keeps momentum.
 
-Sums run over fixed lists of particles in chunks (no atomics): the result does not depend on the schedule.
+Sums run over fixed lists of particles in chunks (no atomics): the result does not depend on the schedule. ``threads``
+threads share a chunk.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.blending import sum_threads12, sum_threads16
 from piavatar_envs.avatar.types import Body, Drive, RigidFits, vec12, vec16
 from piavatar_envs.mpm.types import Particles, row
 
@@ -41,11 +43,12 @@ def sum_moments(
     u: wp.array2d(dtype=wp.vec3),
     reference: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
+    threads: int,
     # out
     moments: wp.array2d(dtype=vec16),
 ):
     """Moments of one chunk of a bone's particles about the bone's reference point (small numbers, small round-off)."""
-    e, c = wp.tid()
+    e, c, thread = wp.tid()
     if failure[e] != 0:
         return
     origin = reference[e, body.chunk_bone[c]]
@@ -56,7 +59,7 @@ def sum_moments(
     diag = wp.vec3()
     off = wp.vec3()
     spin = wp.vec3()
-    for n in range(body.entry_start[c], body.entry_start[c + 1]):
+    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
         p = body.first + body.entry[n]
         w = body.entry_weight[n] * particles.mass[r, p]
         d = x[e, p] - origin
@@ -69,12 +72,17 @@ def sum_moments(
         off += wp.vec3(wd[1] * d[2], wd[2] * d[0], wd[0] * d[1])
         spin += wp.cross(wd, v)
     # fmt: off
-    moments[e, c] = vec16(
-        m, mx[0], mx[1], mx[2], mu[0], mu[1], mu[2],
-        diag[0], diag[1], diag[2], off[0], off[1], off[2],
-        spin[0], spin[1], spin[2],
+    total = sum_threads16(
+        vec16(
+            m, mx[0], mx[1], mx[2], mu[0], mu[1], mu[2],
+            diag[0], diag[1], diag[2], off[0], off[1], off[2],
+            spin[0], spin[1], spin[2],
+        ),
+        threads,
     )
     # fmt: on
+    if thread == 0:
+        moments[e, c] = total
 
 
 @wp.kernel
@@ -159,11 +167,12 @@ def sum_corrections(
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
+    threads: int,
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
     """Momentum and angular momentum, about the bone's centre, of the pull and of the lean in one chunk."""
-    e, c = wp.tid()
+    e, c, thread = wp.tid()
     if failure[e] != 0:
         return
     origin = center[e, body.chunk_bone[c]]
@@ -172,7 +181,7 @@ def sum_corrections(
     l1 = wp.vec3()
     p2 = wp.vec3()
     l2 = wp.vec3()
-    for n in range(body.entry_start[c], body.entry_start[c + 1]):
+    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
         p = body.entry[n]
         w = body.entry_weight[n] * particles.mass[r, body.first + p]
         d = x[e, body.first + p] - origin
@@ -182,9 +191,13 @@ def sum_corrections(
         a = w * lean[e, p]
         p2 += a
         l2 += wp.cross(d, a)
-    corrections[e, c] = vec12(
-        p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2]
-    )  # fmt: skip
+    # fmt: off
+    total = sum_threads12(
+        vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2]), threads
+    )
+    # fmt: on
+    if thread == 0:
+        corrections[e, c] = total
 
 
 @wp.kernel
@@ -197,22 +210,28 @@ def sum_motion(
     center: wp.array2d(dtype=wp.vec3),
     let_go: wp.array(dtype=int),
     failure: wp.array(dtype=int),
+    threads: int,
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
     """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in one chunk."""
-    e, c = wp.tid()
+    e, c, thread = wp.tid()
     if failure[e] != 0 or (drive.free_motion == 0 and let_go[e] == 0):
         return
     origin = center[e, body.chunk_bone[c]]
     r = row(e, particles.mass.shape[0])
     P = wp.vec3()
     K = wp.mat33()
-    for n in range(body.entry_start[c], body.entry_start[c + 1]):
+    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
         p = body.first + body.entry[n]
         a = (body.entry_weight[n] * particles.mass[r, p]) * vk[e, p]
         P += a
         K += wp.outer(x[e, p] - origin, a)
-    corrections[e, c] = vec12(
-        P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2]
-    )  # fmt: skip
+    # fmt: off
+    total = sum_threads12(
+        vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2]),
+        threads,
+    )
+    # fmt: on
+    if thread == 0:
+        corrections[e, c] = total

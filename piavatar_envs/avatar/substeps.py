@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from piavatar_envs.avatar import flesh, posing, rigid_fit
+from piavatar_envs.avatar.blending import pack_bones
 from piavatar_envs.avatar.injection import inject_velocity
 from piavatar_envs.avatar.root import lay_command_on_body, root_wrench
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
@@ -96,8 +97,8 @@ def record_fit(drive: AvatarDrive, program: Program, state: State) -> None:
     reference = drive.tracked.position
     program.launch(
         rigid_fit.sum_moments,
-        (n, drive.num_chunks),
-        [drive.body, drive.model.particles, state.x, state.u, reference, state.failure],
+        (n, drive.num_chunks, drive.chunk_threads),
+        [drive.body, drive.model.particles, state.x, state.u, reference, state.failure, drive.chunk_threads],
         [s.moments],
     )
     program.launch(
@@ -141,16 +142,17 @@ def _record_matrices(drive: AvatarDrive, program: Program, now: Pose, after: Pos
         anchor = [s.anchor_rotation, s.anchor_translation]
         lean = [drive.body, g.command_pose, *anchor, s.bone_from, g.carry, s.gap]
         program.launch(posing.lean_matrices, bones, lean, [s.bone_lean])
+    program.launch(pack_bones, bones, [g.matrices, g.bones], [s.bone_record])
 
 
 def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
     """Kinematic velocity and pulls of every particle."""
     s, g, n = drive.scratch, drive.groups, drive.model.num_envs
-    points, chunks = (n, drive.num_points), (n, drive.num_chunks)
+    points, chunks = (n, drive.num_points), (n, drive.num_chunks, drive.chunk_threads)
     program.launch(
         flesh.drive_particles,
         points,
-        [drive.body, drive.drive, state.x, g.matrices, g.bones, drive.state.let_go, state.failure],
+        [drive.body, drive.drive, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure],
         [state.u, drive.state.motion, state.vk, s.pull, s.lean],
     )
     if drive.drive.free_motion or drive.drive.root_rate > 0.0:  # a root that lets go leaves a free body
@@ -158,7 +160,7 @@ def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
     program.launch(
         rigid_fit.sum_corrections,
         chunks,
-        [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure],
+        [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.chunk_threads],
         [s.corrections],
     )
     program.launch(
@@ -178,10 +180,11 @@ def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
 def _record_free_motion(drive: AvatarDrive, program: Program, state: State) -> None:
     """Take the rigid part out of the commanded motion of bodies that nothing supports."""
     s, g, n, let_go = drive.scratch, drive.groups, drive.model.num_envs, drive.state.let_go
+    body, particles = drive.body, drive.model.particles
     program.launch(
         rigid_fit.sum_motion,
-        (n, drive.num_chunks),
-        [drive.body, drive.drive, drive.model.particles, state.x, state.vk, s.bone_center, let_go, state.failure],
+        (n, drive.num_chunks, drive.chunk_threads),
+        [body, drive.drive, particles, state.x, state.vk, s.bone_center, let_go, state.failure, drive.chunk_threads],
         [s.corrections],
     )
     program.launch(

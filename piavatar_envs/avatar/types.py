@@ -16,6 +16,8 @@ wp.set_module_options({"enable_backward": False})
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
 #: Partial sums of a chunk's corrections: momentum and angular momentum of the pull (6) and of the lean (6).
 vec12 = wp.types.vector(length=12, dtype=wp.float32)
+#: All that a particle blends over its bones, see :mod:`piavatar_envs.avatar.blending`.
+vec52 = wp.types.vector(length=52, dtype=wp.float32)
 
 DRIVE_INCREMENT = wp.constant(0)
 DRIVE_TARGET = wp.constant(1)
@@ -205,6 +207,7 @@ class DriveScratch:
     bone_step: wp.array  # (num_envs, bones) mat44: (G T_{s+1} - G T_s) / dt
     bone_turn: wp.array  # (num_envs, bones) mat33: rotation of the bone in this substep
     bone_lean: wp.array  # (num_envs, bones) mat44: commanded pose laid on the body, minus G T_s
+    bone_record: wp.array  # (num_envs, bones) vec52: the above and the bones' rigid motion
     pull: wp.array  # (num_envs, count) velocity change by shape preservation [m/s]
     lean: wp.array  # (num_envs, count) displacement from the carried to the commanded pose [m]
     corrections: wp.array  # (num_envs, chunks) vec12

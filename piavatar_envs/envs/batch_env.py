@@ -9,12 +9,11 @@ import warp as wp
 
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.envs.actions import apply_actions, refuse_nonfinite
+from piavatar_envs.envs.episodes import begin_episode, count_episodes, end_agent, end_step, find_ended, retire
 from piavatar_envs.envs.observer import Observer
 from piavatar_envs.envs.simulation import Simulation
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.tasks.base import Task
-
-wp.set_module_options({"enable_backward": False})
 
 
 class BatchEnv:
@@ -53,11 +52,11 @@ class BatchEnv:
         self.observer = Observer(self.simulation, task)
         self.layout = self.observer.layout
         self.max_steps = max(1, round(task.config.episode_seconds / task.config.physics.control_dt))
-        self._seeds = np.arange(seed, seed + num_envs, dtype=np.int64)
-        self._episodes = np.full(num_envs, -1, np.int64)
-        self._allocate()
+        self._allocate(seed)
         task.allocate(self)
+        self.observer.connect(self)
         self.reset_program, self.step_program, self.observe_program = (Program(self.device) for _ in range(3))
+        self.count_program, self.ended_program = Program(self.device), Program(self.device)
         self._record()
 
     @property
@@ -65,14 +64,16 @@ class BatchEnv:
         """Bits ``FAILURE_*`` of every environment."""
         return self.simulation.state.failure
 
-    def _allocate(self) -> None:
+    def _allocate(self, seed: int) -> None:
         n, device, task = self.num_envs, self.device, self.task
 
         def zeros(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
         agents = (n, self.num_agents)
-        self.mask, self.seed, self.episode = zeros(n, wp.bool), zeros(n, int), zeros(n, int)
+        self.mask, self._seeded, self._new_seed = zeros(n, wp.bool), zeros(n, wp.bool), zeros(n, int)
+        self.seed = wp.array(_as_int32(seed + np.arange(n)), dtype=int, device=device)
+        self.episode = wp.full(n, -1, dtype=int, device=device)
         self.step_count, self.truncated = zeros(n, int), zeros(n, wp.bool)
         self.action = zeros((*agents, self.action_spec.size), float)
         self.observation = zeros((*agents, self.layout.size), float)
@@ -86,11 +87,17 @@ class BatchEnv:
     def _record(self) -> None:
         n, sim = self.num_envs, self.simulation
         agents = (n, self.num_agents)
+        self.ended_program.launch(find_ended, n, [self.terminated, self.truncated], [self.mask])
+        counters = [self._seeded, self.seed, self.episode]
+        self.count_program.launch(count_episodes, n, [self.mask, self._new_seed], counters)
+
         program = self.reset_program
         flags = [self.step_count, self.terminated, self.truncated, self.success, self.alive]
         program.launch(begin_episode, agents, [self.mask], flags)
+        sim.record_draws(program, self.mask, self.seed, self.episode)
         self.task.record_reset(self, program)
         sim.record_reset(program, self.mask)
+        self.observer.record_reset(program, self.mask)
         self._record_observation(program)
         self._record_observation(self.observe_program)
 
@@ -126,15 +133,18 @@ class BatchEnv:
             self.observer.record(program, agent, self.observation)
             if self.task.terms():
                 self.task.record_observe(self, program, agent, self.observer.task_start)
+            self.observer.record_parameters(program, self, agent)
         self.observer.record_clean(program, self.observation)
 
-    def reset(self, env_mask: np.ndarray | None = None, seeds: Sequence[int] | np.ndarray | None = None) -> wp.array:
+    def reset(
+        self, env_mask: np.ndarray | None = None, seeds: Sequence[int | None] | np.ndarray | None = None
+    ) -> wp.array:
         """Begin new episodes.
 
         Args:
             env_mask: environments to reset, shape ``(num_envs,)`` bool; all if not given.
-            seeds: new seeds of the environments, shape ``(num_envs,)``; those not reset keep theirs. Without seeds an
-                environment goes on to its next episode.
+            seeds: new seeds of the environments, shape ``(num_envs,)``; those not reset keep theirs. Without seeds, or
+                where one is None, an environment goes on to its next episode.
 
         Returns:
             The observation array, of all environments.
@@ -142,31 +152,58 @@ class BatchEnv:
         Raises:
             ValueError: a mask or seeds of the wrong shape, or a seed outside 32 bits.
         """
-        mask = np.ones(self.num_envs, bool) if env_mask is None else np.asarray(env_mask)
-        if mask.shape != (self.num_envs,) or mask.dtype != bool:
-            raise ValueError(f"env_mask has shape {mask.shape} and type {mask.dtype}; use ({self.num_envs},) bool")
+        n = self.num_envs
+        mask = np.ones(n, bool) if env_mask is None else np.asarray(env_mask)
+        if mask.shape != (n,) or mask.dtype != bool:
+            raise ValueError(f"env_mask has shape {mask.shape} and type {mask.dtype}; use ({n},) bool")
         if seeds is not None:
-            seeds = np.asarray(seeds, np.int64)
-            if seeds.shape != (self.num_envs,) or (seeds < 0).any() or (seeds >= 2**32).any():
-                raise ValueError(f"seeds={seeds} must have shape ({self.num_envs},) and be in [0, 2^32)")
-            self._seeds = np.where(mask, seeds, self._seeds)
-            self._episodes = np.where(mask, 0, self._episodes)
-        else:
-            self._episodes = np.where(mask, self._episodes + 1, self._episodes)
+            given = np.array([seed is not None for seed in seeds])
+            values = np.array([0 if seed is None else seed for seed in seeds], np.int64)
+            if values.shape != (n,) or (values < 0).any() or (values >= 2**32).any():
+                raise ValueError(f"seeds={seeds} must have shape ({n},) and be in [0, 2^32)")
+            self._new_seed.assign(_as_int32(values))
+            self._seeded.assign(mask & given)
         self.mask.assign(mask)
-        self.seed.assign(self._seeds.astype(np.uint32).view(np.int32))
-        self.episode.assign(self._episodes.astype(np.int32))
-        self._draw_shapes(np.flatnonzero(mask))
+        return self._begin()
+
+    def find_ended(self) -> wp.array:
+        """Write into :attr:`mask`, and return, which environments have ended: nobody is in, or the clock has run out.
+
+        Nothing leaves the device.
+        """
+        self.ended_program.run()
+        return self.mask
+
+    def reset_masked(self) -> wp.array:
+        """Begin the next episode where :attr:`mask` is set; returns the observation array, of all environments.
+
+        Nothing leaves the device, unless shapes are random and not from a pool: those are drawn on the host.
+        """
+        # where reading costs nothing, nothing to do costs nothing
+        if wp.get_device(self.device).is_cpu and not self.mask.numpy().any():
+            return self.observation
+        return self._begin()
+
+    def _begin(self) -> wp.array:
+        self.count_program.run()
+        self._draw_shapes()
         self.reset_program.run()
+        for flesh in self.simulation.flesh:
+            flesh.fall_behind()
         return self.observation
 
-    def _draw_shapes(self, envs: np.ndarray) -> None:
-        """Random bodies for ``envs``, from their seeds and episodes, for the avatars whose shape is random."""
-        for avatar, flesh in enumerate(self.simulation.flesh):
-            for env in envs if flesh.shape.randomize else ():
-                key = [int(self._seeds[env]), int(self._episodes[env])]
+    def _draw_shapes(self) -> None:
+        """Random bodies for the environments that begin, from seed and episode, for avatars whose shape is random."""
+        avatars = self._random_shapes()
+        if not avatars:
+            return
+        seeds, episodes = self.seed.numpy().view(np.uint32), self.episode.numpy()
+        for env in np.flatnonzero(self.mask.numpy()):
+            key = [int(seeds[env]), int(episodes[env])]
+            for avatar in avatars:
                 rng = np.random.default_rng([*key, avatar] if avatar else key)
-                self.simulation.set_shape(int(env), flesh.draw_parameters(rng), avatar)
+                parameters = self.simulation.flesh[avatar].draw_parameters(rng)
+                self.simulation.set_shape(int(env), parameters, avatar)
 
     def step(self) -> None:
         """Advance every environment by one control step under :attr:`action`."""
@@ -180,7 +217,7 @@ class BatchEnv:
         }
         return (
             self.simulation.arrays()
-            | {f"env.{name}": array for name, array in own.items()}
+            | {f"env.{name}": array for name, array in (own | self.observer.arrays()).items()}
             | {f"task.{name}": array for name, array in self.task.arrays().items()}
         )
 
@@ -192,8 +229,8 @@ class BatchEnv:
         return state
 
     def _random_shapes(self) -> list[int]:
-        """Avatars whose shape is random."""
-        return [index for index, flesh in enumerate(self.simulation.flesh) if flesh.shape.randomize]
+        """Avatars whose shape is drawn on the host."""
+        return [index for index, flesh in enumerate(self.simulation.flesh) if flesh.drawn_on_host]
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Restore what :meth:`get_state` returned; the observation follows. On the CPU the future is bit-identical.
@@ -215,87 +252,11 @@ class BatchEnv:
             array.assign(state[name])
         for avatar in self._random_shapes():
             self.simulation.adopt_shapes(avatar, state[f"shape.{avatar}"])
-        self._seeds = np.asarray(state["env.seed"]).view(np.uint32).astype(np.int64)
-        self._episodes = np.asarray(state["env.episode"], np.int64).copy()
+        for flesh in self.simulation.flesh:
+            flesh.fall_behind()
         self.observe_program.run()
 
 
-@wp.kernel
-def begin_episode(
-    mask: wp.array(dtype=wp.bool),
-    # out
-    step_count: wp.array(dtype=int),
-    terminated: wp.array2d(dtype=wp.bool),
-    truncated: wp.array(dtype=wp.bool),
-    success: wp.array2d(dtype=wp.bool),
-    alive: wp.array2d(dtype=wp.bool),
-):
-    """Clocks and flags of the masked environments back to the start."""
-    e, agent = wp.tid()
-    if mask[e]:
-        step_count[e] = 0
-        truncated[e] = False
-        terminated[e, agent] = False
-        success[e, agent] = False
-        alive[e, agent] = True
-
-
-@wp.kernel
-def retire(agent: int, alive: wp.array2d(dtype=wp.bool), let_go: wp.array(dtype=int)):
-    """Nothing holds the root of an agent that is out."""
-    e = wp.tid()
-    if not alive[e, agent]:
-        let_go[e] = 1
-
-
-@wp.kernel
-def end_agent(
-    agent: int,
-    num_agents: int,
-    failure: wp.array(dtype=int),
-    let_go: wp.array(dtype=int),
-    terms: wp.array3d(dtype=float),
-    cost_terms: wp.array3d(dtype=float),
-    # out
-    reward: wp.array2d(dtype=float),
-    cost: wp.array2d(dtype=float),
-    # in and out
-    terminated: wp.array2d(dtype=wp.bool),
-    alive: wp.array2d(dtype=wp.bool),
-):
-    """Sum the terms of an agent; a fall and a failure terminate it. What is out among several earns nothing."""
-    e = wp.tid()
-    out = num_agents > 1 and not alive[e, agent]
-    total = float(0.0)
-    for n in range(terms.shape[2]):
-        if out or not wp.isfinite(terms[e, agent, n]):
-            terms[e, agent, n] = 0.0
-        total += terms[e, agent, n]
-    reward[e, agent] = total
-    total = float(0.0)
-    for n in range(cost_terms.shape[2]):
-        if out or not wp.isfinite(cost_terms[e, agent, n]):
-            cost_terms[e, agent, n] = 0.0
-        total += cost_terms[e, agent, n]
-    cost[e, agent] = total
-    terminated[e, agent] = failure[e] != 0 or let_go[e] != 0 or terminated[e, agent] or out
-    alive[e, agent] = not terminated[e, agent]
-
-
-@wp.kernel
-def end_step(
-    max_steps: int,
-    terminated: wp.array2d(dtype=wp.bool),
-    # in and out
-    step_count: wp.array(dtype=int),
-    # out
-    truncated: wp.array(dtype=wp.bool),
-):
-    """Count the step; the clock truncates where an agent is still in."""
-    e = wp.tid()
-    step_count[e] = step_count[e] + 1
-    left = int(0)
-    for agent in range(terminated.shape[1]):
-        if not terminated[e, agent]:
-            left += 1
-    truncated[e] = step_count[e] >= max_steps and left > 0
+def _as_int32(seeds: np.ndarray) -> np.ndarray:
+    """Seeds in [0, 2^32) as kernels take them."""
+    return np.asarray(seeds, np.int64).astype(np.uint32).view(np.int32)

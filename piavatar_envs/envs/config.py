@@ -18,7 +18,15 @@ from pydantic import BaseModel, Field
 
 from piavatar_envs.envs.config_io import ConfigError, dump_yaml, load_config, parse_assignments, replace
 from piavatar_envs.envs.scene import AvatarConfig, ColliderConfig, PairFriction, PropConfig, RegionConfig, SceneConfig
-from piavatar_envs.envs.sections import FROZEN, DriveConfig, FrozenDict, PhysicsConfig, RenderConfig, ShapeConfig
+from piavatar_envs.envs.sections import (
+    FROZEN,
+    DriveConfig,
+    FrozenDict,
+    PhysicsConfig,
+    RandomizeConfig,
+    RenderConfig,
+    ShapeConfig,
+)
 
 __all__ = [
     "FROZEN",
@@ -31,6 +39,7 @@ __all__ = [
     "PairFriction",
     "PhysicsConfig",
     "PropConfig",
+    "RandomizeConfig",
     "RegionConfig",
     "RenderConfig",
     "SceneConfig",
@@ -50,9 +59,15 @@ class EnvConfig(BaseModel):
     physics: PhysicsConfig = Field(default_factory=PhysicsConfig, description="the continuum")
     drive: DriveConfig = Field(default_factory=DriveConfig, description="how poses move the body")
     shape: ShapeConfig = Field(default_factory=ShapeConfig, description="the body's shape")
+    randomize: RandomizeConfig = Field(
+        default_factory=RandomizeConfig, description="what every episode draws anew, besides the task and the shape"
+    )
     scene: SceneConfig = Field(default_factory=SceneConfig, description="what is in the world, and how it touches")
     render: RenderConfig = Field(default_factory=RenderConfig, description="pictures")
     episode_seconds: float = Field(5.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
+    observe_parameters: bool = Field(
+        False, description="observe what the episode has drawn (randomize, random shapes, the task) and its clock"
+    )
     obs_mode: Literal["flat", "dict"] = Field(
         "flat", description="observations as one float32 vector (flat) or by name (dict)"
     )

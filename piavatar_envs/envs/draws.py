@@ -14,6 +14,7 @@ STREAM_POSE = wp.constant(0)
 STREAM_TASK = wp.constant(1)
 STREAM_DISTURBANCE = wp.constant(2)
 STREAM_BALL = wp.constant(3)
+STREAM_PARAMETERS = wp.constant(4)
 
 
 @wp.func

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,10 @@ from piavatar_envs.avatar.sampling import ParticleSet, morph
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import BODY_PARTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.soft_tissue import bone_distance, inert_share, softness
+from piavatar_envs.envs.bodies import BodyPool
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, DriveConfig, EnvConfig, RegionConfig
 from piavatar_envs.envs.config import replace as changed
+from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.materials import material_index
 
@@ -45,8 +48,7 @@ class Flesh:
     Attributes:
         physics, drive, shape: the environment's sections with the avatar's own settings laid over them.
         asset, sampled: the body, and its particles in the mean shape.
-        points: its particles in its shapes; a row an environment where shapes are random.
-        shape_parameters: of every environment, shape ``(num_envs, S)``.
+        pool: bodies that episodes draw from on the device, or None.
         part: index into ``BODY_PARTS`` of every particle, shape ``(P,)`` int32.
     """
 
@@ -68,22 +70,57 @@ class Flesh:
         self.shape = changed(config.shape, avatar.shape)
         self.avatar, self.asset, self.sampled, self.num_envs = avatar, asset, sampled, num_envs
         self.base_parameters = asset.parameters(**self.shape.parameters)
-        self.shape_parameters = np.tile(self.base_parameters, (num_envs, 1))
+        self._shape_parameters = np.tile(self.base_parameters, (num_envs, 1))
         for region in avatar.regions:
             self.in_region(region)
         self.part = body_part_of_joint()[sampled.skin_joints[:, 0]].astype(np.int32)
-        self.points, self._volume = self.shaped(self.base_parameters)
+        self._points, self._volume = self.shaped(self.base_parameters)
         if self.shape.randomize:
-            self.points, self._volume = _repeat(self.points, num_envs), np.repeat(self._volume, num_envs, 0)
+            self._points, self._volume = _repeat(self._points, num_envs), np.repeat(self._volume, num_envs, 0)
+        self.pool: BodyPool | None = None
+        self._behind = False
+
+    @property
+    def settings(self) -> tuple:
+        """All that decides which bodies are drawn: avatars with equal settings have equal ones."""
+        return self.physics, self.shape, self.drive.soft_tissue, self.avatar.regions
+
+    @property
+    def drawn_on_host(self) -> bool:
+        """Whether shapes are random and not from a pool."""
+        return self.shape.randomize and self.shape.pool is None
+
+    @property
+    def points(self) -> BodyPoints:
+        """Its particles in its nominal mass and its shapes; a row an environment where shapes are random."""
+        self._catch_up()
+        return self._points
+
+    @property
+    def shape_parameters(self) -> np.ndarray:
+        """Of every environment, shape ``(num_envs, S)``."""
+        self._catch_up()
+        return self._shape_parameters
+
+    def fall_behind(self) -> None:
+        """The device may have drawn other bodies from the pool: look there when the host wants to know."""
+        self._behind = self.pool is not None
+
+    def _catch_up(self) -> None:
+        if self._behind and self.pool is not None:
+            self._behind = False
+            index = self.pool.index.numpy()
+            self._shape_parameters[:] = self.pool.bodies.parameters[index]
+            for name in ("rest", "mass", "joints", "inert"):
+                getattr(self._points, name)[:] = self.pool.bodies.tables[name][index]
 
     def shaped(self, parameters: np.ndarray) -> tuple[BodyPoints, np.ndarray]:
         """Points and volumes [m^3] of one shape."""
         body, sampled = self.asset.shape(parameters), self.sampled
         rest, volume = morph(self.asset, sampled, body)
-        density = self._region_values("density", np.full(len(rest), self.physics.density, np.float32))
         points = BodyPoints(
             rest=rest[None],
-            mass=(density * volume)[None].astype(np.float32),
+            mass=self.masses(volume[None]),
             joints=body.joints[None],
             skin_joints=sampled.skin_joints,
             skin_weights=sampled.skin_weights,
@@ -91,6 +128,11 @@ class Flesh:
             inert=inert_share(self.drive.soft_tissue, self._softness(rest))[None],
         )
         return points, volume[None]
+
+    def masses(self, volume: np.ndarray) -> np.ndarray:
+        """Nominal masses [kg] of particles of these volumes [m^3], shape ``(rows, P)``."""
+        density = np.full(volume.shape[1], self.physics.density, np.float32)
+        return (self._region_values("density", density) * volume).astype(np.float32)
 
     def matter(self) -> MaterialPoints:
         """Its particles as matter; velocity fields and sensors are the world's business."""
@@ -148,6 +190,22 @@ class Flesh:
         if not inside.any():
             raise ConfigError(f"scene.avatars: no flesh of {region.joints} is {region.beyond} m from the bones")
         return inside
+
+
+def shape_ranges(flesh: Sequence[Flesh]) -> dict[str, Parameter]:
+    """What episodes draw of the avatars' shapes, by the names of the asset; empty where no shape is random.
+
+    An avatar whose own shape is fixed has these parameters, too.
+    """
+    found: dict[str, Parameter] = {}
+    random = [body for body in flesh if body.shape.randomize]
+    for index, name in enumerate(flesh[0].asset.shape_names):
+        drawn = [body for body in random if name not in body.shape.parameters]
+        if drawn:
+            fixed = [abs(float(body.base_parameters[index])) for body in flesh if body not in drawn]
+            bound = max(*(body.shape.scale for body in drawn), *fixed, 0.0)
+            found[name] = Parameter(f"shape_{name}", "-", -bound, bound, f"parameter {name} of the shape")
+    return found
 
 
 def _repeat(points: BodyPoints, rows: int) -> BodyPoints:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
@@ -19,6 +20,33 @@ _NUM_PARTS = wp.constant(len(BODY_PARTS))
 
 
 @dataclass(frozen=True)
+class Parameter:
+    """A number that every episode draws from a range.
+
+    Attributes:
+        name: by which it is told.
+        unit: physical unit, ``"-"`` if it has none.
+        low, high: bounds of the range, in that unit.
+        description: one line.
+        log: whether it is drawn, and observed, on a logarithmic scale.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    description: str
+    log: bool = False
+
+    def value(self, observed: float | np.ndarray) -> float | np.ndarray:
+        """The parameter in its unit, from what is observed of it in [-1, 1]."""
+        share = 0.5 * (np.asarray(observed, float) + 1.0)
+        if self.log:
+            return self.low * np.exp(share * math.log(self.high / self.low))
+        return self.low + share * (self.high - self.low)
+
+
+@dataclass(frozen=True)
 class ObservationTerm:
     """A named part of the observation.
 
@@ -28,6 +56,7 @@ class ObservationTerm:
         unit: physical unit, ``"-"`` if it has none.
         frame: ``"world"``, ``"root"`` (origin at the pelvis, turned with it), ``"parent"`` bone, or ``"-"``.
         description: one line.
+        parameters: where it holds what episodes draw: what its components mean, each normalised to [-1, 1].
     """
 
     name: str
@@ -35,6 +64,7 @@ class ObservationTerm:
     unit: str
     frame: str
     description: str
+    parameters: tuple[Parameter, ...] = field(default=(), kw_only=True)
 
 
 @dataclass(frozen=True)

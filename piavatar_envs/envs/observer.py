@@ -19,10 +19,12 @@ from piavatar_envs.envs.observations import (
     tracked_arrays,
 )
 from piavatar_envs.envs.others import observe_other, observe_prop, other_terms, prop_terms
+from piavatar_envs.envs.parameters import Parameters
 from piavatar_envs.envs.simulation import Simulation
 from piavatar_envs.mpm.program import Program
 
 if TYPE_CHECKING:
+    from piavatar_envs.envs.batch_env import BatchEnv
     from piavatar_envs.tasks.base import Task
 
 
@@ -30,11 +32,13 @@ class Observer:
     """Layout of the observation, and how it comes about.
 
     Every agent observes itself, then (where the task says so) contact, props and the other agents, then the task's own
-    terms. The others are counted on from oneself, so that all agents see the world alike.
+    terms and, if the configuration says so, what the episode has drawn. The others are counted on from oneself, so that
+    all agents see the world alike.
 
     Attributes:
         layout: of the flat observation.
         task_start: first component of the task's terms.
+        parameters: what the episode has drawn, or None.
     """
 
     def __init__(self, simulation: Simulation, task: Task) -> None:
@@ -51,7 +55,9 @@ class Observer:
             terms += other_terms(index)
         self.task_start = sum(term.size for term in terms)
         self._num_others = others
-        self.layout = ObservationLayout((*terms, *task.terms()))
+        self.parameters = Parameters(simulation, task) if task.config.observe_parameters else None
+        last = [self.parameters.term] if self.parameters else []
+        self.layout = ObservationLayout((*terms, *task.terms(), *last))
         device = simulation.device
         self._part = [wp.array(flesh.part, dtype=int, device=device) for flesh in simulation.flesh]
 
@@ -101,6 +107,25 @@ class Observer:
                 [observation],
             )
             at += size
+
+    def connect(self, env: BatchEnv) -> None:
+        """Find what is observed of the task's draws, when the task has allocated it."""
+        if self.parameters:
+            self.parameters.connect(env)
+
+    def record_reset(self, program: Program, mask: wp.array) -> None:
+        """Append, when all has been drawn: keep what the masked environments have drawn."""
+        if self.parameters:
+            self.parameters.record_reset(program, mask)
+
+    def record_parameters(self, program: Program, env: BatchEnv, agent: int) -> None:
+        """Append: write what the episode has drawn for ``agent``. Changes nothing else."""
+        if self.parameters:
+            self.parameters.record_observe(program, env, agent)
+
+    def arrays(self) -> dict[str, wp.array]:
+        """Arrays of a checkpoint, by name."""
+        return self.parameters.arrays() if self.parameters else {}
 
     def record_clean(self, program: Program, observation: wp.array) -> None:
         """Append: numbers that are not finite, of an environment that has failed, become zero."""

@@ -1,4 +1,4 @@
-"""Sections of a configuration: the continuum, the drive, the body's shape, pictures."""
+"""Sections of a configuration: the continuum, the drive, the body's shape, what episodes vary, pictures."""
 
 from __future__ import annotations
 
@@ -114,11 +114,53 @@ class ShapeConfig(BaseModel):
     model_config = FROZEN
 
     randomize: bool = Field(False, description="draw a random shape at each reset")
+    pool: int | None = Field(
+        None,
+        ge=1,
+        le=4096,
+        description="bodies that random shapes are taken from, shaped beforehand, so that a reset can draw on the "
+        "device; null shapes a new one at each reset, on the host, 0.1 s each [-]",
+    )
     parameters: Annotated[dict[str, ShapeValue], AfterValidator(FrozenDict)] = Field(
         default_factory=dict, description="shape parameters by name, each in [-1, 1], 0 the mean; kept when randomizing"
     )
     scale: float = Field(
         1.0, ge=0.0, le=1.0, description="width of the random shapes: 0 the mean shape, 1 the full range [-]"
+    )
+
+
+def _positive_range(bounds: tuple[float, float]) -> tuple[float, float]:
+    """``bounds``, in order.
+
+    Raises:
+        ValueError: they are not positive, or fall.
+    """
+    if not 0.0 < bounds[0] <= bounds[1]:
+        raise ValueError("both bounds must be positive and must not fall; give the lower one first")
+    return bounds
+
+
+FactorRange = Annotated[tuple[float, float], AfterValidator(_positive_range)]
+#: The range of a factor that changes nothing.
+UNCHANGED = (1.0, 1.0)
+
+
+class RandomizeConfig(BaseModel):
+    """Factors that every episode draws, uniform in their logarithm; see :mod:`piavatar_envs.envs.randomize`."""
+
+    model_config = FROZEN
+
+    mass_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on an avatar's density, and so on its mass and inertia [-]"
+    )
+    stiffness_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on Young's modulus of an avatar's flesh [-]"
+    )
+    ground_friction_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on all friction with the ground, walls and colliders [-]"
+    )
+    body_friction_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on all friction between avatars and props [-]"
     )
 
 

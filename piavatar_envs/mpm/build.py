@@ -12,19 +12,15 @@ import warp as wp
 from piavatar_envs.mpm.boundaries import Collider, make_boundaries
 from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.materials import lame_parameters, material_index
+from piavatar_envs.mpm.memory import bound_slots, check_memory
 from piavatar_envs.mpm.stencil import BLOCK
 from piavatar_envs.mpm.types import (
     DECOUPLING,
+    SCATTERS,
     Grid,
     Model,
-    Nodes,
     Particles,
-    Scratch,
-    Sensors,
-    State,
     Step,
-    group,
-    vec8,
 )
 
 #: Largest stable ``c dt / dx`` that was measured (0.84 to 1.04, less near incompressibility).
@@ -71,6 +67,11 @@ class MaterialPoints:
         return cls(volume, density * one, young_modulus * one, poisson_ratio * one, index)
 
     @property
+    def fields(self) -> np.ndarray:
+        """Velocity field of every particle, shape ``(num_particles,)`` int."""
+        return np.zeros(self.num_particles, int) if self.field is None else self.field
+
+    @property
     def num_particles(self) -> int:
         """Particles of one environment."""
         return self.volume.shape[1]
@@ -107,20 +108,20 @@ def make_grid(lower: Sequence[float], upper: Sequence[float], dx: float) -> Grid
     """Grid whose particles may move freely in the box ``lower`` to ``upper`` [m].
 
     Raises:
-        ValueError: the box is empty, or its nodes' records take more bytes than Warp's 32-bit strides can count.
+        ValueError: the box is empty, or has more nodes than 32-bit indices count with room to spare.
     """
     lower, upper = np.asarray(lower, float), np.asarray(upper, float)
     if not (np.all(np.isfinite([lower, upper])) and np.all(upper > lower) and dx > 0.0):
         raise ValueError(f"empty domain: lower={lower.tolist()}, upper={upper.tolist()} m, dx={dx} m")
     nodes = np.ceil((upper - lower) / dx).astype(int) + 4  # two nodes of margin for the stencil on each side
-    if nodes.prod() >= 2**26:  # of 32 bytes each
-        raise ValueError(f"{nodes.prod():.3g} grid nodes exceed 2^26; use a dx larger than {dx} m or a smaller domain")
+    if nodes.prod() >= 2**30:
+        raise ValueError(f"{nodes.prod():.3g} grid nodes exceed 2^30; use a dx larger than {dx} m or a smaller domain")
     grid = Grid()
     grid.origin = wp.vec3(*(lower - 2.0 * dx))
     grid.dx, grid.inv_dx = dx, 1.0 / dx
     grid.nodes = wp.vec3i(*nodes.tolist())
     grid.blocks = wp.vec3i(*(-(-nodes // BLOCK)).tolist())
-    grid.num_nodes = int(nodes.prod())
+    grid.num_blocks = int(np.prod(-(-nodes // BLOCK)))
     return grid
 
 
@@ -157,14 +158,19 @@ def build_model(
     colliders: Sequence[Collider] = (),
     fields: Fields | None = None,
     sound_speed: float | None = None,
+    max_slots: int | None = None,
+    scatter: str | None = None,
 ) -> Model:
     """Constants of a simulation on ``device``.
 
     ``num_substeps`` is chosen from the CFL limit unless given; the limit comes from the points, or from
-    ``sound_speed`` [m/s] where parameters will be randomised.
+    ``sound_speed`` [m/s] where parameters will be randomised. ``max_slots`` bounds the blocks with matter of an
+    environment, each field's counted; if not given, no state can exceed it. ``scatter`` is a key of ``SCATTERS``;
+    if not given, ``"runs"`` on a GPU that can match within a warp, else ``"plain"``.
 
     Raises:
-        ValueError: bad material, unstable time step, or more memory than the device has.
+        ValueError: bad material, unstable time step, a scatter that the device does not know, or more memory than it
+            has.
     """
     if decoupling not in DECOUPLING:
         raise ValueError(f"unknown decoupling {decoupling!r}; use one of {', '.join(DECOUPLING)}")
@@ -175,7 +181,9 @@ def build_model(
         num_substeps = choose_num_substeps(control_dt, grid.dx, sound_speed, cfl)
     check_num_substeps(num_substeps, control_dt, grid.dx, sound_speed)
     mu, lam = lame_parameters(points.young_modulus, points.poisson_ratio)
-    check_memory(num_envs, points.num_particles, grid.num_nodes, device, fields.num_fields)
+    scatter = choose_scatter(scatter, device)
+    max_slots = bound_slots(max_slots, points.fields, grid, fields.num_fields)
+    check_memory(num_envs, points.num_particles, max_slots, device, fields.num_fields, grid.num_blocks, scatter)
     step = Step()
     step.dt = control_dt / num_substeps
     step.gravity = wp.vec3(*gravity)
@@ -194,7 +202,26 @@ def build_model(
         sound_speed=sound_speed,
         moving_boundaries=any(collider.moves or collider.kinematic for collider in colliders),
         num_sensors=fields.num_sensors,
+        max_slots=max_slots,
+        scatter=scatter,
     )
+
+
+def choose_scatter(scatter: str | None, device: str) -> str:
+    """How particles reach the nodes on a device.
+
+    Raises:
+        ValueError: there is no such way, or not on this device.
+    """
+    target = wp.get_device(device)
+    matches = target.is_cuda and target.arch >= 70
+    if scatter is None:
+        return "runs" if matches else "plain"
+    if scatter not in SCATTERS:
+        raise ValueError(f"unknown scatter {scatter!r}; use one of {', '.join(SCATTERS)}")
+    if scatter != "plain" and not matches:
+        raise ValueError(f"scatter={scatter!r} needs a GPU of compute capability 7.0 or more; {target} takes 'plain'")
+    return scatter
 
 
 def upload_points(points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, device: str) -> Particles:
@@ -208,79 +235,7 @@ def upload_points(points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, devic
     particles.mass = upload(points.volume * points.density, float)
     particles.volume, particles.mu, particles.lam = upload(points.volume, float), upload(mu, float), upload(lam, float)
     particles.material = upload(points.material, int)
-    particles.field = upload(np.zeros(count) if points.field is None else points.field, int)
+    particles.field = upload(points.fields, int)
     particles.seam = upload(np.zeros(count) if points.seam is None else points.seam, float)
     particles.sensor = upload(np.full(count, -1) if points.sensor is None else points.sensor, int)
     return particles
-
-
-def estimate_bytes(num_envs: int, num_particles: int, num_nodes: int, num_fields: int = 1) -> int:
-    """Device memory of state and scratch [bytes]: 108 B a particle, 77 B a node, 105 B where there are more fields."""
-    node = 2 * 32 + 12 + 1 + (16 + 12 if num_fields > 1 else 0)
-    return num_envs * (num_particles * (3 * 12 + 2 * 36) + num_fields * num_nodes * node)
-
-
-def check_memory(num_envs: int, num_particles: int, num_nodes: int, device: str, num_fields: int = 1) -> None:
-    """Refuse a batch that does not fit.
-
-    Raises:
-        ValueError: the estimate exceeds the free memory of a CUDA device.
-    """
-    target = wp.get_device(device)
-    if not target.is_cuda:
-        return
-    need = estimate_bytes(num_envs, num_particles, num_nodes, num_fields)
-    if need > target.free_memory:
-        fits = int(num_envs * target.free_memory / need)
-        raise ValueError(
-            f"{num_envs} environments need {need / 2**30:.1f} GiB, {target} has {target.free_memory / 2**30:.1f} GiB "
-            f"free; use num_envs <= {fits} or a coarser fidelity"
-        )
-
-
-def allocate(model: Model) -> tuple[State, Scratch]:
-    """Zeroed state (identity deformation) and scratch."""
-    particles = (model.num_envs, model.num_particles)
-    nodes = (model.num_envs, model.contact.num_fields * model.num_nodes)
-    shared = nodes if model.contact.num_fields > 1 else (1, 1)
-
-    def zeros(shape, dtype):
-        return wp.zeros(shape, dtype=dtype, device=model.device)
-
-    identity = np.broadcast_to(np.eye(3, dtype=np.float32), (*particles, 3, 3))
-    state = State(
-        x=zeros(particles, wp.vec3),
-        u=zeros(particles, wp.vec3),
-        C=zeros(particles, wp.mat33),
-        F=wp.array(np.ascontiguousarray(identity), dtype=wp.mat33, device=model.device),
-        vk=zeros(particles, wp.vec3),
-        failure=zeros(model.num_envs, int),
-    )
-    scratch = Scratch(
-        nodes=Nodes(
-            sum=zeros(nodes, vec8),
-            offset=zeros(nodes, wp.vec3),
-            velocity=zeros(nodes, vec8),
-            facing=zeros(shared, wp.vec3),
-        ),
-        block_fields=zeros((2, model.num_envs, model.num_blocks), int),
-        sensors=allocate_sensors(model, zeros(shared, wp.vec4)),
-    )
-    return state, scratch
-
-
-def allocate_sensors(model: Model, node: wp.array) -> Sensors:
-    """Zeroed contact sensors; ``node`` are their records at the nodes."""
-    n, subjects = model.num_envs, model.contact.num_subjects
-
-    def zeros(shape, dtype):
-        return wp.zeros(shape, dtype=dtype, device=model.device)
-
-    return group(
-        Sensors,
-        boundary_impulse=zeros((n, subjects), wp.vec3),
-        pair_impulse=zeros((n, subjects * subjects), wp.vec3),
-        part_impulse=zeros((n, max(1, model.num_sensors), subjects), wp.vec3),
-        node=node,
-        penetration=zeros((n, subjects), float),
-    )

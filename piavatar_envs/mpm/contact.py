@@ -23,10 +23,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.masks import end_of_fields, has_field, lowest_field, lowest_other
+from piavatar_envs.mpm.blocks import end_of_fields, first_record, has_field, lowest_field, lowest_other
+from piavatar_envs.mpm.impulses import add_impulse, pair_entry
 from piavatar_envs.mpm.normals import MASS_MIN, shared_normal, surface_gap, volume_at
-from piavatar_envs.mpm.stencil import node_of
-from piavatar_envs.mpm.types import Contact, Grid, Sensors, row, vec8
+from piavatar_envs.mpm.stencil import block_corner, node_of_block
+from piavatar_envs.mpm.sums import offset_at
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums, row, vec8
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,25 +61,27 @@ def book_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, 
 def touch(
     grid: Grid,
     contact: Contact,
+    blocks: Blocks,
+    sums: Sums,
     e: int,
-    n: int,
+    block: int,
+    local: int,
     a: int,
     b: int,
-    active: wp.array2d(dtype=int),
     node_facing: wp.array2d(dtype=wp.vec3),
-    node_offset: wp.array2d(dtype=wp.vec3),
     node_velocity: wp.array2d(dtype=vec8),
     sensors: Sensors,
 ):
     """Contact of the fields ``a < b`` at a node: equal and opposite impulses along one normal."""
-    ra = a * grid.num_nodes + n
-    rb = b * grid.num_nodes + n
+    ra = first_record(grid, blocks, e, a, block) + local
+    rb = first_record(grid, blocks, e, b, block) + local
     va = node_velocity[e, ra]
     vb = node_velocity[e, rb]
     if va[0] <= MASS_MIN or vb[0] <= MASS_MIN:
         return
-    n_ab = shared_normal(grid, e, node_of(grid, n), a, b, active, node_facing)
-    distance = wp.dot(n_ab, node_offset[e, ra] / va[0] - node_offset[e, rb] / vb[0])
+    n_ab = shared_normal(grid, blocks, e, node_of_block(block_corner(grid, block), local), a, b, node_facing)
+    apart = offset_at(grid, sums, e, a, ra) / va[0] - offset_at(grid, sums, e, b, rb) / vb[0]
+    distance = wp.dot(n_ab, wp.vec3(apart[0], apart[1], apart[2]))
     V_a = volume_at(grid, contact, e, a, va[0])
     V_b = volume_at(grid, contact, e, b, vb[0])
     if surface_gap(grid, V_a, V_b, distance) >= contact.gate:
@@ -94,17 +98,19 @@ def touch(
     first = contact.subject[a]
     second = contact.subject[b]
     if first != second:
-        wp.atomic_add(sensors.pair_impulse, e, first * contact.num_subjects + second, -J)
+        add_impulse(sensors, e, pair_entry(sensors, first * contact.num_subjects + second), -J)
 
 
 @wp.func
 def project_alone(
+    grid: Grid,
     contact: Contact,
-    num_nodes: int,
+    blocks: Blocks,
+    sums: Sums,
     mask: int,
     e: int,
-    n: int,
-    node_offset: wp.array2d(dtype=wp.vec3),
+    block: int,
+    local: int,
     node_velocity: wp.array2d(dtype=vec8),
     sensors: Sensors,
 ):
@@ -114,22 +120,24 @@ def project_alone(
     heaviest = int(0)
     most = float(0.0)
     for f in range(contact.num_fields):
-        v = node_velocity[e, f * num_nodes + n]
-        if has_field(mask, f) and v[0] > MASS_MIN:
-            m += v[0]
-            p += v[0] * wp.vec3(v[1], v[2], v[3])
-            if v[0] > most:
-                most = v[0]
-                heaviest = f
+        if has_field(mask, f):
+            v = node_velocity[e, first_record(grid, blocks, e, f, block) + local]
+            if v[0] > MASS_MIN:
+                m += v[0]
+                p += v[0] * wp.vec3(v[1], v[2], v[3])
+                if v[0] > most:
+                    most = v[0]
+                    heaviest = f
     if m - most <= MASS_MIN:
         return
     common = p / m
     for f in range(contact.num_fields):
         if has_field(mask, f):
-            r = f * num_nodes + n
+            r = first_record(grid, blocks, e, f, block) + local
             v = node_velocity[e, r]
             if v[0] > MASS_MIN:
-                out = wp.normalize(node_offset[e, r])
+                offset = offset_at(grid, sums, e, f, r)
+                out = wp.normalize(wp.vec3(offset[0], offset[1], offset[2]))
                 other = wp.where(f == heaviest, lowest_other(mask, f, contact.num_fields), heaviest)
                 mu = contact.friction[row(e, contact.friction.shape[0]), f * contact.num_fields + other]
                 # against a wall that moves with the common velocity
@@ -142,25 +150,23 @@ def project_alone(
 def touch_all(
     grid: Grid,
     contact: Contact,
+    blocks: Blocks,
+    sums: Sums,
     mask: int,
     e: int,
-    n: int,
-    active: wp.array2d(dtype=int),
+    block: int,
+    local: int,
     node_facing: wp.array2d(dtype=wp.vec3),
-    node_offset: wp.array2d(dtype=wp.vec3),
     node_velocity: wp.array2d(dtype=vec8),
     sensors: Sensors,
 ):
     """Contact of all fields at a node."""
     if contact.own_normals != 0:
-        project_alone(contact, grid.num_nodes, mask, e, n, node_offset, node_velocity, sensors)
+        project_alone(grid, contact, blocks, sums, mask, e, block, local, node_velocity, sensors)
         return
     end = end_of_fields(mask, contact.num_fields)
     for a in range(lowest_field(mask, contact.num_fields), end - 1):
         if has_field(mask, a):
             for b in range(a + 1, end):
                 if has_field(mask, b):
-                    touch(
-                        grid, contact, e, n, a, b, active,
-                        node_facing, node_offset, node_velocity, sensors,
-                    )  # fmt: skip
+                    touch(grid, contact, blocks, sums, e, block, local, a, b, node_facing, node_velocity, sensors)

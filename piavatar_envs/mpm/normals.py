@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.masks import end_of_fields, has_field, lowest_field
-from piavatar_envs.mpm.stencil import block_corner, block_index, node_index
-from piavatar_envs.mpm.types import Contact, Grid, row, vec8
+from piavatar_envs.mpm.blocks import first_record, has_field, held_by, lowest_field
+from piavatar_envs.mpm.stencil import BLOCK_NODES, block_index, node_in_block
+from piavatar_envs.mpm.sums import move_offset, offset_at, take_sum
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, row, vec8
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,29 +36,35 @@ PER_GAP = wp.constant(0.65)
 
 
 @wp.func
-def merge_limbs(
+def take_sums(
+    grid: Grid,
     contact: Contact,
-    num_nodes: int,
+    blocks: Blocks,
+    sums: Sums,
     mask: int,
     e: int,
-    n: int,
-    node_sum: wp.array2d(dtype=vec8),
-    node_offset: wp.array2d(dtype=wp.vec3),
+    block: int,
+    local: int,
+    # out
+    node_velocity: wp.array2d(dtype=vec8),
 ):
-    """Join limbs to their trunk at a node where both have seam particles, those that are skinned to both.
+    """Move the sums of a node to where its velocities will be, and join limbs to their trunk.
 
-    Mass, momentum *and* kinematic momentum are summed, or the shoulders would tear. Without the condition a hand
-    would grow to the belly.
+    They grow together where both have seam particles, those that are skinned to both. Mass, momentum *and* kinematic
+    momentum are summed, or the shoulders would tear. Without the condition a hand would grow to the belly.
     """
     for f in range(contact.num_fields):
-        t = contact.trunk[f]
-        if t != f and has_field(mask, f) and has_field(mask, t):
-            limb = node_sum[e, f * num_nodes + n]
-            trunk = node_sum[e, t * num_nodes + n]
-            if limb[7] > 0.0 and trunk[7] > 0.0:
-                node_sum[e, t * num_nodes + n] = trunk + limb
-                node_offset[e, t * num_nodes + n] += node_offset[e, f * num_nodes + n]
-                node_sum[e, f * num_nodes + n] = vec8(GROWN_TOGETHER, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        if has_field(mask, f):
+            r = first_record(grid, blocks, e, f, block) + local
+            s = take_sum(sums, e, f, r)
+            node_velocity[e, r] = s
+            t = contact.trunk[f]
+            if t != f and has_field(mask, t):
+                into = first_record(grid, blocks, e, t, block) + local
+                if offset_at(grid, sums, e, f, r)[3] > 0.0 and offset_at(grid, sums, e, t, into)[3] > 0.0:
+                    node_velocity[e, into] = node_velocity[e, into] + s
+                    move_offset(sums, e, r, into)
+                    node_velocity[e, r] = vec8(GROWN_TOGETHER, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @wp.func
@@ -68,70 +75,83 @@ def volume_at(grid: Grid, contact: Contact, e: int, f: int, m: float):
 
 
 @wp.func
-def weighted_gradient(grid: Grid, V: float, m: float, offset: wp.vec3):
+def weighted_gradient(grid: Grid, V: float, m: float, offset: wp.vec4):
     """Outward gradient of a volume at a node, times the volume; up to a factor common to all."""
-    return (V * V * grid.inv_dx / m) * offset
+    return (V * V * grid.inv_dx / m) * wp.vec3(offset[0], offset[1], offset[2])
+
+
+@wp.func
+def face_node(
+    grid: Grid,
+    contact: Contact,
+    blocks: Blocks,
+    sums: Sums,
+    mask: int,
+    e: int,
+    block: int,
+    local: int,
+    node_velocity: wp.array2d(dtype=vec8),
+    # out
+    node_facing: wp.array2d(dtype=wp.vec3),
+):
+    """Summands of a node, a vector a field."""
+    volume = float(0.0)
+    outward = wp.vec3()
+    for f in range(contact.num_fields):
+        if has_field(mask, f):
+            r = first_record(grid, blocks, e, f, block) + local
+            m = node_velocity[e, r][0]
+            V = volume_at(grid, contact, e, f, m)
+            if V > 0.0:
+                volume += V
+                outward += weighted_gradient(grid, V, m, offset_at(grid, sums, e, f, r))
+    for f in range(contact.num_fields):
+        if has_field(mask, f):
+            r = first_record(grid, blocks, e, f, block) + local
+            m = node_velocity[e, r][0]
+            V = volume_at(grid, contact, e, f, m)
+            facing = wp.vec3()
+            if V > 0.0 and volume > V:
+                reduced = V * (volume - V) / volume
+                own = weighted_gradient(grid, V, m, offset_at(grid, sums, e, f, r))
+                facing = (reduced * reduced) * (2.0 * own - outward)
+            node_facing[e, r] = facing
 
 
 @wp.kernel
 def find_facing(
     grid: Grid,
     contact: Contact,
-    slabs: int,
-    active: wp.array2d(dtype=int),
-    # in and out: limbs grow together with their trunks
-    node_sum: wp.array2d(dtype=vec8),
-    node_offset: wp.array2d(dtype=wp.vec3),
+    threads: int,
+    blocks: Blocks,
+    # in and out: taken where several fields are
+    sums: Sums,
     # out
+    node_velocity: wp.array2d(dtype=vec8),
     node_facing: wp.array2d(dtype=wp.vec3),
 ):
-    """What every node of a block with several fields says about the normals around it, a vector a field.
+    """What every node of a block with several fields says about the normals around it.
 
     It is the summand of the module's formula, with all other fields of the node as ``b``; zero where there is none.
+    Limbs grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
     """
-    e, block, slab = wp.tid()
-    mask = active[e, block]
-    first = lowest_field(mask, contact.num_fields)
-    end = end_of_fields(mask, contact.num_fields)
-    if end - first < 2:
+    e, slot, thread = wp.tid()
+    held = held_by(grid, blocks, e, slot)
+    if held[0] < 0:
         return
-    corner = block_corner(grid, block)
-    for i in range(corner[0] + slab, wp.min(corner[0] + 4, grid.nodes[0]), slabs):
-        for j in range(corner[1], wp.min(corner[1] + 4, grid.nodes[1])):
-            for k in range(corner[2], wp.min(corner[2] + 4, grid.nodes[2])):
-                n = node_index(grid, i, j, k)
-                merge_limbs(contact, grid.num_nodes, mask, e, n, node_sum, node_offset)
-                volume = float(0.0)
-                outward = wp.vec3()
-                for f in range(first, end):
-                    if has_field(mask, f):
-                        m = node_sum[e, f * grid.num_nodes + n][0]
-                        V = volume_at(grid, contact, e, f, m)
-                        if V > 0.0:
-                            volume += V
-                            outward += weighted_gradient(grid, V, m, node_offset[e, f * grid.num_nodes + n])
-                for f in range(first, end):
-                    if has_field(mask, f):
-                        r = f * grid.num_nodes + n
-                        m = node_sum[e, r][0]
-                        V = volume_at(grid, contact, e, f, m)
-                        facing = wp.vec3()
-                        if V > 0.0 and volume > V:
-                            reduced = V * (volume - V) / volume
-                            own = weighted_gradient(grid, V, m, node_offset[e, r])
-                            facing = (reduced * reduced) * (2.0 * own - outward)
-                        node_facing[e, r] = facing
+    block = held[1]
+    mask = blocks.fields[e, block]
+    if mask == (1 << held[0]) or held[0] != lowest_field(mask, contact.num_fields):
+        return
+    share = BLOCK_NODES // threads
+    for local in range(thread * share, (thread + 1) * share):
+        take_sums(grid, contact, blocks, sums, mask, e, block, local, node_velocity)
+        face_node(grid, contact, blocks, sums, mask, e, block, local, node_velocity, node_facing)
 
 
 @wp.func
 def shared_normal(
-    grid: Grid,
-    e: int,
-    node: wp.vec3i,
-    a: int,
-    b: int,
-    active: wp.array2d(dtype=int),
-    node_facing: wp.array2d(dtype=wp.vec3),
+    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, node_facing: wp.array2d(dtype=wp.vec3)
 ):
     """Unit normal from field ``a`` to field ``b`` at a node; zero if there is no telling."""
     both = (1 << a) | (1 << b)
@@ -140,11 +160,13 @@ def shared_normal(
         for j in range(wp.max(node[1] - 1, 0), wp.min(node[1] + 2, grid.nodes[1])):
             for k in range(wp.max(node[2] - 1, 0), wp.min(node[2] + 2, grid.nodes[2])):
                 # a block without one of the two holds nothing that was written in this substep
-                if (active[e, block_index(grid, i, j, k)] & both) == both:
-                    n = node_index(grid, i, j, k)
+                block = block_index(grid, i, j, k)
+                if (blocks.fields[e, block] & both) == both:
+                    n = node_in_block(i, j, k)
                     d = wp.vec3i(i - node[0], j - node[1], k - node[2])
                     c = 1.0 / float(1 + wp.dot(d, d))
-                    facing += c * (node_facing[e, a * grid.num_nodes + n] - node_facing[e, b * grid.num_nodes + n])
+                    of_a = node_facing[e, first_record(grid, blocks, e, a, block) + n]
+                    facing += c * (of_a - node_facing[e, first_record(grid, blocks, e, b, block) + n])
     # summands of nearly empty nodes are so small that their squares are not
     largest = wp.max(wp.abs(facing))
     if largest <= 0.0:

@@ -6,7 +6,7 @@ CPU the graph saves some 5 us a launch, a tenth of a step at the default resolut
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import warp as wp
@@ -20,24 +20,36 @@ class Program:
 
     def __init__(self, device: str) -> None:
         self.device = wp.get_device(device)
-        self._launches: list[wp.Launch] = []
+        self._launches: list[Callable[[], None]] = []
         self._names: list[str] = []
         self._graph: Any = None
 
     def launch(
-        self, kernel: wp.Kernel, dim: int | Sequence[int], inputs: Sequence[Any], outputs: Sequence[Any] = ()
+        self,
+        kernel: wp.Kernel,
+        dim: int | Sequence[int],
+        inputs: Sequence[Any],
+        outputs: Sequence[Any] = (),
+        block_dim: int = 256,
     ) -> None:
         """Append a launch. Arguments as for ``wp.launch``.
 
         Raises:
             RuntimeError: the program has already run.
         """
+        arguments = {"inputs": list(inputs), "outputs": list(outputs), "block_dim": block_dim}
+        self.call(kernel.key, wp.launch(kernel, dim, **arguments, device=self.device, record_cmd=True).launch)
+
+    def call(self, name: str, function: Callable[[], None]) -> None:
+        """Append a function that launches work on the device by itself and may be captured.
+
+        Raises:
+            RuntimeError: the program has already run.
+        """
         if self._graph is not None:
-            raise RuntimeError(f"cannot append {kernel.key} to a program that has run; build a new one")
-        self._launches.append(
-            wp.launch(kernel, dim, inputs=list(inputs), outputs=list(outputs), device=self.device, record_cmd=True)
-        )
-        self._names.append(kernel.key)
+            raise RuntimeError(f"cannot append {name} to a program that has run; build a new one")
+        self._launches.append(function)
+        self._names.append(name)
 
     def __len__(self) -> int:
         return len(self._launches)
@@ -50,8 +62,9 @@ class Program:
 
     def run_eager(self) -> None:
         """Launch one by one without a graph, to compare with :meth:`run`."""
-        for command in self._launches:
-            command.launch()
+        with wp.ScopedDevice(self.device):
+            for launch in self._launches:
+                launch()
 
     def timed(self, repeats: int = 1) -> dict[str, float]:
         """Seconds spent in each kernel over one run, by name (launches one by one, for profiling).
@@ -62,16 +75,16 @@ class Program:
 
         seconds: dict[str, float] = dict.fromkeys(self._names, 0.0)
         for _ in range(repeats):
-            for name, command in zip(self._names, self._launches, strict=True):
+            for name, launch in zip(self._names, self._launches, strict=True):
                 wp.synchronize_device(self.device)
                 start = time.perf_counter()
-                command.launch()
+                launch()
                 wp.synchronize_device(self.device)
                 seconds[name] += (time.perf_counter() - start) / repeats
         return seconds
 
     def _capture(self) -> None:
         with wp.ScopedDevice(self.device), wp.ScopedCapture(self.device) as capture:
-            for command in self._launches:
-                command.launch()
+            for launch in self._launches:
+                launch()
         self._graph = capture.graph

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.masks import fields_around, has_field
-from piavatar_envs.mpm.stencil import base_node, block_index, grid_position, node_index, spline, stencil_inside
-from piavatar_envs.mpm.types import Contact, Grid, Particles, Sensors, row, vec8
+from piavatar_envs.mpm.blocks import fields_around, has_field, record_of
+from piavatar_envs.mpm.impulses import add_impulse, part_entry
+from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_index, grid_position, spline, stencil_inside
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Particles, Sensors, row, vec8
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,11 +24,10 @@ def sense_contact(
     particles: Particles,
     contact: Contact,
     x: wp.array2d(dtype=wp.vec3),
-    active: wp.array2d(dtype=int),
-    node_contact: wp.array2d(dtype=wp.vec4),
+    blocks: Blocks,
     failure: wp.array(dtype=int),
     # in and out
-    part_impulse: wp.array3d(dtype=wp.vec3),
+    sensors: Sensors,
 ):
     """Impulse on every sensor, by the subject that gave it.
 
@@ -41,33 +41,33 @@ def sense_contact(
     xg = grid_position(grid, x[e, p])
     base = base_node(xg)
     own = particles.field[p]
-    if fields_around(grid, base, e, active) == (1 << own):
+    if fields_around(grid, blocks, base, e) == (1 << own):
         return
     f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
     wx = spline(f[0])
     wy = spline(f[1])
     wz = spline(f[2])
     m = particles.mass[row(e, particles.mass.shape[0]), p]
-    # summed up before it is added to what may be a thousand times as large
+    # added up before it is rounded
     impulse = wp.vec3()
     giver = int(0)
     for i in range(3):
         for j in range(3):
             for k in range(3):
-                mask = active[e, block_index(grid, base[0] + i, base[1] + j, base[2] + k)]
+                mask = blocks.fields[e, block_index(grid, base[0] + i, base[1] + j, base[2] + k)]
                 if mask != (1 << own):
-                    n = node_index(grid, base[0] + i, base[1] + j, base[2] + k)
-                    change = node_contact[e, own * grid.num_nodes + n]
+                    r = record_of(grid, blocks, e, own, base[0] + i, base[1] + j, base[2] + k)
+                    change = sensors.node[e, r]
                     dv = wp.vec3(change[0], change[1], change[2])
                     if wp.length_sq(dv) > 0.0:
                         if int(change[3]) != giver:
                             if wp.length_sq(impulse) > 0.0:
-                                wp.atomic_add(part_impulse, e, sensor, giver, impulse)
+                                add_impulse(sensors, e, part_entry(sensors, sensor, giver), impulse)
                             impulse = wp.vec3()
                             giver = int(change[3])
                         impulse += (m * wx[i] * wy[j] * wz[k]) * dv
     if wp.length_sq(impulse) > 0.0:
-        wp.atomic_add(part_impulse, e, sensor, giver, impulse)
+        add_impulse(sensors, e, part_entry(sensors, sensor, giver), impulse)
 
 
 @wp.kernel
@@ -76,7 +76,7 @@ def sense_penetration(
     particles: Particles,
     contact: Contact,
     x: wp.array2d(dtype=wp.vec3),
-    active: wp.array2d(dtype=int),
+    blocks: Blocks,
     node_velocity: wp.array2d(dtype=vec8),
     failure: wp.array(dtype=int),
     # in and out
@@ -95,7 +95,7 @@ def sense_penetration(
     if not stencil_inside(grid, base):
         return
     own = contact.subject[particles.field[p]]
-    around = fields_around(grid, base, e, active)
+    around = fields_around(grid, blocks, base, e)
     f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
     wx = spline(f[0])
     wy = spline(f[1])
@@ -107,38 +107,13 @@ def sense_penetration(
             for i in range(3):
                 for j in range(3):
                     for k in range(3):
-                        if has_field(active[e, block_index(grid, base[0] + i, base[1] + j, base[2] + k)], g):
-                            n = node_index(grid, base[0] + i, base[1] + j, base[2] + k)
-                            m += wx[i] * wy[j] * wz[k] * node_velocity[e, g * grid.num_nodes + n][0]
+                        if has_field(blocks.fields[e, block_index(grid, base[0] + i, base[1] + j, base[2] + k)], g):
+                            r = record_of(grid, blocks, e, g, base[0] + i, base[1] + j, base[2] + k)
+                            # a block that the last gather has marked knows nothing yet
+                            if r < BLOCK_NODES * blocks.swept[e]:
+                                m += wx[i] * wy[j] * wz[k] * node_velocity[e, r][0]
             density = contact.density[row(e, contact.density.shape[0]), g]
             fraction += m * grid.inv_dx * grid.inv_dx * grid.inv_dx / density
     depth = grid.dx * (wp.min(fraction, 1.0) - SURFACE) / SURFACE_SLOPE
     if depth > 0.0:
         wp.atomic_max(penetration, e, own, depth)
-
-
-@wp.func
-def forget(e: int, sensors: Sensors):
-    """Zero the sensors of an environment."""
-    for s in range(sensors.boundary_impulse.shape[1]):
-        sensors.boundary_impulse[e, s] = wp.vec3(0.0)
-        sensors.penetration[e, s] = 0.0
-    for s in range(sensors.pair_impulse.shape[1]):
-        sensors.pair_impulse[e, s] = wp.vec3(0.0)
-    for i in range(sensors.part_impulse.shape[1]):
-        for s in range(sensors.part_impulse.shape[2]):
-            sensors.part_impulse[e, i, s] = wp.vec3(0.0)
-
-
-@wp.kernel
-def clear_sensors(sensors: Sensors):
-    """Forget the contacts of the last control step."""
-    forget(wp.tid(), sensors)
-
-
-@wp.kernel
-def clear_masked_sensors(mask: wp.array(dtype=wp.bool), sensors: Sensors):
-    """Forget the contacts of the masked environments."""
-    e = wp.tid()
-    if mask[e]:
-        forget(e, sensors)

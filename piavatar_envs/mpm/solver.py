@@ -2,56 +2,75 @@
 
 from __future__ import annotations
 
+from piavatar_envs.mpm import runs
+from piavatar_envs.mpm.blocks import forget_blocks, free_slots, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
-from piavatar_envs.mpm.grid import threads_per_block, update_grid
+from piavatar_envs.mpm.grid import solve_contact, threads_per_block, update_grid
+from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.sensing import clear_sensors, sense_contact, sense_penetration
-from piavatar_envs.mpm.transfer import clear_marks, grid_to_particles, mark_particles, particles_to_grid
+from piavatar_envs.mpm.runs import record_order, record_runs
+from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
+from piavatar_envs.mpm.transfer import grid_to_particles, particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 
-def record_substep(program: Program, model: Model, state: State, scratch: Scratch, index: int) -> None:
-    """Append substep ``index`` of a control step to ``program``.
+def record_substep(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """Append a substep of a control step to ``program``.
 
     The physical velocity, position and deformation in ``state`` advance by ``model.step.dt`` under the kinematic
     velocity ``state.vk``; contact is added to the sensors.
     """
-    m, s, nodes = model, state, scratch.nodes
-    particles = (m.num_envs, m.num_particles)
-    active, next_active = scratch.block_fields[index % 2], scratch.block_fields[(index + 1) % 2]
-    moving = group(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk)
-    program.launch(
-        particles_to_grid,
-        particles,
-        [m.grid, m.step, m.particles, m.boundaries, m.contact, moving, active, s.failure],
-        [nodes.sum, nodes.offset],
-    )
-    slabs = threads_per_block(m.device)
-    blocks = (m.num_envs, m.num_blocks, slabs)
-    if m.contact.num_fields > 1:
-        program.launch(find_facing, blocks, [m.grid, m.contact, slabs, active], [nodes.sum, nodes.offset, nodes.facing])
+    m, s, blocks, sums = model, state, scratch.blocks, scratch.sums
+    record_scatter(program, model, state, scratch)
+    threads = threads_per_block(m.device)
+    nodes = (m.num_envs, m.max_slots, threads)
     program.launch(
         update_grid,
-        blocks,
-        [m.grid, m.step, m.boundaries, m.contact, slabs, active, nodes.facing],
-        [nodes.sum, nodes.offset, nodes.velocity, next_active, scratch.sensors],
+        nodes,
+        [m.grid, m.step, m.boundaries, m.contact, threads],
+        [blocks, sums, scratch.velocity, scratch.sensors],
     )
     if m.contact.num_fields > 1:
-        program.launch(
-            sense_contact,
-            particles,
-            [m.grid, m.particles, m.contact, s.x, active, scratch.sensors.node, s.failure],
-            [scratch.sensors.part_impulse],
-        )
-    program.launch(
-        grid_to_particles,
-        particles,
-        [m.grid, m.step, m.particles, m.boundaries, nodes.velocity, s.vk],
-        [s.x, s.u, s.C, s.F, next_active, s.failure],
-    )
+        _record_contact(program, model, state, scratch)
+    gather = grid_to_particles if m.scatter == "plain" else runs.grid_to_particles
+    inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
+    program.launch(gather, s.x.shape, inputs, [blocks, _moving(s), s.failure])
     if m.moving_boundaries:
         program.launch(move_colliders, m.boundaries.position.shape, [m.step.dt], [m.boundaries])
+
+
+def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """Append the grid pass over the blocks with several fields, and what the contact sensors feel."""
+    m, blocks, sums, threads = model, scratch.blocks, scratch.sums, threads_per_block(model.device)
+    nodes = (m.num_envs, m.max_slots, threads)
+    program.launch(find_facing, nodes, [m.grid, m.contact, threads, blocks], [sums, scratch.velocity, scratch.facing])
+    program.launch(
+        solve_contact,
+        nodes,
+        [m.grid, m.step, m.boundaries, m.contact, threads, blocks, scratch.facing],
+        [sums, scratch.velocity, scratch.sensors],
+    )
+    program.launch(
+        sense_contact,
+        state.x.shape,
+        [m.grid, m.particles, m.contact, state.x, blocks, state.failure],
+        [scratch.sensors],
+    )
+
+
+def record_scatter(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """Append the transfer of particles to nodes, in the way of ``model.scatter``."""
+    m, s = model, state
+    inputs = [m.grid, m.step, m.particles, m.boundaries, m.contact, _moving(s), scratch.blocks]
+    if m.scatter == "plain":
+        program.launch(particles_to_grid, s.x.shape, inputs, [s.failure, scratch.sums])
+    else:
+        record_runs(program, inputs, scratch.order, s.failure, scratch.sums)
+
+
+def _moving(s: State) -> Moving:
+    return group(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk)
 
 
 def record_begin(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -61,27 +80,27 @@ def record_begin(program: Program, model: Model, state: State, scratch: Scratch)
 
 
 def record_marks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
-    """Append: mark the blocks of all particles for the first substep; every substep marks those of the next.
+    """Append: give slots to the blocks of all particles; the gather of every substep adds those that it comes to.
 
     What the last control step left is forgotten first: a reset may have put the particles elsewhere, and a block that
     is marked for nothing costs time and, in its rounding, the equality of runs.
     """
-    program.launch(clear_marks, (model.num_envs, model.num_blocks), [], [scratch.block_fields[0]])
-    program.launch(
-        mark_particles,
-        state.x.shape,
-        [model.grid, model.particles, state.x],
-        [scratch.block_fields[0], state.failure],
-    )
+    m, blocks = model, scratch.blocks
+    program.launch(forget_blocks, (m.num_envs, m.max_slots), [m.grid], [blocks])
+    program.launch(free_slots, m.num_envs, [], [blocks])
+    program.launch(mark_particles, state.x.shape, [m.grid, m.particles, state.x], [blocks, state.failure])
+    if m.scatter != "plain":
+        record_order(program, m, state, scratch)
 
 
 def record_end(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append what comes after the last substep of a control step: what is sensed once a step."""
-    if model.contact.num_subjects > 1:
-        last = scratch.block_fields[(model.num_substeps - 1) % 2]
+    m = model
+    program.launch(read_impulses, m.num_envs, [], [scratch.sensors])
+    if m.contact.num_subjects > 1:
         program.launch(
             sense_penetration,
             state.x.shape,
-            [model.grid, model.particles, model.contact, state.x, last, scratch.nodes.velocity, state.failure],
+            [m.grid, m.particles, m.contact, state.x, scratch.blocks, scratch.velocity, state.failure],
             [scratch.sensors.penetration],
         )

@@ -13,8 +13,10 @@ from piavatar_envs.mpm.types import Grid
 
 wp.set_module_options({"enable_backward": False})
 
-#: Nodes along an edge of a block; blocks are the unit in which the grid is swept.
+#: Nodes along an edge of a block; blocks are the unit in which the grid is stored and swept.
 BLOCK = 4
+#: Nodes of a block.
+BLOCK_NODES = wp.constant(64)
 
 
 @wp.func
@@ -52,16 +54,9 @@ def spline(f: float):
 
 
 @wp.func
-def node_index(grid: Grid, i: int, j: int, k: int):
-    """Linear index of node ``(i, j, k)`` within its velocity field; ``k + 1`` is the next."""
-    return (i * grid.nodes[1] + j) * grid.nodes[2] + k
-
-
-@wp.func
-def node_of(grid: Grid, n: int):
-    """Node of a linear index within its velocity field."""
-    ij = n // grid.nodes[2]
-    return wp.vec3i(ij // grid.nodes[1], ij % grid.nodes[1], n % grid.nodes[2])
+def node_in_block(i: int, j: int, k: int):
+    """Index of node ``(i, j, k)`` among the 64 of its block."""
+    return (((i & 3) * 4) + (j & 3)) * 4 + (k & 3)
 
 
 @wp.func
@@ -80,6 +75,12 @@ def block_index(grid: Grid, i: int, j: int, k: int):
 def blocks_touched(base: wp.vec3i):
     """Blocks along each axis that the stencil at ``base`` lies in, 1 or 2; the second holds ``base + 2``."""
     return wp.vec3i(1 + ((base[0] & 3) >> 1), 1 + ((base[1] & 3) >> 1), 1 + ((base[2] & 3) >> 1))
+
+
+@wp.func
+def node_of_block(corner: wp.vec3i, local: int):
+    """Node ``local`` of the block whose lowest node is ``corner``."""
+    return wp.vec3i(corner[0] + (local >> 4), corner[1] + ((local >> 2) & 3), corner[2] + (local & 3))
 
 
 @wp.func

@@ -8,31 +8,26 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.mpm.blocks import fields_around, line_of_records, mark_blocks, record_of, slab_records
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_PARTICLE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.decouple import advance_deformation
-from piavatar_envs.mpm.masks import fields_around
 from piavatar_envs.mpm.materials import kirchhoff_stress
-from piavatar_envs.mpm.stencil import (
-    base_node,
-    block_index,
-    blocks_touched,
-    grid_position,
-    node_index,
-    spline,
-    stencil_inside,
-)
+from piavatar_envs.mpm.stencil import base_node, grid_position, spline, stencil_inside
+from piavatar_envs.mpm.sums import read_record
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
     FAILURE_OUT_OF_GRID,
     NO_STRESS,
     SPLIT,
+    Blocks,
     Boundaries,
     Contact,
     Grid,
     Moving,
     Particles,
     Step,
+    Sums,
     row,
     vec8,
 )
@@ -45,79 +40,24 @@ _OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
 _CFL = wp.constant(FAILURE_CFL)
 
 
+@wp.struct
+class Scattered:
+    """What a particle adds to the nodes around it; momentum ``m u + affine (x_i - x_p)`` is linear over the stencil."""
+
+    base: wp.vec3i  # lowest node of the stencil
+    f: wp.vec3  # position from there, in grid spacings
+    at_base: vec8  # mass, physical and kinematic momentum, at the lowest node
+    A: wp.mat33  # change of physical momentum from node to node, along the columns
+
+
 @wp.func
-def mark_blocks(grid: Grid, base: wp.vec3i, field: int, e: int, active: wp.array2d(dtype=int)):
-    """Mark the blocks that a stencil touches with the field's bit."""
-    bit = 1 << field
-    blocks = blocks_touched(base)
-    for i in range(blocks[0]):
-        for j in range(blocks[1]):
-            for k in range(blocks[2]):
-                block = block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)
-                if (active[e, block] & bit) == 0:
-                    wp.atomic_or(active, e, block, bit)
-
-
-@wp.kernel
-def clear_marks(active: wp.array2d(dtype=int)):
-    """Forget the fields of all blocks."""
-    e, block = wp.tid()
-    active[e, block] = 0
-
-
-@wp.kernel
-def mark_particles(
-    grid: Grid,
-    particles: Particles,
-    x: wp.array2d(dtype=wp.vec3),
-    # in and out
-    active: wp.array2d(dtype=int),
-    failure: wp.array(dtype=int),
-):
-    """Mark the blocks of all particles, wherever they have been put; one outside the grid flags its environment."""
-    e, p = wp.tid()
-    if failure[e] != 0:
-        return
-    if not wp.isfinite(wp.length_sq(x[e, p])):
-        wp.atomic_or(failure, e, _NONFINITE)
-        return
-    base = base_node(grid_position(grid, x[e, p]))
-    if not stencil_inside(grid, base):
-        wp.atomic_or(failure, e, _OUT_OF_GRID)
-        return
-    mark_blocks(grid, base, particles.field[p], e, active)
-
-
-@wp.kernel
-def particles_to_grid(
-    grid: Grid,
-    step: Step,
-    particles: Particles,
-    boundaries: Boundaries,
-    contact: Contact,
-    moving: Moving,
-    active: wp.array2d(dtype=int),
-    # in and out
-    failure: wp.array(dtype=int),
-    # out
-    node_sum: wp.array2d(dtype=vec8),
-    node_offset: wp.array2d(dtype=wp.vec3),
-):
-    """Sum mass, physical momentum with the stress impulse, and kinematic momentum on the nodes of a field.
-
-    A particle that is not finite flags its environment and is left out.
-    """
-    e, p = wp.tid()
-    if failure[e] != 0:
-        return
-    if not wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p])):
-        wp.atomic_or(failure, e, _NONFINITE)
-        return
+def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int):
+    """What particle ``p`` of environment ``e`` scatters."""
+    s = Scattered()
     xg = grid_position(grid, moving.x[e, p])
-    base = base_node(xg)
-    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
-    r = row(e, particles.mass.shape[0])
-    m = particles.mass[r, p]
+    s.base = base_node(xg)
+    s.f = xg - wp.vec3(float(s.base[0]), float(s.base[1]), float(s.base[2]))
+    m = particles.mass[row(e, particles.mass.shape[0]), p]
     affine = m * moving.C[e, p]
     if step.decoupling != NO_STRESS:
         tau = kirchhoff_stress(
@@ -128,39 +68,102 @@ def particles_to_grid(
         )
         volume = particles.volume[row(e, particles.volume.shape[0]), p]
         affine -= (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
-    # momentum is linear over the stencil, m u + affine (x_i - x_p): one vector register a node
-    A = grid.dx * affine
-    q = m * moving.u[e, p] - A * f
+    s.A = grid.dx * affine
+    q = m * moving.u[e, p] - s.A * s.f
     k = m * moving.vk[e, p]
-    at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], m * particles.seam[p])
+    s.at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
+    return s
+
+
+@wp.func
+def scatters(moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
+    """Whether a particle takes part; one that is not finite flags its environment and does not."""
+    if failure[e] != 0:
+        return False
+    if not wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p])):
+        wp.atomic_or(failure, e, _NONFINITE)
+        return False
+    return True
+
+
+@wp.func
+def tells_place(
+    grid: Grid,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    blocks: Blocks,
+    e: int,
+    p: int,
+    x: wp.vec3,
+    base: wp.vec3i,
+):
+    """Whether nodes must know where this particle is: another field or a boundary is near."""
+    if contact.num_fields > 1 and fields_around(grid, blocks, base, e) != (1 << particles.field[p]):
+        return True
+    return nearest_boundary(boundaries, e, x) < NEAR_PARTICLE * grid.dx
+
+
+@wp.func
+def scatter_offsets(grid: Grid, blocks: Blocks, sums: Sums, e: int, field: int, seam: float, s: Scattered):
+    """Tell the nodes where a particle is."""
+    wx = spline(s.f[0])
+    wy = spline(s.f[1])
+    wz = spline(s.f[2])
+    for i in range(3):
+        for j in range(3):
+            for l in range(3):
+                r = record_of(grid, blocks, e, field, s.base[0] + i, s.base[1] + j, s.base[2] + l)
+                d = grid.dx * (wp.vec3(float(i), float(j), float(l)) - s.f)
+                m = wx[i] * wy[j] * wz[l] * s.at_base[0]
+                wp.atomic_add(sums.offset, e, r, wp.vec4(m * d[0], m * d[1], m * d[2], m * seam))
+
+
+@wp.kernel
+def particles_to_grid(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    moving: Moving,
+    blocks: Blocks,
+    # in and out
+    failure: wp.array(dtype=int),
+    sums: Sums,
+):
+    """Sum mass, physical momentum with the stress impulse, and kinematic momentum on the nodes of a field.
+
+    The plain scatter: a thread a particle, which adds to one node after the other.
+    """
+    e, p = wp.tid()
+    if not scatters(moving, e, p, failure):
+        return
+    s = prepare(grid, step, particles, moving, e, p)
+    base = s.base
+    A = s.A
     along_x = vec8(0.0, A[0, 0], A[1, 0], A[2, 0], 0.0, 0.0, 0.0, 0.0)
     along_y = vec8(0.0, A[0, 1], A[1, 1], A[2, 1], 0.0, 0.0, 0.0, 0.0)
     along_z = vec8(0.0, A[0, 2], A[1, 2], A[2, 2], 0.0, 0.0, 0.0, 0.0)
-    wx = spline(f[0])
-    wy = spline(f[1])
-    wz = spline(f[2])
+    wx = spline(s.f[0])
+    wy = spline(s.f[1])
+    wz = spline(s.f[2])
     field = particles.field[p]
-    of_field = field * grid.num_nodes
-    at_i = at_base
+    at_i = s.at_base
     for i in range(3):
         at_j = wx[i] * at_i
+        slab = slab_records(grid, blocks, e, field, base, i)
         for j in range(3):
-            first = of_field + node_index(grid, base[0] + i, base[1] + j, base[2])
             line = wy[j] * at_j
             step_z = (wx[i] * wy[j]) * along_z
-            wp.atomic_add(node_sum, e, first, wz[0] * line)
-            wp.atomic_add(node_sum, e, first + 1, wz[1] * (line + step_z))
-            wp.atomic_add(node_sum, e, first + 2, wz[2] * (line + 2.0 * step_z))
+            at = line_of_records(slab, base, j)
+            wp.atomic_add(sums.value, e, at[0], wz[0] * line)
+            wp.atomic_add(sums.value, e, at[1], wz[1] * (line + step_z))
+            wp.atomic_add(sums.value, e, at[2], wz[2] * (line + 2.0 * step_z))
             at_j += wx[i] * along_y
         at_i += along_x
-    shared = contact.num_fields > 1 and fields_around(grid, base, e, active) != (1 << field)
-    if shared or nearest_boundary(boundaries, e, moving.x[e, p]) < NEAR_PARTICLE * grid.dx:
-        for i in range(3):
-            for j in range(3):
-                first = of_field + node_index(grid, base[0] + i, base[1] + j, base[2])
-                for l in range(3):
-                    d = grid.dx * (wp.vec3(float(i), float(j), float(l)) - f)
-                    wp.atomic_add(node_offset, e, first + l, (wx[i] * wy[j] * wz[l] * m) * d)
+    if tells_place(grid, particles, boundaries, contact, blocks, e, p, moving.x[e, p], base):
+        scatter_offsets(grid, blocks, sums, e, field, particles.seam[p], s)
 
 
 @wp.func
@@ -175,49 +178,57 @@ def fault_of(grid: Grid, step: Step, F: wp.mat33, advection: wp.vec3, at: wp.vec
     return 0
 
 
-@wp.kernel
-def grid_to_particles(
+@wp.struct
+class Gathered:
+    """A particle at the end of a substep; see :class:`piavatar_envs.mpm.types.State`."""
+
+    fault: int  # why it cannot go on: bits FAILURE_*; then it stays as it is
+    x: wp.vec3
+    u: wp.vec3
+    C: wp.mat33
+    F: wp.mat33
+
+
+@wp.func
+def gather(
     grid: Grid,
     step: Step,
     particles: Particles,
     boundaries: Boundaries,
     node_velocity: wp.array2d(dtype=vec8),
-    vk: wp.array2d(dtype=wp.vec3),
-    # in and out
-    x: wp.array2d(dtype=wp.vec3),
-    u: wp.array2d(dtype=wp.vec3),
-    C: wp.array2d(dtype=wp.mat33),
-    F: wp.array2d(dtype=wp.mat33),
-    next_active: wp.array2d(dtype=int),
+    blocks: Blocks,
+    moved: Moving,
     failure: wp.array(dtype=int),
+    e: int,
+    p: int,
 ):
-    """Gather velocities and gradients; advance position and deformation; mark blocks for the next substep.
+    """Particle ``p`` from the nodes: velocities and gradients, and with them position and deformation.
+
+    The blocks that it comes to are marked for the next substep.
 
     A particle is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking
     exact (1e-5 m against 1e-2 m). What the grid did not see is projected out of the boundaries.
     """
-    e, p = wp.tid()
-    if failure[e] != 0:
-        return
-    xg = grid_position(grid, x[e, p])
+    xg = grid_position(grid, moved.x[e, p])
     base = base_node(xg)
     f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
     wx = spline(f[0])
     wy = spline(f[1])
     wz = spline(f[2])
-    of_field = particles.field[p] * grid.num_nodes
+    field = particles.field[p]
     mean = vec8()
     moment_x = vec8()
     moment_y = vec8()
     moment_z = vec8()
     for i in range(3):
         plane = vec8()
+        slab = slab_records(grid, blocks, e, field, base, i)
         for j in range(3):
-            first = of_field + node_index(grid, base[0] + i, base[1] + j, base[2])
+            at_line = line_of_records(slab, base, j)
             w = wx[i] * wy[j]
-            second = (w * wz[1]) * node_velocity[e, first + 1]
-            third = (w * wz[2]) * node_velocity[e, first + 2]
-            line = (w * wz[0]) * node_velocity[e, first] + second + third
+            second = (w * wz[1]) * read_record(node_velocity, e, at_line[1])
+            third = (w * wz[2]) * read_record(node_velocity, e, at_line[2])
+            line = (w * wz[0]) * read_record(node_velocity, e, at_line[0]) + second + third
             plane += line
             moment_y += float(j) * line
             moment_z += second + 2.0 * third
@@ -233,21 +244,45 @@ def grid_to_particles(
     velocity = wp.vec3(mean[1], mean[2], mean[3])
     advection = velocity
     if step.decoupling == SPLIT or step.decoupling == NO_STRESS:
-        unseen = vk[e, p] - wp.vec3(mean[4], mean[5], mean[6])
+        unseen = moved.vk[e, p] - wp.vec3(mean[4], mean[5], mean[6])
         seen = velocity + wp.vec3(mean[4], mean[5], mean[6])
         if mean[7] > 0.0:
-            unseen = remove_approach(boundaries, e, x[e, p], unseen, CONTACT_GATE * grid.dx)
+            unseen = remove_approach(boundaries, e, moved.x[e, p], unseen, CONTACT_GATE * grid.dx)
         advection = seen + unseen
-    F_next = advance_deformation(
-        F[e, p], grad_v, grad_vk, step.dt, wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
+    s = Gathered()
+    s.u = velocity
+    s.C = grad_v
+    s.F = advance_deformation(
+        moved.F[e, p], grad_v, grad_vk, step.dt, wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
     )
-    at = x[e, p] + step.dt * advection
-    fault = fault_of(grid, step, F_next, advection, at)
-    if fault != 0:
-        wp.atomic_or(failure, e, fault)
+    s.x = moved.x[e, p] + step.dt * advection
+    s.fault = fault_of(grid, step, s.F, advection, s.x)
+    if s.fault != 0:
+        wp.atomic_or(failure, e, s.fault)
+    else:
+        mark_blocks(grid, blocks, base_node(grid_position(grid, s.x)), field, e, failure)
+    return s
+
+
+@wp.kernel
+def grid_to_particles(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    node_velocity: wp.array2d(dtype=vec8),
+    # in and out; vk is read
+    blocks: Blocks,
+    moved: Moving,
+    failure: wp.array(dtype=int),
+):
+    """Move every particle with the grid, see :func:`gather`."""
+    e, p = wp.tid()
+    if failure[e] != 0:
         return
-    mark_blocks(grid, base_node(grid_position(grid, at)), particles.field[p], e, next_active)
-    x[e, p] = at
-    u[e, p] = velocity
-    C[e, p] = grad_v
-    F[e, p] = F_next
+    s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+    if s.fault == 0:
+        moved.x[e, p] = s.x
+        moved.u[e, p] = s.u
+        moved.C[e, p] = s.C
+        moved.F[e, p] = s.F

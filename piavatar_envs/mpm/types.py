@@ -21,21 +21,29 @@ wp.set_module_options({"enable_backward": False})
 #: A grid node's record: mass [kg], physical momentum (3), kinematic momentum (3), padding. Eight floats are one
 #: vector register on a CPU and one 32-byte sector on a GPU.
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
+#: Records in fixed point, see :mod:`piavatar_envs.mpm.sums`.
+vec16i = wp.types.vector(length=16, dtype=wp.int32)
+vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
 # Why an environment failed: bits of ``State.failure``.
 FAILURE_NONFINITE = 1
 FAILURE_OUT_OF_GRID = 2
 FAILURE_CFL = 4
 FAILURE_ACTION = 8
+FAILURE_BLOCKS = 16
 FAILURE_NAMES: dict[int, str] = {
     FAILURE_NONFINITE: "nonfinite",
     FAILURE_OUT_OF_GRID: "out_of_grid",
     FAILURE_CFL: "cfl",
     FAILURE_ACTION: "action",
+    FAILURE_BLOCKS: "blocks",
 }
 
 #: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.decouple`).
 DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
+#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer` and :mod:`piavatar_envs.mpm.runs`), and
+#: whether sums are in fixed point.
+SCATTERS: dict[str, bool] = {"plain": False, "runs": True, "runs_float": False}
 SPLIT = wp.constant(0)
 PAPER = wp.constant(1)
 NO_STRESS = wp.constant(3)
@@ -56,7 +64,7 @@ class Grid:
     inv_dx: float
     nodes: wp.vec3i  # nodes along x, y, z
     blocks: wp.vec3i  # blocks of 4 x 4 x 4 nodes along x, y, z
-    num_nodes: int  # of one velocity field
+    num_blocks: int
 
 
 @wp.struct
@@ -100,10 +108,11 @@ class Contact:
 class Sensors:
     """What contact did in this control step, and at the nodes in this substep."""
 
+    sums: wp.array2d(dtype=wp.int64)  # (num_envs, 3 * entries) see :mod:`piavatar_envs.mpm.impulses`
     boundary_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S) impulse of the colliders on a subject [N s]
     pair_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S * S) on a by b, only a < b [N s]
     part_impulse: wp.array3d(dtype=wp.vec3)  # (num_envs, sensors, S) on the particles of a sensor, by subject [N s]
-    # (num_envs, F * num_nodes) change of velocity by other subjects and the one that did most of it; of shared blocks
+    # (num_envs, records) change of velocity by other subjects and the one that did most of it; of shared blocks
     node: wp.array2d(dtype=wp.vec4)
     penetration: wp.array2d(dtype=float)  # (num_envs, S) deepest particle of a subject inside another [m]
 
@@ -127,8 +136,38 @@ class Boundaries:
 
 
 @wp.struct
+class Blocks:
+    """Where matter is: blocks of 4 x 4 x 4 nodes that hold some have a slot for their nodes' records.
+
+    ``F`` fields, ``B`` blocks of the grid, ``S`` slots. The 64 records of slot ``s`` begin at ``64 s``.
+    """
+
+    fields: wp.array2d(dtype=int)  # (num_envs, B) bit f for matter of field f
+    slot: wp.array2d(dtype=int)  # (num_envs, F * B) slot of a field's block; means something where its bit is set
+    held: wp.array2d(dtype=int)  # (num_envs, S) field * B + block of a slot
+    count: wp.array(dtype=int)  # (num_envs,) slots in use
+    swept: wp.array(dtype=int)  # (num_envs,) slots whose records the last grid pass has written
+
+
+@wp.struct
+class Sums:
+    """What particles add up on nodes, ``(num_envs, 64 S)``, zero between substeps; see :mod:`piavatar_envs.mpm.sums`.
+
+    Either the floating-point or the integer arrays are in use, the others have one entry. Units: ``(rows, F)``.
+    """
+
+    is_fixed: int
+    value: wp.array2d(dtype=vec8)  # mass, physical momentum, kinematic momentum, nothing
+    fixed: wp.array2d(dtype=vec16i)
+    offset: wp.array2d(dtype=wp.vec4)  # sum of w m (x_i - x_p), of w m of seam particles; near others and boundaries
+    offset_fixed: wp.array2d(dtype=vec8i)
+    mass_unit: wp.array2d(dtype=float)  # [kg]
+    momentum_unit: wp.array2d(dtype=float)  # [kg m/s]
+
+
+@wp.struct
 class Moving:
-    """Particle state as the scatter reads it, each of shape ``(num_envs, num_particles)``; see :class:`State`."""
+    """Particle state as the transfers take it, each of shape ``(num_envs, num_particles)``; see :class:`State`."""
 
     x: wp.array2d(dtype=wp.vec3)
     u: wp.array2d(dtype=wp.vec3)
@@ -156,7 +195,8 @@ class Model:
     """Everything that does not change: grid, step, particle constants and boundaries.
 
     ``sound_speed`` is the fastest elastic wave of any particle [m/s]; ``moving_boundaries`` says whether any boundary
-    may have a velocity; ``num_sensors`` counts the rows of the contact sensor.
+    may have a velocity; ``num_sensors`` counts the rows of the contact sensor; ``max_slots`` how many blocks with
+    matter an environment can hold, each field's counted; ``scatter`` is a key of :data:`SCATTERS`.
     """
 
     num_envs: int
@@ -172,16 +212,13 @@ class Model:
     sound_speed: float
     moving_boundaries: bool
     num_sensors: int
-
-    @property
-    def num_nodes(self) -> int:
-        """Grid nodes of one velocity field of one environment."""
-        return int(self.grid.num_nodes)
+    max_slots: int
+    scatter: str
 
     @property
     def num_blocks(self) -> int:
         """Grid blocks of one environment."""
-        return int(np.prod(np.asarray(self.grid.blocks)))
+        return int(self.grid.num_blocks)
 
 
 @dataclass
@@ -201,34 +238,27 @@ class State:
 
 
 @dataclass
-class Nodes:
-    """Grid arrays, ``(num_envs, num_fields * num_nodes)``, rebuilt every substep.
-
-    Attributes:
-        sum: vec8: mass, physical momentum, kinematic momentum, mass of seams. Zero between substeps.
-        offset: vec3: sum of ``w m (x_i - x_p)``, kept near boundaries and other fields only: minus the mass gradient,
-            up to a factor, and where the matter at a node is. Zero between substeps.
-        velocity: vec8: mass, physical velocity, kinematic velocity, 1 near boundaries.
-        facing: vec3: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`; of blocks with
-            several fields only.
-    """
-
-    sum: wp.array
-    offset: wp.array
-    velocity: wp.array
-    facing: wp.array
-
-
-@dataclass
 class Scratch:
     """Grid arrays, rebuilt every substep, and contact sensors.
 
+    A node's records are where its field's block has its slot, see :class:`Blocks`; ``(num_envs, 64 S)``.
+
     Attributes:
-        nodes: records of the nodes.
-        block_fields: ``(2, num_envs, num_blocks)`` int32, bit ``f`` for mass of field ``f``, in even and odd substeps.
+        blocks: which blocks hold matter in this control step, and their slots.
+        sums: what particles have added up.
+        velocity: vec8: mass, physical velocity, kinematic velocity, 1 near boundaries. In blocks with several fields
+            the sums stand here until they have become velocities.
+        facing: vec3: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`; of blocks with
+            several fields only.
+        order: ``(2 * num_envs * num_particles,)`` the particles by cell, and room to sort; of one entry where the
+            scatter does not ask for it. ``keys``: what is sorted by.
         sensors: what contact did in this control step.
     """
 
-    nodes: Nodes
-    block_fields: wp.array
+    blocks: Blocks
+    sums: Sums
+    velocity: wp.array
+    facing: wp.array
+    order: wp.array
+    keys: wp.array
     sensors: Sensors

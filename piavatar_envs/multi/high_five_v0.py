@@ -14,7 +14,8 @@ from pydantic import Field
 from piavatar_envs.api.pettingzoo import AvatarParallelEnv
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
-from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.envs.observations import ObservationTerm, Parameter
+from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.multi.slap import Hands, SlapRule, draw_slap, judge, locate_hand, observe_draws, observe_hands
 from piavatar_envs.multi.together import record_fall_together, record_shift
 from piavatar_envs.tasks.base import Task
@@ -122,6 +123,15 @@ Holding the hands together is not enough: they must swing, at the same moment.""
         if self.config.impulse[0] != self.config.impulse[1]:
             drawn.append(ObservationTerm("least_impulse", 1, "N s", "-", "the weakest slap that counts"))
         return (*self.observation_terms, *drawn)
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        return (
+            Parameter("hand_side", "-", *self.sides, "the hand to raise: 0 the left, 1 the right"),
+            Parameter("least_impulse", "N s", *self.config.impulse, "the weakest slap that counts"),
+        )
+
+    def drawn_values(self, env) -> tuple[Drawn, ...]:
+        return Drawn(self.side), Drawn(self.least)
 
     def action_spec(self) -> ActionSpec:
         return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)

@@ -14,7 +14,8 @@ from pydantic import Field
 from piavatar_envs.api.pettingzoo import AvatarParallelEnv
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import EnvConfig, PropConfig, SceneConfig, replace
-from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.envs.observations import ObservationTerm, Parameter
+from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.multi.passing import PassRule, Play, Serve, judge, keep_near, observe_game, serve_ball
 from piavatar_envs.multi.together import record_fall_together, record_shift
@@ -126,6 +127,12 @@ from its place, so that the ball must be sent, not carried. All are paid alike, 
             ObservationTerm("ball_from_left_foot", 3, "m", "root", "the ball from the left foot's ball"),
             ObservationTerm("ball_from_right_foot", 3, "m", "root", "the ball from the right foot's ball"),
         )
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        return (Parameter("ball_mass", "kg", *self.config.ball_mass, "mass of the ball", log=True),)
+
+    def drawn_values(self, env) -> tuple[Drawn, ...]:
+        return (Drawn(env.simulation.props.density[:, self.index], self.rule.ball_volume),)
 
     def action_spec(self) -> ActionSpec:
         speed = self.config.drive.joint_speed_limit

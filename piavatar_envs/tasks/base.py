@@ -15,11 +15,12 @@ import warp as wp
 from piavatar_envs.avatar.limits import joint_limits
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
-from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.simulation import Domain
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.envs.parameters import Drawn
     from piavatar_envs.mpm.program import Program
     from piavatar_envs.render.scene import Marker
 
@@ -101,6 +102,18 @@ class Task:
     def observed_props(self) -> tuple[str, ...]:
         """Names of the props that agents see."""
         return tuple(prop.name for prop in self.scene.props)
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        """Numbers that the task draws for each episode and that ``observe_parameters`` shows.
+
+        All that changes what will happen, but the bodies' first poses and places, which agents see anyway; also what
+        the task's own terms tell.
+        """
+        return ()
+
+    def drawn_values(self, env: BatchEnv) -> tuple[Drawn, ...]:
+        """Where those numbers are, in the order of :meth:`drawn`; called once, after :meth:`allocate`."""
+        return ()
 
     def action_spec(self) -> ActionSpec:
         """Joints that act, and whether the root does."""

@@ -11,6 +11,28 @@ from piavatar_envs.mpm.types import row
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def offset_of(seed: int, episode: int, interval: int):
+    """How many steps of the first interval are over when an episode begins."""
+    random = generator(seed, episode, STREAM_DISTURBANCE, 0)
+    return wp.randi(random, 0, interval)
+
+
+@wp.kernel
+def draw_offset(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    interval: int,
+    # out
+    offset: wp.array(dtype=int),
+):
+    """The moment of the impulses, to be observed, in the masked environments."""
+    e = wp.tid()
+    if mask[e]:
+        offset[e] = offset_of(seed[e], episode[e], interval)
+
+
 @wp.kernel
 def draw_impulse(
     seed: wp.array(dtype=int),
@@ -27,8 +49,7 @@ def draw_impulse(
     e = wp.tid()
     impulse[e] = wp.vec3(0.0)
     struck[e] = bones[0]
-    start = generator(seed[e], episode[e], STREAM_DISTURBANCE, 0)
-    step = step_count[e] + wp.randi(start, 0, interval)
+    step = step_count[e] + offset_of(seed[e], episode[e], interval)
     if magnitude <= 0.0 or step % interval != interval - 1:
         return
     random = generator(seed[e], episode[e], STREAM_DISTURBANCE, 1 + step)

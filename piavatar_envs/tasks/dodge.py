@@ -14,7 +14,8 @@ from piavatar_envs.avatar.rotation import quat_exp, quat_log
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import EnvConfig, PropConfig, SceneConfig, replace
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
@@ -205,6 +206,17 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
             ObservationTerm("ball_mass", balls, "kg", "-", "mass of each ball"),
             ObservationTerm("place_position", 3, "m", "root", "where the pelvis belongs, from where it is"),
         )
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        mass = self.config.ball_mass
+        return tuple(
+            Parameter(f"ball_{index}_mass", "kg", *mass, f"mass of ball {index}")
+            for index in range(self.config.num_balls)
+        )
+
+    def drawn_values(self, env) -> tuple[Drawn, ...]:
+        density = env.simulation.props.density
+        return tuple(Drawn(density[:, index], self.throws.volume) for index in range(self.config.num_balls))
 
     def action_spec(self) -> ActionSpec:
         config = self.config

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Protocol
 import warp as wp
 
 from piavatar_envs.envs.config import ConfigError, PropConfig, SceneConfig
+from piavatar_envs.envs.observations import Parameter
+from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.gate import Course, Gate, draw_gate, judge_ball, measure_ball, observe_gate
 
@@ -96,6 +98,16 @@ def gate_domain(config: GateConfig, scene: SceneConfig, top: float) -> Domain:
     return body.including((-aside, y - way, 0.0), (aside, 0.0, top + BEHIND))
 
 
+def drawn_goal(config: GateConfig) -> tuple[Parameter, ...]:
+    """What episodes draw of ball and gate."""
+    side = math.sin(config.target_angle)
+    return (
+        Parameter("ball_mass", "kg", *config.ball_mass, "mass of the ball", log=True),
+        Parameter("target_distance", "m", *config.target_distance, "of the gate from where the ball started"),
+        Parameter("target_side", "-", -side, side, "x of the way to the gate, a unit vector: the sine of its angle"),
+    )
+
+
 class Goal:
     """Ball and gate of every environment, and what tasks record about them.
 
@@ -130,6 +142,12 @@ class Goal:
     def arrays(self) -> dict[str, wp.array]:
         """Arrays of a checkpoint."""
         return {name: getattr(self.course, name) for name in ("center", "forward", "length", "last", "best")}
+
+    def drawn_values(self) -> tuple[Drawn, ...]:
+        """Where the parameters of :func:`drawn_goal` are."""
+        density = self.env.simulation.props.density[:, self.index]
+        side = component(self.course.forward, 0)
+        return Drawn(density, self.gate.ball_volume), Drawn(self.course.length), Drawn(side)
 
     def record_reset(self, program: Program) -> None:
         """Append: gates before the balls that ``props.spawn`` has in the masked environments."""

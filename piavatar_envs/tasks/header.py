@@ -13,7 +13,8 @@ from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import DriveConfig, EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.draws import STREAM_BALL, generator
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS
@@ -25,6 +26,7 @@ from piavatar_envs.tasks.goal import (
     Goal,
     ball_config,
     check_range,
+    drawn_goal,
     gate_domain,
 )
 from piavatar_envs.tasks.reach import hand_position
@@ -187,6 +189,12 @@ that all of them but the control cost add up to at most 1, half of it for the go
         scene, config = super().build_scene(), self.config
         height = check_range("ball_height", config.ball_height)[1]
         return replace(scene, props=[ball_config(config, (*config.ball_place, height)), *scene.props])
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        return drawn_goal(self.config)
+
+    def drawn_values(self, env) -> tuple[Drawn, ...]:
+        return self.goal.drawn_values()
 
     def action_spec(self) -> ActionSpec:
         return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)

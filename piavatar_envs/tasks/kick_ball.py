@@ -12,7 +12,8 @@ from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import DriveConfig, EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.draws import STREAM_BALL, generator
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS
@@ -23,6 +24,7 @@ from piavatar_envs.tasks.goal import (
     TERMINATION_DOC,
     Goal,
     ball_config,
+    drawn_goal,
     gate_domain,
 )
 from piavatar_envs.tasks.spawn import record_standing
@@ -167,6 +169,12 @@ that all of them but the control cost add up to at most 1, half of it for the go
         scene = super().build_scene()
         ball = ball_config(self.config, (*self.config.ball_place, self.config.ball_radius))
         return replace(scene, props=[ball, *scene.props])
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        return drawn_goal(self.config)
+
+    def drawn_values(self, env) -> tuple[Drawn, ...]:
+        return self.goal.drawn_values()
 
     def action_spec(self) -> ActionSpec:
         return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)

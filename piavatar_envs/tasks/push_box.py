@@ -12,7 +12,8 @@ from pydantic import Field
 
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import ConfigError, EnvConfig, PropConfig, SceneConfig, replace
-from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.envs.observations import ObservationTerm, Parameter
+from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.leash import record_leash
@@ -140,6 +141,15 @@ of the root, too, which is never more than 0.1 m and 0.3 rad ahead of it."""
         """What is ``distance`` [m] before the avatar's place, ``angle`` [rad] from straight ahead."""
         x, y, yaw = self.place
         return x + distance * math.sin(yaw + angle), y - distance * math.cos(yaw + angle)
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        return (
+            Parameter("box_mass", "kg", *self.config.box_mass, "mass of the box"),
+            Parameter("target_distance", "m", *self.config.target_distance, "of the target from where the box started"),
+        )
+
+    def drawn_values(self, env) -> tuple[Drawn, ...]:
+        return Drawn(env.simulation.props.density[:, self.push.box], self.push.volume), Drawn(self.way)
 
     def action_spec(self) -> ActionSpec:
         joint_speed = self.config.drive.joint_speed_limit

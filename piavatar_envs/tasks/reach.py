@@ -14,7 +14,8 @@ from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import EnvConfig
 from piavatar_envs.envs.draws import STREAM_TASK, generator
-from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
@@ -24,6 +25,9 @@ wp.set_module_options({"enable_backward": False})
 
 _LEFT_WRIST = wp.constant(joint_index("left_wrist"))
 _RIGHT_WRIST = wp.constant(joint_index("right_wrist"))
+#: Middles of the target's swing: azimuth to either side, elevation from and to; its pace from; a whole turn [rad].
+SIDE, BELOW, ABOVE = wp.constant(1.6), wp.constant(-0.7), wp.constant(0.9)
+SLOWEST, TURN = wp.constant(0.3), wp.constant(6.2831853)
 
 
 class ReachConfig(EnvConfig):
@@ -65,12 +69,12 @@ def draw_target(
     if not mask[e]:
         return
     random = generator(seed[e], episode[e], STREAM_TASK, 0)
-    azimuth = wp.randf(random, -1.6, 1.6)
-    elevation = wp.randf(random, -0.7, 0.9)
-    pace = wp.randf(random, 0.3, 1.0)
-    tilt = wp.randf(random, 0.0, 6.2831853)
+    azimuth = wp.randf(random, -SIDE, SIDE)
+    elevation = wp.randf(random, BELOW, ABOVE)
+    pace = wp.randf(random, SLOWEST, 1.0)
+    tilt = wp.randf(random, 0.0, TURN)
     course[e] = wp.vec4(azimuth, elevation, pace, tilt)
-    phase[e] = wp.vec2(wp.randf(random, 0.0, 6.2831853), wp.randf(random, 0.0, 6.2831853))
+    phase[e] = wp.vec2(wp.randf(random, 0.0, TURN), wp.randf(random, 0.0, TURN))
 
 
 @wp.func
@@ -202,6 +206,20 @@ middle of either hand to the target and stay with it."""
     def __init__(self, config: ReachConfig) -> None:
         super().__init__(config)
         self.joints = select_joints(config.joints)
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        return (
+            Parameter("target_azimuth", "rad", -SIDE, SIDE, "middle of the target's swing, from the front"),
+            Parameter("target_elevation", "rad", BELOW, ABOVE, "the same upwards"),
+            Parameter("target_pace", "-", SLOWEST, 1.0, "greatest speed of the target over target_speed"),
+            Parameter("target_tilt", "rad", 0.0, TURN, "direction of the swing: its parts in azimuth and elevation"),
+            Parameter("target_phase_azimuth", "rad", 0.0, TURN, "where the swing in azimuth begins"),
+            Parameter("target_phase_elevation", "rad", 0.0, TURN, "where the swing in elevation begins"),
+        )
+
+    def drawn_values(self, env) -> tuple[Drawn, ...]:
+        course = [component(self.course, n) for n in range(4)]
+        return tuple(Drawn(values) for values in (*course, component(self.phase, 0), component(self.phase, 1)))
 
     def action_spec(self) -> ActionSpec:
         return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)

@@ -16,11 +16,12 @@ from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import EnvConfig
-from piavatar_envs.envs.observations import ObservationTerm, write_rotation, write_vector
+from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_rotation, write_vector
+from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.clip import Clip, advance_reference, draw_start, read_clip
-from piavatar_envs.tasks.disturb import apply_impulse, draw_impulse
+from piavatar_envs.tasks.disturb import apply_impulse, draw_impulse, draw_offset
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 
 wp.set_module_options({"enable_backward": False})
@@ -153,9 +154,22 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         motion = load_motion(config.motion, asset, body)
         steps = max(1, round(config.episode_seconds / dt))
         period = max(1, round(motion.duration / dt))
+        self.interval = max(1, round(config.impulse_interval / dt))
         self.starts = period if config.random_start and motion.loop else 1
         frames = self.starts + steps + 2 if motion.loop else min(period, steps) + 2
         self.rotations, self.roots = motion.sample(np.arange(frames) * dt)
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        dt = self.config.physics.control_dt
+        last = (self.interval - 1) * dt if self.config.impulse > 0.0 else 0.0
+        return (
+            Parameter("motion_start", "s", 0.0, (self.starts - 1) * dt, "where the episode enters the clip"),
+            Parameter("impulse_offset", "s", 0.0, last, "time of the first interval that is over at the start"),
+        )
+
+    def drawn_values(self, env) -> tuple[Drawn, ...]:
+        dt = self.config.physics.control_dt
+        return Drawn(self.start, dt), Drawn(self.offset, dt)
 
     def action_spec(self) -> ActionSpec:
         return ActionSpec(
@@ -192,7 +206,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         self.clip_rotation, self.clip_root = zeros((n, NUM_JOINTS), wp.quat), zeros(n, wp.vec3)
         self.clip_world, self.clip_position = zeros((n, NUM_JOINTS), wp.quat), zeros((n, NUM_JOINTS), wp.vec3)
         self.still = zeros((n, NUM_JOINTS), wp.vec3)
-        self.impulse, self.struck = zeros(n, wp.vec3), zeros(n, int)
+        self.impulse, self.struck, self.offset = zeros(n, wp.vec3), zeros(n, int), zeros(n, int)
         self.bones = wp.array([joint_index(name) for name in STRUCK], dtype=int, device=device)
 
     def arrays(self) -> dict[str, wp.array]:
@@ -206,6 +220,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
             [env.mask, env.seed, env.episode, self.clip, env.simulation.avatar.body],
             [self.start, self.origin, drive.command_rotation, drive.command_root],
         )
+        program.launch(draw_offset, env.num_envs, [env.mask, env.seed, env.episode, self.interval], [self.offset])
 
     def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
         drive, config = env.simulation.avatar.state, self.config
@@ -218,11 +233,10 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
             ],
             [self.reference_rotation, self.reference_root],
         )  # fmt: skip
-        interval = max(1, round(config.impulse_interval / config.physics.control_dt))
         program.launch(
             draw_impulse,
             env.num_envs,
-            [env.seed, env.episode, env.step_count, interval, config.impulse, self.bones],
+            [env.seed, env.episode, env.step_count, self.interval, config.impulse, self.bones],
             [self.impulse, self.struck],
         )
         avatar = env.simulation.avatar

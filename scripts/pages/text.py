@@ -44,6 +44,7 @@ FAILURE_DOCS = {
     "out_of_grid": "the body has left the domain",
     "cfl": "flesh moves too fast for the time step",
     "action": "an action was not finite",
+    "blocks": "the flesh is spread over more blocks of the grid than have memory",
 }
 USAGE = """```python
 import gymnasium as gym
@@ -77,6 +78,7 @@ def entry_page(entry: Entry, facts: Facts) -> str:
             scene_section(facts.task.scene, facts.task.agent_names),
             _actions(facts),
             _observations(facts),
+            _parameters(facts),
             _reward(entry),
             _costs(entry),
             _episode(entry, facts),
@@ -182,6 +184,22 @@ def _observations(facts: Facts) -> str:
             f"that of body parts is {listed(BODY_PARTS)}.",
         ]
     )
+
+
+def _parameters(facts: Facts) -> str:
+    others = " (one's own, then those of the others, counted on from oneself)" if facts.agents else ""
+    text = (
+        "With `observe_parameters=True` the observation ends with the term `parameters`, all that the episode has "
+        "drawn, each from its range to [-1, 1]: the factors of `randomize` and the parameters of random shapes"
+        f"{others}, then what the task draws, and last `clock`, the share of the episode that is over."
+    )
+    drawn = [p for p in facts.task.drawn() if p.low < p.high]
+    rows = [
+        (code(p.name), p.unit, f"{number(p.low)} to {number(p.high)}{', logarithmic' if p.log else ''}", p.description)
+        for p in drawn
+    ]
+    told = table(("drawn by the task", "unit", "range", "meaning"), rows) if rows else ""
+    return page(["## Parameters", text, told])
 
 
 def _named(docs: Mapping[str, str], names: Sequence[str]) -> list[tuple[str, str]]:

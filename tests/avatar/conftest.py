@@ -17,8 +17,9 @@ from piavatar_envs.avatar.sampling import morph, sample_particles, spacing_for
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index, skin
 from piavatar_envs.mpm.boundaries import Collider
-from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
+from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.diagnostics import Totals, totals
+from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import Model, Scratch, State
 
@@ -78,7 +79,7 @@ class Rig:
     def run_part_of_step(self, kernel: str, count: int) -> None:
         """Run a control step up to and with the ``count``-th launch of a kernel."""
         for launch, name in zip(self.step_program._launches, self.step_program._names, strict=True):
-            launch.launch()
+            launch()
             count -= name == kernel
             if count == 0:
                 return

@@ -10,7 +10,10 @@ from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
 
-SETTINGS = [{}, {"shape.randomize": True}]
+VARIED = {"shape.randomize": True, "observe_parameters": True}
+VARIED |= {f"{name}_factor": (0.6, 1.5) for name in ("mass", "stiffness", "ground_friction", "body_friction")}
+SETTINGS = [{}, {"shape.randomize": True}, VARIED, VARIED | {"shape.pool": 3}]
+IDS = ["plain", "random shapes", "all random", "all random, bodies of a pool"]
 
 
 def batch_step(batch, actions) -> dict[str, np.ndarray]:
@@ -21,7 +24,7 @@ def batch_step(batch, actions) -> dict[str, np.ndarray]:
     return {name: getattr(batch, name).numpy().copy() for name in names}
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+@pytest.mark.parametrize("settings", SETTINGS, ids=IDS)
 def test_environment_i_is_the_single_environment_of_seed_plus_i(make_env, make_batch, env_id, equal, settings, device):
     batch, seed = make_batch(env_id, 3, **settings), 21
     steps_a_run = 12 if device == "cpu" else 4  # on a GPU round-off grows with every step of contact
@@ -48,7 +51,7 @@ def test_environment_i_is_the_single_environment_of_seed_plus_i(make_env, make_b
     batch.action.zero_()
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+@pytest.mark.parametrize("settings", SETTINGS, ids=IDS)
 @pytest.mark.parametrize("seeded", [True, False])
 def test_a_masked_reset_touches_its_environments_only(make_batch, env_id, equal, settings, seeded, device):
     batch = make_batch(env_id, 3, **settings)

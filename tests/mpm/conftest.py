@@ -10,9 +10,10 @@ import pytest
 import warp as wp
 
 from piavatar_envs.mpm.boundaries import Collider
-from piavatar_envs.mpm.build import MaterialPoints, allocate, build_model, make_grid
+from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.fields import CONTACT_GATE, Fields
+from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
@@ -77,6 +78,11 @@ class Simulation:
         return self.model.particles.field.numpy() == field
 
     @property
+    def sums_are_clear(self) -> bool:
+        sums = self.scratch.sums
+        return not any(array.numpy().any() for array in (sums.value, sums.fixed, sums.offset, sums.offset_fixed))
+
+    @property
     def failures(self) -> list[int]:
         return self.state.failure.numpy().tolist()
 
@@ -128,12 +134,11 @@ def simulate(device: str) -> Callable[..., Simulation]:
             record_begin(program, model, state, scratch)
         else:  # sensors add up over control steps
             record_marks(program, model, state, scratch)
-        for index in range(model.num_substeps):
-            record_substep(program, model, state, scratch, index)
+        for _ in range(model.num_substeps):
+            record_substep(program, model, state, scratch)
             if pushed:
                 program.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
-        if "fields" in kwargs:
-            record_end(program, model, state, scratch)
+        record_end(program, model, state, scratch)
         return Simulation(model, state, scratch, program, rest, keep, kick).set(x=rest)
 
     return build

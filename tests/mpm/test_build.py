@@ -5,20 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.mpm import build
+from piavatar_envs.mpm import memory
 from piavatar_envs.mpm.boundaries import Collider, make_boundaries
 from piavatar_envs.mpm.build import (
     CFL_STABLE,
     MaterialPoints,
-    allocate,
     build_model,
     check_num_substeps,
     choose_num_substeps,
-    estimate_bytes,
     make_grid,
 )
 from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.materials import MATERIALS, material_index
+from piavatar_envs.mpm.memory import allocate, estimate_bytes
 
 
 def wave_speed(young_modulus, poisson_ratio, density=1000.0):
@@ -95,7 +94,7 @@ def test_model_is_what_was_asked_for(model_of):
     assert list(model.step.gravity) == [0.0, 1.0, -2.0]
     assert model.particles.mass.numpy() == pytest.approx(np.ones((1, 8)))
     state, scratch = allocate(model)
-    assert state.x.shape == (2, 8) and scratch.nodes.sum.shape == (2, model.num_nodes)
+    assert state.x.shape == (2, 8) and scratch.velocity.shape == (2, 64 * model.max_slots)
     assert np.array_equal(state.F.numpy(), np.broadcast_to(np.eye(3), (2, 8, 3, 3)))
 
 
@@ -147,9 +146,25 @@ def test_empty_domain(lower, upper, dx):
 
 
 def test_too_fine_grid():
-    """A node's record is 32 bytes and Warp's strides are 32-bit: 2^31 bytes an environment."""
-    with pytest.raises(ValueError, match=r"nodes exceed 2\^26.*dx larger than 0.001 m"):
-        make_grid((0, 0, 0), (1, 1, 1), 1e-3)
+    with pytest.raises(ValueError, match=r"nodes exceed 2\^30.*dx larger than 0.0009 m"):
+        make_grid((0, 0, 0), (1, 1, 1), 9e-4)
+
+
+def test_slots(model_of):
+    """As many as all particles can touch at once, fewer if asked for; a record's stride is 32-bit."""
+    blocks = model_of().num_blocks
+    assert model_of().max_slots == min(8 * 8, blocks) and model_of(max_slots=5).max_slots == 5
+    for slots in (0, -1):
+        with pytest.raises(ValueError, match=rf"{slots} blocks of nodes.*at least 1"):
+            model_of(max_slots=slots)
+
+
+def test_unknown_scatter_is_refused(model_of, device):
+    with pytest.raises(ValueError, match=r"unknown scatter 'heap'.*plain, runs"):
+        model_of(scatter="heap")
+    if device == "cpu":
+        with pytest.raises(ValueError, match=r"scatter='runs' needs a GPU.*cpu takes 'plain'"):
+            model_of(scatter="runs")
 
 
 def test_domain_lies_inside_its_grid():
@@ -171,9 +186,20 @@ def test_memory_estimate(model_of, fields):
     """Close to what the arrays take."""
     model = model_of(num_envs=3, fields=Fields(tuple(range(fields))))
     state, scratch = allocate(model)
-    arrays = [*vars(state).values(), scratch.block_fields, *vars(scratch.nodes).values()]
-    taken = sum(array.capacity for array in arrays)
-    estimate = estimate_bytes(3, model.num_particles, model.num_nodes, fields)
+    sums, blocks = scratch.sums, scratch.blocks
+    grid = [
+        sums.value,
+        sums.offset,
+        sums.fixed,
+        sums.offset_fixed,
+        scratch.velocity,
+        scratch.facing,
+        scratch.sensors.node,
+    ]
+    grid += [blocks.fields, blocks.slot, blocks.held, scratch.order, scratch.keys]
+    taken = sum(array.capacity for array in [*vars(state).values(), *grid])
+    layout = model.max_slots, fields, model.num_blocks, model.scatter
+    estimate = estimate_bytes(3, model.num_particles, *layout)
     assert taken <= estimate <= 1.25 * taken
 
 
@@ -181,9 +207,9 @@ def test_batch_that_does_not_fit_is_refused(monkeypatch):
     class Small:
         is_cuda, free_memory = True, 2**30
 
-    monkeypatch.setattr(build.wp, "get_device", lambda name: Small())
-    need = estimate_bytes(1, 3000, 50**3)
+    monkeypatch.setattr(memory.wp, "get_device", lambda name: Small())
+    need = estimate_bytes(1, 3000, 300)
     fits = 2**30 // need
-    build.check_memory(fits, 3000, 50**3, "cuda:0")
+    memory.check_memory(fits, 3000, 300, "cuda:0")
     with pytest.raises(ValueError, match=rf"{10 * fits} environments need .* GiB.*num_envs <= {fits}"):
-        build.check_memory(10 * fits, 3000, 50**3, "cuda:0")
+        memory.check_memory(10 * fits, 3000, 300, "cuda:0")

@@ -7,11 +7,14 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.mpm.blocks import held_by, record_of
 from piavatar_envs.mpm.grid import threads_per_block
 from piavatar_envs.mpm.normals import find_facing, shared_normal, surface_gap, volume_at
-from piavatar_envs.mpm.stencil import node_of
-from piavatar_envs.mpm.transfer import mark_particles, particles_to_grid
-from piavatar_envs.mpm.types import Contact, Grid, Moving, group, vec8
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.solver import record_marks, record_scatter
+from piavatar_envs.mpm.stencil import block_corner, node_of_block, node_position
+from piavatar_envs.mpm.sums import offset_at
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, vec8
 
 DX = 0.05
 #: Two bodies that touch in the plane z = 0: first halves of a cube, then a block on a table.
@@ -23,56 +26,68 @@ BLOCK, TABLE = ((-0.1, -0.1, 0.0), (0.1, 0.1, 0.2)), ((-0.3, -0.25, -0.15), (0.3
 def look_at_nodes(
     grid: Grid,
     contact: Contact,
-    active: wp.array2d(dtype=int),
-    node_sum: wp.array2d(dtype=vec8),
-    node_offset: wp.array2d(dtype=wp.vec3),
+    blocks: Blocks,
+    sums: Sums,
+    node_velocity: wp.array2d(dtype=vec8),
     node_facing: wp.array2d(dtype=wp.vec3),
     # out
     volume: wp.array2d(dtype=float),
     normal: wp.array(dtype=wp.vec3),
+    alone: wp.array(dtype=wp.vec3),
     gap: wp.array(dtype=float),
+    position: wp.array(dtype=wp.vec3),
 ):
-    n = wp.tid()
-    m_a = node_sum[0, n][0]
-    m_b = node_sum[0, grid.num_nodes + n][0]
+    """The nodes of the blocks that both fields share, where the first of them has its slot."""
+    slot, local = wp.tid()
+    held = held_by(grid, blocks, 0, slot)
+    if held[0] != 0 or blocks.fields[0, held[1]] != 3:
+        return
+    node = node_of_block(block_corner(grid, held[1]), local)
+    a = record_of(grid, blocks, 0, 0, node[0], node[1], node[2])
+    b = record_of(grid, blocks, 0, 1, node[0], node[1], node[2])
+    m_a = node_velocity[0, a][0]  # not yet velocities
+    m_b = node_velocity[0, b][0]
     if m_a > 0.0 and m_b > 0.0:
+        n = 64 * slot + local
         volume[0, n] = volume_at(grid, contact, 0, 0, m_a)
         volume[1, n] = volume_at(grid, contact, 0, 1, m_b)
-        n_ab = shared_normal(grid, 0, node_of(grid, n), 0, 1, active, node_facing)
-        distance = wp.dot(n_ab, node_offset[0, n] / m_a - node_offset[0, grid.num_nodes + n] / m_b)
+        n_ab = shared_normal(grid, blocks, 0, node, 0, 1, node_facing)
+        of_a = offset_at(grid, sums, 0, 0, a)
+        of_b = offset_at(grid, sums, 0, 1, b)
+        apart = of_a / m_a - of_b / m_b
+        distance = wp.dot(n_ab, wp.vec3(apart[0], apart[1], apart[2]))
         normal[n] = n_ab
+        alone[n] = wp.normalize(wp.vec3(of_a[0] - of_b[0], of_a[1] - of_b[1], of_a[2] - of_b[2]))
         gap[n] = surface_gap(grid, volume[0, n], volume[1, n], distance)
+        position[n] = node_position(grid, node[0], node[1], node[2])
 
 
 class Look:
     """What the nodes that two bodies share see: normals, gaps [m], reduced volumes, positions, and local normals."""
 
     def __init__(self, sim) -> None:
-        model, state, nodes, active = sim.model, sim.state, sim.scratch.nodes, sim.scratch.block_fields[0]
-        device, count = model.device, model.num_nodes
-        moving = group(Moving, x=state.x, u=state.u, C=state.C, F=state.F, vk=state.vk)
-        marks, matter = [model.grid, model.particles, state.x], [model.grid, model.step, model.particles]
-        wp.launch(mark_particles, state.x.shape, marks, [active, state.failure], device=device)
-        matter += [model.boundaries, model.contact, moving, active, state.failure]
-        wp.launch(particles_to_grid, state.x.shape, matter, [nodes.sum, nodes.offset], device=device)
-        slabs = threads_per_block(device)
-        fields = [model.grid, model.contact, slabs, active]
-        found = [nodes.sum, nodes.offset, nodes.facing]
-        wp.launch(find_facing, (1, model.num_blocks, slabs), fields, found, device=device)
-        volume = wp.zeros((2, count), dtype=float, device=device)
-        normal, gap = wp.zeros(count, dtype=wp.vec3, device=device), wp.zeros(count, dtype=float, device=device)
-        wp.launch(
-            look_at_nodes, count, [model.grid, model.contact, active, *found], [volume, normal, gap], device=device
-        )
+        model, state, scratch = sim.model, sim.state, sim.scratch
+        program, threads = Program(model.device), threads_per_block(model.device)
+        record_marks(program, model, state, scratch)
+        record_scatter(program, model, state, scratch)
+        nodes = (1, model.max_slots, threads)
+        found = [scratch.sums, scratch.velocity, scratch.facing]
+        program.launch(find_facing, nodes, [model.grid, model.contact, threads, scratch.blocks], found)
+        count = 64 * model.max_slots
+
+        def zeros(shape, dtype):
+            return wp.zeros(shape, dtype=dtype, device=model.device)
+
+        volume, gap = zeros((2, count), float), zeros(count, float)
+        normal, alone, position = (zeros(count, wp.vec3) for _ in range(3))
+        inputs = [model.grid, model.contact, scratch.blocks, scratch.sums, scratch.velocity, scratch.facing]
+        program.launch(look_at_nodes, (model.max_slots, 64), inputs, [volume, normal, alone, gap, position])
+        program.run()
         a, b = volume.numpy()
         shared = (a > 1e-4) & (b > 1e-4)
         self.weight = (a * b / np.maximum(a + b, 1e-12))[shared]
         self.normal, self.gap = normal.numpy()[shared], gap.numpy()[shared]
-        index = np.array(np.unravel_index(np.flatnonzero(shared), model.grid.nodes)).T
-        self.position = np.asarray(model.grid.origin) + model.grid.dx * index
-        alone = nodes.offset.numpy()[0].reshape(2, count, 3)
-        alone = (alone[0] - alone[1])[shared]
-        self.alone = alone / np.linalg.norm(alone, axis=1, keepdims=True)
+        self.position, self.alone = position.numpy()[shared], alone.numpy()[shared]
 
     def tilt(self, normals: np.ndarray, true: np.ndarray) -> float:
         """Mean angle [deg] to the true normal, each node's as its share of an impulse."""

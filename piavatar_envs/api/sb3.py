@@ -1,0 +1,209 @@
+"""The view of Stable-Baselines3: its ``VecEnv`` over the vector of environments, SAME_STEP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from piavatar_envs.api.vector import AvatarVectorEnv
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as error:
+    message = "Stable-Baselines3 is not installed; install it with: pip install 'piavatar-envs[train]'"
+    raise ImportError(message) from error
+
+#: Indices of environments as Stable-Baselines3 gives them; None for all.
+Indices = int | Iterable[int] | None
+
+
+class SB3VecEnv(VecEnv):
+    """Many environments for ``PPO("MlpPolicy", SB3VecEnv("KickBall-v0", num_envs=64, device="cuda"))``.
+
+    What ends begins anew in the same step: the observation it ended with is ``info["terminal_observation"]``, and
+    ``info["TimeLimit.truncated"]`` says whether only the clock has run out. ``info["is_success"]`` is what
+    Stable-Baselines3 logs as ``rollout/success_rate``; put a ``VecMonitor`` around this for returns and lengths.
+
+    Attributes:
+        vector: the environments.
+    """
+
+    def __init__(
+        self,
+        task: str = "Reach-v0",
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        device: str = "cpu",
+        config: Any = None,
+        num_threads: int | None = None,
+        step_infos: bool = True,
+        **overrides: Any,
+    ) -> None:
+        """Build the environments.
+
+        Args:
+            task: id of the task, with or without the namespace.
+            num_envs: number of environments.
+            render_mode: None or ``"rgb_array"``.
+            device: Warp device, ``"cpu"`` or ``"cuda:0"``; what leaves are NumPy arrays either way.
+            config: settings as a mapping, a YAML file or a configuration.
+            num_threads: threads that share the environments on a CPU; one a core if not given.
+            step_infos: whether ``infos`` tell of every step, or only of the last one of an episode. A thousand
+                dictionaries a step cost more than the thousand environments on a GPU.
+            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+
+        Raises:
+            ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ValueError: an unknown task, render mode or device, or no environments.
+        """
+        self.vector = AvatarVectorEnv(
+            task,
+            num_envs,
+            render_mode,
+            device,
+            config,
+            autoreset_mode=AutoresetMode.SAME_STEP,
+            num_threads=num_threads,
+            **overrides,
+        )
+        self._step_infos = step_infos
+        self._actions: np.ndarray | None = None
+        super().__init__(num_envs, self.vector.single_observation_space, self.vector.single_action_space)
+        self.metadata = {**self.metadata, "render_fps": self.vector.metadata["render_fps"]}
+
+    def reset(self) -> Any:
+        """Begin episodes: of the seed given to :meth:`seed` before, or the next ones.
+
+        Raises:
+            ValueError: options were set; none are known.
+        """
+        if any(self._options):
+            raise ValueError(f"unknown reset options {sorted(set().union(*self._options))}; there are none")
+        observation, infos = self.vector.reset(seed=self._seeds)
+        self.reset_infos = _rows(infos, self.num_envs)
+        self._reset_seeds()
+        return observation
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions ``(num_envs, action_size)`` for :meth:`step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Advance all environments by one control step.
+
+        Returns:
+            Observations, rewards (float32), whether episodes ended, and an info for every environment.
+
+        Raises:
+            ValueError: actions of the wrong shape, or that are not finite; nothing has changed then.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        observation, reward, terminated, truncated, infos = self.vector.step(self._actions)
+        ended = terminated | truncated
+        final, last = infos.pop("final_info", {}), infos.pop("final_obs", None)
+        told = self._step_infos or ended.any()
+        now = _rows(infos, self.num_envs) if told else []
+        rows = [row | {"TimeLimit.truncated": False} if self._step_infos else {} for row in now]
+        rows = rows or [{} for _ in range(self.num_envs)]
+        for env, info in enumerate(_rows(final, self.num_envs)):
+            if ended[env]:
+                self.reset_infos[env] = now[env]
+                rows[env] = info | {
+                    "is_success": info["success"],
+                    "terminal_observation": last[env],
+                    "TimeLimit.truncated": bool(truncated[env] and not terminated[env]),
+                }
+        return observation, reward.astype(np.float32), ended, rows
+
+    def close(self) -> None:
+        """Free what the environments hold."""
+        self.vector.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """A picture of every environment, None without ``render_mode="rgb_array"``."""
+        return self.vector.render() or [None] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """An attribute of the vector, once for every environment: they share it.
+
+        Raises:
+            AttributeError: there is none of this name.
+        """
+        value = getattr(self.vector, _SINGLE.get(attr_name, attr_name))
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Set an attribute of the vector, which all environments share.
+
+        Raises:
+            ValueError: ``indices`` are not all of them.
+        """
+        if set(self._get_indices(indices)) != set(range(self.num_envs)):
+            raise ValueError(f"set_attr({attr_name!r}): environments of a batch share their attributes; leave indices")
+        setattr(self.vector, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any) -> list:
+        """Call what a single environment would have, for some environments: ``reset``, ``render`` and ``get_state``.
+
+        ``env_method("reset", seed=7, indices=2)`` begins an episode in one environment and returns a list of its
+        observation and info, as :meth:`AvatarEnv.reset` does; the others go on.
+
+        Raises:
+            AttributeError: the environments of a batch have no such method of their own.
+        """
+        wanted = list(self._get_indices(indices))
+        if method_name == "reset":
+            return self._reset_some(wanted, *method_args, **method_kwargs)
+        if method_name == "render":
+            frames = self.get_images()
+            return [frames[env] for env in wanted]
+        if method_name == "get_state":
+            state = self.vector.get_state()
+            return [{name: value[env : env + 1] for name, value in state.items()} for env in wanted]
+        raise AttributeError(
+            f"env_method({method_name!r}): environments of a batch are stepped and reset together; they have 'reset', "
+            "'render' and 'get_state', everything else is the vector's: use .vector"
+        )
+
+    def _reset_some(
+        self, envs: Sequence[int], *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> list[tuple[Any, dict[str, Any]]]:
+        """Begin episodes in some environments, each of the same seed or the next one of its own."""
+        if not self.vector.episodes.ready:
+            self.reset()
+        mask = np.zeros(self.num_envs, bool)
+        mask[envs] = True
+        seeds = [seed if held else None for held in mask]
+        observation, infos = self.vector.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
+        rows = _rows(infos, self.num_envs)
+        named = isinstance(observation, dict)
+        own = [{k: v[env] for k, v in observation.items()} if named else observation[env] for env in envs]
+        return [(seen, rows[env]) for seen, env in zip(own, envs, strict=True)]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+        """Whether environments are wrapped: environments of a batch never are."""
+        return [False for _ in self._get_indices(indices)]
+
+
+#: Attributes of a single environment that the vector has under another name.
+_SINGLE = {"action_space": "single_action_space", "observation_space": "single_observation_space"}
+
+
+def _rows(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
+    """Infos in vector format as one dictionary an environment, with what its masks say it has."""
+    rows: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+    for name, mask in infos.items():
+        if not name.startswith("_") or name[1:] not in infos:
+            continue
+        values = infos[name[1:]]
+        if isinstance(values, dict):
+            values = _rows(values, num_envs)
+        elif values.ndim == 1:
+            values = values.tolist()
+        for env in np.flatnonzero(mask):
+            rows[env][name[1:]] = values[env]
+    return rows

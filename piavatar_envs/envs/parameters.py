@@ -1,0 +1,206 @@
+"""What an episode has drawn, as its agents may observe it: with ``observe_parameters`` nothing that is drawn is hidden.
+
+Parameters are written once a reset, normalised to [-1, 1] over the range they were drawn from. An agent sees the
+world's, its own avatar's, those of the others, counted on from itself, then the task's, and last the episode's clock,
+by which what has been drawn for later is known, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.envs.observations import ObservationTerm, Parameter
+from piavatar_envs.envs.simulation import Simulation
+from piavatar_envs.mpm.program import Program
+
+if TYPE_CHECKING:
+    from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.tasks.base import Task
+
+wp.set_module_options({"enable_backward": False})
+
+#: Name of the term.
+PARAMETERS = "parameters"
+CLOCK = Parameter("clock", "-", 0.0, 1.0, "time since the reset over episode_seconds")
+
+
+class Drawn(NamedTuple):
+    """Where the number of a :class:`Parameter` is.
+
+    Attributes:
+        values: of every environment, shape ``(num_envs,)``, float or int.
+        scale: from there to the parameter's unit.
+    """
+
+    values: wp.array
+    scale: float = 1.0
+
+
+def component(vectors: wp.array, index: int) -> wp.array:
+    """One component of an array of vectors ``(num_envs,)``, as a view; the array must outlive it."""
+    return wp.array(
+        ptr=vectors.ptr + 4 * index,
+        dtype=wp.float32,
+        shape=vectors.shape,
+        strides=vectors.strides,
+        device=vectors.device,
+    )
+
+
+class Parameters:
+    """The term :data:`PARAMETERS` of a batch.
+
+    Attributes:
+        term: what an agent observes.
+        values: every parameter of every environment, normalised, shape ``(num_envs, columns)``: the world's, those of
+            each avatar, the task's. None before :meth:`connect`.
+    """
+
+    def __init__(self, simulation: Simulation, task: Task) -> None:
+        self.simulation = simulation
+        world, own = simulation.randomization.parameters()
+        shape = [parameter for parameter, _ in simulation.drawn_shape(0).values()]
+        self._world, self._own, self._task = (_ranging(group) for group in (world, (*own, *shape), task.drawn()))
+        others = [
+            replace(parameter, name=f"other_{index}_{parameter.name}")
+            for index in range(len(simulation.avatars) - 1)
+            for parameter in self._own
+        ]
+        seen = (*self._world, *self._own, *others, *self._task, CLOCK)
+        self.term = ObservationTerm(
+            PARAMETERS, len(seen), "-", "-", f"what the episode has drawn: {_told(seen)}", parameters=seen
+        )
+        self.values: wp.array | None = None
+
+    def connect(self, env: BatchEnv) -> None:
+        """Find the numbers, when the task has allocated its own."""
+        simulation, count = self.simulation, len(self.simulation.avatars)
+        random, device = simulation.randomization, simulation.device
+        sources = [(parameter, Drawn(random.column(parameter.name))) for parameter in self._world]
+        for index in range(count):
+            shape = {name: column for name, (_, column) in simulation.drawn_shape(index).items()}
+            for parameter in self._own:
+                known = parameter.name in shape
+                column = shape[parameter.name] if known else random.column(parameter.name, index)
+                sources.append((parameter, Drawn(column)))
+        of_task = zip(env.task.drawn(), env.task.drawn_values(env), strict=True)
+        sources += [(parameter, drawn) for parameter, drawn in of_task if parameter in self._task]
+        self._sources = sources
+        self.values = wp.zeros((env.num_envs, max(1, len(sources))), dtype=float, device=device)
+        self._columns = [wp.array(self._columns_of(agent, count), dtype=int, device=device) for agent in range(count)]
+
+    def _columns_of(self, agent: int, count: int) -> np.ndarray:
+        """Columns of ``values`` in the order in which an agent observes them."""
+        world, own, task = len(self._world), len(self._own), len(self._task)
+        bodies = [world + (agent + index) % count * own + np.arange(own) for index in range(count)]
+        return np.concatenate([np.arange(world), *bodies, world + count * own + np.arange(task)]).astype(np.int32)
+
+    def record_reset(self, program: Program, mask: wp.array) -> None:
+        """Append, when all has been drawn: normalise the parameters of the masked environments."""
+        for column, (parameter, drawn) in enumerate(self._sources):
+            program.launch(
+                normalize if drawn.values.dtype is wp.float32 else normalize_count,
+                len(mask),
+                [mask, drawn.values, drawn.scale, parameter.low, parameter.high, int(parameter.log), column],
+                [self.values],
+            )
+
+    def record_observe(self, program: Program, env: BatchEnv, agent: int) -> None:
+        """Append: write the term for ``agent``. Changes nothing else."""
+        program.launch(
+            observe_parameters,
+            (env.num_envs, self.term.size),
+            [
+                self.values, self._columns[agent], agent, env.layout[PARAMETERS].slice.start, env.step_count,
+                env.max_steps,
+            ],
+            [env.observation],
+        )  # fmt: skip
+
+    def arrays(self) -> dict[str, wp.array]:
+        """Arrays of a checkpoint, by name."""
+        return {"parameters": self.values}
+
+
+def _ranging(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """Those that have a range: the others are not drawn."""
+    return tuple(parameter for parameter in parameters if parameter.low < parameter.high)
+
+
+def _told(parameters: Sequence[Parameter]) -> str:
+    """Names, ranges and units, in one line."""
+    told = []
+    for p in parameters:
+        unit = "" if p.unit == "-" else f" {p.unit}"
+        told.append(f"{p.name} ({p.low:.4g} to {p.high:.4g}{unit}{', log' if p.log else ''})")
+    return "; ".join(told)
+
+
+@wp.func
+def normalized(value: float, low: float, high: float, log: int):
+    """A parameter from its range to [-1, 1]."""
+    share = (value - low) / (high - low)
+    if log != 0:
+        share = wp.log(value / low) / wp.log(high / low)
+    return wp.clamp(2.0 * share - 1.0, -1.0, 1.0)
+
+
+@wp.kernel
+def normalize(
+    mask: wp.array(dtype=wp.bool),
+    drawn: wp.array(dtype=float),
+    scale: float,
+    low: float,
+    high: float,
+    log: int,
+    column: int,
+    # out
+    values: wp.array2d(dtype=float),
+):
+    """A parameter of the masked environments."""
+    e = wp.tid()
+    if mask[e]:
+        values[e, column] = normalized(scale * drawn[e], low, high, log)
+
+
+@wp.kernel
+def normalize_count(
+    mask: wp.array(dtype=wp.bool),
+    drawn: wp.array(dtype=int),
+    scale: float,
+    low: float,
+    high: float,
+    log: int,
+    column: int,
+    # out
+    values: wp.array2d(dtype=float),
+):
+    """The same of a whole number."""
+    e = wp.tid()
+    if mask[e]:
+        values[e, column] = normalized(scale * float(drawn[e]), low, high, log)
+
+
+@wp.kernel
+def observe_parameters(
+    values: wp.array2d(dtype=float),
+    columns: wp.array(dtype=int),
+    agent: int,
+    start: int,
+    step_count: wp.array(dtype=int),
+    max_steps: int,
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """The parameters of ``columns``, then the clock; over ``(num_envs, components)``."""
+    e, n = wp.tid()
+    if n < columns.shape[0]:
+        observation[e, agent, start + n] = values[e, columns[n]]
+    else:
+        time = float(step_count[e]) / float(max_steps)
+        observation[e, agent, start + n] = 2.0 * wp.min(time, 1.0) - 1.0

@@ -1,0 +1,199 @@
+"""The sparse grid: blocks of 4 x 4 x 4 nodes get room for their nodes' records when matter comes to them.
+
+A block has a bit for every velocity field with matter in it, and a slot for each of those. Slots are given out as
+particles arrive and taken back at the next control step, so memory and time depend on the bodies, not on the empty
+space around them. In which order they are given out is not determined on a GPU; nothing but addresses depends on it.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.stencil import (
+    BLOCK_NODES,
+    base_node,
+    block_index,
+    blocks_touched,
+    grid_position,
+    node_in_block,
+    stencil_inside,
+)
+from piavatar_envs.mpm.types import (
+    FAILURE_BLOCKS,
+    FAILURE_NONFINITE,
+    FAILURE_OUT_OF_GRID,
+    Blocks,
+    Grid,
+    Particles,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+_BLOCKS = wp.constant(FAILURE_BLOCKS)
+_NONFINITE = wp.constant(FAILURE_NONFINITE)
+_OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
+
+
+@wp.func
+def has_field(mask: int, f: int):
+    """Whether bit ``f`` of a block's mask is set."""
+    return ((mask >> f) & 1) != 0
+
+
+@wp.func
+def lowest_field(mask: int, num_fields: int):
+    """First field of a mask; ``num_fields`` if it is empty."""
+    f = int(0)
+    while f < num_fields and not has_field(mask, f):
+        f += 1
+    return f
+
+
+@wp.func
+def end_of_fields(mask: int, num_fields: int):
+    """One more than the last field of a mask; 0 if it is empty."""
+    f = num_fields
+    while f > 0 and not has_field(mask, f - 1):
+        f -= 1
+    return f
+
+
+@wp.func
+def lowest_other(mask: int, f: int, num_fields: int):
+    """First field of a mask that is not ``f``."""
+    other = lowest_field(mask, num_fields)
+    if other == f:
+        other = f + 1
+        while other < num_fields - 1 and not has_field(mask, other):
+            other += 1
+    return other
+
+
+@wp.func
+def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
+    """Fields that have matter in any block of a stencil."""
+    mask = int(0)
+    touched = blocks_touched(base)
+    for i in range(touched[0]):
+        for j in range(touched[1]):
+            for k in range(touched[2]):
+                mask = mask | blocks.fields[e, block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)]
+    return mask
+
+
+@wp.func
+def first_record(grid: Grid, blocks: Blocks, e: int, f: int, block: int):
+    """Record of the first node of a block that holds matter of field ``f``."""
+    return BLOCK_NODES * blocks.slot[e, f * grid.num_blocks + block]
+
+
+@wp.func
+def record_of(grid: Grid, blocks: Blocks, e: int, f: int, i: int, j: int, k: int):
+    """Record of node ``(i, j, k)``, whose block must hold matter of field ``f``."""
+    return first_record(grid, blocks, e, f, block_index(grid, i, j, k)) + node_in_block(i, j, k)
+
+
+@wp.func
+def slab_records(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i, i: int):
+    """Where the nodes ``base + (i, ...)`` of a stencil have their records, for :func:`line_of_records`.
+
+    The slab lies in two blocks along y and two along z; where it does not, the second repeats the first.
+    """
+    block = block_index(grid, base[0] + i, base[1], base[2])
+    lower = first_record(grid, blocks, e, f, block)
+    lower_last = lower
+    upper = lower
+    upper_last = lower
+    if (base[2] & 3) > 1:
+        lower_last = first_record(grid, blocks, e, f, block + 1) - 4
+        upper_last = lower_last
+    if (base[1] & 3) > 1:
+        upper = first_record(grid, blocks, e, f, block + grid.blocks[2])
+        upper_last = upper
+        if (base[2] & 3) > 1:
+            upper_last = first_record(grid, blocks, e, f, block + grid.blocks[2] + 1) - 4
+    in_slab = 16 * ((base[0] + i) & 3) + (base[2] & 3)
+    return wp.vec4i(lower + in_slab, lower_last + in_slab, upper + in_slab, upper_last + in_slab)
+
+
+@wp.func
+def line_of_records(slab: wp.vec4i, base: wp.vec3i, j: int):
+    """Records of the nodes ``base + (i, j, 0..2)`` of a stencil, ``slab`` those of ``i``."""
+    y = (base[1] & 3) + j
+    first = wp.where(y > 3, slab[2], slab[0]) + 4 * (y & 3)
+    last = wp.where(y > 3, slab[3], slab[1]) + 4 * (y & 3)
+    return wp.vec3i(first, wp.where((base[2] & 3) == 3, last, first) + 1, last + 2)
+
+
+@wp.func
+def slots_used(blocks: Blocks, e: int):
+    """Slots of environment ``e`` that mean something, though more may have been asked for."""
+    return wp.min(blocks.count[e], blocks.held.shape[1])
+
+
+@wp.func
+def held_by(grid: Grid, blocks: Blocks, e: int, slot: int):
+    """Field and block that a slot belongs to; -1 and 0 if it is free."""
+    held = wp.vec2i(-1, 0)
+    if slot < slots_used(blocks, e):
+        n = blocks.held[e, slot]
+        held = wp.vec2i(n // grid.num_blocks, n % grid.num_blocks)
+    return held
+
+
+@wp.func
+def mark_blocks(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: int, failure: wp.array(dtype=int)):
+    """See that a field has slots in all blocks that a stencil touches; too few slots flag the environment."""
+    bit = 1 << field
+    touched = blocks_touched(base)
+    for i in range(touched[0]):
+        for j in range(touched[1]):
+            for k in range(touched[2]):
+                block = block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)
+                if (blocks.fields[e, block] & bit) == 0:
+                    before = wp.atomic_or(blocks.fields, e, block, bit)
+                    if (before & bit) == 0:
+                        slot = wp.atomic_add(blocks.count, e, 1)
+                        if slot < blocks.held.shape[1]:
+                            blocks.held[e, slot] = field * grid.num_blocks + block
+                            blocks.slot[e, field * grid.num_blocks + block] = slot
+                        else:
+                            wp.atomic_and(blocks.fields, e, block, ~bit)
+                            wp.atomic_or(failure, e, _BLOCKS)
+
+
+@wp.kernel
+def forget_blocks(grid: Grid, blocks: Blocks):
+    """No block holds matter; the slots are taken back by :func:`free_slots`."""
+    e, slot = wp.tid()
+    if slot < slots_used(blocks, e):
+        blocks.fields[e, blocks.held[e, slot] % grid.num_blocks] = 0
+
+
+@wp.kernel
+def free_slots(blocks: Blocks):
+    """No slot is in use."""
+    blocks.count[wp.tid()] = 0
+
+
+@wp.kernel
+def mark_particles(
+    grid: Grid,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    # in and out
+    blocks: Blocks,
+    failure: wp.array(dtype=int),
+):
+    """Mark the blocks of all particles, wherever they have been put; one outside the grid flags its environment."""
+    e, p = wp.tid()
+    if failure[e] != 0:
+        return
+    if not wp.isfinite(wp.length_sq(x[e, p])):
+        wp.atomic_or(failure, e, _NONFINITE)
+        return
+    base = base_node(grid_position(grid, x[e, p]))
+    if not stencil_inside(grid, base):
+        wp.atomic_or(failure, e, _OUT_OF_GRID)
+        return
+    mark_blocks(grid, blocks, base, particles.field[p], e, failure)

@@ -1,0 +1,184 @@
+"""Memory of a simulation: how many blocks of nodes it may come to need, what that takes, and getting it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
+from piavatar_envs.mpm.sums import units
+from piavatar_envs.mpm.types import (
+    SCATTERS,
+    Blocks,
+    Grid,
+    Model,
+    Scratch,
+    Sensors,
+    State,
+    Sums,
+    group,
+    vec8,
+    vec8i,
+    vec16i,
+)
+
+#: Blocks with matter that a body may come to need, over those that it needs at rest. Random poses of the embedded body
+#: took 1.2 times as many at most.
+SLOT_MARGIN = 2.0
+
+
+def bound_slots(max_slots: int | None, field: np.ndarray, grid: Grid, num_fields: int) -> int:
+    """Slots of an environment: as asked for, at most what its particles, of velocity fields ``field``, touch at once.
+
+    Raises:
+        ValueError: there is none, or their records take more bytes than Warp's 32-bit strides can count.
+    """
+    count = np.bincount(field, minlength=num_fields)
+    most = int(np.minimum(8 * count, grid.num_blocks).sum())
+    slots = most if max_slots is None else min(max_slots, most)
+    if not 1 <= slots < 2**31 // (32 * BLOCK**3):
+        raise ValueError(
+            f"{slots} blocks of nodes an environment: use at least 1 and less than 2^20 (a coarser dx, or max_slots)"
+        )
+    return slots
+
+
+def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin: float = SLOT_MARGIN) -> int:
+    """Slots that bodies will need, from how many they take where they are at rest.
+
+    Args:
+        rest: positions of the particles [m], shape ``(num_particles, 3)``; how bodies lie to each other is immaterial.
+        field: their velocity fields, shape ``(num_particles,)``; the first for all if not given.
+        dx: grid spacing [m].
+        margin: how many times as many slots a body may come to need, in another pose or shape.
+    """
+    field = np.zeros(len(rest), int) if field is None else field
+    corners = np.array(np.meshgrid([0, 2], [0, 2], [0, 2])).reshape(3, -1).T
+    needed = 0
+    for index in np.unique(field):
+        base = np.floor(rest[field == index] / dx - 0.5).astype(int)
+        counts = []
+        for shift in np.ndindex(2, 2, 2):  # the grid may lie to the body as it likes
+            touched = (base[:, None] + 2 * np.array(shift) + corners) // BLOCK
+            counts.append(len(np.unique(touched.reshape(-1, 3), axis=0)))
+        needed += math.ceil(margin * max(counts)) + 8
+    return needed
+
+
+def estimate_bytes(
+    num_envs: int, num_particles: int, max_slots: int, num_fields: int = 1, num_blocks: int = 0, scatter: str = "plain"
+) -> int:
+    """Device memory of state and scratch [bytes].
+
+    108 B a particle, 24 more where they are sorted; 80 B a node of a slot, 48 more in fixed point, 28 more where there
+    are several fields; the map of blocks.
+    """
+    node = (32 + 16) * (1 + SCATTERS[scatter]) + 32 + (16 + 12 if num_fields > 1 else 0)
+    particle = 108 + (0 if scatter == "plain" else 24)
+    slots = max_slots * (BLOCK**3 * node + 4)
+    return num_envs * (num_particles * particle + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
+
+
+def check_memory(
+    num_envs: int,
+    num_particles: int,
+    max_slots: int,
+    device: str,
+    num_fields: int = 1,
+    num_blocks: int = 0,
+    scatter: str = "plain",
+) -> None:
+    """Refuse a batch that does not fit.
+
+    Raises:
+        ValueError: the estimate exceeds the free memory of a CUDA device.
+    """
+    target = wp.get_device(device)
+    if not target.is_cuda:
+        return
+    need = estimate_bytes(num_envs, num_particles, max_slots, num_fields, num_blocks, scatter)
+    if need > target.free_memory:
+        fits = int(num_envs * target.free_memory / need)
+        raise ValueError(
+            f"{num_envs} environments need {need / 2**30:.1f} GiB, {target} has {target.free_memory / 2**30:.1f} GiB "
+            f"free; use num_envs <= {fits} or a coarser fidelity"
+        )
+
+
+def allocate(model: Model) -> tuple[State, Scratch]:
+    """Zeroed state (identity deformation) and scratch."""
+    particles = (model.num_envs, model.num_particles)
+    identity = np.broadcast_to(np.eye(3, dtype=np.float32), (*particles, 3, 3))
+    state = State(
+        x=_zeros(model, particles, wp.vec3),
+        u=_zeros(model, particles, wp.vec3),
+        C=_zeros(model, particles, wp.mat33),
+        F=wp.array(np.ascontiguousarray(identity), dtype=wp.mat33, device=model.device),
+        vk=_zeros(model, particles, wp.vec3),
+        failure=_zeros(model, model.num_envs, int),
+    )
+    records = (model.num_envs, int(BLOCK_NODES) * model.max_slots)
+    shared = records if model.contact.num_fields > 1 else (1, 1)
+    sort = 1 if model.scatter == "plain" else 2 * int(np.prod(particles))
+    scratch = Scratch(
+        blocks=allocate_blocks(model),
+        sums=allocate_sums(model, records),
+        velocity=_zeros(model, records, vec8),
+        facing=_zeros(model, shared, wp.vec3),
+        order=_zeros(model, sort, int),
+        keys=_zeros(model, sort, wp.int64),
+        sensors=allocate_sensors(model, _zeros(model, shared, wp.vec4)),
+    )
+    return state, scratch
+
+
+def _zeros(model: Model, shape: int | tuple[int, ...], dtype: type) -> wp.array:
+    return wp.zeros(shape, dtype=dtype, device=model.device)
+
+
+def allocate_blocks(model: Model) -> Blocks:
+    """No block holds matter yet."""
+    n, count = model.num_envs, model.num_blocks
+    return group(
+        Blocks,
+        fields=_zeros(model, (n, count), int),
+        slot=_zeros(model, (n, model.contact.num_fields * count), int),
+        held=_zeros(model, (n, model.max_slots), int),
+        count=_zeros(model, n, int),
+        swept=_zeros(model, n, int),
+    )
+
+
+def allocate_sums(model: Model, records: tuple[int, int]) -> Sums:
+    """Zeroed sums of the nodes, and their units."""
+    fixed = SCATTERS[model.scatter]
+    mass, momentum = units(model.contact.density.numpy(), model.grid, model.step)
+    floats, integers = ((1, 1), records) if fixed else (records, (1, 1))
+    return group(
+        Sums,
+        is_fixed=int(fixed),
+        value=_zeros(model, floats, vec8),
+        fixed=_zeros(model, integers, vec16i),
+        offset=_zeros(model, floats, wp.vec4),
+        offset_fixed=_zeros(model, integers, vec8i),
+        mass_unit=wp.array(mass.astype(np.float32), dtype=float, device=model.device),
+        momentum_unit=wp.array(momentum.astype(np.float32), dtype=float, device=model.device),
+    )
+
+
+def allocate_sensors(model: Model, node: wp.array) -> Sensors:
+    """Zeroed contact sensors; ``node`` are their records at the nodes."""
+    n, subjects = model.num_envs, model.contact.num_subjects
+    rows = max(1, model.num_sensors)
+    entries = subjects * (1 + subjects + rows)
+    return group(
+        Sensors,
+        sums=_zeros(model, (n, 3 * entries), wp.int64),
+        boundary_impulse=_zeros(model, (n, subjects), wp.vec3),
+        pair_impulse=_zeros(model, (n, subjects * subjects), wp.vec3),
+        part_impulse=_zeros(model, (n, rows, subjects), wp.vec3),
+        node=node,
+        penetration=_zeros(model, (n, subjects), float),
+    )
