@@ -31,6 +31,10 @@ class EvaluationSettings(BaseModel):
     )
 
 
+#: Workers that are processes of their own.
+MOST_PROCESSES = 256
+
+
 class TrainingConfig(BaseModel):
     """Everything that a training run depends on."""
 
@@ -48,7 +52,10 @@ class TrainingConfig(BaseModel):
     total_steps: int = Field(
         100_000, ge=1, description="control steps to train for, over all workers and their learning agents"
     )
-    num_workers: int = Field(4, ge=1, le=256, description="environments, each in a process of its own")
+    num_workers: int = Field(4, ge=1, le=16_384, description="environments, each in a process of its own")
+    vector: bool = Field(
+        False, description="step the environments as one batch (a GPU's, or on the threads of a CPU), not in processes"
+    )
     seed: int = Field(0, ge=0, lt=1000, description="of the networks, the actions and the training episodes")
     checkpoint_every: int = Field(50_000, ge=1, description="control steps between two checkpoints")
     ppo: PPOSettings = Field(default_factory=PPOSettings, description="the algorithm")
@@ -101,6 +108,10 @@ def load_training(
         raise ConfigError(f"env: obs_mode={env.obs_mode!r} must be 'flat' to train; choose terms with observe")
     if config.selfplay and not config.is_multi:
         raise ConfigError(f"selfplay is given, but env_id={config.env_id!r} has one agent; use a world such as sumo_v0")
+    if config.vector and config.is_multi:
+        raise ConfigError(f"vector is for one agent; env_id={config.env_id!r} is a world of several")
+    if config.num_workers > MOST_PROCESSES and not config.vector:
+        raise ConfigError(f"num_workers={config.num_workers} must be <= {MOST_PROCESSES} processes; use vector=true")
     batch, rollout = config.ppo.batch_size, config.num_workers * config.ppo.rollout_steps
     if batch > rollout:
         raise ConfigError(

@@ -23,7 +23,7 @@ from agents.evaluate import Evaluation, evaluate, policy_agent
 from agents.learning import Curve, begin, learn
 from agents.parallel import AgentVecEnv
 from agents.report import draw_curve, show_matches, show_table, versions, write_results
-from agents.workers import EnvFacts, components, factory, prepare, start_workers
+from agents.workers import EnvFacts, components, factory, prepare, start_vector, start_workers
 from piavatar_envs.envs.config import ConfigError, dump_yaml, parse_assignments
 
 Results = Sequence[Evaluation] | Sequence[matches.Match]
@@ -113,7 +113,7 @@ def main(args: list[str] | None = None) -> None:
         components(facts.layout, config.observe)
     except ConfigError as error:
         sys.exit(f"error: {error}")
-    workers = start_workers(make, config.num_workers)
+    workers = start_vector(config, options.device) if config.vector else start_workers(make, config.num_workers)
     run = train_selfplay if config.selfplay else train_together if config.is_multi else train_single
     try:
         curve, results = run(config, workers, facts, folder, options.resume)

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from agents.config import TrainingConfig, multi_module
 from agents.parallel import World, WorldFactory
+from piavatar_envs.api.sb3 import SB3VecEnv
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.envs.observations import ObservationLayout
@@ -89,6 +90,16 @@ def start_workers(make: EnvFactory | WorldFactory, num_workers: int) -> VecEnv:
         return DummyVecEnv([make])
     methods = multiprocessing.get_all_start_methods()  # never fork: a copy of a running Warp is not a working one
     return SubprocVecEnv([make] * num_workers, start_method="forkserver" if "forkserver" in methods else "spawn")
+
+
+def start_vector(config: TrainingConfig, device: str = "cpu") -> VecEnv:
+    """The environments of a configuration as one batch, in this process.
+
+    Raises:
+        ValueError: an unknown device, or a batch that does not fit.
+    """
+    torch.set_num_threads(1)  # the environments have the cores; the networks are small
+    return SB3VecEnv(config.env_id, config.num_workers, device=device, config=dict(config.env))
 
 
 def components(layout: ObservationLayout, observe: tuple[str, ...] | None) -> list[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +14,8 @@ from stable_baselines3 import PPO
 from agents import demo, train
 from agents.config import load_training
 from agents.evaluate import evaluate, policy_agent
-from agents.workers import factory, prepare, start_workers
-from piavatar_envs.envs.config import dump_yaml
+from agents.workers import factory, prepare, start_vector, start_workers
+from piavatar_envs.envs.config import ConfigError, dump_yaml
 
 
 @pytest.fixture
@@ -75,6 +76,43 @@ def test_networks_see_only_the_chosen_terms(workers, facts, tmp_path):
     np.testing.assert_array_equal(act(observation[None]), act(changed[None]))
     changed[seen] += 0.5
     assert not np.array_equal(act(observation[None]), act(changed[None]))
+
+
+def test_a_vector_trains_what_workers_train(tiny, workers, facts, tmp_path, device):
+    """The same steps, hence the same networks, bit for bit on a CPU."""
+    venv = start_vector(tiny.model_copy(update={"vector": True}), device)
+    weights = []
+    for own in (workers, venv):
+        model, curve = train.train(tiny, own, facts, tmp_path)
+        assert curve.steps == [15, 30, 45, 60]
+        weights.append(np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()]))
+    agent = policy_agent(model)
+    returns = [evaluate("x", agent, own, 3, 7, progress=False).returns for own in (workers, venv)]
+    venv.close()
+    np.testing.assert_allclose(*returns, rtol=0.0, atol=0.0 if device == "cpu" else 1e-2)
+    np.testing.assert_allclose(*weights, rtol=0.0, atol=0.0 if device == "cpu" else 1e-2)
+
+
+def test_worlds_of_several_are_no_vector():
+    with pytest.raises(ConfigError, match=r"vector is for one agent.*'sumo_v0'"):
+        load_training({"env_id": "sumo_v0", "env": {"fidelity": "tiny"}, "vector": True})
+
+
+def test_a_thousand_processes_are_refused_and_a_thousand_environments_are_not():
+    many = {"env": {"fidelity": "tiny"}, "num_workers": 1000}
+    with pytest.raises(ConfigError, match=r"num_workers=1000 must be <= 256.*vector"):
+        load_training(many)
+    assert load_training(many | {"vector": True}).num_workers == 1000
+
+
+def test_the_published_vector_trains(device, tmp_path):
+    path = Path(__file__).resolve().parents[2] / "configs" / "sb3" / "reach_sb3.yaml"
+    small = (
+        "env.fidelity=tiny", "env.episode_seconds=0.5", "total_steps=64", "num_workers=4", "ppo.rollout_steps=16",
+        "ppo.batch_size=16", "ppo.epochs=1", "evaluation.episodes=2",
+    )  # fmt: skip
+    train.main([str(path), *small, "--out", str(tmp_path), "--device", device])
+    assert load_training(tmp_path / "config.yaml").vector and (tmp_path / "policy.zip").is_file()
 
 
 def test_resuming_goes_on_to_the_total_and_not_beyond(tiny, workers, facts, tmp_path):

@@ -1,0 +1,205 @@
+"""What trainings on one batch have in common, whichever library learns: configuration, command line, evaluation.
+
+A batch advances all its environments in the same kernel launches and hands out tensors on their device. The learning
+itself is in ``agents/skrl_mappo.py`` and ``agents/rsl_ppo.py``.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+import tyro
+from pydantic import AfterValidator, BaseModel, Field
+from rich.console import Console
+
+from agents.config import EvaluationSettings
+from agents.evaluate import Agent, Episode, Evaluation
+from agents.learning import Curve
+from agents.report import draw_curve, show_table, versions, write_results
+from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.doctor import quiet_warp
+from piavatar_envs.envs.config import (
+    FROZEN,
+    ConfigError,
+    EnvConfig,
+    FrozenDict,
+    dump_yaml,
+    load_config,
+    parse_assignments,
+)
+from piavatar_envs.mpm.types import failure_name
+from piavatar_envs.tasks.base import Task
+
+#: Training episodes begin here, above those of evaluations, which no agent was trained on.
+_FIRST_SEED, _SEEDS_A_RUN = 2**30, 2**16
+
+
+class BatchTraining(BaseModel):
+    """What a training on a batch depends on; a library's settings come in a subclass."""
+
+    model_config = FROZEN
+
+    env_id: str = Field(description="registered id, or a module of piavatar_envs.multi such as high_five_v0")
+    env: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
+        default_factory=dict, description="settings of the environment that differ from its defaults"
+    )
+    observe: tuple[str, ...] | None = Field(
+        None, description="terms of the observation that the networks see; null for all of it"
+    )
+    num_envs: int = Field(64, ge=1, le=_SEEDS_A_RUN, description="environments of the batch")
+    iterations: int = Field(100, ge=1, description="rollouts, each followed by an update")
+    seed: int = Field(0, ge=0, lt=1000, description="of the networks, the actions and the training episodes")
+    evaluation: EvaluationSettings = Field(default_factory=EvaluationSettings, description="how agents are compared")
+
+    @property
+    def first_seed(self) -> int:
+        """Seed of the first environment's episodes; environment ``i`` plays those of ``first_seed + i``."""
+        return _FIRST_SEED + _SEEDS_A_RUN * self.seed
+
+
+Training = TypeVar("Training", bound=BatchTraining)
+#: From a training's environment id to the task.
+FindTask = Callable[[str], type[Task]]
+
+
+def load_batched(
+    cls: type[Training],
+    find_task: FindTask,
+    source: Mapping[str, Any] | str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Training:
+    """A resolved configuration: what ``env`` left to the task's defaults is filled in.
+
+    Args:
+        cls: of the library's training.
+        find_task: the task of an environment's id; a ValueError where there is none.
+        source: a YAML file or a mapping.
+        overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
+
+    Raises:
+        ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment.
+    """
+    overrides = dict(overrides or {})
+    for_env = {key[len("env.") :]: overrides.pop(key) for key in list(overrides) if key.startswith("env.")}
+    config = load_config(cls, source, overrides)
+    try:
+        env = load_config(find_task(config.env_id).Config, config.env, for_env)
+    except ValueError as error:
+        raise ConfigError(f"env: {error}" if isinstance(error, ConfigError) else f"env_id: {error}") from None
+    if env.obs_mode != "flat":
+        raise ConfigError(f"env: obs_mode={env.obs_mode!r} must be 'flat' to train; choose terms with observe")
+    return config.model_copy(update={"env": FrozenDict(env.model_dump(mode="json"))})
+
+
+def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Evaluation:
+    """Let an agent play one episode in every environment of a batch, to their ends.
+
+    Args:
+        name: the agent's, for tables.
+        agent: from observations ``(num_envs, num_agents, size)`` to actions ``(num_envs, num_agents, action_size)``.
+        batch: of NumPy arrays; whatever it was playing is given up.
+        first_seed: environment ``i`` plays the episode of ``first_seed + i``.
+    """
+    episodes = [Episode(first_seed + env) for env in range(batch.num_envs)]
+    batch.reset([episode.seed for episode in episodes])
+    distance = batch.task.metrics.index("distance") if "distance" in batch.task.metrics else None
+    success = np.zeros((batch.num_envs, batch.num_agents), bool)
+    playing = np.ones(batch.num_envs, bool)
+    while playing.any():
+        acted = batch.alive()
+        batch.step(agent(batch.observation()))
+        # that of an agent that is out is what it was in its last step
+        success = np.where(acted, batch.read(lambda group: group.success), success)
+        metrics = batch.read(lambda group: group.metrics)
+        rewards, failures = batch.reward(), batch.read(lambda group: group.failure)
+        for env in np.flatnonzero(playing):
+            info: dict[str, Any] = {"success": success[env].all(), "failure": failure_name(int(failures[env]))}
+            if distance is not None:
+                info["distance"] = float(metrics[env, acted[env], distance].mean())
+            if batch.num_agents > 1:
+                info |= {"rewards": rewards[env].astype(np.float64), "successes": success[env].copy()}
+            episodes[env].book(float(rewards[env].mean()), info)
+        playing &= ~batch.find_ended()
+    return Evaluation(name, episodes)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a library hands back.
+
+    Attributes:
+        agent: the trained policy's mean action, as :func:`play` takes it.
+        curve: returns of the training episodes.
+    """
+
+    agent: Agent
+    curve: Curve
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train agents on one batch of environments, and evaluate them."""
+
+    #: YAML file with what differs from the defaults
+    config: tyro.conf.Positional[Path]
+    #: settings that win over the file: iterations=10 env.fidelity=tiny num_envs=256
+    settings: tyro.conf.Positional[tuple[str, ...]] = ()
+    #: folder to write to; by default runs/ and the name of the file
+    out: Path | None = None
+    #: where to simulate and to learn
+    device: str = "cpu"
+
+
+def run(
+    name: str,
+    cls: type[Training],
+    find_task: FindTask,
+    learn: Callable[[Training, Task, Path, str], Learned],
+    args: list[str] | None = None,
+) -> None:
+    """The command line of a script: train as a file says, evaluate, leave ``results.json`` and a curve.
+
+    Args:
+        name: of the script.
+        cls: its configuration.
+        find_task: the task of an environment's id.
+        learn: trains; given the configuration, the task, the folder to write to and the device.
+        args: command line, by default the process's own.
+    """
+    options = tyro.cli(Options, prog=f"python -m agents.{name}", args=args)
+    quiet_warp()
+    try:
+        config = load_batched(cls, find_task, options.config, parse_assignments(options.settings))
+        task = new_task(config, find_task)
+        folder = options.out or Path("runs") / options.config.stem
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
+        learned = learn(config, task, folder, options.device)
+    except ConfigError as error:
+        sys.exit(f"error: {error}")
+    batch = BatchedEpisodes(new_task(config, find_task), config.evaluation.episodes, options.device)
+    shape = (batch.num_envs, batch.num_agents, batch.action_size)
+    players: dict[str, Agent] = {"zero": lambda observation: np.zeros(shape, np.float32), "trained": learned.agent}
+    results = [play(player, agent, batch, config.evaluation.first_seed) for player, agent in players.items()]
+    batch.close()
+    learned.curve.save(folder / "curve.csv")
+    bands = {result.agent: result.estimate() for result in results}
+    draw_curve(folder / "curve.png", learned.curve.steps, learned.curve.returns, bands, config.env_id)
+    about = versions(name, options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
+    extra = {"training_s": learned.curve.seconds, "num_envs": config.num_envs, "agents": task.agent_names}
+    write_results(folder / "results.json", about, results, extra)
+    console = Console(highlight=False, soft_wrap=True)
+    show_table(results, console)
+    console.print(f"in {folder}: policy.pt, curve.png, curve.csv, config.yaml, results.json")
+
+
+def new_task(config: BatchTraining, find_task: FindTask) -> Task:
+    """The task of a resolved configuration; every batch needs one of its own, which holds its arrays."""
+    task_class = find_task(config.env_id)
+    settings: EnvConfig = load_config(task_class.Config, config.env)
+    return task_class(settings)

@@ -1,0 +1,155 @@
+"""PPO by rsl_rl on a batch of environments: ``python -m agents.rsl_ppo configs/rsl_rl/reach_rsl.yaml``.
+
+Leaves in the folder: the resolved configuration, the networks, TensorBoard's files and rsl_rl's checkpoints, the
+learning curve, and the evaluation.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, Field
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils.log_writer import LogWriter
+from torch.utils.tensorboard import SummaryWriter
+
+from agents.batches import BatchTraining, Learned, run
+from agents.evaluate import Agent
+from agents.learning import Curve
+from piavatar_envs.api.rsl_rl import AvatarRslEnv
+from piavatar_envs.envs.config import FROZEN
+from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks.base import Task
+
+
+class RslPPOSettings(BaseModel):
+    """Hyper-parameters of rsl_rl's PPO."""
+
+    model_config = FROZEN
+
+    rollout_steps: int = Field(32, ge=2, description="steps of every environment between two updates")
+    epochs: int = Field(8, ge=1, description="passes over a rollout")
+    minibatches: int = Field(4, ge=1, description="minibatches in a pass")
+    learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's first learning rate [-]")
+    desired_kl: float | None = Field(
+        0.01, gt=0.0, description="divergence of an update to which the learning rate adapts [-]; null for a fixed rate"
+    )
+    discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
+    gae_lambda: float = Field(0.8, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
+    clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
+    value_weight: float = Field(1.0, ge=0.0, description="weight of the critic's squared error [-]")
+    entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
+    largest_gradient: float = Field(1.0, gt=0.0, description="norm to which gradients are clipped [-]")
+    action_std: float = Field(0.6, gt=0.0, description="standard deviation of the first actions [-]")
+    normalize_observation: bool = Field(False, description="whether networks see observations by running statistics")
+    hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of both networks")
+
+
+class RslTraining(BatchTraining):
+    """Everything that a training with rsl_rl depends on."""
+
+    env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
+    ppo: RslPPOSettings = Field(default_factory=RslPPOSettings, description="the algorithm")
+
+
+class CurveWriter(LogWriter):
+    """Writes what rsl_rl reports for TensorBoard, and keeps the mean return of the latest 100 training episodes."""
+
+    def __init__(self, log_dir: str, steps_an_iteration: int) -> None:
+        self.curve, self.steps_an_iteration = Curve(), steps_an_iteration
+        self._events = SummaryWriter(log_dir=log_dir)
+
+    def add_scalar(self, tag: str, scalar_value: Any, global_step: int) -> None:
+        """Log a number of an iteration."""
+        self._events.add_scalar(tag, scalar_value, global_step)
+        if tag == "Train/mean_reward":
+            self.curve.steps.append(self.steps_an_iteration * (global_step + 1))
+            self.curve.returns.append(float(scalar_value))
+
+    def stop(self) -> None:
+        """Close the file."""
+        self._events.close()
+
+
+def runner_settings(config: RslTraining) -> dict[str, Any]:
+    """The configuration as rsl_rl's runner takes it."""
+    ppo = config.ppo
+    network = {
+        "class_name": "MLPModel",
+        "hidden_dims": list(ppo.hidden),
+        "activation": "tanh",
+        "obs_normalization": ppo.normalize_observation,
+    }
+    spread = {"class_name": "GaussianDistribution", "init_std": ppo.action_std, "std_type": "log"}
+    return {
+        "num_steps_per_env": ppo.rollout_steps,
+        "save_interval": max(1, config.iterations // 10),
+        "logger": {"class_name": CurveWriter, "steps_an_iteration": config.num_envs * ppo.rollout_steps},
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": {**network, "distribution_cfg": spread},
+        "critic": network,
+        "algorithm": {
+            "class_name": "PPO",
+            "num_learning_epochs": ppo.epochs,
+            "num_mini_batches": ppo.minibatches,
+            "learning_rate": ppo.learning_rate,
+            "schedule": "fixed" if ppo.desired_kl is None else "adaptive",
+            "desired_kl": ppo.desired_kl,
+            "gamma": ppo.discount,
+            "lam": ppo.gae_lambda,
+            "clip_param": ppo.clip_range,
+            "value_loss_coef": ppo.value_weight,
+            "entropy_coef": ppo.entropy_weight,
+            "max_grad_norm": ppo.largest_gradient,
+        },
+    }
+
+
+def learn(config: RslTraining, task: Task, folder: Path, device: str) -> Learned:
+    """Train an agent.
+
+    Args:
+        config: resolved.
+        task: of the environments.
+        folder: where to write; exists.
+        device: where to simulate and to learn.
+
+    Raises:
+        ConfigError: there is no such term to observe.
+    """
+    groups = None if config.observe is None else {"policy": config.observe}
+    env = AvatarRslEnv(config.env_id, config.num_envs, device, task.config, groups, config.first_seed)
+    torch.manual_seed(config.seed)
+    runner = OnPolicyRunner(env, runner_settings(config), log_dir=str(folder / "rsl_rl"), device=str(env.device))
+    runner.logger.git_status_repos.clear()  # results.json says which commit; no diffs of whatever repository is around
+    start = time.monotonic()
+    runner.learn(config.iterations, init_at_random_ep_len=True)
+    curve = runner.logger.writer.curve
+    curve.seconds = time.monotonic() - start
+    runner.save(str(folder / "policy.pt"))
+    env.close()
+    return Learned(mean_agent(runner, env), curve)
+
+
+def mean_agent(runner: OnPolicyRunner, env: AvatarRslEnv) -> Agent:
+    """The policy's mean actions, from observations ``(n, 1, size)`` to ``(n, 1, action_size)``."""
+    policy = runner.get_inference_policy(str(env.device))
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return policy(env.grouped(torch.as_tensor(observation, device=env.device)))[:, None].cpu().numpy()
+
+    return act
+
+
+def main(args: list[str] | None = None) -> None:
+    """The command line."""
+    run("rsl_ppo", RslTraining, load_task, learn, args)
+
+
+if __name__ == "__main__":
+    main()

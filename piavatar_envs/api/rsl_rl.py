@@ -1,0 +1,179 @@
+"""The view for rsl_rl: its ``VecEnv`` over a batch, observations as TensorDicts of groups.
+
+::
+
+    from rsl_rl.runners import OnPolicyRunner
+    env = AvatarRslEnv("PIAvatar/Reach-v0", num_envs=4096, device="cuda", seed=0)
+    OnPolicyRunner(env, train_cfg, log_dir="runs/reach", device="cuda").learn(300)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.episode import Settings
+from piavatar_envs.api.same_step import means, step_and_reset
+from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.tasks import load_task
+
+try:
+    import torch
+    from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
+except ImportError as error:
+    raise ImportError("this view needs rsl_rl; install it with: pip install 'piavatar-envs[rsl]'") from error
+
+
+class AvatarRslEnv(VecEnv):
+    """One avatar in each environment, for rsl_rl's runners.
+
+    There is an episode from the start: runners never reset. An environment that ends is reset in the same step; what
+    its last observation was, rsl_rl does not ask (it bootstraps a time-out from the value before the step), but
+    ``extras["final_observations"]`` holds it. All tensors are the caller's own, and live on ``device``.
+
+    Attributes:
+        num_envs, num_actions: numbers of environments and of an action's components.
+        max_episode_length: control steps until the clock runs out.
+        device: torch's, of all tensors.
+        cfg: the settings as plain values, for rsl_rl's loggers.
+        config: the settings.
+        groups: names of the terms in every observation group.
+        episodes: the environments on the device.
+    """
+
+    def __init__(
+        self,
+        task: str = "Reach-v0",
+        num_envs: int = 1,
+        device: str = "cpu",
+        config: Settings = None,
+        groups: Mapping[str, Sequence[str]] | None = None,
+        seed: int | None = None,
+        num_threads: int | None = None,
+        **overrides: Any,
+    ) -> None:
+        """Build the environments, and begin their first episodes.
+
+        Args:
+            task: id of the task, with or without the namespace.
+            num_envs: number of environments.
+            device: Warp device, ``"cpu"`` or ``"cuda:0"``.
+            config: settings as a mapping, a YAML file or a configuration.
+            groups: terms of the observation by observation group, such as ``{"policy": ["target_position"]}``, to be
+                named in the runner's ``obs_groups``. By default all of it is ``policy``; with ``obs_mode="dict"`` every
+                term is a group of its own.
+            seed: environment ``i`` plays the episodes of ``seed + i``; without one they differ every time.
+            num_threads: threads on a CPU; as many as there are cores if not given.
+            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+
+        Raises:
+            ConfigError: a setting that is unknown, of the wrong type or out of range, or an unknown term in a group.
+            ValueError: an unknown task or device, no environments, or a seed outside [0, 2^32).
+        """
+        task_class = load_task(task)
+        self.config = load_config(task_class.Config, config, overrides)
+        self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, "torch", num_threads)
+        self.num_envs, self.num_actions = num_envs, self.episodes.action_size
+        self.device = self.episodes.api.device
+        self.max_episode_length = self.episodes.groups[0].max_steps
+        self.cfg = self.config.model_dump(mode="json")
+        self.groups = self._checked_groups(groups)
+        self.reset(seed)
+
+    def _checked_groups(self, groups: Mapping[str, Sequence[str]] | None) -> dict[str, tuple[str, ...]]:
+        layout = self.episodes.layout
+        if groups is None:
+            by_term = self.config.obs_mode == "dict"
+            return {name: (name,) for name in layout} if by_term else {"policy": tuple(layout)}
+        for group, names in groups.items():
+            unknown = [name for name in names if name not in layout]
+            if unknown or not names:
+                what = f"has no term {unknown[0]!r}" if unknown else "is empty"
+                raise ConfigError(f"groups: {group!r} {what}; use some of {', '.join(layout)}")
+        return {group: tuple(names) for group, names in groups.items()}
+
+    @property
+    def unwrapped(self) -> AvatarRslEnv:
+        """Itself."""
+        return self
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """Name, slice, unit and frame of everything in the flat observation."""
+        return self.episodes.layout
+
+    @property
+    def step_dt(self) -> float:
+        """Time of a control step [s]; rsl_rl's random network distillation asks for it."""
+        return self.config.physics.control_dt
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps since every episode began, ``(num_envs,)`` int64.
+
+        Setting it sets the clocks, as runners do to spread the ends of the first episodes (``init_at_random_ep_len``).
+        """
+        return self.episodes.read(lambda group: group.step_count).long()
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        if tuple(steps.shape) != (self.num_envs,):
+            raise ValueError(f"episode_length_buf has shape {tuple(steps.shape)}, expected {(self.num_envs,)}")
+        clocks = steps.to(self.device).clamp(0, self.max_episode_length - 1)
+        self.episodes.api.write(clocks, [group.step_count for group in self.episodes.groups])
+
+    def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
+        """Begin an episode in every environment; returns the observations and empty extras.
+
+        Args:
+            seed: environment ``i`` plays the episodes of ``seed + i``. Without one, the next of the seed before.
+
+        Raises:
+            ValueError: a seed outside [0, 2^32).
+        """
+        self.episodes.reset(None if seed is None else [seed + index for index in range(self.num_envs)])
+        return self.get_observations(), {}
+
+    def get_observations(self) -> TensorDict:
+        """What the avatars see, by group, each ``(num_envs, size)``."""
+        return self.grouped(self.episodes.observation())
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Advance by one control step.
+
+        Args:
+            actions: ``(num_envs, num_actions)`` float32 on :attr:`device`. A component that is not finite acts as zero
+                and ends its environment with a failure.
+
+        Returns:
+            Observations by group; reward and done (int64), each ``(num_envs,)``; and extras: ``time_outs``
+            ``(num_envs,)`` bool, ``log`` (means of success, metrics and the reward's terms), ``final_observations``
+            (to which the step led, also where an environment was reset), and ``info``, a row an environment.
+
+        Raises:
+            ValueError: actions of a wrong shape, type or device; nothing has changed then.
+        """
+        done = step_and_reset(self.episodes, actions[:, None])
+        extras = {
+            "time_outs": done.truncated[:, 0],
+            "log": means(done.infos, self.episodes.task.metrics),
+            "final_observations": self.grouped(done.final_observation),
+            "info": done.infos[0],
+        }
+        return self.grouped(done.observation), done.reward[:, 0], done.ended.long(), extras
+
+    def grouped(self, observation: torch.Tensor) -> TensorDict:
+        """Flat observations ``(n, 1, observation_size)`` by group, as the runner's networks take them."""
+        layout = self.episodes.layout
+        groups = {
+            group: torch.cat([observation[:, 0, layout[name].slice] for name in names], dim=-1)
+            for group, names in self.groups.items()
+        }
+        return TensorDict(groups, batch_size=[len(observation)], device=self.device)
+
+    def close(self) -> None:
+        """End the threads."""
+        self.episodes.close()

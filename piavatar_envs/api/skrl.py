@@ -1,0 +1,301 @@
+"""The views for skrl: dictionaries of torch tensors, a row an environment. Needs torch; skrl's wrappers do the rest.
+
+One avatar::
+
+    from skrl.envs.wrappers.torch import wrap_env
+    env = wrap_env(AvatarSkrlEnv("PIAvatar/Reach-v0", num_envs=2048, device="cuda"), wrapper="isaaclab-single-agent")
+
+Several, for MAPPO and IPPO::
+
+    from piavatar_envs.multi import high_five_v0
+    env = AvatarSkrlMultiEnv(high_five_v0.TASK, num_envs=1024, device="cuda")
+    env = wrap_env(env, wrapper="isaaclab-multi-agent")
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from piavatar_envs.api import spaces
+from piavatar_envs.api.arrays import Array
+from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.episode import Settings
+from piavatar_envs.api.same_step import Transition, means, step_and_reset
+from piavatar_envs.envs.config import load_config
+from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks.base import Task
+
+
+class AvatarSkrlEnv:
+    """One avatar in each environment, as skrl's wrapper ``"isaaclab-single-agent"`` wants it.
+
+    An environment that ends is reset in the same step: the observation returned is the first of its next episode, and
+    ``info["final_obs"]`` is the last one of the episode, where ``info["_final_obs"]`` is True. Elsewhere the two are
+    the same. All tensors are the caller's own, and live on ``device``.
+
+    Attributes:
+        num_envs: number of environments.
+        device: torch's, of all tensors.
+        single_observation_space: ``{"policy": space}`` of one environment.
+        single_action_space: of one environment.
+        config: the settings.
+        episodes: the environments on the device.
+    """
+
+    def __init__(
+        self,
+        task: str = "Reach-v0",
+        num_envs: int = 1,
+        device: str = "cpu",
+        config: Settings = None,
+        num_threads: int | None = None,
+        **overrides: Any,
+    ) -> None:
+        """Build the environments.
+
+        Args:
+            task: id of the task, with or without the namespace.
+            num_envs: number of environments.
+            device: Warp device, ``"cpu"`` or ``"cuda:0"``.
+            config: settings as a mapping, a YAML file or a configuration.
+            num_threads: threads on a CPU; as many as there are cores if not given.
+            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+
+        Raises:
+            ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ImportError: torch is not installed.
+            ValueError: an unknown task or device, or no environments.
+        """
+        task_class = load_task(task)
+        self.config = load_config(task_class.Config, config, overrides)
+        self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, "torch", num_threads)
+        self.num_envs, self.device = num_envs, self.episodes.api.device
+        self.single_observation_space = gym.spaces.Dict({"policy": self.episodes.observation_space()})
+        self.single_action_space = self.episodes.action_space()
+
+    @property
+    def unwrapped(self) -> AvatarSkrlEnv:
+        """Itself."""
+        return self
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """Name, slice, unit and frame of everything in the flat observation."""
+        return self.episodes.layout
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode in every environment.
+
+        Args:
+            seed: environment ``i`` plays the episodes of ``seed + i``. Without one, the next of the seed before.
+            options: none are known; ignored.
+
+        Returns:
+            ``{"policy": observation}``, the observation ``(num_envs, size)``, or a dictionary of such with
+            ``obs_mode="dict"``; and an empty info.
+
+        Raises:
+            ValueError: a seed outside [0, 2^32).
+        """
+        self.episodes.reset(_consecutive(seed, self.num_envs))
+        return {"policy": self._seen(self.episodes.observation())}, {}
+
+    def step(self, actions: Array) -> tuple[dict[str, Any], Array, Array, Array, dict[str, Any]]:
+        """Advance by one control step.
+
+        Args:
+            actions: ``(num_envs, action_size)`` float32 on :attr:`device`. A component that is not finite acts as zero
+                and ends its environment with a failure.
+
+        Returns:
+            ``{"policy": observation}``, then reward, terminated and truncated, each ``(num_envs,)``, and the info:
+            beside the final observation the task's metrics, ``reward_terms``, ``success``, ``failure`` (bits) and the
+            root's wrench, a row an environment.
+
+        Raises:
+            ValueError: actions of a wrong shape, type or device; nothing has changed then.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        done = step_and_reset(self.episodes, _joint([actions], self.num_envs, self.episodes.action_size))
+        info = {
+            **done.infos[0],
+            "final_obs": {"policy": self._seen(done.final_observation)},
+            "_final_obs": done.ended,
+            "episode": means(done.infos, self.episodes.task.metrics),
+        }
+        outcome = done.reward[:, 0], done.terminated[:, 0], done.truncated[:, 0]
+        return {"policy": self._seen(done.observation)}, *outcome, info
+
+    def _seen(self, observation: Array) -> Any:
+        return self.episodes.named(observation[:, 0])
+
+    def close(self) -> None:
+        """End the threads."""
+        self.episodes.close()
+
+
+class AvatarSkrlMultiEnv:
+    """Several avatars in each environment, dictionaries by agent, as skrl's ``"isaaclab-multi-agent"`` wants them.
+
+    All agents are always there, because the batch is: an agent that is out keeps its rows while the others of its world
+    go on. There its reward is 0, ``terminated`` stays True, its actions are ignored, and it observes what its body,
+    passive by now, would see. A world ends with its last agent, or with its clock (then ``truncated`` is True for those
+    still in), and is reset in the same step. ``infos`` says what a learner must know of that:
+
+    - ``infos["acted"][agent]`` ``(num_envs,)`` bool: the step was the agent's own. Others should not be learned from.
+    - ``infos["alive"][agent]`` ``(num_envs,)`` bool: it acts in the next step.
+    - ``infos["final_obs"][agent]``, ``infos["final_state"]``: to what the step led, also where the world was reset
+      (``infos["_final_obs"]``, ``(num_envs,)`` bool); elsewhere they are what was returned.
+    - ``infos[agent]``: metrics, ``reward_terms``, ``success``, ``failure`` (bits) and the root's wrench, a row a world.
+
+    All tensors are the caller's own, and live on ``device``.
+
+    Attributes:
+        num_envs: number of worlds.
+        device: torch's, of all tensors.
+        possible_agents: names of the agents.
+        observation_spaces, action_spaces: of one world, by agent.
+        state_space: of :meth:`state`, of one world.
+        config: the settings.
+        episodes: the worlds on the device.
+    """
+
+    def __init__(
+        self,
+        task_class: type[Task],
+        num_envs: int = 1,
+        device: str = "cpu",
+        config: Settings = None,
+        num_threads: int | None = None,
+        **overrides: Any,
+    ) -> None:
+        """Build the worlds.
+
+        Args:
+            task_class: the task, such as ``piavatar_envs.multi.high_five_v0.TASK``.
+            num_envs: number of worlds.
+            device: Warp device, ``"cpu"`` or ``"cuda:0"``.
+            config: settings as a mapping, a YAML file or a configuration.
+            num_threads: threads on a CPU; as many as there are cores if not given.
+            **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
+
+        Raises:
+            ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ImportError: torch is not installed.
+            ValueError: an unknown device, or no worlds.
+        """
+        self.config = load_config(task_class.Config, config, overrides)
+        self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, "torch", num_threads)
+        self.num_envs, self.device = num_envs, self.episodes.api.device
+        self.possible_agents = list(self.episodes.task.agent_names)
+        self.action_spaces = {name: self.episodes.action_space() for name in self.possible_agents}
+        self.observation_spaces = {name: self.episodes.observation_space() for name in self.possible_agents}
+        self.state_space = spaces.state_space(self.episodes.groups[0])
+
+    @property
+    def unwrapped(self) -> AvatarSkrlMultiEnv:
+        """Itself."""
+        return self
+
+    @property
+    def agents(self) -> list[str]:
+        """All agents: a world whose last one is out has begun anew."""
+        return list(self.possible_agents)
+
+    @property
+    def num_agents(self) -> int:
+        """Number of agents."""
+        return len(self.possible_agents)
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """Name, slice, unit and frame of everything in an agent's flat observation."""
+        return self.episodes.layout
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode in every world.
+
+        Args:
+            seed: world ``i`` plays the episodes of ``seed + i``. Without one, the next episode of the seed before.
+            options: none are known; ignored.
+
+        Returns:
+            Observations ``(num_envs, size)`` by agent, or dictionaries of such with ``obs_mode="dict"``; and infos.
+
+        Raises:
+            ValueError: a seed outside [0, 2^32).
+        """
+        self.episodes.reset(_consecutive(seed, self.num_envs))
+        return self._seen(self.episodes.observation()), {"alive": self._by_agent(self.episodes.alive())}
+
+    def step(self, actions: Mapping[str, Array]) -> tuple[dict[str, Any], ...]:
+        """Advance by one control step.
+
+        Args:
+            actions: of every agent, ``(num_envs, action_size)`` float32 on :attr:`device`. A component that is not
+                finite acts as zero and ends its world with a failure.
+
+        Returns:
+            Observations, rewards, terminated and truncated (each of the latter ``(num_envs,)``) by agent, and infos.
+
+        Raises:
+            ValueError: actions that are missing, of no agent, or of a wrong shape, type or device; nothing has changed
+                then.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if set(actions) != set(self.possible_agents):
+            raise ValueError(f"actions of {sorted(actions)}; give one for each of {', '.join(self.possible_agents)}")
+        rows = [actions[name] for name in self.possible_agents]
+        done = step_and_reset(self.episodes, _joint(rows, self.num_envs, self.episodes.action_size))
+        flags = (self._by_agent(values) for values in (done.reward, done.terminated, done.truncated))
+        return self._seen(done.observation), *flags, self._infos(done)
+
+    def _infos(self, done: Transition) -> dict[str, Any]:
+        return {
+            **dict(zip(self.possible_agents, done.infos, strict=True)),
+            "acted": self._by_agent(done.acted),
+            "alive": self._by_agent(self.episodes.alive()),
+            "final_obs": self._seen(done.final_observation),
+            "final_state": done.final_observation.flatten(1),
+            "_final_obs": done.ended,
+            "episode": means(done.infos, self.episodes.task.metrics),
+        }
+
+    def state(self) -> Array:
+        """The flat observations of all agents one after the other, ``(num_envs, size)``, for central critics."""
+        self.episodes.check_ready("state")
+        return self.episodes.observation().flatten(1)
+
+    def _seen(self, observation: Array) -> dict[str, Any]:
+        return {name: self.episodes.named(seen) for name, seen in self._by_agent(observation).items()}
+
+    def _by_agent(self, values: Array) -> dict[str, Array]:
+        """``values`` ``(num_envs, num_agents, ...)`` by agent, copies that share nothing."""
+        return {name: values[:, index].clone() for index, name in enumerate(self.possible_agents)}
+
+    def close(self) -> None:
+        """End the threads."""
+        self.episodes.close()
+
+
+def _consecutive(seed: int | None, count: int) -> list[int] | None:
+    """Seeds of ``count`` environments, from the first one's."""
+    return None if seed is None else [seed + index for index in range(count)]
+
+
+def _joint(rows: list[Array], num_envs: int, size: int) -> Array:
+    """Actions ``(num_envs, num_agents, size)`` from those of every agent.
+
+    Raises:
+        ValueError: an agent's have a wrong shape.
+    """
+    import torch
+
+    for row in rows:
+        if tuple(row.shape) != (num_envs, size):
+            raise ValueError(f"an agent's actions have shape {tuple(row.shape)}, expected {(num_envs, size)}")
+    return torch.stack([torch.as_tensor(row) for row in rows], dim=1)

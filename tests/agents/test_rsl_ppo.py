@@ -1,0 +1,74 @@
+"""Training by rsl_rl: the published configurations, and a run of seconds from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extras train and rsl")
+for needed in ("rsl_rl", "tensordict", "git"):
+    pytest.importorskip(needed, reason="needs the extra rsl")
+
+from agents import rsl_ppo  # noqa: E402
+from agents.batches import load_batched, new_task  # noqa: E402
+from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
+from piavatar_envs.tasks import load_task  # noqa: E402
+
+CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "rsl_rl").glob("*.yaml"))
+TINY = (
+    "env.fidelity=tiny", "env.episode_seconds=0.3", "num_envs=2", "iterations=3", "ppo.rollout_steps=8",
+    "ppo.minibatches=2", "ppo.epochs=2", "evaluation.episodes=2",
+)  # fmt: skip
+
+
+def test_there_are_published_configurations():
+    assert CONFIGS
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_published_configurations_train_and_leave_their_results(path, device, tmp_path, capsys):
+    rsl_ppo.main([str(path), *TINY, "--out", str(tmp_path), "--device", device])
+    assert "trained" in capsys.readouterr().out
+    left = {entry.name for entry in tmp_path.iterdir()}
+    assert {"policy.pt", "curve.png", "curve.csv", "config.yaml", "results.json"} <= left
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["benchmark"] == "rsl_ppo" and results["num_envs"] == 2 and results["training_s"] > 0.0
+    assert [row["case"] for row in results["results"]] == ["zero", "trained"]
+    assert np.isfinite([row["return_mean"] for row in results["results"]]).all()
+    steps = [line.split(",")[0] for line in (tmp_path / "curve.csv").read_text().split()[1:]]
+    assert steps == ["16", "32", "48"]
+    again = load_batched(rsl_ppo.RslTraining, load_task, tmp_path / "config.yaml")
+    assert again.iterations == 3 and again.env["physics"]["fidelity"] == "tiny"
+
+
+def test_training_changes_the_policy_repeats_and_depends_on_its_seed(device, tmp_path, capsys):
+    overrides = {"observe": ["target_position"]}
+    for assignment in TINY:
+        name, _, value = assignment.partition("=")
+        overrides[name] = value if name == "env.fidelity" else json.loads(value)
+    actors, agents = {}, {}
+    for name, extra in (("a", {}), ("b", {}), ("c", {"seed": 1}), ("short", {"iterations": 1})):
+        config = load_batched(rsl_ppo.RslTraining, load_task, None, overrides | extra)
+        folder = tmp_path / name
+        folder.mkdir()
+        agents[name] = rsl_ppo.learn(config, new_task(config, load_task), folder, device).agent
+        saved = torch.load(folder / "policy.pt", weights_only=False, map_location="cpu")
+        actors[name] = {key: value for key, value in saved["actor_state_dict"].items() if "weight" in key}
+
+    def apart(one: str, other: str) -> float:
+        return max((actors[one][key] - actors[other][key]).abs().max().item() for key in actors[one])
+
+    assert device != "cpu" or apart("a", "b") == 0.0
+    assert apart("a", "c") > 1e-2 and apart("a", "short") > 1e-5
+    rng = np.random.default_rng(0)
+    layout = BatchedEpisodes(new_task(config, load_task), 1, device).layout
+    seen, changed = rng.normal(size=(2, 4, 1, layout.size)).astype(np.float32)
+    chosen = layout["target_position"].slice
+    changed[..., chosen] = seen[..., chosen]
+    actions = agents["a"](seen)
+    assert actions.shape[:2] == (4, 1) and np.array_equal(agents["a"](changed), actions), "it sees what was chosen"
+    changed[..., chosen] += 1.0
+    assert not np.allclose(agents["a"](changed), actions, atol=1e-3)
