@@ -1,0 +1,122 @@
+"""Clocks and memory of a device: programs as a whole, their kernels one by one, bytes in use."""
+
+from __future__ import annotations
+
+import gc
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.mpm.program import Program
+
+wp.set_module_options({"enable_backward": False})
+
+_HASH = re.compile(r"_[0-9a-f]{8}$")  # Warp's, at the end of a kernel's name
+
+
+@dataclass(frozen=True)
+class KernelTime:
+    """What a kernel took in one run of a program.
+
+    Attributes:
+        ms: time on the device in all of its launches [ms].
+        launches: their number; None where only the sum is known.
+    """
+
+    ms: float
+    launches: int | None
+
+
+def wall_times(device: str, action: Callable[[], object], repeats: int) -> np.ndarray:
+    """Seconds of each of ``repeats`` calls, the device idle before and after; shape ``(repeats,)``."""
+    seconds = np.empty(repeats)
+    for index in range(repeats):
+        wp.synchronize_device(device)
+        start = time.perf_counter()
+        action()
+        wp.synchronize_device(device)
+        seconds[index] = time.perf_counter() - start
+    return seconds
+
+
+def kernel_times(program: Program, repeats: int = 1) -> dict[str, KernelTime]:
+    """Time of each kernel in one run, launched one by one; the state advances by ``repeats`` runs.
+
+    On a GPU the times come from events around each launch. What events around a kernel that does nothing measure is
+    taken off, so launches and the gaps between kernels are not in these times. Library calls (a sort) have no events:
+    theirs are times of the host, less those of a kernel that does nothing. On a CPU all are times of the calls, the
+    median of the runs, because one thread that is interrupted says nothing about a kernel; elsewhere the mean.
+    """
+    device = program.device
+    if not device.is_cuda:
+        runs = [program.timed() for _ in range(repeats)]
+        return {name: KernelTime(1e3 * float(np.median([run[name] for run in runs])), None) for name in runs[0]}
+    nothing = Program(device.alias)
+    for _ in range(200):
+        nothing.launch(do_nothing, 1, [], [])
+    nothing.run_eager()  # the module is loaded outside of what is timed
+    floor = float(np.median(_launch_times(nothing)["do_nothing"]))
+    events: dict[str, list[float]] = {}
+    for _ in range(repeats):
+        for name, launches in _launch_times(program).items():
+            events.setdefault(name, []).extend(launches)
+    found = {
+        name: KernelTime(float(np.maximum(np.array(ms) - floor, 0.0).sum()) / repeats, len(ms) // repeats)
+        for name, ms in events.items()
+    }
+    call = nothing.timed()["do_nothing"] / len(nothing)
+    calls = {name: 1e3 * max(0.0, took - call) for name, took in program.timed().items() if name not in found}
+    return found | {name: KernelTime(ms, None) for name, ms in calls.items()}
+
+
+def _launch_times(program: Program) -> dict[str, list[float]]:
+    """Milliseconds of every launch of an eager run on a GPU, by kernel."""
+    wp.timing_begin(wp.TIMING_ALL)
+    program.run_eager()
+    found: dict[str, list[float]] = {}
+    for result in wp.timing_end():
+        name = result.name.removeprefix("forward kernel ").removeprefix("builtin kernel ")
+        found.setdefault(_HASH.sub("", name), []).append(result.elapsed)
+    return found
+
+
+def array_bytes(device: str) -> int:
+    """Bytes in use: on a GPU those of Warp's memory pool, on a CPU those of the Warp arrays that are alive."""
+    target = wp.get_device(device)
+    if not target.is_cuda:
+        own = (item for item in gc.get_objects() if type(item) is wp.array)  # not fixed arrays in kernels
+        return sum(array.capacity for array in own if array.device == target and array.deleter is not None)
+    wp.synchronize_device(target)  # the pool knows of what is freed when the device has come to it
+    if target.is_mempool_enabled:
+        return int(wp.get_mempool_used_mem_current(target))
+    return target.total_memory - target.free_memory
+
+
+def device_bytes(device: str) -> int | None:
+    """Bytes of a GPU that are not free, whoever has them, as ``nvidia-smi`` counts; None on a CPU."""
+    target = wp.get_device(device)
+    return target.total_memory - target.free_memory if target.is_cuda else None
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process now.
+
+    Raises:
+        RuntimeError: the system does not tell.
+    """
+    try:
+        status = Path("/proc/self/status").read_text(encoding="utf-8")
+    except OSError:
+        raise RuntimeError("resident memory is read from /proc, which this system does not have; use Linux") from None
+    (kilobytes,) = (line.split()[1] for line in status.splitlines() if line.startswith("VmRSS:"))
+    return 1024 * int(kilobytes)
+
+
+@wp.kernel
+def do_nothing():
+    """The price of a launch."""
