@@ -189,8 +189,8 @@ def collide(
     for name in ("free", "damped"):
         program = world.programs[name] = Program(device)
         record_begin(program, model, state, scratch)
-        for _ in range(model.num_substeps):
-            record_substep(program, model, state, scratch)
+        for index in range(model.num_substeps):
+            record_substep(program, model, state, scratch, index)
             if name == "damped":
                 program.launch(damp, state.x.shape, [float(np.exp(-50.0 * model.step.dt)), state.u, state.C])
         record_end(program, model, state, scratch)

@@ -228,8 +228,8 @@ class Crowd:
         for avatar in self.avatars:
             avatar.record_begin(self.once)
             record_drive(avatar, self.once, self.state, 0)
-        for _ in range(self.model.num_substeps):
-            record_substep(self.once, *world)
+        for index in range(self.model.num_substeps):
+            record_substep(self.once, *world, index)
         record_end(self.once, *world)
         for avatar in self.avatars:
             avatar.record_end(self.once, self.state)

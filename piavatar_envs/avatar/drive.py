@@ -162,7 +162,7 @@ def record_control_step(
     for step in range(model.num_substeps):
         for avatar in () if injected else avatars:
             record_drive(avatar, program, state, step)
-        record_substep(program, model, state, scratch)
+        record_substep(program, model, state, scratch, step)
     record_end(program, model, state, scratch)
     for avatar in avatars:
         avatar.record_end(program, state)

@@ -50,7 +50,8 @@ class Fields:
         """Refuse what the grid cannot hold.
 
         Raises:
-            ValueError: too many fields, subjects out of order, a negative friction, an unknown rule for normals.
+            ValueError: too many fields, subjects out of order, a negative friction, an unknown rule for normals, or
+                fields of one subject with different reference densities.
         """
         if self.num_fields > MAX_FIELDS:
             raise ValueError(
@@ -61,6 +62,14 @@ class Fields:
             raise ValueError(f"subjects of the fields {list(self.subject)} must be 0, 1, ... in order")
         if not np.all(np.asarray(self.friction) >= 0.0):
             raise ValueError(f"friction={np.min(self.friction):g} between bodies must not be negative")
+        density = np.broadcast_to(np.asarray(self.density, float), (self.num_fields,))
+        for subject in range(self.num_subjects):
+            own = density[np.array(self.subject) == subject]
+            if np.ptp(own) > 0.0:
+                raise ValueError(
+                    f"density={own.tolist()} of the fields of subject {subject}: fields that grow together share one "
+                    f"reference density"
+                )
         if self.normals not in ("shared", "own"):
             raise ValueError(f"normals={self.normals!r} must be 'shared' or 'own'")
         if not (np.isfinite(self.gate) and self.gate >= 0.0):

@@ -27,6 +27,8 @@ from piavatar_envs.mpm.types import (
 #: Blocks with matter that a body may come to need, over those that it needs at rest. Random poses of the embedded body
 #: took 1.2 times as many at most.
 SLOT_MARGIN = 2.0
+#: Warp's strides are 32-bit: the records of an environment, of 64 bytes at most, take less than 2^31.
+MOST_SLOTS = 2**31 // (64 * BLOCK**3)
 
 
 def bound_slots(max_slots: int | None, field: np.ndarray, grid: Grid, num_fields: int) -> int:
@@ -38,9 +40,10 @@ def bound_slots(max_slots: int | None, field: np.ndarray, grid: Grid, num_fields
     count = np.bincount(field, minlength=num_fields)
     most = int(np.minimum(8 * count, grid.num_blocks).sum())
     slots = most if max_slots is None else min(max_slots, most)
-    if not 1 <= slots < 2**31 // (32 * BLOCK**3):
+    if not 1 <= slots < MOST_SLOTS:
         raise ValueError(
-            f"{slots} blocks of nodes an environment: use at least 1 and less than 2^20 (a coarser dx, or max_slots)"
+            f"{slots} blocks of nodes an environment: use at least 1 and less than {MOST_SLOTS} (a coarser dx, or "
+            f"max_slots)"
         )
     return slots
 

@@ -74,13 +74,14 @@ class Program:
         import time
 
         seconds: dict[str, float] = dict.fromkeys(self._names, 0.0)
-        for _ in range(repeats):
-            for name, launch in zip(self._names, self._launches, strict=True):
-                wp.synchronize_device(self.device)
-                start = time.perf_counter()
-                launch()
-                wp.synchronize_device(self.device)
-                seconds[name] += (time.perf_counter() - start) / repeats
+        with wp.ScopedDevice(self.device):
+            for _ in range(repeats):
+                for name, launch in zip(self._names, self._launches, strict=True):
+                    wp.synchronize_device(self.device)
+                    start = time.perf_counter()
+                    launch()
+                    wp.synchronize_device(self.device)
+                    seconds[name] += (time.perf_counter() - start) / repeats
         return seconds
 
     def _capture(self) -> None:

@@ -4,8 +4,9 @@ What a warp does with them is in :mod:`piavatar_envs.mpm.warp_scatter`. Particle
 step, so that those of the same cell come together; those that have changed cells since are still found, because equal
 cells are matched anywhere in the warp.
 
-In which order a warp adds up depends on the particles' positions alone. With the nodes' sums in fixed point
-(:mod:`piavatar_envs.mpm.sums`) the result does not depend on the schedule of the warps either.
+In which order a warp adds up depends on the particles' positions and on where they lie in the batch. With the nodes'
+sums in fixed point (:mod:`piavatar_envs.mpm.sums`) the result does not depend on the schedule of the warps: the same
+batch repeats bit for bit, as long as no environment fails (one that does stops at a moment that depends on it).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from piavatar_envs.mpm.stencil import base_node, block_index, grid_position, nod
 from piavatar_envs.mpm.stores import store_matrix, store_vector
 from piavatar_envs.mpm.transfer import Gathered, Scattered, gather, prepare, scatters, tells_place
 from piavatar_envs.mpm.types import (
+    FAILURE_CFL,
     FAILURE_NONFINITE,
     Blocks,
     Boundaries,
@@ -31,6 +33,7 @@ from piavatar_envs.mpm.types import (
     State,
     Step,
     Sums,
+    row,
     vec8,
 )
 from piavatar_envs.mpm.warp_scatter import scatter_runs
@@ -38,6 +41,9 @@ from piavatar_envs.mpm.warp_scatter import scatter_runs
 wp.set_module_options({"enable_backward": False})
 
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
+_CFL = wp.constant(FAILURE_CFL)
+#: Units of momentum that a particle may have: those of 4,000 full cells that move a grid spacing in a time step.
+MOST_UNITS = wp.constant(float(2**48))
 #: Threads of a CUDA block: four warps, whose stages and bricks fit the shared memory of a block.
 THREADS = 128
 #: Particles of a block among the 32 of a round that are worth a change of the brick; fewer go to the nodes directly.
@@ -55,10 +61,18 @@ def cell_key(grid: Grid, e: int, field: int, num_fields: int, base: wp.vec3i):
 
 
 @wp.func
-def is_finite(s: Scattered):
-    """Whether all that a particle scatters is a number."""
-    momentum = s.at_base[1] + s.at_base[2] + s.at_base[3]
-    return wp.isfinite(momentum + wp.dot(s.A * wp.vec3(1.0, 1.0, 1.0), wp.vec3(1.0, 1.0, 1.0)))
+def fault_of_sums(s: Scattered, unit: float):
+    """Why a particle must not be added up, bits ``FAILURE_*``: an integer would hide what is no number or too large."""
+    columns = s.A * wp.vec3(1.0, 1.0, 1.0)
+    momentum = wp.vec3(s.at_base[1], s.at_base[2], s.at_base[3])
+    kinematic = wp.vec3(s.at_base[4], s.at_base[5], s.at_base[6])
+    if not wp.isfinite(wp.dot(momentum + kinematic + columns, wp.vec3(1.0, 1.0, 1.0))):
+        return _NONFINITE
+    most = wp.max(wp.max(wp.abs(momentum)), wp.max(wp.abs(kinematic)))
+    for i in range(3):
+        for j in range(3):
+            most = wp.max(most, wp.abs(s.A[i, j]))
+    return wp.where(most > MOST_UNITS * unit, _CFL, 0)
 
 
 @wp.kernel
@@ -94,11 +108,12 @@ def runs_to_grid(
             p = order[at] % per_env
             if scatters(moving, e, p, failure):
                 s = prepare(grid, step, particles, moving, e, p)
-                if is_finite(s):
+                fault = fault_of_sums(s, sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), particles.field[p]])
+                if fault == 0:
                     key = cell_key(grid, e, particles.field[p], contact.num_fields, s.base)
                     tells = tells_place(grid, particles, boundaries, contact, blocks, e, p, moving.x[e, p], s.base)
-                else:  # an integer would hide it
-                    wp.atomic_or(failure, e, _NONFINITE)
+                else:
+                    wp.atomic_or(failure, e, fault)
         scatter_runs(
             grid, blocks, sums, contact.num_fields, WORTH_A_BRICK, n == 0, n == rounds - 1, key, tells,
             particles.seam[p], s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]),

@@ -14,14 +14,22 @@ from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
 from piavatar_envs.mpm.transfer import grid_to_particles, particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
+#: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In so
+#: many substeps nothing moves further than two blocks.
+MARKS_EVERY = 8
+#: Substeps after which particles are sorted again, on a GPU.
+SORT_EVERY = 3 * MARKS_EVERY
 
-def record_substep(program: Program, model: Model, state: State, scratch: Scratch) -> None:
-    """Append a substep of a control step to ``program``.
+
+def record_substep(program: Program, model: Model, state: State, scratch: Scratch, index: int) -> None:
+    """Append substep ``index`` of a control step to ``program``.
 
     The physical velocity, position and deformation in ``state`` advance by ``model.step.dt`` under the kinematic
     velocity ``state.vk``; contact is added to the sensors.
     """
     m, s, blocks, sums = model, state, scratch.blocks, scratch.sums
+    if index > 0 and index % MARKS_EVERY == 0:
+        record_marks(program, model, state, scratch, sort=index % SORT_EVERY == 0)
     record_scatter(program, model, state, scratch)
     threads = threads_per_block(m.device)
     nodes = (m.num_envs, m.max_slots, threads)
@@ -79,17 +87,19 @@ def record_begin(program: Program, model: Model, state: State, scratch: Scratch)
     record_marks(program, model, state, scratch)
 
 
-def record_marks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+def record_marks(program: Program, model: Model, state: State, scratch: Scratch, sort: bool = True) -> None:
     """Append: give slots to the blocks of all particles; the gather of every substep adds those that it comes to.
 
-    What the last control step left is forgotten first: a reset may have put the particles elsewhere, and a block that
-    is marked for nothing costs time and, in its rounding, the equality of runs.
+    The particles are sorted, too, where the scatter asks for it and ``sort`` does not say otherwise.
+
+    What has been is forgotten first: a reset may have put the particles elsewhere, and a block that is marked for
+    nothing costs time and, in its rounding, the equality of runs.
     """
     m, blocks = model, scratch.blocks
     program.launch(forget_blocks, (m.num_envs, m.max_slots), [m.grid], [blocks])
     program.launch(free_slots, m.num_envs, [], [blocks])
     program.launch(mark_particles, state.x.shape, [m.grid, m.particles, state.x], [blocks, state.failure])
-    if m.scatter != "plain":
+    if sort and m.scatter != "plain":
         record_order(program, m, state, scratch)
 
 

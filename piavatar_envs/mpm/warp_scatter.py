@@ -70,7 +70,7 @@ auto put_down = [&](long long of) {
     look_up(of);
     int count = 0;
     for (int t = lane; t < 7 * 32; t += 32) {
-        const bool has = t < BRICK && brick[t] * per_mass >= 0.5f;  // who adds no mass adds nothing
+        const bool has = t < BRICK && brick[t] * per_mass > 0.5f;  // who adds no mass adds nothing
         const unsigned having = __ballot_sync(ALL, has);
         if (has) list[count + __popc(having & ((1u << lane) - 1u))] = (unsigned char)t;
         count += __popc(having);
@@ -151,7 +151,7 @@ while (runs) {
             for (int c = 0; c < 7; ++c) node[c * BRICK] += sum[c];
     } else {
         look_up(of);
-        const bool adds = on && sum[0] * per_mass >= 0.5f;
+        const bool adds = on && sum[0] * per_mass > 0.5f;
         for (int c = 0; c < 7; ++c) {
             add(adds, i, j, k, c, sum[c]);
             if (sums.is_fixed) add(adds, i, j, k, 8 + c, sum[c]);

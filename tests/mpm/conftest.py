@@ -134,8 +134,8 @@ def simulate(device: str) -> Callable[..., Simulation]:
             record_begin(program, model, state, scratch)
         else:  # sensors add up over control steps
             record_marks(program, model, state, scratch)
-        for _ in range(model.num_substeps):
-            record_substep(program, model, state, scratch)
+        for index in range(model.num_substeps):
+            record_substep(program, model, state, scratch, index)
             if pushed:
                 program.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
         record_end(program, model, state, scratch)

@@ -157,6 +157,11 @@ def test_slots(model_of):
     for slots in (0, -1):
         with pytest.raises(ValueError, match=rf"{slots} blocks of nodes.*at least 1"):
             model_of(max_slots=slots)
+    fine = make_grid((0, 0, 0), (4, 4, 4), 0.005)
+    field = np.zeros(10**6, int)
+    assert memory.bound_slots(memory.MOST_SLOTS - 1, field, fine, 1) * 64 * 64 < 2**31
+    with pytest.raises(ValueError, match=rf"{memory.MOST_SLOTS} blocks.*less than {memory.MOST_SLOTS}"):
+        memory.bound_slots(memory.MOST_SLOTS, field, fine, 1)
 
 
 def test_unknown_scatter_is_refused(model_of, device):
