@@ -171,9 +171,22 @@ def forget_blocks(grid: Grid, blocks: Blocks):
 
 
 @wp.kernel
-def free_slots(blocks: Blocks):
+def free_slots(failure: wp.array(dtype=int), blocks: Blocks):
     """No slot is in use."""
-    blocks.count[wp.tid()] = 0
+    e = wp.tid()
+    blocks.count[e] = 0
+    blocks.frozen[e] = failure[e]
+
+
+@wp.kernel
+def freeze(failure: wp.array(dtype=int), blocks: Blocks):
+    """From now on environments that have failed take no part.
+
+    Threads of one launch must not stop at what others of it have found, or what a failed environment is left with would
+    depend on their order.
+    """
+    e = wp.tid()
+    blocks.frozen[e] = failure[e]
 
 
 @wp.kernel
@@ -187,7 +200,7 @@ def mark_particles(
 ):
     """Mark the blocks of all particles, wherever they have been put; one outside the grid flags its environment."""
     e, p = wp.tid()
-    if failure[e] != 0:
+    if blocks.frozen[e] != 0:
         return
     if not wp.isfinite(wp.length_sq(x[e, p])):
         wp.atomic_or(failure, e, _NONFINITE)

@@ -88,6 +88,7 @@ def update_grid(
     boundaries: Boundaries,
     contact: Contact,
     threads: int,
+    failure: wp.array(dtype=int),
     # in and out: sums are read, then cleared
     blocks: Blocks,
     sums: Sums,
@@ -102,6 +103,7 @@ def update_grid(
     e, slot, thread = wp.tid()
     if slot == 0 and thread == 0:
         blocks.swept[e] = slots_used(blocks, e)
+        blocks.frozen[e] = failure[e]  # the scatter has ended
     held = held_by(grid, blocks, e, slot)
     f = held[0]
     if f < 0 or blocks.fields[e, held[1]] != (1 << f):

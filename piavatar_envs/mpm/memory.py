@@ -151,6 +151,7 @@ def allocate_blocks(model: Model) -> Blocks:
         held=_zeros(model, (n, model.max_slots), int),
         count=_zeros(model, n, int),
         swept=_zeros(model, n, int),
+        frozen=_zeros(model, n, int),
     )
 
 

@@ -6,7 +6,7 @@ cells are matched anywhere in the warp.
 
 In which order a warp adds up depends on the particles' positions and on where they lie in the batch. With the nodes'
 sums in fixed point (:mod:`piavatar_envs.mpm.sums`) the result does not depend on the schedule of the warps: the same
-batch repeats bit for bit, as long as no environment fails (one that does stops at a moment that depends on it).
+batch repeats bit for bit.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def runs_to_grid(
         if at < moving.x.shape[0] * per_env:
             e = order[at] // per_env
             p = order[at] % per_env
-            if scatters(moving, e, p, failure):
+            if scatters(blocks, moving, e, p, failure):
                 s = prepare(grid, step, particles, moving, e, p)
                 fault = fault_of_sums(s, sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), particles.field[p]])
                 if fault == 0:
@@ -137,7 +137,7 @@ def grid_to_particles(
     Unlike the gather of a CPU it has its loops unrolled, and its threads store together.
     """
     e, p = wp.tid()
-    stays = failure[e] != 0
+    stays = blocks.frozen[e] != 0
     s = Gathered()
     if not stays:
         s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from piavatar_envs.mpm import runs
-from piavatar_envs.mpm.blocks import forget_blocks, free_slots, mark_particles
+from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.grid import solve_contact, threads_per_block, update_grid
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
@@ -36,7 +36,7 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     program.launch(
         update_grid,
         nodes,
-        [m.grid, m.step, m.boundaries, m.contact, threads],
+        [m.grid, m.step, m.boundaries, m.contact, threads, s.failure],
         [blocks, sums, scratch.velocity, scratch.sensors],
     )
     if m.contact.num_fields > 1:
@@ -97,8 +97,9 @@ def record_marks(program: Program, model: Model, state: State, scratch: Scratch,
     """
     m, blocks = model, scratch.blocks
     program.launch(forget_blocks, (m.num_envs, m.max_slots), [m.grid], [blocks])
-    program.launch(free_slots, m.num_envs, [], [blocks])
+    program.launch(free_slots, m.num_envs, [state.failure], [blocks])
     program.launch(mark_particles, state.x.shape, [m.grid, m.particles, state.x], [blocks, state.failure])
+    program.launch(freeze, m.num_envs, [state.failure], [blocks])
     if sort and m.scatter != "plain":
         record_order(program, m, state, scratch)
 

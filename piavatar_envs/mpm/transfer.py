@@ -15,6 +15,7 @@ from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline, stencil_inside
 from piavatar_envs.mpm.sums import read_record
 from piavatar_envs.mpm.types import (
+    FAILURE_BLOCKS,
     FAILURE_CFL,
     FAILURE_NONFINITE,
     FAILURE_OUT_OF_GRID,
@@ -38,6 +39,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
 _CFL = wp.constant(FAILURE_CFL)
+_BLOCKS = wp.constant(FAILURE_BLOCKS)
 
 
 @wp.struct
@@ -76,9 +78,10 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
 
 
 @wp.func
-def scatters(moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
+def scatters(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
     """Whether a particle takes part; one that is not finite flags its environment and does not."""
-    if failure[e] != 0:
+    # where slots have run out since, some particles have none; no scatter sets that flag
+    if blocks.frozen[e] != 0 or (failure[e] & _BLOCKS) != 0:
         return False
     if not wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p])):
         wp.atomic_or(failure, e, _NONFINITE)
@@ -137,7 +140,7 @@ def particles_to_grid(
     The plain scatter: a thread a particle, which adds to one node after the other.
     """
     e, p = wp.tid()
-    if not scatters(moving, e, p, failure):
+    if not scatters(blocks, moving, e, p, failure):
         return
     s = prepare(grid, step, particles, moving, e, p)
     base = s.base
@@ -278,7 +281,7 @@ def grid_to_particles(
 ):
     """Move every particle with the grid, see :func:`gather`."""
     e, p = wp.tid()
-    if failure[e] != 0:
+    if blocks.frozen[e] != 0:
         return
     s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
     if s.fault == 0:

@@ -147,6 +147,7 @@ class Blocks:
     held: wp.array2d(dtype=int)  # (num_envs, S) field * B + block of a slot
     count: wp.array(dtype=int)  # (num_envs,) slots in use
     swept: wp.array(dtype=int)  # (num_envs,) slots whose records the last grid pass has written
+    frozen: wp.array(dtype=int)  # (num_envs,) not 0: had failed when this was last looked at, see :func:`freeze`
 
 
 @wp.struct

@@ -88,6 +88,7 @@ auto put_down = [&](long long of) {
     __syncwarp();
 };
 
+const long long per_env = (long long)num_fields * grid.num_blocks;
 long long held = begins ? -1 : holds[warp];
 if (begins)
     for (int n = lane; n < 7 * BRICK; n += 32) brick[n] = 0.0f;
@@ -127,7 +128,9 @@ while (runs) {
     runs &= runs - 1;
     const int begin = __shfl_sync(ALL, before, leader), end = begin + __shfl_sync(ALL, size, leader);
     const long long cell = __shfl_sync(ALL, (long long)key, leader), of = cell >> 6;
-    if (of != held && (held < 0 || __popc(__ballot_sync(ALL, key >= 0 && (key >> 6) == of)) >= worth_a_brick)) {
+    // what another environment holds is put down at once: whether it does is not this one's business
+    const bool other = held < 0 || of / per_env != held / per_env;
+    if (of != held && (other || __popc(__ballot_sync(ALL, key >= 0 && (key >> 6) == of)) >= worth_a_brick)) {
         if (held >= 0) put_down(held);
         held = of;
     }

@@ -105,13 +105,13 @@ def test_substeps_equal_control_steps(simulate, device):
 def test_timed_reports_every_kernel(simulate):
     sim = simulate(**SCENE)
     seconds = sim.program.timed(1)
-    once = {"forget_blocks", "free_slots", "mark_particles", "read_impulses"}
+    once = {"forget_blocks", "free_slots", "mark_particles", "freeze", "read_impulses"}
     scatter = {"particles_to_grid"}
     if sim.model.scatter == "runs":
         scatter, once = {"runs_to_grid"}, once | {"number_cells", "radix_sort_pairs"}
     assert set(seconds) == once | scatter | {"update_grid", "grid_to_particles"}
     assert all(value > 0.0 for value in seconds.values())
-    marks = {"forget_blocks", "free_slots", "mark_particles"}  # at the start, and after 8, 16 and 24 substeps
+    marks = {"forget_blocks", "free_slots", "mark_particles", "freeze"}  # at the start, and after 8, 16 and 24 substeps
     sorts = {"number_cells", "radix_sort_pairs"} & once  # at the start, and after 24
     assert len(sim.program) == 1 + 4 * len(marks) + 2 * len(sorts) + 3 * 25
 

@@ -114,3 +114,23 @@ def test_failure_names():
     assert failure_name(0) is None
     assert failure_name(FAILURE_CFL) == "cfl"
     assert failure_name(FAILURE_NONFINITE | FAILURE_OUT_OF_GRID) == "nonfinite+out_of_grid"
+
+
+def test_what_a_failure_leaves_does_not_depend_on_the_order_of_the_particles(simulate):
+    """All others make the substep in which one fails, whether they come before it or after it in memory."""
+    rest = simulate().rest
+    broken = np.argmin(np.linalg.norm(rest - rest.min(axis=0), axis=1))
+    moved = []
+    for order in (np.arange(len(rest)), np.arange(len(rest))[::-1]):
+        sim = simulate(rest=rest[order], num_substeps=20).set(u=(0.3, 0.0, 0.0))
+        u = sim.state.u.numpy().copy()
+        u[0, np.flatnonzero(order == broken)[0]] = (1e6, 0.0, 0.0)
+        sim.state.u.assign(u)
+        sim.run()
+        assert sim.failures == [FAILURE_CFL]
+        moved.append((sim.get("x") - rest[order])[np.argsort(order)])
+    far = np.linalg.norm(rest - rest[broken], axis=1) > 0.2
+    assert far.sum() > 50
+    step = 0.3 * float(sim.model.step.dt)
+    for motion in moved:
+        np.testing.assert_allclose(motion[far], np.tile([step, 0.0, 0.0], (far.sum(), 1)), atol=1e-6)
