@@ -17,7 +17,7 @@ import tyro
 from pydantic import AfterValidator, BaseModel, Field
 from rich.console import Console
 
-from agents.config import EvaluationSettings
+from agents.config import EvaluationSettings, load_resolved
 from agents.evaluate import Agent, Episode, Evaluation
 from agents.learning import Curve
 from agents.report import draw_curve, show_table, versions, write_results
@@ -84,16 +84,7 @@ def load_batched(
     Raises:
         ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment.
     """
-    overrides = dict(overrides or {})
-    for_env = {key[len("env.") :]: overrides.pop(key) for key in list(overrides) if key.startswith("env.")}
-    config = load_config(cls, source, overrides)
-    try:
-        env = load_config(find_task(config.env_id).Config, config.env, for_env)
-    except ValueError as error:
-        raise ConfigError(f"env: {error}" if isinstance(error, ConfigError) else f"env_id: {error}") from None
-    if env.obs_mode != "flat":
-        raise ConfigError(f"env: obs_mode={env.obs_mode!r} must be 'flat' to train; choose terms with observe")
-    return config.model_copy(update={"env": FrozenDict(env.model_dump(mode="json"))})
+    return load_resolved(cls, lambda config: find_task(config.env_id).Config, source, overrides)
 
 
 def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Evaluation:

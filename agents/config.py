@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, Field
 
@@ -17,6 +17,7 @@ from piavatar_envs.envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict
 from piavatar_envs.multi import multi_modules
 from piavatar_envs.tasks import load_task
 
+Resolved = TypeVar("Resolved", bound=BaseModel)
 _MULTI_ID = re.compile(r"\w+_v\d+")
 
 
@@ -85,6 +86,35 @@ def multi_module(env_id: str) -> ModuleType:
         raise ValueError(f"{env_id} is not importable: {error}") from error
 
 
+def load_resolved(
+    cls: type[Resolved],
+    env_class: Callable[[Resolved], type[EnvConfig]],
+    source: Mapping[str, Any] | str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Resolved:
+    """A configuration with a section ``env``, of which what it left to the environment's defaults is filled in.
+
+    Args:
+        cls: of the configuration.
+        env_class: the environment's configuration class; a ValueError where there is no such environment.
+        source: a YAML file or a mapping.
+        overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
+
+    Raises:
+        ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment.
+    """
+    overrides = dict(overrides or {})
+    for_env = {key[len("env.") :]: overrides.pop(key) for key in list(overrides) if key.startswith("env.")}
+    config = load_config(cls, source, overrides)
+    try:
+        env = load_config(env_class(config), config.env, for_env)
+    except ValueError as error:
+        raise ConfigError(f"env: {error}" if isinstance(error, ConfigError) else f"env_id: {error}") from None
+    if env.obs_mode != "flat":
+        raise ConfigError(f"env: obs_mode={env.obs_mode!r} must be 'flat' to train; choose terms with observe")
+    return config.model_copy(update={"env": FrozenDict(env.model_dump(mode="json"))})
+
+
 def load_training(
     source: Mapping[str, Any] | str | Path | None = None, overrides: Mapping[str, Any] | None = None
 ) -> TrainingConfig:
@@ -97,15 +127,7 @@ def load_training(
     Raises:
         ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment.
     """
-    overrides = dict(overrides or {})
-    for_env = {key[len("env.") :]: overrides.pop(key) for key in list(overrides) if key.startswith("env.")}
-    config = load_config(TrainingConfig, source, overrides)
-    try:
-        env = load_config(_env_class(config), config.env, for_env)
-    except ValueError as error:
-        raise ConfigError(f"env: {error}" if isinstance(error, ConfigError) else f"env_id: {error}") from None
-    if env.obs_mode != "flat":
-        raise ConfigError(f"env: obs_mode={env.obs_mode!r} must be 'flat' to train; choose terms with observe")
+    config = load_resolved(TrainingConfig, _env_class, source, overrides)
     if config.selfplay and not config.is_multi:
         raise ConfigError(f"selfplay is given, but env_id={config.env_id!r} has one agent; use a world such as sumo_v0")
     if config.vector and config.is_multi:
@@ -117,7 +139,7 @@ def load_training(
         raise ConfigError(
             f"ppo.batch_size={batch} must be <= {rollout}, the steps of a rollout (num_workers * ppo.rollout_steps)"
         )
-    return config.model_copy(update={"env": FrozenDict(env.model_dump(mode="json"))})
+    return config
 
 
 def env_config(config: TrainingConfig) -> EnvConfig:
