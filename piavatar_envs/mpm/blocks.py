@@ -142,6 +142,17 @@ def held_by(grid: Grid, blocks: Blocks, e: int, slot: int):
 
 
 @wp.func
+def shared_by(grid: Grid, blocks: Blocks, e: int, slot: int, num_fields: int):
+    """:func:`held_by` where the block has several fields and the slot is of the first of them; else -1 and 0."""
+    held = held_by(grid, blocks, e, slot)
+    if held[0] >= 0:
+        mask = blocks.fields[e, held[1]]
+        if mask == (1 << held[0]) or held[0] != lowest_field(mask, num_fields):
+            held = wp.vec2i(-1, 0)
+    return held
+
+
+@wp.func
 def mark_blocks(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: int, failure: wp.array(dtype=int)):
     """See that a field has slots in all blocks that a stencil touches; too few slots flag the environment."""
     bit = 1 << field

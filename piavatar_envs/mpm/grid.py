@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import end_of_fields, first_record, has_field, held_by, lowest_field, slots_used
+from piavatar_envs.mpm.blocks import end_of_fields, first_record, has_field, held_by, shared_by, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_SLAB, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.contact import touch_all
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry
@@ -143,19 +143,19 @@ def solve_contact(
 ):
     """The same in blocks with several fields, whose sums have been taken: bodies touch, boundaries are met."""
     e, slot, thread = wp.tid()
-    held = held_by(grid, blocks, e, slot)
+    held = shared_by(grid, blocks, e, slot, contact.num_fields)
     if held[0] < 0:
         return
     block = held[1]
     mask = blocks.fields[e, block]
-    if mask == (1 << held[0]) or held[0] != lowest_field(mask, contact.num_fields):
-        return
     corner = block_corner(grid, block)
     end = end_of_fields(mask, contact.num_fields)
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     share = BLOCK_NODES // threads
+    near = bool(False)
     for local in range(thread * share, (thread + 1) * share):
-        near = near_slab(grid, boundaries, e, corner, local)
+        if local == thread * share or local % SLAB_NODES == 0:
+            near = near_slab(grid, boundaries, e, corner, local)
         node = node_of_block(corner, local)
         at = node_position(grid, node[0], node[1], node[2])
         for f in range(held[0], end):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import first_record, has_field, held_by, lowest_field
+from piavatar_envs.mpm.blocks import first_record, has_field, shared_by
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_index, node_in_block
 from piavatar_envs.mpm.sums import move_offset, offset_at, take_sum
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, row, vec8
@@ -136,13 +136,11 @@ def find_facing(
     Limbs grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
     """
     e, slot, thread = wp.tid()
-    held = held_by(grid, blocks, e, slot)
+    held = shared_by(grid, blocks, e, slot, contact.num_fields)
     if held[0] < 0:
         return
     block = held[1]
     mask = blocks.fields[e, block]
-    if mask == (1 << held[0]) or held[0] != lowest_field(mask, contact.num_fields):
-        return
     share = BLOCK_NODES // threads
     for local in range(thread * share, (thread + 1) * share):
         take_sums(grid, contact, blocks, sums, mask, e, block, local, node_velocity)
