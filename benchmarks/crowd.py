@@ -7,6 +7,7 @@ the root wrench act in one of a hundred substeps only.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.asset import AvatarAsset, dense_weights, load_body, mesh_volume, top_weights
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
-from piavatar_envs.avatar.sampling import sample_particles
+from piavatar_envs.avatar.sampling import order_along_curve, sample_particles
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_JOINTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.substeps import record_drive
@@ -79,8 +80,8 @@ SMALL = Scale(nodes=30, width=2.4, skin=1200, interior=700, substeps=12)
 def skin_body(count: int, seed: int = 0) -> tuple[BodyPoints, np.ndarray]:
     """``count`` particles on the skin of the mean body and their volumes [m^3]; each has the same share of its mass.
 
-    Area-weighted: one random point in each of ``count`` equal parts of the skin's area, in the order of the triangles.
-    Weights are those of the skin at the point; the firmest particles of every bone track it.
+    Area-weighted: one random point in each of ``count`` equal parts of the skin's area. Weights are those of the skin
+    there; the firmest particles of every bone track it.
     """
     asset, rng = load_body(), np.random.default_rng(seed)
     body = asset.mean_body()
@@ -93,6 +94,8 @@ def skin_body(count: int, seed: int = 0) -> tuple[BodyPoints, np.ndarray]:
     positions = np.einsum("pc,pci->pi", coordinates, corners[face]).astype(np.float32)
     dense = dense_weights(asset.skin_joints, asset.skin_weights)[asset.faces[face]]
     weights = np.einsum("pc,pcj->pj", coordinates, dense)
+    order = order_along_curve(positions, math.sqrt(area.sum() / count))
+    positions, weights = positions[order], weights[order]
     bone = _trackers(positions, weights)
     volume = np.full(count, mesh_volume(body.vertices, asset.faces) / count, np.float32)
     return _body_points(asset, positions, volume, *top_weights(weights), bone), volume

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from piavatar_envs.mpm.types import Model, State
+from piavatar_envs.mpm.types import SCATTERS, Model, State
 
 #: x, u, vk (3 floats each), C, F (9 each); x, u, C, F are written; mass, volume, mu, lam, material, field, seam.
 STATE_BYTES, WRITTEN_BYTES, CONSTANT_BYTES = 108, 96, 28
@@ -142,19 +142,20 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
     """
     particles, nodes = counts.particles, counts.nodes
     constants = CONSTANT_BYTES if model.particles.mass.shape[0] > 1 else 0
+    sums = nodes * NODE_BYTES * (2 if SCATTERS[model.scatter] else 1)  # in fixed point a number has two words
     # state and constants in; sums read and written where particles are
-    scatter = particles * (STATE_BYTES + constants) + nodes * 2 * NODE_BYTES
+    scatter = particles * (STATE_BYTES + constants) + 2 * sums
     formulas = {
         "particles_to_grid": scatter,
-        "runs_to_grid": scatter + particles * 4,  # the order of the particles
+        "runs_to_grid": scatter,
         # sums in, sums cleared, velocities out
-        "update_grid": nodes * 3 * NODE_BYTES,
+        "update_grid": 2 * sums + nodes * NODE_BYTES,
         # x, F, vk and velocities in; x, u, C, F out
         "grid_to_particles": particles * (60 + WRITTEN_BYTES) + nodes * NODE_BYTES,
-        # x, u, motion in; u, motion, vk, pull, lean out
-        "drive_particles": particles * 8 * 12,
-        # x, u, vk, pull, lean in; u, vk out
-        "apply_corrections": particles * 7 * 12,
+        # x, u in; vk, pull, lean out; of flesh that is not inert and bodies that are held
+        "drive_particles": particles * 5 * 12,
+        # x, u, pull in; u out
+        "apply_corrections": particles * 4 * 12,
         "sum_moments": particles * 2 * 12,  # x, u
         "sum_corrections": particles * 3 * 12,  # x, pull, lean
     }

@@ -48,9 +48,8 @@ def kernel_times(program: Program, repeats: int = 1) -> dict[str, KernelTime]:
     """Time of each kernel in one run, launched one by one; the state advances by ``repeats`` runs.
 
     On a GPU the times come from events around each launch. What events around a kernel that does nothing measure is
-    taken off, so launches and the gaps between kernels are not in these times. Library calls (a sort) have no events:
-    theirs are times of the host, less those of a kernel that does nothing. On a CPU all are times of the calls, the
-    median of the runs, because one thread that is interrupted says nothing about a kernel; elsewhere the mean.
+    taken off, so launches and the gaps between kernels are not in these times. On a CPU they are times of the calls,
+    the median of the runs, because one thread that is interrupted says nothing about a kernel; elsewhere the mean.
     """
     device = program.device
     if not device.is_cuda:
@@ -65,13 +64,10 @@ def kernel_times(program: Program, repeats: int = 1) -> dict[str, KernelTime]:
     for _ in range(repeats):
         for name, launches in _launch_times(program).items():
             events.setdefault(name, []).extend(launches)
-    found = {
+    return {
         name: KernelTime(float(np.maximum(np.array(ms) - floor, 0.0).sum()) / repeats, len(ms) // repeats)
         for name, ms in events.items()
     }
-    call = nothing.timed()["do_nothing"] / len(nothing)
-    calls = {name: 1e3 * max(0.0, took - call) for name, took in program.timed().items() if name not in found}
-    return found | {name: KernelTime(ms, None) for name, ms in calls.items()}
 
 
 def _launch_times(program: Program) -> dict[str, list[float]]:

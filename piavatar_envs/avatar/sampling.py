@@ -95,7 +95,7 @@ def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rin
     flesh = flesh[cKDTree(bones).query(flesh)[0] > BONE_CLEARANCE * spacing]
     positions = np.concatenate([bones, flesh]).astype(np.float32)
     bone = np.concatenate([bone_of, np.full(len(flesh), -1)]).astype(np.int32)
-    order = _along_curve(positions, spacing)
+    order = order_along_curve(positions, spacing)
     positions, bone = positions[order], bone[order]
     distance, face, coordinates = skin.query(positions)
     anchors = asset.faces[face]
@@ -220,7 +220,7 @@ def _bone_lattice(asset: AvatarAsset, skin: ClosedSurface, rings: int) -> tuple[
     return points.reshape(-1, 3), np.repeat(np.arange(NUM_JOINTS), points.shape[1])
 
 
-def _along_curve(positions: np.ndarray, spacing: float) -> np.ndarray:
+def order_along_curve(positions: np.ndarray, spacing: float) -> np.ndarray:
     """Order of the particles along Morton's curve, ``(P,)``: what is close in memory is close in the body.
 
     Threads and cache lines then share grid nodes and bones.

@@ -27,7 +27,7 @@ from piavatar_envs.mpm.types import (
     Particles,
 )
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 _BLOCKS = wp.constant(FAILURE_BLOCKS)
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
@@ -95,9 +95,10 @@ def record_of(grid: Grid, blocks: Blocks, e: int, f: int, i: int, j: int, k: int
 
 @wp.func
 def slab_records(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i, i: int):
-    """Where the nodes ``base + (i, ...)`` of a stencil have their records, for :func:`line_of_records`.
+    """Where the blocks of the nodes ``base + (i, ...)`` of a stencil have their records, for :func:`line_of_records`.
 
-    The slab lies in two blocks along y and two along z; where it does not, the second repeats the first.
+    The slab lies in two blocks along y and two along z; where it does not, the second repeats the first. What is found
+    holds for all slabs of a stencil in the same blocks.
     """
     block = block_index(grid, base[0] + i, base[1], base[2])
     lower = first_record(grid, blocks, e, f, block)
@@ -112,16 +113,16 @@ def slab_records(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i, i: 
         upper_last = upper
         if (base[2] & 3) > 1:
             upper_last = first_record(grid, blocks, e, f, block + grid.blocks[2] + 1) - 4
-    in_slab = 16 * ((base[0] + i) & 3) + (base[2] & 3)
-    return wp.vec4i(lower + in_slab, lower_last + in_slab, upper + in_slab, upper_last + in_slab)
+    return wp.vec4i(lower, lower_last, upper, upper_last)
 
 
 @wp.func
-def line_of_records(slab: wp.vec4i, base: wp.vec3i, j: int):
-    """Records of the nodes ``base + (i, j, 0..2)`` of a stencil, ``slab`` those of ``i``."""
+def line_of_records(slab: wp.vec4i, base: wp.vec3i, i: int, j: int):
+    """Records of the nodes ``base + (i, j, 0..2)`` of a stencil, ``slab`` those of the blocks of ``i``."""
     y = (base[1] & 3) + j
-    first = wp.where(y > 3, slab[2], slab[0]) + 4 * (y & 3)
-    last = wp.where(y > 3, slab[3], slab[1]) + 4 * (y & 3)
+    in_block = 16 * ((base[0] + i) & 3) + 4 * (y & 3) + (base[2] & 3)
+    first = wp.where(y > 3, slab[2], slab[0]) + in_block
+    last = wp.where(y > 3, slab[3], slab[1]) + in_block
     return wp.vec3i(first, wp.where((base[2] & 3) == 3, last, first) + 1, last + 2)
 
 

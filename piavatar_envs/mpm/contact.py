@@ -24,10 +24,10 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.blocks import end_of_fields, first_record, has_field, lowest_field, lowest_other
-from piavatar_envs.mpm.impulses import add_impulse, pair_entry
+from piavatar_envs.mpm.impulses import add_impulse, pair_entry, read_change, write_change
 from piavatar_envs.mpm.normals import MASS_MIN, shared_normal, surface_gap, volume_at
-from piavatar_envs.mpm.stencil import block_corner, node_of_block
-from piavatar_envs.mpm.sums import offset_at
+from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
+from piavatar_envs.mpm.sums import offset_at, read_record, write_record
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums, row, vec8
 
 wp.set_module_options({"enable_backward": False})
@@ -50,11 +50,12 @@ def coulomb(m_a: float, m_b: float, approach: wp.vec3, n: wp.vec3, friction: flo
 @wp.func
 def book_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, sensors: Sensors):
     """Add a change of velocity [m/s] to a node's record, and keep the subject that has done most of it."""
-    before = sensors.node[e, r]
+    sensors.touched[e, r // BLOCK_NODES] = 1
+    before = read_change(sensors.node, e, r)
     so_far = wp.vec3(before[0], before[1], before[2])
     subject = wp.where(wp.length_sq(change) >= wp.length_sq(so_far), float(contact.subject[other]), before[3])
     after = so_far + change
-    sensors.node[e, r] = wp.vec4(after[0], after[1], after[2], subject)
+    write_change(sensors.node, e, r, wp.vec4(after[0], after[1], after[2], subject))
 
 
 @wp.func
@@ -75,8 +76,8 @@ def touch(
     """Contact of the fields ``a < b`` at a node: equal and opposite impulses along one normal."""
     ra = first_record(grid, blocks, e, a, block) + local
     rb = first_record(grid, blocks, e, b, block) + local
-    va = node_velocity[e, ra]
-    vb = node_velocity[e, rb]
+    va = read_record(node_velocity, e, ra)
+    vb = read_record(node_velocity, e, rb)
     if va[0] <= MASS_MIN or vb[0] <= MASS_MIN:
         return
     n_ab = shared_normal(grid, blocks, e, node_of_block(block_corner(grid, block), local), a, b, node_facing)
@@ -91,8 +92,8 @@ def touch(
     J = coulomb(va[0], vb[0], approach, n_ab, contact.friction[pairs, a * contact.num_fields + b])
     if wp.length_sq(J) <= 0.0:
         return
-    node_velocity[e, ra] = va - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / va[0]
-    node_velocity[e, rb] = vb + vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / vb[0]
+    write_record(node_velocity, e, ra, va - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / va[0])
+    write_record(node_velocity, e, rb, vb + vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / vb[0])
     book_contact(contact, e, ra, b, -J / va[0], sensors)
     book_contact(contact, e, rb, a, J / vb[0], sensors)
     first = contact.subject[a]

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import end_of_fields, first_record, has_field, held_by, shared_by, slots_used
+from piavatar_envs.mpm.blocks import first_record, has_field, held_by, shared_by, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_SLAB, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.contact import touch_all
-from piavatar_envs.mpm.impulses import add_impulse, boundary_entry
+from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, read_change, write_change
 from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
-from piavatar_envs.mpm.sums import clear_offset, offset_at, take_sum, write_record
+from piavatar_envs.mpm.sums import clear_offset, offset_at, read_record, take_sum, write_record
+from piavatar_envs.mpm.sweep import THREADS, Sweep, first_node, from_lane, lane_of_thread
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, vec8
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: Nodes of a slab of a block, the unit in which boundaries are looked for.
 SLAB_NODES = wp.constant(16)
-
-
-def threads_per_block(device: str) -> int:
-    """Threads that share the nodes of a block: on a CPU an idle thread costs as much as a slab of nodes."""
-    return int(BLOCK_NODES) if wp.get_device(device).is_cuda else 1
+#: One more than the bits of all slabs of a block.
+ALL_SLABS = wp.constant(16)
 
 
 @wp.func
@@ -74,20 +72,54 @@ def physical_velocity(split: bool, near: bool, total: vec8):
 
 
 @wp.func
-def near_slab(grid: Grid, boundaries: Boundaries, e: int, corner: wp.vec3i, local: int):
-    """Whether a boundary is near the slab of 4 x 4 nodes that node ``local`` of a block is in."""
-    i = corner[0] + local // SLAB_NODES
-    center = node_position(grid, i, corner[1], corner[2]) + grid.dx * wp.vec3(0.0, 1.5, 1.5)
-    return nearest_boundary(boundaries, e, center) < NEAR_SLAB * grid.dx
+def with_near(grid: Grid, sweep: Sweep, boundaries: Boundaries, e: int, held: wp.vec2i, begin: int):
+    """Field and block of a slot, with the field a bit for each slab that a boundary is near; -1 and 0 stay.
+
+    A slab has 4 x 4 nodes; the bits are right for those of a turn from record ``begin``.
+    """
+    if held[0] < 0:
+        return held
+    corner = block_corner(grid, held[1])
+    first = (begin % BLOCK_NODES) // SLAB_NODES
+    about = held[0] * ALL_SLABS
+    for slab in range(first, first + wp.max(sweep.share // SLAB_NODES, 2)):  # a warp's turn is two slabs
+        center = node_position(grid, corner[0] + slab, corner[1], corner[2]) + grid.dx * wp.vec3(0.0, 1.5, 1.5)
+        if nearest_boundary(boundaries, e, center) < NEAR_SLAB * grid.dx:
+            about = about | (1 << slab)
+    return wp.vec2i(about, held[1])
 
 
-@wp.kernel
+@wp.func
+def near_node(about: int, local: int):
+    """Whether a boundary is near the slab of node ``local``, from what :func:`with_near` says."""
+    return ((about >> (local // SLAB_NODES)) & 1) != 0
+
+
+@wp.func
+def place_of(grid: Grid, corner: wp.vec3i, local: int):
+    """Position of node ``local`` of the block with the lowest node ``corner`` [m]."""
+    node = node_of_block(corner, local)
+    return node_position(grid, node[0], node[1], node[2])
+
+
+@wp.func
+def alone_in(grid: Grid, contact: Contact, blocks: Blocks, sensors: Sensors, e: int, r: int):
+    """Field and block of record ``r`` if the block has no other field, else -1 and 0; nothing has touched it yet."""
+    held = held_by(grid, blocks, e, r // BLOCK_NODES)
+    if held[0] >= 0 and contact.num_fields > 1:
+        sensors.touched[e, r // BLOCK_NODES] = 0
+        if blocks.fields[e, held[1]] != (1 << held[0]):
+            held = wp.vec2i(-1, 0)
+    return held
+
+
+@wp.kernel(launch_bounds=(THREADS, 7))
 def update_grid(
     grid: Grid,
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
-    threads: int,
+    sweep: Sweep,
     failure: wp.array(dtype=int),
     # in and out: sums are read, then cleared
     blocks: Blocks,
@@ -96,44 +128,94 @@ def update_grid(
     node_velocity: wp.array2d(dtype=vec8),
     sensors: Sensors,
 ):
-    """Velocity of every node with mass in blocks of one field. ``threads`` threads share a slot's block.
+    """Velocity of every node with mass in blocks of one field.
 
     Contact acts on the total velocity ``v = u + vk``; the rest is physical.
     """
-    e, slot, thread = wp.tid()
-    if slot == 0 and thread == 0:
-        blocks.swept[e] = slots_used(blocks, e)
+    e, thread = wp.tid()
+    lane = lane_of_thread()
+    used = slots_used(blocks, e)
+    if thread == 0:
+        blocks.swept[e] = used
         blocks.frozen[e] = failure[e]  # the scatter has ended
-    held = held_by(grid, blocks, e, slot)
-    f = held[0]
-    if f < 0 or blocks.fields[e, held[1]] != (1 << f):
-        return
-    corner = block_corner(grid, held[1])
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    share = BLOCK_NODES // threads
-    near = bool(False)
-    for local in range(thread * share, (thread + 1) * share):
-        if local == thread * share or local % SLAB_NODES == 0:
-            near = near_slab(grid, boundaries, e, corner, local)  # most skip all of that work
-        r = BLOCK_NODES * slot + local
-        total = total_velocity(step, split, take_sum(sums, e, f, r))
-        if near:
-            node = node_of_block(corner, local)
-            at = node_position(grid, node[0], node[1], node[2])
-            total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
-        write_record(node_velocity, e, r, physical_velocity(split, near, total))
-        # particles next to another field's block have left their offsets here, too
-        if near or contact.num_fields > 1:
+    end = BLOCK_NODES * used
+    begin = first_node(sweep, thread)
+    if begin >= end:
+        return
+    held = alone_in(grid, contact, blocks, sensors, e, begin + lane * sweep.stride)
+    known = with_near(grid, sweep, boundaries, e, held, begin)
+    for turn in range(sweep.turns):
+        first = begin + turn * sweep.stride
+        if first >= end:
+            break
+        about = from_lane(known[0], turn)
+        if about < 0:
+            continue
+        f = about // ALL_SLABS
+        block = from_lane(known[1], turn)
+        corner = wp.vec3i()
+        if about % ALL_SLABS != 0:
+            corner = block_corner(grid, block)
+        for r in range(first + lane, first + lane + sweep.share):
+            is_near = near_node(about, r % BLOCK_NODES)
+            total = total_velocity(step, split, take_sum(sums, e, f, r))
+            if is_near:  # most skip all of that work
+                at = place_of(grid, corner, r % BLOCK_NODES)
+                total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
+            write_record(node_velocity, e, r, physical_velocity(split, is_near, total))
+            # particles next to another field's block have left their offsets here, too
+            if is_near or contact.num_fields > 1:
+                clear_offset(sums, e, r)
+
+
+@wp.func
+def settle_node(
+    grid: Grid,
+    step: Step,
+    boundaries: Boundaries,
+    contact: Contact,
+    blocks: Blocks,
+    sums: Sums,
+    mask: int,
+    near: bool,
+    corner: wp.vec3i,
+    e: int,
+    block: int,
+    local: int,
+    node_velocity: wp.array2d(dtype=vec8),
+    sensors: Sensors,
+):
+    """What comes after the contact of the fields of a node: boundaries are met, and velocities become physical."""
+    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    for f in range(contact.num_fields):
+        if has_field(mask, f):
+            r = first_record(grid, blocks, e, f, block) + local
+            total = read_record(node_velocity, e, r)
+            if total[0] == GROWN_TOGETHER:
+                # the trunk comes first: its velocity is final
+                t = first_record(grid, blocks, e, contact.trunk[f], block) + local
+                v = read_record(node_velocity, e, t)
+                write_record(node_velocity, e, r, vec8(0.0, v[1], v[2], v[3], v[4], v[5], v[6], v[7]))
+                change = read_change(sensors.node, e, t)
+                write_change(sensors.node, e, r, change)
+                if wp.length_sq(wp.vec3(change[0], change[1], change[2])) > 0.0:
+                    sensors.touched[e, r // BLOCK_NODES] = 1
+            else:
+                if near:
+                    at = place_of(grid, corner, local)
+                    total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
+                write_record(node_velocity, e, r, physical_velocity(split, near, total))
             clear_offset(sums, e, r)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(THREADS, 4))
 def solve_contact(
     grid: Grid,
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
-    threads: int,
+    sweep: Sweep,
     blocks: Blocks,
     node_facing: wp.array2d(dtype=wp.vec3),
     # in and out: offsets are read, then cleared; sums become velocities
@@ -142,40 +224,35 @@ def solve_contact(
     sensors: Sensors,
 ):
     """The same in blocks with several fields, whose sums have been taken: bodies touch, boundaries are met."""
-    e, slot, thread = wp.tid()
-    held = shared_by(grid, blocks, e, slot, contact.num_fields)
-    if held[0] < 0:
-        return
-    block = held[1]
-    mask = blocks.fields[e, block]
-    corner = block_corner(grid, block)
-    end = end_of_fields(mask, contact.num_fields)
+    e, thread = wp.tid()
+    lane = lane_of_thread()
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    share = BLOCK_NODES // threads
-    near = bool(False)
-    for local in range(thread * share, (thread + 1) * share):
-        if local == thread * share or local % SLAB_NODES == 0:
-            near = near_slab(grid, boundaries, e, corner, local)
-        node = node_of_block(corner, local)
-        at = node_position(grid, node[0], node[1], node[2])
-        for f in range(held[0], end):
-            if has_field(mask, f):
-                r = first_record(grid, blocks, e, f, block) + local
-                node_velocity[e, r] = total_velocity(step, split, node_velocity[e, r])
-                sensors.node[e, r] = wp.vec4(0.0)
-        touch_all(grid, contact, blocks, sums, mask, e, block, local, node_facing, node_velocity, sensors)
-        for f in range(held[0], end):
-            if has_field(mask, f):
-                r = first_record(grid, blocks, e, f, block) + local
-                total = node_velocity[e, r]
-                if total[0] == GROWN_TOGETHER:
-                    # the trunk comes first: its velocity is final
-                    t = first_record(grid, blocks, e, contact.trunk[f], block) + local
-                    v = node_velocity[e, t]
-                    node_velocity[e, r] = vec8(0.0, v[1], v[2], v[3], v[4], v[5], v[6], v[7])
-                    sensors.node[e, r] = sensors.node[e, t]
-                else:
-                    if near:
-                        total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
-                    node_velocity[e, r] = physical_velocity(split, near, total)
-                clear_offset(sums, e, r)
+    end = BLOCK_NODES * slots_used(blocks, e)
+    begin = first_node(sweep, thread)
+    if begin >= end:
+        return
+    held = shared_by(grid, blocks, e, (begin + lane * sweep.stride) // BLOCK_NODES, contact.num_fields)
+    known = with_near(grid, sweep, boundaries, e, held, begin)
+    for turn in range(sweep.turns):
+        first = begin + turn * sweep.stride
+        if first >= end:
+            break
+        about = from_lane(known[0], turn)
+        if about < 0:
+            continue
+        block = from_lane(known[1], turn)
+        mask = blocks.fields[e, block]
+        corner = block_corner(grid, block)
+        for n in range(first + lane, first + lane + sweep.share):
+            local = n % BLOCK_NODES
+            for f in range(about // ALL_SLABS, contact.num_fields):
+                if has_field(mask, f):
+                    r = first_record(grid, blocks, e, f, block) + local
+                    v = total_velocity(step, split, read_record(node_velocity, e, r))
+                    write_record(node_velocity, e, r, v)
+                    write_change(sensors.node, e, r, wp.vec4(0.0))
+            touch_all(grid, contact, blocks, sums, mask, e, block, local, node_facing, node_velocity, sensors)
+            settle_node(
+                grid, step, boundaries, contact, blocks, sums, mask, near_node(about, local), corner, e, block, local,
+                node_velocity, sensors,
+            )  # fmt: skip

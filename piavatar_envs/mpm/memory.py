@@ -75,13 +75,12 @@ def estimate_bytes(
 ) -> int:
     """Device memory of state and scratch [bytes].
 
-    108 B a particle, 24 more where they are sorted; 80 B a node of a slot, 48 more in fixed point, 28 more where there
-    are several fields; the map of blocks.
+    108 B a particle; 80 B a node of a slot, 48 more in fixed point, 28 more where there are several fields; the map of
+    blocks.
     """
     node = (32 + 16) * (1 + SCATTERS[scatter]) + 32 + (16 + 12 if num_fields > 1 else 0)
-    particle = 108 + (0 if scatter == "plain" else 24)
-    slots = max_slots * (BLOCK**3 * node + 4)
-    return num_envs * (num_particles * particle + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
+    slots = max_slots * (BLOCK**3 * node + (8 if num_fields > 1 else 4))
+    return num_envs * (num_particles * 108 + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
 
 
 def check_memory(
@@ -124,15 +123,12 @@ def allocate(model: Model) -> tuple[State, Scratch]:
     )
     records = (model.num_envs, int(BLOCK_NODES) * model.max_slots)
     shared = records if model.contact.num_fields > 1 else (1, 1)
-    sort = 1 if model.scatter == "plain" else 2 * int(np.prod(particles))
     scratch = Scratch(
         blocks=allocate_blocks(model),
         sums=allocate_sums(model, records),
         velocity=_zeros(model, records, vec8),
         facing=_zeros(model, shared, wp.vec3),
-        order=_zeros(model, sort, int),
-        keys=_zeros(model, sort, wp.int64),
-        sensors=allocate_sensors(model, _zeros(model, shared, wp.vec4)),
+        sensors=allocate_sensors(model, shared),
     )
     return state, scratch
 
@@ -172,8 +168,8 @@ def allocate_sums(model: Model, records: tuple[int, int]) -> Sums:
     )
 
 
-def allocate_sensors(model: Model, node: wp.array) -> Sensors:
-    """Zeroed contact sensors; ``node`` are their records at the nodes."""
+def allocate_sensors(model: Model, records: tuple[int, int]) -> Sensors:
+    """Zeroed contact sensors, with ``records`` at the nodes."""
     n, subjects = model.num_envs, model.contact.num_subjects
     rows = max(1, model.num_sensors)
     entries = subjects * (1 + subjects + rows)
@@ -183,6 +179,7 @@ def allocate_sensors(model: Model, node: wp.array) -> Sensors:
         boundary_impulse=_zeros(model, (n, subjects), wp.vec3),
         pair_impulse=_zeros(model, (n, subjects * subjects), wp.vec3),
         part_impulse=_zeros(model, (n, rows, subjects), wp.vec3),
-        node=node,
+        node=_zeros(model, records, wp.vec4),
+        touched=_zeros(model, (records[0], -(-records[1] // int(BLOCK_NODES))), int),
         penetration=_zeros(model, (n, subjects), float),
     )

@@ -15,12 +15,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import first_record, has_field, shared_by
-from piavatar_envs.mpm.stencil import BLOCK_NODES, block_index, node_in_block
-from piavatar_envs.mpm.sums import move_offset, offset_at, take_sum
+from piavatar_envs.mpm.blocks import first_record, has_field, shared_by, slots_used
+from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES, block_index, node_in_block
+from piavatar_envs.mpm.sums import move_offset, offset_at, read_record, take_sum, write_record
+from piavatar_envs.mpm.sweep import THREADS, Sweep, first_node, from_lane, lane_of_thread
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, row, vec8
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: Nodes lighter than this [kg] carry nothing but round-off.
 MASS_MIN = wp.constant(1.0e-15)
@@ -57,14 +58,14 @@ def take_sums(
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
             s = take_sum(sums, e, f, r)
-            node_velocity[e, r] = s
+            write_record(node_velocity, e, r, s)
             t = contact.trunk[f]
             if t != f and has_field(mask, t):
                 into = first_record(grid, blocks, e, t, block) + local
                 if offset_at(grid, sums, e, f, r)[3] > 0.0 and offset_at(grid, sums, e, t, into)[3] > 0.0:
-                    node_velocity[e, into] = node_velocity[e, into] + s
+                    write_record(node_velocity, e, into, read_record(node_velocity, e, into) + s)
                     move_offset(sums, e, r, into)
-                    node_velocity[e, r] = vec8(GROWN_TOGETHER, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+                    write_record(node_velocity, e, r, vec8(GROWN_TOGETHER, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
 
 @wp.func
@@ -118,11 +119,11 @@ def face_node(
             node_facing[e, r] = facing
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(THREADS, 6))
 def find_facing(
     grid: Grid,
     contact: Contact,
-    threads: int,
+    sweep: Sweep,
     blocks: Blocks,
     # in and out: taken where several fields are
     sums: Sums,
@@ -135,16 +136,24 @@ def find_facing(
     It is the summand of the module's formula, with all other fields of the node as ``b``; zero where there is none.
     Limbs grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
     """
-    e, slot, thread = wp.tid()
-    held = shared_by(grid, blocks, e, slot, contact.num_fields)
-    if held[0] < 0:
+    e, thread = wp.tid()
+    lane = lane_of_thread()
+    end = BLOCK_NODES * slots_used(blocks, e)
+    begin = first_node(sweep, thread)
+    if begin >= end:
         return
-    block = held[1]
-    mask = blocks.fields[e, block]
-    share = BLOCK_NODES // threads
-    for local in range(thread * share, (thread + 1) * share):
-        take_sums(grid, contact, blocks, sums, mask, e, block, local, node_velocity)
-        face_node(grid, contact, blocks, sums, mask, e, block, local, node_velocity, node_facing)
+    held = shared_by(grid, blocks, e, (begin + lane * sweep.stride) // BLOCK_NODES, contact.num_fields)
+    for turn in range(sweep.turns):
+        first = begin + turn * sweep.stride
+        if first >= end:
+            break
+        if from_lane(held[0], turn) < 0:
+            continue
+        block = from_lane(held[1], turn)
+        mask = blocks.fields[e, block]
+        for n in range(first + lane, first + lane + sweep.share):
+            take_sums(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity)
+            face_node(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity, node_facing)
 
 
 @wp.func
@@ -154,17 +163,25 @@ def shared_normal(
     """Unit normal from field ``a`` to field ``b`` at a node; zero if there is no telling."""
     both = (1 << a) | (1 << b)
     facing = wp.vec3()
+    start = wp.max(node[2] - 1, 0)
+    has_both = bool(False)
+    ra = int(0)
+    rb = int(0)
     for i in range(wp.max(node[0] - 1, 0), wp.min(node[0] + 2, grid.nodes[0])):
         for j in range(wp.max(node[1] - 1, 0), wp.min(node[1] + 2, grid.nodes[1])):
-            for k in range(wp.max(node[2] - 1, 0), wp.min(node[2] + 2, grid.nodes[2])):
-                # a block without one of the two holds nothing that was written in this substep
-                block = block_index(grid, i, j, k)
-                if (blocks.fields[e, block] & both) == both:
+            for k in range(start, wp.min(node[2] + 2, grid.nodes[2])):
+                if k == start or k % BLOCK == 0:  # another block
+                    block = block_index(grid, i, j, k)
+                    # one without one of the two holds nothing that was written in this substep
+                    has_both = (blocks.fields[e, block] & both) == both
+                    if has_both:
+                        ra = first_record(grid, blocks, e, a, block)
+                        rb = first_record(grid, blocks, e, b, block)
+                if has_both:
                     n = node_in_block(i, j, k)
                     d = wp.vec3i(i - node[0], j - node[1], k - node[2])
                     c = 1.0 / float(1 + wp.dot(d, d))
-                    of_a = node_facing[e, first_record(grid, blocks, e, a, block) + n]
-                    facing += c * (of_a - node_facing[e, first_record(grid, blocks, e, b, block) + n])
+                    facing += c * (node_facing[e, ra + n] - node_facing[e, rb + n])
     # summands of nearly empty nodes are so small that their squares are not
     largest = wp.max(wp.abs(facing))
     if largest <= 0.0:

@@ -37,19 +37,11 @@ class Program:
         Raises:
             RuntimeError: the program has already run.
         """
-        arguments = {"inputs": list(inputs), "outputs": list(outputs), "block_dim": block_dim}
-        self.call(kernel.key, wp.launch(kernel, dim, **arguments, device=self.device, record_cmd=True).launch)
-
-    def call(self, name: str, function: Callable[[], None]) -> None:
-        """Append a function that launches work on the device by itself and may be captured.
-
-        Raises:
-            RuntimeError: the program has already run.
-        """
         if self._graph is not None:
-            raise RuntimeError(f"cannot append {name} to a program that has run; build a new one")
-        self._launches.append(function)
-        self._names.append(name)
+            raise RuntimeError(f"cannot append {kernel.key} to a program that has run; build a new one")
+        arguments = {"inputs": list(inputs), "outputs": list(outputs), "block_dim": block_dim}
+        self._launches.append(wp.launch(kernel, dim, **arguments, device=self.device, record_cmd=True).launch)
+        self._names.append(kernel.key)
 
     def __len__(self) -> int:
         return len(self._launches)

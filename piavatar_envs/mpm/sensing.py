@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import fields_around, has_field, record_of
-from piavatar_envs.mpm.impulses import add_impulse, part_entry
-from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_index, grid_position, spline, stencil_inside
+from piavatar_envs.mpm.blocks import fields_around, first_record, has_field, record_of
+from piavatar_envs.mpm.impulses import add_impulse, part_entry, read_change
+from piavatar_envs.mpm.stencil import (
+    BLOCK_NODES,
+    base_node,
+    block_index,
+    blocks_touched,
+    grid_position,
+    spline,
+    stencil_inside,
+)
+from piavatar_envs.mpm.sweep import THREADS
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Particles, Sensors, row, vec8
 
-wp.set_module_options({"enable_backward": False})
+# unrolled, the stencil takes so many registers that a GPU has few threads at once
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 #: Volume fraction of another subject at which a particle lies on its surface.
 SURFACE = wp.constant(0.5)
@@ -18,11 +28,29 @@ SURFACE = wp.constant(0.5)
 SURFACE_SLOPE = wp.constant(0.55)
 
 
-@wp.kernel
+@wp.func
+def pick(w: wp.vec3, n: int):
+    """``w[n]``; where a loop is not unrolled, a GPU would put ``w`` into memory for it."""
+    return wp.where(n == 0, w[0], wp.where(n == 1, w[1], w[2]))
+
+
+@wp.func
+def touched_around(grid: Grid, blocks: Blocks, sensors: Sensors, e: int, f: int, base: wp.vec3i):
+    """Whether contact has changed velocities of field ``f`` in any block of a stencil."""
+    touched = blocks_touched(base)
+    any = int(0)
+    for i in range(touched[0]):
+        for j in range(touched[1]):
+            for k in range(touched[2]):
+                block = block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)
+                any = any | sensors.touched[e, first_record(grid, blocks, e, f, block) // BLOCK_NODES]
+    return any != 0
+
+
+@wp.kernel(launch_bounds=(THREADS, 8))
 def sense_contact(
     grid: Grid,
     particles: Particles,
-    contact: Contact,
     x: wp.array2d(dtype=wp.vec3),
     blocks: Blocks,
     failure: wp.array(dtype=int),
@@ -41,7 +69,8 @@ def sense_contact(
     xg = grid_position(grid, x[e, p])
     base = base_node(xg)
     own = particles.field[p]
-    if fields_around(grid, blocks, base, e) == (1 << own):
+    # nearly all particles leave here
+    if fields_around(grid, blocks, base, e) == (1 << own) or not touched_around(grid, blocks, sensors, e, own, base):
         return
     f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
     wx = spline(f[0])
@@ -54,10 +83,9 @@ def sense_contact(
     for i in range(3):
         for j in range(3):
             for k in range(3):
-                mask = blocks.fields[e, block_index(grid, base[0] + i, base[1] + j, base[2] + k)]
-                if mask != (1 << own):
-                    r = record_of(grid, blocks, e, own, base[0] + i, base[1] + j, base[2] + k)
-                    change = sensors.node[e, r]
+                r = record_of(grid, blocks, e, own, base[0] + i, base[1] + j, base[2] + k)
+                if sensors.touched[e, r // BLOCK_NODES] != 0:  # else its records are of the past
+                    change = read_change(sensors.node, e, r)
                     dv = wp.vec3(change[0], change[1], change[2])
                     if wp.length_sq(dv) > 0.0:
                         if int(change[3]) != giver:
@@ -65,7 +93,7 @@ def sense_contact(
                                 add_impulse(sensors, e, part_entry(sensors, sensor, giver), impulse)
                             impulse = wp.vec3()
                             giver = int(change[3])
-                        impulse += (m * wx[i] * wy[j] * wz[k]) * dv
+                        impulse += (m * pick(wx, i) * pick(wy, j) * pick(wz, k)) * dv
     if wp.length_sq(impulse) > 0.0:
         add_impulse(sensors, e, part_entry(sensors, sensor, giver), impulse)
 
@@ -111,7 +139,7 @@ def sense_penetration(
                             r = record_of(grid, blocks, e, g, base[0] + i, base[1] + j, base[2] + k)
                             # a block that the last gather has marked knows nothing yet
                             if r < BLOCK_NODES * blocks.swept[e]:
-                                m += wx[i] * wy[j] * wz[k] * node_velocity[e, r][0]
+                                m += pick(wx, i) * pick(wy, j) * pick(wz, k) * node_velocity[e, r][0]
             density = contact.density[row(e, contact.density.shape[0]), g]
             fraction += m * grid.inv_dx * grid.inv_dx * grid.inv_dx / density
     depth = grid.dx * (wp.min(fraction, 1.0) - SURFACE) / SURFACE_SLOPE

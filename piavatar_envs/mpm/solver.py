@@ -5,20 +5,19 @@ from __future__ import annotations
 from piavatar_envs.mpm import runs
 from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
-from piavatar_envs.mpm.grid import solve_contact, threads_per_block, update_grid
+from piavatar_envs.mpm.grid import solve_contact, update_grid
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import record_order, record_runs
+from piavatar_envs.mpm.runs import record_runs
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
+from piavatar_envs.mpm.sweep import THREADS, plan_sweep
 from piavatar_envs.mpm.transfer import grid_to_particles, particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 #: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In so
 #: many substeps nothing moves further than two blocks.
 MARKS_EVERY = 8
-#: Substeps after which particles are sorted again, on a GPU.
-SORT_EVERY = 3 * MARKS_EVERY
 
 
 def record_substep(program: Program, model: Model, state: State, scratch: Scratch, index: int) -> None:
@@ -29,42 +28,51 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     """
     m, s, blocks, sums = model, state, scratch.blocks, scratch.sums
     if index > 0 and index % MARKS_EVERY == 0:
-        record_marks(program, model, state, scratch, sort=index % SORT_EVERY == 0)
+        record_marks(program, model, state, scratch)
     record_scatter(program, model, state, scratch)
-    threads = threads_per_block(m.device)
-    nodes = (m.num_envs, m.max_slots, threads)
+    threads, sweep = plan_sweep(m)
     program.launch(
         update_grid,
-        nodes,
-        [m.grid, m.step, m.boundaries, m.contact, threads, s.failure],
+        threads,
+        [m.grid, m.step, m.boundaries, m.contact, sweep, s.failure],
         [blocks, sums, scratch.velocity, scratch.sensors],
+        block_dim=THREADS,
     )
     if m.contact.num_fields > 1:
         _record_contact(program, model, state, scratch)
     gather = grid_to_particles if m.scatter == "plain" else runs.grid_to_particles
     inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
-    program.launch(gather, s.x.shape, inputs, [blocks, _moving(s), s.failure])
+    program.launch(gather, s.x.shape, inputs, [blocks, _moving(s), s.failure], block_dim=runs.THREADS)
     if m.moving_boundaries:
         program.launch(move_colliders, m.boundaries.position.shape, [m.step.dt], [m.boundaries])
 
 
 def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append the grid pass over the blocks with several fields, and what the contact sensors feel."""
-    m, blocks, sums, threads = model, scratch.blocks, scratch.sums, threads_per_block(model.device)
-    nodes = (m.num_envs, m.max_slots, threads)
-    program.launch(find_facing, nodes, [m.grid, m.contact, threads, blocks], [sums, scratch.velocity, scratch.facing])
+    m, blocks, sums = model, scratch.blocks, scratch.sums
+    threads, sweep = plan_sweep(m)
+    program.launch(
+        find_facing,
+        threads,
+        [m.grid, m.contact, sweep, blocks],
+        [sums, scratch.velocity, scratch.facing],
+        block_dim=THREADS,
+    )
     program.launch(
         solve_contact,
-        nodes,
-        [m.grid, m.step, m.boundaries, m.contact, threads, blocks, scratch.facing],
+        threads,
+        [m.grid, m.step, m.boundaries, m.contact, sweep, blocks, scratch.facing],
         [sums, scratch.velocity, scratch.sensors],
+        block_dim=THREADS,
     )
-    program.launch(
-        sense_contact,
-        state.x.shape,
-        [m.grid, m.particles, m.contact, state.x, blocks, state.failure],
-        [scratch.sensors],
-    )
+    if m.num_sensors > 0:
+        program.launch(
+            sense_contact,
+            state.x.shape,
+            [m.grid, m.particles, state.x, blocks, state.failure],
+            [scratch.sensors],
+            block_dim=THREADS,
+        )
 
 
 def record_scatter(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -74,7 +82,7 @@ def record_scatter(program: Program, model: Model, state: State, scratch: Scratc
     if m.scatter == "plain":
         program.launch(particles_to_grid, s.x.shape, inputs, [s.failure, scratch.sums])
     else:
-        record_runs(program, inputs, scratch.order, s.failure, scratch.sums)
+        record_runs(program, inputs, s.x.shape, s.failure, scratch.sums)
 
 
 def _moving(s: State) -> Moving:
@@ -87,10 +95,8 @@ def record_begin(program: Program, model: Model, state: State, scratch: Scratch)
     record_marks(program, model, state, scratch)
 
 
-def record_marks(program: Program, model: Model, state: State, scratch: Scratch, sort: bool = True) -> None:
+def record_marks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append: give slots to the blocks of all particles; the gather of every substep adds those that it comes to.
-
-    The particles are sorted, too, where the scatter asks for it and ``sort`` does not say otherwise.
 
     What has been is forgotten first: a reset may have put the particles elsewhere, and a block that is marked for
     nothing costs time and, in its rounding, the equality of runs.
@@ -100,8 +106,6 @@ def record_marks(program: Program, model: Model, state: State, scratch: Scratch,
     program.launch(free_slots, m.num_envs, [state.failure], [blocks])
     program.launch(mark_particles, state.x.shape, [m.grid, m.particles, state.x], [blocks, state.failure])
     program.launch(freeze, m.num_envs, [state.failure], [blocks])
-    if sort and m.scatter != "plain":
-        record_order(program, m, state, scratch)
 
 
 def record_end(program: Program, model: Model, state: State, scratch: Scratch) -> None:

@@ -19,10 +19,20 @@ BLOCK = 4
 BLOCK_NODES = wp.constant(64)
 
 
-@wp.func
-def grid_position(grid: Grid, x: wp.vec3):
+# A product that the compiler may fuse with what comes next would put a particle into one cell here, into another there
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return wp::vec3(
+    __fmul_rn(x[0] - grid.origin[0], grid.inv_dx),
+    __fmul_rn(x[1] - grid.origin[1], grid.inv_dx),
+    __fmul_rn(x[2] - grid.origin[2], grid.inv_dx));
+#else
+return (x - grid.origin) * grid.inv_dx;
+#endif
+""")
+def grid_position(grid: Grid, x: wp.vec3) -> wp.vec3:
     """Position in units of the grid spacing, from the first node."""
-    return (x - grid.origin) * grid.inv_dx
+    ...
 
 
 @wp.func

@@ -34,35 +34,137 @@ def units(density: np.ndarray, grid: Grid, step: Step) -> tuple[np.ndarray, np.n
     return np.exp2(np.round(np.log2(mass))), np.exp2(np.round(np.log2(mass * grid.dx / step.dt)))
 
 
+@wp.func_native("return (wp::uint64)&wp::index(records, e, 0);")
+def first_of_records(records: wp.array2d(dtype=vec8), e: int) -> wp.uint64:
+    """Address of ``records[e, 0]``, for :func:`read_record_from`."""
+    ...
+
+
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-const float4* at = reinterpret_cast<const float4*>(&wp::index(records, e, r));
+const float4* at = reinterpret_cast<const float4*>(first) + 2 * r;
 const float4 a = at[0], b = at[1];
 wp::vec_t<8, wp::float32> value;
 value[0] = a.x; value[1] = a.y; value[2] = a.z; value[3] = a.w;
 value[4] = b.x; value[5] = b.y; value[6] = b.z; value[7] = b.w;
 return value;
 #else
-return wp::index(records, e, r);
+return reinterpret_cast<const wp::vec_t<8, wp::float32>*>(first)[r];
 #endif
 """)
-def read_record(records: wp.array2d(dtype=vec8), e: int, r: int) -> vec8:
-    """``records[e, r]``, on a GPU in two loads of 16 bytes instead of eight of 4."""
+def read_record_from(first: wp.uint64, r: int) -> vec8:
+    """Record ``r`` after that at the address ``first``, on a GPU in two loads of 16 bytes instead of eight of 4."""
     ...
+
+
+@wp.func
+def read_record(records: wp.array2d(dtype=vec8), e: int, r: int):
+    """``records[e, r]``; for many of an environment, :func:`read_record_from` finds its row once."""
+    return read_record_from(first_of_records(records, e), r)
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-float4* at = reinterpret_cast<float4*>(&wp::index(records, e, r));
-at[0] = make_float4(value[0], value[1], value[2], value[3]);
-at[1] = make_float4(value[4], value[5], value[6], value[7]);
+float4* const mine = reinterpret_cast<float4*>(&wp::index(records, e, r));
+const float4 a = make_float4(value[0], value[1], value[2], value[3]);
+const float4 b = make_float4(value[4], value[5], value[6], value[7]);
+constexpr unsigned ALL = 0xffffffffu;
+if (__activemask() != ALL) {
+    mine[0] = a;
+    mine[1] = b;
+    return;
+}
+// memory takes 32 bytes at a time: two threads write one's record, then the other's, with a half each
+const int odd = threadIdx.x & 1;
+const float4 give = odd ? a : b;
+float4 got;
+got.x = __shfl_xor_sync(ALL, give.x, 1);
+got.y = __shfl_xor_sync(ALL, give.y, 1);
+got.z = __shfl_xor_sync(ALL, give.z, 1);
+got.w = __shfl_xor_sync(ALL, give.w, 1);
+float4* const other = (float4*)__shfl_xor_sync(ALL, (unsigned long long)mine, 1);
+__syncwarp();  // the other may have read its own, and will read it again
+(odd ? other : mine)[odd] = odd ? got : a;
+(odd ? mine : other)[odd] = odd ? b : got;
+__syncwarp();
 #else
 wp::index(records, e, r) = value;
 #endif
 """)
 def write_record(records: wp.array2d(dtype=vec8), e: int, r: int, value: vec8):
-    """``records[e, r] = value`` in two stores of 16 bytes."""
+    """``records[e, r] = value`` in two stores of 16 bytes; threads of a warp must not write the same record."""
     ...
+
+
+_READ_PART = """
+#if defined(__CUDA_ARCH__)
+const int4 n = reinterpret_cast<const int4*>(&wp::index(records, e, r))[part];
+return wp::vec_t<4, wp::int32>(n.x, n.y, n.z, n.w);
+#else
+const auto& n = wp::index(records, e, r);
+return wp::vec_t<4, wp::int32>(n[4 * part], n[4 * part + 1], n[4 * part + 2], n[4 * part + 3]);
+#endif
+"""
+_CLEAR = """
+#if defined(__CUDA_ARCH__)
+constexpr int PARTS = sizeof(wp::index(records, e, r)) / 16;
+int4* const mine = reinterpret_cast<int4*>(&wp::index(records, e, r));
+const int4 zero = make_int4(0, 0, 0, 0);
+constexpr unsigned ALL = 0xffffffffu;
+if (__activemask() == ALL) {
+    const int lane = threadIdx.x & 31;
+    int4* const first = (int4*)__shfl_sync(ALL, (unsigned long long)mine, 0);
+    if (__all_sync(ALL, mine == first + PARTS * lane)) {  // a warp's records lie together: cleared as they lie
+        const unsigned cleared = __ballot_sync(ALL, clears);
+        __syncwarp();  // all have read theirs
+#pragma unroll
+        for (int part = lane; part < 32 * PARTS; part += 32)
+            if (cleared >> (part / PARTS) & 1u) first[part] = zero;
+        __syncwarp();
+        return;
+    }
+}
+if (clears) {
+#pragma unroll
+    for (int part = 0; part < PARTS; ++part) mine[part] = zero;
+}
+#else
+if (clears) wp::index(records, e, r) = {};
+#endif
+"""
+
+
+@wp.func_native(_READ_PART)
+def part_of_sum(records: wp.array2d(dtype=vec16i), e: int, r: int, part: int) -> wp.vec4i:
+    """Integers ``4 part`` to ``4 part + 3`` of ``records[e, r]``, on a GPU in one load."""
+    ...
+
+
+@wp.func_native(_READ_PART)
+def part_of_offset(records: wp.array2d(dtype=vec8i), e: int, r: int, part: int) -> wp.vec4i:
+    """:func:`part_of_sum` of offsets."""
+    ...
+
+
+@wp.func_native(_CLEAR)
+def clear_fixed_sum(records: wp.array2d(dtype=vec16i), e: int, r: int, clears: bool):
+    """``records[e, r] = 0`` if ``clears``; at best all threads of a warp come here."""
+    ...
+
+
+@wp.func_native(_CLEAR)
+def clear_fixed_offset(records: wp.array2d(dtype=vec8i), e: int, r: int, clears: bool):
+    """:func:`clear_fixed_sum` of offsets."""
+    ...
+
+
+@wp.func
+def join_parts(high: wp.vec4i, low: wp.vec4i):
+    """Four numbers, from their parts."""
+    n = wp.vec4()
+    for c in range(4):
+        n[c] = HIGH * float(high[c]) + float(low[c])
+    return n
 
 
 @wp.func
@@ -73,14 +175,13 @@ def take_sum(sums: Sums, e: int, f: int, r: int):
         s = read_record(sums.value, e, r)
         write_record(sums.value, e, r, vec8())
     else:
-        n = sums.fixed[e, r]
-        m = HIGH * float(n[0]) + float(n[8])
-        if m > 0.0:  # who adds no mass adds nothing
-            units = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
-            for c in range(1, 7):
-                s[c] = units * (HIGH * float(n[c]) + float(n[8 + c]))
-            s[0] = sums.mass_unit[row(e, sums.mass_unit.shape[0]), f] * m
-            sums.fixed[e, r] = vec16i()
+        a = join_parts(part_of_sum(sums.fixed, e, r, 0), part_of_sum(sums.fixed, e, r, 2))
+        if a[0] > 0.0:  # who adds no mass adds nothing
+            b = join_parts(part_of_sum(sums.fixed, e, r, 1), part_of_sum(sums.fixed, e, r, 3))
+            m = sums.mass_unit[row(e, sums.mass_unit.shape[0]), f]
+            p = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
+            s = vec8(m * a[0], p * a[1], p * a[2], p * a[3], p * b[0], p * b[1], p * b[2], 0.0)
+        clear_fixed_sum(sums.fixed, e, r, a[0] > 0.0)
     return s
 
 
@@ -95,13 +196,9 @@ def offset_at(grid: Grid, sums: Sums, e: int, f: int, r: int):
     """Sum of ``w m (x_i - x_p)`` [kg m] and of the mass of seam particles [kg] at record ``r`` of field ``f``."""
     if sums.is_fixed == 0:
         return sums.offset[e, r]
-    n = sums.offset_fixed[e, r]
-    unit = offset_unit(grid, sums, e, f)
-    s = wp.vec4()
-    for c in range(4):
-        s[c] = unit * (HIGH * float(n[c]) + float(n[4 + c]))
-    s[3] = s[3] / grid.dx
-    return s
+    n = join_parts(part_of_offset(sums.offset_fixed, e, r, 0), part_of_offset(sums.offset_fixed, e, r, 1))
+    s = offset_unit(grid, sums, e, f) * n
+    return wp.vec4(s[0], s[1], s[2], s[3] / grid.dx)
 
 
 @wp.func
@@ -119,4 +216,4 @@ def clear_offset(sums: Sums, e: int, r: int):
     if sums.is_fixed == 0:
         sums.offset[e, r] = wp.vec4(0.0)
     else:
-        sums.offset_fixed[e, r] = vec8i()
+        clear_fixed_offset(sums.offset_fixed, e, r, True)

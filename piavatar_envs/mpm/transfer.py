@@ -13,7 +13,7 @@ from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_PARTICLE, nearest_bou
 from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline, stencil_inside
-from piavatar_envs.mpm.sums import read_record
+from piavatar_envs.mpm.sums import first_of_records, read_record_from
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
     FAILURE_CFL,
@@ -90,6 +90,12 @@ def scatters(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(d
 
 
 @wp.func
+def near_boundary(grid: Grid, boundaries: Boundaries, e: int, x: wp.vec3):
+    """Whether a particle at ``x`` is so near a boundary that its nodes must know where it is."""
+    return nearest_boundary(boundaries, e, x) < NEAR_PARTICLE * grid.dx
+
+
+@wp.func
 def tells_place(
     grid: Grid,
     particles: Particles,
@@ -104,7 +110,7 @@ def tells_place(
     """Whether nodes must know where this particle is: another field or a boundary is near."""
     if contact.num_fields > 1 and fields_around(grid, blocks, base, e) != (1 << particles.field[p]):
         return True
-    return nearest_boundary(boundaries, e, x) < NEAR_PARTICLE * grid.dx
+    return near_boundary(grid, boundaries, e, x)
 
 
 @wp.func
@@ -153,13 +159,15 @@ def particles_to_grid(
     wz = spline(s.f[2])
     field = particles.field[p]
     at_i = s.at_base
+    slab = wp.vec4i()
     for i in range(3):
         at_j = wx[i] * at_i
-        slab = slab_records(grid, blocks, e, field, base, i)
+        if i == 0 or ((base[0] + i) & 3) == 0:
+            slab = slab_records(grid, blocks, e, field, base, i)
         for j in range(3):
             line = wy[j] * at_j
             step_z = (wx[i] * wy[j]) * along_z
-            at = line_of_records(slab, base, j)
+            at = line_of_records(slab, base, i, j)
             wp.atomic_add(sums.value, e, at[0], wz[0] * line)
             wp.atomic_add(sums.value, e, at[1], wz[1] * (line + step_z))
             wp.atomic_add(sums.value, e, at[2], wz[2] * (line + 2.0 * step_z))
@@ -193,57 +201,22 @@ class Gathered:
 
 
 @wp.func
-def gather(
+def advance(
     grid: Grid,
     step: Step,
-    particles: Particles,
     boundaries: Boundaries,
-    node_velocity: wp.array2d(dtype=vec8),
-    blocks: Blocks,
     moved: Moving,
-    failure: wp.array(dtype=int),
     e: int,
     p: int,
+    mean: vec8,
+    grad_v: wp.mat33,
+    grad_vk: wp.mat33,
 ):
-    """Particle ``p`` from the nodes: velocities and gradients, and with them position and deformation.
+    """Particle ``p`` a substep later, from the ``mean`` of the nodes' records around it and the velocities' gradients.
 
-    The blocks that it comes to are marked for the next substep.
-
-    A particle is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking
-    exact (1e-5 m against 1e-2 m). What the grid did not see is projected out of the boundaries.
+    It is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking exact
+    (1e-5 m against 1e-2 m). What the grid did not see is projected out of the boundaries.
     """
-    xg = grid_position(grid, moved.x[e, p])
-    base = base_node(xg)
-    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
-    wx = spline(f[0])
-    wy = spline(f[1])
-    wz = spline(f[2])
-    field = particles.field[p]
-    mean = vec8()
-    moment_x = vec8()
-    moment_y = vec8()
-    moment_z = vec8()
-    for i in range(3):
-        plane = vec8()
-        slab = slab_records(grid, blocks, e, field, base, i)
-        for j in range(3):
-            at_line = line_of_records(slab, base, j)
-            w = wx[i] * wy[j]
-            second = (w * wz[1]) * read_record(node_velocity, e, at_line[1])
-            third = (w * wz[2]) * read_record(node_velocity, e, at_line[2])
-            line = (w * wz[0]) * read_record(node_velocity, e, at_line[0]) + second + third
-            plane += line
-            moment_y += float(j) * line
-            moment_z += second + 2.0 * third
-        mean += plane
-        moment_x += float(i) * plane
-    # gradient of quadratic-spline APIC: (4 / dx^2) sum w v (x_i - x_p)^T
-    scale = 4.0 * grid.inv_dx
-    gx = scale * (moment_x - f[0] * mean)
-    gy = scale * (moment_y - f[1] * mean)
-    gz = scale * (moment_z - f[2] * mean)
-    grad_v = wp.mat33(gx[1], gy[1], gz[1], gx[2], gy[2], gz[2], gx[3], gy[3], gz[3])
-    grad_vk = wp.mat33(gx[4], gy[4], gz[4], gx[5], gy[5], gz[5], gx[6], gy[6], gz[6])
     velocity = wp.vec3(mean[1], mean[2], mean[3])
     advection = velocity
     if step.decoupling == SPLIT or step.decoupling == NO_STRESS:
@@ -260,10 +233,70 @@ def gather(
     )
     s.x = moved.x[e, p] + step.dt * advection
     s.fault = fault_of(grid, step, s.F, advection, s.x)
+    return s
+
+
+@wp.func
+def gather(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    node_velocity: wp.array2d(dtype=vec8),
+    blocks: Blocks,
+    moved: Moving,
+    failure: wp.array(dtype=int),
+    e: int,
+    p: int,
+):
+    """Particle ``p`` from the nodes: velocities and gradients, and with them position and deformation.
+
+    The blocks that it comes to are marked for the next substep.
+    """
+    xg = grid_position(grid, moved.x[e, p])
+    base = base_node(xg)
+    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
+    wx = spline(f[0])
+    wy = spline(f[1])
+    wz = spline(f[2])
+    field = particles.field[p]
+    nodes = first_of_records(node_velocity, e)
+    mean = vec8()
+    moment_x = vec8()
+    moment_y = vec8()
+    moment_z = vec8()
+    slab = wp.vec4i()
+    planes = int(3)  # not a constant: a GPU has too few registers for the loads of all three at once
+    for i in range(planes):
+        wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
+        plane = vec8()
+        if i == 0 or ((base[0] + i) & 3) == 0:
+            slab = slab_records(grid, blocks, e, field, base, i)
+        for j in range(3):
+            at_line = line_of_records(slab, base, i, j)
+            w = wi * wy[j]
+            second = (w * wz[1]) * read_record_from(nodes, at_line[1])
+            third = (w * wz[2]) * read_record_from(nodes, at_line[2])
+            line = (w * wz[0]) * read_record_from(nodes, at_line[0]) + second + third
+            plane += line
+            moment_y += float(j) * line
+            moment_z += second + 2.0 * third
+        mean += plane
+        moment_x += float(i) * plane
+    # gradient of quadratic-spline APIC: (4 / dx^2) sum w v (x_i - x_p)^T
+    scale = 4.0 * grid.inv_dx
+    gx = scale * (moment_x - f[0] * mean)
+    gy = scale * (moment_y - f[1] * mean)
+    gz = scale * (moment_z - f[2] * mean)
+    grad_v = wp.mat33(gx[1], gy[1], gz[1], gx[2], gy[2], gz[2], gx[3], gy[3], gz[3])
+    grad_vk = wp.mat33(gx[4], gy[4], gz[4], gx[5], gy[5], gz[5], gx[6], gy[6], gz[6])
+    s = advance(grid, step, boundaries, moved, e, p, mean, grad_v, grad_vk)
     if s.fault != 0:
         wp.atomic_or(failure, e, s.fault)
     else:
-        mark_blocks(grid, blocks, base_node(grid_position(grid, s.x)), field, e, failure)
+        to = base_node(grid_position(grid, s.x))
+        if to[0] != base[0] or to[1] != base[1] or to[2] != base[2]:
+            mark_blocks(grid, blocks, to, field, e, failure)
     return s
 
 

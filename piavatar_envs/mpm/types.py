@@ -114,6 +114,7 @@ class Sensors:
     part_impulse: wp.array3d(dtype=wp.vec3)  # (num_envs, sensors, S) on the particles of a sensor, by subject [N s]
     # (num_envs, records) change of velocity by other subjects and the one that did most of it; of shared blocks
     node: wp.array2d(dtype=wp.vec4)
+    touched: wp.array2d(dtype=int)  # (num_envs, slots) not 0: ``node`` has changes in this slot, in this substep
     penetration: wp.array2d(dtype=float)  # (num_envs, S) deepest particle of a subject inside another [m]
 
 
@@ -251,8 +252,6 @@ class Scratch:
             the sums stand here until they have become velocities.
         facing: vec3: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`; of blocks with
             several fields only.
-        order: ``(2 * num_envs * num_particles,)`` the particles by cell, and room to sort; of one entry where the
-            scatter does not ask for it. ``keys``: what is sorted by.
         sensors: what contact did in this control step.
     """
 
@@ -260,6 +259,4 @@ class Scratch:
     sums: Sums
     velocity: wp.array
     facing: wp.array
-    order: wp.array
-    keys: wp.array
     sensors: Sensors

@@ -1,9 +1,9 @@
 """The scatter of a warp, 32 threads that work together, in CUDA: Warp's own language has no words for what they share.
 
 A thread that adds its particle to 27 nodes by atomic operations waits for them, and so do all the others. Here a warp
-puts 32 particles into shared memory, finds those of the same cell and adds each such run up in registers, a thread a
-node of the stencil. Runs of the same block of 4 x 4 x 4 cells meet in a brick of 6 x 6 x 6 nodes in shared memory, and
-nodes are touched when the warp goes on to another block, by as many threads a node as its record has parts.
+puts its particles into shared memory and adds those of the same cell up in registers: a thread has the three nodes of a
+line of the stencil along z, and one component of the momenta. Such runs meet in a brick of 6 x 6 x 6 nodes in shared
+memory, which lies wherever the warp's particles do. Nodes are touched when it is full, by eight threads a node.
 """
 
 from __future__ import annotations
@@ -19,175 +19,205 @@ wp.set_module_options({"enable_backward": False})
 _SCATTER_RUNS = """
 #if defined(__CUDA_ARCH__)
 constexpr unsigned ALL = 0xffffffffu;
-constexpr int WORDS = 31;  // of a staged particle: 7 sums, 9 of A, 9 weights, 5 of its place; odd, for the banks
-constexpr int BRICK = 216;
-__shared__ float stages[4 * 32 * WORDS];
-__shared__ float bricks[4 * 7 * BRICK];
-__shared__ unsigned char lists[4 * BRICK];
-__shared__ long long holds[4];
+// a staged particle: weights along z and mass; three times a momentum at the lowest node and its change along x, y, z;
+// kinematic momentum and the mass that tells its place; weights along x and y, and the seam's mass that tells its place
+constexpr int QUADS = 7;  // odd, for the banks
+// a brick's nodes have seven sums each; strides along z, y and x for which the lanes of a run meet in no bank
+constexpr int NODES = 216, ALONG_Z = 7, ALONG_Y = 42, ALONG_X = 259, BRICK = 1556;
+__shared__ float4 stages[4 * 32 * QUADS];
+__shared__ __align__(16) float bricks[4 * BRICK];
+__shared__ int records[4 * NODES];
+__shared__ unsigned short places[4 * NODES];
+__shared__ int4 helds[4];
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
-float* const stage = stages + warp * 32 * WORDS;
-float* const brick = bricks + warp * 7 * BRICK;
-unsigned char* const list = lists + warp * BRICK;
+float4* const stage = stages + warp * 32 * QUADS;
+float* const brick = bricks + warp * BRICK;
+int* const record_of_node = records + warp * NODES;
+unsigned short* const place_of_node = places + warp * NODES;
 
-// what is known of the block that a key is of
-int env = 0, field = 0, x = 0, y = 0, z = 0, around = 0;
-float per_mass = 0.0f, per_momentum = 0.0f;
-auto look_up = [&](long long of) {
-    const int block = (int)(of % grid.num_blocks), of_field = (int)(of / grid.num_blocks);
-    env = of_field / num_fields;
-    field = of_field % num_fields;
-    z = block % grid.blocks[2];
-    y = block / grid.blocks[2] % grid.blocks[1];
-    x = block / (grid.blocks[2] * grid.blocks[1]);
-    // lane 4 i + 2 j + k knows the slot of its neighbour (i, j, k); of one that has none, nothing is asked
-    const int i = min(x + (lane >> 2 & 1), grid.blocks[0] - 1), j = min(y + (lane >> 1 & 1), grid.blocks[1] - 1);
-    const int k = min(z + (lane & 1), grid.blocks[2] - 1);
-    around = wp::index(blocks.slot, env, field * grid.num_blocks + (i * grid.blocks[1] + j) * grid.blocks[2] + k);
-    per_mass = 1.0f / wp::index(sums.mass_unit, min(env, sums.mass_unit.shape[0] - 1), field);
-    per_momentum = 1.0f / wp::index(sums.momentum_unit, min(env, sums.momentum_unit.shape[0] - 1), field);
-};
-// the high or the low part of a number of units
-auto piece = [](float units, int low) {
-    const long long n = __float2ll_rn(units);
-    return low ? (int)(n & 0xfffff) : (int)(n >> 20);
-};
-// adds a part of component c to node (i, j, k) from the lowest of the block looked up: 0 to 7 are the high parts of a
-// record or its floating-point numbers, 8 to 15 the low parts; all lanes take part, some do not add
-auto add = [&](bool adds, int i, int j, int k, int part, float value) {
-    const int c = part & 7;
-    const int slot = __shfl_sync(ALL, around, (i >> 2) * 4 + (j >> 2) * 2 + (k >> 2));
-    const int record = 64 * slot + ((i & 3) * 4 + (j & 3)) * 4 + (k & 3);
-    if (!adds) return;
-    const float units = value * (c == 0 ? per_mass : per_momentum);
-    if (sums.is_fixed)
-        atomicAdd((int*)&wp::index(sums.fixed, env, record) + part, piece(units, part >> 3));
-    else
-        atomicAdd((float*)&wp::index(sums.value, env, record) + c, value);
-};
-// adds the brick to the nodes, by a quarter of the warp each, and empties it
-auto put_down = [&](long long of) {
-    look_up(of);
-    int count = 0;
-    for (int t = lane; t < 7 * 32; t += 32) {
-        const bool has = t < BRICK && brick[t] * per_mass > 0.5f;  // who adds no mass adds nothing
-        const unsigned having = __ballot_sync(ALL, has);
-        if (has) list[count + __popc(having & ((1u << lane) - 1u))] = (unsigned char)t;
-        count += __popc(having);
-    }
-    __syncwarp();
-    // as many lanes a node as its record has parts
-    const int log_parts = sums.is_fixed ? 4 : 3, parts = 1 << log_parts;
-    for (int u = 0; u < parts * count; u += 32) {
-        const bool adds = u + lane < parts * count && (lane & 7) < 7;
-        const int n = adds ? list[(u + lane) >> log_parts] : 0;
-        add(adds, n / 36, n / 6 % 6, n % 6, lane & (parts - 1), adds ? brick[(lane & 7) * BRICK + n] : 0.0f);
-    }
-    __syncwarp();
-    for (int n = lane; n < 7 * BRICK; n += 32) brick[n] = 0.0f;
-    __syncwarp();
-};
-
-const long long per_env = (long long)num_fields * grid.num_blocks;
-long long held = begins ? -1 : holds[warp];
-if (begins)
-    for (int n = lane; n < 7 * BRICK; n += 32) brick[n] = 0.0f;
 // lanes of the same cell get neighbouring places, the cells in the order of their first lanes
-const unsigned same = __match_any_sync(ALL, (unsigned long long)key);
+const int x = s.base[0], y = s.base[1], z = s.base[2];
+const long long cell = (long long)x | (long long)y << 19 | (long long)z << 38 | (long long)field << 57;
+const unsigned same = __match_any_sync(ALL, (unsigned long long)(takes ? cell : -1));
 const int first = __ffs(same) - 1;
-const bool leads = key >= 0 && first == lane;
-const int size = leads ? __popc(same) : 0;
-int before = size;
+const bool leads = takes && first == lane;
+int before = leads ? __popc(same) : 0;
 for (int d = 1; d < 32; d <<= 1) {
     const int left = __shfl_up_sync(ALL, before, d);
     if (lane >= d) before += left;
 }
-before -= size;
+before -= leads ? __popc(same) : 0;
 const int place = __shfl_sync(ALL, before, first) + __popc(same & ((1u << lane) - 1u));
-if (key >= 0) {
-    float* const mine = stage + place * WORDS;
-    for (int c = 0; c < 7; ++c) mine[c] = s.at_base[c];
-    for (int c = 0; c < 3; ++c) {
-        for (int d = 0; d < 3; ++d) mine[7 + 3 * c + d] = s.A.data[c][d];
-        mine[16 + c] = wx[c];
-        mine[19 + c] = wy[c];
-        mine[22 + c] = wz[c];
-        mine[25 + c] = tells ? s.f[c] * s.at_base[0] : 0.0f;
-    }
-    mine[28] = tells ? s.at_base[0] : 0.0f;
-    mine[29] = tells ? seam * s.at_base[0] : 0.0f;
+float4* const mine = stage + place * QUADS;
+if (takes) {
+    mine[0] = make_float4(wz[0], wz[1], wz[2], s.at_base[0]);
+    for (int c = 0; c < 3; ++c)
+        mine[1 + c] = make_float4(s.at_base[1 + c], s.A.data[c][0], s.A.data[c][1], s.A.data[c][2]);
+    mine[4] = make_float4(s.at_base[4], s.at_base[5], s.at_base[6], 0.0f);
+    mine[5] = make_float4(wx[0], wx[1], wx[2], wy[0]);
+    mine[6] = make_float4(wy[1], wy[2], 0.0f, 0.0f);
 }
-__syncwarp();
-
+// a lane's line of nodes (i, j, 0 to 2) and its component of the vectors; five have none
 const bool on = lane < 27;
-const int li = on ? lane / 9 : 0, lj = on ? (lane / 3) % 3 : 0, lk = on ? lane % 3 : 0;
-const float ri = li, rj = lj, rk = lk;
-unsigned runs = __ballot_sync(ALL, leads);
-while (runs) {
-    const int leader = __ffs(runs) - 1;
-    runs &= runs - 1;
-    const int begin = __shfl_sync(ALL, before, leader), end = begin + __shfl_sync(ALL, size, leader);
-    const long long cell = __shfl_sync(ALL, (long long)key, leader), of = cell >> 6;
-    // what another environment holds is put down at once: whether it does is not this one's business
-    const bool other = held < 0 || of / per_env != held / per_env;
-    if (of != held && (other || __popc(__ballot_sync(ALL, key >= 0 && (key >> 6) == of)) >= worth_a_brick)) {
-        if (held >= 0) put_down(held);
-        held = of;
-    }
-    float sum[7] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
-#pragma unroll 2
-    for (int n = begin; n < end; ++n) {
-        const float* const a = stage + n * WORDS;
-        const float w = a[16 + li] * a[19 + lj] * a[22 + lk];
-        sum[0] += w * a[0];
-        sum[1] += w * (a[1] + a[7] * ri + a[8] * rj + a[9] * rk);
-        sum[2] += w * (a[2] + a[10] * ri + a[11] * rj + a[12] * rk);
-        sum[3] += w * (a[3] + a[13] * ri + a[14] * rj + a[15] * rk);
-        sum[4] += w * a[4];
-        sum[5] += w * a[5];
-        sum[6] += w * a[6];
-    }
-    const int i = ((int)cell >> 4 & 3) + li, j = ((int)cell >> 2 & 3) + lj, k = ((int)cell & 3) + lk;
-    if (of == held) {
-        float* const node = brick + (i * 6 + j) * 6 + k;
-        if (on)
-            for (int c = 0; c < 7; ++c) node[c * BRICK] += sum[c];
-    } else {
-        look_up(of);
-        const bool adds = on && sum[0] * per_mass > 0.5f;
-        for (int c = 0; c < 7; ++c) {
-            add(adds, i, j, k, c, sum[c]);
-            if (sums.is_fixed) add(adds, i, j, k, 8 + c, sum[c]);
-        }
-    }
-    if (__ballot_sync(ALL, tells && first == leader)) {
-        float m = 0.0f, place[3] = {0.0f, 0.0f, 0.0f}, grown = 0.0f;
-        for (int n = begin; n < end; ++n) {
-            const float* const a = stage + n * WORDS;
-            const float w = a[16 + li] * a[19 + lj] * a[22 + lk];
-            m += w * a[28];
-            grown += w * a[29];
-            for (int c = 0; c < 3; ++c) place[c] += w * a[25 + c];
-        }
-        look_up(of);
-        const int slot = __shfl_sync(ALL, around, (i >> 2) * 4 + (j >> 2) * 2 + (k >> 2));
-        const int record = 64 * slot + ((i & 3) * 4 + (j & 3)) * 4 + (k & 3);
-        const float value[4] = {m * ri - place[0], m * rj - place[1], m * rk - place[2], grown};
-        if (on)
-            for (int c = 0; c < 4; ++c)
-                if (sums.is_fixed) {
-                    int* const into = (int*)&wp::index(sums.offset_fixed, env, record);
-                    atomicAdd(into + c, piece(value[c] * per_mass, 0));
-                    atomicAdd(into + 4 + c, piece(value[c] * per_mass, 1));
-                } else {
-                    float* const into = (float*)&wp::index(sums.offset, env, record);
-                    atomicAdd(into + c, c < 3 ? value[c] * grid.dx : value[c]);
+const int li = on ? lane / 9 : 0, lj = on ? lane / 3 % 3 : 0, lc = on ? lane % 3 : 0;
+const float ri = li, rj = lj;
+// the two integers of so many units
+auto high = [](float units) { return rintf(units * 0x1p-20f); };
+auto low = [](float units, float high) { return __float2int_rn(fmaf(high, -0x1p20f, units)); };
+// the brick at hand: its field, -1 for none, and its lowest node
+int f = begins ? -1 : helds[warp].w, ox = helds[warp].x, oy = helds[warp].y, oz = helds[warp].z;
+unsigned waiting = __ballot_sync(ALL, leads);
+for (;;) {
+    const bool fits = waiting >> lane & 1u && field == f && (unsigned)(x - ox) < 4u && (unsigned)(y - oy) < 4u &&
+                      (unsigned)(z - oz) < 4u;
+    const unsigned fitting = __ballot_sync(ALL, fits);
+    // lane 9 i + 3 j + k knows the slot of block (i, j, k) from the brick's first; of one that is not needed, nonsense
+    const int bx = min((ox >> 2) + li, grid.blocks[0] - 1), by = min((oy >> 2) + lj, grid.blocks[1] - 1);
+    const int bz = min((oz >> 2) + lc, grid.blocks[2] - 1);
+    const int block = (bx * grid.blocks[1] + by) * grid.blocks[2] + bz;
+    const int slot = f < 0 ? 0 : wp::index(blocks.slot, e, f * grid.num_blocks + block);
+    auto record_at = [&](int i, int j, int k) {  // of the brick's node; all lanes ask
+        i += ox, j += oy, k += oz;
+        const int from = ((i >> 2) - (ox >> 2)) * 9 + ((j >> 2) - (oy >> 2)) * 3 + (k >> 2) - (oz >> 2);
+        return 64 * __shfl_sync(ALL, slot, from) + ((i & 3) * 4 + (j & 3)) * 4 + (k & 3);
+    };
+    if (fitting == 0) {
+        if (f >= 0 && (waiting || ends)) {
+            // which nodes have got something: who adds no mass adds nothing
+            const float per_mass = 1.0f / wp::index(sums.mass_unit, min(e, sums.mass_unit.shape[0] - 1), f);
+            const float per_momentum = 1.0f / wp::index(sums.momentum_unit, min(e, sums.momentum_unit.shape[0] - 1), f);
+            int count = 0;
+#pragma unroll 1
+            for (int t = lane; t < 7 * 32; t += 32) {
+                const int at_brick = t / 36 * ALONG_X + t / 6 % 6 * ALONG_Y + t % 6 * ALONG_Z;
+                const bool has = t < NODES && brick[t < NODES ? at_brick : 0] * per_mass > 0.5f;
+                const unsigned having = __ballot_sync(ALL, has);
+                const int record = record_at(t / 36, t / 6 % 6, t % 6);
+                if (has) {
+                    const int at = count + __popc(having & ((1u << lane) - 1u));
+                    record_of_node[at] = record;
+                    place_of_node[at] = (unsigned short)at_brick;
                 }
+                count += __popc(having);
+            }
+            __syncwarp();
+            const int c = lane & 7;
+            const float per_unit = c == 0 ? per_mass : per_momentum;
+            int* const fixed = (int*)&wp::index(sums.fixed, sums.is_fixed ? e : 0, 0) + c;
+            float* const value = (float*)&wp::index(sums.value, sums.is_fixed ? 0 : e, 0) + c;
+            if (c < 7)
+                for (int n = lane >> 3; n < count; n += 4) {
+                    const float added = brick[c + place_of_node[n]];
+                    const int record = record_of_node[n];
+                    if (sums.is_fixed) {
+                        const float units = added * per_unit, part = high(units);
+                        atomicAdd(fixed + 16 * record, (int)part);
+                        atomicAdd(fixed + 16 * record + 8, low(units, part));
+                    } else
+                        atomicAdd(value + 8 * record, added);
+                }
+            __syncwarp();
+        }
+        if (waiting == 0) break;
+        // a brick for the first cell that waits, put so that the others of its field fit in if they can
+        const int leader = __ffs(waiting) - 1;
+        f = __shfl_sync(ALL, field, leader);
+        const bool waits = waiting >> lane & 1u && field == f;
+        auto corner = [&](int at) {
+            const int least = __reduce_min_sync(ALL, waits ? at : 0x7fffffff), own = __shfl_sync(ALL, at, leader);
+            return own - least > 3 ? own - 1 : least;
+        };
+        ox = corner(x), oy = corner(y), oz = corner(z);
+        for (int n = lane; n < BRICK / 4; n += 32)
+            reinterpret_cast<float4*>(brick)[n] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        continue;
+    }
+    waiting &= ~fitting;
+    // a particle tells its place if a boundary is near, or if a block that it touches has matter of another field
+    bool tells = takes && fitting >> first & 1u && near;
+    if (num_fields > 1) {
+        const int others = wp::index(blocks.fields, e, block) & ~(1 << f);
+        const unsigned shared = __ballot_sync(ALL, on && others != 0);
+        if (shared && takes && fitting >> first & 1u) {
+            const int i = (x >> 2) - (ox >> 2), j = (y >> 2) - (oy >> 2), k = (z >> 2) - (oz >> 2);
+            unsigned touched = 1u << k | ((z & 3) > 1 ? 2u << k : 0u);
+            touched = touched << 3 * j | ((y & 3) > 1 ? touched << 3 * j + 3 : 0u);
+            touched = touched << 9 * i | ((x & 3) > 1 ? touched << 9 * i + 9 : 0u);
+            tells = tells || (shared & touched) != 0;
+        }
+    }
+    const unsigned telling = __ballot_sync(ALL, tells);
+    if (telling && takes) {
+        mine[4].w = tells ? s.at_base[0] : 0.0f;
+        mine[6].z = tells ? seam * s.at_base[0] : 0.0f;
     }
     __syncwarp();
+
+    // where a run begins, how long it is, and where its cell is in the brick
+    const int corner_node = (x - ox) * ALONG_X + (y - oy) * ALONG_Y + (z - oz) * ALONG_Z;
+    const int run = before | __popc(same) << 5 | (same & telling ? 1 << 11 : 0) | corner_node << 12;
+    for (unsigned runs = fitting; runs; runs &= runs - 1) {
+        const int now = __shfl_sync(ALL, run, __ffs(runs) - 1);
+        const int begin = now & 31, end = begin + (now >> 5 & 63);
+        float m[3] = {0.0f, 0.0f, 0.0f}, q[3] = {0.0f, 0.0f, 0.0f}, k[3] = {0.0f, 0.0f, 0.0f};
+#pragma unroll 1
+        for (int n = begin; n < end; ++n) {
+            const float4* const a = stage + n * QUADS;
+            const float* const b = reinterpret_cast<const float*>(a + 4);
+            const float4 of_z = a[0], line = a[1 + lc];
+            const float w = b[4 + li] * b[7 + lj], kinematic = b[lc];
+            const float w0 = w * of_z.x, w1 = w * of_z.y, w2 = w * of_z.z;
+            const float at = line.x + line.y * ri + line.z * rj;
+            m[0] += w0 * of_z.w, m[1] += w1 * of_z.w, m[2] += w2 * of_z.w;
+            q[0] += w0 * at, q[1] += w1 * (at + line.w), q[2] += w2 * (at + 2.0f * line.w);
+            k[0] += w0 * kinematic, k[1] += w1 * kinematic, k[2] += w2 * kinematic;
+        }
+        float* const into = brick + (now >> 12) + li * ALONG_X + lj * ALONG_Y;
+        if (on) {  // all reads before the first write, or each would wait for the one before it
+            for (int c = 0; c < 3; ++c) {
+                q[c] += into[1 + lc + c * ALONG_Z];
+                k[c] += into[4 + lc + c * ALONG_Z];
+                if (lc == 0) m[c] += into[c * ALONG_Z];
+            }
+            for (int c = 0; c < 3; ++c) {
+                into[1 + lc + c * ALONG_Z] = q[c];
+                into[4 + lc + c * ALONG_Z] = k[c];
+                if (lc == 0) into[c * ALONG_Z] = m[c];
+            }
+        }
+        if (now >> 11 & 1) {  // sums of w m (x_i - x_p), and of w m of seam particles, straight to the nodes
+            float offset[3] = {0.0f, 0.0f, 0.0f}, grown[3] = {0.0f, 0.0f, 0.0f};
+            for (int n = begin; n < end; ++n) {
+                const float* const a = reinterpret_cast<const float*>(stage + n * QUADS);
+                const float* const along = a + (lc == 0 ? 20 : lc == 1 ? 23 : 0);
+                const float from = (lc == 0 ? ri : lc == 1 ? rj : 0.0f) - (1.0f + along[2] - along[0]);  // - f
+                const float w = a[20 + li] * a[23 + lj];
+                for (int c = 0; c < 3; ++c) {
+                    offset[c] += w * a[c] * a[19] * (lc == 2 ? from + c : from);
+                    grown[c] += w * a[c] * a[26];
+                }
+            }
+            const float per_mass = 1.0f / wp::index(sums.mass_unit, min(e, sums.mass_unit.shape[0] - 1), f);
+            const int at = now >> 12, i = at / ALONG_X + li, j = at % ALONG_X / ALONG_Y + lj;
+            for (int c = 0; c < 3; ++c) {
+                const int record = record_at(i, j, at % ALONG_X % ALONG_Y / ALONG_Z + c);
+                if (!on) continue;
+                if (sums.is_fixed) {
+                    int* const at = (int*)&wp::index(sums.offset_fixed, e, record);
+                    const float o = offset[c] * per_mass, g = grown[c] * per_mass;
+                    atomicAdd(at + lc, (int)high(o)), atomicAdd(at + 4 + lc, low(o, high(o)));
+                    if (lc == 0) atomicAdd(at + 3, (int)high(g)), atomicAdd(at + 7, low(g, high(g)));
+                } else {
+                    float* const at = (float*)&wp::index(sums.offset, e, record);
+                    atomicAdd(at + lc, offset[c] * grid.dx);
+                    if (lc == 0) atomicAdd(at + 3, grown[c]);
+                }
+            }
+        }
+        __syncwarp();
+    }
 }
-if (ends && held >= 0) put_down(held);
-if (lane == 0) holds[warp] = held;
+if (lane == 0) helds[warp] = make_int4(ox, oy, oz, f);
 __syncwarp();
 #endif
 """
@@ -199,21 +229,21 @@ def scatter_runs(
     blocks: Blocks,
     sums: Sums,
     num_fields: int,
-    worth_a_brick: int,
+    e: int,
     begins: bool,
     ends: bool,
-    key: wp.int64,
-    tells: bool,
+    takes: bool,
+    near: bool,
+    field: int,
     seam: float,
     s: Scattered,
     wx: wp.vec3,
     wy: wp.vec3,
     wz: wp.vec3,
 ):
-    """Scatter the particles of a warp, one a lane; those with a negative ``key`` do not take part.
+    """Scatter the particles of a warp, one a lane, all of environment ``e``; lanes that do not ``take`` part have none.
 
-    One that ``tells`` its place adds to the nodes' offsets, too.
-
+    One with a boundary ``near`` adds to the nodes' offsets, too, as does one in whose blocks there are other fields.
     The brick is kept from call to call of a warp, from that which ``begins`` to that which ``ends``.
     """
     ...

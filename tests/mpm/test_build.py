@@ -200,8 +200,9 @@ def test_memory_estimate(model_of, fields):
         scratch.velocity,
         scratch.facing,
         scratch.sensors.node,
+        scratch.sensors.touched,
     ]
-    grid += [blocks.fields, blocks.slot, blocks.held, scratch.order, scratch.keys]
+    grid += [blocks.fields, blocks.slot, blocks.held]
     taken = sum(array.capacity for array in [*vars(state).values(), *grid])
     layout = model.max_slots, fields, model.num_blocks, model.scatter
     estimate = estimate_bytes(3, model.num_particles, *layout)

@@ -8,12 +8,12 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.mpm.blocks import held_by, record_of
-from piavatar_envs.mpm.grid import threads_per_block
 from piavatar_envs.mpm.normals import find_facing, shared_normal, surface_gap, volume_at
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_marks, record_scatter
 from piavatar_envs.mpm.stencil import block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import offset_at
+from piavatar_envs.mpm.sweep import THREADS, plan_sweep
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, vec8
 
 DX = 0.05
@@ -67,12 +67,14 @@ class Look:
 
     def __init__(self, sim) -> None:
         model, state, scratch = sim.model, sim.state, sim.scratch
-        program, threads = Program(model.device), threads_per_block(model.device)
+        program = Program(model.device)
         record_marks(program, model, state, scratch)
         record_scatter(program, model, state, scratch)
-        nodes = (1, model.max_slots, threads)
+        threads, sweep = plan_sweep(model)
         found = [scratch.sums, scratch.velocity, scratch.facing]
-        program.launch(find_facing, nodes, [model.grid, model.contact, threads, scratch.blocks], found)
+        program.launch(
+            find_facing, threads, [model.grid, model.contact, sweep, scratch.blocks], found, block_dim=THREADS
+        )
         count = 64 * model.max_slots
 
         def zeros(shape, dtype):

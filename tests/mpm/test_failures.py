@@ -53,7 +53,7 @@ def break_particle(sim, name, value):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_fault_is_flagged_and_contained(three, device, fault):
+def test_fault_is_flagged_and_contained(three, fault):
     name, value, failure = FAULTS[fault]
     expected = three().run(3).state.numpy()
     sim = three()
@@ -62,10 +62,7 @@ def test_fault_is_flagged_and_contained(three, device, fault):
     assert sim.failures == [0, failure, 0]
     for array in ARRAYS:
         for env in (0, 2):
-            if device == "cpu":
-                assert np.array_equal(got[array][env], expected[array][env]), array
-            else:
-                assert np.allclose(got[array][env], expected[array][env], atol=1e-4), array
+            assert np.array_equal(got[array][env], expected[array][env]), array
 
 
 @pytest.mark.parametrize("fault", ["position is not a number", "left above", "absurd speed"])

@@ -30,7 +30,8 @@ def energy(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
 def polar_rotation(F: wp.mat33):
     """Orthogonal factor of ``F = R S`` by scaled Newton iteration; the identity if ``F`` is singular."""
     R = F
-    for _n in range(_NEWTON_STEPS):
+    steps = int(_NEWTON_STEPS)  # not a constant, or the loop would be unrolled into most of the scatter's instructions
+    for _n in range(steps):
         # the rows of R^-T are cross products of those of R, over the determinant
         yz = wp.cross(R[1], R[2])
         J = wp.dot(R[0], yz)

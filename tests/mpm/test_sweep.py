@@ -1,0 +1,100 @@
+"""The grid passes find every node once, and read and clear what particles have added up."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from piavatar_envs.mpm import sweep
+from piavatar_envs.mpm.sums import clear_offset, offset_at, read_record, take_sum, write_record
+from piavatar_envs.mpm.types import Grid, Sums, group, vec8, vec8i, vec16i
+
+RECORDS = 64
+LOW = 2**20
+
+
+@pytest.mark.parametrize("cuda", [False, True])
+@pytest.mark.parametrize("num_envs", [1, 3, 64, 4096])
+@pytest.mark.parametrize("slots", [1, 7, 8, 208, 4010, 17784, 200000])
+def test_every_node_has_one_thread(monkeypatch, cuda, num_envs, slots):
+    """Warps see whole turns of 32 nodes, and no more turns than they have threads to look ahead."""
+    monkeypatch.setattr(sweep.wp, "get_device", lambda name: SimpleNamespace(is_cuda=cuda))
+    (envs, threads), plan = sweep.plan_sweep(SimpleNamespace(device="any", num_envs=num_envs, max_slots=slots))
+    warp = sweep.LANES if cuda else 1
+    assert envs == num_envs and threads % warp == 0 and plan.stride % 64 == 0
+    assert plan.turns <= warp and threads <= 64 * slots
+    thread = np.arange(threads)
+    first = thread * plan.share - thread % warp  # of the warp, see first_node
+    nodes = first[:, None] + plan.stride * np.arange(plan.turns) + (thread % warp)[:, None]
+    nodes = (nodes[..., None] + np.arange(plan.share)).ravel()
+    assert np.array_equal(np.sort(nodes[nodes < 64 * slots]), np.arange(64 * slots))
+
+
+@wp.kernel
+def take_all(grid: Grid, sums: Sums, taken: wp.array(dtype=vec8), offset: wp.array(dtype=wp.vec4)):
+    """Records of field 1."""
+    r = wp.tid()
+    taken[r] = take_sum(sums, 0, 1, r)
+    offset[r] = offset_at(grid, sums, 0, 1, r)
+    if r % 2 == 0:
+        clear_offset(sums, 0, r)
+
+
+def test_fixed_sums(device):
+    """High and low parts make a number; a record with mass is cleared when it is taken, one without is not touched."""
+    rng = np.random.default_rng(1)
+    parts = rng.integers(-900, 900, (1, RECORDS, 16)).astype(np.int32)
+    parts[..., 0] = np.abs(parts[..., 0]) + 1
+    parts[..., [7, 15]] = 0
+    parts[0, ::3] = 0
+    offsets = rng.integers(-900, 900, (1, RECORDS, 8)).astype(np.int32)
+    unit = np.array([[1.0, 2.0**-30]], np.float32), np.array([[1.0, 2.0**-28]], np.float32)
+    sums = group(
+        Sums,
+        is_fixed=1,
+        value=wp.zeros((1, 1), dtype=vec8, device=device),
+        fixed=wp.array(parts, dtype=vec16i, device=device),
+        offset=wp.zeros((1, 1), dtype=wp.vec4, device=device),
+        offset_fixed=wp.array(offsets, dtype=vec8i, device=device),
+        mass_unit=wp.array(unit[0], dtype=float, device=device),
+        momentum_unit=wp.array(unit[1], dtype=float, device=device),
+    )
+    grid = Grid()
+    grid.dx = 0.25
+    taken = wp.zeros(RECORDS, dtype=vec8, device=device)
+    found = wp.zeros(RECORDS, dtype=wp.vec4, device=device)
+    wp.launch(take_all, RECORDS, inputs=[grid, sums], outputs=[taken, found], device=device)
+    scale = np.array([2.0**-30] + 7 * [2.0**-28])
+    np.testing.assert_allclose(
+        taken.numpy(), scale * (LOW * parts[0, :, :8].astype(float) + parts[0, :, 8:]), rtol=1e-6
+    )
+    assert not sums.fixed.numpy().any()
+    scale = np.array(3 * [0.25 * 2.0**-30] + [2.0**-30])
+    np.testing.assert_allclose(
+        found.numpy(), scale * (LOW * offsets[0, :, :4].astype(float) + offsets[0, :, 4:]), rtol=1e-6
+    )
+    left = sums.offset_fixed.numpy()[0]
+    assert not left[::2].any() and np.array_equal(left[1::2], offsets[0, 1::2])
+
+
+@wp.kernel
+def count_up(stride: int, records: wp.array2d(dtype=vec8)):
+    """Record ``stride t`` is read and written, as by threads of whole and of broken warps."""
+    r = stride * wp.tid()
+    write_record(records, 0, r, read_record(records, 0, r) + vec8(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, float(r)))
+
+
+@pytest.mark.parametrize("threads", [32, 45, 64])
+@pytest.mark.parametrize("stride", [1, 3])
+def test_records_are_written_whole(device, threads, stride):
+    start = np.random.default_rng(2).integers(0, 99, (1, RECORDS * stride, 8)).astype(np.float32)
+    records = wp.array(start, dtype=vec8, device=device)
+    wp.launch(count_up, threads, inputs=[stride], outputs=[records], device=device)
+    at = stride * np.arange(threads)
+    expected = start[0].copy()
+    expected[at, :7] += np.arange(1, 8)
+    expected[at, 7] += at
+    np.testing.assert_array_equal(records.numpy()[0], expected)
