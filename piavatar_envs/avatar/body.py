@@ -10,8 +10,11 @@ import warp as wp
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.types import Body
 
-#: Entries of one chunk of a bone's particle list: one thread sums one chunk.
-CHUNK = 64
+#: Entries of one chunk of a bone's particle list, which a warp sums on a GPU: few enough that one body keeps many warps
+#: busy, so many that adding up the threads' sums costs little.
+CHUNK = 128
+#: In large bodies chunks are longer, so that there are about so many: what they sum to is added up in turn.
+MOST_CHUNKS = 2048
 #: Fewest tracking particles from which a rotation is fitted reliably.
 MIN_TRACKERS = 18
 
@@ -49,10 +52,11 @@ def _bone_lists(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Chunked lists of the particles that each bone moves: chunk_start, chunk_bone, entry_start, entry, weight."""
     chunk_start, chunk_bone, entry_start, entries, weights = [0], [], [0], [], []
+    chunk = max(CHUNK, 32 * -(-np.count_nonzero(skin_weights > 0.0) // (32 * MOST_CHUNKS)))
     for bone in range(NUM_JOINTS):
         point, slot = np.nonzero((points.skin_joints == bone) & (skin_weights > 0.0))
-        for begin in range(0, len(point), CHUNK):
-            part = slice(begin, begin + CHUNK)
+        for begin in range(0, len(point), chunk):
+            part = slice(begin, begin + chunk)
             entries.append(point[part])
             weights.append(skin_weights[point[part], slot[part]])
             entry_start.append(entry_start[-1] + len(point[part]))
@@ -65,6 +69,14 @@ def _bone_lists(
         np.concatenate(entries),
         np.concatenate(weights),
     )
+
+
+def _joint_depths() -> list[int]:
+    """Joints between each joint and the root."""
+    depths: list[int] = []
+    for parent in PARENTS:
+        depths.append(0 if parent < 0 else depths[parent] + 1)
+    return depths
 
 
 def bone_masses(points: BodyPoints) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +123,8 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.rest_joint = upload(points.joints, wp.vec3)
     body.rest_center = upload(center, wp.vec3)
     body.bone_mass = upload(bone_mass, float)
-    body.parent = upload(PARENTS, int)
+    depths = _joint_depths()
+    body.parent, body.depth, body.levels = upload(PARENTS, int), upload(depths, int), max(depths) + 1
     body.tracker_start = upload(np.cumsum([0, *map(len, trackers)]), int)
     body.tracker = upload(np.concatenate(trackers), int)
     body.chunk_start, body.chunk_bone = upload(chunk_start, int), upload(chunk_bone, int)

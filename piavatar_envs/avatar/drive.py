@@ -12,19 +12,19 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar import posing
-from piavatar_envs.avatar.blending import threads_per_chunk
 from piavatar_envs.avatar.body import BodyPoints, build_body
 from piavatar_envs.avatar.kabsch import local_rotations, track_bones
+from piavatar_envs.avatar.lanes import chunk_threads, warp_threads
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.spawn import place_particles, reset_drive
 from piavatar_envs.avatar.substeps import Groups, record_drive, record_injection, record_pose
-from piavatar_envs.avatar.types import DriveScratch, DriveState, Tracked, vec12, vec16, vec52
+from piavatar_envs.avatar.types import DriveScratch, DriveState, Tracked, vec8, vec12, vec16, vec52
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import DECOUPLING, Model, Scratch, State
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 class AvatarDrive:
@@ -42,7 +42,9 @@ class AvatarDrive:
         self.body_mass = wp.array(points.mass.sum(1).astype(np.float32), dtype=float, device=model.device)
         self.num_points = points.num_points
         self.num_chunks = self.body.chunk_bone.shape[0]
-        self.chunk_threads = threads_per_chunk(model.device)
+        self.threads = warp_threads(model.device)
+        most_chunks = int(np.diff(self.body.chunk_start.numpy()).max())
+        self.bone_threads = chunk_threads(model.device, most_chunks)
         self.state = self._allocate(DriveState)
         self.tracked = self._allocate(Tracked)
         self.scratch = self._allocate(DriveScratch)
@@ -68,9 +70,9 @@ class AvatarDrive:
             "body_inertia": (n, wp.mat33),
             "bone_from": (bones, wp.mat44),
             "bone_step": (bones, wp.mat44),
-            "bone_lean": (bones, wp.mat44),
-            "bone_turn": (bones, wp.mat33),
             "bone_record": (bones, vec52),
+            "bone_corrections": (bones, vec12),
+            "bone_change": (bones, vec8),
             "removed_turn": (n, wp.mat33),
             "pull": ((n, self.num_points), wp.vec3),
             "lean": ((n, self.num_points), wp.vec3),

@@ -13,24 +13,30 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import (
-    LEAN,
-    PLACE,
-    STEP,
+    AT_LEAN,
+    AT_PLACE,
+    AT_STEP,
+    blend_changes,
     blend_records,
-    blended_point,
     blended_turn,
+    blended_vector,
     blended_velocity,
 )
+from piavatar_envs.avatar.lanes import sum_threads12, sum_threads16
+from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
-from piavatar_envs.avatar.types import Body, BoneChange, Drive, RemovedMotion, RigidFit, RigidFits, vec12, vec52
+from piavatar_envs.avatar.types import Body, Drive, RemovedMotion, RigidFit, RigidFits, vec8, vec12, vec16, vec52
 from piavatar_envs.mpm.stores import store_vector
 from piavatar_envs.mpm.types import row
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+#: Threads of a block in all launches of this module.
+BLOCK = 128
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 7))
 def drive_particles(
     body: Body,
     drive: Drive,
@@ -47,7 +53,7 @@ def drive_particles(
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
 ):
-    """Kinematic velocity of a particle, its shape pull [m/s] and its way to the commanded pose [m].
+    """Kinematic velocity of a particle, its pulls [m/s] and its way to the commanded pose [m].
 
     ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
     that contact has caused along with the bone. Inert flesh misses its share of every change of that velocity.
@@ -55,37 +61,33 @@ def drive_particles(
     e, p = wp.tid()
     if failure[e] != 0:
         return
-    at = x[e, body.first + p]
-    rest = body.rest[row(e, body.rest.shape[0]), p]
-    s = blend_records(record, e, body.joint[p], body.weight[p])
-    place = blended_point(s, PLACE, rest)
-    step = blended_point(s, STEP, rest)
-    turn = blended_turn(s)
-    carried = blended_velocity(s, at - bones.center[e, 0])
-    displacement = at - place
-    k = step + (turn * displacement - displacement) / drive.dt
+    at = vector_at(x, e, body.first + p)
+    before = vector_at(u, e, body.first + p)
+    inert = number_at(body.inert, row(e, body.inert.shape[0]), p)
+    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+    s = blend_records(record, e, body.joint, body.weight, p, rest)
+    displacement = at - blended_vector(s, AT_PLACE)
+    k = blended_vector(s, AT_STEP) + (1.0 / drive.dt) * (blended_turn(s) * displacement - displacement)
     # the paper's shape preservation is part of the prescribed velocity
     k -= drive.kinematic_shape_rate * displacement
-    change = k - motion[e, p]
-    before = u[e, body.first + p]
-    relative = before - carried
-    # a body that nothing supports could not take the reaction
-    reacts = drive.free_motion == 0 and let_go[e] == 0
-    missed = body.inert[row(e, body.inert.shape[0]), p] * change
-    store_vector(u, e, body.first + p, before - missed, reacts)
+    relative = before - blended_velocity(s, at - bones.center[e, 0])
+    pulled = implicit_velocity(drive.shape_rate, drive.dt, -displacement, relative) - relative
+    way = blended_vector(s, AT_LEAN)
+    if inert > 0.0:
+        # a body that nothing supports could not take the reaction
+        if drive.free_motion == 0 and let_go[e] == 0:
+            u[e, body.first + p] = before - inert * (k - motion[e, p])
+        motion[e, p] = k
     store_vector(vk, e, body.first + p, k, True)
-    store_vector(motion, e, p, k, True)
-    store_vector(pull, e, p, implicit_velocity(drive.shape_rate, drive.dt, -displacement, relative) - relative, True)
-    store_vector(lean, e, p, blended_point(s, LEAN, rest), drive.tone_rate > 0.0)
+    store_vector(pull, e, p, pulled + pull_gain(drive.tone_rate, drive.dt) * way, True)
+    store_vector(lean, e, p, way, drive.tone_rate > 0.0)
 
 
 @wp.func
-def correction_momentum(body: Body, e: int, b: int, corrections: wp.array2d(dtype=vec12)):
-    """Sum of the chunks of one bone."""
-    s = vec12()
-    for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
-        s += corrections[e, c]
-    return s
+def bone_change(velocity: wp.vec3, spin: wp.vec3, arm: wp.vec3):
+    """The record of a change of rigid motion; the pelvis' centre is ``arm`` from where ``velocity`` is."""
+    v = velocity + wp.cross(spin, arm)
+    return vec8(v[0], v[1], v[2], spin[0], spin[1], spin[2], 0.0, 0.0)
 
 
 @wp.kernel
@@ -97,15 +99,15 @@ def blend_corrections(
     whole: RigidFit,
     wrench_linear: wp.array(dtype=wp.vec3),
     wrench_angular: wp.array(dtype=wp.vec3),
+    threads: int,
     # out
-    change_velocity: wp.array2d(dtype=wp.vec3),
-    change_spin: wp.array2d(dtype=wp.vec3),
+    change: wp.array2d(dtype=vec8),
 ):
     """All that happens to bones as a whole, one field a bone.
 
     The shape pull given back, the tone, the damping of motion between bones, and the root wrench.
     """
-    e = wp.tid()
+    e, thread = wp.tid()
     r = row(e, body.bone_mass.shape[0])
     dt = drive.dt
     gain = pull_gain(drive.tone_rate, dt)
@@ -113,27 +115,30 @@ def blend_corrections(
     m = float(0.0)
     P = wp.vec3()
     L = wp.vec3()
-    for b in range(body.parent.shape[0]):
-        s = correction_momentum(body, e, b, corrections)
+    for b in range(thread, body.parent.shape[0], threads):
+        s = corrections[e, b]
         p1 = wp.vec3(s[0], s[1], s[2])
         l1 = wp.vec3(s[3], s[4], s[5])
         arm = bones.center[e, b] - whole.center[e]
         mass = wp.max(body.bone_mass[r, b], 1.0e-12)
-        dv = -p1 / mass + keep * (bones.velocity[e, b] - whole.velocity[e] - wp.cross(whole.spin[e], arm))
-        dw = -spin_of(bones.inertia[e, b], l1) + keep * (bones.spin[e, b] - whole.spin[e])
-        change_velocity[e, b] = dv
-        change_spin[e, b] = dw
-        p = mass * dv + p1 + gain * wp.vec3(s[6], s[7], s[8])
+        # what the shape pull alone did is given back
+        dv = -(p1 - gain * wp.vec3(s[6], s[7], s[8])) / mass
+        dv += keep * (bones.velocity[e, b] - whole.velocity[e] - wp.cross(whole.spin[e], arm))
+        dw = -spin_of(bones.inertia[e, b], l1 - gain * wp.vec3(s[9], s[10], s[11]))
+        dw += keep * (bones.spin[e, b] - whole.spin[e])
+        change[e, b] = bone_change(dv, dw, bones.center[e, 0] - bones.center[e, b])
+        p = mass * dv + p1
         m += mass
         P += p
-        L += bones.inertia[e, b] * dw + l1 + gain * wp.vec3(s[9], s[10], s[11]) + wp.cross(arm, p)
+        L += bones.inertia[e, b] * dw + l1 + wp.cross(arm, p)
+    total = sum_threads12(vec12(m, P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0), threads)
     # All of this is internal: its rigid part comes off, and with it what round-off left (a drag of 1e-6 a second else).
     # To command a turn of the whole body is the root's business.
-    V = dt * wrench_linear[e] - P / m
-    W = dt * wrench_angular[e] - spin_of(whole.inertia[e], L)
-    for b in range(body.parent.shape[0]):
-        change_velocity[e, b] = change_velocity[e, b] + V + wp.cross(W, bones.center[e, b] - whole.center[e])
-        change_spin[e, b] = change_spin[e, b] + W
+    V = dt * wrench_linear[e] - wp.vec3(total[1], total[2], total[3]) / total[0]
+    W = dt * wrench_angular[e] - spin_of(whole.inertia[e], wp.vec3(total[4], total[5], total[6]))
+    rigid = bone_change(V, W, bones.center[e, 0] - whole.center[e])
+    for b in range(thread, body.parent.shape[0], threads):
+        change[e, b] = change[e, b] + rigid
 
 
 @wp.func
@@ -162,6 +167,7 @@ def free_motion(
     bones: RigidFits,
     whole: RigidFit,
     let_go: wp.array(dtype=int),
+    threads: int,
     # out
     removed_velocity: wp.array(dtype=wp.vec3),
     removed_turn: wp.array(dtype=wp.mat33),
@@ -175,23 +181,37 @@ def free_motion(
     momentum: ``vk' = y + A (r + dt y)`` with ``y = vk - V`` and ``sum m r x vk' = 0``. And as the inertia changes, a
     spinning body keeps its angular momentum, not its spin (a skater who draws in the arms).
     """
-    e = wp.tid()
-    removed_velocity[e] = wp.vec3(0.0)
-    removed_turn[e] = wp.mat33()
-    removed_center[e] = wp.vec3(0.0)  # one left over from before would enter the carry by its round-off
+    e, thread = wp.tid()
     if drive.free_motion == 0 and let_go[e] == 0:
+        if thread == 0:  # one left over from before would enter the carry by its round-off
+            removed_velocity[e] = wp.vec3(0.0)
+            removed_turn[e] = wp.mat33()
+            removed_center[e] = wp.vec3(0.0)
         return
     r = row(e, body.bone_mass.shape[0])
     m = float(0.0)
+    for b in range(thread, body.parent.shape[0], threads):
+        m += body.bone_mass[r, b]
     P = wp.vec3()
     K = wp.mat33()
-    for b in range(body.parent.shape[0]):
-        s = correction_momentum(body, e, b, corrections)
+    for c in range(thread, body.chunk_bone.shape[0], threads):
+        s = corrections[e, c]
         p = wp.vec3(s[0], s[1], s[2])
-        m += body.bone_mass[r, b]
         P += p
         K += wp.mat33(s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])
-        K += wp.outer(bones.center[e, b] - whole.center[e], p)
+        K += wp.outer(bones.center[e, body.chunk_bone[c]] - whole.center[e], p)
+    # fmt: off
+    t = sum_threads16(
+        vec16(
+            m, P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2],
+            0.0, 0.0, 0.0,
+        ),
+        threads,
+    )
+    # fmt: on
+    if thread > 0:
+        return
+    K = wp.mat33(t[4], t[5], t[6], t[7], t[8], t[9], t[10], t[11], t[12])
     I = whole.inertia[e]
     second = wp.diag(wp.vec3(0.5 * wp.trace(I))) - I
     A = wp.mat33()
@@ -201,23 +221,23 @@ def free_motion(
         w -= spin_of(I, axial(moment))
         A = finite_turn(w, drive.dt)
         moment = K + (drive.dt * K + second) * wp.transpose(A)
-    removed_velocity[e] = P / m
+    removed_velocity[e] = wp.vec3(t[1], t[2], t[3]) / t[0]
     removed_turn[e] = A
     removed_center[e] = whole.center[e]
     W = whole.spin[e]
     wrench_angular[e] = wrench_angular[e] - spin_of(I, wp.trace(moment) * W - moment * W)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 12))
 def apply_corrections(
     body: Body,
     drive: Drive,
     x: wp.array2d(dtype=wp.vec3),
     pull: wp.array2d(dtype=wp.vec3),
-    lean: wp.array2d(dtype=wp.vec3),
     bones: RigidFits,
-    change: BoneChange,
+    change: wp.array2d(dtype=vec8),
     removed: RemovedMotion,
+    let_go: wp.array(dtype=int),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
@@ -227,18 +247,11 @@ def apply_corrections(
     e, p = wp.tid()
     if failure[e] != 0:
         return
-    at = x[e, body.first + p]
-    du = pull[e, p] + pull_gain(drive.tone_rate, drive.dt) * lean[e, p]
-    joint = body.joint[p]
-    weight = body.weight[p]
-    for n in range(4):
-        w = weight[n]
-        if w > 0.0:
-            b = joint[n]
-            du += w * (change.velocity[e, b] + wp.cross(change.spin[e, b], at - bones.center[e, b]))
-    store_vector(u, e, body.first + p, u[e, body.first + p] + du, True)
-    V = removed.velocity[e]
-    A = removed.turn[e]
-    if wp.length_sq(V) + wp.ddot(A, A) > 0.0:
-        free = vk[e, body.first + p] - V
-        vk[e, body.first + p] = free + A * (at - removed.center[e] + drive.dt * free)
+    at = vector_at(x, e, body.first + p)
+    s = blend_changes(change, e, body.joint, body.weight, p)
+    field = wp.vec3(s[0], s[1], s[2]) + wp.cross(wp.vec3(s[3], s[4], s[5]), at - bones.center[e, 0])
+    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, e, p) + field, True)
+    if drive.free_motion != 0 or let_go[e] != 0:
+        free = vector_at(vk, e, body.first + p) - removed.velocity[e]
+        free += removed.turn[e] * (at - removed.center[e] + drive.dt * free)
+        store_vector(vk, e, body.first + p, free, True)

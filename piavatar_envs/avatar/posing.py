@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.blending import LEAN, PLACE, SPIN, STEP, TURN, VELOCITY, store_record
+from piavatar_envs.avatar.lanes import meet_threads
 from piavatar_envs.avatar.rotation import quat_exp, quat_log, rigid_matrix, turn_about_z
 from piavatar_envs.avatar.types import (
     DRIVE_REFERENCE,
@@ -21,10 +23,11 @@ from piavatar_envs.avatar.types import (
     RemovedMotion,
     RigidFit,
     RigidFits,
+    vec52,
 )
 from piavatar_envs.mpm.types import row
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 
@@ -70,20 +73,18 @@ def pose_bone(
     body: Body,
     e: int,
     b: int,
-    local: wp.quat,
     root: wp.vec3,
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """Forward kinematics of one bone; its parent must have been posed."""
+    """Forward kinematics of one bone, whose ``rotation`` is local so far; its parent must have been posed."""
     parent = body.parent[b]
     if parent < 0:
-        rotation[e, b] = local
         position[e, b] = root
     else:
         r = row(e, body.rest_joint.shape[0])
         offset = body.rest_joint[r, b] - body.rest_joint[r, parent]
-        rotation[e, b] = wp.normalize(rotation[e, parent] * local)
+        rotation[e, b] = wp.normalize(rotation[e, parent] * rotation[e, b])
         position[e, b] = position[e, parent] + wp.quat_rotate(rotation[e, parent], offset)
 
 
@@ -95,67 +96,73 @@ def pose_body(
     base_root: wp.array(dtype=wp.vec3),
     increment: wp.array2d(dtype=wp.vec3),
     root_increment: wp.array(dtype=wp.vec3),
+    threads: int,
     # out
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """Pose at ``fraction`` of the control step: base local rotations turned along arcs, then forward kinematics."""
-    e = wp.tid()
+    """Pose at ``fraction`` of the control step: base local rotations turned along arcs, then forward kinematics.
+
+    A thread that is alone poses the bones in their order, parents first; the threads of a warp do so level by level.
+    """
+    e, thread = wp.tid()
     root = base_root[e] + fraction * root_increment[e]
-    for b in range(body.parent.shape[0]):
-        local = base_rotation[e, b] * quat_exp(fraction * increment[e, b])
-        pose_bone(body, e, b, local, root, rotation, position)
+    for b in range(thread, body.parent.shape[0], threads):
+        rotation[e, b] = base_rotation[e, b] * quat_exp(fraction * increment[e, b])
+    levels = wp.where(threads > 1, body.levels, 1)
+    for level in range(levels):
+        for b in range(thread, body.parent.shape[0], threads):
+            if threads == 1 or body.depth[b] == level:
+                pose_bone(body, e, b, root, rotation, position)
+        meet_threads(threads)
+
+
+@wp.func
+def carried(
+    e: int, dt: float, removed: RemovedMotion, c: wp.vec3, velocity: wp.vec3, spin: wp.vec3, q: wp.quat, t: wp.vec3
+):
+    """The rigid motion ``(q, t)``, moved on by a body whose centre has reached ``c`` in a substep.
+
+    What was taken out of the kinematic velocity is a motion that nothing made: it comes off first.
+    """
+    back = I3 + dt * removed.turn[e]
+    q_back = wp.quat_from_matrix(back) * q
+    t_back = back * (t - removed.center[e] - dt * removed.velocity[e]) + removed.center[e]
+    turn = quat_exp(dt * spin)
+    # c was reached by moving at the velocity: turn about where it came from
+    before = c - dt * velocity
+    return wp.normalize(turn * q_back), wp.quat_rotate(turn, t_back - before) + c
 
 
 @wp.kernel
 def carry_bones(
     dt: float,
     bones: RigidFits,
+    whole: RigidFit,
     removed: RemovedMotion,
     failure: wp.array(dtype=int),
     # in and out
     carry_rotation: wp.array2d(dtype=wp.quat),
     carry_translation: wp.array2d(dtype=wp.vec3),
-):
-    """Advance ``G`` by the rigid motion that the physical velocity gave each bone in the last substep.
-
-    What was taken out of the kinematic velocity is a motion the bones did not make: it comes off first.
-    """
-    e, b = wp.tid()
-    if failure[e] != 0:
-        return
-    back = I3 + dt * removed.turn[e]
-    q = wp.quat_from_matrix(back) * carry_rotation[e, b]
-    t = back * (carry_translation[e, b] - removed.center[e] - dt * removed.velocity[e]) + removed.center[e]
-    c = bones.center[e, b]
-    turn = quat_exp(dt * bones.spin[e, b])
-    carry_rotation[e, b] = wp.normalize(turn * q)
-    # c was reached by moving at the bone's velocity: turn about where it came from
-    before = c - dt * bones.velocity[e, b]
-    carry_translation[e, b] = wp.quat_rotate(turn, t - before) + c
-
-
-@wp.kernel
-def carry_anchor(
-    dt: float,
-    whole: RigidFit,
-    removed: RemovedMotion,
-    failure: wp.array(dtype=int),
-    # in and out
     anchor_rotation: wp.array(dtype=wp.quat),
     anchor_translation: wp.array(dtype=wp.vec3),
 ):
-    """Carry the commanded pose along with the body's own rigid motion, as the bones are."""
-    e = wp.tid()
+    """Advance ``G`` by the motion that the physical velocity gave each bone, the laid command by the body's own."""
+    e, b = wp.tid()
     if failure[e] != 0:
         return
-    back = I3 + dt * removed.turn[e]
-    q = wp.quat_from_matrix(back) * anchor_rotation[e]
-    t = back * (anchor_translation[e] - removed.center[e] - dt * removed.velocity[e]) + removed.center[e]
-    turn = quat_exp(dt * whole.spin[e])
-    anchor_rotation[e] = wp.normalize(turn * q)
-    before = whole.center[e] - dt * whole.velocity[e]
-    anchor_translation[e] = wp.quat_rotate(turn, t - before) + whole.center[e]
+    q, t = carried(
+        e, dt, removed, bones.center[e, b], bones.velocity[e, b], bones.spin[e, b],
+        carry_rotation[e, b], carry_translation[e, b],
+    )  # fmt: skip
+    carry_rotation[e, b] = q
+    carry_translation[e, b] = t
+    if b == 0:
+        q_anchor, t_anchor = carried(
+            e, dt, removed, whole.center[e], whole.velocity[e], whole.spin[e], anchor_rotation[e], anchor_translation[e]
+        )
+        anchor_rotation[e] = q_anchor
+        anchor_translation[e] = t_anchor
 
 
 @wp.kernel
@@ -190,54 +197,78 @@ def rest_matrices(
     bone_from[e, b] = rigid_matrix(rotation[e, b], rest, position[e, b])
 
 
+@wp.func
+def carried_bone(body: Body, pose: Pose, carry: Carry, e: int, b: int):
+    """Rotation and skinning matrix of a bone in a pose, where contact has carried it to."""
+    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+    G = carry.rotation[e, b]
+    q = G * pose.rotation[e, b]
+    return q, rigid_matrix(q, rest, wp.quat_rotate(G, pose.position[e, b]) + carry.translation[e, b])
+
+
 @wp.kernel
 def bone_matrices(
     body: Body,
-    drive: Drive,
+    dt: float,
     pose: Pose,
     next_pose: Pose,
     carry: Carry,
     # out
     bone_from: wp.array2d(dtype=wp.mat44),
     bone_step: wp.array2d(dtype=wp.mat44),
-    bone_turn: wp.array2d(dtype=wp.mat33),
 ):
-    """Skinning matrices of the substep: where a bone is, the velocity that takes it on, how far it turns."""
+    """Skinning matrices of a step: where a bone is, and the velocity that takes it on."""
     e, b = wp.tid()
-    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
-    G = carry.rotation[e, b]
-    q = G * pose.rotation[e, b]
-    q_next = G * next_pose.rotation[e, b]
-    start = wp.quat_rotate(G, pose.position[e, b]) + carry.translation[e, b]
-    end = wp.quat_rotate(G, next_pose.position[e, b]) + carry.translation[e, b]
-    A = rigid_matrix(q, rest, start)
+    _, A = carried_bone(body, pose, carry, e, b)
+    _, B = carried_bone(body, next_pose, carry, e, b)
     bone_from[e, b] = A
-    bone_step[e, b] = (rigid_matrix(q_next, rest, end) - A) / drive.dt
-    bone_turn[e, b] = wp.quat_to_matrix(q_next * wp.quat_inverse(q))
+    bone_step[e, b] = (B - A) / dt
 
 
 @wp.kernel
-def lean_matrices(
+def write_records(
     body: Body,
+    drive: Drive,
+    pose: Pose,
+    next_pose: Pose,
+    carry: Carry,
+    bones: RigidFits,
     command: Pose,
     anchor_rotation: wp.array(dtype=wp.quat),
     anchor_translation: wp.array(dtype=wp.vec3),
-    bone_from: wp.array2d(dtype=wp.mat44),
-    carry: Carry,
     gap: wp.array2d(dtype=wp.vec3),
     # out
-    bone_lean: wp.array2d(dtype=wp.mat44),
+    record: wp.array2d(dtype=vec52),
 ):
-    """From the carried to the commanded bone: the commanded pose is laid on the body by the anchor.
+    """All that particles blend of a bone in a substep: where it is, the velocity that takes it on, how far it turns.
 
-    A bone that contact has torn off its parent is carried where the parent would have it; its way back is added.
+    Then from the carried to the commanded bone: the commanded pose is laid on the body by the anchor. A bone that
+    contact has torn off its parent is carried where the parent would have it; its way back is added.
     """
     e, b = wp.tid()
-    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
-    q = anchor_rotation[e] * command.rotation[e, b]
-    at = wp.quat_rotate(anchor_rotation[e], command.position[e, b]) + anchor_translation[e]
-    back = wp.quat_rotate(carry.rotation[e, b], gap[e, b])
-    bone_lean[e, b] = rigid_matrix(q, rest, at - back) - bone_from[e, b]
+    q, A = carried_bone(body, pose, carry, e, b)
+    q_next, B = carried_bone(body, next_pose, carry, e, b)
+    step = (B - A) / drive.dt
+    lean = wp.mat44()
+    if drive.tone_rate > 0.0:
+        rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+        at = wp.quat_rotate(anchor_rotation[e], command.position[e, b]) + anchor_translation[e]
+        back = wp.quat_rotate(carry.rotation[e, b], gap[e, b])
+        lean = rigid_matrix(anchor_rotation[e] * command.rotation[e, b], rest, at - back) - A
+    turn = wp.quat_to_matrix(q_next * wp.quat_inverse(q))
+    spin = bones.spin[e, b]
+    velocity = bones.velocity[e, b] - wp.cross(spin, bones.center[e, b] - bones.center[e, 0])
+    s = vec52()
+    for i in range(3):
+        for j in range(4):
+            s[PLACE + 4 * i + j] = A[i, j]
+            s[STEP + 4 * i + j] = step[i, j]
+            s[LEAN + 4 * i + j] = lean[i, j]
+        for j in range(3):
+            s[TURN + 3 * i + j] = turn[i, j]
+        s[VELOCITY + i] = velocity[i]
+        s[SPIN + i] = spin[i]
+    store_record(record, e, b, s)
 
 
 @wp.kernel

@@ -28,4 +28,4 @@ def critical_pull(rate: float, dt: float, error: wp.vec3, v: wp.vec3):
 @wp.func
 def implicit_velocity(rate: float, dt: float, displacement: wp.vec3, v: wp.vec3):
     """Velocity after ``dt`` of an implicit critically damped pull of natural frequency ``rate`` [1/s]."""
-    return (v + dt * rate * rate * displacement) / pull_denominator(rate, dt)
+    return (1.0 / pull_denominator(rate, dt)) * (v + dt * rate * rate * displacement)

@@ -5,18 +5,22 @@ exactly the linear and angular momentum of the velocity it was fitted to, bone b
 or takes away goes through such fields, which is why it keeps momentum.
 
 Sums run over fixed lists of particles in chunks (no atomics): the result does not depend on the schedule. ``threads``
-threads share a chunk.
+threads share a chunk, the chunks of a bone, or the bones of a body.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import sum_threads12, sum_threads16
+from piavatar_envs.avatar.lanes import store_sum12, store_sum16, sum_threads12, sum_threads16
+from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
 from piavatar_envs.avatar.types import Body, Drive, RigidFits, vec12, vec16
 from piavatar_envs.mpm.types import Particles, row
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+#: Threads of a block in all launches of this module.
+BLOCK = 128
 
 
 @wp.func
@@ -35,7 +39,7 @@ def point_inertia(mass: float, d: wp.vec3):
     return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 10))
 def sum_moments(
     body: Body,
     particles: Particles,
@@ -60,10 +64,10 @@ def sum_moments(
     off = wp.vec3()
     spin = wp.vec3()
     for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
-        p = body.first + body.entry[n]
-        w = body.entry_weight[n] * particles.mass[r, p]
-        d = x[e, p] - origin
-        v = u[e, p]
+        p = body.first + int_at(body.entry, n)
+        w = float_at(body.entry_weight, n) * number_at(particles.mass, r, p)
+        d = vector_at(x, e, p) - origin
+        v = vector_at(u, e, p)
         wd = w * d
         m += w
         mx += wd
@@ -72,17 +76,13 @@ def sum_moments(
         off += wp.vec3(wd[1] * d[2], wd[2] * d[0], wd[0] * d[1])
         spin += wp.cross(wd, v)
     # fmt: off
-    total = sum_threads16(
-        vec16(
-            m, mx[0], mx[1], mx[2], mu[0], mu[1], mu[2],
-            diag[0], diag[1], diag[2], off[0], off[1], off[2],
-            spin[0], spin[1], spin[2],
-        ),
-        threads,
+    total = vec16(
+        m, mx[0], mx[1], mx[2], mu[0], mu[1], mu[2],
+        diag[0], diag[1], diag[2], off[0], off[1], off[2],
+        spin[0], spin[1], spin[2],
     )
     # fmt: on
-    if thread == 0:
-        moments[e, c] = total
+    store_sum16(moments, e, c, total, threads)
 
 
 @wp.kernel
@@ -91,6 +91,7 @@ def fit_bones(
     reference: wp.array2d(dtype=wp.vec3),
     moments: wp.array2d(dtype=vec16),
     failure: wp.array(dtype=int),
+    threads: int,
     # out
     center: wp.array2d(dtype=wp.vec3),
     velocity: wp.array2d(dtype=wp.vec3),
@@ -98,12 +99,15 @@ def fit_bones(
     inertia: wp.array2d(dtype=wp.mat33),
 ):
     """Rigid motion of every bone: centre [m], its velocity [m/s], angular velocity [rad/s], inertia [kg m^2]."""
-    e, b = wp.tid()
+    e, b, thread = wp.tid()
     if failure[e] != 0:
         return
     s = vec16()
-    for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
+    for c in range(body.chunk_start[b] + thread, body.chunk_start[b + 1], threads):
         s += moments[e, c]
+    s = sum_threads16(s, threads)
+    if thread > 0:
+        return
     m = wp.max(s[0], 1.0e-12)
     d = wp.vec3(s[1], s[2], s[3]) / m
     V = wp.vec3(s[4], s[5], s[6]) / m
@@ -127,6 +131,7 @@ def fit_body(
     body: Body,
     bones: RigidFits,
     failure: wp.array(dtype=int),
+    threads: int,
     # out
     body_center: wp.array(dtype=wp.vec3),
     body_velocity: wp.array(dtype=wp.vec3),
@@ -134,31 +139,41 @@ def fit_body(
     body_inertia: wp.array(dtype=wp.mat33),
 ):
     """Rigid motion of the whole body from those of its bones: their momenta add up to the body's."""
-    e = wp.tid()
+    e, thread = wp.tid()
     if failure[e] != 0:
         return
     r = row(e, body.bone_mass.shape[0])
+    pelvis = bones.center[e, 0]
     m = float(0.0)
     mx = wp.vec3()
     mv = wp.vec3()
-    for b in range(body.parent.shape[0]):
+    for b in range(thread, body.parent.shape[0], threads):
         m += body.bone_mass[r, b]
-        mx += body.bone_mass[r, b] * (bones.center[e, b] - bones.center[e, 0])
+        mx += body.bone_mass[r, b] * (bones.center[e, b] - pelvis)
         mv += body.bone_mass[r, b] * bones.velocity[e, b]
-    c = bones.center[e, 0] + mx / m
+    s = sum_threads12(vec12(m, mx[0], mx[1], mx[2], mv[0], mv[1], mv[2], 0.0, 0.0, 0.0, 0.0, 0.0), threads)
+    c = pelvis + wp.vec3(s[1], s[2], s[3]) / s[0]
     I = wp.mat33()
     L = wp.vec3()
-    for b in range(body.parent.shape[0]):
+    for b in range(thread, body.parent.shape[0], threads):
         d = bones.center[e, b] - c
         I += bones.inertia[e, b] + point_inertia(body.bone_mass[r, b], d)
         L += bones.inertia[e, b] * bones.spin[e, b] + body.bone_mass[r, b] * wp.cross(d, bones.velocity[e, b])
-    body_center[e] = c
-    body_velocity[e] = mv / m
-    body_spin[e] = spin_of(I, L)
-    body_inertia[e] = I
+    # fmt: off
+    t = sum_threads12(
+        vec12(L[0], L[1], L[2], I[0, 0], I[0, 1], I[0, 2], I[1, 0], I[1, 1], I[1, 2], I[2, 0], I[2, 1], I[2, 2]),
+        threads,
+    )
+    # fmt: on
+    if thread == 0:
+        I = wp.mat33(t[3], t[4], t[5], t[6], t[7], t[8], t[9], t[10], t[11])
+        body_center[e] = c
+        body_velocity[e] = wp.vec3(s[4], s[5], s[6]) / s[0]
+        body_spin[e] = spin_of(I, wp.vec3(t[0], t[1], t[2]))
+        body_inertia[e] = I
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 10))
 def sum_corrections(
     body: Body,
     particles: Particles,
@@ -171,7 +186,7 @@ def sum_corrections(
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """Momentum and angular momentum, about the bone's centre, of the pull and of the lean in one chunk."""
+    """Momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk."""
     e, c, thread = wp.tid()
     if failure[e] != 0:
         return
@@ -182,25 +197,41 @@ def sum_corrections(
     p2 = wp.vec3()
     l2 = wp.vec3()
     for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
-        p = body.entry[n]
-        w = body.entry_weight[n] * particles.mass[r, body.first + p]
-        d = x[e, body.first + p] - origin
-        a = w * pull[e, p]
+        p = int_at(body.entry, n)
+        w = float_at(body.entry_weight, n) * number_at(particles.mass, r, body.first + p)
+        d = vector_at(x, e, body.first + p) - origin
+        a = w * vector_at(pull, e, p)
         p1 += a
         l1 += wp.cross(d, a)
-        a = w * lean[e, p]
+        a = w * vector_at(lean, e, p)
         p2 += a
         l2 += wp.cross(d, a)
-    # fmt: off
-    total = sum_threads12(
-        vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2]), threads
-    )
-    # fmt: on
-    if thread == 0:
-        corrections[e, c] = total
+    total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])
+    store_sum12(corrections, e, c, total, threads)
 
 
 @wp.kernel
+def add_chunks(
+    body: Body,
+    corrections: wp.array2d(dtype=vec12),
+    failure: wp.array(dtype=int),
+    threads: int,
+    # out
+    bone_corrections: wp.array2d(dtype=vec12),
+):
+    """Sum of the chunks of every bone."""
+    e, b, thread = wp.tid()
+    if failure[e] != 0:
+        return
+    s = vec12()
+    for c in range(body.chunk_start[b] + thread, body.chunk_start[b + 1], threads):
+        s += corrections[e, c]
+    s = sum_threads12(s, threads)
+    if thread == 0:
+        bone_corrections[e, b] = s
+
+
+@wp.kernel(launch_bounds=(BLOCK, 10))
 def sum_motion(
     body: Body,
     drive: Drive,
@@ -223,15 +254,9 @@ def sum_motion(
     P = wp.vec3()
     K = wp.mat33()
     for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
-        p = body.first + body.entry[n]
-        a = (body.entry_weight[n] * particles.mass[r, p]) * vk[e, p]
+        p = body.first + int_at(body.entry, n)
+        a = (float_at(body.entry_weight, n) * number_at(particles.mass, r, p)) * vector_at(vk, e, p)
         P += a
-        K += wp.outer(x[e, p] - origin, a)
-    # fmt: off
-    total = sum_threads12(
-        vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2]),
-        threads,
-    )
-    # fmt: on
-    if thread == 0:
-        corrections[e, c] = total
+        K += wp.outer(vector_at(x, e, p) - origin, a)
+    total = vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2])
+    store_sum12(corrections, e, c, total, threads)

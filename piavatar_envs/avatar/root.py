@@ -11,12 +11,13 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.kabsch import kabsch_rotation
+from piavatar_envs.avatar.lanes import sum_threads12
 from piavatar_envs.avatar.pulls import critical_pull
 from piavatar_envs.avatar.rotation import quat_exp, quat_log
-from piavatar_envs.avatar.types import Body, Carry, Command, Drive, Pose, RigidFit
+from piavatar_envs.avatar.types import Body, Carry, Command, Drive, Pose, RigidFit, vec12
 from piavatar_envs.mpm.types import row
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
@@ -79,36 +80,48 @@ def root_wrench(
     wrench_torque[e] = wrench_torque[e] + share * torque
 
 
+@wp.func
+def bone_place(body: Body, pose: Pose, e: int, b: int):
+    """Where a pose has the centre of mass of a bone."""
+    arm = body.rest_center[row(e, body.bone_mass.shape[0]), b] - body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+    return pose.position[e, b] + wp.quat_rotate(pose.rotation[e, b], arm)
+
+
 @wp.kernel
 def lay_command_on_body(
     body: Body,
     command: Pose,
     pose: Pose,
+    threads: int,
     # out
     anchor_rotation: wp.array(dtype=wp.quat),
     anchor_translation: wp.array(dtype=wp.vec3),
 ):
     """Best rigid motion from the commanded to the tracked pose: Kabsch over the bones' centres of mass."""
-    e = wp.tid()
+    e, thread = wp.tid()
     r = row(e, body.bone_mass.shape[0])
-    rj = row(e, body.rest_joint.shape[0])
     m = float(0.0)
-    mean = wp.vec3()
-    mean_command = wp.vec3()
-    for b in range(body.parent.shape[0]):
-        arm = body.rest_center[r, b] - body.rest_joint[rj, b]
+    x = wp.vec3()
+    y = wp.vec3()
+    for b in range(thread, body.parent.shape[0], threads):
         w = body.bone_mass[r, b]
         m += w
-        mean += w * (pose.position[e, b] + wp.quat_rotate(pose.rotation[e, b], arm))
-        mean_command += w * (command.position[e, b] + wp.quat_rotate(command.rotation[e, b], arm))
-    mean = mean / m
-    mean_command = mean_command / m
+        x += w * bone_place(body, pose, e, b)
+        y += w * bone_place(body, command, e, b)
+    s = sum_threads12(vec12(m, x[0], x[1], x[2], y[0], y[1], y[2], 0.0, 0.0, 0.0, 0.0, 0.0), threads)
+    mean = wp.vec3(s[1], s[2], s[3]) / s[0]
+    mean_command = wp.vec3(s[4], s[5], s[6]) / s[0]
     H = wp.mat33()
-    for b in range(body.parent.shape[0]):
-        arm = body.rest_center[r, b] - body.rest_joint[rj, b]
-        at = pose.position[e, b] + wp.quat_rotate(pose.rotation[e, b], arm)
-        at_command = command.position[e, b] + wp.quat_rotate(command.rotation[e, b], arm)
-        H += body.bone_mass[r, b] * wp.outer(at - mean, at_command - mean_command)
-    q = wp.normalize(wp.quat_from_matrix(kabsch_rotation(H)))
-    anchor_rotation[e] = q
-    anchor_translation[e] = mean - wp.quat_rotate(q, mean_command)
+    for b in range(thread, body.parent.shape[0], threads):
+        at = bone_place(body, pose, e, b) - mean
+        H += body.bone_mass[r, b] * wp.outer(at, bone_place(body, command, e, b) - mean_command)
+    # fmt: off
+    t = sum_threads12(
+        vec12(H[0, 0], H[0, 1], H[0, 2], H[1, 0], H[1, 1], H[1, 2], H[2, 0], H[2, 1], H[2, 2], 0.0, 0.0, 0.0), threads
+    )
+    # fmt: on
+    if thread == 0:
+        H = wp.mat33(t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7], t[8])
+        q = wp.normalize(wp.quat_from_matrix(kabsch_rotation(H)))
+        anchor_rotation[e] = q
+        anchor_translation[e] = mean - wp.quat_rotate(q, mean_command)

@@ -9,13 +9,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from piavatar_envs.avatar import flesh, posing, rigid_fit
-from piavatar_envs.avatar.blending import pack_bones
 from piavatar_envs.avatar.injection import inject_velocity
 from piavatar_envs.avatar.root import lay_command_on_body, root_wrench
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import (
-    BoneChange,
-    BoneMatrices,
     Carry,
     Command,
     DriveScratch,
@@ -55,14 +52,12 @@ class Groups:
             root=d.command_root,
             goal_root=d.goal_root,
         )
-        self.matrices = group(BoneMatrices, start=s.bone_from, step=s.bone_step, turn=s.bone_turn, lean=s.bone_lean)
-        self.change = group(BoneChange, velocity=s.change_velocity, spin=s.change_spin)
 
 
 def record_pose(drive: AvatarDrive, program: Program, fraction: float, rotation, root, increment, out: Pose) -> None:
     """Append: the pose at ``fraction`` of a control step that starts from local ``rotation`` and ``root``."""
-    inputs = [drive.body, fraction, rotation, root, increment, drive.scratch.root_increment]
-    program.launch(posing.pose_body, drive.model.num_envs, inputs, [out.rotation, out.position])
+    inputs = [drive.body, fraction, rotation, root, increment, drive.scratch.root_increment, drive.threads]
+    program.launch(posing.pose_body, (drive.model.num_envs, drive.threads), inputs, [out.rotation, out.position])
 
 
 def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) -> None:
@@ -79,7 +74,8 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         record_pose(drive, program, step / steps, *command, g.command_pose)
         if step == 0:
             anchor = [s.anchor_rotation, s.anchor_translation]
-            program.launch(lay_command_on_body, n, [drive.body, g.command_pose, now], anchor)
+            inputs = [drive.body, g.command_pose, now, drive.threads]
+            program.launch(lay_command_on_body, (n, drive.threads), inputs, anchor)
             program.launch(posing.find_gaps, (n, NUM_JOINTS), [drive.tracked.position, now], [s.gap])
     program.launch(
         root_wrench,
@@ -87,7 +83,7 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         [drive.drive, step / steps, g.command, now, g.carry, g.whole, drive.body_mass],
         [d.let_go, d.wrench_force, d.wrench_torque, s.wrench_linear, s.wrench_angular],
     )
-    _record_matrices(drive, program, now, after)
+    _record_bones(drive, program, now, after)
     _record_flesh(drive, program, state)
 
 
@@ -97,21 +93,24 @@ def record_fit(drive: AvatarDrive, program: Program, state: State) -> None:
     reference = drive.tracked.position
     program.launch(
         rigid_fit.sum_moments,
-        (n, drive.num_chunks, drive.chunk_threads),
-        [drive.body, drive.model.particles, state.x, state.u, reference, state.failure, drive.chunk_threads],
+        (n, drive.num_chunks, drive.threads),
+        [drive.body, drive.model.particles, state.x, state.u, reference, state.failure, drive.threads],
         [s.moments],
+        block_dim=rigid_fit.BLOCK,
     )
     program.launch(
         rigid_fit.fit_bones,
-        (n, NUM_JOINTS),
-        [drive.body, reference, s.moments, state.failure],
+        (n, NUM_JOINTS, drive.bone_threads),
+        [drive.body, reference, s.moments, state.failure, drive.bone_threads],
         [s.bone_center, s.bone_velocity, s.bone_spin, s.bone_inertia],
+        block_dim=rigid_fit.BLOCK,
     )
     program.launch(
         rigid_fit.fit_body,
-        n,
-        [drive.body, bones, state.failure],
+        (n, drive.threads),
+        [drive.body, bones, state.failure, drive.threads],
         [s.body_center, s.body_velocity, s.body_spin, s.body_inertia],
+        block_dim=rigid_fit.BLOCK,
     )
 
 
@@ -121,59 +120,51 @@ def _record_carry(drive: AvatarDrive, program: Program, state: State) -> None:
     program.launch(
         posing.carry_bones,
         (n, NUM_JOINTS),
-        [dt, g.bones, g.removed, state.failure],
-        [s.carry_rotation, s.carry_translation],
-    )
-    program.launch(
-        posing.carry_anchor, n, [dt, g.whole, g.removed, state.failure], [s.anchor_rotation, s.anchor_translation]
+        [dt, g.bones, g.whole, g.removed, state.failure],
+        [s.carry_rotation, s.carry_translation, s.anchor_rotation, s.anchor_translation],
     )
 
 
-def _record_matrices(drive: AvatarDrive, program: Program, now: Pose, after: Pose) -> None:
-    """Skinning matrices of the substep from ``now`` to ``after``."""
-    s, g, bones = drive.scratch, drive.groups, (drive.model.num_envs, NUM_JOINTS)
+def _record_bones(drive: AvatarDrive, program: Program, now: Pose, after: Pose) -> None:
+    """What particles blend of their bones in the substep from ``now`` to ``after``."""
+    s, g = drive.scratch, drive.groups
+    anchor = [s.anchor_rotation, s.anchor_translation]
     program.launch(
-        posing.bone_matrices,
-        bones,
-        [drive.body, drive.drive, now, after, g.carry],
-        [s.bone_from, s.bone_step, s.bone_turn],
+        posing.write_records,
+        (drive.model.num_envs, NUM_JOINTS),
+        [drive.body, drive.drive, now, after, g.carry, g.bones, g.command_pose, *anchor, s.gap],
+        [s.bone_record],
     )
-    if drive.settings.tone > 0.0:
-        anchor = [s.anchor_rotation, s.anchor_translation]
-        lean = [drive.body, g.command_pose, *anchor, s.bone_from, g.carry, s.gap]
-        program.launch(posing.lean_matrices, bones, lean, [s.bone_lean])
-    program.launch(pack_bones, bones, [g.matrices, g.bones], [s.bone_record])
 
 
 def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
     """Kinematic velocity and pulls of every particle."""
     s, g, n = drive.scratch, drive.groups, drive.model.num_envs
-    points, chunks = (n, drive.num_points), (n, drive.num_chunks, drive.chunk_threads)
     program.launch(
         flesh.drive_particles,
-        points,
+        (n, drive.num_points),
         [drive.body, drive.drive, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure],
         [state.u, drive.state.motion, state.vk, s.pull, s.lean],
+        block_dim=flesh.BLOCK,
     )
     if drive.drive.free_motion or drive.drive.root_rate > 0.0:  # a root that lets go leaves a free body
         _record_free_motion(drive, program, state)
-    program.launch(
-        rigid_fit.sum_corrections,
-        chunks,
-        [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.chunk_threads],
-        [s.corrections],
-    )
+    _record_sums(drive, program, state)
     program.launch(
         flesh.blend_corrections,
-        n,
-        [drive.body, drive.drive, s.corrections, g.bones, g.whole, s.wrench_linear, s.wrench_angular],
-        [s.change_velocity, s.change_spin],
+        (n, drive.threads),
+        [drive.body, drive.drive, s.bone_corrections, g.bones, g.whole, s.wrench_linear, s.wrench_angular]
+        + [drive.threads],
+        [s.bone_change],
+        block_dim=flesh.BLOCK,
     )
     program.launch(
         flesh.apply_corrections,
-        points,
-        [drive.body, drive.drive, state.x, s.pull, s.lean, g.bones, g.change, g.removed, state.failure],
+        (n, drive.num_points),
+        [drive.body, drive.drive, state.x, s.pull, g.bones, s.bone_change, g.removed, drive.state.let_go]
+        + [state.failure],
         [state.u, state.vk],
+        block_dim=flesh.BLOCK,
     )
 
 
@@ -183,29 +174,48 @@ def _record_free_motion(drive: AvatarDrive, program: Program, state: State) -> N
     body, particles = drive.body, drive.model.particles
     program.launch(
         rigid_fit.sum_motion,
-        (n, drive.num_chunks, drive.chunk_threads),
-        [body, drive.drive, particles, state.x, state.vk, s.bone_center, let_go, state.failure, drive.chunk_threads],
+        (n, drive.num_chunks, drive.threads),
+        [body, drive.drive, particles, state.x, state.vk, s.bone_center, let_go, state.failure, drive.threads],
         [s.corrections],
+        block_dim=rigid_fit.BLOCK,
     )
     program.launch(
         flesh.free_motion,
-        n,
-        [drive.body, drive.drive, s.corrections, g.bones, g.whole, let_go],
+        (n, drive.threads),
+        [drive.body, drive.drive, s.corrections, g.bones, g.whole, let_go, drive.threads],
         [s.removed_velocity, s.removed_turn, s.removed_center, s.wrench_angular],
+        block_dim=flesh.BLOCK,
+    )
+
+
+def _record_sums(drive: AvatarDrive, program: Program, state: State) -> None:
+    """Momenta of the pulls, bone by bone."""
+    s, n = drive.scratch, drive.model.num_envs
+    program.launch(
+        rigid_fit.sum_corrections,
+        (n, drive.num_chunks, drive.threads),
+        [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.threads],
+        [s.corrections],
+        block_dim=rigid_fit.BLOCK,
+    )
+    program.launch(
+        rigid_fit.add_chunks,
+        (n, NUM_JOINTS, drive.bone_threads),
+        [drive.body, s.corrections, state.failure, drive.bone_threads],
+        [s.bone_corrections],
+        block_dim=rigid_fit.BLOCK,
     )
 
 
 def record_injection(drive: AvatarDrive, program: Program, state: State) -> None:
     """Append the paper's drive: one injection of velocity, before the plain substeps of a control step."""
     s, g = drive.scratch, drive.groups
-    chord = drive.settings.kernel_parameters(drive.model)
-    chord.dt = drive.model.control_dt
     record_pose(drive, program, 1.0, *drive.start_pose(), s.increment, g.next_pose)
     program.launch(
         posing.bone_matrices,
         (drive.model.num_envs, NUM_JOINTS),
-        [drive.body, chord, g.pose, g.next_pose, g.carry],
-        [s.bone_from, s.bone_step, s.bone_turn],
+        [drive.body, drive.model.control_dt, g.pose, g.next_pose, g.carry],
+        [s.bone_from, s.bone_step],
     )
     program.launch(
         inject_velocity,

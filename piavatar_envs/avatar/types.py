@@ -14,10 +14,13 @@ wp.set_module_options({"enable_backward": False})
 
 #: Partial sums of a chunk: m, m x (3), m u (3), m x x^T (6), m x cross u (3).
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
-#: Partial sums of a chunk's corrections: momentum and angular momentum of the pull (6) and of the lean (6).
+#: Partial sums of a chunk's corrections: momentum and angular momentum of the pulls (6), those of the lean alone (6).
 vec12 = wp.types.vector(length=12, dtype=wp.float32)
-#: All that a particle blends over its bones, see :mod:`piavatar_envs.avatar.blending`.
+#: All that a particle blends over its bones, and what it has blended, see :mod:`piavatar_envs.avatar.blending`.
 vec52 = wp.types.vector(length=52, dtype=wp.float32)
+vec24 = wp.types.vector(length=24, dtype=wp.float32)
+#: Change of a bone's rigid motion: velocity where the pelvis' centre is (3), spin (3), padding to 32 bytes.
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
 
 DRIVE_INCREMENT = wp.constant(0)
 DRIVE_TARGET = wp.constant(1)
@@ -38,6 +41,8 @@ class Body:
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
     bone_mass: wp.array2d(dtype=float)  # (rows, bones) skinning-weighted mass [kg]
     parent: wp.array(dtype=int)  # (bones,)
+    depth: wp.array(dtype=int)  # (bones,) joints between a bone and the root
+    levels: int  # different depths
     # particles that track bone b: tracker[tracker_start[b] : tracker_start[b + 1]]
     tracker_start: wp.array(dtype=int)
     tracker: wp.array(dtype=int)
@@ -128,24 +133,6 @@ class Command:
     goal_root: wp.array(dtype=wp.vec3)
 
 
-@wp.struct
-class BoneMatrices:
-    """Skinning matrices of a substep; ``(num_envs, bones)``."""
-
-    start: wp.array2d(dtype=wp.mat44)  # rest world to world, at its start
-    step: wp.array2d(dtype=wp.mat44)  # change over it, per second
-    turn: wp.array2d(dtype=wp.mat33)  # rotation over it
-    lean: wp.array2d(dtype=wp.mat44)  # commanded pose laid on the body, minus start
-
-
-@wp.struct
-class BoneChange:
-    """Change of velocity and spin of every bone about its centre; ``(num_envs, bones)``."""
-
-    velocity: wp.array2d(dtype=wp.vec3)
-    spin: wp.array2d(dtype=wp.vec3)
-
-
 @dataclass
 class DriveState:
     """What a checkpoint holds of a drive. Quaternions are Warp's ``xyzw``; ``[:, 0]`` is the root in the world."""
@@ -155,7 +142,8 @@ class DriveState:
     goal_rotation: wp.array  # (num_envs, bones) local rotations to reach at the end of this control step
     goal_root: wp.array  # (num_envs,) pelvis position to reach [m]
     let_go: wp.array  # (num_envs,) int: 1 once the root wrench has let go
-    motion: wp.array  # (num_envs, count) kinematic velocity of the last substep, before any rigid part came off
+    # (num_envs, count) kinematic velocity of inert flesh in the last substep, before any rigid part came off
+    motion: wp.array
     wrench_force: wp.array  # (num_envs,) mean root force of the last control step [N]
     wrench_torque: wp.array  # (num_envs,) mean root torque of the last control step [N m]
 
@@ -203,13 +191,12 @@ class DriveScratch:
     removed_velocity: wp.array  # (num_envs,) V [m/s]
     removed_turn: wp.array  # (num_envs,) mat33: A, the finite rotation minus the identity, over dt [1/s]
     removed_center: wp.array  # (num_envs,) c [m]
+    # only where poses are set or velocity is injected
     bone_from: wp.array  # (num_envs, bones) mat44: G T_s, rest world to world
     bone_step: wp.array  # (num_envs, bones) mat44: (G T_{s+1} - G T_s) / dt
-    bone_turn: wp.array  # (num_envs, bones) mat33: rotation of the bone in this substep
-    bone_lean: wp.array  # (num_envs, bones) mat44: commanded pose laid on the body, minus G T_s
-    bone_record: wp.array  # (num_envs, bones) vec52: the above and the bones' rigid motion
-    pull: wp.array  # (num_envs, count) velocity change by shape preservation [m/s]
+    bone_record: wp.array  # (num_envs, bones) vec52: all that particles blend of a bone
+    pull: wp.array  # (num_envs, count) velocity change by shape preservation and tone [m/s]
     lean: wp.array  # (num_envs, count) displacement from the carried to the commanded pose [m]
     corrections: wp.array  # (num_envs, chunks) vec12
-    change_velocity: wp.array  # (num_envs, bones) correction field: velocity at the bone's centre
-    change_spin: wp.array  # (num_envs, bones)
+    bone_corrections: wp.array  # (num_envs, bones) vec12: their sums
+    bone_change: wp.array  # (num_envs, bones) vec8: correction field

@@ -257,11 +257,11 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
             [self.clip, env.simulation.avatar.body, self.start, self.origin, env.step_count],
             [self.clip_rotation, self.clip_root],
         )
-        body = env.simulation.avatar.body
+        avatar = env.simulation.avatar
         program.launch(
             pose_body,
-            n,
-            [body, 0.0, self.clip_rotation, self.clip_root, self.still, self.still[:, 0]],
+            (n, avatar.threads),
+            [avatar.body, 0.0, self.clip_rotation, self.clip_root, self.still, self.still[:, 0], avatar.threads],
             [self.clip_world, self.clip_position],
         )
 

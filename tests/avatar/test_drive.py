@@ -32,7 +32,8 @@ def test_kernels_pose_the_body_like_numpy(make_rig, wild_pose, fraction):
     rotation = wp.zeros((2, 22), dtype=wp.quat, device=rig.model.device)
     position = wp.zeros((2, 22), dtype=wp.vec3, device=rig.model.device)
     program = Program(rig.model.device)
-    program.launch(posing.pose_body, 2, [rig.drive.body, fraction, *inputs], [rotation, position])
+    threads = rig.drive.threads
+    program.launch(posing.pose_body, (2, threads), [rig.drive.body, fraction, *inputs, threads], [rotation, position])
     program.run()
     for env in range(2):
         local = (Rotation.from_rotvec(base[env]) * Rotation.from_rotvec(fraction * turn[env])).as_matrix()

@@ -1,0 +1,95 @@
+"""Sums over the threads that share a piece of work: a warp, or a part of one, on a GPU; one thread on a CPU.
+
+A sum runs in an order that never changes, whatever the schedule and the number of environments. Threads that share a
+sum follow each other in the last dimension of the launch, are a power of two and at most 32, and all come to it.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.types import vec12, vec16
+
+wp.set_module_options({"enable_backward": False})
+
+
+def warp_threads(device: str) -> int:
+    """Threads that share a chunk of a bone's particles, or the bones of an environment: a warp on a GPU."""
+    return 32 if wp.get_device(device).is_cuda else 1
+
+
+def chunk_threads(device: str, chunks: int) -> int:
+    """Threads that add up the ``chunks`` of a bone, about two each."""
+    return min(warp_threads(device), 1 << max(0, (chunks - 1) // 2).bit_length())
+
+
+_SUM = """
+#if defined(__CUDA_ARCH__)
+const unsigned group = threads >= 32 ? 0xffffffffu : ((1u << threads) - 1u) << (threadIdx.x & 31 & -threads);
+for (int distance = threads >> 1; distance > 0; distance >>= 1)
+#pragma unroll
+    for (int c = 0; c < %d; ++c) value[c] += __shfl_xor_sync(group, value[c], distance);
+#endif
+return value;
+"""
+
+
+@wp.func_native(_SUM % 12)
+def sum_threads12(value: vec12, threads: int) -> vec12:
+    """Sum over ``threads`` threads, told to all of them."""
+    ...
+
+
+@wp.func_native(_SUM % 16)
+def sum_threads16(value: vec16, threads: int) -> vec16:
+    """:func:`sum_threads12` of sixteen numbers."""
+    ...
+
+
+# Each step halves the numbers that a thread goes on with, as well as the threads that go on with the same: 16 exchanges
+# instead of 80, and each of the numbers ends up with the thread that stores it.
+_STORE_SUM = """
+#if defined(__CUDA_ARCH__)
+if (threads == 32) {
+    constexpr int WORDS = %d;
+    const int lane = threadIdx.x & 31;
+    float part[16];
+#pragma unroll
+    for (int k = 0; k < 16; ++k) part[k] = k < WORDS ? value[k] : 0.0f;
+#define HALVE(half)                                                                                  \
+    _Pragma("unroll") for (int k = 0; k < half; ++k) {                                               \
+        const bool upper = lane & 2 * half;                                                          \
+        const float away = upper ? part[k] : part[k + half];                                         \
+        part[k] = (upper ? part[k + half] : part[k]) + __shfl_xor_sync(0xffffffffu, away, 2 * half); \
+    }
+    HALVE(8) HALVE(4) HALVE(2) HALVE(1)
+    part[0] += __shfl_xor_sync(0xffffffffu, part[0], 1);
+    const int word = lane >> 1;
+    if ((lane & 1) == 0 && word < WORDS) reinterpret_cast<float*>(&wp::index(into, e, c))[word] = part[0];
+    return;
+}
+#endif
+wp::index(into, e, c) = value;
+"""
+
+
+@wp.func_native(_STORE_SUM % 12)
+def store_sum12(into: wp.array2d(dtype=vec12), e: int, c: int, value: vec12, threads: int):
+    """``into[e, c]`` = the sum of ``value`` over the threads of a warp; ``value`` of a thread that is alone."""
+    ...
+
+
+@wp.func_native(_STORE_SUM % 16)
+def store_sum16(into: wp.array2d(dtype=vec16), e: int, c: int, value: vec16, threads: int):
+    """:func:`store_sum12` of sixteen numbers."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+if (threads > 1) __syncwarp();
+#endif
+""")
+def meet_threads(threads: int):
+    """What one thread of a warp has stored, the others see from here on."""
+    ...

@@ -1,0 +1,143 @@
+"""Sums over the threads that share a piece of work, and records blended by particles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from piavatar_envs.avatar.blending import blend_changes, blend_records, store_record
+from piavatar_envs.avatar.lanes import (
+    chunk_threads,
+    store_sum12,
+    store_sum16,
+    sum_threads12,
+    sum_threads16,
+    warp_threads,
+)
+from piavatar_envs.avatar.types import vec8, vec12, vec16, vec24, vec52
+
+wp.set_module_options({"enable_backward": False})
+
+ROWS, POINTS, BONES = 5, 70, 22
+
+
+@wp.kernel
+def add_up(
+    values: wp.array3d(dtype=float), threads: int, out12: wp.array3d(dtype=vec12), out16: wp.array3d(dtype=vec16)
+):
+    e, c, thread = wp.tid()
+    if e == 1:
+        return  # the threads of a failed environment leave before the sum
+    v12 = vec12()
+    v16 = vec16()
+    for n in range(16):
+        v16[n] = values[e, c, 16 * thread + n]
+        if n < 12:
+            v12[n] = v16[n]
+    out12[e, c, thread] = sum_threads12(v12, threads)
+    out16[e, c, thread] = sum_threads16(v16, threads)
+
+
+@wp.kernel
+def store_up(
+    values: wp.array3d(dtype=float), threads: int, out12: wp.array2d(dtype=vec12), out16: wp.array2d(dtype=vec16)
+):
+    e, c, thread = wp.tid()
+    v12 = vec12()
+    v16 = vec16()
+    for n in range(16):
+        v16[n] = values[e, c, 16 * thread + n]
+        if n < 12:
+            v12[n] = v16[n]
+    store_sum12(out12, e, c, v12, threads)
+    store_sum16(out16, e, c, v16, threads)
+
+
+@wp.kernel
+def copy_records(source: wp.array2d(dtype=vec52), out: wp.array2d(dtype=vec52)):
+    e, b = wp.tid()
+    store_record(out, e, b, source[e, b])
+
+
+@wp.kernel
+def blend(
+    record: wp.array2d(dtype=vec52),
+    change: wp.array2d(dtype=vec8),
+    joint: wp.array(dtype=wp.vec4i),
+    weight: wp.array(dtype=wp.vec4),
+    rest: wp.array(dtype=wp.vec3),
+    out: wp.array2d(dtype=vec24),
+    out_change: wp.array2d(dtype=vec8),
+):
+    e, p = wp.tid()
+    out[e, p] = blend_records(record, e, joint, weight, p, rest[p])
+    out_change[e, p] = blend_changes(change, e, joint, weight, p)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 8, 32])
+def test_threads_add_up_what_each_of_them_has(device, threads):
+    """Groups of any size, some of them gone; every thread is told the sum of its own group, in every run the same."""
+    threads = min(threads, warp_threads(device))
+    values = np.random.default_rng(0).normal(size=(ROWS, 3, 16 * threads)).astype(np.float32)
+    expected = values.reshape(ROWS, 3, threads, 16).astype(float).sum(2)
+    expected[1] = 0.0
+    runs = []
+    for _ in range(2):
+        out12 = wp.zeros((ROWS, 3, threads), dtype=vec12, device=device)
+        out16 = wp.zeros((ROWS, 3, threads), dtype=vec16, device=device)
+        given = wp.array(values, dtype=float, device=device)
+        wp.launch(add_up, (ROWS, 3, threads), [given, threads], [out12, out16], device=device)
+        for n in range(threads):
+            np.testing.assert_allclose(out16.numpy()[:, :, n], expected, atol=1e-5)
+            np.testing.assert_allclose(out12.numpy()[:, :, n], expected[..., :12], atol=1e-5)
+        runs.append(out16.numpy())
+    assert np.array_equal(*runs)
+
+
+def test_a_warp_stores_its_sum(device):
+    """Each number of the sum goes to its place."""
+    threads = warp_threads(device)
+    values = np.random.default_rng(1).normal(size=(ROWS, 3, 16 * threads)).astype(np.float32)
+    expected = values.reshape(ROWS, 3, threads, 16).astype(float).sum(2)
+    out12 = wp.zeros((ROWS, 3), dtype=vec12, device=device)
+    out16 = wp.zeros((ROWS, 3), dtype=vec16, device=device)
+    given = wp.array(values, dtype=float, device=device)
+    wp.launch(store_up, (ROWS, 3, threads), [given, threads], [out12, out16], device=device)
+    np.testing.assert_allclose(out16.numpy(), expected, atol=1e-5)
+    np.testing.assert_allclose(out12.numpy(), expected[..., :12], atol=1e-5)
+
+
+@pytest.mark.parametrize(("chunks", "threads"), [(0, 1), (1, 1), (2, 1), (3, 2), (5, 4), (64, 32), (5000, 32)])
+def test_a_thread_adds_about_two_chunks(device, chunks, threads):
+    """But no more threads share a bone than a warp has."""
+    assert chunk_threads(device, chunks) == min(threads, warp_threads(device))
+
+
+def test_particles_blend_the_records_of_their_bones(device):
+    """Matrices applied to the rest position, the other numbers as they are, weighted."""
+    rng = np.random.default_rng(2)
+    record = rng.normal(size=(ROWS, BONES, 52)).astype(np.float32)
+    change = rng.normal(size=(ROWS, BONES, 8)).astype(np.float32)
+    joint = rng.integers(0, BONES, size=(POINTS, 4)).astype(np.int32)
+    weight = np.sort(rng.random((POINTS, 4)).astype(np.float32))[:, ::-1] * (
+        np.arange(4) <= rng.integers(0, 4, (POINTS, 1))
+    )
+    rest = rng.normal(size=(POINTS, 3)).astype(np.float32)
+
+    def upload(value, dtype):
+        return wp.array(np.ascontiguousarray(value), dtype=dtype, device=device)
+
+    out = wp.zeros((ROWS, POINTS), dtype=vec24, device=device)
+    out_change = wp.zeros((ROWS, POINTS), dtype=vec8, device=device)
+    stored = wp.zeros((ROWS, BONES), dtype=vec52, device=device)
+    wp.launch(copy_records, (ROWS, BONES), [upload(record, vec52)], [stored], device=device)
+    skin = [upload(joint, wp.vec4i), upload(weight.astype(np.float32), wp.vec4), upload(rest, wp.vec3)]
+    wp.launch(blend, (ROWS, POINTS), [stored, upload(change, vec8), *skin], [out, out_change], device=device)
+    blended = np.einsum("pn,epnc->epc", weight.astype(float), record[:, joint].astype(float))
+    rows = blended[..., :36].reshape(ROWS, POINTS, 9, 4)
+    points = np.einsum("epqi,pi->epq", rows[..., :3], rest.astype(float)) + rows[..., 3]
+    np.testing.assert_allclose(out.numpy()[..., :9], points, atol=1e-5)
+    np.testing.assert_allclose(out.numpy()[..., 9:], blended[..., 36:51], atol=1e-5)
+    expected = np.einsum("pn,epnc->epc", weight.astype(float), change[:, joint].astype(float))
+    np.testing.assert_allclose(out_change.numpy()[..., :6], expected[..., :6], atol=1e-5)
