@@ -79,7 +79,7 @@ def test_networks_see_only_the_chosen_terms(workers, facts, tmp_path):
 
 
 def test_a_vector_trains_what_workers_train(tiny, workers, facts, tmp_path, device):
-    """The same steps, hence the same networks, bit for bit on a CPU."""
+    """The same steps, hence the same networks: bit for bit where torch repeats itself, which it does on a CPU."""
     venv = start_vector(tiny.model_copy(update={"vector": True}), device)
     weights = []
     for own in (workers, venv):
@@ -89,8 +89,8 @@ def test_a_vector_trains_what_workers_train(tiny, workers, facts, tmp_path, devi
     agent = policy_agent(model)
     returns = [evaluate("x", agent, own, 3, 7, progress=False).returns for own in (workers, venv)]
     venv.close()
-    np.testing.assert_allclose(*returns, rtol=0.0, atol=0.0 if device == "cpu" else 1e-2)
-    np.testing.assert_allclose(*weights, rtol=0.0, atol=0.0 if device == "cpu" else 1e-2)
+    np.testing.assert_allclose(*returns, rtol=0.0, atol=0.0 if device == "cpu" else 1e-4)
+    np.testing.assert_allclose(*weights, rtol=0.0, atol=0.0 if device == "cpu" else 1e-4)
 
 
 def test_worlds_of_several_are_no_vector():

@@ -67,9 +67,7 @@ def same(equal):
                 compare(x, y, f"{where}[{i}]")
         elif isinstance(a, np.ndarray):
             assert a.dtype == b.dtype, f"{where}: {a.dtype} is not {b.dtype}"
-            # forces of constraints differ by more than round-off on a GPU
-            loose = equal(0.0, 1e-6) and ("root_force" in where or "root_torque" in where)
-            assert loose or equal(a, b), f"{where}: {a} is not {b}"
+            assert equal(a, b), f"{where}: {a} is not {b}"
         else:
             assert a == b or (isinstance(a, float) and equal(a, b)), f"{where}: {a} is not {b}"
 

@@ -331,20 +331,19 @@ def everything(batch, steps: int) -> list[np.ndarray]:
     return log
 
 
-def test_a_restored_state_brings_what_was_drawn(make_batch, env_id, equal, device):
+def test_a_restored_state_brings_what_was_drawn(make_batch, env_id, equal):
     settings = {"observe_parameters": True, "shape.randomize": True, **VARIED}
     batch = make_batch(env_id, 2, **settings)
     batch.reset(seeds=[3, 4])
     state, constants = batch.get_state(), constants_of(batch)
-    steps = 4 if device == "cpu" else 2
-    expected = everything(batch, steps)
+    expected = everything(batch, 4)
     batch.reset(seeds=[8, 9])
     assert not np.allclose(constants_of(batch)["mass"], constants["mass"])
     batch.set_state(state)
     assert all(np.array_equal(value, constants[name]) for name, value in constants_of(batch).items())
     nominal = constants["mass"] / factors_of(batch)["mass_factor"]
     assert batch.simulation.flesh[0].points.mass == pytest.approx(nominal, rel=1e-6)
-    assert all(equal(a, b) for a, b in zip(everything(batch, steps), expected, strict=True))
+    assert all(equal(a, b) for a, b in zip(everything(batch, 4), expected, strict=True))
 
 
 # What is observed.

@@ -80,7 +80,7 @@ def play():
 
 @pytest.fixture(scope="session")
 def same(equal):
-    """Whether two results of ``reset`` or ``step`` are the same: bit for bit on the CPU, within round-off elsewhere."""
+    """Whether two results of ``reset`` or ``step`` are the same: bit for bit."""
 
     def compare(a, b) -> bool:
         if isinstance(a, dict):

@@ -71,9 +71,9 @@ def test_agents_are_told_of_the_others_in_order(make_crowd, module_name):
                 assert np.array_equal(mine[f"other_{index}_{name}"], theirs[name])
 
 
-def test_world_i_is_the_single_world_of_seed_plus_i(make_crowd, module_name, equal, device):
+def test_world_i_is_the_single_world_of_seed_plus_i(make_crowd, module_name, equal):
     crowd, single, seed = make_crowd(module_name, 4), make_crowd(module_name, 1), 21
-    rng, steps = np.random.default_rng(0), 8 if device == "cpu" else 3
+    rng, steps = np.random.default_rng(0), 8
     actions = rng.uniform(-1.0, 1.0, (2, steps, *crowd.action.shape)).astype(np.float32)
     rows = []
     for episode in range(2):

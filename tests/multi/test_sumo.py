@@ -304,7 +304,7 @@ def test_the_walls_keep_who_is_thrown_out(make_world, play, walls):
 def test_a_batch_is_as_many_worlds(make_world, same, device):
     from piavatar_envs.envs.batch_env import BatchEnv
 
-    single, seed, steps = make_world(SUMO), 3, 8 if device == "cpu" else 3
+    single, seed, steps = make_world(SUMO), 3, 8
     batch = BatchEnv(type(single.batch.task)(single.config), 2, device)
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1.0, 1.0, (steps, *batch.action.shape)).astype(np.float32)
