@@ -1,8 +1,8 @@
 """The tables of ``PERFORMANCE.md``, from the JSON files in ``results/``.
 
 ``python -m benchmarks.performance`` writes what stands between ``<!-- table: NAME -->`` and ``<!-- end -->`` anew, and
-refuses if a file that a table needs is missing or was not finished. ``--check`` changes nothing: it ends with an error
-if something would change.
+refuses if a file that a table needs is missing or was not finished. ``--only`` names the tables that are written, the
+others stay as they are. ``--check`` changes nothing: it ends with an error if something would change.
 """
 
 from __future__ import annotations
@@ -233,17 +233,18 @@ TABLES: dict[str, Table] = {
 }
 
 
-def fill(text: str, results: Path = RESULTS) -> str:
-    """``text`` with all its marked tables written anew.
+def fill(text: str, results: Path = RESULTS, only: Sequence[str] = ()) -> str:
+    """``text`` with its marked tables written anew, or those of the names ``only``.
 
     Raises:
         FileNotFoundError: files that tables need, all at once, and the commands that make them.
-        ValueError: a mark without a table of that name, or a file whose run was not finished.
+        ValueError: a mark or a name without a table, or a file whose run was not finished.
     """
     names = [match["name"] for match in MARKED.finditer(text)]
-    unknown = sorted(set(names) - set(TABLES))
+    unknown = sorted({*names, *only} - set(TABLES))
     if unknown or not names:
         raise ValueError(f"marks {unknown or 'of tables'} are not known or not there; use {', '.join(TABLES)}")
+    names = [name for name in names if not only or name in only]
     missing = sorted({TABLES[name].file for name in names if not (results / TABLES[name].file).exists()})
     if missing:
         commands = {TABLES[name].file: TABLES[name].command for name in names}
@@ -252,6 +253,8 @@ def fill(text: str, results: Path = RESULTS) -> str:
         raise FileNotFoundError(f"no {', '.join(missing)} in {folder}; make them: {how}")
 
     def table(match: re.Match[str]) -> str:
+        if match["name"] not in names:
+            return match[0]
         report = json.loads((results / TABLES[match["name"]].file).read_text(encoding="utf-8"))
         if not report["complete"]:
             raise ValueError(f"{TABLES[match['name']].file} is of a run that was stopped; run it again to the end")
@@ -260,21 +263,24 @@ def fill(text: str, results: Path = RESULTS) -> str:
     return MARKED.sub(table, text)
 
 
-def main(check: bool = False) -> None:
+def main(only: tuple[str, ...] = (), check: bool = False) -> None:
     """Fill the tables of PERFORMANCE.md, and draw the profile.
 
     Args:
+        only: names of the tables to fill; all if not given.
         check: change nothing; end with an error if something would change.
     """
     before = DOCUMENT.read_text(encoding="utf-8")
     try:
-        after = fill(before)
+        after = fill(before, only=only)
     except (FileNotFoundError, ValueError) as error:
         sys.exit(f"error: {error}")
     if check and after != before:
         sys.exit(f"error: tables of {DOCUMENT.name} are not those of the results; run python -m benchmarks.performance")
-    if not check:
-        DOCUMENT.write_text(after, encoding="utf-8")
+    if check:
+        return
+    DOCUMENT.write_text(after, encoding="utf-8")
+    if not only or "profile_reach" in only:
         profile.draw(json.loads((RESULTS / PROFILE).read_text(encoding="utf-8"))["results"], RESULTS / PICTURE)
 
 

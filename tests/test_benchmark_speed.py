@@ -386,6 +386,10 @@ def test_tables_refuse_what_is_missing_or_unfinished(results: Path, tmp_path: Pa
     shutil.copy(results / "soak.json", tmp_path)
     with pytest.raises(ValueError, match=r"substep\.json .*stopped"):
         performance.fill(text, tmp_path)
+    filled = performance.fill(text, tmp_path, only=["soak"])  # the other one stays as it was
+    assert filled.startswith("<!-- table: substep -->\n<!-- end -->\n") and "verdict" in filled
+    with pytest.raises(ValueError, match="sonnet"):
+        performance.fill(text, tmp_path, only=["sonnet"])
     with pytest.raises(ValueError, match="sonnet"):
         performance.fill("<!-- table: sonnet -->\n<!-- end -->\n", results)
 

@@ -104,7 +104,7 @@ class AvatarEnv(gym.Env):
         self._episode.close()
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on; :meth:`set_state` restores it, bit for bit on the CPU."""
+        """Everything that the future depends on; :meth:`set_state` restores it, bit for bit."""
         return self.batch.get_state()
 
     def set_state(self, state: dict[str, np.ndarray]) -> Any:

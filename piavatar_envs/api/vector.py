@@ -23,7 +23,7 @@ from piavatar_envs.tasks import load_task
 class AvatarVectorEnv(VectorEnv):
     """Many worlds of one soft avatar and a task, stepped at once.
 
-    Environment ``i`` is the single environment of seed ``seed + i``: on a CPU bit for bit. Its ``info`` is the single
+    Environment ``i`` is the single environment of seed ``seed + i``, bit for bit. Its ``info`` is the single
     one's in Gymnasium's vector format: arrays, and beside each ``name`` the mask ``_name`` of environments that it
     holds for. With ``array_api="torch"`` all of it are tensors on the environments' device and nothing in :meth:`step`
     makes the host wait; then ``info["failure"]`` are bits (``piavatar_envs.mpm.types.failure_name`` knows their names),
@@ -247,7 +247,7 @@ class AvatarVectorEnv(VectorEnv):
         self.episodes.close()
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on; :meth:`set_state` restores it, bit for bit on the CPU.
+        """Everything that the future depends on; :meth:`set_state` restores it, bit for bit.
 
         The first dimension of every array is the environment; whether one is about to be reset is part of it.
         """

@@ -124,7 +124,13 @@ for (;;) {
         f = __shfl_sync(ALL, field, leader);
         const bool waits = waiting >> lane & 1u && field == f;
         auto corner = [&](int at) {
-            const int least = __reduce_min_sync(ALL, waits ? at : 0x7fffffff), own = __shfl_sync(ALL, at, leader);
+            int least = waits ? at : 0x7fffffff;
+#if __CUDA_ARCH__ >= 800
+            least = __reduce_min_sync(ALL, least);
+#else
+            for (int d = 16; d > 0; d >>= 1) least = min(least, __shfl_xor_sync(ALL, least, d));
+#endif
+            const int own = __shfl_sync(ALL, at, leader);
             return own - least > 3 ? own - 1 : least;
         };
         ox = corner(x), oy = corner(y), oz = corner(z);
