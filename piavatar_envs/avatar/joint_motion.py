@@ -1,0 +1,146 @@
+"""What velocities of the joints do to bones and particles: the skinning Jacobian ``J``, applied and never stored.
+
+A generalised velocity is that of the pelvis and, for every joint, the angular velocity against its parent in the
+world's axes; see :mod:`piavatar_envs.avatar.mass_matrix`. Each bone then has a rigid motion, and a particle the blend
+of those of its bones: at the particle, not at its skinned place, or angular momentum would not be kept.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.blending import blend_changes
+from piavatar_envs.avatar.mass_matrix import BONES
+from piavatar_envs.avatar.rotation import quat_exp
+from piavatar_envs.avatar.types import Body, vec8
+from piavatar_envs.mpm.types import row
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.func
+def joint_part(q: wp.array2d(dtype=float), e: int, c: int):
+    """Three components of a generalised vector, those of joint ``c``."""
+    return wp.vec3(q[e, 3 + 3 * c], q[e, 4 + 3 * c], q[e, 5 + 3 * c])
+
+
+@wp.func
+def set_part(q: wp.array2d(dtype=float), e: int, first: int, v: wp.vec3):
+    """Write three components of a generalised vector."""
+    for i in range(3):
+        q[e, first + i] = v[i]
+
+
+@wp.kernel
+def spread_motion(
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    q: wp.array2d(dtype=float),
+    # out
+    field: wp.array2d(dtype=vec8),
+):
+    """Rigid motion of every bone under a generalised velocity: velocity where the pelvis joint is, and spin."""
+    e = wp.tid()
+    for b in range(BONES):
+        w = joint_part(q, e, b)
+        v = wp.vec3(q[e, 0], q[e, 1], q[e, 2])
+        if b > 0:
+            above = field[e, body.parent[b]]
+            v = wp.vec3(above[0], above[1], above[2]) + wp.cross(w, position[e, 0] - position[e, b])
+            w += wp.vec3(above[3], above[4], above[5])
+        field[e, b] = vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
+
+
+@wp.func
+def skinned_motion(body: Body, field: wp.array2d(dtype=vec8), e: int, p: int, arm: wp.vec3):
+    """``J q`` at a particle, ``arm`` from the pelvis joint."""
+    s = blend_changes(field, e, body.joint, body.weight, p)
+    return wp.vec3(s[0], s[1], s[2]) + wp.cross(wp.vec3(s[3], s[4], s[5]), arm)
+
+
+@wp.kernel
+def take_over(
+    body: Body,
+    x: wp.array2d(dtype=wp.vec3),
+    position: wp.array2d(dtype=wp.vec3),
+    taken: wp.array2d(dtype=vec8),
+    moving: wp.array2d(dtype=vec8),
+    failure: wp.array(dtype=int),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    # out
+    vk: wp.array2d(dtype=wp.vec3),
+):
+    """Take ``J dq`` from the physical velocity, and write ``J qdot``."""
+    e, p = wp.tid()
+    if failure[e] != 0:
+        return
+    arm = x[e, body.first + p] - position[e, 0]
+    u[e, body.first + p] = u[e, body.first + p] - skinned_motion(body, taken, e, p, arm)
+    vk[e, body.first + p] = skinned_motion(body, moving, e, p, arm)
+
+
+@wp.kernel
+def hand_back(
+    body: Body,
+    x: wp.array2d(dtype=wp.vec3),
+    position: wp.array2d(dtype=wp.vec3),
+    moving: wp.array2d(dtype=vec8),
+    failure: wp.array(dtype=int),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+):
+    """Write ``J qdot`` of a new pose; what it has changed goes to the physical velocity."""
+    e, p = wp.tid()
+    if failure[e] != 0:
+        return
+    v = skinned_motion(body, moving, e, p, x[e, body.first + p] - position[e, 0])
+    u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
+    vk[e, body.first + p] = v
+
+
+@wp.kernel
+def find_displacement(
+    body: Body,
+    x: wp.array2d(dtype=wp.vec3),
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    # out
+    displacement: wp.array2d(dtype=wp.vec3),
+):
+    """Of the particles from where the pose has them by linear blend skinning [m], at their places in the world."""
+    e, p = wp.tid()
+    r = row(e, body.rest_joint.shape[0])
+    rest = body.rest[row(e, body.rest.shape[0]), p]
+    joint = body.joint[p]
+    weight = body.weight[p]
+    at = wp.vec3()
+    for n in range(4):
+        b = joint[n]
+        at += weight[n] * (wp.quat_rotate(rotation[e, b], rest - body.rest_joint[r, b]) + position[e, b])
+    displacement[e, body.first + p] = x[e, body.first + p] - at
+
+
+@wp.kernel
+def move_joints(
+    body: Body,
+    dt: float,
+    field: wp.array2d(dtype=vec8),
+    # in and out
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+):
+    """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together."""
+    e = wp.tid()
+    r = row(e, body.rest_joint.shape[0])
+    for b in range(BONES):
+        s = field[e, b]
+        if b == 0:
+            position[e, b] = position[e, b] + dt * wp.vec3(s[0], s[1], s[2])
+        else:
+            a = body.parent[b]
+            offset = body.rest_joint[r, b] - body.rest_joint[r, a]
+            position[e, b] = position[e, a] + wp.quat_rotate(rotation[e, a], offset)
+        turn = quat_exp(dt * wp.vec3(s[3], s[4], s[5]))
+        rotation[e, b] = wp.normalize(turn * rotation[e, b])

@@ -1,0 +1,258 @@
+"""Joints under torques against the Jacobian written out in double precision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.linalg import eigh
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.articulated import ArticulatedBody
+from piavatar_envs.avatar.cholesky import factorize, solve
+from piavatar_envs.avatar.lanes import warp_threads
+from piavatar_envs.avatar.mass_matrix import NUM_DOF
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
+
+GAINS = np.ones((1, NUM_JOINTS))
+
+
+def carried_by() -> np.ndarray:
+    """Whether joint ``c`` carries bone ``b``, shape ``(c, b)``."""
+    carries = np.eye(NUM_JOINTS)
+    for bone in range(NUM_JOINTS - 1, 0, -1):
+        above = PARENTS[bone]
+        while above >= 0:
+            carries[above, bone] = 1.0
+            above = PARENTS[above]
+    return carries
+
+
+class Joints:
+    """An articulated body beside a rig's particles, and programs of its parts."""
+
+    def __init__(self, rig, stiffness=0.0, damping=0.0):
+        self.rig, self.model, self.state = rig, rig.model, rig.state
+        self.body = ArticulatedBody(
+            rig.points, rig.drive.body, rig.model, stiffness * GAINS, np.broadcast_to(damping, GAINS.shape).copy()
+        )
+
+    def pose(self, rotvec, root=None):
+        """Put pose and particles where the local rotation vectors have them, at rest."""
+        joints = self.rig.points.joints[0].astype(float)
+        rotations = Rotation.from_rotvec(np.asarray(rotvec)).as_matrix()
+        root = joints[0] if root is None else root
+        world, positions = forward_kinematics(rotations, root, joints)
+        n = self.model.num_envs
+        quaternions = Rotation.from_matrix(world).as_quat().astype(np.float32)
+        self.body.rotation.assign(np.broadcast_to(quaternions, (n, NUM_JOINTS, 4)).copy())
+        self.body.position.assign(np.broadcast_to(positions.astype(np.float32), (n, NUM_JOINTS, 3)).copy())
+        self.state.x.assign(
+            np.broadcast_to(self.rig.skinned(rotations, root).astype(np.float32), self.state.x.shape + (3,)).copy()
+        )
+        self.run("record_refresh", fit=False)
+        return self
+
+    def run(self, part: str, **options) -> None:
+        program = Program(self.model.device)
+        getattr(self.body, part)(program, self.state, **options)
+        program.run()
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """``J`` at the particles, shape ``(P, 3, 69)``."""
+        x, position = self.rig.read("x"), self.body.position.numpy()[0].astype(float)
+        share = self.rig.weights.astype(float)
+        share = (share / share.sum(1, keepdims=True)) @ carried_by().T
+        J = np.zeros((len(x), 3, NUM_DOF))
+        J[:, :, :3] = np.eye(3)
+        for c in range(NUM_JOINTS):
+            arm = x - position[c]
+            for axis in range(3):
+                J[:, :, 3 + 3 * c + axis] = share[:, c, None] * np.cross(np.eye(3)[axis], arm)
+        return J
+
+    @property
+    def total(self) -> np.ndarray:
+        """Velocity of the particles [m/s]."""
+        return self.rig.read("u") + self.rig.read("vk")
+
+    def momenta(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Momentum, angular momentum, and the sum of ``m |v|``."""
+        m, x, v = self.rig.mass, self.rig.read("x"), self.total
+        return m @ v, m @ np.cross(x, v), float(m @ np.linalg.norm(v, axis=1))
+
+
+@pytest.fixture
+def joints(make_rig, wild_pose):
+    """Joints in a wild pose, particles shaken about it, in random motion."""
+
+    def build(seed=0, **gains) -> Joints:
+        rng = np.random.default_rng(seed)
+        made = Joints(make_rig(cells=16), **gains).pose(wild_pose(rng))
+        shape = made.state.x.numpy().shape
+        made.state.x.assign(made.state.x.numpy() + rng.normal(0.0, 2e-3, shape).astype(np.float32))
+        made.state.u.assign(rng.normal(0.0, 1.0, shape).astype(np.float32))
+        made.run("record_refresh", fit=False)
+        return made
+
+    return build
+
+
+def test_factors_solve(device):
+    rng, size, n, threads = np.random.default_rng(0), 37, 3, warp_threads(device)
+    root = rng.normal(size=(n, size, size))
+    matrix = (root @ root.transpose(0, 2, 1) + 2.0 * np.eye(size)).astype(np.float32)
+    diagonal, right = rng.uniform(0.0, 3.0, (1, size)), rng.normal(size=(n, size))
+    arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in (matrix, diagonal, right)]
+    factor, x = wp.zeros((n, size, size), dtype=float, device=device), wp.zeros((n, size), dtype=float, device=device)
+    wp.launch(factorize, (n, threads), [*arrays[:2], threads], [factor], device=device)
+    wp.launch(solve, (n, threads), [factor, arrays[2], threads], [x], device=device)
+    whole = matrix + np.diag(diagonal[0])
+    L = np.tril(factor.numpy().astype(float))
+    np.testing.assert_allclose(L @ L.transpose(0, 2, 1), whole, atol=1e-5 * np.abs(whole).max())
+    np.testing.assert_allclose(x.numpy(), np.linalg.solve(whole, right[..., None])[..., 0], atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mass_matrix_is_that_of_the_jacobian(joints, seed):
+    made = joints(seed)
+    J, m = made.jacobian, made.rig.mass
+    expected = np.einsum("p,pia,pib->ab", m, J, J)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert (np.abs(made.body.mass.numpy()[0] - expected) / scale).max() < 1e-5
+    assert np.linalg.eigvalsh(made.body.mass.numpy()[0].astype(float)).min() > 0.0
+
+
+def test_joints_take_over_all_they_can_and_change_no_velocity(joints):
+    made = joints()
+    before, J, m = made.total, made.jacobian, made.rig.mass
+    made.run("record_substep")
+    np.testing.assert_allclose(made.total, before, atol=2e-5)
+    share = np.einsum("pia,p,pi->a", J, m, made.rig.read("u"))
+    alone = np.einsum("pia,p,pi->a", J, m, before)
+    size = np.sqrt(np.einsum("p,pia,pia->a", m, J, J))
+    assert np.abs(share / size).max() < 1e-3 * np.abs(alone / size).max()
+    expected = np.linalg.solve(np.einsum("p,pia,pib->ab", m, J, J), alone)
+    got = made.body.velocity.numpy()[0]
+    assert np.linalg.norm(got - expected) < 2e-3 * np.linalg.norm(expected)
+    np.testing.assert_allclose(made.rig.read("vk"), J @ got, atol=1e-4)
+
+
+@pytest.mark.parametrize("stale", [False, True], ids=["fresh", "stale"])
+def test_torques_change_neither_momentum(joints, wild_pose, stale):
+    """Springs, dampers and torques of a thousand newton metres; also with a mass matrix of another place."""
+    made = joints(1, stiffness=300.0, damping=10.0)
+    rng = np.random.default_rng(3)
+    if stale:
+        made.state.x.assign(made.state.x.numpy() + rng.normal(0.0, 2e-2, made.state.x.numpy().shape).astype(np.float32))
+    made.body.target.assign(Rotation.from_rotvec(wild_pose(rng)).as_quat()[None].astype(np.float32))
+    made.body.torque.assign(rng.normal(0.0, 1e3, (1, NUM_JOINTS, 3)).astype(np.float32))
+    p, L, _ = made.momenta()
+    made.run("record_substep")
+    p_after, L_after, size = made.momenta()
+    assert size > 2.0 * made.rig.mass.sum() * 0.5
+    assert np.linalg.norm(p_after - p) < 3e-6 * size
+    assert np.linalg.norm(L_after - L) < 3e-6 * size
+
+
+def test_torque_turns_a_joint_as_the_inertia_says(joints):
+    """Without springs ``M d = dt tau``, less the rigid motion; compared in double precision."""
+    made = joints(2)
+    made.state.u.zero_()
+    elbow = joint_index("left_elbow")
+    torque = np.zeros((1, NUM_JOINTS, 3), np.float32)
+    torque[0, elbow] = (3.0, -2.0, 5.0)
+    made.body.torque.assign(torque)
+    J, m, dt = made.jacobian, made.rig.mass, made.model.step.dt
+    made.run("record_substep")
+    right = np.zeros(NUM_DOF)
+    right[3 + 3 * elbow : 6 + 3 * elbow] = dt * torque[0, elbow]
+    expected = np.linalg.solve(np.einsum("p,pia,pib->ab", m, J, J), right)
+    got = made.body.velocity.numpy()[0]
+    assert np.linalg.norm(got - expected) < 1e-3 * np.linalg.norm(expected)
+
+
+def test_refresh_fits_the_pose_and_keeps_velocities(joints, wild_pose):
+    rng = np.random.default_rng(5)
+    rotvec = wild_pose(rng)
+    made = Joints(joints(0).rig).pose(rotvec)
+    made.state.u.assign(rng.normal(0.0, 1.0, made.state.x.numpy().shape).astype(np.float32))
+    made.body.velocity.assign(rng.normal(0.0, 1.0, (1, NUM_DOF)).astype(np.float32))
+    made.run("record_refresh", fit=False)
+    turned = Rotation.from_rotvec(rotvec) * Rotation.from_rotvec(rng.normal(0.0, 0.02, rotvec.shape))
+    root = made.body.position.numpy()[0, 0] + (0.01, -0.02, 0.015)
+    made.state.x.assign(made.rig.skinned(turned.as_matrix(), root)[None].astype(np.float32))
+    before = made.total
+    for _ in range(3):
+        made.run("record_refresh")
+    np.testing.assert_allclose(made.total, before, atol=5e-5)
+    world, positions = forward_kinematics(turned.as_matrix(), root, made.rig.points.joints[0].astype(float))
+    np.testing.assert_allclose(made.body.position.numpy()[0], positions, atol=2e-4)
+    off = Rotation.from_quat(made.body.rotation.numpy()[0].astype(float)) * Rotation.from_matrix(world).inv()
+    assert off.magnitude().max() < 2e-3
+
+
+def test_a_mode_swings_at_its_frequency(make_rig):
+    """Small swings of the softest springs: ``K x = omega^2 M x``, in a body that nothing holds."""
+    made = Joints(make_rig(cells=16), stiffness=60.0).pose(np.zeros((NUM_JOINTS, 3)))
+    M = made.body.mass.numpy()[0].astype(float)
+    K = np.diag(np.r_[np.zeros(6), np.full(NUM_DOF - 6, 60.0)])
+    values, modes = eigh(K, M)
+    omega, mode = np.sqrt(values[6]), modes[:, 6]  # six rigid motions come first
+    mode *= 0.1 / np.abs(mode[6:]).max()
+    dt = made.model.step.dt
+    made.body.velocity.assign(mode[None].astype(np.float32))
+    made.state.vk.assign((made.jacobian @ mode)[None].astype(np.float32))
+    program = Program(made.model.device)
+    made.body.record_substep(program, made.state)
+    swing, steps = [], round(np.pi / omega / dt)
+    for _ in range(steps):
+        program.run()
+        made.state.u.zero_()
+        made.state.x.assign(made.state.x.numpy() + np.float32(dt) * made.state.vk.numpy())
+        swing.append(mode @ M @ made.body.velocity.numpy()[0] / (mode @ M @ mode))
+    damped = np.exp(-0.5 * omega**2 * dt * dt * np.arange(1, steps + 1))  # of the implicit step
+    expected = damped * np.cos(omega * dt * np.arange(1, steps + 1))
+    assert steps > 20
+    np.testing.assert_allclose(swing, expected, atol=0.03)
+
+
+def test_free_float_keeps_momentum(make_rig, wild_pose):
+    """A body that flails in empty space, springs and flesh together: the drift is small against the sum of m |v|."""
+    rig = make_rig(cells=16)
+    made = Joints(rig, stiffness=100.0, damping=3.0).pose(np.zeros((NUM_JOINTS, 3)))
+    rng = np.random.default_rng(7)
+    program, model = Program(rig.model.device), rig.model
+    record_begin(program, model, rig.state, rig.scratch)
+    for step in range(model.num_substeps):
+        made.body.record_refresh(program, rig.state)
+        made.body.record_substep(program, rig.state)
+        record_substep(program, model, rig.state, rig.scratch, step)
+    record_end(program, model, rig.state, rig.scratch)
+    start = rig.totals()
+    largest, worst = 0.0, np.zeros(2)
+    for _ in range(6):
+        made.body.target.assign(Rotation.from_rotvec(0.6 * wild_pose(rng)).as_quat()[None].astype(np.float32))
+        program.run()
+        now = rig.totals()  # with the affine part of the angular momentum
+        largest = max(largest, made.momenta()[2])
+        changes = now.momentum - start.momentum, now.angular_momentum - start.angular_momentum
+        worst = np.maximum(worst, [np.linalg.norm(change) for change in changes])
+    assert rig.state.failure.numpy().sum() == 0
+    assert largest > 10.0  # it did move [kg m/s]
+    assert (worst < 1e-5 * largest).all(), worst / largest
+
+
+@pytest.mark.parametrize("name", ["stiffness", "damping"])
+@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
+def test_bad_gains_are_refused(make_rig, name, bad):
+    rig = make_rig(cells=16)
+    gains = {"stiffness": GAINS.copy(), "damping": GAINS.copy()}
+    gains[name][0, 3] = bad
+    with pytest.raises(ValueError, match=f"{name} must be finite and not negative"):
+        ArticulatedBody(rig.points, rig.drive.body, rig.model, **gains)
+    with pytest.raises(ValueError, match=f"{name} has shape"):
+        ArticulatedBody(rig.points, rig.drive.body, rig.model, **{**gains, name: np.ones(3)})
