@@ -14,6 +14,10 @@ between bones must change neither momentum nor angular momentum. With the mass m
 may be a few substeps old, so what rigid motion ``J d`` has comes off, found from the bones' moments as they are. When
 the mass matrix is built anew the pose is fitted to the particles, too (``dq = M^-1 J^T m (x - LBS)``).
 
+Flesh may be held to the bones by a pull, implicit and critically damped, ``u' = (u + dt w^2 d)/(1 + dt w)^2`` with
+``d`` from the particle to its skinned place; the joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, with
+exactly its momentum.
+
 Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
 of more than some 5 ms ago makes fast limbs unstable.
@@ -28,7 +32,9 @@ import warp as wp
 
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.cholesky import factorize, solve
+from piavatar_envs.avatar.joint_momentum import balance, gather_momentum
 from piavatar_envs.avatar.joint_motion import (
+    attach_flesh,
     find_displacement,
     hand_back,
     joint_part,
@@ -39,8 +45,6 @@ from piavatar_envs.avatar.joint_motion import (
 )
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import (
-    BONES,
-    I3,
     NUM_DOF,
     build_pairs,
     compose_moments,
@@ -48,7 +52,7 @@ from piavatar_envs.avatar.mass_matrix import (
     place_pairs,
     sum_pairs,
 )
-from piavatar_envs.avatar.rigid_fit import BLOCK, point_inertia, spin_of, sum_moments
+from piavatar_envs.avatar.rigid_fit import BLOCK, sum_moments
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
@@ -56,37 +60,6 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import Model, State, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
-
-
-@wp.kernel
-def gather_momentum(
-    body: Body,
-    position: wp.array2d(dtype=wp.vec3),
-    moments: wp.array2d(dtype=vec16),
-    # scratch
-    linear: wp.array2d(dtype=wp.vec3),
-    angular: wp.array2d(dtype=wp.vec3),
-    # out
-    bones: wp.array2d(dtype=vec16),
-    momentum: wp.array2d(dtype=float),
-):
-    """``J^T m u`` from the moments of the bones about their joints: each joint has what all beyond it have."""
-    e = wp.tid()
-    for b in range(BONES):
-        s = vec16()
-        for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
-            s += moments[e, c]
-        bones[e, b] = s
-        linear[e, b] = wp.vec3(s[4], s[5], s[6])
-        angular[e, b] = wp.vec3(s[13], s[14], s[15])
-    for n in range(BONES - 1):
-        b = BONES - 1 - n  # children come after their parents
-        a = body.parent[b]
-        angular[e, a] = angular[e, a] + angular[e, b] + wp.cross(position[e, b] - position[e, a], linear[e, b])
-        linear[e, a] = linear[e, a] + linear[e, b]
-        set_part(momentum, e, 3 + 3 * b, angular[e, b])
-    set_part(momentum, e, 0, linear[e, 0])
-    set_part(momentum, e, 3, angular[e, 0])
 
 
 @wp.kernel
@@ -127,53 +100,6 @@ def torque_impulse(
 
 
 @wp.kernel
-def balance(
-    position: wp.array2d(dtype=wp.vec3),
-    bones: wp.array2d(dtype=vec16),
-    field: wp.array2d(dtype=vec8),
-    # in and out
-    change: wp.array2d(dtype=float),
-):
-    """Take the body's rigid motion out of a change of the joints' velocities, whose motion of the bones is ``field``.
-
-    The blend of the bones' motions has the momenta of the bones' own sums, because weights add up to one.
-    """
-    e = wp.tid()
-    m = float(0.0)
-    first = wp.vec3()
-    I = wp.mat33()
-    P = wp.vec3()
-    L = wp.vec3()
-    for b in range(BONES):
-        s = bones[e, b]
-        arm = position[e, b] - position[e, 0]
-        d = wp.vec3(s[1], s[2], s[3])  # first moment about the joint, as are the others
-        w = wp.vec3(field[e, b][3], field[e, b][4], field[e, b][5])
-        v = wp.vec3(field[e, b][0], field[e, b][1], field[e, b][2]) + wp.cross(w, arm)  # at the joint
-        # fmt: off
-        second = wp.mat33(
-            s[7], s[12], s[11],
-            s[12], s[8], s[10],
-            s[11], s[10], s[9],
-        )
-        # fmt: on
-        inertia = wp.diag(wp.vec3(wp.trace(second))) - second
-        p = s[0] * v + wp.cross(w, d)
-        P += p
-        L += wp.cross(d, v) + inertia * w + wp.cross(arm, p)
-        m += s[0]
-        first += d + s[0] * arm
-        I += inertia + s[0] * (wp.dot(arm, arm) * I3 - wp.outer(arm, arm))
-        I += 2.0 * wp.dot(d, arm) * I3 - wp.outer(d, arm) - wp.outer(arm, d)
-    center = first / m
-    W = spin_of(I - point_inertia(m, center), L - wp.cross(center, P))
-    V = P / m - wp.cross(W, center)
-    for i in range(3):
-        change[e, i] = change[e, i] - V[i]
-        change[e, 3 + i] = change[e, 3 + i] - W[i]
-
-
-@wp.kernel
 def implicit_diagonal(
     dt: float, stiffness: wp.array2d(dtype=float), damping: wp.array2d(dtype=float), diagonal: wp.array2d(dtype=float)
 ):
@@ -192,11 +118,18 @@ class ArticulatedBody:
         target: local rotations to which the springs pull, ``(num_envs, 22)``.
         torque: torques on the joints, ``(num_envs, 22)`` vectors in the world's axes [N m]; that of the pelvis is none.
         stiffness, damping: of the springs, ``(1 or num_envs, 22)`` [N m/rad, N m s/rad].
+        attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s], or None.
         mass: the mass matrix, ``(num_envs, 69, 69)``.
     """
 
     def __init__(
-        self, points: BodyPoints, body: Body, model: Model, stiffness: np.ndarray, damping: np.ndarray
+        self,
+        points: BodyPoints,
+        body: Body,
+        model: Model,
+        stiffness: np.ndarray,
+        damping: np.ndarray,
+        attachment: np.ndarray | None = None,
     ) -> None:
         """Allocate; :meth:`record_refresh` must run before anything else.
 
@@ -206,21 +139,29 @@ class ArticulatedBody:
             model: of the world.
             stiffness: of the joints, shape ``(1 or num_envs, 22)`` [N m/rad].
             damping: likewise [N m s/rad].
+            attachment: rates of the pulls that hold flesh to bones, shape ``(1 or num_envs, num_points)`` [1/s];
+                without them flesh is held by its own stiffness only.
 
         Raises:
-            ValueError: a stiffness or damping is negative or not finite, or the shape is another one.
+            ValueError: a stiffness, damping or rate is negative or not finite, or the shape is another one.
         """
-        for name, value in (("stiffness", stiffness), ("damping", damping)):
-            if value.shape not in ((1, NUM_JOINTS), (model.num_envs, NUM_JOINTS)):
-                raise ValueError(f"{name} has shape {value.shape}, expected (1 or {model.num_envs}, {NUM_JOINTS})")
+        n, device = model.num_envs, model.device
+        rates = np.zeros((1, points.num_points)) if attachment is None else attachment
+        sizes = (("stiffness", stiffness, NUM_JOINTS), ("damping", damping, NUM_JOINTS))
+        for name, value, size in (*sizes, ("attachment", rates, points.num_points)):
+            if value.shape not in ((1, size), (n, size)):
+                raise ValueError(f"{name} has shape {value.shape}, expected (1 or {n}, {size})")
             if not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
-        n, device = model.num_envs, model.device
         self.body, self.model, self.threads = body, model, warp_threads(device)
         self.pairs = build_pairs(points, device)
         self.stiffness, self.damping = (
             wp.array(value.astype(np.float32), dtype=float, device=device) for value in (stiffness, damping)
         )
+
+        self.attachment = None
+        if attachment is not None:
+            self.attachment = wp.array(attachment.astype(np.float32), dtype=float, device=device)
 
         def zeros(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -294,10 +235,24 @@ class ArticulatedBody:
         program.launch(gather_momentum, n, [self.body, self.position, self._chunks], outputs)
         program.launch(solve, (n, self.threads), [self._factor, self._right, self.threads], [self._change])
 
+    def _record_attachment(self, program: Program, state: State) -> None:
+        """Append: flesh is pulled to the bones, and the bones to the flesh."""
+        n, points = self.model.num_envs, (self.model.num_envs, self.body.count)
+        pose = [self.rotation, self.position]
+        program.launch(find_displacement, points, [self.body, state.x, *pose], [self._displacement])
+        inputs = [self.body, self.model.step.dt, self.attachment, state.failure]
+        program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
+        self._record_share(program, state, self._displacement)
+        program.launch(spread_motion, n, [self.body, self.position, self._change], [self._moving])
+        program.launch(balance, n, [self.position, self._bones, 1.0, self._moving], [self._change])
+        program.launch(add_change, (n, NUM_DOF), [self._change], [self.velocity])
+
     def record_substep(self, program: Program, state: State) -> None:
         """Append what the joints do before an MPM substep: take over, act, and move the pose on."""
         n, dt = self.model.num_envs, self.model.step.dt
         self._record_hand_back(program, state)
+        if self.attachment is not None:
+            self._record_attachment(program, state)
         self._record_share(program, state, state.u)
         program.launch(spread_motion, n, [self.body, self.position, self._change], [self._taken])
         program.launch(add_change, (n, NUM_DOF), [self._change], [self.velocity])
@@ -309,7 +264,7 @@ class ArticulatedBody:
         )
         program.launch(solve, (n, self.threads), [self._driven, self._right, self.threads], [self._change])
         program.launch(spread_motion, n, [self.body, self.position, self._change], [self._moving])
-        program.launch(balance, n, [self.position, self._bones, self._moving], [self._change])
+        program.launch(balance, n, [self.position, self._bones, 0.0, self._moving], [self._change])
         program.launch(add_change, (n, NUM_DOF), [self._change], [self.velocity])
         program.launch(spread_motion, n, [self.body, self.position, self.velocity], [self._moving])
         inputs = [self.body, state.x, self.position, self._taken, self._moving, state.failure]

@@ -11,6 +11,7 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import blend_changes
 from piavatar_envs.avatar.mass_matrix import BONES
+from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body, vec8
 from piavatar_envs.mpm.types import row
@@ -120,6 +121,31 @@ def find_displacement(
         b = joint[n]
         at += weight[n] * (wp.quat_rotate(rotation[e, b], rest - body.rest_joint[r, b]) + position[e, b])
     displacement[e, body.first + p] = x[e, body.first + p] - at
+
+
+@wp.kernel
+def attach_flesh(
+    body: Body,
+    dt: float,
+    rate: wp.array2d(dtype=float),
+    failure: wp.array(dtype=int),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    away: wp.array2d(dtype=wp.vec3),
+):
+    """Pull every particle to its place on the bones, implicit in time and critically damped.
+
+    ``away`` is the displacement from there [m], and then what the pull has taken of the velocity [m/s].
+    """
+    e, p = wp.tid()
+    if failure[e] != 0:
+        away[e, body.first + p] = wp.vec3(0.0)
+        return
+    before = u[e, body.first + p]
+    w = rate[row(e, rate.shape[0]), p]
+    after = implicit_velocity(w, dt, -away[e, body.first + p], before)
+    u[e, body.first + p] = after
+    away[e, body.first + p] = before - after
 
 
 @wp.kernel

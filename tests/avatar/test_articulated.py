@@ -33,11 +33,11 @@ def carried_by() -> np.ndarray:
 class Joints:
     """An articulated body beside a rig's particles, and programs of its parts."""
 
-    def __init__(self, rig, stiffness=0.0, damping=0.0):
+    def __init__(self, rig, stiffness=0.0, damping=0.0, attachment=None):
         self.rig, self.model, self.state = rig, rig.model, rig.state
-        self.body = ArticulatedBody(
-            rig.points, rig.drive.body, rig.model, stiffness * GAINS, np.broadcast_to(damping, GAINS.shape).copy()
-        )
+        rates = None if attachment is None else np.broadcast_to(attachment, (1, rig.points.num_points))
+        body = rig.points, rig.drive.body, rig.model
+        self.body = ArticulatedBody(*body, stiffness * GAINS, damping * GAINS, rates)
 
     def pose(self, rotvec, root=None):
         """Put pose and particles where the local rotation vectors have them, at rest."""
@@ -143,8 +143,8 @@ def test_joints_take_over_all_they_can_and_change_no_velocity(joints):
 
 @pytest.mark.parametrize("stale", [False, True], ids=["fresh", "stale"])
 def test_torques_change_neither_momentum(joints, wild_pose, stale):
-    """Springs, dampers and torques of a thousand newton metres; also with a mass matrix of another place."""
-    made = joints(1, stiffness=300.0, damping=10.0)
+    """Springs, dampers, torques of 1000 N m, flesh on bones; also with a mass matrix of another place."""
+    made = joints(1, stiffness=300.0, damping=10.0, attachment=200.0)
     rng = np.random.default_rng(3)
     if stale:
         made.state.x.assign(made.state.x.numpy() + rng.normal(0.0, 2e-2, made.state.x.numpy().shape).astype(np.float32))
@@ -244,6 +244,26 @@ def test_free_float_keeps_momentum(make_rig, wild_pose):
     assert rig.state.failure.numpy().sum() == 0
     assert largest > 10.0  # it did move [kg m/s]
     assert (worst < 1e-5 * largest).all(), worst / largest
+
+
+def test_flesh_comes_back_to_the_bones(make_rig):
+    """Displaced flesh in empty space: at a rate of 100/s nothing is left of it after a control step or two."""
+    made = Joints(make_rig(cells=16), stiffness=300.0, damping=10.0, attachment=100.0).pose(np.zeros((NUM_JOINTS, 3)))
+    rng, dt = np.random.default_rng(0), made.model.step.dt
+    rest = made.rig.read("x")
+    bump = 0.02 * np.sin(12.0 * rest) * rng.normal(size=3)
+    made.state.x.assign((rest + bump)[None].astype(np.float32))
+    program = Program(made.model.device)
+    made.body.record_refresh(program, made.state)
+    made.body.record_substep(program, made.state)
+    for _ in range(round(0.1 / dt)):
+        program.run()
+        made.state.x.assign(made.state.x.numpy() + np.float32(dt) * (made.state.u.numpy() + made.state.vk.numpy()))
+    turned = Rotation.from_quat(made.body.rotation.numpy()[0].astype(float)).as_matrix()
+    local = np.stack([turned[0], *(turned[PARENTS[b]].T @ turned[b] for b in range(1, NUM_JOINTS))])
+    off = made.rig.read("x") - made.rig.skinned(local, made.body.position.numpy()[0, 0].astype(float))
+    assert np.abs(bump).max() > 0.01
+    assert np.abs(off).max() < 0.02 * np.abs(bump).max()
 
 
 @pytest.mark.parametrize("name", ["stiffness", "damping"])

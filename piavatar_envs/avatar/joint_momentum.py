@@ -1,0 +1,92 @@
+"""What momentum the joints have to do with: that of the particles as they see it, and that which they must not make."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.joint_motion import set_part
+from piavatar_envs.avatar.mass_matrix import BONES, I3
+from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of
+from piavatar_envs.avatar.types import Body, vec8, vec16
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.kernel
+def gather_momentum(
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    moments: wp.array2d(dtype=vec16),
+    # scratch
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+    # out
+    bones: wp.array2d(dtype=vec16),
+    momentum: wp.array2d(dtype=float),
+):
+    """``J^T m u`` from the moments of the bones about their joints: each joint has what all beyond it have."""
+    e = wp.tid()
+    for b in range(BONES):
+        s = vec16()
+        for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
+            s += moments[e, c]
+        bones[e, b] = s
+        linear[e, b] = wp.vec3(s[4], s[5], s[6])
+        angular[e, b] = wp.vec3(s[13], s[14], s[15])
+    for n in range(BONES - 1):
+        b = BONES - 1 - n  # children come after their parents
+        a = body.parent[b]
+        angular[e, a] = angular[e, a] + angular[e, b] + wp.cross(position[e, b] - position[e, a], linear[e, b])
+        linear[e, a] = linear[e, a] + linear[e, b]
+        set_part(momentum, e, 3 + 3 * b, angular[e, b])
+    set_part(momentum, e, 0, linear[e, 0])
+    set_part(momentum, e, 3, angular[e, 0])
+
+
+@wp.kernel
+def balance(
+    position: wp.array2d(dtype=wp.vec3),
+    bones: wp.array2d(dtype=vec16),
+    reaction: float,
+    field: wp.array2d(dtype=vec8),
+    # in and out
+    change: wp.array2d(dtype=float),
+):
+    """Give a change of the joints' velocities, whose motion of the bones is ``field``, the momentum that it must have.
+
+    That is none, or with ``reaction`` 1 what the bones' sums say. A rigid motion of the body makes up the difference.
+    The blend of the bones' motions has the momenta of the bones' own sums, because weights add up to one.
+    """
+    e = wp.tid()
+    m = float(0.0)
+    first = wp.vec3()
+    I = wp.mat33()
+    P = wp.vec3()
+    L = wp.vec3()
+    for b in range(BONES):
+        s = bones[e, b]
+        arm = position[e, b] - position[e, 0]
+        d = wp.vec3(s[1], s[2], s[3])  # first moment about the joint, as are the others
+        w = wp.vec3(field[e, b][3], field[e, b][4], field[e, b][5])
+        v = wp.vec3(field[e, b][0], field[e, b][1], field[e, b][2]) + wp.cross(w, arm)  # at the joint
+        # fmt: off
+        second = wp.mat33(
+            s[7], s[12], s[11],
+            s[12], s[8], s[10],
+            s[11], s[10], s[9],
+        )
+        # fmt: on
+        inertia = wp.diag(wp.vec3(wp.trace(second))) - second
+        p = s[0] * v + wp.cross(w, d) - reaction * wp.vec3(s[4], s[5], s[6])
+        P += p
+        L += wp.cross(d, v) + inertia * w - reaction * wp.vec3(s[13], s[14], s[15]) + wp.cross(arm, p)
+        m += s[0]
+        first += d + s[0] * arm
+        I += inertia + s[0] * (wp.dot(arm, arm) * I3 - wp.outer(arm, arm))
+        I += 2.0 * wp.dot(d, arm) * I3 - wp.outer(d, arm) - wp.outer(arm, d)
+    center = first / m
+    W = spin_of(I - point_inertia(m, center), L - wp.cross(center, P))
+    V = P / m - wp.cross(W, center)
+    for i in range(3):
+        change[e, i] = change[e, i] - V[i]
+        change[e, 3 + i] = change[e, 3 + i] - W[i]
