@@ -90,14 +90,14 @@ class BatchedEpisodes:
 
     # episodes
 
-    def reset(self, seeds: Sequence[int | None] | None = None, mask: np.ndarray | None = None) -> None:
+    def reset(self, seeds: int | Sequence[int | None] | None = None, mask: np.ndarray | None = None) -> None:
         """Begin new episodes.
 
         Environments that were never seeded are different every time, as Gymnasium asks.
 
         Args:
-            seeds: of the environments' next and all following episodes, ``num_envs`` of them. Without seeds, or where
-                one is None, the next episode of the seed before.
+            seeds: of the environments' next and all following episodes: of environment ``i`` it is ``seeds + i``, or
+                ``seeds[i]``. Without seeds, or where one is None, the next episode of the seed before.
             mask: environments to reset, shape ``(num_envs,)`` bool; all if not given.
 
         Raises:
@@ -119,8 +119,9 @@ class BatchedEpisodes:
         self._captured.add(BatchEnv.reset_masked)
         self.ready = True
 
-    def _checked_seeds(self, seeds: Sequence[int | None] | None) -> list[int | None]:
+    def _checked_seeds(self, seeds: int | Sequence[int | None] | None) -> list[int | None]:
         n = self.num_envs
+        seeds = [seeds + env for env in range(n)] if np.isscalar(seeds) else seeds
         seeds = [None] * n if seeds is None else [None if seed is None else _checked_seed(seed) for seed in seeds]
         if len(seeds) != n:
             raise ValueError(f"there are {len(seeds)} seeds for num_envs={n} environments")

@@ -134,7 +134,7 @@ class AvatarRslEnv(VecEnv):
         Raises:
             ValueError: a seed outside [0, 2^32).
         """
-        self.episodes.reset(None if seed is None else [seed + index for index in range(self.num_envs)])
+        self.episodes.reset(seed)
         return self.get_observations(), {}
 
     def get_observations(self) -> TensorDict:

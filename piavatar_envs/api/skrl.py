@@ -101,7 +101,7 @@ class AvatarSkrlEnv:
         Raises:
             ValueError: a seed outside [0, 2^32).
         """
-        self.episodes.reset(_consecutive(seed, self.num_envs))
+        self.episodes.reset(seed)
         return {"policy": self._seen(self.episodes.observation())}, {}
 
     def step(self, actions: Array) -> tuple[dict[str, Any], Array, Array, Array, dict[str, Any]]:
@@ -229,7 +229,7 @@ class AvatarSkrlMultiEnv:
         Raises:
             ValueError: a seed outside [0, 2^32).
         """
-        self.episodes.reset(_consecutive(seed, self.num_envs))
+        self.episodes.reset(seed)
         return self._seen(self.episodes.observation()), {"alive": self._by_agent(self.episodes.alive())}
 
     def step(self, actions: Mapping[str, Array]) -> tuple[dict[str, Any], ...]:
@@ -280,11 +280,6 @@ class AvatarSkrlMultiEnv:
     def close(self) -> None:
         """End the threads."""
         self.episodes.close()
-
-
-def _consecutive(seed: int | None, count: int) -> list[int] | None:
-    """Seeds of ``count`` environments, from the first one's."""
-    return None if seed is None else [seed + index for index in range(count)]
 
 
 def _joint(rows: list[Array], num_envs: int, size: int) -> Array:

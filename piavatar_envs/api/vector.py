@@ -121,8 +121,7 @@ class AvatarVectorEnv(VectorEnv):
             gymnasium.error.Error: what is no seed, or a first reset with a mask that leaves environments out.
         """
         mask = self._reset_mask(options)
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else seed
-        self.episodes.reset(seeds, mask)
+        self.episodes.reset(seed, mask)
         super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
         held = None if mask is None else self.episodes.api.from_host(mask)
         return self._observation(), self._in_vector_format(self._standing(), held)

@@ -12,7 +12,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from pydantic import Field
 
 from piavatar_envs.api.pettingzoo import AvatarParallelEnv
-from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
@@ -132,9 +132,6 @@ Holding the hands together is not enough: they must swing, at the same moment.""
 
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         return Drawn(self.side), Drawn(self.least)
-
-    def action_spec(self) -> ActionSpec:
-        return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)
 
     def allocate(self, env) -> None:
         n, device = env.num_envs, env.device

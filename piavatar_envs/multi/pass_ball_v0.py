@@ -13,7 +13,7 @@ from pydantic import Field
 
 from piavatar_envs.api.pettingzoo import AvatarParallelEnv
 from piavatar_envs.envs.actions import ActionSpec, select_joints
-from piavatar_envs.envs.config import EnvConfig, PropConfig, SceneConfig, replace
+from piavatar_envs.envs.config import EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
@@ -21,7 +21,7 @@ from piavatar_envs.multi.passing import PassRule, Play, Serve, judge, keep_near,
 from piavatar_envs.multi.together import record_fall_together, record_shift
 from piavatar_envs.multi.versus import Referee, on_circle
 from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.goal import BALL, BALL_FRICTION
+from piavatar_envs.tasks.goal import BALL, ball_config
 from piavatar_envs.tasks.kick_ball import observe_feet
 from piavatar_envs.tasks.leash import record_leash
 from piavatar_envs.tasks.ranges import check_ranges
@@ -106,13 +106,7 @@ from its place, so that the ball must be sent, not carried. All are paid alike, 
     def build_scene(self) -> SceneConfig:
         config = self.config
         scene = on_circle(config.scene, config.num_agents, config.spacing)
-        ball = PropConfig(
-            name=BALL,
-            size=(config.ball_radius,),
-            mass=float(np.sqrt(config.ball_mass[0] * config.ball_mass[1])),
-            position=(0.0, 0.0, config.ball_radius),
-            friction=BALL_FRICTION,
-        )
+        ball = ball_config(config, (0.0, 0.0, config.ball_radius))
         return replace(scene, props=[ball, *scene.props])
 
     def terms(self) -> tuple[ObservationTerm, ...]:

@@ -7,6 +7,7 @@ import warp as wp
 from piavatar_envs.envs.draws import STREAM_BALL, generator
 from piavatar_envs.envs.observations import write_vector
 from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.tasks.leash import held_back
 from piavatar_envs.tasks.rewards import mean_square_action
 
 wp.set_module_options({"enable_backward": False})
@@ -107,9 +108,7 @@ def keep_near(
 ):
     """The commanded root, no farther from its place than it may go."""
     e = wp.tid()
-    off = command_root[e] - place
-    off[2] = 0.0
-    reference_root[e] = command_root[e] - (1.0 - wp.min(1.0, roam / wp.max(wp.length(off), 1.0e-6))) * off
+    reference_root[e] = held_back(command_root[e], place, roam)
 
 
 @wp.func

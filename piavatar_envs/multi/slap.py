@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.skeleton import BODY_PARTS, joint_index
+from piavatar_envs.avatar.skeleton import BODY_PARTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.draws import STREAM_TASK, generator
 from piavatar_envs.envs.observations import write_vector
 from piavatar_envs.mpm.types import Sensors
-from piavatar_envs.tasks.reach import hand_position
+from piavatar_envs.multi.versus import part_impulse_by
+from piavatar_envs.tasks.hands import LEFT_WRIST, RIGHT_WRIST, flesh_middle
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 
 wp.set_module_options({"enable_backward": False})
 
-_LEFT_WRIST, _RIGHT_WRIST = wp.constant(joint_index("left_wrist")), wp.constant(joint_index("right_wrist"))
-_NUM_PARTS, _LEFT_ARM = wp.constant(len(BODY_PARTS)), wp.constant(list(BODY_PARTS).index("left_arm"))
+_LEFT_ARM = wp.constant(list(BODY_PARTS).index("left_arm"))
 #: Way that a hand which points straight down instead of straight up seems to have to go [m].
 _TURN = wp.constant(0.4)
 
@@ -75,8 +75,8 @@ def locate_hand(
 ):
     """Find the hand that an agent shall raise."""
     e = wp.tid()
-    wrist = wp.where(side[e] == 0, _LEFT_WRIST, _RIGHT_WRIST)
-    middle = hand_position(body, e, wrist, rotation[e, wrist], position[e, wrist])
+    wrist = wp.where(side[e] == 0, LEFT_WRIST, RIGHT_WRIST)
+    middle = flesh_middle(body, e, wrist, rotation, position)
     hands.middle[e, agent] = middle
     hands.direction[e, agent] = wp.normalize(middle - position[e, wrist])
     hands.velocity[e, agent] = velocity[e, wrist]
@@ -85,7 +85,7 @@ def locate_hand(
 @wp.func
 def arm_impulse(sensors: Sensors, e: int, agent: int, side: int):
     """Impulse of the other agent on the arm that an agent shall raise [N s]."""
-    return wp.length(sensors.part_impulse[e, agent * _NUM_PARTS + _LEFT_ARM + side, 1 - agent])
+    return wp.length(part_impulse_by(sensors, e, agent, _LEFT_ARM + side, 1 - agent))
 
 
 @wp.kernel

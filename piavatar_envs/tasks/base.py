@@ -48,6 +48,11 @@ class Task:
         history: version and what was new in it, the newest first.
         picture_seconds: moment of the picture [s]; picture_actions: how the avatars acted until then: ``"zero"``,
             ``"random"`` or constant actions by component name; picture_settings: settings other than the defaults.
+
+    Attributes:
+        config: the settings.
+        joints: names of those that act: all, unless a task says otherwise.
+        scene: what is in the world.
     """
 
     Config: ClassVar[type[EnvConfig]] = EnvConfig
@@ -77,6 +82,7 @@ class Task:
 
     def __init__(self, config: EnvConfig) -> None:
         self.config = config
+        self.joints = select_joints(None)
         self.scene = self.build_scene()
 
     def build_scene(self) -> SceneConfig:
@@ -117,7 +123,7 @@ class Task:
 
     def action_spec(self) -> ActionSpec:
         """Joints that act, and whether the root does."""
-        return ActionSpec(select_joints(None), joint_speed=self.config.drive.joint_speed_limit)
+        return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the joints' rotation vectors [rad], each ``(22, 3)``."""

@@ -10,18 +10,15 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.avatar.rotation import quat_exp, quat_log
-from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.config import EnvConfig, PropConfig, SceneConfig, replace
-from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
-from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.hits import Hits
+from piavatar_envs.tasks.place import PlaceRule, judge_pose, keep_place, observe_home
 from piavatar_envs.tasks.ranges import check_ranges
-from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 from piavatar_envs.tasks.spawn import record_standing
 from piavatar_envs.tasks.throws import (
     catching_distance,
@@ -31,8 +28,6 @@ from piavatar_envs.tasks.throws import (
     throw_balls,
     waiting_places,
 )
-
-wp.set_module_options({"enable_backward": False})
 
 #: Speed of the root at action 1 [m/s].
 ROOT_SPEED = 1.5
@@ -61,87 +56,6 @@ class DodgeConfig(EnvConfig):
     )
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
-
-
-@wp.struct
-class Rule:
-    """Constants of what counts."""
-
-    place: wp.vec3  # where the avatar belongs: x, y [m] and yaw [rad]
-    range: float
-    pose_margin: float
-    place_margin: float
-    control_cost: float
-
-
-@wp.func
-def home(rule: Rule, body: Body, e: int):
-    """Where the pelvis is when the avatar stands in its place [m]."""
-    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), 0]
-    turned = wp.quat_rotate(quat_exp(wp.vec3(0.0, 0.0, rule.place[2])), rest)
-    return turned + wp.vec3(rule.place[0], rule.place[1], 0.0)
-
-
-@wp.kernel
-def keep_place(
-    rule: Rule,
-    body: Body,
-    command_root: wp.array(dtype=wp.vec3),
-    # out
-    reference_root: wp.array(dtype=wp.vec3),
-):
-    """The commanded root, no farther from its place than it may be steered."""
-    e = wp.tid()
-    center = home(rule, body, e)
-    out = command_root[e] - center
-    out[2] = 0.0
-    distance = wp.length(out)
-    excess = wp.max(distance - rule.range, 0.0) / wp.max(distance, 1.0e-6)
-    reference_root[e] = command_root[e] - excess * out
-
-
-@wp.kernel
-def judge_pose(
-    rule: Rule,
-    body: Body,
-    local: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    action: wp.array3d(dtype=float),
-    # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-):
-    """Reward of standing as in the rest pose, in one's place, and its cost."""
-    e = wp.tid()
-    bones = local.shape[1]
-    angle = wp.length(quat_log(wp.quat_inverse(quat_exp(wp.vec3(0.0, 0.0, rule.place[2]))) * local[e, 0]))
-    for b in range(1, bones):
-        angle += wp.length(quat_log(local[e, b]))
-    angle /= float(bones)
-    off = position[e, 0] - home(rule, body, e)
-    distance = wp.length(wp.vec2(off[0], off[1]))
-    terms[e, 0, 0] = 0.6 * tolerance(angle, 0.05, rule.pose_margin)
-    terms[e, 0, 1] = 0.4 * tolerance(distance, 0.02, rule.place_margin)
-    terms[e, 0, 2] = -rule.control_cost * mean_square_action(action, e, 0)
-    metrics[e, 0, 0] = wp.degrees(angle)
-    metrics[e, 0, 1] = distance
-
-
-@wp.kernel
-def observe_home(
-    rule: Rule,
-    body: Body,
-    agent: int,
-    start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    # out
-    observation: wp.array3d(dtype=float),
-):
-    """The place from the pelvis."""
-    e = wp.tid()
-    way = home(rule, body, e) - position[e, 0]
-    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(rotation[e, 0]), way))
 
 
 class DodgeTask(Task):
@@ -221,7 +135,7 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
     def action_spec(self) -> ActionSpec:
         config = self.config
         speed = min(ROOT_SPEED, config.root_range / config.physics.control_dt)  # one step stays within the range
-        return ActionSpec(select_joints(None), root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
+        return ActionSpec(self.joints, root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
 
     def domain(self) -> Domain:
         """Room for balls to wait in, and to fly past the waiting ones before they are caught."""
@@ -232,7 +146,7 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
 
     def allocate(self, env) -> None:
         n, device, config = env.num_envs, env.device, self.config
-        self.throws, self.rule = make_throws(config, self.place, self.waiting, env), Rule()
+        self.throws, self.rule = make_throws(config, self.place, self.waiting, env), PlaceRule()
         rule = self.rule
         # the action comes on top of what is kept within the range
         rule.place, rule.range = wp.vec3(*self.place), config.root_range - env.action_map.root_step

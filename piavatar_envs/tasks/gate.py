@@ -1,4 +1,4 @@
-"""A gate that a ball shall pass: where it stands, whether the ball went through, and what its flight promises."""
+"""A ball and the gate that it shall pass: how they are drawn, whether it went through, what its flight promises."""
 
 from __future__ import annotations
 
@@ -17,6 +17,17 @@ APPROACH, AIM, GOAL = wp.constant(0.1), wp.constant(0.4), wp.constant(0.5)
 HORIZON = wp.constant(1.0)
 #: Distance between striking bone and ball's surface at which the approach counts a tenth [m].
 APPROACH_MARGIN = wp.constant(0.4)
+
+
+@wp.struct
+class Ball:
+    """Constants of where the ball starts, and how heavy it is."""
+
+    prop: int
+    place: wp.vec3  # middle of its places [m]
+    jitter: float  # along x and y [m]
+    light: float  # natural logarithm of the least density in kg/m^3
+    heavy: float  # and of the greatest
 
 
 @wp.struct
@@ -43,6 +54,21 @@ class Course:
     length: wp.array(dtype=float)  # from the ball's start, along the ground [m]
     last: wp.array(dtype=wp.vec3)  # where the ball was a control step ago [m]
     best: wp.array(dtype=wp.vec2)  # best approach and best promise of the episode; negative: not yet known
+
+
+@wp.func
+def turn_and_weigh(
+    random: wp.uint32,
+    e: int,
+    ball: Ball,
+    # out
+    rotation: wp.array2d(dtype=wp.quat),
+    density: wp.array2d(dtype=float),
+):
+    """Draw how a ball is turned, and its mass, uniform in its logarithm: the last that its kernel draws."""
+    axis = wp.sample_unit_sphere_surface(random)
+    rotation[e, ball.prop] = wp.quat_from_axis_angle(axis, wp.randf(random, 0.0, 3.0))
+    density[e, ball.prop] = wp.exp(wp.randf(random, ball.light, ball.heavy))
 
 
 @wp.kernel

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
-from piavatar_envs.envs.config import ConfigError, PropConfig, SceneConfig
+from piavatar_envs.envs.config import PropConfig, SceneConfig
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.envs.simulation import Domain
-from piavatar_envs.tasks.gate import Course, Gate, draw_gate, judge_ball, measure_ball, observe_gate
+from piavatar_envs.tasks.gate import Ball, Course, Gate, draw_gate, judge_ball, measure_ball, observe_gate
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
@@ -44,14 +44,19 @@ SUCCESS_DOC = "the ball's centre has passed the gate within `target_radius` of i
 TERMINATION_DOC = "the ball has passed the gate"
 
 
-class GateConfig(Protocol):
+class BallConfig(Protocol):
+    """Settings of a ball."""
+
+    ball_radius: float
+    ball_mass: tuple[float, float]
+
+
+class GateConfig(BallConfig, Protocol):
     """Settings that tasks with a gate have in common."""
 
     joints: tuple[str, ...] | None
     ball_place: tuple[float, float]
     ball_jitter: float
-    ball_radius: float
-    ball_mass: tuple[float, float]
     target_distance: tuple[float, float]
     target_angle: float
     target_height: float
@@ -59,25 +64,9 @@ class GateConfig(Protocol):
     control_cost: float
 
 
-def check_range(name: str, bounds: tuple[float, float]) -> tuple[float, float]:
-    """``bounds``, in order.
-
-    Raises:
-        ConfigError: they are not positive, or fall.
-    """
-    if not 0.0 < bounds[0] <= bounds[1]:
-        raise ConfigError(f"{name}={list(bounds)} must be positive and not fall; give the lower bound first")
-    return bounds
-
-
-def ball_config(config: GateConfig, position: Sequence[float]) -> PropConfig:
-    """The ball in the scene, of middling mass; episodes make it lighter or heavier.
-
-    Raises:
-        ConfigError: a range that falls.
-    """
-    check_range("target_distance", config.target_distance)
-    mass = math.sqrt(math.prod(check_range("ball_mass", config.ball_mass)))
+def ball_config(config: BallConfig, position: Sequence[float]) -> PropConfig:
+    """The ball in the scene, of middling mass; episodes make it lighter or heavier."""
+    mass = math.sqrt(math.prod(config.ball_mass))
     return PropConfig(
         name=BALL, size=(config.ball_radius,), mass=mass, position=tuple(position), friction=BALL_FRICTION
     )
@@ -112,17 +101,25 @@ class Goal:
     """Ball and gate of every environment, and what tasks record about them.
 
     Attributes:
+        index: of the ball among the props.
         gate: constants.
         course: the gates and what the balls have done.
-        log_density: natural logarithms of the ball's least and greatest density in kg/m^3.
+        ball: constants of how it is drawn, by the task.
         gap: from the striking bone to the ball's surface [m], written by the task.
     """
 
-    def __init__(self, env: BatchEnv, config: GateConfig) -> None:
+    def __init__(self, env: BatchEnv, config: GateConfig, height: float) -> None:
+        """Allocate.
+
+        Args:
+            env: the batch.
+            config: its task's settings.
+            height: of the middle of the ball's places [m].
+        """
         n, device, simulation = env.num_envs, env.device, env.simulation
         self.env = env
         self.index = simulation.props.index(BALL)
-        gate, course = Gate(), Course()
+        gate, course, ball = Gate(), Course(), Ball()
         gate.radius, gate.height, gate.spread = config.target_radius, config.target_height, config.target_angle
         gate.near, gate.far = config.target_distance
         gate.ball_radius, gate.control_cost = config.ball_radius, config.control_cost
@@ -131,8 +128,9 @@ class Goal:
         for name, dtype in (("center", wp.vec3), ("forward", wp.vec3), ("length", float), ("last", wp.vec3)):
             setattr(course, name, wp.zeros(n, dtype=dtype, device=device))
         course.best = wp.zeros(n, dtype=wp.vec2, device=device)
-        self.gate, self.course = gate, course
-        self.log_density = tuple(math.log(mass / gate.ball_volume) for mass in config.ball_mass)
+        ball.prop, ball.jitter, ball.place = self.index, config.ball_jitter, wp.vec3(*config.ball_place, height)
+        ball.light, ball.heavy = (math.log(mass / gate.ball_volume) for mass in config.ball_mass)
+        self.gate, self.course, self.ball = gate, course, ball
         self.gap = wp.zeros(n, dtype=float, device=device)
 
     def column(self, name: str) -> wp.array:

@@ -10,14 +10,14 @@ from pydantic import Field
 
 from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.envs.config import DriveConfig, EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.draws import STREAM_BALL, generator
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS
+from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS, Ball, turn_and_weigh
 from piavatar_envs.tasks.goal import (
     METRIC_DOCS,
     REWARD_DOCS,
@@ -25,11 +25,11 @@ from piavatar_envs.tasks.goal import (
     TERMINATION_DOC,
     Goal,
     ball_config,
-    check_range,
     drawn_goal,
     gate_domain,
 )
-from piavatar_envs.tasks.reach import hand_position
+from piavatar_envs.tasks.hands import flesh_middle
+from piavatar_envs.tasks.ranges import check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
@@ -70,17 +70,12 @@ class HeaderConfig(EnvConfig):
 
 @wp.struct
 class Fall:
-    """Constants of where the ball comes from, and how heavy it is."""
+    """Constants of how the ball comes down to its place."""
 
-    prop: int
-    place: wp.vec3  # middle of where it comes down, at the height of the head [m]
-    jitter: float  # along x and y [m]
     speed: float  # greatest along x and y [m/s]
     low: float  # range of its first height [m]
     high: float
     gravity: float  # downward [m/s^2]
-    light: float  # natural logarithm of the least density in kg/m^3
-    heavy: float  # and of the greatest
 
 
 @wp.kernel
@@ -88,6 +83,7 @@ def throw_ball(
     mask: wp.array(dtype=wp.bool),
     seed: wp.array(dtype=int),
     episode: wp.array(dtype=int),
+    ball: Ball,
     fall: Fall,
     # out
     position: wp.array2d(dtype=wp.vec3),
@@ -104,14 +100,12 @@ def throw_ball(
     drift = fall.speed * wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
     height = wp.randf(random, fall.low, fall.high)
     # at most a second, for want of gravity
-    time = wp.min(wp.sqrt(2.0 * wp.max(height - fall.place[2], 0.0) / wp.max(fall.gravity, 0.1)), 1.0)
-    start = fall.place + fall.jitter * offset - time * drift
+    time = wp.min(wp.sqrt(2.0 * wp.max(height - ball.place[2], 0.0) / wp.max(fall.gravity, 0.1)), 1.0)
+    start = ball.place + ball.jitter * offset - time * drift
     start[2] = height
-    position[e, fall.prop] = start
-    velocity[e, fall.prop] = drift
-    axis = wp.sample_unit_sphere_surface(random)
-    rotation[e, fall.prop] = wp.quat_from_axis_angle(axis, wp.randf(random, 0.0, 3.0))
-    density[e, fall.prop] = wp.exp(wp.randf(random, fall.light, fall.heavy))
+    position[e, ball.prop] = start
+    velocity[e, ball.prop] = drift
+    turn_and_weigh(random, e, ball, rotation, density)
 
 
 @wp.kernel
@@ -127,7 +121,7 @@ def find_head(
 ):
     """Middle of the head [m], and how far the ball's surface is from its [m]."""
     e = wp.tid()
-    middle = hand_position(body, e, _HEAD, rotation[e, _HEAD], position[e, _HEAD])
+    middle = flesh_middle(body, e, _HEAD, rotation, position)
     head[e] = middle
     gap[e] = wp.length(ball[e] - middle) - ball_radius - HEAD_RADIUS
 
@@ -182,13 +176,14 @@ that all of them but the control cost add up to at most 1, half of it for the go
     config: HeaderConfig
 
     def __init__(self, config: HeaderConfig) -> None:
+        check_ranges(config, "ball_height", "target_distance", "ball_mass")
         super().__init__(config)
         self.joints = select_joints(config.joints)
 
     def build_scene(self) -> SceneConfig:
         scene, config = super().build_scene(), self.config
-        height = check_range("ball_height", config.ball_height)[1]
-        return replace(scene, props=[ball_config(config, (*config.ball_place, height)), *scene.props])
+        ball = ball_config(config, (*config.ball_place, config.ball_height[1]))
+        return replace(scene, props=[ball, *scene.props])
 
     def drawn(self) -> tuple[Parameter, ...]:
         return drawn_goal(self.config)
@@ -196,22 +191,14 @@ that all of them but the control cost add up to at most 1, half of it for the go
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         return self.goal.drawn_values()
 
-    def action_spec(self) -> ActionSpec:
-        return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)
-
     def domain(self) -> Domain:
         return gate_domain(self.config, self.scene, self.config.ball_height[1])
 
     def allocate(self, env) -> None:
-        config = self.config
-        self.goal = Goal(env, config)
-        fall = Fall()
-        fall.prop, fall.jitter, fall.speed = self.goal.index, config.ball_jitter, config.ball_speed
-        fall.place = wp.vec3(*config.ball_place, TOUCH_HEIGHT)
-        fall.gravity = config.physics.gravity
+        config, fall = self.config, Fall()
+        fall.speed, fall.gravity = config.ball_speed, config.physics.gravity
         fall.low, fall.high = config.ball_height
-        fall.light, fall.heavy = self.goal.log_density
-        self.fall = fall
+        self.goal, self.fall = Goal(env, config, TOUCH_HEIGHT), fall
         self.head = wp.zeros(env.num_envs, dtype=wp.vec3, device=env.device)
 
     def arrays(self) -> dict[str, wp.array]:
@@ -223,7 +210,7 @@ that all of them but the control cost add up to at most 1, half of it for the go
         program.launch(
             throw_ball,
             env.num_envs,
-            [env.mask, env.seed, env.episode, self.fall],
+            [env.mask, env.seed, env.episode, self.goal.ball, self.fall],
             [props.spawn.position, props.spawn.rotation, props.spawn.velocity, props.density],
         )
         self.goal.record_reset(program)

@@ -9,14 +9,14 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.skeleton import joint_index
-from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.envs.config import DriveConfig, EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.draws import STREAM_BALL, generator
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS
+from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS, Ball, turn_and_weigh
 from piavatar_envs.tasks.goal import (
     METRIC_DOCS,
     REWARD_DOCS,
@@ -27,6 +27,7 @@ from piavatar_envs.tasks.goal import (
     drawn_goal,
     gate_domain,
 )
+from piavatar_envs.tasks.ranges import check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
@@ -59,23 +60,12 @@ class KickBallConfig(EnvConfig):
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 
-@wp.struct
-class Lie:
-    """Constants of where the ball lies at first, and how heavy it is."""
-
-    prop: int
-    place: wp.vec3  # middle of its places [m]
-    jitter: float  # along x and y [m]
-    light: float  # natural logarithm of the least density in kg/m^3
-    heavy: float  # and of the greatest
-
-
 @wp.kernel
 def draw_ball(
     mask: wp.array(dtype=wp.bool),
     seed: wp.array(dtype=int),
     episode: wp.array(dtype=int),
-    lie: Lie,
+    ball: Ball,
     # out
     position: wp.array2d(dtype=wp.vec3),
     rotation: wp.array2d(dtype=wp.quat),
@@ -87,10 +77,8 @@ def draw_ball(
         return
     random = generator(seed[e], episode[e], STREAM_BALL, 0)
     offset = wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
-    position[e, lie.prop] = lie.place + lie.jitter * offset
-    axis = wp.sample_unit_sphere_surface(random)
-    rotation[e, lie.prop] = wp.quat_from_axis_angle(axis, wp.randf(random, 0.0, 3.0))
-    density[e, lie.prop] = wp.exp(wp.randf(random, lie.light, lie.heavy))
+    position[e, ball.prop] = ball.place + ball.jitter * offset
+    turn_and_weigh(random, e, ball, rotation, density)
 
 
 @wp.kernel
@@ -162,6 +150,7 @@ that all of them but the control cost add up to at most 1, half of it for the go
     config: KickBallConfig
 
     def __init__(self, config: KickBallConfig) -> None:
+        check_ranges(config, "target_distance", "ball_mass")
         super().__init__(config)
         self.joints = select_joints(config.joints)
 
@@ -176,19 +165,11 @@ that all of them but the control cost add up to at most 1, half of it for the go
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         return self.goal.drawn_values()
 
-    def action_spec(self) -> ActionSpec:
-        return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)
-
     def domain(self) -> Domain:
         return gate_domain(self.config, self.scene, self.config.ball_radius)
 
     def allocate(self, env) -> None:
-        self.goal = Goal(env, self.config)
-        lie = Lie()
-        lie.prop, lie.jitter = self.goal.index, self.config.ball_jitter
-        lie.place = wp.vec3(*self.config.ball_place, self.config.ball_radius)
-        lie.light, lie.heavy = self.goal.log_density
-        self.lie = lie
+        self.goal = Goal(env, self.config, self.config.ball_radius)
 
     def arrays(self) -> dict[str, wp.array]:
         return self.goal.arrays()
@@ -199,7 +180,7 @@ that all of them but the control cost add up to at most 1, half of it for the go
         program.launch(
             draw_ball,
             env.num_envs,
-            [env.mask, env.seed, env.episode, self.lie],
+            [env.mask, env.seed, env.episode, self.goal.ball],
             [props.spawn.position, props.spawn.rotation, props.density],
         )
         self.goal.record_reset(program)

@@ -48,6 +48,15 @@ def record_leash(env: BatchEnv, program: Program, length: float, turn: float) ->
     return references
 
 
+@wp.func
+def held_back(root: wp.vec3, center: wp.vec3, reach: float):
+    """``root``, or what is nearest to it within the horizontal distance ``reach`` [m] of ``center``."""
+    off = root - center
+    off = wp.vec3(off[0], off[1], 0.0)
+    excess = 1.0 - wp.min(1.0, reach / wp.max(wp.length(off), 1.0e-6))
+    return root - excess * off
+
+
 @wp.kernel
 def leash_root(
     length: float,
@@ -63,10 +72,7 @@ def leash_root(
     e = wp.tid()
     if let_go[e] != 0:
         return
-    ahead = command_root[e] - position[e, 0]
-    ahead = wp.vec3(ahead[0], ahead[1], 0.0)
-    excess = 1.0 - wp.min(1.0, length / wp.max(wp.length(ahead), 1.0e-6))
-    command_root[e] = command_root[e] - excess * ahead
+    command_root[e] = held_back(command_root[e], position[e, 0], length)
     q = command_rotation[e, 0]
     heading = quat_log(turn_about_z(q) * wp.quat_inverse(turn_about_z(rotation[e, 0])))[2]
     back = wp.clamp(heading, -turn, turn) - heading

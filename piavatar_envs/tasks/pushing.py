@@ -5,20 +5,18 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.rotation import quat_exp, quat_log, turn_about_z
-from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.draws import STREAM_TASK, generator
 from piavatar_envs.envs.observations import write_vector
 from piavatar_envs.mpm.colliders import BOX, solid_distance
 from piavatar_envs.mpm.types import Sensors
-from piavatar_envs.tasks.reach import hand_position
+from piavatar_envs.tasks.hands import write_hands
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 
 wp.set_module_options({"enable_backward": False})
 
 #: Margin of the reward for a box that starts at its target [m].
 LEAST_MARGIN = wp.constant(0.1)
-_LEFT_WRIST, _RIGHT_WRIST = wp.constant(joint_index("left_wrist")), wp.constant(joint_index("right_wrist"))
 
 
 @wp.struct
@@ -85,8 +83,7 @@ def find_hands(
 ):
     """Middles of both hands in the world."""
     e = wp.tid()
-    hands[e, 0] = hand_position(body, e, _LEFT_WRIST, rotation[e, _LEFT_WRIST], position[e, _LEFT_WRIST])
-    hands[e, 1] = hand_position(body, e, _RIGHT_WRIST, rotation[e, _RIGHT_WRIST], position[e, _RIGHT_WRIST])
+    write_hands(body, e, rotation, position, hands)
 
 
 @wp.func

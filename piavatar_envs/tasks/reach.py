@@ -9,22 +9,21 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, joint_index
+from piavatar_envs.avatar.skeleton import JOINT_NAMES
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.envs.config import EnvConfig
 from piavatar_envs.envs.draws import STREAM_TASK, generator
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
 from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.hands import write_hands
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 from piavatar_envs.tasks.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
 
-_LEFT_WRIST = wp.constant(joint_index("left_wrist"))
-_RIGHT_WRIST = wp.constant(joint_index("right_wrist"))
 #: Middles of the target's swing: azimuth to either side, elevation from and to; its pace from; a whole turn [rad].
 SIDE, BELOW, ABOVE = wp.constant(1.6), wp.constant(-0.7), wp.constant(0.9)
 SLOWEST, TURN = wp.constant(0.3), wp.constant(6.2831853)
@@ -88,14 +87,6 @@ def target_position(target: Target, center: wp.vec3, course: wp.vec4, phase: wp.
     return center + target.radius * out
 
 
-@wp.func
-def hand_position(body: Body, e: int, wrist: int, q: wp.quat, joint: wp.vec3):
-    """Middle of the hand's flesh, carried by the tracked wrist."""
-    arm = body.rest_center[row(e, body.rest_center.shape[0]), wrist]
-    arm -= body.rest_joint[row(e, body.rest_joint.shape[0]), wrist]
-    return joint + wp.quat_rotate(q, arm)
-
-
 @wp.kernel
 def locate(
     target: Target,
@@ -119,8 +110,7 @@ def locate(
     goal[e] = here
     next = target_position(target, center, course[e], phase[e], time + target.control_dt)
     goal_velocity[e] = (next - here) / target.control_dt
-    hands[e, 0] = hand_position(body, e, _LEFT_WRIST, rotation[e, _LEFT_WRIST], position[e, _LEFT_WRIST])
-    hands[e, 1] = hand_position(body, e, _RIGHT_WRIST, rotation[e, _RIGHT_WRIST], position[e, _RIGHT_WRIST])
+    write_hands(body, e, rotation, position, hands)
 
 
 @wp.kernel
@@ -220,9 +210,6 @@ middle of either hand to the target and stay with it."""
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         course = [component(self.course, n) for n in range(4)]
         return tuple(Drawn(values) for values in (*course, component(self.phase, 0), component(self.phase, 1)))
-
-    def action_spec(self) -> ActionSpec:
-        return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)
 
     def allocate(self, env) -> None:
         n, device = env.num_envs, env.device

@@ -14,7 +14,7 @@ from piavatar_envs.avatar.motion import load_motion
 from piavatar_envs.avatar.posing import pose_body
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
-from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.config import EnvConfig
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_rotation, write_vector
 from piavatar_envs.envs.parameters import Drawn
@@ -172,9 +172,8 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         return Drawn(self.start, dt), Drawn(self.offset, dt)
 
     def action_spec(self) -> ActionSpec:
-        return ActionSpec(
-            select_joints(None), root=self.config.root_action, joint_speed=self.config.drive.joint_speed_limit
-        )
+        speed = self.config.drive.joint_speed_limit
+        return ActionSpec(self.joints, root=self.config.root_action, joint_speed=speed)
 
     def domain(self) -> Domain:
         """The default box, moved along the clip; random bodies may take longer steps than the one it was loaded for."""
