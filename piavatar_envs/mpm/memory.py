@@ -24,9 +24,9 @@ from piavatar_envs.mpm.types import (
     vec16i,
 )
 
-#: Blocks with matter that a body may come to need, over those that it needs at rest. Random poses of the embedded body
-#: took 1.2 times as many at most.
-SLOT_MARGIN = 2.0
+#: Blocks with matter that a body may come to need, over those that it needs at rest. Random full-scale actions, also of
+#: random shapes, made it 1.2 times as many at most.
+SLOT_MARGIN = 1.7
 #: Warp's strides are 32-bit: the records of an environment, of 64 bytes at most, take less than 2^31.
 MOST_SLOTS = 2**31 // (64 * BLOCK**3)
 
