@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from agents.config import TrainingConfig, load_training
 from agents.evaluate import Agent, Evaluation, evaluate, policy_agent, random_agent, zero_agent
@@ -37,9 +37,11 @@ class Options(runner.Options):
 
     #: ids and modules; all if not given
     ids: tuple[str, ...] = ()
+    #: agents that play: zero, random, trained
+    agents: tuple[Literal["zero", "random", "trained"], ...] = ("zero", "random", "trained")
     #: episodes an agent plays
     episodes: int = 20
-    #: control steps that PPO may learn for; 0 for no training
+    #: control steps that PPO may learn for; 0 for no trained agent
     train_steps: int = 0
     #: environments side by side
     workers: int = 2
@@ -80,9 +82,11 @@ def score(env_id: str, options: Options) -> Iterator[dict[str, Any]]:
     size, protocol = len(facts.action_names), config.evaluation
     try:
         for name, agent in (("zero", zero_agent(size)), ("random", random_agent(size, seed=0))):
+            if name not in options.agents:
+                continue
             agent = _in_every_seat(agent, len(facts.agents))
             yield row(env_id, evaluate(name, agent, workers, protocol.episodes, protocol.first_seed))
-        if options.train_steps > 0:
+        if options.train_steps > 0 and "trained" in options.agents:
             venv = AgentVecEnv(workers) if config.is_multi else workers
             with tempfile.TemporaryDirectory() as folder:
                 model, curve = train(config, venv, facts, Path(folder))
