@@ -8,11 +8,12 @@ lets torques act on them:
     (M + dt D + dt^2 K) d = dt (K e - (D + dt K) qdot + tau),   qdot <- qdot + d
     vk = J qdot
 
-``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each. The
-first line moves velocity from one share to the other and changes no particle's, whatever the mass matrix. Torques
-between bones must change neither momentum nor angular momentum. With the mass matrix of this moment they would not; it
-may be a few substeps old, so what rigid motion ``J d`` has comes off, found from the bones' moments as they are. When
-the mass matrix is built anew the pose is fitted to the particles, too (``dq = M^-1 J^T m (x - LBS)``).
+``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each; the
+pelvis may be held by springs from outside. The first line moves velocity from one share to the other and changes no
+particle's, whatever the mass matrix. Torques between bones must change neither momentum nor angular momentum. With the
+mass matrix of this moment they would not; it may be a few substeps old, so what rigid motion ``J d`` has too much comes
+off, found from the bones' moments as they are. When the mass matrix is built anew the pose is fitted to the particles,
+too (``dq = M^-1 J^T m (x - LBS)``).
 
 Flesh may be held to the bones by a pull, implicit and critically damped, ``u' = (u + dt w^2 d)/(1 + dt w)^2`` with
 ``d`` from the particle to its skinned place; the joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, with
@@ -37,7 +38,6 @@ from piavatar_envs.avatar.joint_motion import (
     attach_flesh,
     find_displacement,
     hand_back,
-    joint_part,
     move_joints,
     set_part,
     spread_motion,
@@ -57,9 +57,28 @@ from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.types import Model, State, row
+from piavatar_envs.mpm.types import Model, State, group, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.struct
+class Springs:
+    """Springs and dampers: of the pelvis' place, then of all joints, ``(1 or num_envs, 1 + bones)``.
+
+    Those of the pelvis, ``[:, :2]``, act from outside: a body that nobody holds has none.
+    """
+
+    stiffness: wp.array2d(dtype=float)  # [N/m], then [N m/rad]
+    damping: wp.array2d(dtype=float)  # [N s/m], then [N m s/rad]
+
+
+@wp.struct
+class Target:
+    """Where springs pull to; ``(num_envs, bones)`` and ``(num_envs,)``."""
+
+    rotation: wp.array2d(dtype=wp.quat)  # local; of the pelvis in the world
+    root: wp.array(dtype=wp.vec3)  # of the pelvis joint [m]
 
 
 @wp.kernel
@@ -73,40 +92,63 @@ def add_change(change: wp.array2d(dtype=float), q: wp.array2d(dtype=float)):
 def torque_impulse(
     body: Body,
     dt: float,
+    gravity: wp.vec3,
     rotation: wp.array2d(dtype=wp.quat),
-    target: wp.array2d(dtype=wp.quat),
-    stiffness: wp.array2d(dtype=float),
-    damping: wp.array2d(dtype=float),
+    position: wp.array2d(dtype=wp.vec3),
+    target: Target,
+    springs: Springs,
     torque: wp.array2d(dtype=wp.vec3),
     q: wp.array2d(dtype=float),
     # out
     impulse: wp.array2d(dtype=float),
 ):
-    """``dt (K e - (D + dt K) qdot + tau)`` of every joint but the pelvis; launched over ``(num_envs, bones)``.
+    """``dt (K e - (D + dt K) qdot + tau)`` of the pelvis' place, then of all joints; over ``(num_envs, 1 + bones)``.
 
-    ``target`` are local rotations, ``torque`` [N m] in the world's axes.
+    ``torque`` [N m] is in the world's axes; that of the pelvis, which would come from outside, is not asked for. The
+    fall of this substep is still to come and counts as velocity: else a held body would rise as fast as it falls, and
+    its damper would resist that.
     """
-    e, c = wp.tid()
-    if c == 0:
-        set_part(impulse, e, 0, wp.vec3(0.0))
-        set_part(impulse, e, 3, wp.vec3(0.0))
-        return
-    r = row(e, stiffness.shape[0])
-    K = stiffness[r, c]
-    above = rotation[e, body.parent[c]]
-    error = quat_log(target[e, c] * wp.quat_inverse(wp.quat_inverse(above) * rotation[e, c]))
-    push = K * wp.quat_rotate(above, error) - (damping[r, c] + dt * K) * joint_part(q, e, c) + torque[e, c]
-    set_part(impulse, e, 3 + 3 * c, dt * push)
+    e, n = wp.tid()
+    r = row(e, springs.stiffness.shape[0])
+    K = springs.stiffness[r, n]
+    D = springs.damping[r, n]
+    error = target.root[e] - position[e, 0]
+    push = wp.vec3()
+    v = wp.vec3(q[e, 3 * n], q[e, 3 * n + 1], q[e, 3 * n + 2])
+    if n == 0:
+        v += dt * gravity
+    else:
+        c = n - 1
+        above = wp.quat(0.0, 0.0, 0.0, 1.0)
+        if c > 0:
+            above = rotation[e, body.parent[c]]
+            push = torque[e, c]
+        error = wp.quat_rotate(
+            above, quat_log(target.rotation[e, c] * wp.quat_inverse(wp.quat_inverse(above) * rotation[e, c]))
+        )
+    push += K * error - (D + dt * K) * v
+    set_part(impulse, e, 3 * n, dt * push)
 
 
 @wp.kernel
-def implicit_diagonal(
-    dt: float, stiffness: wp.array2d(dtype=float), damping: wp.array2d(dtype=float), diagonal: wp.array2d(dtype=float)
+def implicit_diagonal(dt: float, springs: Springs, diagonal: wp.array2d(dtype=float)):
+    """``dt D + dt^2 K``; launched over ``(rows, 1 + bones)``."""
+    r, n = wp.tid()
+    value = dt * springs.damping[r, n] + dt * dt * springs.stiffness[r, n]
+    set_part(diagonal, r, 3 * n, wp.vec3(value))
+
+
+@wp.kernel
+def find_support(
+    impulse: wp.array2d(dtype=float),
+    diagonal: wp.array2d(dtype=float),
+    change: wp.array2d(dtype=float),
+    # out
+    support: wp.array2d(dtype=float),
 ):
-    """``dt D + dt^2 K``; launched over ``(rows, bones)``."""
-    r, c = wp.tid()
-    value = wp.where(c > 0, dt * damping[r, c] + dt * dt * stiffness[r, c], 0.0)
-    set_part(diagonal, r, 3 + 3 * c, wp.vec3(value))
+    """What the pelvis' springs really give, implicit as they are: the only impulse from outside; ``(num_envs, 6)``."""
+    e, i = wp.tid()
+    support[e, i] = impulse[e, i] - diagonal[row(e, diagonal.shape[0]), i] * change[e, i]
 
 
 class ArticulatedBody:
@@ -115,9 +157,9 @@ class ArticulatedBody:
     Attributes:
         rotation, position: pose of the bones in the world, ``(num_envs, 22)`` quaternions and [m].
         velocity: generalised velocity, ``(num_envs, 69)``: the pelvis' [m/s], then spins of the joints [rad/s].
-        target: local rotations to which the springs pull, ``(num_envs, 22)``.
+        target: where the springs pull to.
         torque: torques on the joints, ``(num_envs, 22)`` vectors in the world's axes [N m]; that of the pelvis is none.
-        stiffness, damping: of the springs, ``(1 or num_envs, 22)`` [N m/rad, N m s/rad].
+        springs: of the pelvis and of all joints.
         attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s], or None.
         mass: the mass matrix, ``(num_envs, 69, 69)``.
     """
@@ -137,8 +179,8 @@ class ArticulatedBody:
             points: the body as its drive was built from it.
             body: the same on the device.
             model: of the world.
-            stiffness: of the joints, shape ``(1 or num_envs, 22)`` [N m/rad].
-            damping: likewise [N m s/rad].
+            stiffness: of the springs, as :class:`Springs` has it, shape ``(1 or num_envs, 23)``.
+            damping: likewise.
             attachment: rates of the pulls that hold flesh to bones, shape ``(1 or num_envs, num_points)`` [1/s];
                 without them flesh is held by its own stiffness only.
 
@@ -147,7 +189,7 @@ class ArticulatedBody:
         """
         n, device = model.num_envs, model.device
         rates = np.zeros((1, points.num_points)) if attachment is None else attachment
-        sizes = (("stiffness", stiffness, NUM_JOINTS), ("damping", damping, NUM_JOINTS))
+        sizes = (("stiffness", stiffness, 1 + NUM_JOINTS), ("damping", damping, 1 + NUM_JOINTS))
         for name, value, size in (*sizes, ("attachment", rates, points.num_points)):
             if value.shape not in ((1, size), (n, size)):
                 raise ValueError(f"{name} has shape {value.shape}, expected (1 or {n}, {size})")
@@ -155,10 +197,11 @@ class ArticulatedBody:
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
         self.body, self.model, self.threads = body, model, warp_threads(device)
         self.pairs = build_pairs(points, device)
-        self.stiffness, self.damping = (
-            wp.array(value.astype(np.float32), dtype=float, device=device) for value in (stiffness, damping)
+        self.springs = group(
+            Springs,
+            stiffness=wp.array(stiffness.astype(np.float32), dtype=float, device=device),
+            damping=wp.array(damping.astype(np.float32), dtype=float, device=device),
         )
-
         self.attachment = None
         if attachment is not None:
             self.attachment = wp.array(attachment.astype(np.float32), dtype=float, device=device)
@@ -167,13 +210,15 @@ class ArticulatedBody:
             return wp.zeros(shape, dtype=dtype, device=device)
 
         bones = (n, NUM_JOINTS)
-        self.rotation, self.target = zeros(bones, wp.quat), zeros(bones, wp.quat)
-        self.target.fill_(wp.quat_identity())
+        self.rotation = zeros(bones, wp.quat)
+        self.target = group(Target, rotation=zeros(bones, wp.quat), root=zeros(n, wp.vec3))
+        self.target.rotation.fill_(wp.quat_identity())
         self.position, self.torque = zeros(bones, wp.vec3), zeros(bones, wp.vec3)
         self.velocity, self.mass = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF, NUM_DOF), float)
         self._factor, self._driven = zeros(self.mass.shape, float), zeros(self.mass.shape, float)
         self._none, self._diagonal = zeros((1, NUM_DOF), float), zeros((len(stiffness), NUM_DOF), float)
         self._right, self._change = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF), float)
+        self._support, self._nothing = zeros((n, 6), float), zeros((n, 6), float)
         self._taken, self._moving = zeros(bones, vec8), zeros(bones, vec8)
         self._linear, self._angular = zeros(bones, wp.vec3), zeros(bones, wp.vec3)
         self._displacement = zeros((n, model.num_particles), wp.vec3)
@@ -216,8 +261,7 @@ class ArticulatedBody:
         for columns in (0, 1):
             program.launch(compose_moments, (n, NUM_JOINTS), [self.body, self.position, columns], [moments])
         program.launch(fill_mass_matrix, moments.shape, [moments], [self.mass])
-        gains = [m.step.dt, self.stiffness, self.damping]
-        program.launch(implicit_diagonal, self.stiffness.shape, gains, [self._diagonal])
+        program.launch(implicit_diagonal, self.springs.stiffness.shape, [m.step.dt, self.springs], [self._diagonal])
         for diagonal, factor in ((self._none, self._factor), (self._diagonal, self._driven)):
             program.launch(factorize, (n, self.threads), [self.mass, diagonal, self.threads], [factor])
 
@@ -244,12 +288,13 @@ class ArticulatedBody:
         program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
         self._record_share(program, state, self._displacement)
         program.launch(spread_motion, n, [self.body, self.position, self._change], [self._moving])
-        program.launch(balance, n, [self.position, self._bones, 1.0, self._moving], [self._change])
+        inputs = [self.position, self._bones, 1.0, self._nothing, self._moving]
+        program.launch(balance, n, inputs, [self._change])
         program.launch(add_change, (n, NUM_DOF), [self._change], [self.velocity])
 
     def record_substep(self, program: Program, state: State) -> None:
         """Append what the joints do before an MPM substep: take over, act, and move the pose on."""
-        n, dt = self.model.num_envs, self.model.step.dt
+        n, dt, pose = self.model.num_envs, self.model.step.dt, [self.rotation, self.position]
         self._record_hand_back(program, state)
         if self.attachment is not None:
             self._record_attachment(program, state)
@@ -258,15 +303,17 @@ class ArticulatedBody:
         program.launch(add_change, (n, NUM_DOF), [self._change], [self.velocity])
         program.launch(
             torque_impulse,
-            (n, NUM_JOINTS),
-            [self.body, dt, self.rotation, self.target, self.stiffness, self.damping, self.torque, self.velocity],
+            (n, 1 + NUM_JOINTS),
+            [self.body, dt, self.model.step.gravity, *pose, self.target, self.springs, self.torque, self.velocity],
             [self._right],
         )
         program.launch(solve, (n, self.threads), [self._driven, self._right, self.threads], [self._change])
         program.launch(spread_motion, n, [self.body, self.position, self._change], [self._moving])
-        program.launch(balance, n, [self.position, self._bones, 0.0, self._moving], [self._change])
+        program.launch(find_support, (n, 6), [self._right, self._diagonal, self._change], [self._support])
+        inputs = [self.position, self._bones, 0.0, self._support, self._moving]
+        program.launch(balance, n, inputs, [self._change])
         program.launch(add_change, (n, NUM_DOF), [self._change], [self.velocity])
         program.launch(spread_motion, n, [self.body, self.position, self.velocity], [self._moving])
         inputs = [self.body, state.x, self.position, self._taken, self._moving, state.failure]
         program.launch(take_over, (n, self.body.count), inputs, [state.u, state.vk])
-        program.launch(move_joints, n, [self.body, dt, self._moving], [self.rotation, self.position])
+        program.launch(move_joints, n, [self.body, dt, self._moving], pose)

@@ -48,21 +48,23 @@ def balance(
     position: wp.array2d(dtype=wp.vec3),
     bones: wp.array2d(dtype=vec16),
     reaction: float,
+    support: wp.array2d(dtype=float),
     field: wp.array2d(dtype=vec8),
     # in and out
     change: wp.array2d(dtype=float),
 ):
     """Give a change of the joints' velocities, whose motion of the bones is ``field``, the momentum that it must have.
 
-    That is none, or with ``reaction`` 1 what the bones' sums say. A rigid motion of the body makes up the difference.
-    The blend of the bones' motions has the momenta of the bones' own sums, because weights add up to one.
+    That is ``support``, an impulse and its moment about the pelvis joint, and with ``reaction`` 1 what the bones' sums
+    say. A rigid motion of the body makes up the difference. The blend of the bones' motions has the momenta of the
+    bones' own sums, because weights add up to one.
     """
     e = wp.tid()
     m = float(0.0)
     first = wp.vec3()
     I = wp.mat33()
-    P = wp.vec3()
-    L = wp.vec3()
+    P = -wp.vec3(support[e, 0], support[e, 1], support[e, 2])
+    L = -wp.vec3(support[e, 3], support[e, 4], support[e, 5])
     for b in range(BONES):
         s = bones[e, b]
         arm = position[e, b] - position[e, 0]

@@ -16,7 +16,8 @@ from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematic
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 
-GAINS = np.ones((1, NUM_JOINTS))
+#: Springs of the joints, none of the pelvis.
+GAINS = np.r_[0.0, 0.0, np.ones(NUM_JOINTS - 1)][None]
 
 
 def carried_by() -> np.ndarray:
@@ -148,7 +149,7 @@ def test_torques_change_neither_momentum(joints, wild_pose, stale):
     rng = np.random.default_rng(3)
     if stale:
         made.state.x.assign(made.state.x.numpy() + rng.normal(0.0, 2e-2, made.state.x.numpy().shape).astype(np.float32))
-    made.body.target.assign(Rotation.from_rotvec(wild_pose(rng)).as_quat()[None].astype(np.float32))
+    made.body.target.rotation.assign(Rotation.from_rotvec(wild_pose(rng)).as_quat()[None].astype(np.float32))
     made.body.torque.assign(rng.normal(0.0, 1e3, (1, NUM_JOINTS, 3)).astype(np.float32))
     p, L, _ = made.momenta()
     made.run("record_substep")
@@ -235,7 +236,7 @@ def test_free_float_keeps_momentum(make_rig, wild_pose):
     start = rig.totals()
     largest, worst = 0.0, np.zeros(2)
     for _ in range(6):
-        made.body.target.assign(Rotation.from_rotvec(0.6 * wild_pose(rng)).as_quat()[None].astype(np.float32))
+        made.body.target.rotation.assign(Rotation.from_rotvec(0.6 * wild_pose(rng)).as_quat()[None].astype(np.float32))
         program.run()
         now = rig.totals()  # with the affine part of the angular momentum
         largest = max(largest, made.momenta()[2])
@@ -276,3 +277,33 @@ def test_bad_gains_are_refused(make_rig, name, bad):
         ArticulatedBody(rig.points, rig.drive.body, rig.model, **gains)
     with pytest.raises(ValueError, match=f"{name} has shape"):
         ArticulatedBody(rig.points, rig.drive.body, rig.model, **{**gains, name: np.ones(3)})
+
+
+def test_a_held_pelvis_bears_the_weight(make_rig):
+    """Springs of the pelvis carry a body at rest: with stiff joints it sinks by ``m g / K``, and stays."""
+    rig = make_rig(cells=16, gravity=9.81)
+    stiffness, damping = 3000.0 * GAINS, 100.0 * GAINS
+    stiffness[0, :2], damping[0, :2] = (2e4, 1e4), (2e3, 1e3)
+    body = ArticulatedBody(
+        rig.points, rig.drive.body, rig.model, stiffness, damping, np.full((1, len(rig.mass)), 300.0)
+    )
+    made = Joints(rig)
+    made.body = body
+    made.pose(np.zeros((NUM_JOINTS, 3)))
+    root = body.position.numpy()[0, 0].copy()
+    body.target.root.assign(root[None])
+    model, program = rig.model, Program(rig.model.device)
+    record_begin(program, model, rig.state, rig.scratch)
+    for step in range(model.num_substeps):
+        body.record_refresh(program, rig.state)
+        body.record_substep(program, rig.state)
+        record_substep(program, model, rig.state, rig.scratch, step)
+    record_end(program, model, rig.state, rig.scratch)
+    for _ in range(30):
+        program.run()
+    assert rig.state.failure.numpy().sum() == 0
+    sunk = root - body.position.numpy()[0, 0]
+    weight = 9.81 * rig.mass.sum()
+    assert sunk[2] == pytest.approx(weight / 2e4, rel=0.01)
+    assert np.abs(sunk[:2]).max() < 2e-3
+    assert np.abs(made.total).max() < 0.1
