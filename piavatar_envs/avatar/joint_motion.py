@@ -118,6 +118,8 @@ def find_displacement(
     weight = body.weight[p]
     at = wp.vec3()
     for n in range(4):
+        if weight[n] <= 0.0:
+            continue
         b = joint[n]
         at += weight[n] * (wp.quat_rotate(rotation[e, b], rest - body.rest_joint[r, b]) + position[e, b])
     displacement[e, body.first + p] = x[e, body.first + p] - at
