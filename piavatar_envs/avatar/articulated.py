@@ -39,6 +39,7 @@ from piavatar_envs.avatar.joint_motion import (
     find_displacement,
     hand_back,
     move_joints,
+    part_of,
     set_part,
     spread_motion,
     take_over,
@@ -114,7 +115,7 @@ def torque_impulse(
     D = springs.damping[r, n]
     error = target.root[e] - position[e, 0]
     push = wp.vec3()
-    v = wp.vec3(q[e, 3 * n], q[e, 3 * n + 1], q[e, 3 * n + 2])
+    v = part_of(q, e, 3 * n)
     if n == 0:
         v += dt * gravity
     else:
@@ -229,7 +230,8 @@ class ArticulatedBody:
     def record_refresh(self, program: Program, state: State, fit: bool = True) -> None:
         """Append: fit the pose to the particles (``fit``), and build the mass matrix where they are.
 
-        The total velocity of every particle stays as it is. The pose can be fitted once there is a mass matrix.
+        No velocity changes; what those of the joints do from here :meth:`record_substep` finds. The pose can be fitted
+        once there is a mass matrix.
         """
         n = self.model.num_envs
         if fit:
@@ -239,14 +241,6 @@ class ArticulatedBody:
             program.launch(spread_motion, n, [self.body, self.position, self._change], [self._taken])
             program.launch(move_joints, n, [self.body, 1.0, self._taken], pose)
         self._record_mass(program, state)
-        self._record_hand_back(program, state)
-
-    def _record_hand_back(self, program: Program, state: State) -> None:
-        """Append: ``J qdot`` where the particles and the pose are now; the change goes to the physical velocity."""
-        n = self.model.num_envs
-        program.launch(spread_motion, n, [self.body, self.position, self.velocity], [self._moving])
-        inputs = [self.body, state.x, self.position, self._moving, state.failure]
-        program.launch(hand_back, (n, self.body.count), inputs, [state.u, state.vk])
 
     def _record_mass(self, program: Program, state: State) -> None:
         n, m = self.model.num_envs, self.model
@@ -295,7 +289,9 @@ class ArticulatedBody:
     def record_substep(self, program: Program, state: State) -> None:
         """Append what the joints do before an MPM substep: take over, act, and move the pose on."""
         n, dt, pose = self.model.num_envs, self.model.step.dt, [self.rotation, self.position]
-        self._record_hand_back(program, state)
+        program.launch(spread_motion, n, [self.body, self.position, self.velocity], [self._moving])
+        inputs = [self.body, state.x, self.position, self._moving, state.failure]
+        program.launch(hand_back, (n, self.body.count), inputs, [state.u, state.vk])
         if self.attachment is not None:
             self._record_attachment(program, state)
         self._record_share(program, state, state.u)

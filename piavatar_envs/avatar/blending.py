@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 PLACE, STEP, LEAN, TURN = wp.constant(0), wp.constant(12), wp.constant(24), wp.constant(36)
 VELOCITY, SPIN = wp.constant(45), wp.constant(48)
 #: Where in what a particle has blended the same parts begin.
-AT_PLACE, AT_STEP, AT_LEAN, AT_TURN = wp.constant(0), wp.constant(3), wp.constant(6), wp.constant(9)
+AT_PLACE, AT_STEP, AT_LEAN = wp.constant(0), wp.constant(3), wp.constant(6)
 AT_VELOCITY, AT_SPIN = wp.constant(18), wp.constant(21)
 
 # What a particle is skinned to, in loads of 16 bytes.
@@ -145,3 +145,9 @@ def blend_changes(
 ) -> vec8:
     """``sum_n weight_n change[e, joint_n]`` of particle ``p``."""
     ...
+
+
+@wp.func
+def motion_at(change: vec8, arm: wp.vec3):
+    """Velocity under a bone's change, or under a blend of them, ``arm`` from where the pelvis' velocity is [m/s]."""
+    return wp.vec3(change[0], change[1], change[2]) + wp.cross(wp.vec3(change[3], change[4], change[5]), arm)

@@ -21,6 +21,7 @@ from piavatar_envs.avatar.blending import (
     blended_turn,
     blended_vector,
     blended_velocity,
+    motion_at,
 )
 from piavatar_envs.avatar.lanes import sum_threads12, sum_threads16
 from piavatar_envs.avatar.loads import number_at, vector_at
@@ -248,8 +249,7 @@ def apply_corrections(
     if failure[e] != 0:
         return
     at = vector_at(x, e, body.first + p)
-    s = blend_changes(change, e, body.joint, body.weight, p)
-    field = wp.vec3(s[0], s[1], s[2]) + wp.cross(wp.vec3(s[3], s[4], s[5]), at - bones.center[e, 0])
+    field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - bones.center[e, 0])
     store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, e, p) + field, True)
     if drive.free_motion != 0 or let_go[e] != 0:
         free = vector_at(vk, e, body.first + p) - removed.velocity[e]

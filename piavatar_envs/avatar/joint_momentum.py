@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.joint_motion import set_part
+from piavatar_envs.avatar.blending import motion_at
+from piavatar_envs.avatar.joint_motion import part_of, set_part
 from piavatar_envs.avatar.mass_matrix import BONES, I3
-from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of
+from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body, vec8, vec16
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -63,28 +64,22 @@ def balance(
     m = float(0.0)
     first = wp.vec3()
     I = wp.mat33()
-    P = -wp.vec3(support[e, 0], support[e, 1], support[e, 2])
-    L = -wp.vec3(support[e, 3], support[e, 4], support[e, 5])
+    P = -part_of(support, e, 0)
+    L = -part_of(support, e, 3)
     for b in range(BONES):
         s = bones[e, b]
         arm = position[e, b] - position[e, 0]
         d = wp.vec3(s[1], s[2], s[3])  # first moment about the joint, as are the others
         w = wp.vec3(field[e, b][3], field[e, b][4], field[e, b][5])
-        v = wp.vec3(field[e, b][0], field[e, b][1], field[e, b][2]) + wp.cross(w, arm)  # at the joint
-        # fmt: off
-        second = wp.mat33(
-            s[7], s[12], s[11],
-            s[12], s[8], s[10],
-            s[11], s[10], s[9],
-        )
-        # fmt: on
+        v = motion_at(field[e, b], arm)  # at the joint
+        second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
         inertia = wp.diag(wp.vec3(wp.trace(second))) - second
         p = s[0] * v + wp.cross(w, d) - reaction * wp.vec3(s[4], s[5], s[6])
         P += p
         L += wp.cross(d, v) + inertia * w - reaction * wp.vec3(s[13], s[14], s[15]) + wp.cross(arm, p)
         m += s[0]
         first += d + s[0] * arm
-        I += inertia + s[0] * (wp.dot(arm, arm) * I3 - wp.outer(arm, arm))
+        I += inertia + point_inertia(s[0], arm)
         I += 2.0 * wp.dot(d, arm) * I3 - wp.outer(d, arm) - wp.outer(arm, d)
     center = first / m
     W = spin_of(I - point_inertia(m, center), L - wp.cross(center, P))

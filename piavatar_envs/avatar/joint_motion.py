@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_changes
+from piavatar_envs.avatar.blending import blend_changes, motion_at
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.rotation import quat_exp
@@ -20,9 +20,9 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
-def joint_part(q: wp.array2d(dtype=float), e: int, c: int):
-    """Three components of a generalised vector, those of joint ``c``."""
-    return wp.vec3(q[e, 3 + 3 * c], q[e, 4 + 3 * c], q[e, 5 + 3 * c])
+def part_of(q: wp.array2d(dtype=float), e: int, first: int):
+    """Three components of a generalised vector."""
+    return wp.vec3(q[e, first], q[e, first + 1], q[e, first + 2])
 
 
 @wp.func
@@ -43,8 +43,8 @@ def spread_motion(
     """Rigid motion of every bone under a generalised velocity: velocity where the pelvis joint is, and spin."""
     e = wp.tid()
     for b in range(BONES):
-        w = joint_part(q, e, b)
-        v = wp.vec3(q[e, 0], q[e, 1], q[e, 2])
+        w = part_of(q, e, 3 + 3 * b)
+        v = part_of(q, e, 0)
         if b > 0:
             above = field[e, body.parent[b]]
             v = wp.vec3(above[0], above[1], above[2]) + wp.cross(w, position[e, 0] - position[e, b])
@@ -55,8 +55,7 @@ def spread_motion(
 @wp.func
 def skinned_motion(body: Body, field: wp.array2d(dtype=vec8), e: int, p: int, arm: wp.vec3):
     """``J q`` at a particle, ``arm`` from the pelvis joint."""
-    s = blend_changes(field, e, body.joint, body.weight, p)
-    return wp.vec3(s[0], s[1], s[2]) + wp.cross(wp.vec3(s[3], s[4], s[5]), arm)
+    return motion_at(blend_changes(field, e, body.joint, body.weight, p), arm)
 
 
 @wp.kernel

@@ -24,6 +24,7 @@ import warp as wp
 
 from piavatar_envs.avatar.body import CHUNK, BodyPoints
 from piavatar_envs.avatar.lanes import store_sum12
+from piavatar_envs.avatar.rigid_fit import symmetric
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
 from piavatar_envs.mpm.types import Particles, row
@@ -170,13 +171,7 @@ def place_pairs(
     s = vec12()
     for c in range(pairs.chunk_start[pair], pairs.chunk_start[pair + 1]):
         s += sums[e, c]
-    # fmt: off
-    second = wp.mat33(
-        s[4], s[9], s[8],
-        s[9], s[5], s[7],
-        s[8], s[7], s[6],
-    )
-    # fmt: on
+    second = symmetric(wp.vec3(s[4], s[5], s[6]), wp.vec3(s[7], s[8], s[9]))
     origin = position[e, pairs.first[pair]]
     alpha = origin - position[e, n // BONES]
     beta = origin - position[e, n % BONES]

@@ -34,6 +34,18 @@ def spin_of(inertia: wp.mat33, angular_momentum: wp.vec3):
 
 
 @wp.func
+def symmetric(diag: wp.vec3, off: wp.vec3):
+    """Symmetric matrix with the diagonal ``xx, yy, zz`` and beside it ``yz, zx, xy``."""
+    # fmt: off
+    return wp.mat33(
+        diag[0], off[2], off[1],
+        off[2], diag[1], off[0],
+        off[1], off[0], diag[2],
+    )
+    # fmt: on
+
+
+@wp.func
 def point_inertia(mass: float, d: wp.vec3):
     """Inertia of a point mass at ``d``."""
     return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
@@ -111,13 +123,7 @@ def fit_bones(
     m = wp.max(s[0], 1.0e-12)
     d = wp.vec3(s[1], s[2], s[3]) / m
     V = wp.vec3(s[4], s[5], s[6]) / m
-    # fmt: off
-    second = wp.mat33(
-        s[7], s[12], s[11],
-        s[12], s[8], s[10],
-        s[11], s[10], s[9],
-    ) - m * wp.outer(d, d)
-    # fmt: on
+    second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12])) - m * wp.outer(d, d)
     I = wp.diag(wp.vec3(wp.trace(second))) - second
     L = wp.vec3(s[13], s[14], s[15]) - m * wp.cross(d, V)
     center[e, b] = reference[e, b] + d
