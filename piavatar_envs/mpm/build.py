@@ -13,6 +13,7 @@ from piavatar_envs.mpm.boundaries import Collider, make_boundaries
 from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.materials import lame_parameters, material_index
 from piavatar_envs.mpm.memory import bound_slots, check_memory
+from piavatar_envs.mpm.shared_room import MOST_PARTICLES, most_particles, suits_shared
 from piavatar_envs.mpm.stencil import BLOCK
 from piavatar_envs.mpm.types import (
     DECOUPLING,
@@ -166,7 +167,8 @@ def build_model(
     ``num_substeps`` is chosen from the CFL limit unless given; the limit comes from the points, or from
     ``sound_speed`` [m/s] where parameters will be randomised. ``max_slots`` bounds the blocks with matter of an
     environment, each field's counted; if not given, no state can exceed it. ``scatter`` is a key of ``SCATTERS``;
-    if not given, ``"runs"`` on a GPU that can match within a warp, else ``"plain"``.
+    if not given, ``"shared"`` on a GPU whose shared memory holds an environment's grid, ``"runs"`` on one that can
+    match within a warp, else ``"plain"``.
 
     Raises:
         ValueError: bad material, unstable time step, a scatter that the device does not know, or more memory than it
@@ -181,8 +183,8 @@ def build_model(
         num_substeps = choose_num_substeps(control_dt, grid.dx, sound_speed, cfl)
     check_num_substeps(num_substeps, control_dt, grid.dx, sound_speed)
     mu, lam = lame_parameters(points.young_modulus, points.poisson_ratio)
-    scatter = choose_scatter(scatter, device)
     max_slots = bound_slots(max_slots, points.fields, grid, fields.num_fields)
+    scatter = choose_scatter(scatter, device, points.fields, max_slots)
     check_memory(num_envs, points.num_particles, max_slots, device, fields.num_fields, grid.num_blocks, scatter)
     step = Step()
     step.dt = control_dt / num_substeps
@@ -207,20 +209,26 @@ def build_model(
     )
 
 
-def choose_scatter(scatter: str | None, device: str) -> str:
-    """How particles reach the nodes on a device.
+def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slots: int) -> str:
+    """How particles of velocity fields ``field`` reach the nodes, on a device.
 
     Raises:
-        ValueError: there is no such way, or not on this device.
+        ValueError: there is no such way, or not on this device or for that size.
     """
     target = wp.get_device(device)
     matches = target.is_cuda and target.arch >= 70
+    shared = suits_shared(device, field, max_slots)
     if scatter is None:
-        return "runs" if matches else "plain"
+        return "shared" if shared else "runs" if matches else "plain"
     if scatter not in SCATTERS:
         raise ValueError(f"unknown scatter {scatter!r}; use one of {', '.join(SCATTERS)}")
     if scatter != "plain" and not matches:
         raise ValueError(f"scatter={scatter!r} needs a GPU of compute capability 7.0 or more; {target} takes 'plain'")
+    if scatter == "shared" and not shared:
+        raise ValueError(
+            f"scatter='shared' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
+            f"particles a body (here {most_particles(field)}) and few slots ({max_slots}); {target} takes 'runs'"
+        )
     return scatter
 
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import warp as wp
 
+from piavatar_envs.mpm.shared_room import plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.sums import units
 from piavatar_envs.mpm.types import (
@@ -75,10 +76,11 @@ def estimate_bytes(
 ) -> int:
     """Device memory of state and scratch [bytes].
 
-    108 B a particle; 80 B a node of a slot, 48 more in fixed point, 28 more where there are several fields; the map of
-    blocks.
+    108 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 28 more
+    where there are several fields; the map of blocks.
     """
-    node = (32 + 16) * (1 + SCATTERS[scatter]) + 32 + (16 + 12 if num_fields > 1 else 0)
+    sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter])
+    node = sums + 32 + (16 + 12 if num_fields > 1 else 0)
     slots = max_slots * (BLOCK**3 * node + (8 if num_fields > 1 else 4))
     return num_envs * (num_particles * 108 + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
 
@@ -123,12 +125,14 @@ def allocate(model: Model) -> tuple[State, Scratch]:
     )
     records = (model.num_envs, int(BLOCK_NODES) * model.max_slots)
     shared = records if model.contact.num_fields > 1 else (1, 1)
+    velocity = _zeros(model, records, vec8)
     scratch = Scratch(
         blocks=allocate_blocks(model),
-        sums=allocate_sums(model, records),
-        velocity=_zeros(model, records, vec8),
+        sums=allocate_sums(model, velocity),
+        velocity=velocity,
         facing=_zeros(model, shared, wp.vec3),
         sensors=allocate_sensors(model, shared),
+        room=plan_room(model),
     )
     return state, scratch
 
@@ -151,15 +155,15 @@ def allocate_blocks(model: Model) -> Blocks:
     )
 
 
-def allocate_sums(model: Model, records: tuple[int, int]) -> Sums:
-    """Zeroed sums of the nodes, and their units."""
-    fixed = SCATTERS[model.scatter]
+def allocate_sums(model: Model, velocity: wp.array) -> Sums:
+    """Zeroed sums of the nodes, and their units. Sums from shared memory come to the records of the ``velocity``."""
+    fixed, records = SCATTERS[model.scatter], velocity.shape
     mass, momentum = units(model.contact.density.numpy(), model.grid, model.step)
     floats, integers = ((1, 1), records) if fixed else (records, (1, 1))
     return group(
         Sums,
         is_fixed=int(fixed),
-        value=_zeros(model, floats, vec8),
+        value=velocity if model.scatter == "shared" else _zeros(model, floats, vec8),
         fixed=_zeros(model, integers, vec16i),
         offset=_zeros(model, floats, wp.vec4),
         offset_fixed=_zeros(model, integers, vec8i),

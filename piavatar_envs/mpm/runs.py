@@ -15,10 +15,11 @@ from typing import Any
 
 import warp as wp
 
+from piavatar_envs.mpm.gather import Gathered, gather
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.stencil import spline
-from piavatar_envs.mpm.stores import store_matrix, store_vector
-from piavatar_envs.mpm.transfer import Gathered, Scattered, gather, near_boundary, prepare, scatters
+from piavatar_envs.mpm.stores import store_particle
+from piavatar_envs.mpm.transfer import Scattered, near_boundary, prepare, scatters
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -120,7 +121,7 @@ def grid_to_particles(
     moved: Moving,
     failure: wp.array(dtype=int),
 ):
-    """Move every particle with the grid, see :func:`piavatar_envs.mpm.transfer.gather`.
+    """Move every particle with the grid, see :func:`piavatar_envs.mpm.gather.gather`.
 
     Unlike the gather of a CPU it has its loops unrolled, and its threads store together.
     """
@@ -130,10 +131,7 @@ def grid_to_particles(
     if not stays:
         s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
         stays = s.fault != 0
-    store_vector(moved.x, e, p, s.x, not stays)
-    store_vector(moved.u, e, p, s.u, not stays)
-    store_matrix(moved.C, e, p, s.C, not stays)
-    store_matrix(moved.F, e, p, s.F, not stays)
+    store_particle(moved, e, p, s, not stays)
 
 
 def record_runs(program: Program, inputs: list[Any], shape: tuple[int, int], failure: wp.array, sums: Sums) -> None:

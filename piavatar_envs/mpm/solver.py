@@ -5,14 +5,16 @@ from __future__ import annotations
 from piavatar_envs.mpm import runs
 from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
+from piavatar_envs.mpm.gather import grid_to_particles
 from piavatar_envs.mpm.grid import solve_contact, update_grid
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import record_runs
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
+from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep
-from piavatar_envs.mpm.transfer import grid_to_particles, particles_to_grid
+from piavatar_envs.mpm.transfer import particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 #: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In so
@@ -27,22 +29,26 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     velocity ``state.vk``; contact is added to the sensors.
     """
     m, s, blocks, sums = model, state, scratch.blocks, scratch.sums
+    if index == 0 and m.scatter == "shared":
+        program.launch(forget_speeds, scratch.room.speed.shape, [scratch.room])
     if index > 0 and index % MARKS_EVERY == 0:
         record_marks(program, model, state, scratch)
     record_scatter(program, model, state, scratch)
-    threads, sweep = plan_sweep(m)
-    program.launch(
-        update_grid,
-        threads,
-        [m.grid, m.step, m.boundaries, m.contact, sweep, s.failure],
-        [blocks, sums, scratch.velocity, scratch.sensors],
-        block_dim=THREADS,
-    )
+    if m.scatter != "shared":
+        threads, sweep = plan_sweep(m)
+        program.launch(
+            update_grid,
+            threads,
+            [m.grid, m.step, m.boundaries, m.contact, sweep, s.failure],
+            [blocks, sums, scratch.velocity, scratch.sensors],
+            block_dim=THREADS,
+        )
     if m.contact.num_fields > 1:
         _record_contact(program, model, state, scratch)
-    gather = grid_to_particles if m.scatter == "plain" else runs.grid_to_particles
-    inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
-    program.launch(gather, s.x.shape, inputs, [blocks, _moving(s), s.failure], block_dim=runs.THREADS)
+    if m.contact.num_fields > 1 or m.scatter != "shared":
+        gather = grid_to_particles if m.scatter == "plain" else runs.grid_to_particles
+        inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
+        program.launch(gather, s.x.shape, inputs, [blocks, _moving(s), s.failure], block_dim=runs.THREADS)
     if m.moving_boundaries:
         program.launch(move_colliders, m.boundaries.position.shape, [m.step.dt], [m.boundaries])
 
@@ -76,8 +82,11 @@ def _record_contact(program: Program, model: Model, state: State, scratch: Scrat
 
 
 def record_scatter(program: Program, model: Model, state: State, scratch: Scratch) -> None:
-    """Append the transfer of particles to nodes, in the way of ``model.scatter``."""
+    """Append the transfer of particles to nodes, in the way of ``model.scatter``; if shared, what goes with it."""
     m, s = model, state
+    if m.scatter == "shared":
+        record_in_block(program, model, state, scratch, _moving(s))
+        return
     inputs = [m.grid, m.step, m.particles, m.boundaries, m.contact, _moving(s), scratch.blocks]
     if m.scatter == "plain":
         program.launch(particles_to_grid, s.x.shape, inputs, [s.failure, scratch.sums])

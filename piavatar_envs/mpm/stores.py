@@ -9,45 +9,65 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.mpm.gather import Gathered
+from piavatar_envs.mpm.types import Moving
+
 wp.set_module_options({"enable_backward": False})
 
 _STORE = """
-auto* const mine = reinterpret_cast<float*>(&wp::index(into, e, p));
 #if defined(__CUDA_ARCH__)
 constexpr unsigned ALL = 0xffffffffu;
-constexpr int WORDS = %d;
-__shared__ float stages[32 * 32 * WORDS / 4];  // of the 8 warps of 256 threads
+constexpr int STAGE = 144;  // words of a warp: 16 matrices
+__shared__ float stages[WP_TILE_BLOCK_DIM / 32 * STAGE];  // as many threads as the module is compiled for
 const int lane = threadIdx.x & 31;
-const unsigned here = __activemask();
-if (here == ALL && blockDim.x <= 256) {
-    float* const first = (float*)__shfl_sync(ALL, (unsigned long long)mine, 0);
-    if (__all_sync(ALL, mine == first + WORDS * lane)) {
-        float* const stage = stages + (threadIdx.x >> 5) * 32 * WORDS;
-        const unsigned storing = __ballot_sync(ALL, store);
-#pragma unroll
-        for (int c = 0; c < WORDS; ++c) stage[WORDS * lane + c] = reinterpret_cast<const float*>(&value)[c];
-        __syncwarp();
-#pragma unroll
-        for (int c = 0; c < WORDS; ++c) {
-            const int word = 32 * c + lane;
-            if (storing >> (word / WORDS) & 1u) first[word] = stage[word];
-        }
-        __syncwarp();
+float* const stage = stages + (threadIdx.x >> 5) * STAGE;
+const bool here = __activemask() == ALL && blockDim.x <= WP_TILE_BLOCK_DIM;
+bool together = false;
+unsigned storing = 0;
+if (here) {  // all threads of the warp go on to every exchange, or they would wait for each other for ever
+    const int first = __shfl_sync(ALL, p, 0), row = __shfl_sync(ALL, e, 0);
+    together = __all_sync(ALL, p == first + lane && e == row);
+    storing = __ballot_sync(ALL, store);
+}
+auto put = [&](auto& into, const auto& value) {
+    if (!together) {
+        if (store) wp::index(into, e, p) = value;
         return;
     }
-}
+    constexpr int WORDS = sizeof(value) / 4, AT_ONCE = WORDS > 4 ? 16 : 32, TURNS = (WORDS * AT_ONCE + 31) / 32;
+    float* const first = reinterpret_cast<float*>(&wp::index(into, e, p - lane));
+#pragma unroll
+    for (int begin = 0; begin < 32; begin += AT_ONCE) {
+        if (lane >= begin && lane < begin + AT_ONCE)
+            for (int c = 0; c < WORDS; ++c)
+                stage[WORDS * (lane - begin) + c] = reinterpret_cast<const float*>(&value)[c];
+        __syncwarp();
+#pragma unroll
+        for (int c = 0; c < TURNS; ++c) {
+            const int word = 32 * c + lane;
+            if (word < WORDS * AT_ONCE && (storing >> (begin + word / WORDS) & 1u))
+                first[WORDS * begin + word] = stage[word];
+        }
+        __syncwarp();
+    }
+};
+%s
+#else
+auto put = [&](auto& into, const auto& value) {
+    if (store) wp::index(into, e, p) = value;
+};
+%s
 #endif
-if (store) wp::index(into, e, p) = value;
 """
 
 
-@wp.func_native(_STORE % 3)
+@wp.func_native(_STORE % (("put(into, value);",) * 2))
 def store_vector(into: wp.array2d(dtype=wp.vec3), e: int, p: int, value: wp.vec3, store: bool):
     """``into[e, p] = value`` if ``store``; at best all threads of a warp come here."""
     ...
 
 
-@wp.func_native(_STORE % 9)
-def store_matrix(into: wp.array2d(dtype=wp.mat33), e: int, p: int, value: wp.mat33, store: bool):
-    """:func:`store_vector` of a matrix."""
+@wp.func_native(_STORE % (("put(moved.x, s.x); put(moved.u, s.u); put(moved.C, s.C); put(moved.F, s.F);",) * 2))
+def store_particle(moved: Moving, e: int, p: int, s: Gathered, store: bool):
+    """:func:`store_vector` of all that a particle ``p`` has become."""
     ...

@@ -41,9 +41,9 @@ FAILURE_NAMES: dict[int, str] = {
 
 #: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.decouple`).
 DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
-#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer` and :mod:`piavatar_envs.mpm.runs`), and
-#: whether sums are in fixed point.
-SCATTERS: dict[str, bool] = {"plain": False, "runs": True, "runs_float": False}
+#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, :mod:`piavatar_envs.mpm.runs` and
+#: :mod:`piavatar_envs.mpm.shared_substep`), and whether the nodes have sums in fixed point.
+SCATTERS: dict[str, bool] = {"plain": False, "runs": True, "runs_float": False, "shared": False}
 SPLIT = wp.constant(0)
 PAPER = wp.constant(1)
 NO_STRESS = wp.constant(3)
@@ -168,6 +168,19 @@ class Sums:
 
 
 @wp.struct
+class Room:
+    """What lies where in the shared memory of a CUDA block, in words; see :mod:`piavatar_envs.mpm.shared_grid`."""
+
+    numbers: int  # of the bricks, two a word
+    told: int  # bits of particles that tell their place
+    places: int  # of the bricks: 8 slot + brick in block, two a word
+    bricks: int
+    capacity: int  # bricks that the room has; one more takes what is not of this round
+    part: wp.array(dtype=wp.vec3i)  # (parts,) first particle, one after the last, bits of the fields that are theirs
+    speed: wp.array2d(dtype=float)  # (num_envs, fields) at which momenta are counted [m/s], 0 for not known
+
+
+@wp.struct
 class Moving:
     """Particle state as the transfers take it, each of shape ``(num_envs, num_particles)``; see :class:`State`."""
 
@@ -260,3 +273,4 @@ class Scratch:
     velocity: wp.array
     facing: wp.array
     sensors: Sensors
+    room: Room

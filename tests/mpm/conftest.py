@@ -80,7 +80,10 @@ class Simulation:
     @property
     def sums_are_clear(self) -> bool:
         sums = self.scratch.sums
-        return not any(array.numpy().any() for array in (sums.value, sums.fixed, sums.offset, sums.offset_fixed))
+        arrays = [sums.fixed, sums.offset, sums.offset_fixed]
+        if self.model.scatter != "shared":  # whose sums are written, not added up
+            arrays.append(sums.value)
+        return not any(array.numpy().any() for array in arrays)
 
     @property
     def failures(self) -> list[int]:

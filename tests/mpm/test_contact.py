@@ -105,11 +105,15 @@ def test_equal_bodies_exchange_their_velocities(meet):
 
 
 @pytest.mark.parametrize("speed", [0.05, 2.0])
-def test_bodies_that_separate_are_not_held(meet, equal, speed):
-    """No tension, and no friction on what leaves: each does what it would do alone, to the bit."""
+def test_bodies_that_separate_are_not_held(meet, equal, speed, device):
+    """No tension, and no friction on what leaves: each does what it would do alone, to the bit.
+
+    In the same kernels: a GPU has others for a world of one field.
+    """
+    scatter = "plain" if device == "cpu" else "runs"
     bodies = [LEFT | {"velocity": (-speed, 0.3, 0.0)}, RIGHT | {"velocity": (speed, 0.3, 0.0)}]
-    both = meet(bodies, friction=1.0)
-    alone = [meet([body]) for body in bodies]
+    both = meet(bodies, friction=1.0, scatter=scatter)
+    alone = [meet([body], scatter=scatter) for body in bodies]
     for _ in range(3):
         both.run()
         for field, single in enumerate(alone):
@@ -126,12 +130,16 @@ def test_bodies_side_by_side_leave_each_other_alone(meet):
     assert np.abs(sim.get("u") - (0.3, 0.2, -0.1)).max() < 1e-4
 
 
-def test_far_bodies_do_not_know_each_other(meet, equal):
-    """A node with one field is untouched, though the two do share blocks of nodes: 3.5 spacings lie between them."""
+def test_far_bodies_do_not_know_each_other(meet, equal, device):
+    """A node with one field is untouched, though the two do share blocks of nodes: 3.5 spacings lie between them.
+
+    In the same kernels: a GPU has others for a world of one field.
+    """
     far = {"ball": ((0.29, 0.02, 0.01), 0.06), "velocity": (0.0, 1.0, 0.0)}
     plane = [((0.0, 0.0, 1.0), -0.11, 0.5)]
     near = BLOCK | {"velocity": (-0.5, 0.0, -2.0)}
     gravity = {"gravity": (0.0, 0.0, -9.81), "planes": plane, "num_substeps": 15}
+    gravity["scatter"] = "plain" if device == "cpu" else "runs"
     both = meet([near, far], friction=0.5, **gravity).run(3)
     assert (both.scratch.blocks.fields.numpy() == 3).any()
     for field, body in enumerate((near, far)):

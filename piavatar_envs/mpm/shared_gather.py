@@ -1,0 +1,110 @@
+"""The gather of a body from the velocities in the shared memory of its CUDA block."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.gather import Gathered, Gradients, finish_gather, gather
+from piavatar_envs.mpm.shared_grid import (
+    bricks_around,
+    line_in_bricks,
+    meet_warp,
+    node_record,
+    thread_of_block,
+    threads_of_block,
+)
+from piavatar_envs.mpm.stencil import base_node, grid_position, spline
+from piavatar_envs.mpm.stores import store_particle
+from piavatar_envs.mpm.types import (
+    Blocks,
+    Boundaries,
+    Grid,
+    Moving,
+    Particles,
+    Room,
+    Step,
+    vec8,
+)
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.func
+def gather_from_bricks(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    blocks: Blocks,
+    room: Room,
+    moved: Moving,
+    failure: wp.array(dtype=int),
+    e: int,
+    p: int,
+):
+    """Particle ``p`` from the nodes, see :func:`piavatar_envs.mpm.gather.gather`."""
+    xg = grid_position(grid, moved.x[e, p])
+    base = base_node(xg)
+    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
+    wx = spline(f[0])
+    wy = spline(f[1])
+    wz = spline(f[2])
+    bricks = bricks_around(grid, blocks, room, e, particles.field[p], base, 0)
+    g = Gradients()
+    planes = int(3)  # not a constant: too few registers for the loads of all three at once
+    for i in range(planes):
+        wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
+        plane = vec8()
+        along_y = vec8()
+        along_z = vec8()
+        for j in range(3):
+            at = line_in_bricks(bricks, base, i, j)
+            second = node_record(at[1])
+            third = node_record(at[2])
+            line = wz[0] * node_record(at[0]) + wz[1] * second + wz[2] * third
+            plane += wy[j] * line
+            along_y += (float(j) * wy[j]) * line
+            along_z += (wy[j] * wz[1]) * second + (2.0 * wy[j] * wz[2]) * third
+        g.mean += wi * plane
+        g.along_x += (float(i) * wi) * plane
+        g.along_y += wi * along_y
+        g.along_z += wi * along_z
+    return finish_gather(grid, step, particles, boundaries, blocks, moved, failure, e, p, g, base, f)
+
+
+@wp.func
+def gather_all(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    node_velocity: wp.array2d(dtype=vec8),
+    blocks: Blocks,
+    room: Room,
+    moved: Moving,
+    failure: wp.array(dtype=int),
+    e: int,
+    fails: bool,
+    outside: bool,
+):
+    """Move all particles, unless the environment ``fails``; velocities are in the room or ``outside``."""
+    t = thread_of_block()
+    count = moved.x.shape[1]
+    if outside:
+        for start in range(0, count, threads_of_block()):
+            p = wp.min(start + t, count - 1)
+            s = Gathered()
+            stays = fails or p < start + t
+            if not stays:
+                s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+            meet_warp()
+            store_particle(moved, e, p, s, not stays and s.fault == 0)
+    else:
+        for start in range(0, count, threads_of_block()):
+            p = wp.min(start + t, count - 1)
+            s = Gathered()
+            stays = fails or p < start + t
+            if not stays:
+                s = gather_from_bricks(grid, step, particles, boundaries, blocks, room, moved, failure, e, p)
+            meet_warp()
+            store_particle(moved, e, p, s, not stays and s.fault == 0)

@@ -1,0 +1,330 @@
+"""The grid of a small body in the shared memory of one CUDA block: where its nodes lie there, and how to get at them.
+
+A small body touches two thousand nodes. They fit into the memory that a multiprocessor shares among the threads of a
+CUDA block, where an integer is added a hundred times as fast as in the GPU's own. There they lie in bricks of 2 x 2 x 2
+nodes, numbered anew in every substep as the particles touch them; what touches more than fit goes in several rounds.
+
+An integer has 32 bits. Of mass they count units of 2^-27 of a field's heaviest particle, so a node may hold 16 of them;
+where one gets more, the environment counts anew, eight units as one. Of momentum they count such units at a speed that
+none of the field's particles exceeds, a power of two, in every substep another: so the integers are used to the full,
+and what a particle adds is rounded as a floating-point number would be.
+
+Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; for every brick of every slot a half word, its
+number; a bit for every particle; the bricks' own places; bricks of seven words a node.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.transfer import Scattered
+from piavatar_envs.mpm.types import Blocks, Grid, Room, vec8, vec8i
+
+wp.set_module_options({"enable_backward": False})
+
+#: Words of a node: mass, physical and kinematic momentum; odd, for the banks. Later: whether a boundary is near, and
+#: the velocities.
+NODE_WORDS = 7
+#: Words of a brick of 2 x 2 x 2 nodes.
+BRICK_WORDS = wp.constant(8 * NODE_WORDS)
+#: Bricks of a block of 4 x 4 x 4 nodes.
+BLOCK_BRICKS = wp.constant(8)
+#: Words of the header: bricks in use; bits FAILURE_*; not 0 if a particle tells its place; not 0 if a node holds too
+#: much; units in a field's heaviest particle; and of every field, of which
+#: there are 32 at most, for they are bits of a block's mask: the mass of its heaviest particle [kg], the speed of its
+#: fastest, and the speed that its momenta are counted at [m/s].
+HEADER = wp.constant(104)
+COUNT, FAULTS, TOLD, CROWDED, UNITS = (wp.constant(n) for n in range(5))
+HEAVIEST, FASTEST, SPEED = (wp.constant(n) for n in (8, 40, 72))
+#: Units of mass in a field's heaviest particle, if no node holds too much.
+MOST_UNITS = wp.constant(float(2**27))
+#: No brick has this number.
+NO_BRICK = wp.constant(0xFFFF)
+
+
+def _native(cuda: str, otherwise: str = "") -> str:
+    """A snippet that finds the room as ``room``; on a CPU, where nobody launches it, ``otherwise``."""
+    start = "extern __shared__ int piavatar_room[];\nint* const room = piavatar_room;\n"
+    return f"#if defined(__CUDA_ARCH__)\n{start}{cuda}\n#else\n{otherwise}\n#endif\n"
+
+
+@wp.func_native(_native("__syncwarp();"))
+def meet_warp():
+    """Wait for the other threads of the warp: where not all of them have come, they do one after the other."""
+    ...
+
+
+@wp.func_native(_native("return threadIdx.x;", "return 0;"))
+def thread_of_block() -> int:
+    """Place of a thread in its CUDA block."""
+    ...
+
+
+@wp.func_native(_native("return blockDim.x;", "return 1;"))
+def threads_of_block() -> int:
+    """Threads of a CUDA block."""
+    ...
+
+
+@wp.func_native(_native("__syncthreads();"))
+def meet():
+    """Wait for the other threads of the CUDA block."""
+    ...
+
+
+@wp.func_native(_native("return room[at];", "return 0;"))
+def word(at: int) -> int:
+    """Word ``at``."""
+    ...
+
+
+@wp.func_native(_native("room[at] = value;"))
+def set_word(at: int, value: int):
+    """Write word ``at``."""
+    ...
+
+
+@wp.func_native(_native("atomicOr(room + at, bits);"))
+def or_word(at: int, bits: int):
+    """Set bits of word ``at``."""
+    ...
+
+
+@wp.func_native(_native("return reinterpret_cast<const unsigned short*>(room + at)[n];", "return 0;"))
+def half_word(at: int, n: int) -> int:
+    """Half word ``n`` after word ``at``."""
+    ...
+
+
+@wp.func_native(_native("reinterpret_cast<unsigned short*>(room + at)[n] = (unsigned short)value;"))
+def set_half_word(at: int, n: int, value: int):
+    """Write half word ``n`` after word ``at``."""
+    ...
+
+
+@wp.func_native(_native("if (value > __int_as_float(room[at])) atomicMax(room + at, __float_as_int(value));"))
+def raise_to(at: int, value: float):
+    """Make the number in word ``at`` at least ``value``, which is not negative."""
+    ...
+
+
+@wp.func_native(_native("return __int_as_float(room[at]);", "return 0.0f;"))
+def number(at: int) -> float:
+    """The number in word ``at``."""
+    ...
+
+
+@wp.func_native(_native("room[at] = __float_as_int(value);"))
+def set_number(at: int, value: float):
+    """Write a number to word ``at``."""
+    ...
+
+
+@wp.func_native(_native("return __uint_as_float((__float_as_uint(x) + 0x7fffffu) & 0xff800000u);", "return x;"))
+def power_of_two(x: float) -> float:
+    """The least power of two that is not below ``x``, which is positive or 0."""
+    ...
+
+
+@wp.func_native(
+    _native("""
+int4* const first = reinterpret_cast<int4*>(room + start);
+const int4 zero = make_int4(0, 0, 0, 0);
+for (int n = threadIdx.x; n < words / 4; n += blockDim.x) first[n] = zero;
+""")
+)
+def clear_words(start: int, words: int):
+    """Zero ``words`` words, a multiple of four; ``start`` is one, too."""
+    ...
+
+
+@wp.func_native(
+    _native("""
+unsigned short* const number = reinterpret_cast<unsigned short*>(room + numbers);
+unsigned short* const place = reinterpret_cast<unsigned short*>(room + places);
+if (threadIdx.x < 32) {
+    int count = 0;
+    for (int n = threadIdx.x; n - (int)threadIdx.x < most; n += 32) {
+        const bool touched = n < most && number[n] != 0;
+        const unsigned all = __ballot_sync(0xffffffffu, touched);
+        const int own = count + __popc(all & ((1u << threadIdx.x) - 1u));
+        if (n < most) number[n] = touched ? own : 0xFFFF;
+        if (touched) place[own] = n;
+        count += __popc(all);
+    }
+    if (threadIdx.x == 0) room[0] = count;
+}
+""")
+)
+def number_bricks(numbers: int, places: int, most: int):
+    """Number the bricks whose half word is not 0, of ``most``, and note their places."""
+    ...
+
+
+_AROUND = """
+const int* const slots = &wp::index(blocks.slot, e, field * grid.num_blocks);
+const int ny = grid.blocks[1], nz = grid.blocks[2];
+const int of_x[2] = {(base[0] >> 2) * ny, ((base[0] + 2) >> 2) * ny};
+const int of_y[2] = {base[1] >> 2, (base[1] + 2) >> 2}, of_z[2] = {base[2] >> 2, (base[2] + 2) >> 2};
+const int in_x[2] = {(base[0] & 2) << 1, 4 - ((base[0] & 2) << 1)}, in_y[2] = {base[1] & 2, 2 - (base[1] & 2)};
+const int in_z[2] = {(base[2] & 2) >> 1, 1 - ((base[2] & 2) >> 1)};
+wp::vec_t<8, wp::int32> n;
+for (int i = 0; i < 2; ++i)
+    for (int j = 0; j < 2; ++j)
+        for (int k = 0; k < 2; ++k)
+            n[4 * i + 2 * j + k] = 8 * slots[(of_x[i] + of_y[j]) * nz + of_z[k]] + in_x[i] + in_y[j] + in_z[k];
+"""
+
+
+@wp.func_native(_native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
+def places_around(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i) -> vec8i:
+    """Where the bricks of a stencil have their half words: 8 slot + brick in block, for x, y and z lower and upper."""
+    ...
+
+
+@wp.func_native(
+    _native(
+        _AROUND
+        + """
+const unsigned short* const number = reinterpret_cast<const unsigned short*>(room + layout.numbers);
+for (int b = 0; b < 8; ++b)  // the last brick takes what is not of this round
+    n[b] = layout.bricks + 56 * (int)min((unsigned)(number[n[b]] - first), (unsigned)layout.capacity);
+return n;
+""",
+        "return wp::vec_t<8, wp::int32>();",
+    )
+)
+def bricks_around(grid: Grid, blocks: Blocks, layout: Room, e: int, field: int, base: wp.vec3i, first: int) -> vec8i:
+    """Words at which the bricks of a stencil begin, in a round of bricks from the ``first`` on."""
+    ...
+
+
+@wp.func_native(
+    _native("""
+const int px = s.base[0] & 1, py = s.base[1] & 1, pz = s.base[2] & 1;
+const float m = s.at_base[0] * per_mass;
+float q[3], k[3], along[3][3];
+for (int c = 0; c < 3; ++c) {
+    q[c] = s.at_base[1 + c] * per_momentum;
+    k[c] = s.at_base[4 + c] * per_momentum;
+    for (int d = 0; d < 3; ++d) along[c][d] = s.A.data[c][d] * per_momentum;
+}
+// threads that add to the same word wait for each other: neighbours, which are often in the same cell, take the nodes
+// of a plane in another order
+float weight_y[3], weight_z[3], at_y[3], at_z[3];
+int word_y[3], word_z[3];
+bool upper_y[3], upper_z[3];
+int j = threadIdx.x / 3 % 3, l = threadIdx.x % 3;
+for (int n = 0; n < 3; ++n) {
+    weight_y[n] = j == 0 ? wy[0] : j == 1 ? wy[1] : wy[2];
+    weight_z[n] = l == 0 ? wz[0] : l == 1 ? wz[1] : wz[2];
+    at_y[n] = (float)j, at_z[n] = (float)l;
+    word_y[n] = ((py + j) & 1) * 14, word_z[n] = ((pz + l) & 1) * 7;
+    upper_y[n] = py + j > 1, upper_z[n] = pz + l > 1;
+    j = j == 2 ? 0 : j + 1, l = l == 2 ? 0 : l + 1;
+}
+#pragma unroll 1
+for (int i = 0; i < 3; ++i) {
+    const float wi = i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2];
+    const bool far = px + i > 1;
+    const int b00 = far ? bricks[4] : bricks[0], b01 = far ? bricks[5] : bricks[1];
+    const int b10 = far ? bricks[6] : bricks[2], b11 = far ? bricks[7] : bricks[3];
+    int* const plane = room + ((px + i) & 1) * 28;
+#pragma unroll
+    for (int j = 0; j < 3; ++j) {
+        int* const line = plane + word_y[j];
+        const int first = upper_y[j] ? b10 : b00, last = upper_y[j] ? b11 : b01;
+        const float w = wi * weight_y[j];
+        float at[3];
+        for (int c = 0; c < 3; ++c) at[c] = q[c] + at_y[j] * along[c][1];
+#pragma unroll
+        for (int l = 0; l < 3; ++l) {
+            int* const node = line + (upper_z[l] ? last : first) + word_z[l];
+            const float wl = w * weight_z[l];
+            atomicAdd(node, __float2int_rn(wl * m));
+            for (int c = 0; c < 3; ++c) {
+                atomicAdd(node + 1 + c, __float2int_rn(wl * (at[c] + at_z[l] * along[c][2])));
+                atomicAdd(node + 4 + c, __float2int_rn(wl * k[c]));
+            }
+        }
+    }
+    for (int c = 0; c < 3; ++c) q[c] += along[c][0];
+}
+""")
+)
+def add_to_bricks(
+    bricks: vec8i, s: Scattered, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, per_mass: float, per_momentum: float
+):
+    """Add a particle to the 27 nodes of its stencil, in eight bricks that begin at those words."""
+    ...
+
+
+@wp.func_native(
+    _native("""
+const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
+const float g[3] = {wx[1] + 2.0f * wx[2], wy[1] + 2.0f * wy[2], wz[1] + 2.0f * wz[2]};  // where it is, from the lowest
+#pragma unroll 1
+for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j)
+        for (int l = 0; l < 3; ++l) {
+            const int b = (px + i > 1 ? 4 : 0) + (py + j > 1 ? 2 : 0) + (pz + l > 1 ? 1 : 0);
+            int* const node = room + bricks[b] + ((px + i) & 1) * 28 + ((py + j) & 1) * 14 + ((pz + l) & 1) * 7;
+            const float m = wx[i] * wy[j] * wz[l] * mass;
+            atomicAdd(node, __float2int_rn(m * ((float)i - g[0])));
+            atomicAdd(node + 1, __float2int_rn(m * ((float)j - g[1])));
+            atomicAdd(node + 2, __float2int_rn(m * ((float)l - g[2])));
+            atomicAdd(node + 3, __float2int_rn(m * seam));
+        }
+""")
+)
+def add_place(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, mass: float, seam: float):
+    """Tell the nodes of a stencil where a particle is: ``w m (x_i - x_p) / dx``, and ``w m`` of a seam; in units."""
+    ...
+
+
+@wp.func_native(
+    _native(
+        """
+const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
+const bool far = px + i > 1, upper = py + j > 1;
+const int first = far ? (upper ? bricks[6] : bricks[4]) : (upper ? bricks[2] : bricks[0]);
+const int last = far ? (upper ? bricks[7] : bricks[5]) : (upper ? bricks[3] : bricks[1]);
+const int line = ((px + i) & 1) * 28 + ((py + j) & 1) * 14;
+return wp::vec3i(line + first + pz * 7, line + (pz ? last : first) + (pz ? 0 : 7), line + last + pz * 7);
+""",
+        "return wp::vec3i();",
+    )
+)
+def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
+    """Words of the nodes ``base + (i, j, 0..2)``."""
+    ...
+
+
+@wp.func_native(
+    _native(
+        """
+const float* const node = reinterpret_cast<const float*>(room + at);
+wp::vec_t<8, wp::float32> value;
+value[0] = 0.0f;
+for (int c = 1; c < 7; ++c) value[c] = node[c];
+value[7] = node[0];
+return value;
+""",
+        "return wp::vec_t<8, wp::float32>();",
+    )
+)
+def node_record(at: int) -> vec8:
+    """Nothing, physical and kinematic velocity of the node at a word, 1 near boundaries."""
+    ...
+
+
+@wp.func_native(
+    _native("""
+float* const node = reinterpret_cast<float*>(room + at);
+node[0] = value[7];
+for (int c = 1; c < 7; ++c) node[c] = value[c];
+""")
+)
+def set_node_record(at: int, value: vec8):
+    """Write what :func:`node_record` reads."""
+    ...

@@ -1,0 +1,82 @@
+"""Which worlds have their grids in shared memory, in what parts, and what lies where there.
+
+The bodies of an environment have CUDA blocks of their own where they share no velocity field: until contact they have
+nothing to do with each other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.mpm.shared_grid import BLOCK_BRICKS, BRICK_WORDS, HEADER
+from piavatar_envs.mpm.types import Model, Room
+
+#: Words of a room of which two fit into a multiprocessor, and of one that takes it all; with what stores take of it.
+SMALL_ROOM, LARGE_ROOM = 27_136, 54_528
+#: Threads of their CUDA blocks.
+SMALL_THREADS, LARGE_THREADS = 320, 640
+#: Slots of a part up to which the small one does: they are more than will be used, and half of their nodes.
+MOST_SLOTS_SMALL = 210
+#: Particles of a part up to which its CUDA block has no more to do than others have time for.
+MOST_PARTICLES = 8192
+
+
+def parts_of(field: np.ndarray) -> list[tuple[int, int, int]]:
+    """The shortest runs of particles that share no velocity field, each for a CUDA block of its own.
+
+    Args:
+        field: velocity fields of the particles, shape ``(num_particles,)``.
+
+    Returns:
+        First particle, one after the last, and bits of the fields, of every part.
+    """
+    last = {int(f): int(np.flatnonzero(field == f)[-1]) for f in np.unique(field)}
+    parts, first, end = [], 0, 0
+    for p, f in enumerate(field.tolist()):
+        end = max(end, last[f])
+        if p == end:
+            parts.append((first, p + 1, int(np.bitwise_or.reduce(1 << np.unique(field[first : p + 1])))))
+            first = p + 1
+    return parts
+
+
+def most_particles(field: np.ndarray) -> int:
+    """Particles of the largest part."""
+    return max(end - first for first, end, _ in parts_of(field))
+
+
+def suits_shared(device: str, field: np.ndarray, max_slots: int) -> bool:
+    """Whether environments with such particles may have CUDA blocks of their own, and enough shared memory."""
+    target = wp.get_device(device)
+    if not (target.is_cuda and target.arch >= 80 and most_particles(field) <= MOST_PARTICLES):
+        return False
+    tables = int(BLOCK_BRICKS) * max_slots + len(field) // 32
+    return target.max_shared_memory_per_block >= 227 * 1024 and 4 * tables < LARGE_ROOM
+
+
+def has_large_room(model: Model) -> bool:
+    """Whether the room of a part takes a multiprocessor."""
+    share = most_particles(model.particles.field.numpy()) / model.num_particles
+    return share * model.max_slots > MOST_SLOTS_SMALL
+
+
+def plan_room(model: Model) -> Room:
+    """Where things lie in a room."""
+    room = Room()
+    if model.scatter != "shared":
+        return room
+    words = LARGE_ROOM if has_large_room(model) else SMALL_ROOM
+    room.numbers = int(HEADER)
+    room.told = room.numbers + int(BLOCK_BRICKS) * model.max_slots // 2
+    room.places = _multiple_of_4(room.told + -(-model.num_particles // 32))
+    room.bricks = _multiple_of_4(room.places + int(BLOCK_BRICKS) * model.max_slots // 2)
+    room.capacity = (words - room.bricks) // int(BRICK_WORDS) - 1
+    parts = np.array(parts_of(model.particles.field.numpy()), np.int32)
+    room.part = wp.array(parts, dtype=wp.vec3i, device=model.device)
+    room.speed = wp.zeros((model.num_envs, model.contact.num_fields), dtype=float, device=model.device)
+    return room
+
+
+def _multiple_of_4(words: int) -> int:
+    return -(-words // 4) * 4

@@ -1,0 +1,308 @@
+"""The scatter of a body into the shared memory of its CUDA block: bricks are numbered, and integers added up.
+
+Where they lie is in :mod:`piavatar_envs.mpm.shared_grid`. The result does not depend on the order of the threads, and
+not on how many bricks there is room for.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.blocks import has_field, slots_used
+from piavatar_envs.mpm.runs import fault_of_sums
+from piavatar_envs.mpm.shared_grid import (
+    BLOCK_BRICKS,
+    BRICK_WORDS,
+    COUNT,
+    CROWDED,
+    FASTEST,
+    FAULTS,
+    HEAVIEST,
+    SPEED,
+    TOLD,
+    UNITS,
+    add_place,
+    add_to_bricks,
+    bricks_around,
+    clear_words,
+    half_word,
+    meet,
+    number,
+    number_bricks,
+    or_word,
+    places_around,
+    power_of_two,
+    raise_to,
+    set_half_word,
+    set_number,
+    set_word,
+    thread_of_block,
+    threads_of_block,
+    word,
+)
+from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, grid_position, spline
+from piavatar_envs.mpm.transfer import (
+    Scattered,
+    near_boundary,
+    prepare,
+    scatters,
+)
+from piavatar_envs.mpm.types import (
+    FAILURE_BLOCKS,
+    FAILURE_CFL,
+    FAILURE_NONFINITE,
+    Blocks,
+    Boundaries,
+    Contact,
+    Grid,
+    Moving,
+    Particles,
+    Room,
+    Step,
+    Sums,
+    row,
+)
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+_BLOCKS = wp.constant(FAILURE_BLOCKS)
+_CFL = wp.constant(FAILURE_CFL)
+_NONFINITE = wp.constant(FAILURE_NONFINITE)
+#: Slowest speed that momenta are counted at [m/s].
+SLOWEST = wp.constant(2.0**-20)
+#: Units of mass in a field's heaviest particle where places are told.
+PLACE_UNITS = wp.constant(2.0**23)
+#: A particle that goes or is driven further than this in a substep [grid spacings] has failed, and is not added up.
+MOST_CELLS = wp.constant(8.0)
+
+
+@wp.func
+def lay_out(
+    grid: Grid,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    blocks: Blocks,
+    room: Room,
+    failure: wp.array(dtype=int),
+    e: int,
+    part: wp.vec3i,
+    x: wp.array2d(dtype=wp.vec3),
+):
+    """Number the bricks that particles touch, and find the particles that tell their places."""
+    t = thread_of_block()
+    most = BLOCK_BRICKS * slots_used(blocks, e)
+    clear_words(0, room.places)
+    meet()
+    end = part[1]
+    if blocks.frozen[e] != 0 or (failure[e] & _BLOCKS) != 0:
+        end = part[0]  # they may be anywhere
+    for p in range(part[0] + t, end, threads_of_block()):
+        at = x[e, p]
+        field = particles.field[p]
+        raise_to(HEAVIEST + field, particles.mass[row(e, particles.mass.shape[0]), p])
+        base = base_node(grid_position(grid, at))
+        n = places_around(grid, blocks, e, field, base)
+        for b in range(8):
+            set_half_word(room.numbers, n[b], 1)
+        tells = near_boundary(grid, boundaries, e, at)
+        if contact.num_fields > 1 and not tells:
+            for b in range(8):
+                block = blocks.held[e, n[b] // BLOCK_BRICKS] % grid.num_blocks
+                tells = tells or blocks.fields[e, block] != (1 << field)
+        if tells:
+            or_word(room.told + p // 32, 1 << (p % 32))
+            set_word(TOLD, 1)
+    meet()
+    number_bricks(room.numbers, room.places, most)
+    meet()
+
+
+@wp.func
+def scatter_places(
+    grid: Grid,
+    particles: Particles,
+    blocks: Blocks,
+    room: Room,
+    e: int,
+    part: wp.vec3i,
+    first: int,
+    x: wp.array2d(dtype=wp.vec3),
+    # out
+    sums: Sums,
+):
+    """Where particles are, to the nodes' offsets, from those that tell it."""
+    t = thread_of_block()
+    clear_words(room.bricks, BRICK_WORDS * wp.min(word(COUNT) - first, room.capacity))
+    meet()
+    for p in range(part[0] + t, part[1], threads_of_block()):
+        if ((word(room.told + p // 32) >> (p % 32)) & 1) != 0:
+            field = particles.field[p]
+            xg = grid_position(grid, x[e, p])
+            base = base_node(xg)
+            f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
+            m = particles.mass[row(e, particles.mass.shape[0]), p] / unit_of_place(field)
+            n = bricks_around(grid, blocks, room, e, field, base, first)
+            add_place(n, base, spline(f[0]), spline(f[1]), spline(f[2]), m, particles.seam[p])
+    meet()
+    for n in range(t, 8 * wp.min(word(COUNT) - first, room.capacity), threads_of_block()):
+        at = room.bricks + BRICK_WORDS * (n // 8) + 7 * (n % 8)
+        place = half_word(room.places, first + n // 8)
+        if word(at) != 0 or word(at + 1) != 0 or word(at + 2) != 0 or word(at + 3) != 0:
+            unit = unit_of_place(blocks.held[e, place // BLOCK_BRICKS] // grid.num_blocks)
+            o = (grid.dx * unit) * wp.vec3(float(word(at)), float(word(at + 1)), float(word(at + 2)))
+            sums.offset[e, record_of_place(place, n % 8)] = wp.vec4(o[0], o[1], o[2], unit * float(word(at + 3)))
+    meet()
+
+
+@wp.func
+def unit_of_mass(field: int):
+    """Mass that a word counts [kg], a power of two."""
+    return power_of_two(number(HEAVIEST + field)) / number(UNITS)
+
+
+@wp.func
+def unit_of_place(field: int):
+    """Mass that a word of places counts [kg]: more than it does of masses, for they are seen to after these."""
+    return power_of_two(number(HEAVIEST + field)) / PLACE_UNITS
+
+
+@wp.func
+def record_of_place(place: int, node: int):
+    """Record of node ``node`` of 2 x 2 x 2 of a brick."""
+    brick = place % BLOCK_BRICKS
+    i = ((brick >> 2) << 1) + (node >> 2)
+    j = (((brick >> 1) & 1) << 1) + ((node >> 1) & 1)
+    k = ((brick & 1) << 1) + (node & 1)
+    return BLOCK_NODES * (place // BLOCK_BRICKS) + 16 * i + 4 * j + k
+
+
+@wp.func
+def speed_of(s: Scattered):
+    """A bound of the momenta that a particle adds, by its mass [m/s]."""
+    most = float(0.0)
+    for c in range(3):
+        reach = wp.abs(s.A[c, 0]) + wp.abs(s.A[c, 1]) + wp.abs(s.A[c, 2])
+        center = s.at_base[1 + c] + s.A[c, 0] + s.A[c, 1] + s.A[c, 2]
+        most = wp.max(most, wp.max(wp.abs(center) + reach, wp.abs(s.at_base[4 + c])))
+    return most / s.at_base[0]
+
+
+@wp.func
+def scatter_momenta(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    moving: Moving,
+    blocks: Blocks,
+    room: Room,
+    sums: Sums,
+    failure: wp.array(dtype=int),
+    e: int,
+    part: wp.vec3i,
+    first: int,
+    adds: bool,
+):
+    """Find the fastest particle of every field, and where it ``adds``, add masses and momenta of all to the bricks."""
+    t = thread_of_block()
+    if t < room.speed.shape[1]:
+        set_word(FASTEST + t, 0)
+    if adds:
+        clear_words(room.bricks, BRICK_WORDS * wp.min(word(COUNT) - first, room.capacity))
+    meet()
+    for p in range(part[0] + t, part[1], threads_of_block()):
+        if scatters(blocks, moving, e, p, failure):
+            field = particles.field[p]
+            s = prepare(grid, step, particles, moving, e, p)
+            fault = fault_of_sums(s, sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field])
+            speed = speed_of(s)
+            if fault != 0:
+                wp.atomic_or(failure, e, fault)
+                or_word(FAULTS, fault)
+            elif speed * step.dt > MOST_CELLS * grid.dx:  # the others go on in this substep; it would blur their sums
+                wp.atomic_or(failure, e, _CFL)
+            else:
+                raise_to(FASTEST + field, speed)
+                if adds:
+                    n = bricks_around(grid, blocks, room, e, field, s.base, first)
+                    per_mass = 1.0 / unit_of_mass(field)
+                    per_momentum = per_mass / number(SPEED + field)
+                    add_to_bricks(n, s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_mass, per_momentum)
+        else:
+            or_word(FAULTS, _NONFINITE)
+    meet()
+
+
+@wp.func
+def speed_for(fastest: float):
+    """A power of two that the fastest particle will not exceed, if it does not gain a quarter at once."""
+    return wp.max(SLOWEST, power_of_two(1.25 * fastest))
+
+
+@wp.func
+def speeds_known(room: Room, part: wp.vec3i):
+    """Whether there is a speed at which to count the momenta of every field."""
+    known = bool(True)
+    for f in range(room.speed.shape[1]):
+        known = known and (number(SPEED + f) > 0.0 or not has_field(part[2], f))
+    return known
+
+
+@wp.func
+def sums_hold(room: Room, part: wp.vec3i, first: int):
+    """Whether momenta have been counted at speeds that no particle exceeds, and no word counts more than it can.
+
+    All threads come here.
+    """
+    known = speeds_known(room, part)
+    if known:
+        for n in range(thread_of_block(), 8 * wp.min(word(COUNT) - first, room.capacity), threads_of_block()):
+            if word(room.bricks + BRICK_WORDS * (n // 8) + 7 * (n % 8)) < 0:
+                set_word(CROWDED, 1)
+    meet()
+    hold = known and word(CROWDED) == 0
+    for f in range(room.speed.shape[1]):
+        hold = hold and (number(FASTEST + f) <= number(SPEED + f) or not has_field(part[2], f))
+    return hold
+
+
+@wp.func
+def correct_units(room: Room, part: wp.vec3i):
+    """Count the momenta of fields that were too fast at higher speeds, and in larger units if words were too small.
+
+    All threads come here.
+    """
+    f = thread_of_block()
+    meet()
+    if f == 0 and word(CROWDED) != 0:
+        set_number(UNITS, number(UNITS) / 8.0)
+        set_word(CROWDED, 0)
+    if f < room.speed.shape[1]:
+        slow = number(SPEED + f) == 0.0 or number(FASTEST + f) > number(SPEED + f)
+        if slow and has_field(part[2], f):
+            set_number(SPEED + f, speed_for(number(FASTEST + f)))
+    meet()
+
+
+@wp.func
+def scatter_round(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    moving: Moving,
+    blocks: Blocks,
+    room: Room,
+    sums: Sums,
+    failure: wp.array(dtype=int),
+    e: int,
+    part: wp.vec3i,
+    first: int,
+):
+    """Sums of the bricks from the ``first`` on, in units that hold."""
+    hold = bool(False)
+    while not hold:
+        adds = speeds_known(room, part)
+        scatter_momenta(grid, step, particles, moving, blocks, room, sums, failure, e, part, first, adds)
+        hold = sums_hold(room, part, first)
+        if not hold:
+            correct_units(room, part)
