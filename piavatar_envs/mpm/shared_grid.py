@@ -40,6 +40,8 @@ HEAVIEST, FASTEST, SPEED = (wp.constant(n) for n in (8, 40, 72))
 MOST_UNITS = wp.constant(float(2**27))
 #: No brick has this number.
 NO_BRICK = wp.constant(0xFFFF)
+#: What a brick's place has besides its slot and its number there: a bit for each of its planes of nodes across x.
+PLACES = wp.constant(0x4000)
 
 
 def _native(cuda: str, otherwise: str = "") -> str:

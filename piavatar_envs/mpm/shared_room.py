@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.shared_grid import BLOCK_BRICKS, BRICK_WORDS, HEADER
+from piavatar_envs.mpm.shared_grid import BLOCK_BRICKS, BRICK_WORDS, HEADER, PLACES
 from piavatar_envs.mpm.types import Model, Room
 
 #: Words of a room of which two fit into a multiprocessor, and of one that takes it all; with what stores take of it.
@@ -52,7 +52,8 @@ def suits_shared(device: str, field: np.ndarray, max_slots: int) -> bool:
     if not (target.is_cuda and target.arch >= 80 and most_particles(field) <= MOST_PARTICLES):
         return False
     tables = int(BLOCK_BRICKS) * max_slots + len(field) // 32
-    return target.max_shared_memory_per_block >= 227 * 1024 and 4 * tables < LARGE_ROOM
+    fits = 4 * tables < LARGE_ROOM and int(BLOCK_BRICKS) * max_slots < int(PLACES)
+    return target.max_shared_memory_per_block >= 227 * 1024 and fits
 
 
 def has_large_room(model: Model) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.blocks import has_field, slots_used
+from piavatar_envs.mpm.grid import SLAB_NODES, slab_is_near
 from piavatar_envs.mpm.runs import fault_of_sums
 from piavatar_envs.mpm.shared_grid import (
     BLOCK_BRICKS,
@@ -18,6 +19,7 @@ from piavatar_envs.mpm.shared_grid import (
     FASTEST,
     FAULTS,
     HEAVIEST,
+    PLACES,
     SPEED,
     TOLD,
     UNITS,
@@ -40,7 +42,7 @@ from piavatar_envs.mpm.shared_grid import (
     threads_of_block,
     word,
 )
-from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, grid_position, spline
+from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_corner, grid_position, spline
 from piavatar_envs.mpm.transfer import (
     Scattered,
     near_boundary,
@@ -89,7 +91,10 @@ def lay_out(
     part: wp.vec3i,
     x: wp.array2d(dtype=wp.vec3),
 ):
-    """Number the bricks that particles touch, and find the particles that tell their places."""
+    """Number the bricks that particles touch, and find the particles that tell their places.
+
+    Planes of a brick that a boundary is near have their bits in its place.
+    """
     t = thread_of_block()
     most = BLOCK_BRICKS * slots_used(blocks, e)
     clear_words(0, room.places)
@@ -115,6 +120,15 @@ def lay_out(
             set_word(TOLD, 1)
     meet()
     number_bricks(room.numbers, room.places, most)
+    meet()
+    for n in range(t, word(COUNT), threads_of_block()):
+        place = half_word(room.places, n)
+        corner = block_corner(grid, blocks.held[e, place // BLOCK_BRICKS] % grid.num_blocks)
+        first = record_of_place(place, 0) % BLOCK_NODES
+        for plane in range(2):
+            if slab_is_near(grid, boundaries, e, corner, first + SLAB_NODES * plane):
+                place += PLACES << plane
+        set_half_word(room.places, n, place)
     meet()
 
 
@@ -147,7 +161,7 @@ def scatter_places(
     meet()
     for n in range(t, 8 * wp.min(word(COUNT) - first, room.capacity), threads_of_block()):
         at = room.bricks + BRICK_WORDS * (n // 8) + 7 * (n % 8)
-        place = half_word(room.places, first + n // 8)
+        place = half_word(room.places, first + n // 8) % PLACES
         if word(at) != 0 or word(at + 1) != 0 or word(at + 2) != 0 or word(at + 3) != 0:
             unit = unit_of_place(blocks.held[e, place // BLOCK_BRICKS] // grid.num_blocks)
             o = (grid.dx * unit) * wp.vec3(float(word(at)), float(word(at + 1)), float(word(at + 2)))

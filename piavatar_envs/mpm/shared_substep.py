@@ -14,7 +14,7 @@ from functools import cache
 import warp as wp
 
 from piavatar_envs.mpm.blocks import freeze, has_field, slots_used
-from piavatar_envs.mpm.grid import meet_boundaries, physical_velocity, place_of, slab_is_near, total_velocity
+from piavatar_envs.mpm.grid import meet_boundaries, physical_velocity, place_of, total_velocity
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.shared_gather import gather_all
 from piavatar_envs.mpm.shared_grid import (
@@ -25,6 +25,7 @@ from piavatar_envs.mpm.shared_grid import (
     FAULTS,
     MOST_UNITS,
     NO_BRICK,
+    PLACES,
     SPEED,
     TOLD,
     UNITS,
@@ -93,7 +94,8 @@ def update_bricks(
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     for n in range(thread_of_block(), 8 * wp.min(word(COUNT) - first, room.capacity), threads_of_block()):
         at = room.bricks + BRICK_WORDS * (n // 8) + 7 * (n % 8)
-        place = half_word(room.places, first + n // 8)
+        marked = half_word(room.places, first + n // 8)
+        place = marked % PLACES
         r = record_of_place(place, n % 8)
         held = blocks.held[e, place // BLOCK_BRICKS]
         f = held // grid.num_blocks
@@ -105,14 +107,11 @@ def update_bricks(
             q * float(word(at + 4)), q * float(word(at + 5)), q * float(word(at + 6)), 0.0,
         )  # fmt: skip
         if contact.num_fields == 1 or blocks.fields[e, block] == (1 << f):
-            corner = block_corner(grid, block)
-            local = r % BLOCK_NODES
-            near = slab_is_near(grid, boundaries, e, corner, local)
+            near = (marked & (PLACES << ((n >> 2) & 1))) != 0
             s = total_velocity(step, split, s)
             if near:
-                s = meet_boundaries(
-                    grid, boundaries, contact, sums, e, f, r, place_of(grid, corner, local), s, sensors
-                )  # fmt: skip
+                x = place_of(grid, block_corner(grid, block), r % BLOCK_NODES)
+                s = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, s, sensors)
             s = physical_velocity(split, near, s)
             if near or contact.num_fields > 1:
                 sums.offset[e, r] = wp.vec4()
@@ -133,13 +132,13 @@ def clear_untouched(
     part: wp.vec3i,
 ):
     """Records of nodes that no particle touches, in slots that the fields use; nothing has touched anything yet."""
-    for place in range(thread_of_block(), BLOCK_BRICKS * slots_used(blocks, e), threads_of_block()):
-        slot = place // BLOCK_BRICKS
+    for r in range(thread_of_block(), BLOCK_NODES * slots_used(blocks, e), threads_of_block()):
+        slot = r // BLOCK_NODES
         if has_field(part[2], blocks.held[e, slot] // grid.num_blocks):
-            if half_word(room.numbers, place) == NO_BRICK:
-                for n in range(8):
-                    write_record(node_velocity, e, record_of_place(place, n), vec8())
-            if place % BLOCK_BRICKS == 0:
+            brick = ((r >> 5) & 1) * 4 + ((r >> 3) & 1) * 2 + ((r >> 1) & 1)
+            if half_word(room.numbers, BLOCK_BRICKS * slot + brick) == NO_BRICK:
+                write_record(node_velocity, e, r, vec8())
+            if r % BLOCK_NODES == 0:
                 sensors.touched[e, slot] = 0
 
 
