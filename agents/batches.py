@@ -18,8 +18,8 @@ from pydantic import AfterValidator, BaseModel, Field
 from rich.console import Console
 
 from agents.config import EvaluationSettings, load_resolved
+from agents.curve import Curve
 from agents.evaluate import Agent, Episode, Evaluation
-from agents.learning import Curve
 from agents.report import draw_curve, show_table, versions, write_results
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp

@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, Field
 
 from agents.ppo import PPOSettings
+from agents.sac import SACSettings
 from agents.selfplay import SelfPlaySettings
 from piavatar_envs.envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
 from piavatar_envs.multi import multi_modules
@@ -58,8 +59,11 @@ class TrainingConfig(BaseModel):
         False, description="step the environments as one batch (a GPU's, or on the threads of a CPU), not in processes"
     )
     seed: int = Field(0, ge=0, lt=1000, description="of the networks, the actions and the training episodes")
-    checkpoint_every: int = Field(50_000, ge=1, description="control steps between two checkpoints")
+    checkpoint_every: int = Field(
+        50_000, ge=1, description="control steps between two checkpoints; they are written between rollouts"
+    )
     ppo: PPOSettings = Field(default_factory=PPOSettings, description="the algorithm")
+    sac: SACSettings | None = Field(None, description="the algorithm in place of ppo, for one agent; null for ppo")
     selfplay: SelfPlaySettings | None = Field(
         None, description="agents compete, also with earlier policies; null where there is one, or they have one aim"
     )
@@ -134,8 +138,10 @@ def load_training(
         raise ConfigError(f"vector is for one agent; env_id={config.env_id!r} is a world of several")
     if config.num_workers > MOST_PROCESSES and not config.vector:
         raise ConfigError(f"num_workers={config.num_workers} must be <= {MOST_PROCESSES} processes; use vector=true")
+    if config.sac and config.is_multi:
+        raise ConfigError(f"sac is for one agent; env_id={config.env_id!r} is a world of several, use ppo")
     batch, rollout = config.ppo.batch_size, config.num_workers * config.ppo.rollout_steps
-    if batch > rollout:
+    if batch > rollout and not config.sac:
         raise ConfigError(
             f"ppo.batch_size={batch} must be <= {rollout}, the steps of a rollout (num_workers * ppo.rollout_steps)"
         )

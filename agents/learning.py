@@ -1,59 +1,59 @@
-"""What every training does: begin or go on, watch, book the episodes, leave checkpoints and the policy."""
+"""What every training with stable-baselines3 does: begin or go on, watch, book the episodes, leave policies."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
-from agents import ppo
+from agents import ppo, resume, sac
+from agents.checkpoint import Checkpoint
 from agents.config import TrainingConfig
+from agents.curve import Curve
 from agents.parallel import WAITING
 from agents.rollouts import MarkPlayed
 from agents.workers import EnvFacts, components
+from piavatar_envs.envs.config import ConfigError
 
 
-@dataclass
-class Curve:
-    """Returns of the training episodes, as they ended.
+class Events(TensorBoardOutputFormat):
+    """TensorBoard's files of a run, also of one that was killed and goes on."""
 
-    Attributes:
-        steps: control steps taken by then, over all workers and their learning agents.
-        returns: undiscounted returns, of actions that were drawn at random from the policy.
-        seconds: time that the training took [s].
-    """
+    def __init__(self, folder: Path, steps: int) -> None:
+        """Write to a folder.
 
-    steps: list[int] = field(default_factory=list)
-    returns: list[float] = field(default_factory=list)
-    seconds: float = 0.0
-
-    def save(self, path: Path) -> None:
-        """Write it as CSV."""
-        rows = [f"{step},{value:.6g}" for step, value in zip(self.steps, self.returns, strict=True)]
-        path.write_text("\n".join(["step,return", *rows]) + "\n", encoding="utf-8")
+        Args:
+            folder: for the files; those of the run's earlier parts stay.
+            steps: that the run has had; what it logged of later ones, before it was killed, is no longer shown.
+        """
+        self.writer = SummaryWriter(log_dir=str(folder), purge_step=steps + 1 if steps else None)
+        self._is_closed = False
 
 
 class Progress(BaseCallback):
     """Books the episodes, shows a bar, and ends the training when its time is over."""
 
-    def __init__(self, curve: Curve, total_steps: int, deadline: float | None) -> None:
+    def __init__(self, curve: Curve, total_steps: int, start: float, deadline: float | None) -> None:
         """Watch a training.
 
         Args:
             curve: where to book.
             total_steps: at which the bar is full.
+            start: of the training by ``time.monotonic()``, earlier parts of a resumed one included.
             deadline: by ``time.monotonic()``, or None.
         """
         super().__init__()
-        self.curve, self.total_steps, self.deadline = curve, total_steps, deadline
+        self.curve, self.total_steps, self.start, self.deadline = curve, total_steps, start, deadline
 
     def _on_training_start(self) -> None:
         # where nobody watches, a line now and then will do
@@ -69,58 +69,72 @@ class Progress(BaseCallback):
                 self.curve.returns.append(float(info["episode"]["r"]))
                 self.bar.set_postfix({"return": f"{np.mean(self.curve.returns[-20:]):.1f}"}, refresh=False)
         self.bar.update(self.num_timesteps - self.bar.n)
+        self.curve.seconds = time.monotonic() - self.start
         return self.deadline is None or time.monotonic() < self.deadline
 
     def _on_training_end(self) -> None:
         self.bar.close()
 
 
-def begin(config: TrainingConfig, venv: VecEnv, facts: EnvFacts, resume: Path | None = None) -> PPO:
-    """An agent that has steps to learn from before it.
+def begin(config: TrainingConfig, venv: VecEnv, facts: EnvFacts) -> BaseAlgorithm:
+    """An untrained agent, of the algorithm that the configuration names.
 
     Args:
         config: resolved.
         venv: where to train: the workers, or the learning agents of their worlds.
         facts: of their environment.
-        resume: a checkpoint to go on from, or None.
-
-    Raises:
-        ValueError: the checkpoint has had all its steps already.
-        FileNotFoundError: there is no such checkpoint.
     """
-    monitored = VecMonitor(venv)
-    if resume is not None:
-        model = ppo.resume(resume, monitored, config.seed)
-    else:
-        model = ppo.build(config.ppo, monitored, components(facts.layout, config.observe), config.seed)
-    if model.num_timesteps >= config.total_steps:
-        raise ValueError(
-            f"{resume} has had {model.num_timesteps} steps, total_steps={config.total_steps}; ask for more of them"
-        )
-    return model
+    seen = components(facts.layout, config.observe)
+    if config.sac is not None:
+        return sac.build(config.sac, VecMonitor(venv), seen, config.seed)
+    return ppo.build(config.ppo, VecMonitor(venv), seen, config.seed)
 
 
 def learn(
     config: TrainingConfig,
-    model: PPO,
+    model: BaseAlgorithm,
     folder: Path,
+    checkpoint: Checkpoint | None = None,
     deadline: float | None = None,
     watchers: Sequence[BaseCallback] = (),
 ) -> Curve:
-    """Train until the steps or the time are over; leaves checkpoints, curve and policy in ``folder``.
+    """Train until the steps or the time are over; leaves policies, curve and TensorBoard's files in ``folder``.
 
     Args:
         config: resolved.
         model: from :func:`begin`.
         folder: where to write; exists.
+        checkpoint: from which to go on, and which to keep up; None for a training that cannot be resumed.
         deadline: by ``time.monotonic()``, or None.
-        watchers: what else to call at every step.
+        watchers: what else to call at every step, before the checkpoint is written.
+
+    Raises:
+        ConfigError: the checkpoint has had more steps than the configuration asks for.
     """
-    curve, start = Curve(), time.monotonic()
-    checkpoints = CheckpointCallback(max(1, config.checkpoint_every // model.n_envs), str(folder / "checkpoints"))
-    watch = CallbackList([MarkPlayed(), checkpoints, *watchers, Progress(curve, config.total_steps, deadline)])
-    model.learn(config.total_steps - model.num_timesteps, callback=watch, reset_num_timesteps=False)
-    curve.seconds = time.monotonic() - start
+    curve = Curve()
+    if checkpoint is not None and checkpoint.state is not None:
+        _check_steps(config, model, checkpoint)
+        resume.restore(model, curve, checkpoint.state)
+    start = time.monotonic() - curve.seconds
+    model.set_logger(Logger(folder=None, output_formats=[Events(folder / "tensorboard", model.num_timesteps)]))
+    snapshots = CheckpointCallback(max(1, config.checkpoint_every // model.n_envs), str(folder / "checkpoints"))
+    snapshots.n_calls = model.num_timesteps // model.n_envs
+    watch = [MarkPlayed()] if isinstance(model, PPO) else []
+    watch += [snapshots, *watchers, Progress(curve, config.total_steps, start, deadline)]
+    if checkpoint is not None:
+        watch.append(resume.KeepCheckpoint(checkpoint, config.checkpoint_every, curve))
+    model.learn(config.total_steps - model.num_timesteps, callback=CallbackList(watch), reset_num_timesteps=False)
+    model.logger.close()
     model.save(folder / "policy.zip")
     curve.save(folder / "curve.csv")
     return curve
+
+
+def _check_steps(config: TrainingConfig, model: BaseAlgorithm, checkpoint: Checkpoint) -> None:
+    """Refuse to take back what was trained too much."""
+    had = checkpoint.state["steps"]
+    rollout = model.n_envs * (model.n_steps if isinstance(model, PPO) else model.train_freq.frequency)
+    if had >= config.total_steps + rollout:
+        raise ConfigError(
+            f"{checkpoint.path} has had {had} steps, total_steps={config.total_steps}; ask for as many or more of them"
+        )

@@ -103,6 +103,19 @@ class World(gym.Env):
         terminated = over and bool(info["terminated"].any())
         return self._observation.copy(), float(info["rewards"].mean()), terminated, over and not terminated, info
 
+    def get_state(self) -> dict[str, Any]:
+        """Everything that the future depends on."""
+        return {"env": self.env.get_state(), "seen": self._observation.copy(), "successes": self._successes.copy()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned.
+
+        Raises:
+            ValueError: the state is of another world.
+        """
+        self.env.set_state(state["env"])
+        self._observation, self._successes = state["seen"].copy(), state["successes"].copy()
+
     def _rows(self, values: dict[str, Any], playing: dict[str, Any], dtype: type) -> np.ndarray:
         return np.array([values[name] if name in playing else 0 for name in self.names], dtype)
 
@@ -226,6 +239,23 @@ class AgentVecEnv(VecEnv):
                     self._observation[world] = self.worlds.env_method("reset", indices=world)[0][0]
                 self._take_seats(world)
         return self._observation[self.slot_world, self.slot_agent], rewards, dones, infos
+
+    def get_state(self) -> dict[str, Any]:
+        """Who sits where and plays against whom, and what was seen last; the worlds have states of their own."""
+        return {
+            "seen": self._observation.copy(),
+            "seats": self.slot_agent.copy(),
+            "random": self.rng.bit_generator.state,
+            "drawn": dict(self.opponents.drawn) if self.opponents else {},
+            "pool": list(self.opponents.pool.steps) if self.opponents else [],
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_state` returned; the pool of the opponents is as it was then."""
+        self._observation, self.slot_agent = state["seen"].copy(), state["seats"].copy()
+        self.rng.bit_generator.state = state["random"]
+        if self.opponents:
+            self.opponents.seat(state["drawn"])
 
     def _duel_slot(self, world: int) -> int:
         return self.num_envs - self.worlds.num_envs + world

@@ -7,10 +7,8 @@ already, while some (the height of a root that is held up) hardly vary, and divi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import gymnasium as gym
-import numpy as np
 import torch
 from pydantic import BaseModel, Field
 from stable_baselines3 import PPO
@@ -20,7 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.rollouts import PlayedBuffer
 from piavatar_envs.envs.config import FROZEN
 
-_EPISODE_SEEDS = 1000  # seeds of training episodes that belong to a run's seed
+#: Seeds of training episodes that belong to a run's seed.
+EPISODE_SEEDS = 1000
 
 
 class PPOSettings(BaseModel):
@@ -83,25 +82,5 @@ def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: 
         seed=seed,
         device="cpu",
     )
-    venv.seed(_EPISODE_SEEDS * seed)  # worker i plays the episodes of this seed plus i: no two runs share any
-    return model
-
-
-def resume(path: str | Path, venv: VecEnv, seed: int) -> PPO:
-    """A saved agent with its optimizer's state, to be trained on.
-
-    Args:
-        path: the checkpoint.
-        venv: environments to train in.
-        seed: of the run; with the steps had it says which episodes come next, none of them played before.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it was trained with another observation or action space.
-    """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"no checkpoint {path}; give the .zip that a run has left")
-    model = PPO.load(path, env=venv, device="cpu", rollout_buffer_class=PlayedBuffer)
-    drawn = np.random.SeedSequence((seed, model.num_timesteps)).generate_state(1)[0]
-    venv.seed(2**30 + int(drawn) % 2**30)  # above those of training and of evaluation
+    venv.seed(EPISODE_SEEDS * seed)  # worker i plays the episodes of this seed plus i: no two runs share any
     return model

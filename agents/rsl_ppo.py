@@ -18,8 +18,8 @@ from rsl_rl.utils.log_writer import LogWriter
 from torch.utils.tensorboard import SummaryWriter
 
 from agents.batches import BatchTraining, Learned, run
+from agents.curve import Curve
 from agents.evaluate import Agent
-from agents.learning import Curve
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
 from piavatar_envs.envs.config import FROZEN
 from piavatar_envs.tasks import load_task

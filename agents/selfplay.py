@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
-import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -16,8 +15,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 
+from agents.checkpoint import write_whole
 from agents.parallel import AgentVecEnv
-from piavatar_envs.envs.config import FROZEN
+from piavatar_envs.envs.config import FROZEN, ConfigError
 
 _NAME = re.compile(r"snapshot_(\d+)_steps\.pt")
 
@@ -55,38 +55,26 @@ class Pool:
     """
 
     def __init__(self, folder: Path, steps: Iterable[int] = ()) -> None:
-        """Keep a pool in ``folder``; snapshots that it holds from elsewhere are removed.
+        """Keep a pool in ``folder``; snapshots that it holds besides are removed.
 
         Args:
             folder: made if there is none.
             steps: of the snapshots that the pool begins with; their files exist.
+
+        Raises:
+            ConfigError: one of them has no file.
         """
         self.folder, self.steps = folder, sorted(steps)
         folder.mkdir(parents=True, exist_ok=True)
+        missing = sorted(set(self.steps) - set(_snapshots(folder)))
+        if missing:
+            raise ConfigError(f"{folder} has no {_file_name(missing[0])}; resume in the folder of the run")
         for found in set(_snapshots(folder)) - set(self.steps):
             self._path(found).unlink()
 
-    @classmethod
-    def resumed(cls, folder: Path, checkpoint: Path, steps: int) -> Pool:
-        """The pool as it was when ``checkpoint`` was written, after ``steps`` steps.
-
-        Raises:
-            FileNotFoundError: there is no pool beside the checkpoint.
-        """
-        beside = [parent / "pool" for parent in checkpoint.resolve().parents[:2]]
-        source = next((path for path in beside if _snapshots(path)), None)
-        if source is None:
-            raise FileNotFoundError(f"no snapshots in {beside[0]} or {beside[1]}; resume with the folder of the run")
-        kept = [found for found in _snapshots(source) if found <= steps]
-        folder.mkdir(parents=True, exist_ok=True)
-        if source != folder.resolve():
-            for found in kept:
-                shutil.copyfile(source / _file_name(found), folder / _file_name(found))
-        return cls(folder, kept)
-
     def add(self, policy: BasePolicy, steps: int) -> None:
         """Keep the policy as it is now."""
-        torch.save(policy.state_dict(), self._path(steps))
+        write_whole(self._path(steps), lambda file: torch.save(policy.state_dict(), file))
         self.steps.append(steps)
 
     def load(self, policy: BasePolicy, steps: int) -> None:
@@ -125,6 +113,12 @@ class Opponents:
             self.pool.load(self._policies[world], steps)
             self.drawn[world] = steps
 
+    def seat(self, drawn: Mapping[int, int]) -> None:
+        """Let the snapshots play on that were drawn for the worlds, by their steps."""
+        for world, steps in drawn.items():
+            self.pool.load(self._policies[world], steps)
+        self.drawn = dict(drawn)
+
     def act(self, world: int, observation: np.ndarray) -> np.ndarray:
         """Actions for observations ``(n, observation_size)``."""
         return self._policies[world].predict(observation)[0]
@@ -146,22 +140,21 @@ class Snapshots(BaseCallback):
 
 
 def enter(
-    settings: SelfPlaySettings, venv: AgentVecEnv, model: PPO, folder: Path, checkpoint: Path | None
+    settings: SelfPlaySettings, venv: AgentVecEnv, model: PPO, folder: Path, steps: Iterable[int] = ()
 ) -> Snapshots:
     """Seat the opponents, before the training begins; returns what keeps their pool growing.
 
     Args:
         settings: of self-play.
         venv: the worlds, reset afterwards.
-        model: untrained, or as the checkpoint has it.
+        model: untrained.
         folder: of the run; the pool is in its folder ``pool``.
-        checkpoint: from which the training goes on, or None.
+        steps: of the snapshots of a training that goes on.
 
     Raises:
-        FileNotFoundError: the checkpoint has no pool beside it.
+        ConfigError: one of them has no file.
     """
-    where = folder / "pool"
-    pool = Pool(where) if checkpoint is None else Pool.resumed(where, checkpoint, model.num_timesteps)
+    pool = Pool(folder / "pool", steps)
     if not pool.steps:
         pool.add(model.policy, model.num_timesteps)
     venv.opponents = Opponents(pool, model.policy, venv.duels)

@@ -26,8 +26,8 @@ from skrl.trainers.torch import SequentialTrainer
 
 from agents.batches import BatchTraining, Learned, run
 from agents.config import multi_module
+from agents.curve import Curve
 from agents.evaluate import Agent
-from agents.learning import Curve
 from agents.workers import components
 from piavatar_envs.api.skrl import AvatarSkrlMultiEnv
 from piavatar_envs.envs.config import FROZEN

@@ -2,7 +2,8 @@
 
 The environment is one agent's, or a world of several: then all its learning agents share one policy, and with a section
 ``selfplay`` they compete, also with snapshots of earlier policies. Leaves in the folder: the resolved configuration,
-checkpoints, the policy, every training episode's return, the evaluation, and the snapshots.
+the policy and some on the way there, every training episode's return, TensorBoard's files, the evaluation, and the
+snapshots. What was killed goes on with ``--resume``, from the latest checkpoint and as if nothing had happened.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from pathlib import Path
 
 import tyro
 from rich.console import Console
-from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents import matches, selfplay
+from agents.checkpoint import Checkpoint
 from agents.config import TrainingConfig, load_training
+from agents.curve import Curve
 from agents.evaluate import Evaluation, evaluate, policy_agent
-from agents.learning import Curve, begin, learn
+from agents.learning import begin, learn
 from agents.parallel import AgentVecEnv
 from agents.report import draw_curve, show_matches, show_table, versions, write_results
 from agents.workers import EnvFacts, components, factory, prepare, start_vector, start_workers
@@ -34,53 +37,58 @@ def train(
     venv: VecEnv,
     facts: EnvFacts,
     folder: Path,
-    resume: Path | None = None,
+    checkpoint: Checkpoint | None = None,
     deadline: float | None = None,
-) -> tuple[PPO, Curve]:
-    """Train until the steps or the time are over; leaves checkpoints and the policy in ``folder``.
+) -> tuple[BaseAlgorithm, Curve]:
+    """Train until the steps or the time are over; leaves policies and the curve in ``folder``.
 
     Args:
         config: resolved.
         venv: the workers, or the learning agents of their worlds.
         facts: of their environment.
         folder: where to write; exists.
-        resume: a checkpoint to go on from, up to the same total number of steps.
+        checkpoint: from which to go on, and which to keep up; None for a training that cannot be resumed.
         deadline: by ``time.monotonic()``, or None.
 
     Raises:
-        ValueError: the checkpoint has had all its steps already.
-        FileNotFoundError: there is no such checkpoint.
+        ConfigError: the checkpoint has had more steps than the configuration asks for.
     """
-    model = begin(config, venv, facts, resume)
-    return model, learn(config, model, folder, deadline)
+    model = begin(config, venv, facts)
+    return model, learn(config, model, folder, checkpoint, deadline)
 
 
 def train_single(
-    config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, resume: Path | None
+    config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, checkpoint: Checkpoint | None
 ) -> tuple[Curve, Results]:
     """One agent: train and evaluate it."""
-    model, curve = train(config, workers, facts, folder, resume)
+    model, curve = train(config, workers, facts, folder, checkpoint)
     episodes, first_seed = config.evaluation.episodes, config.evaluation.first_seed
     return curve, [evaluate("trained", policy_agent(model), workers, episodes, first_seed)]
 
 
 def train_together(
-    config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, resume: Path | None
+    config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, checkpoint: Checkpoint | None
 ) -> tuple[Curve, Results]:
     """Agents with one aim: one policy for all, which all learn."""
-    model, curve = train(config, AgentVecEnv(workers), facts, folder, resume)
+    model, curve = train(config, AgentVecEnv(workers), facts, folder, checkpoint)
     return curve, matches.play_together(config, model, workers)
 
 
 def train_selfplay(
-    config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, resume: Path | None
+    config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, checkpoint: Checkpoint | None
 ) -> tuple[Curve, Results]:
     """Agents that compete: one policy for all, against itself and its snapshots."""
     venv = AgentVecEnv(workers, config.selfplay.num_duels(workers.num_envs))
-    model = begin(config, venv, facts, resume)
-    snapshots = selfplay.enter(config.selfplay, venv, model, folder, resume)
-    curve = learn(config, model, folder, watchers=[snapshots])
+    model = begin(config, venv, facts)
+    snapshots = selfplay.enter(config.selfplay, venv, model, folder, pool_of(checkpoint))
+    curve = learn(config, model, folder, checkpoint, watchers=[snapshots])
     return curve, matches.play_matches(config, model, snapshots.pool, workers)
+
+
+def pool_of(checkpoint: Checkpoint | None) -> list[int]:
+    """Steps of the snapshots against which a resumed training plays; none for one that begins."""
+    resumed = checkpoint is not None and checkpoint.state is not None
+    return checkpoint.state["envs"]["folded"]["pool"] if resumed else []
 
 
 @dataclass(frozen=True)
@@ -95,8 +103,8 @@ class Options:
     out: Path | None = None
     #: where to simulate
     device: str = "cpu"
-    #: checkpoint to go on from
-    resume: Path | None = None
+    #: go on from the folder's checkpoint; where there is none, begin
+    resume: bool = False
 
 
 def main(args: list[str] | None = None) -> None:
@@ -107,6 +115,7 @@ def main(args: list[str] | None = None) -> None:
         config = load_training(options.config, parse_assignments(options.settings))
         folder = options.out or Path("runs") / options.config.stem
         folder.mkdir(parents=True, exist_ok=True)
+        checkpoint = Checkpoint(folder, "train", config, options.device, options.resume)
         (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
         make = factory(config, options.device)
         facts = prepare(make)
@@ -116,8 +125,8 @@ def main(args: list[str] | None = None) -> None:
     workers = start_vector(config, options.device) if config.vector else start_workers(make, config.num_workers)
     run = train_selfplay if config.selfplay else train_together if config.is_multi else train_single
     try:
-        curve, results = run(config, workers, facts, folder, options.resume)
-    except (ValueError, FileNotFoundError) as error:
+        curve, results = run(config, workers, facts, folder, checkpoint)
+    except ConfigError as error:
         sys.exit(f"error: {error}")
     finally:
         workers.close()
@@ -127,7 +136,7 @@ def main(args: list[str] | None = None) -> None:
     about = versions("train", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
     write_results(folder / "results.json", about, results, {"training_s": curve.seconds, "agents": facts.agents})
     (show_matches if config.selfplay else show_table)(results, console)
-    files = "policy.zip, curve.png, curve.csv, config.yaml, results.json, checkpoints/"
+    files = "policy.zip, curve.png, curve.csv, config.yaml, results.json, checkpoints/, tensorboard/"
     console.print(f"in {folder}: {files}{', pool/' if config.selfplay else ''}")
 
 

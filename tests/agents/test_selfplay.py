@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -12,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import matches, ppo, selfplay, train
+from agents.checkpoint import Checkpoint
 from agents.config import TrainingConfig, load_training
 from agents.evaluate import Episode, random_agent, zero_agent
 from agents.learning import begin, learn
@@ -19,11 +19,13 @@ from agents.parallel import AgentVecEnv, WorldFactory
 from agents.selfplay import Opponents, Pool, SelfPlaySettings
 from agents.workers import factory, prepare
 from piavatar_envs.envs.config import ConfigError, dump_yaml
+from tests.agents.killing import KillAt, Killed
 
 AUCTION = {
     "env_id": "auction_v0",
     "total_steps": 4 * 192,
     "num_workers": 2,
+    "checkpoint_every": 192,
     "seed": 3,
     "selfplay": {"duel_share": 0.5, "snapshot_every": 192, "evaluate_against": ["random", "first"]},
     "ppo": {"rollout_steps": 64, "batch_size": 48, "epochs": 5, "hidden": [16], "learning_rate": 5e-3},
@@ -37,14 +39,19 @@ def auction(games) -> TrainingConfig:
     return load_training(AUCTION)
 
 
-def play(config: TrainingConfig, folder, resume=None, watcher: BaseCallback | None = None):
+def keep(config: TrainingConfig, folder) -> Checkpoint:
+    folder.mkdir(exist_ok=True)
+    return Checkpoint(folder, "train", config, "cpu", resume=True)
+
+
+def play(config: TrainingConfig, folder, checkpoint: Checkpoint | None = None, watcher: BaseCallback | None = None):
     """What ``train.train_selfplay`` does before it evaluates, with all worlds in this process."""
     make = factory(config)
     folder.mkdir(parents=True, exist_ok=True)
     venv = AgentVecEnv(DummyVecEnv([make] * config.num_workers), config.selfplay.num_duels(config.num_workers))
-    model = begin(config, venv, prepare(make), resume)
-    snapshots = selfplay.enter(config.selfplay, venv, model, folder, resume)
-    curve = learn(config, model, folder, watchers=[snapshots, *([watcher] if watcher else [])])
+    model = begin(config, venv, prepare(make))
+    snapshots = selfplay.enter(config.selfplay, venv, model, folder, train.pool_of(checkpoint))
+    curve = learn(config, model, folder, checkpoint, watchers=[snapshots, *([watcher] if watcher else [])])
     return model, snapshots.pool, curve
 
 
@@ -83,22 +90,17 @@ def test_a_snapshot_is_the_policy_of_its_time(policy, tmp_path):
     )
 
 
-def test_a_pool_is_resumed_as_it_was_and_begins_empty(policy, tmp_path):
-    pool = Pool(tmp_path / "old" / "pool")
+def test_a_pool_goes_on_as_it_was_and_begins_empty(policy, tmp_path):
+    pool = Pool(tmp_path / "pool")
     for steps in (0, 100, 1000):
         pool.add(policy, steps)
-    for checkpoint in ("old/policy.zip", "old/checkpoints/x.zip"):
-        again = Pool.resumed(tmp_path / "new" / "pool", tmp_path / checkpoint, 500)
-        assert again.steps == [0, 100]
-        again.load(policy, 100)
-    assert len(list((tmp_path / "old" / "pool").iterdir())) == 3
-    # in its own folder it forgets what came after the checkpoint
-    assert Pool.resumed(pool.folder, tmp_path / "old" / "policy.zip", 500).steps == [0, 100]
+    # it forgets what came after the checkpoint
+    assert Pool(pool.folder, [0, 100]).steps == [0, 100]
     assert sorted(path.name for path in pool.folder.iterdir()) == ["snapshot_0_steps.pt", "snapshot_100_steps.pt"]
+    with pytest.raises(ConfigError, match=r"has no snapshot_1000_steps\.pt; resume in the folder of the run"):
+        Pool(pool.folder, [0, 100, 1000])
     assert Pool(pool.folder).steps == []
     assert not list(pool.folder.iterdir())
-    with pytest.raises(FileNotFoundError, match="no snapshots in"):
-        Pool.resumed(tmp_path / "new" / "pool", tmp_path / "nowhere" / "checkpoints" / "x.zip", 500)
 
 
 def test_opponents_act_as_the_drawn_snapshot_and_all_are_drawn(policy, tmp_path):
@@ -172,27 +174,25 @@ def test_a_run_repeats_and_depends_on_its_seed(auction, tmp_path):
     assert runs[0][1] != runs[2][1]
 
 
-def test_resuming_goes_on_with_the_pool(auction, tmp_path):
-    half = auction.model_copy(update={"total_steps": 384})
-    play(half, tmp_path / "run")
-    shutil.copytree(tmp_path / "run", tmp_path / "copy")
-    runs = []
-    for folder in ("run", "copy"):
+def test_what_is_interrupted_goes_on_with_its_pool_as_if_it_had_not_been(auction, tmp_path):
+    """Killed in the third rollout; the checkpoint is of its start, when a third snapshot had just joined the pool."""
+    runs = {}
+    for name, stops in (("whole", []), ("parts", [500])):
+        folder = tmp_path / name
+        for at in stops:
+            with pytest.raises(Killed):
+                play(auction, folder, checkpoint=keep(auction, folder), watcher=KillAt(at))
+            (folder / "pool" / "snapshot_9999_steps.pt").touch()  # of a future that will not come
         watch = Watch()
-        model, pool, curve = play(auction, tmp_path / folder, tmp_path / folder / "policy.zip", watch)
-        assert model.num_timesteps == auction.total_steps
-        assert pool.steps == [0, 192, 384, 576]
-        assert min(curve.steps) > 384
-        assert {0, 192} & {steps for _, steps in watch.drawn}  # the old ones play on
-        assert min(watch.seeds) >= 2**30  # in episodes that were not played before
-        runs.append((weights(model), watch.drawn))
-    np.testing.assert_array_equal(runs[0][0], runs[1][0])  # a resumed run repeats as well
-    assert runs[0][1] == runs[1][1]
-    with pytest.raises(FileNotFoundError, match="no snapshots in"):
-        (tmp_path / "alone").mkdir()
-        shutil.copy(tmp_path / "run" / "policy.zip", tmp_path / "alone")
-        longer = auction.model_copy(update={"total_steps": 10_000})
-        play(longer, tmp_path / "else", tmp_path / "alone" / "policy.zip")
+        model, pool, curve = play(auction, folder, checkpoint=keep(auction, folder), watcher=watch)
+        assert model.num_timesteps == auction.total_steps and pool.steps == [0, 192, 384, 576]
+        runs[name] = weights(model), curve, watch.drawn
+    np.testing.assert_array_equal(runs["whole"][0], runs["parts"][0])
+    assert runs["whole"][1].steps == runs["parts"][1].steps
+    assert runs["whole"][1].returns == runs["parts"][1].returns
+    drawn = runs["parts"][2]
+    assert drawn == [(step, snapshot) for step, snapshot in runs["whole"][2] if step > 384]
+    assert {0, 192} & {snapshot for _, snapshot in drawn}  # the old ones play on
 
 
 def test_self_play_beats_where_it_began(games, tmp_path, capsys, monkeypatch):
@@ -202,7 +202,17 @@ def test_self_play_beats_where_it_began(games, tmp_path, capsys, monkeypatch):
     settings = ["total_steps=2304", "selfplay.snapshot_every=576", "checkpoint_every=1000"]
     train.main([str(path), *settings, "--out", str(tmp_path / "run")])
     left = {entry.name for entry in (tmp_path / "run").iterdir()}
-    assert left == {"policy.zip", "curve.png", "curve.csv", "config.yaml", "results.json", "pool", "checkpoints"}
+    assert left == {
+        "policy.zip",
+        "curve.png",
+        "curve.csv",
+        "config.yaml",
+        "results.json",
+        "pool",
+        "checkpoints",
+        "tensorboard",
+        "checkpoint.pt",
+    }
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     assert results["agents"] == ["left", "right"]
     rows = {row["case"]: row for row in results["results"]}

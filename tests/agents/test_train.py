@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 from stable_baselines3 import PPO
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from agents import demo, train
 from agents.config import load_training
 from agents.evaluate import evaluate, policy_agent
 from agents.workers import factory, prepare, start_vector, start_workers
 from piavatar_envs.envs.config import ConfigError, dump_yaml
+
+PUBLISHED = sorted((Path(__file__).resolve().parents[2] / "configs" / "sb3").glob("*.yaml"))
 
 
 @pytest.fixture
@@ -93,9 +96,10 @@ def test_a_vector_trains_what_workers_train(tiny, workers, facts, tmp_path, devi
     np.testing.assert_allclose(*weights, rtol=0.0, atol=0.0 if device == "cpu" else 1e-4)
 
 
-def test_worlds_of_several_are_no_vector():
-    with pytest.raises(ConfigError, match=r"vector is for one agent.*'sumo_v0'"):
-        load_training({"env_id": "sumo_v0", "env": {"fidelity": "tiny"}, "vector": True})
+@pytest.mark.parametrize("what", [{"vector": True}, {"sac": {}}], ids=["vector", "sac"])
+def test_worlds_of_several_are_no_vector_and_not_for_sac(what):
+    with pytest.raises(ConfigError, match=rf"{next(iter(what))} is for one agent.*'sumo_v0'"):
+        load_training({"env_id": "sumo_v0", "env": {"fidelity": "tiny"}} | what)
 
 
 def test_a_thousand_processes_are_refused_and_a_thousand_environments_are_not():
@@ -105,26 +109,26 @@ def test_a_thousand_processes_are_refused_and_a_thousand_environments_are_not():
     assert load_training(many | {"vector": True}).num_workers == 1000
 
 
-def test_the_published_vector_trains(device, tmp_path):
-    path = Path(__file__).resolve().parents[2] / "configs" / "sb3" / "reach_sb3.yaml"
-    small = (
-        "env.fidelity=tiny", "env.episode_seconds=0.5", "total_steps=64", "num_workers=4", "ppo.rollout_steps=16",
-        "ppo.batch_size=16", "ppo.epochs=1", "evaluation.episodes=2",
-    )  # fmt: skip
+@pytest.mark.parametrize("path", PUBLISHED, ids=lambda path: path.stem)
+def test_published_vectors_train_and_leave_their_results(path, device, tmp_path):
+    small = [
+        "env.fidelity=tiny", "env.episode_seconds=0.5", "total_steps=128", "num_workers=4", "evaluation.episodes=2",
+        "checkpoint_every=64",
+    ]  # fmt: skip
+    if load_training(path).sac:
+        small += ["sac.first_random=32", "sac.batch_size=16", "sac.minibatches=2"]
+    else:
+        small += ["ppo.rollout_steps=16", "ppo.batch_size=16", "ppo.epochs=1"]
     train.main([str(path), *small, "--out", str(tmp_path), "--device", device])
     assert load_training(tmp_path / "config.yaml").vector and (tmp_path / "policy.zip").is_file()
-
-
-def test_resuming_goes_on_to_the_total_and_not_beyond(tiny, workers, facts, tmp_path):
-    train.train(tiny, workers, facts, tmp_path)
-    longer = tiny.model_copy(update={"total_steps": 128})
-    model, curve = train.train(longer, workers, facts, tmp_path, resume=tmp_path / "policy.zip")
-    assert model.num_timesteps == 128
-    assert min(curve.steps) > 64  # the first half is not played again
-    with pytest.raises(ValueError, match="has had 128 steps, total_steps=128"):
-        train.train(longer, workers, facts, tmp_path, resume=tmp_path / "policy.zip")
-    with pytest.raises(FileNotFoundError, match=r"no checkpoint .*nowhere\.zip"):
-        train.train(longer, workers, facts, tmp_path, resume=tmp_path / "nowhere.zip")
+    results = json.loads((tmp_path / "results.json").read_text())["results"]
+    assert [row["case"] for row in results][-1] == "trained" and np.isfinite(results[-1]["return_mean"])
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    shown = {"rollout/ep_rew_mean", "rollout/success_rate", "train/learning_rate"}
+    shown |= {"train/ent_coef", "train/actor_loss"} if load_training(path).sac else {"train/value_loss"}
+    assert shown <= set(events.Tags()["scalars"])
+    curve = [line.split(",") for line in (tmp_path / "curve.csv").read_text().split()[1:]]
+    assert events.Scalars("rollout/ep_rew_mean")[-1].step <= 128 and len(curve) == 8
 
 
 def test_checkpoints_come_at_their_steps(tiny, workers, facts, tmp_path):
@@ -146,7 +150,15 @@ def test_the_command_line_trains_and_refuses(tiny, device, tmp_path, capsys):
     path.write_text(dump_yaml(tiny))
     train.main([str(path), "total_steps=32", "--out", str(tmp_path / "run")])
     left = {entry.name for entry in (tmp_path / "run").iterdir()}
-    assert {"policy.zip", "curve.png", "curve.csv", "config.yaml", "results.json"} <= left
+    assert {
+        "tensorboard",
+        "checkpoint.pt",
+        "policy.zip",
+        "curve.png",
+        "curve.csv",
+        "config.yaml",
+        "results.json",
+    } <= left
     assert load_training(tmp_path / "run" / "config.yaml").total_steps == 32
     with pytest.raises(SystemExit) as refused:
         train.main([str(path), "ppo.epoch=3", "--out", str(tmp_path / "run")])

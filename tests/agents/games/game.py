@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import gymnasium as gym
@@ -10,6 +11,9 @@ from pettingzoo import ParallelEnv
 
 from piavatar_envs.envs.config import EnvConfig, load_config
 from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
+
+#: What no game changes while it is played.
+_FIXED = ("config", "device", "render_mode", "possible_agents", "observation_layout", "action_names")
 
 
 class Game(ParallelEnv):
@@ -52,6 +56,15 @@ class Game(ParallelEnv):
         observations = self._observations()
         self.agents = [name for name in self.agents if not terminations[name] and not truncations[name]]
         return observations, rewards, terminations, truncations, infos
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything that the future depends on: what a game has set in :meth:`begin` as well."""
+        return {name: copy.deepcopy(value) for name, value in vars(self).items() if name not in _FIXED}
+
+    def set_state(self, state: dict[str, Any]) -> dict:
+        """Restore what :meth:`get_state` returned."""
+        vars(self).update(copy.deepcopy(state))
+        return self._observations()
 
     def _observations(self) -> dict[str, np.ndarray]:
         return {name: np.array(self.observe(name), np.float32) for name in self.agents}

@@ -1,0 +1,193 @@
+"""The checkpoint of a training: one file, written whole or not at all, that says what it belongs to.
+
+A run that was killed goes on from it, and on a CPU comes to the same curve and the same networks, bit for bit, as one
+that was left alone. For that a checkpoint holds everything that the future depends on: networks, optimizers, random
+numbers, environments, what the learner saw last, and the curve so far. It is read without running code that it might
+carry (``torch.load(weights_only=True)``).
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import random
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel
+
+from benchmarks.runner import git_commit
+from piavatar_envs.doctor import package_version
+from piavatar_envs.envs.config import ConfigError
+
+NAME = "checkpoint.pt"
+#: Of the file's content; rises with every change.
+FORMAT = 1
+#: Settings that what has been learned so far does not depend on.
+FREE = ("total_steps", "iterations", "checkpoint_every", "evaluation")
+#: Packages whose version the arithmetic depends on.
+PACKAGES = (
+    "piavatar-envs", "numpy", "torch", "warp-lang", "gymnasium", "pettingzoo", "stable-baselines3", "rsl-rl-lib",
+)  # fmt: skip
+
+
+def write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
+    """Replace a file by what ``write`` writes: whoever is killed in between, the old one or the new one is there.
+
+    Args:
+        path: of the file. A half of a new one, left by whoever was killed, lies beside it as ``NAME.partial``, and the
+            next write replaces it.
+        write: given a file that is open for bytes.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    with partial.open("wb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+    if hasattr(os, "O_DIRECTORY"):  # the new name, too, must outlast a power cut; Windows has no such call
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+class Checkpoint:
+    """What a run goes on from, and where it leaves the next one.
+
+    Attributes:
+        path: of the file.
+        state: what it held when the run began, or None for a run from the start.
+    """
+
+    def __init__(self, folder: Path, script: str, config: BaseModel, device: str, resume: bool) -> None:
+        """Begin or go on.
+
+        Args:
+            folder: of the run; exists.
+            script: that trains.
+            config: resolved.
+            device: where it simulates and learns.
+            resume: whether to go on from what the folder holds; where it holds nothing, the run begins.
+
+        Raises:
+            ConfigError: a checkpoint of another configuration, device or version, or one that cannot be read; or
+                there is one, and ``resume`` was not asked for.
+        """
+        self.path = folder / NAME
+        self.state: dict[str, Any] | None = None
+        commit, _ = git_commit()
+        self._about = {
+            "script": script,
+            "device": device,
+            "config": config.model_dump(mode="json"),
+            "versions": {name: package_version(name) for name in PACKAGES},
+            "commit": commit,
+        }
+        if not self.path.exists():
+            return
+        if not resume:
+            raise ConfigError(
+                f"{folder} holds a training already; go on with --resume, write to another folder with --out, or "
+                f"delete {self.path} to lose it"
+            )
+        self.state = self._read()
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Keep a state in place of the one before: nested containers of tensors, arrays and plain values."""
+        content = {"format": FORMAT, "about": self._about, "state": as_tensors(state)}
+        write_whole(self.path, lambda file: torch.save(content, file))
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            content = torch.load(self.path, map_location="cpu", weights_only=True)
+        except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ConfigError(f"{self.path} cannot be read ({reason}); delete it to begin anew") from None
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            found = content.get("format") if isinstance(content, dict) else None
+            raise ConfigError(f"{self.path} has format={found}, this reads {FORMAT}; delete it to begin anew")
+        self._compare(content["about"])
+        return content["state"]
+
+    def _compare(self, was: dict[str, Any]) -> None:
+        """Refuse what would not go on as it began."""
+        for section, remedy in (
+            ("versions", "install that version, or begin anew in another folder with --out"),
+            ("config", "give the same settings, or begin anew in another folder with --out"),
+        ):
+            before, now = flattened(was[section]), flattened(self._about[section])
+            for name in sorted(set(before) | set(now)):
+                free = section == "config" and name.partition(".")[0] in FREE
+                if not free and before.get(name) != now.get(name):
+                    raise ConfigError(
+                        f"{self.path} was written with {name}={before.get(name)}, now it is {now.get(name)}; {remedy}"
+                    )
+        for name in ("script", "device"):
+            if was[name] != self._about[name]:
+                raise ConfigError(
+                    f"{self.path} was written with {name} {was[name]!r}, now it is {self._about[name]!r}; use the same"
+                )
+        if was["commit"] != self._about["commit"]:
+            warnings.warn(
+                f"{self.path} was written by commit {was['commit']}, this is {self._about['commit']}: the curve may "
+                "go on otherwise than it would have",
+                stacklevel=4,
+            )
+
+
+def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Leaves of nested dictionaries by dotted name."""
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            found |= flattened(value, f"{prefix}{name}.")
+        else:
+            found[f"{prefix}{name}"] = value
+    return found
+
+
+def as_tensors(value: Any) -> Any:
+    """Nested plain containers with tensors in place of NumPy's arrays, and Python's numbers in place of its scalars."""
+    if isinstance(value, Mapping):
+        return {name: as_tensors(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(as_tensors(item) for item in value)
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(np.array(value))
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def as_arrays(value: Any) -> Any:
+    """What :func:`as_tensors` was given, with NumPy's arrays in place of all tensors."""
+    if isinstance(value, Mapping):
+        return {name: as_arrays(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(as_arrays(item) for item in value)
+    return value.numpy() if isinstance(value, torch.Tensor) else value
+
+
+def random_states() -> dict[str, Any]:
+    """Where the generators are that Python, NumPy and torch share among all who draw."""
+    kind, keys, position, has_gauss, gauss = np.random.get_state()
+    return {
+        "python": random.getstate(),
+        "numpy": {"kind": kind, "keys": keys, "position": position, "has_gauss": has_gauss, "gauss": gauss},
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
+    }
+
+
+def set_random_states(states: Mapping[str, Any]) -> None:
+    """Go on drawing where :func:`random_states` was."""
+    random.setstate(states["python"])
+    own = states["numpy"]
+    np.random.set_state((own["kind"], own["keys"].numpy(), own["position"], own["has_gauss"], own["gauss"]))
+    torch.set_rng_state(states["torch"])
+    if states["cuda"]:
+        torch.cuda.set_rng_state_all(states["cuda"])

@@ -1,0 +1,79 @@
+"""Trainings that are killed: by an exception in this process, or by SIGKILL in one of their own.
+
+``python -m tests.agents.killing train step 40 ARGS`` is ``python -m agents.train ARGS`` until its 40th step of the
+environments, and ``... write 2 ARGS`` until it has written half of its second checkpoint.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+ROOT = Path(__file__).resolve().parents[2]
+#: What takes a step of all environments, in the process that learns.
+_STEPS = {
+    "train": ("stable_baselines3.common.vec_env", "VecMonitor", "step_wait"),
+    "rsl_ppo": ("piavatar_envs.api.rsl_rl", "AvatarRslEnv", "step"),
+}
+
+
+class Killed(Exception):
+    """A training has been killed."""
+
+
+class KillAt(BaseCallback):
+    """Kills a training in this process as soon as it has had some steps."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self.steps:
+            raise Killed
+        return True
+
+
+def run_killed(script: str, when: str, count: int, *args: str) -> None:
+    """Run a training that is killed, and see that it was."""
+    command = [sys.executable, "-m", "tests.agents.killing", script, when, str(count), *args]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == -signal.SIGKILL, done.stdout[-2000:] + done.stderr[-2000:]
+
+
+def main(script: str, when: str, count: int, args: list[str]) -> None:
+    """Be killed."""
+    training = importlib.import_module(f"agents.{script}")
+    left = count
+
+    def counting(original):
+        def counted(*arguments, **keywords):
+            nonlocal left
+            left -= 1
+            if left == 0:
+                if when == "write":
+                    os.ftruncate(arguments[0], os.fstat(arguments[0]).st_size // 2)
+                os.kill(os.getpid(), signal.SIGKILL)
+            return original(*arguments, **keywords)
+
+        return counted
+
+    if when == "write":
+        # the pool's snapshots and the folders are synchronised, too; the checkpoint's file is the only one that is long
+        checkpoint = importlib.import_module("agents.checkpoint")
+        checkpoint.os.fsync = counting(os.fsync)
+    else:
+        module, views, method = _STEPS[script]
+        view = getattr(importlib.import_module(module), views)
+        setattr(view, method, counting(getattr(view, method)))
+    training.main(args)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], int(sys.argv[3]), sys.argv[4:])

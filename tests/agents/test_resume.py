@@ -1,0 +1,230 @@
+"""What is killed goes on as if nothing had happened: the same curve and the same networks, bit for bit."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.vec_env import DummyVecEnv
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from agents import train
+from agents.checkpoint import Checkpoint, as_arrays, as_tensors, random_states, set_random_states, write_whole
+from agents.config import load_training
+from agents.learning import begin, learn
+from agents.workers import factory, prepare, start_vector, start_workers
+from piavatar_envs.envs.config import ConfigError, dump_yaml
+from tests.agents.conftest import TINY
+from tests.agents.killing import KillAt, Killed, run_killed
+
+SAC = {"sac": {"memory_size": 48, "batch_size": 8, "first_random": 8, "hidden": [8]}}
+
+
+def networks(policy: Path) -> dict[str, np.ndarray]:
+    """Weights and the optimizer's moments in a saved policy, flat, by name."""
+    found = {}
+    with ZipFile(policy) as archive:
+        for name in ("policy.pth", "policy.optimizer.pth"):
+            with archive.open(name) as file:
+                found |= leaves(torch.load(file, weights_only=True), name)
+    return found
+
+
+def leaves(value, name: str) -> dict[str, np.ndarray]:
+    if isinstance(value, dict):
+        return {k: v for key, item in value.items() for k, v in leaves(item, f"{name}.{key}").items()}
+    return {name: value.numpy()} if isinstance(value, torch.Tensor) else {}
+
+
+def checkpoint_of(config, folder: Path, resume: bool = True, script: str = "train") -> Checkpoint:
+    folder.mkdir(exist_ok=True)
+    return Checkpoint(folder, script, config, "cpu", resume)
+
+
+def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path):
+    path = tmp_path / "short.yaml"
+    settings = {"total_steps": 160, "checkpoint_every": 32, "seed": 5}
+    path.write_text(dump_yaml(load_training(TINY | settings)))
+    command = [str(path), "--device", device, "--out"]
+    train.main([*command, str(tmp_path / "whole")])
+    parts = tmp_path / "parts"
+    run_killed("train", "step", 75, *command, str(parts))
+    assert checkpoint_steps(parts) == 64
+    assert not (parts / "policy.zip").exists()
+    # the file and its folder are synchronised each time: half of the third checkpoint has been written
+    run_killed("train", "write", 3, *command, str(parts), "--resume")
+    assert checkpoint_steps(parts) == 96
+    half = parts / "checkpoint.pt.partial"
+    assert 0 < half.stat().st_size < (parts / "checkpoint.pt").stat().st_size
+    with pytest.raises(SystemExit) as refused:
+        train.main([*command, str(parts)])
+    assert re.match(r"error: .* holds a training already; go on with --resume, .*--out.*delete", str(refused.value))
+    train.main([*command, str(parts), "--resume"])
+    assert not half.exists()
+    assert (parts / "curve.csv").read_text() == (tmp_path / "whole" / "curve.csv").read_text()
+    assert len((parts / "curve.csv").read_text().splitlines()) == 11  # 160 steps of episodes of 15
+    # TensorBoard forgets what was logged after the checkpoint and lost
+    events = EventAccumulator(str(parts / "tensorboard")).Reload()
+    assert [event.step for event in events.Scalars("time/fps")] == [32, 64, 96, 128, 160]
+    whole, resumed = (networks(tmp_path / run / "policy.zip") for run in ("whole", "parts"))
+    assert len(whole) > 20
+    for name, value in whole.items():
+        np.testing.assert_array_equal(resumed[name], value, err_msg=name)
+
+
+def checkpoint_steps(folder: Path) -> int:
+    return torch.load(folder / "checkpoint.pt", weights_only=True)["state"]["steps"]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"num_workers": 2}, {"num_workers": 3, "vector": True}, SAC],
+    ids=["processes", "vector", "sac"],
+)
+def test_every_way_of_training_goes_on_bit_for_bit(settings, device, tmp_path):
+    config = load_training(TINY | {"total_steps": 192, "checkpoint_every": 40} | settings)
+    facts, make = prepare(factory(config)), factory(config)
+    states, curves = [], []
+    for name, kills in (("whole", ()), ("parts", (70, 150))):
+        if config.vector:
+            venv = start_vector(config)
+        elif kills:
+            venv = start_workers(make, config.num_workers)
+        else:  # one process does what several do
+            venv = DummyVecEnv([make] * config.num_workers)
+        for steps in kills:
+            with pytest.raises(Killed):
+                learn_on(config, venv, facts, tmp_path / name, watchers=[KillAt(steps)])
+        curves.append(learn_on(config, venv, facts, tmp_path / name))
+        venv.close()
+        states.append(as_arrays(checkpoint_of(config, tmp_path / name).state))
+    assert curves[0].returns and curves[0].returns == curves[1].returns and curves[0].steps == curves[1].steps
+    # the last checkpoints hold all there is: networks, moments, random numbers, environments, replayed steps
+    seconds = re.compile(r"\.seconds$|\.latest\.\d+\.2$")
+    whole, parts = (dict(flat(state)) for state in states)
+    assert whole.keys() == parts.keys() and len(whole) > 800
+    for name, value in whole.items():
+        if not seconds.search(name):
+            np.testing.assert_array_equal(parts[name], value, err_msg=name)
+
+
+def learn_on(config, venv, facts, folder: Path, watchers=()):
+    """Begin, or go on where the folder's checkpoint is; the environments may stand anywhere."""
+    return learn(config, begin(config, venv, facts), folder, checkpoint_of(config, folder), watchers=watchers)
+
+
+def flat(value, name: str = ""):
+    """Leaves of nested containers by dotted name."""
+    if isinstance(value, (dict, list, tuple)):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from flat(item, f"{name}.{key}")
+    else:
+        yield name, value
+
+
+def test_a_finished_training_has_nothing_to_do_and_can_be_made_longer(tiny, device, tmp_path):
+    config = tiny.model_copy(update={"checkpoint_every": 32})
+    facts, make = prepare(factory(config)), factory(config)
+    longer = config.model_copy(update={"total_steps": 128})
+
+    def go_on(config, name):
+        venv = start_workers(make, 1)
+        model, curve = train.train(config, venv, facts, tmp_path / name, checkpoint_of(config, tmp_path / name))
+        venv.close()
+        return torch.cat([p.detach().ravel() for p in model.policy.parameters()]).numpy(), curve.returns
+
+    done = go_on(config, "run")
+    np.testing.assert_array_equal(go_on(config, "run")[0], done[0])
+    whole, longer_run = go_on(longer, "whole"), go_on(longer, "run")
+    np.testing.assert_array_equal(longer_run[0], whole[0])
+    assert longer_run[1] == whole[1] and len(whole[1]) > len(done[1])
+    with pytest.raises(ConfigError, match=r"has had 128 steps, total_steps=64; ask for as many or more"):
+        go_on(config, "run")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"seed": 1}, ["seed=0", "now it is 1", "same settings", "--out"]),
+        ({"ppo": {"learning_rate": 0.5}}, ["ppo.learning_rate=0.0007", "now it is 0.5"]),
+        ({"env": {"fidelity": "tiny", "episode_seconds": 0.4}}, ["env.episode_seconds=0.5", "now it is 0.4"]),
+    ],
+)
+def test_another_configuration_is_refused(tiny, change, words, tmp_path):
+    checkpoint_of(tiny, tmp_path).save({})
+    free = {"total_steps": 999, "checkpoint_every": 7, "evaluation": {"episodes": 5}}
+    assert checkpoint_of(load_training(TINY | free), tmp_path).state == {}
+    with pytest.raises(ConfigError) as refused:
+        checkpoint_of(load_training(TINY | {"ppo": TINY["ppo"] | change.pop("ppo", {})} | change), tmp_path)
+    assert "\n" not in str(refused.value)
+    assert all(word in str(refused.value) for word in words), refused.value
+
+
+def test_other_versions_devices_and_scripts_are_refused(tiny, tmp_path, monkeypatch):
+    checkpoint_of(tiny, tmp_path).save({})
+    with pytest.raises(ConfigError, match=r"script 'train', now it is 'rsl_ppo'"):
+        checkpoint_of(tiny, tmp_path, script="rsl_ppo")
+    with pytest.raises(ConfigError, match=r"device 'cpu', now it is 'cuda:0'"):
+        Checkpoint(tmp_path, "train", tiny, "cuda:0", resume=True)
+    with monkeypatch.context() as patch:
+        patch.setattr("agents.checkpoint.package_version", lambda name: "0.0.1" if name == "torch" else "1")
+        with pytest.raises(ConfigError, match=r"now it is .*; install that version, or begin anew"):
+            checkpoint_of(tiny, tmp_path)
+    monkeypatch.setattr("agents.checkpoint.git_commit", lambda: ("abc", False))
+    with pytest.warns(UserWarning, match="this is abc: the curve may go on otherwise"):
+        checkpoint_of(tiny, tmp_path)
+
+
+def test_a_file_that_is_no_checkpoint_is_refused_and_never_run(tiny, tmp_path):
+    path = tmp_path / "checkpoint.pt"
+    path.write_bytes(b"not one")
+    with pytest.raises(ConfigError, match=r"cannot be read \(.*\); delete it to begin anew"):
+        checkpoint_of(tiny, tmp_path)
+    torch.save({"format": 0}, path)
+    with pytest.raises(ConfigError, match="has format=0, this reads 1; delete it"):
+        checkpoint_of(tiny, tmp_path)
+
+    class Trap:
+        def __reduce__(self):
+            return (tmp_path / "sprung").touch, ()
+
+    torch.save({"format": Trap()}, path)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        checkpoint_of(tiny, tmp_path)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path):
+    path = tmp_path / "file"
+    write_whole(path, lambda file: file.write(b"old"))
+
+    def fail(file):
+        file.write(b"ne")
+        raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space"):
+        write_whole(path, fail)
+    assert path.read_bytes() == b"old"
+    write_whole(path, lambda file: file.write(b"new"))
+    assert path.read_bytes() == b"new" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+
+def test_all_random_numbers_go_on(tiny, tmp_path):
+    import random
+
+    def draw():
+        return random.random(), np.random.normal(), np.random.randint(2**31), torch.randn(3).tolist()
+
+    np.random.normal()  # one of a pair is kept for the next call
+    checkpoint_of(tiny, tmp_path).save({"random": random_states(), "tree": {"a": (np.arange(3), np.float32(2.0))}})
+    first = draw()
+    state = checkpoint_of(tiny, tmp_path).state
+    set_random_states(state["random"])
+    assert draw() == first
+    tree = as_arrays(state["tree"])
+    np.testing.assert_array_equal(tree["a"][0], np.arange(3))
+    assert tree["a"][1] == 2.0 and isinstance(as_tensors(np.float32(1.0)), float)
