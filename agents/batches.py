@@ -17,6 +17,7 @@ import tyro
 from pydantic import AfterValidator, BaseModel, Field
 from rich.console import Console
 
+from agents.checkpoint import Checkpoint
 from agents.config import EvaluationSettings, load_resolved
 from agents.curve import Curve
 from agents.evaluate import Agent, Episode, Evaluation
@@ -54,6 +55,7 @@ class BatchTraining(BaseModel):
     num_envs: int = Field(64, ge=1, le=_SEEDS_A_RUN, description="environments of the batch")
     iterations: int = Field(100, ge=1, description="rollouts, each followed by an update")
     seed: int = Field(0, ge=0, lt=1000, description="of the networks, the actions and the training episodes")
+    checkpoint_every: int = Field(10, ge=1, description="iterations between two checkpoints")
     evaluation: EvaluationSettings = Field(default_factory=EvaluationSettings, description="how agents are compared")
 
     @property
@@ -132,6 +134,18 @@ class Learned:
     curve: Curve
 
 
+def iterations_of(checkpoint: Checkpoint, asked: int) -> int:
+    """How many iterations a training has had when it begins or goes on.
+
+    Raises:
+        ConfigError: more than are asked for.
+    """
+    had = checkpoint.state["iterations"] if checkpoint.state else 0
+    if had > asked:
+        raise ConfigError(f"{checkpoint.path} has had {had} iterations, iterations={asked}; ask for as many or more")
+    return had
+
+
 @dataclass(frozen=True)
 class Options:
     """Train agents on one batch of environments, and evaluate them."""
@@ -144,13 +158,15 @@ class Options:
     out: Path | None = None
     #: where to simulate and to learn
     device: str = "cpu"
+    #: go on from the folder's checkpoint; where there is none, begin
+    resume: bool = False
 
 
 def run(
     name: str,
     cls: type[Training],
     find_task: FindTask,
-    learn: Callable[[Training, Task, Path, str], Learned],
+    learn: Callable[[Training, Task, Path, str, Checkpoint], Learned],
     args: list[str] | None = None,
 ) -> None:
     """The command line of a script: train as a file says, evaluate, leave ``results.json`` and a curve.
@@ -159,7 +175,8 @@ def run(
         name: of the script.
         cls: its configuration.
         find_task: the task of an environment's id.
-        learn: trains; given the configuration, the task, the folder to write to and the device.
+        learn: trains; given the configuration, the task, the folder to write to, the device, and the checkpoint from
+            which to go on and which to keep up.
         args: command line, by default the process's own.
     """
     options = tyro.cli(Options, prog=f"python -m agents.{name}", args=args)
@@ -169,8 +186,9 @@ def run(
         task = new_task(config, find_task)
         folder = options.out or Path("runs") / options.config.stem
         folder.mkdir(parents=True, exist_ok=True)
+        checkpoint = Checkpoint(folder, name, config, options.device, options.resume)
         (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
-        learned = learn(config, task, folder, options.device)
+        learned = learn(config, task, folder, options.device, checkpoint)
     except ConfigError as error:
         sys.exit(f"error: {error}")
     batch = BatchedEpisodes(new_task(config, find_task), config.evaluation.episodes, options.device)

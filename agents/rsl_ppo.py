@@ -1,7 +1,8 @@
 """PPO by rsl_rl on a batch of environments: ``python -m agents.rsl_ppo configs/rsl_rl/reach_rsl.yaml``.
 
-Leaves in the folder: the resolved configuration, the networks, TensorBoard's files and rsl_rl's checkpoints, the
-learning curve, and the evaluation.
+Leaves in the folder: the resolved configuration, the networks, TensorBoard's files and rsl_rl's own saved networks, the
+learning curve, and the evaluation. What was killed goes on with ``--resume``, from the latest checkpoint and as if
+nothing had happened.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.log_writer import LogWriter
 from torch.utils.tensorboard import SummaryWriter
 
-from agents.batches import BatchTraining, Learned, run
+from agents.batches import BatchTraining, Learned, iterations_of, run
+from agents.checkpoint import Checkpoint, as_arrays, random_states, set_random_states
 from agents.curve import Curve
 from agents.evaluate import Agent
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
@@ -59,12 +61,22 @@ class RslTraining(BatchTraining):
 class CurveWriter(LogWriter):
     """Writes what rsl_rl reports for TensorBoard, and keeps the mean return of the latest 100 training episodes."""
 
-    def __init__(self, log_dir: str, steps_an_iteration: int) -> None:
-        self.curve, self.steps_an_iteration = Curve(), steps_an_iteration
-        self._events = SummaryWriter(log_dir=log_dir)
+    def __init__(self, log_dir: str, steps_an_iteration: int, first_iteration: int, curve: Curve) -> None:
+        """Write to a folder.
+
+        Args:
+            log_dir: for the files; those of the run's earlier parts stay.
+            steps_an_iteration: of all environments.
+            first_iteration: what was logged of this one and later ones, before the run was killed, is no longer shown.
+            curve: so far.
+        """
+        self.curve, self.steps_an_iteration = curve, steps_an_iteration
+        self._events = SummaryWriter(log_dir=log_dir, purge_step=first_iteration or None)
 
     def add_scalar(self, tag: str, scalar_value: Any, global_step: int) -> None:
         """Log a number of an iteration."""
+        if tag.endswith("/time"):  # against seconds; TensorBoard does that by itself, and would purge it by iterations
+            return
         self._events.add_scalar(tag, scalar_value, global_step)
         if tag == "Train/mean_reward":
             self.curve.steps.append(self.steps_an_iteration * (global_step + 1))
@@ -73,6 +85,77 @@ class CurveWriter(LogWriter):
     def stop(self) -> None:
         """Close the file."""
         self._events.close()
+
+
+class Runner(OnPolicyRunner):
+    """rsl_rl's runner, which keeps up a checkpoint beside the networks that it saves, and goes on from one.
+
+    Attributes:
+        curve: of the training.
+        iterations: how many it has had.
+    """
+
+    def __init__(self, env: AvatarRslEnv, config: RslTraining, folder: Path, checkpoint: Checkpoint) -> None:
+        """Begin, or go on where the checkpoint is."""
+        saved = checkpoint.state
+        self.curve, self.iterations, self.checkpoint = Curve(), saved["iterations"] if saved else 0, checkpoint
+        if saved:
+            self.curve.load(saved["curve"])
+        self._begun = time.monotonic() - self.curve.seconds
+        settings = runner_settings(config) | {
+            "logger": {
+                "class_name": CurveWriter,
+                "steps_an_iteration": config.num_envs * config.ppo.rollout_steps,
+                "first_iteration": self.iterations,
+                "curve": self.curve,
+            }
+        }
+        super().__init__(env, settings, log_dir=str(folder / "rsl_rl"), device=str(env.device))
+        self.logger.git_status_repos.clear()  # results.json says which commit; no diffs of what is around
+        if saved:
+            self._restore(saved)
+
+    def train(self, iterations: int) -> None:
+        """Learn until there have been so many iterations.
+
+        Raises:
+            ConfigError: there have been more already.
+        """
+        left = iterations - iterations_of(self.checkpoint, iterations)
+        if left:
+            self.current_learning_iteration = self.iterations
+            self.learn(left, init_at_random_ep_len=self.iterations == 0)
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        """Save the networks, and the checkpoint; rsl_rl calls it between iterations."""
+        super().save(path, infos)
+        self.iterations, self.curve = self.current_learning_iteration + 1, self.logger.writer.curve
+        self.curve.seconds = time.monotonic() - self._begun
+        self.checkpoint.save(self._state())
+
+    def _state(self) -> dict[str, Any]:
+        log = self.logger
+        return {
+            "iterations": self.iterations,
+            "algorithm": self.alg.save(),
+            "envs": self.env.episodes.get_state(),
+            "returns": [list(log.rewbuffer), list(log.lenbuffer)],
+            "playing": [log.cur_reward_sum, log.cur_episode_length],
+            "logged": [log.tot_timesteps, log.tot_time],
+            "curve": self.curve.state(),
+            "random": random_states(),
+        }
+
+    def _restore(self, saved: dict[str, Any]) -> None:
+        self.alg.load(saved["algorithm"], None, strict=True)  # the adapted learning rate is the optimizer's
+        self.env.episodes.set_state(as_arrays(saved["envs"]))
+        log = self.logger
+        for own, latest in zip((log.rewbuffer, log.lenbuffer), saved["returns"], strict=True):
+            own.extend(latest)
+        for own, sums in zip((log.cur_reward_sum, log.cur_episode_length), saved["playing"], strict=True):
+            own.copy_(sums)
+        log.tot_timesteps, log.tot_time = saved["logged"]
+        set_random_states(saved["random"])
 
 
 def runner_settings(config: RslTraining) -> dict[str, Any]:
@@ -87,8 +170,7 @@ def runner_settings(config: RslTraining) -> dict[str, Any]:
     spread = {"class_name": "GaussianDistribution", "init_std": ppo.action_std, "std_type": "log"}
     return {
         "num_steps_per_env": ppo.rollout_steps,
-        "save_interval": max(1, config.iterations // 10),
-        "logger": {"class_name": CurveWriter, "steps_an_iteration": config.num_envs * ppo.rollout_steps},
+        "save_interval": config.checkpoint_every,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
         "actor": {**network, "distribution_cfg": spread},
         "critic": network,
@@ -109,7 +191,7 @@ def runner_settings(config: RslTraining) -> dict[str, Any]:
     }
 
 
-def learn(config: RslTraining, task: Task, folder: Path, device: str) -> Learned:
+def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:
     """Train an agent.
 
     Args:
@@ -117,22 +199,19 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str) -> Learned
         task: of the environments.
         folder: where to write; exists.
         device: where to simulate and to learn.
+        checkpoint: from which to go on, and which to keep up.
 
     Raises:
-        ConfigError: there is no such term to observe.
+        ConfigError: there is no such term to observe, or the checkpoint has had more iterations than are asked for.
     """
     groups = None if config.observe is None else {"policy": config.observe}
     env = AvatarRslEnv(config.env_id, config.num_envs, device, task.config, groups, config.first_seed)
     torch.manual_seed(config.seed)
-    runner = OnPolicyRunner(env, runner_settings(config), log_dir=str(folder / "rsl_rl"), device=str(env.device))
-    runner.logger.git_status_repos.clear()  # results.json says which commit; no diffs of whatever repository is around
-    start = time.monotonic()
-    runner.learn(config.iterations, init_at_random_ep_len=True)
-    curve = runner.logger.writer.curve
-    curve.seconds = time.monotonic() - start
-    runner.save(str(folder / "policy.pt"))
+    runner = Runner(env, config, folder, checkpoint)
+    runner.train(config.iterations)
+    OnPolicyRunner.save(runner, str(folder / "policy.pt"))  # without another checkpoint
     env.close()
-    return Learned(mean_agent(runner, env), curve)
+    return Learned(mean_agent(runner, env), runner.curve)
 
 
 def mean_agent(runner: OnPolicyRunner, env: AvatarRslEnv) -> Agent:

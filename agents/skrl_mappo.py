@@ -2,58 +2,37 @@
 
 MAPPO (Yu et al., "The Surprising Effectiveness of PPO in Cooperative Multi-Agent Games", 2022): every agent has a
 policy of what it sees itself and a critic of what all of them see. Leaves in the folder: the resolved configuration,
-the networks, TensorBoard's files with skrl's checkpoints, every training episode's return, and the evaluation.
+the networks, TensorBoard's files with networks on the way there, every training episode's return, and the evaluation.
+What was killed goes on with ``--resume``, from the latest checkpoint and as if nothing had happened.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
-from pydantic import BaseModel, Field
+from pydantic import Field
 from skrl import config as skrl_config
 from skrl.envs.wrappers.torch import wrap_env
-from skrl.memories.torch import RandomMemory
-from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
 from skrl.multi_agents.torch.mappo import MAPPO
 from skrl.trainers.torch import SequentialTrainer
 
-from agents.batches import BatchTraining, Learned, run
+from agents.batches import BatchTraining, Learned, iterations_of, run
+from agents.checkpoint import Checkpoint, as_arrays, random_states, set_random_states
 from agents.config import multi_module
 from agents.curve import Curve
 from agents.evaluate import Agent
+from agents.skrl_networks import ActedMemory, Critic, MAPPOSettings, Policy
 from agents.workers import components
 from piavatar_envs.api.skrl import AvatarSkrlMultiEnv
-from piavatar_envs.envs.config import FROZEN
 from piavatar_envs.tasks.base import Task
 
 #: Parts of skrl's MAPPO that are not used.
 _OPTIONAL = ("learning_rate_scheduler", "observation_preprocessor", "state_preprocessor", "value_preprocessor")
-
-
-class MAPPOSettings(BaseModel):
-    """Hyper-parameters of MAPPO."""
-
-    model_config = FROZEN
-
-    rollout_steps: int = Field(32, ge=2, description="steps of every world between two updates")
-    epochs: int = Field(8, ge=1, description="passes over a rollout")
-    minibatches: int = Field(4, ge=1, description="minibatches in a pass")
-    learning_rate: float = Field(5.0e-4, gt=0.0, description="Adam's learning rate [-]")
-    discount: float = Field(0.95, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
-    gae_lambda: float = Field(0.9, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
-    clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
-    value_weight: float = Field(0.5, ge=0.0, description="weight of the critic's squared error [-]")
-    entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
-    largest_gradient: float = Field(0.5, ge=0.0, description="norm to which gradients are clipped [-]; 0 for never")
-    log_std: float = Field(-0.7, ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")
-    hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of both networks")
 
 
 class MAPPOTraining(BatchTraining):
@@ -72,79 +51,48 @@ def find_world(env_id: str) -> type[Task]:
     return multi_module(env_id).TASK
 
 
-def layers(seen: int, hidden: Sequence[int], out: int) -> torch.nn.Sequential:
-    """A network with tanh between its layers, whose first answers are near zero."""
-    widths = [seen, *hidden]
-    inner = [module for size, width in pairwise(widths) for module in (torch.nn.Linear(size, width), torch.nn.Tanh())]
-    last = torch.nn.Linear(widths[-1], out)
-    torch.nn.init.orthogonal_(last.weight, 0.01)
-    torch.nn.init.zeros_(last.bias)
-    return torch.nn.Sequential(*inner, last)
+class Worlds(AvatarSkrlMultiEnv):
+    """Worlds that stand where a checkpoint is when skrl's trainer has reset them, which it does first of all.
 
+    Attributes:
+        saved: the state of the worlds; None for new episodes.
+    """
 
-class Policy(GaussianMixin, Model):
-    """Normally distributed actions from some components of the agent's observation."""
+    saved: dict[str, np.ndarray] | None = None
 
-    def __init__(
-        self, observation: gym.Space, action: gym.Space, seen: Sequence[int], settings: MAPPOSettings, device: Any
-    ) -> None:
-        Model.__init__(self, observation_space=observation, action_space=action, device=device)
-        GaussianMixin.__init__(self)
-        self.register_buffer("seen", torch.as_tensor(list(seen)))
-        self.net = layers(len(seen), settings.hidden, self.num_actions)
-        self.log_std = torch.nn.Parameter(torch.full((self.num_actions,), settings.log_std))
-
-    def compute(self, inputs: dict[str, torch.Tensor], role: str = "") -> tuple[torch.Tensor, dict[str, Any]]:
-        """Mean actions and the logarithm of their spread."""
-        return self.net(inputs["observations"][:, self.seen]), {"log_std": self.log_std}
-
-
-class Critic(DeterministicMixin, Model):
-    """The value of a world for one agent, from the same components of all agents' observations."""
-
-    def __init__(self, state: gym.Space, seen: Sequence[int], settings: MAPPOSettings, device: Any) -> None:
-        Model.__init__(self, state_space=state, device=device)
-        DeterministicMixin.__init__(self)
-        self.register_buffer("seen", torch.as_tensor(list(seen)))
-        self.net = layers(len(seen), settings.hidden, 1)
-
-    def compute(self, inputs: dict[str, torch.Tensor], role: str = "") -> tuple[torch.Tensor, dict[str, Any]]:
-        """The value."""
-        return self.net(inputs["states"][:, self.seen]), {}
-
-
-class ActedMemory(RandomMemory):
-    """Gives the loss only the steps that the agent took itself, not those for which it was out."""
-
-    def __init__(self, memory_size: int, num_envs: int, device: Any) -> None:
-        super().__init__(memory_size=memory_size, num_envs=num_envs, device=device)
-        self.acted = torch.ones(memory_size, num_envs, dtype=torch.bool, device=self.device)
-
-    def set_tensor_by_name(self, name: str, tensor: torch.Tensor) -> None:
-        """As its base does, but advantages are normalised over the steps that count."""
-        if name == "advantages" and self.acted.any():
-            counted = tensor[self.acted]
-            tensor = (tensor - counted.mean()) / (counted.std(unbiased=False) + 1e-8)
-        super().set_tensor_by_name(name, tensor)
-
-    def sample(
-        self, names: list[str], *, batch_size: int, mini_batches: int = 1, sequence_length: int = 1
-    ) -> list[list[torch.Tensor]]:
-        """Minibatches in random order; none at all where the agent was out all the time."""
-        rows = self.acted.flatten().nonzero().flatten().cpu()
-        rows = rows[torch.randperm(len(rows))]
-        return self.sample_by_index(names, indexes=rows, mini_batches=min(mini_batches, len(rows))) if len(rows) else []
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode in every world, or go on."""
+        begun = super().reset(seed, options)
+        if self.saved is None:
+            return begun
+        self.episodes.set_state(self.saved)
+        return self._seen(self.episodes.observation()), {"alive": self._by_agent(self.episodes.alive())}
 
 
 class WorldMAPPO(MAPPO):
-    """skrl's MAPPO, told by the view who acted and where the episodes really ended.
+    """skrl's MAPPO, told by the view who acted and where the episodes really ended, and kept up by a checkpoint.
 
     Without that it would take the first observation of the next episode for the last one of a truncated episode.
+
+    Attributes:
+        curve: of the training.
+        iterations: how many it has had.
     """
 
-    def __init__(self, curve: Curve, **arguments: Any) -> None:
+    def __init__(self, env: Worlds, checkpoint: Checkpoint | None, checkpoint_every: int, **arguments: Any) -> None:
+        """Begin; :meth:`resume` goes on where the checkpoint is.
+
+        Args:
+            env: the worlds.
+            checkpoint: from which to go on, and which to keep up; None for neither.
+            checkpoint_every: iterations.
+            **arguments: of skrl's MAPPO.
+        """
         super().__init__(**arguments)
-        self.curve, self._steps, self._totals = curve, 0, 0.0
+        self.env, self.checkpoint, self.checkpoint_every = env, checkpoint, checkpoint_every
+        self.curve, self.iterations = Curve(), 0
+        self._first_step, self._steps, self._totals = 0, 0, torch.zeros(env.num_envs, device=self.device)
+        self._begun = time.monotonic()
 
     def record_transition(self, *, infos: dict[str, Any], rewards: dict[str, torch.Tensor], **transition: Any) -> None:
         """Store a step."""
@@ -166,8 +114,53 @@ class WorldMAPPO(MAPPO):
         self.curve.returns += returns
         self._totals[ended] = 0.0
 
+    def post_interaction(self, *, timestep: int, timesteps: int) -> None:
+        """Learn at the end of a rollout, and write the checkpoint when its time has come, and at the end."""
+        super().post_interaction(timestep=self._first_step + timestep, timesteps=timesteps)
+        if self._rollout % self.cfg.rollouts == 0:
+            self.iterations += 1
+            self.curve.seconds = time.monotonic() - self._begun
+            due = self.iterations % self.checkpoint_every == 0 or timestep + 1 == timesteps
+            if self.checkpoint is not None and due:
+                self.checkpoint.save(self._state())
 
-def learn(config: MAPPOTraining, task: Task, folder: Path, device: str) -> Learned:
+    def _state(self) -> dict[str, Any]:
+        return {
+            "iterations": self.iterations,
+            "agents": {
+                name: {part: module.state_dict() for part, module in modules.items()}
+                for name, modules in self._modules()
+            },
+            "envs": self.env.episodes.get_state(),
+            "playing": [self._steps, self._totals],
+            "curve": self.curve.state(),
+            "random": random_states(),
+        }
+
+    def _modules(self) -> Iterable[tuple[str, dict[str, Any]]]:
+        """Networks and optimizers of every agent."""
+        for name, modules in self.checkpoint_modules.items():
+            yield name, {part: module for part, module in modules.items() if hasattr(module, "state_dict")}
+
+    def resume(self) -> None:
+        """Go on where the checkpoint is, if it is of a training; the last of all that draws random numbers before."""
+        saved = self.checkpoint.state if self.checkpoint else None
+        if saved is None:
+            return
+        for name, modules in self._modules():
+            for part, module in modules.items():
+                module.load_state_dict(saved["agents"][name][part])
+        self.env.saved = as_arrays(saved["envs"])
+        self.iterations = saved["iterations"]
+        self._first_step = self.iterations * self.cfg.rollouts
+        self._steps, totals = saved["playing"]
+        self._totals = totals.to(self.device)
+        self.curve.load(saved["curve"])
+        self._begun = time.monotonic() - self.curve.seconds
+        set_random_states(saved["random"])
+
+
+def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:
     """Train the agents of a world.
 
     Args:
@@ -175,33 +168,34 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str) -> Learn
         task: the world's.
         folder: where to write; exists.
         device: where to simulate and to learn.
+        checkpoint: from which to go on, and which to keep up.
 
     Raises:
-        ConfigError: there is no such term to observe.
+        ConfigError: there is no such term to observe, or the checkpoint has had more iterations than are asked for.
     """
-    env = AvatarSkrlMultiEnv(type(task), config.num_envs, device, task.config)
+    env = Worlds(type(task), config.num_envs, device, task.config)
     torch.manual_seed(config.seed)
     skrl_config.torch.key = config.first_seed  # what skrl's wrapper seeds the worlds with
-    mappo = build(config, env, folder)
+    mappo = build(config, env, folder, checkpoint)
+    left = config.iterations - iterations_of(checkpoint, config.iterations)
     trainer = SequentialTrainer(
         env=wrap_env(env, wrapper="isaaclab-multi-agent", verbose=False),
         agents=mappo,
         cfg={
-            "timesteps": config.iterations * config.mappo.rollout_steps,
+            "timesteps": left * config.mappo.rollout_steps,
             "headless": True,
             "disable_progressbar": None,
             "close_environment_at_exit": False,
         },
     )
-    start = time.monotonic()
+    mappo.resume()
     trainer.train()
-    mappo.curve.seconds = time.monotonic() - start
     mappo.save(str(folder / "policy.pt"))
     env.close()
     return Learned(joint_agent(mappo), mappo.curve)
 
 
-def build(config: MAPPOTraining, env: AvatarSkrlMultiEnv, folder: Path) -> WorldMAPPO:
+def build(config: MAPPOTraining, env: Worlds, folder: Path, checkpoint: Checkpoint | None = None) -> WorldMAPPO:
     """Untrained agents.
 
     Raises:
@@ -211,7 +205,9 @@ def build(config: MAPPOTraining, env: AvatarSkrlMultiEnv, folder: Path) -> World
     seen = components(layout, config.observe)
     of_all = [agent * layout.size + index for agent in range(env.num_agents) for index in seen]
     return WorldMAPPO(
-        Curve(),
+        env,
+        checkpoint,
+        config.checkpoint_every,
         possible_agents=names,
         models={
             name: {

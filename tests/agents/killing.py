@@ -12,7 +12,9 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,6 +47,14 @@ def run_killed(script: str, when: str, count: int, *args: str) -> None:
     command = [sys.executable, "-m", "tests.agents.killing", script, when, str(count), *args]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == -signal.SIGKILL, done.stdout[-2000:] + done.stderr[-2000:]
+
+
+def flat(value: Any, name: str = "") -> dict[str, str]:
+    """Leaves of nested containers by dotted name: the bits of arrays and tensors, everything else as it is written."""
+    if isinstance(value, (dict, list, tuple)):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return {key: bits for part, item in items for key, bits in flat(item, f"{name}.{part}").items()}
+    return {name: repr(value) if np.isscalar(value) or value is None else np.asarray(value).tobytes().hex()}
 
 
 def main(script: str, when: str, count: int, args: list[str]) -> None:

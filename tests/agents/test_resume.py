@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -19,25 +20,19 @@ from agents.learning import begin, learn
 from agents.workers import factory, prepare, start_vector, start_workers
 from piavatar_envs.envs.config import ConfigError, dump_yaml
 from tests.agents.conftest import TINY
-from tests.agents.killing import KillAt, Killed, run_killed
+from tests.agents.killing import KillAt, Killed, flat, run_killed
 
 SAC = {"sac": {"memory_size": 48, "batch_size": 8, "first_random": 8, "hidden": [8]}}
 
 
-def networks(policy: Path) -> dict[str, np.ndarray]:
-    """Weights and the optimizer's moments in a saved policy, flat, by name."""
+def networks(policy: Path) -> dict[str, str]:
+    """Weights and the optimizer's moments in a saved policy, by name."""
     found = {}
     with ZipFile(policy) as archive:
         for name in ("policy.pth", "policy.optimizer.pth"):
             with archive.open(name) as file:
-                found |= leaves(torch.load(file, weights_only=True), name)
+                found |= flat(torch.load(file, weights_only=True), name)
     return found
-
-
-def leaves(value, name: str) -> dict[str, np.ndarray]:
-    if isinstance(value, dict):
-        return {k: v for key, item in value.items() for k, v in leaves(item, f"{name}.{key}").items()}
-    return {name: value.numpy()} if isinstance(value, torch.Tensor) else {}
 
 
 def checkpoint_of(config, folder: Path, resume: bool = True, script: str = "train") -> Checkpoint:
@@ -63,6 +58,7 @@ def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path):
     with pytest.raises(SystemExit) as refused:
         train.main([*command, str(parts)])
     assert re.match(r"error: .* holds a training already; go on with --resume, .*--out.*delete", str(refused.value))
+    time.sleep(1.0)  # TensorBoard orders a run's files by the second in which they were begun
     train.main([*command, str(parts), "--resume"])
     assert not half.exists()
     assert (parts / "curve.csv").read_text() == (tmp_path / "whole" / "curve.csv").read_text()
@@ -71,9 +67,7 @@ def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path):
     events = EventAccumulator(str(parts / "tensorboard")).Reload()
     assert [event.step for event in events.Scalars("time/fps")] == [32, 64, 96, 128, 160]
     whole, resumed = (networks(tmp_path / run / "policy.zip") for run in ("whole", "parts"))
-    assert len(whole) > 20
-    for name, value in whole.items():
-        np.testing.assert_array_equal(resumed[name], value, err_msg=name)
+    assert len(whole) > 20 and resumed == whole
 
 
 def checkpoint_steps(folder: Path) -> int:
@@ -101,29 +95,18 @@ def test_every_way_of_training_goes_on_bit_for_bit(settings, device, tmp_path):
                 learn_on(config, venv, facts, tmp_path / name, watchers=[KillAt(steps)])
         curves.append(learn_on(config, venv, facts, tmp_path / name))
         venv.close()
-        states.append(as_arrays(checkpoint_of(config, tmp_path / name).state))
+        states.append(checkpoint_of(config, tmp_path / name).state)
     assert curves[0].returns and curves[0].returns == curves[1].returns and curves[0].steps == curves[1].steps
     # the last checkpoints hold all there is: networks, moments, random numbers, environments, replayed steps
     seconds = re.compile(r"\.seconds$|\.latest\.\d+\.2$")
-    whole, parts = (dict(flat(state)) for state in states)
+    whole, parts = (flat(state) for state in states)
     assert whole.keys() == parts.keys() and len(whole) > 800
-    for name, value in whole.items():
-        if not seconds.search(name):
-            np.testing.assert_array_equal(parts[name], value, err_msg=name)
+    assert [name for name in whole if parts[name] != whole[name] and not seconds.search(name)] == []
 
 
 def learn_on(config, venv, facts, folder: Path, watchers=()):
     """Begin, or go on where the folder's checkpoint is; the environments may stand anywhere."""
     return learn(config, begin(config, venv, facts), folder, checkpoint_of(config, folder), watchers=watchers)
-
-
-def flat(value, name: str = ""):
-    """Leaves of nested containers by dotted name."""
-    if isinstance(value, (dict, list, tuple)):
-        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from flat(item, f"{name}.{key}")
-    else:
-        yield name, value
 
 
 def test_a_finished_training_has_nothing_to_do_and_can_be_made_longer(tiny, device, tmp_path):

@@ -14,8 +14,10 @@ for needed in ("rsl_rl", "tensordict", "git"):
 
 from agents import rsl_ppo  # noqa: E402
 from agents.batches import load_batched, new_task  # noqa: E402
+from agents.checkpoint import Checkpoint  # noqa: E402
 from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
+from tests.agents.killing import flat, run_killed  # noqa: E402
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "rsl_rl").glob("*.yaml"))
 TINY = (
@@ -54,8 +56,9 @@ def test_training_changes_the_policy_repeats_and_depends_on_its_seed(device, tmp
         config = load_batched(rsl_ppo.RslTraining, load_task, None, overrides | extra)
         folder = tmp_path / name
         folder.mkdir()
-        agents[name] = rsl_ppo.learn(config, new_task(config, load_task), folder, device).agent
-        saved = torch.load(folder / "policy.pt", weights_only=False, map_location="cpu")
+        checkpoint = Checkpoint(folder, "rsl_ppo", config, device, resume=False)
+        agents[name] = rsl_ppo.learn(config, new_task(config, load_task), folder, device, checkpoint).agent
+        saved = torch.load(folder / "policy.pt", weights_only=True, map_location="cpu")
         actors[name] = {key: value for key, value in saved["actor_state_dict"].items() if "weight" in key}
 
     def apart(one: str, other: str) -> float:
@@ -72,3 +75,27 @@ def test_training_changes_the_policy_repeats_and_depends_on_its_seed(device, tmp
     assert actions.shape[:2] == (4, 1) and np.array_equal(agents["a"](changed), actions), "it sees what was chosen"
     changed[..., chosen] += 1.0
     assert not np.allclose(agents["a"](changed), actions, atol=1e-3)
+
+
+def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path, capsys):
+    """With a rate that adapts and observations that are normalised, whose statistics must go on, too."""
+    path = next(path for path in CONFIGS if path.stem == "kick_ball_rsl")
+    longer = [setting for setting in TINY if not setting.startswith("iterations")]
+    longer += ["checkpoint_every=2", "ppo.normalize_observation=true", "ppo.desired_kl=0.01"]
+    few, command = ([str(path), *longer, f"iterations={n}", "--device", device, "--out"] for n in (4, 6))
+    rsl_ppo.main([*command, str(tmp_path / "whole")])
+    parts = tmp_path / "parts"
+    run_killed("rsl_ppo", "step", 30, *command, str(parts))  # in the fourth iteration; the first and third are kept
+    assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 3
+    run_killed("rsl_ppo", "write", 3, *command, str(parts), "--resume")
+    assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 5
+    assert (parts / "checkpoint.pt.partial").exists()
+    rsl_ppo.main([*command, str(parts), "--resume"])
+    assert (parts / "curve.csv").read_text() == (tmp_path / "whole" / "curve.csv").read_text()
+    whole, resumed = (torch.load(tmp_path / run / "policy.pt", weights_only=True) for run in ("whole", "parts"))
+    assert flat(resumed) == flat(whole) and len(flat(whole)) > 30
+    rates = {torch.load(tmp_path / run / "checkpoint.pt", weights_only=True)["state"]["algorithm"]
+             ["optimizer_state_dict"]["param_groups"][0]["lr"] for run in ("whole", "parts")}  # fmt: skip
+    assert len(rates) == 1 and rates != {1e-3}  # the rate has adapted, and alike
+    with pytest.raises(SystemExit, match="has had 6 iterations, iterations=4; ask for as many or more"):
+        rsl_ppo.main([*few, str(parts), "--resume"])

@@ -17,8 +17,10 @@ pytest.importorskip("pettingzoo", reason="needs the extra multi")
 
 from agents import skrl_mappo  # noqa: E402
 from agents.batches import load_batched, new_task  # noqa: E402
+from agents.checkpoint import Checkpoint  # noqa: E402
 from piavatar_envs.api.skrl import AvatarSkrlMultiEnv  # noqa: E402
 from piavatar_envs.envs.config import ConfigError  # noqa: E402
+from tests.agents.killing import Killed, flat  # noqa: E402
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "skrl").glob("*.yaml"))
 TINY = (
@@ -182,7 +184,8 @@ def test_training_repeats_and_depends_on_its_seed(config, env, device, tmp_path)
         folder.mkdir()
         changed = config.model_copy(update={"seed": seed, "iterations": iterations})
         task = new_task(changed, skrl_mappo.find_world)
-        actions.append(skrl_mappo.learn(changed, task, folder, device).agent(seen))
+        checkpoint = Checkpoint(folder, "skrl_mappo", changed, device, resume=False)
+        actions.append(skrl_mappo.learn(changed, task, folder, device, checkpoint).agent(seen))
         saved = torch.load(folder / "policy.pt", weights_only=False, map_location="cpu")
         first_layers.append(saved["agent_1"]["policy"]["net.0.weight"])
     assert actions[0].shape == (3, 2, env.action_spaces["agent_0"].shape[0])
@@ -190,3 +193,38 @@ def test_training_repeats_and_depends_on_its_seed(config, env, device, tmp_path)
     assert np.abs(actions[0] - actions[2]).max() > 1e-3, "another seed"
     assert (first_layers[0] - first_layers[2]).abs().mean() > 1e-2, "of the networks, too"
     assert np.abs(actions[0] - actions[3]).max() > 1e-5, "an update less"
+
+
+def test_what_is_interrupted_goes_on_as_if_it_had_not_been(config, device, tmp_path, monkeypatch):
+    """Interrupted in the fourth iteration, after the second one was kept, and finished; then made longer."""
+    step = skrl_mappo.Worlds.step
+
+    def run(name: str, iterations: int, resume: bool = True):
+        changed = config.model_copy(update={"iterations": iterations, "checkpoint_every": 2})
+        folder = tmp_path / name
+        folder.mkdir(exist_ok=True)
+        checkpoint = Checkpoint(folder, "skrl_mappo", changed, device, resume)
+        curve = skrl_mappo.learn(changed, new_task(changed, skrl_mappo.find_world), folder, device, checkpoint).curve
+        saved = torch.load(folder / "checkpoint.pt", weights_only=True)["state"]
+        return curve.steps, curve.returns, flat({name: saved[name] for name in ("agents", "envs", "playing", "random")})
+
+    whole = run("whole", 5)
+    steps = 3 * config.mappo.rollout_steps + 3
+
+    def killed(self, actions):
+        nonlocal steps
+        steps -= 1
+        if steps < 0:
+            raise Killed
+        return step(self, actions)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(skrl_mappo.Worlds, "step", killed)
+        with pytest.raises(Killed):
+            run("parts", 4)
+    assert torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 2
+    run("parts", 4)
+    run("parts", 4)  # there is nothing left to do
+    assert run("parts", 5) == whole and len(whole[0]) >= 4
+    with pytest.raises(ConfigError, match="has had 5 iterations, iterations=3; ask for as many or more"):
+        run("parts", 3)
