@@ -20,7 +20,7 @@ from rich.console import Console
 from agents.checkpoint import Checkpoint
 from agents.config import EvaluationSettings, load_resolved
 from agents.curve import Curve
-from agents.evaluate import Agent, Episode, Evaluation
+from agents.evaluate import Agent, Episode, Evaluation, baselines, begin_round
 from agents.report import draw_curve, show_table, versions, write_results
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
@@ -103,6 +103,7 @@ def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Ev
     distance = batch.task.metrics.index("distance") if "distance" in batch.task.metrics else None
     success = np.zeros((batch.num_envs, batch.num_agents), bool)
     playing = np.ones(batch.num_envs, bool)
+    begin_round(agent, batch.num_envs)
     while playing.any():
         acted = batch.alive()
         batch.step(agent(batch.observation()))
@@ -132,6 +133,16 @@ class Learned:
 
     agent: Agent
     curve: Curve
+
+
+def in_every_seat(agent: Agent) -> Agent:
+    """An agent as :func:`play` takes it, from one for observations ``(n, size)``."""
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        envs, agents = observation.shape[:2]
+        return agent(observation.reshape(envs * agents, -1)).reshape(envs, agents, -1)
+
+    return act
 
 
 def iterations_of(checkpoint: Checkpoint, asked: int) -> int:
@@ -191,10 +202,11 @@ def run(
         learned = learn(config, task, folder, options.device, checkpoint)
     except ConfigError as error:
         sys.exit(f"error: {error}")
+    first_seed = config.evaluation.first_seed
     batch = BatchedEpisodes(new_task(config, find_task), config.evaluation.episodes, options.device)
-    shape = (batch.num_envs, batch.num_agents, batch.action_size)
-    players: dict[str, Agent] = {"zero": lambda observation: np.zeros(shape, np.float32), "trained": learned.agent}
-    results = [play(player, agent, batch, config.evaluation.first_seed) for player, agent in players.items()]
+    players = {name: in_every_seat(agent) for name, agent in baselines(batch.action_size, first_seed).items()}
+    players["trained"] = learned.agent
+    results = [play(player, agent, batch, first_seed) for player, agent in players.items()]
     batch.close()
     learned.curve.save(folder / "curve.csv")
     bands = {result.agent: result.estimate() for result in results}

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from agents import ppo
 from agents.config import TrainingConfig, load_training
-from agents.evaluate import Evaluation, evaluate, policy_agent, random_agent, separated, zero_agent
+from agents.evaluate import Evaluation, baselines, evaluate, policy_agent, separated
 from agents.film import film
 from agents.ik import ReachIK
 from agents.report import draw_curve, show_table, versions, write_results
@@ -126,8 +126,7 @@ def play_references(config: TrainingConfig, venv, facts: EnvFacts) -> list[tuple
     """What the trained policy is compared with, and the time that each took [s]."""
     size = len(facts.action_names)
     agents = {
-        "zero": zero_agent(size),
-        "random": random_agent(size, config.evaluation.first_seed),
+        **baselines(size, config.evaluation.first_seed),
         "scripted IK": ReachIK(facts.layout, facts.action_names, facts.action_step, facts.control_dt),
     }
     return [_timed_play(name, agent, config, venv) for name, agent in agents.items()]

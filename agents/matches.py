@@ -66,7 +66,13 @@ class Match:
 
 
 def seated(agents: Sequence[Agent]) -> Agent:
-    """An agent of a whole world, observations ``(n, agents, size)``, from one for every seat."""
+    """An agent of a whole world, observations ``(n, agents, size)``, from one for every seat.
+
+    Raises:
+        ValueError: one that remembers; here an agent may sit in several seats.
+    """
+    if any(hasattr(agent, "begin") for agent in agents):
+        raise ValueError("an agent with begin() remembers; only agents without memory can be seated")
     return lambda observation: np.stack([agent(observation[:, seat]) for seat, agent in enumerate(agents)], axis=1)
 
 

@@ -22,7 +22,7 @@ from agents import matches, selfplay
 from agents.checkpoint import Checkpoint
 from agents.config import TrainingConfig, load_training
 from agents.curve import Curve
-from agents.evaluate import Evaluation, evaluate, policy_agent
+from agents.evaluate import Evaluation, baselines, evaluate, policy_agent
 from agents.learning import begin, learn
 from agents.parallel import AgentVecEnv
 from agents.report import draw_curve, show_matches, show_table, versions, write_results
@@ -63,7 +63,8 @@ def train_single(
     """One agent: train and evaluate it."""
     model, curve = train(config, workers, facts, folder, checkpoint)
     episodes, first_seed = config.evaluation.episodes, config.evaluation.first_seed
-    return curve, [evaluate("trained", policy_agent(model), workers, episodes, first_seed)]
+    players = baselines(len(facts.action_names), first_seed) | {"trained": policy_agent(model)}
+    return curve, [evaluate(name, agent, workers, episodes, first_seed) for name, agent in players.items()]
 
 
 def train_together(
@@ -131,8 +132,7 @@ def main(args: list[str] | None = None) -> None:
     finally:
         workers.close()
     bands = {result.agent: result.estimate() for result in results if isinstance(result, Evaluation)}
-    # one agent's curve stands alone: what it is compared with is the demo's affair
-    draw_curve(folder / "curve.png", curve.steps, curve.returns, bands if config.is_multi else {}, config.env_id)
+    draw_curve(folder / "curve.png", curve.steps, curve.returns, bands, config.env_id)
     about = versions("train", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
     write_results(folder / "results.json", about, results, {"training_s": curve.seconds, "agents": facts.agents})
     (show_matches if config.selfplay else show_table)(results, console)

@@ -7,7 +7,19 @@ import pytest
 from scipy import stats
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.evaluate import Episode, Evaluation, evaluate, random_agent, separated, zero_agent
+from agents.evaluate import (
+    Episode,
+    Evaluation,
+    evaluate,
+    over_seeds,
+    random_agent,
+    separated,
+    share_interval,
+    share_interval_over_seeds,
+    wilson,
+    zero_agent,
+)
+from agents.matches import seated
 
 
 def ones(observation):
@@ -23,6 +35,44 @@ def test_every_seed_is_played_once_to_its_end(countdown, workers):
     assert [e.steps for e in result.episodes] == lengths
     # each step pays 1, the last one the seed in addition
     np.testing.assert_allclose(result.returns, [n + seed for n, seed in zip(lengths, range(11, 17), strict=True)])
+
+
+class Remembering:
+    """Pays attention to when episodes begin: its first action of each is 1, the others are 0."""
+
+    def __init__(self):
+        self.rounds, self.fresh = [], None
+
+    def begin(self, num_envs):
+        self.rounds.append(num_envs)
+        self.fresh = np.ones((num_envs, 2), np.float32)
+
+    def __call__(self, observation):
+        action, self.fresh = self.fresh, np.zeros_like(self.fresh)
+        return action
+
+
+def test_all_episodes_of_a_round_begin_with_a_reset_of_all_and_none_begins_in_between(countdown):
+    resets = []
+
+    class Watched(countdown):
+        def reset(self, **arguments):
+            resets.append(arguments["seed"] if arguments.get("seed") is not None else None)
+            return super().reset(**arguments)
+
+    agent = Remembering()
+    result = evaluate("x", agent, DummyVecEnv([Watched] * 3), episodes=7, first_seed=20, progress=False)
+    assert agent.rounds == [3, 3, 3]
+    # each episode got the action of its beginning once, the seed at its end, and nothing else
+    np.testing.assert_allclose(result.returns, [1.0 + seed for seed in range(20, 27)])
+    assert [seed for seed in resets if seed is not None] == list(range(20, 29))  # two of the last round do not count
+    lengths = [2 + seed % 4 for seed in range(20, 27)]
+    assert [episode.steps for episode in result.episodes] == lengths
+    assert result.row()["mean_steps"] == pytest.approx(np.mean(lengths))
+    low, high = result.row()["steps_interval"]
+    np.testing.assert_allclose((low, high), stats.t.interval(0.95, 6, np.mean(lengths), stats.sem(lengths)))
+    with pytest.raises(ValueError, match="only agents without memory can be seated"):
+        seated([agent, agent])
 
 
 def test_success_once_at_the_end_and_its_share(countdown):
@@ -42,6 +92,59 @@ def test_the_interval_is_students_t():
     low, high = result.row()["return_interval"]
     expected = stats.t.interval(0.95, 3, loc=np.mean(values), scale=stats.sem(values))
     np.testing.assert_allclose((low, high), expected)
+
+
+def test_wilsons_interval_is_scipys_and_is_not_empty_at_the_ends():
+    for successes, size in ((0, 12), (5, 12), (12, 12), (99, 100)):
+        expected = stats.binomtest(successes, size).proportion_ci(0.95, method="wilson")
+        found = share_interval([True] * successes + [False] * (size - successes))
+        np.testing.assert_allclose(found, [expected.low, expected.high], atol=1e-12)
+
+
+def rows(returns, once, episodes=40, case="trained"):
+    return [
+        {
+            "case": case, "episodes": episodes, "return_mean": value, "mean_steps": 10.0 * value, "success_once": share,
+            "success_at_end": share / 2.0, "failures": 1,
+        }
+        for value, share in zip(returns, once, strict=True)
+    ]  # fmt: skip
+
+
+def test_over_seeds_the_seeds_are_the_sample():
+    values, shares = [3.0, 5.0, 10.0, 2.0, 4.0], [0.95, 0.95, 0.975, 0.925, 0.95]
+    row = over_seeds(rows(values, shares))
+    assert (row["case"], row["seeds"], row["episodes"], row["failures"]) == ("trained", 5, 40, 5)
+    interval = stats.t.interval(0.95, 4, np.mean(values), stats.sem(values))
+    np.testing.assert_allclose(row["return_interval"], interval)
+    np.testing.assert_allclose(row["steps_interval"], 10.0 * np.array(interval))
+    assert row["success_once"] == pytest.approx(0.95) and row["success_at_end"] == pytest.approx(0.475)
+    # seeds that scatter as little as episodes do are worth all their episodes, by Student's quantile
+    expected = wilson(0.95, 200.0, stats.t.ppf(0.975, 4))
+    np.testing.assert_allclose(row["success_once_interval"], expected)
+    # seeds that scatter more are worth fewer: p (1 - p) / n is to be the variance of their mean, 0.0025 / 5
+    apart = over_seeds(rows(values, [1.0, 0.9, 0.95, 1.0, 0.9]))["success_once_interval"]
+    np.testing.assert_allclose(apart, wilson(0.95, 0.95 * 0.05 / 0.0005, stats.t.ppf(0.975, 4)))
+    assert over_seeds(rows([1.0], [0.5]))["success_once_interval"] == [0.0, 1.0]  # one seed says nothing
+    assert over_seeds(rows([1.0], [0.5]))["return_interval"] is None
+    all_won = over_seeds(rows(values, [1.0] * 5))["success_once_interval"]
+    assert all_won[1] == pytest.approx(1.0) and 0.9 < all_won[0] < 1.0
+    with pytest.raises(ValueError, match="rows of one agent"):
+        over_seeds(rows([1.0], [0.5]) + rows([1.0], [0.5], case="zero"))
+
+
+def test_the_interval_of_shares_covers_what_it_says_also_where_seeds_differ():
+    """95 of 100 times, with shares of seeds from a beta distribution; all episodes in one sample would not."""
+    rng = np.random.default_rng(0)
+    seeds, episodes, trials, a, b = 5, 40, 1500, 8.0, 2.0
+    shares = rng.binomial(episodes, rng.beta(a, b, (trials, seeds))) / episodes
+    truth = a / (a + b)
+
+    def coverage(intervals):
+        return np.mean([low <= truth <= high for low, high in intervals])
+
+    assert 0.93 < coverage([share_interval_over_seeds(row, episodes) for row in shares]) < 0.985
+    assert coverage([wilson(row.mean(), seeds * episodes, 1.96) for row in shares]) < 0.8
 
 
 def test_separated_asks_for_whole_intervals():

@@ -271,6 +271,9 @@ def test_gains_follow_from_what_hangs_on_a_joint():
     np.testing.assert_allclose(gains.kd**2, 4 * 0.7**2 * gains.kp * gains.inertia)
     # level, it sags by 1 / stiffness
     assert PID(gains, 0.01, (1, 3, 3)).step(np.full((1, 3, 3), 0.01), np.zeros((1, 3, 3))).shape == (1, 3, 3)
+    # not on a line: about the axis across both arms
+    flat = subtrees((-1, 0), np.array([2.0, 3.0]), np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]), np.zeros((2, 3)))
+    np.testing.assert_allclose(flat.inertia, [2.0 + 3.0 * 4.0, 3.0 * 4.0])
     with pytest.raises(ValueError, match="joint 0 comes before its parent 1"):
         subtrees((1, -1), masses[:2], centres[:2], positions[:2])
 

@@ -38,7 +38,7 @@ def test_published_configurations_train_and_leave_their_results(path, device, tm
     assert {"policy.pt", "curve.png", "curve.csv", "config.yaml", "results.json"} <= left
     results = json.loads((tmp_path / "results.json").read_text())
     assert results["benchmark"] == "rsl_ppo" and results["num_envs"] == 2 and results["training_s"] > 0.0
-    assert [row["case"] for row in results["results"]] == ["zero", "trained"]
+    assert [row["case"] for row in results["results"]] == ["zero", "random", "trained"]
     assert np.isfinite([row["return_mean"] for row in results["results"]]).all()
     steps = [line.split(",")[0] for line in (tmp_path / "curve.csv").read_text().split()[1:]]
     assert steps == ["16", "32", "48"]

@@ -64,7 +64,7 @@ def test_published_configurations_train_and_leave_their_results(path, device, tm
     assert {"policy.pt", "curve.png", "curve.csv", "config.yaml", "results.json"} <= left
     results = json.loads((tmp_path / "results.json").read_text())
     assert results["benchmark"] == "skrl_mappo" and results["agents"] == ["agent_0", "agent_1"]
-    assert [row["case"] for row in results["results"]] == ["zero", "trained"]
+    assert [row["case"] for row in results["results"]] == ["zero", "random", "trained"]
     assert all(len(row["agent_return_mean"]) == 2 for row in results["results"])
     # 20 steps of two worlds, whose episodes have 9
     curve = np.loadtxt(tmp_path / "curve.csv", delimiter=",", skiprows=1)

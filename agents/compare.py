@@ -1,0 +1,122 @@
+"""Sum up trainings that differ in their seed: ``python -m agents.compare runs/reach_*/results.json --out FILE.json``.
+
+The runs are of ``agents.train``, ``agents.rsl_ppo`` or ``agents.skrl_mappo``, each with a seed of its own. What no seed
+of a training changes (zero and random actions) is shown once, with its interval over episodes.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from agents.checkpoint import flattened
+from agents.evaluate import over_seeds
+from benchmarks.runner import plain, write_json
+
+
+def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """One report for several runs.
+
+    Args:
+        runs: contents of their ``results.json``, by name.
+
+    Returns:
+        What is common to the runs, their ``seeds``, and a row for every agent in ``results``.
+
+    Raises:
+        ValueError: fewer than two runs, two of the same seed, other settings than the seed, or competing agents.
+    """
+    if len(runs) < 2:
+        raise ValueError(f"there are {len(runs)} runs; give at least two, of different seeds")
+    (first_name, first), *others = runs.items()
+    settings = _settings(first)
+    for name, run in others:
+        own = _settings(run)
+        differ = sorted(key for key in settings.keys() | own.keys() if settings.get(key) != own.get(key))
+        if differ:
+            key = differ[0]
+            raise ValueError(
+                f"{name} has {key}={own.get(key)}, {first_name} has {settings.get(key)}; only seeds may differ"
+            )
+    seeds = [run["seed"] for run in runs.values()]
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"the runs have the seeds {seeds}; each must have one of its own")
+    rows = [_row([run["results"][place] for run in runs.values()]) for place in range(len(first["results"]))]
+    config = {key: value for key, value in first["config"].items() if key != "seed"}
+    commits = sorted({str(run["commit"]) for run in runs.values()})
+    about = {"benchmark": "compare", "of": first["benchmark"], "commits": commits, "device": first["device"]}
+    return about | {"versions": first["versions"], "seeds": seeds, "config": config, "results": rows}
+
+
+def _settings(run: Mapping[str, Any]) -> dict[str, Any]:
+    """All that must be alike."""
+    return {
+        "script": run["benchmark"],
+        **flattened({key: run["config"][key] for key in run["config"] if key != "seed"}),
+    }
+
+
+def _row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    if "success_once" not in rows[0]:
+        raise ValueError(f"{rows[0]['case']!r} is a match of competing agents; compare the runs' tables instead")
+    if all(row == rows[0] for row in rows):
+        return {**rows[0], "seeds": None}
+    return over_seeds(rows)
+
+
+def show(report: Mapping[str, Any], console: Console) -> None:
+    """Print the agents beside each other."""
+    title = f"{report['config']['env_id']}, trained with {len(report['seeds'])} seeds; mean and 95 % interval over them"
+    table = Table(title=title, title_justify="left", caption_justify="left")
+    table.caption = "once, at end: task fulfilled in an episode, in its last step"
+    table.add_column("agent", no_wrap=True)
+    for column in ("return", "once", "at end", "steps"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for row in report["results"]:
+        table.add_row(
+            row["case"],
+            _shown(row["return_mean"], row["return_interval"], ".1f"),
+            _shown(row["success_once"], row["success_once_interval"], ".0%"),
+            _shown(row["success_at_end"], row["success_at_end_interval"], ".0%"),
+            _shown(row["mean_steps"], row["steps_interval"], ".0f"),
+        )
+    console.print(table)
+
+
+def _shown(mean: float, interval: Sequence[float], form: str) -> str:
+    return f"{mean:{form}} ({interval[0]:{form}} to {interval[1]:{form}})"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Sum up trainings that differ in their seed."""
+
+    #: results.json of every run, or its folder
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    #: JSON file to write
+    out: Path | None = None
+
+
+def main(args: list[str] | None = None) -> None:
+    """The command line."""
+    options = tyro.cli(Options, prog="python -m agents.compare", args=args)
+    try:
+        files = [path / "results.json" if path.is_dir() else path for path in options.runs]
+        report = summarize({str(path): json.loads(path.read_text(encoding="utf-8")) for path in files})
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    if options.out is not None:
+        write_json(options.out, plain(report, "compare"))
+    show(report, Console(highlight=False, soft_wrap=True))
+
+
+if __name__ == "__main__":
+    main()
