@@ -19,7 +19,7 @@ from rsl_rl.utils.log_writer import LogWriter
 from torch.utils.tensorboard import SummaryWriter
 
 from agents.batches import BatchTraining, Learned, iterations_of, run
-from agents.checkpoint import Checkpoint, as_arrays, random_states, set_random_states
+from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, set_random_states
 from agents.curve import Curve
 from agents.evaluate import Agent
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
@@ -206,7 +206,7 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
     """
     groups = None if config.observe is None else {"policy": config.observe}
     env = AvatarRslEnv(config.env_id, config.num_envs, device, task.config, groups, config.first_seed)
-    torch.manual_seed(config.seed)
+    seed_all(config.seed)
     runner = Runner(env, config, folder, checkpoint)
     runner.train(config.iterations)
     OnPolicyRunner.save(runner, str(folder / "policy.pt"))  # without another checkpoint

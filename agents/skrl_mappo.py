@@ -22,7 +22,7 @@ from skrl.multi_agents.torch.mappo import MAPPO
 from skrl.trainers.torch import SequentialTrainer
 
 from agents.batches import BatchTraining, Learned, iterations_of, run
-from agents.checkpoint import Checkpoint, as_arrays, random_states, set_random_states
+from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, set_random_states
 from agents.config import multi_module
 from agents.curve import Curve
 from agents.evaluate import Agent
@@ -174,7 +174,7 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
         ConfigError: there is no such term to observe, or the checkpoint has had more iterations than are asked for.
     """
     env = Worlds(type(task), config.num_envs, device, task.config)
-    torch.manual_seed(config.seed)
+    seed_all(config.seed)
     skrl_config.torch.key = config.first_seed  # what skrl's wrapper seeds the worlds with
     mappo = build(config, env, folder, checkpoint)
     left = config.iterations - iterations_of(checkpoint, config.iterations)

@@ -202,12 +202,16 @@ def test_all_random_numbers_go_on(tiny, tmp_path):
     def draw():
         return random.random(), np.random.normal(), np.random.randint(2**31), torch.randn(3).tolist()
 
+    array = np.broadcast_to(np.arange(6.0).reshape(2, 3).T, (2, 3, 2))[:, ::-1]  # neither in order nor writable
     np.random.normal()  # one of a pair is kept for the next call
-    checkpoint_of(tiny, tmp_path).save({"random": random_states(), "tree": {"a": (np.arange(3), np.float32(2.0))}})
+    tree = {"a": (np.arange(3), np.float32(2.0)), "b": array}
+    checkpoint_of(tiny, tmp_path).save({"random": random_states(), "tree": tree})
     first = draw()
     state = checkpoint_of(tiny, tmp_path).state
     set_random_states(state["random"])
     assert draw() == first
     tree = as_arrays(state["tree"])
     np.testing.assert_array_equal(tree["a"][0], np.arange(3))
+    np.testing.assert_array_equal(tree["b"], array)
+    assert as_tensors(np.array(3.0)).shape == ()
     assert tree["a"][1] == 2.0 and isinstance(as_tensors(np.float32(1.0)), float)

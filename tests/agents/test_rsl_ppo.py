@@ -92,10 +92,13 @@ def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path, capsys
     assert (parts / "checkpoint.pt.partial").exists()
     rsl_ppo.main([*command, str(parts), "--resume"])
     assert (parts / "curve.csv").read_text() == (tmp_path / "whole" / "curve.csv").read_text()
-    whole, resumed = (torch.load(tmp_path / run / "policy.pt", weights_only=True) for run in ("whole", "parts"))
-    assert flat(resumed) == flat(whole) and len(flat(whole)) > 30
-    rates = {torch.load(tmp_path / run / "checkpoint.pt", weights_only=True)["state"]["algorithm"]
-             ["optimizer_state_dict"]["param_groups"][0]["lr"] for run in ("whole", "parts")}  # fmt: skip
-    assert len(rates) == 1 and rates != {1e-3}  # the rate has adapted, and alike
+    whole, resumed = (
+        torch.load(tmp_path / run / "checkpoint.pt", weights_only=True)["state"] for run in ("whole", "parts")
+    )
+    rate = whole["algorithm"]["optimizer_state_dict"]["param_groups"][0]["lr"]
+    assert rate != 1e-3, "it has adapted"
+    bits, others = flat(whole), flat(resumed)
+    timed = {".curve.seconds", ".logged.1"}
+    assert [name for name in bits if others[name] != bits[name] and name not in timed] == [] and len(bits) > 800
     with pytest.raises(SystemExit, match="has had 6 iterations, iterations=4; ask for as many or more"):
         rsl_ppo.main([*few, str(parts), "--resume"])
