@@ -124,6 +124,7 @@ def learn(
     if checkpoint is not None:
         watch.append(resume.KeepCheckpoint(checkpoint, config.checkpoint_every, curve))
     model.learn(config.total_steps - model.num_timesteps, callback=CallbackList(watch), reset_num_timesteps=False)
+    curve.seconds = time.monotonic() - start
     model.logger.close()
     model.save(folder / "policy.zip")
     curve.save(folder / "curve.csv")
