@@ -1,7 +1,8 @@
 """Trainings that are killed: by an exception in this process, or by SIGKILL in one of their own.
 
 ``python -m tests.agents.killing train step 40 ARGS`` is ``python -m agents.train ARGS`` until its 40th step of the
-environments, and ``... write 2 ARGS`` until it has written half of its second checkpoint.
+environments, and ``... write 3 ARGS`` until it has written half of what its third ``fsync`` is of: each checkpoint
+synchronises its file, then its folder, so this is the second one.
 """
 
 from __future__ import annotations
@@ -75,7 +76,6 @@ def main(script: str, when: str, count: int, args: list[str]) -> None:
         return counted
 
     if when == "write":
-        # the pool's snapshots and the folders are synchronised, too; the checkpoint's file is the only one that is long
         checkpoint = importlib.import_module("agents.checkpoint")
         checkpoint.os.fsync = counting(os.fsync)
     else:
