@@ -20,7 +20,7 @@ PACKAGES = ("piavatar-envs", "warp-lang", "numpy", "scipy", "gymnasium", "pydant
 #: Modules by extra; an extra is present if all of its modules are.
 EXTRAS = {
     "render": ("pyvista", "imageio", "imageio_ffmpeg", "PIL"),
-    "train": ("stable_baselines3", "torch", "matplotlib"),
+    "train": ("stable_baselines3", "torch", "matplotlib", "tensorboard"),
     "motions": ("pybullet_data",),
     "props": ("trimesh",),
     "multi": ("pettingzoo",),

@@ -5,14 +5,8 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.gather import Gathered, Gradients, finish_gather, gather
-from piavatar_envs.mpm.shared_grid import (
-    bricks_around,
-    line_in_bricks,
-    meet_warp,
-    node_record,
-    thread_of_block,
-    threads_of_block,
-)
+from piavatar_envs.mpm.shared_grid import bricks_around, line_in_bricks, node_record
+from piavatar_envs.mpm.shared_memory import meet_warp, thread_of_block, threads_of_block
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
 from piavatar_envs.mpm.stores import store_particle
 from piavatar_envs.mpm.types import (

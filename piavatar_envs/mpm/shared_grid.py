@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.transfer import Scattered
 from piavatar_envs.mpm.types import Blocks, Grid, Room, vec8, vec8i
 
@@ -44,104 +45,8 @@ NO_BRICK = wp.constant(0xFFFF)
 PLACES = wp.constant(0x4000)
 
 
-def _native(cuda: str, otherwise: str = "") -> str:
-    """A snippet that finds the room as ``room``; on a CPU, where nobody launches it, ``otherwise``."""
-    start = "extern __shared__ int piavatar_room[];\nint* const room = piavatar_room;\n"
-    return f"#if defined(__CUDA_ARCH__)\n{start}{cuda}\n#else\n{otherwise}\n#endif\n"
-
-
-@wp.func_native(_native("__syncwarp();"))
-def meet_warp():
-    """Wait for the other threads of the warp: where not all of them have come, they do one after the other."""
-    ...
-
-
-@wp.func_native(_native("return threadIdx.x;", "return 0;"))
-def thread_of_block() -> int:
-    """Place of a thread in its CUDA block."""
-    ...
-
-
-@wp.func_native(_native("return blockDim.x;", "return 1;"))
-def threads_of_block() -> int:
-    """Threads of a CUDA block."""
-    ...
-
-
-@wp.func_native(_native("__syncthreads();"))
-def meet():
-    """Wait for the other threads of the CUDA block."""
-    ...
-
-
-@wp.func_native(_native("return room[at];", "return 0;"))
-def word(at: int) -> int:
-    """Word ``at``."""
-    ...
-
-
-@wp.func_native(_native("room[at] = value;"))
-def set_word(at: int, value: int):
-    """Write word ``at``."""
-    ...
-
-
-@wp.func_native(_native("atomicOr(room + at, bits);"))
-def or_word(at: int, bits: int):
-    """Set bits of word ``at``."""
-    ...
-
-
-@wp.func_native(_native("return reinterpret_cast<const unsigned short*>(room + at)[n];", "return 0;"))
-def half_word(at: int, n: int) -> int:
-    """Half word ``n`` after word ``at``."""
-    ...
-
-
-@wp.func_native(_native("reinterpret_cast<unsigned short*>(room + at)[n] = (unsigned short)value;"))
-def set_half_word(at: int, n: int, value: int):
-    """Write half word ``n`` after word ``at``."""
-    ...
-
-
-@wp.func_native(_native("if (value > __int_as_float(room[at])) atomicMax(room + at, __float_as_int(value));"))
-def raise_to(at: int, value: float):
-    """Make the number in word ``at`` at least ``value``, which is not negative."""
-    ...
-
-
-@wp.func_native(_native("return __int_as_float(room[at]);", "return 0.0f;"))
-def number(at: int) -> float:
-    """The number in word ``at``."""
-    ...
-
-
-@wp.func_native(_native("room[at] = __float_as_int(value);"))
-def set_number(at: int, value: float):
-    """Write a number to word ``at``."""
-    ...
-
-
-@wp.func_native(_native("return __uint_as_float((__float_as_uint(x) + 0x7fffffu) & 0xff800000u);", "return x;"))
-def power_of_two(x: float) -> float:
-    """The least power of two that is not below ``x``, which is positive or 0."""
-    ...
-
-
 @wp.func_native(
-    _native("""
-int4* const first = reinterpret_cast<int4*>(room + start);
-const int4 zero = make_int4(0, 0, 0, 0);
-for (int n = threadIdx.x; n < words / 4; n += blockDim.x) first[n] = zero;
-""")
-)
-def clear_words(start: int, words: int):
-    """Zero ``words`` words, a multiple of four; ``start`` is one, too."""
-    ...
-
-
-@wp.func_native(
-    _native("""
+    native("""
 unsigned short* const number = reinterpret_cast<unsigned short*>(room + numbers);
 unsigned short* const place = reinterpret_cast<unsigned short*>(room + places);
 if (threadIdx.x < 32) {
@@ -178,14 +83,14 @@ for (int i = 0; i < 2; ++i)
 """
 
 
-@wp.func_native(_native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
+@wp.func_native(native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
 def places_around(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i) -> vec8i:
     """Where the bricks of a stencil have their half words: 8 slot + brick in block, for x, y and z lower and upper."""
     ...
 
 
 @wp.func_native(
-    _native(
+    native(
         _AROUND
         + """
 const unsigned short* const number = reinterpret_cast<const unsigned short*>(room + layout.numbers);
@@ -202,7 +107,7 @@ def bricks_around(grid: Grid, blocks: Blocks, layout: Room, e: int, field: int, 
 
 
 @wp.func_native(
-    _native("""
+    native("""
 const int px = s.base[0] & 1, py = s.base[1] & 1, pz = s.base[2] & 1;
 const float m = s.at_base[0] * per_mass;
 float q[3], k[3], along[3][3];
@@ -262,7 +167,7 @@ def add_to_bricks(
 
 
 @wp.func_native(
-    _native("""
+    native("""
 const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
 const float g[3] = {wx[1] + 2.0f * wx[2], wy[1] + 2.0f * wy[2], wz[1] + 2.0f * wz[2]};  // where it is, from the lowest
 #pragma unroll 1
@@ -285,7 +190,7 @@ def add_place(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.ve
 
 
 @wp.func_native(
-    _native(
+    native(
         """
 const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
 const bool far = px + i > 1, upper = py + j > 1;
@@ -303,7 +208,7 @@ def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
 
 
 @wp.func_native(
-    _native(
+    native(
         """
 const float* const node = reinterpret_cast<const float*>(room + at);
 wp::vec_t<8, wp::float32> value;
@@ -321,7 +226,7 @@ def node_record(at: int) -> vec8:
 
 
 @wp.func_native(
-    _native("""
+    native("""
 float* const node = reinterpret_cast<float*>(room + at);
 node[0] = value[7];
 for (int c = 1; c < 7; ++c) node[c] = value[c];

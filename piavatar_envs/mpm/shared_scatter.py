@@ -26,13 +26,15 @@ from piavatar_envs.mpm.shared_grid import (
     add_place,
     add_to_bricks,
     bricks_around,
+    number_bricks,
+    places_around,
+)
+from piavatar_envs.mpm.shared_memory import (
     clear_words,
     half_word,
     meet,
     number,
-    number_bricks,
     or_word,
-    places_around,
     power_of_two,
     raise_to,
     set_half_word,

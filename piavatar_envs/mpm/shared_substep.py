@@ -29,11 +29,13 @@ from piavatar_envs.mpm.shared_grid import (
     SPEED,
     TOLD,
     UNITS,
+    set_node_record,
+)
+from piavatar_envs.mpm.shared_memory import (
     half_word,
     meet,
     number,
     or_word,
-    set_node_record,
     set_number,
     thread_of_block,
     threads_of_block,

@@ -1,0 +1,106 @@
+"""The dynamic shared memory of a CUDA block, its room, as words of 4 bytes; a kernel reserves it as a tile.
+
+Warp's tiles are read and written by all threads together; here each goes its own way. Nothing here runs on a CPU.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+def native(cuda: str, otherwise: str = "") -> str:
+    """A snippet that finds the room as ``room``; on a CPU, where nobody launches it, ``otherwise``."""
+    start = "extern __shared__ int piavatar_room[];\nint* const room = piavatar_room;\n"
+    return f"#if defined(__CUDA_ARCH__)\n{start}{cuda}\n#else\n{otherwise}\n#endif\n"
+
+
+@wp.func_native(native("__syncwarp();"))
+def meet_warp():
+    """Wait for the other threads of the warp: where not all of them have come, they do one after the other."""
+    ...
+
+
+@wp.func_native(native("return threadIdx.x;", "return 0;"))
+def thread_of_block() -> int:
+    """Place of a thread in its CUDA block."""
+    ...
+
+
+@wp.func_native(native("return blockDim.x;", "return 1;"))
+def threads_of_block() -> int:
+    """Threads of a CUDA block."""
+    ...
+
+
+@wp.func_native(native("__syncthreads();"))
+def meet():
+    """Wait for the other threads of the CUDA block."""
+    ...
+
+
+@wp.func_native(native("return room[at];", "return 0;"))
+def word(at: int) -> int:
+    """Word ``at``."""
+    ...
+
+
+@wp.func_native(native("room[at] = value;"))
+def set_word(at: int, value: int):
+    """Write word ``at``."""
+    ...
+
+
+@wp.func_native(native("atomicOr(room + at, bits);"))
+def or_word(at: int, bits: int):
+    """Set bits of word ``at``."""
+    ...
+
+
+@wp.func_native(native("return reinterpret_cast<const unsigned short*>(room + at)[n];", "return 0;"))
+def half_word(at: int, n: int) -> int:
+    """Half word ``n`` after word ``at``."""
+    ...
+
+
+@wp.func_native(native("reinterpret_cast<unsigned short*>(room + at)[n] = (unsigned short)value;"))
+def set_half_word(at: int, n: int, value: int):
+    """Write half word ``n`` after word ``at``."""
+    ...
+
+
+@wp.func_native(native("if (value > __int_as_float(room[at])) atomicMax(room + at, __float_as_int(value));"))
+def raise_to(at: int, value: float):
+    """Make the number in word ``at`` at least ``value``, which is not negative."""
+    ...
+
+
+@wp.func_native(native("return __int_as_float(room[at]);", "return 0.0f;"))
+def number(at: int) -> float:
+    """The number in word ``at``."""
+    ...
+
+
+@wp.func_native(native("room[at] = __float_as_int(value);"))
+def set_number(at: int, value: float):
+    """Write a number to word ``at``."""
+    ...
+
+
+@wp.func_native(native("return __uint_as_float((__float_as_uint(x) + 0x7fffffu) & 0xff800000u);", "return x;"))
+def power_of_two(x: float) -> float:
+    """The least power of two that is not below ``x``, which is positive or 0."""
+    ...
+
+
+@wp.func_native(
+    native("""
+int4* const first = reinterpret_cast<int4*>(room + start);
+const int4 zero = make_int4(0, 0, 0, 0);
+for (int n = threadIdx.x; n < words / 4; n += blockDim.x) first[n] = zero;
+""")
+)
+def clear_words(start: int, words: int):
+    """Zero ``words`` words, a multiple of four; ``start`` is one, too."""
+    ...
