@@ -135,6 +135,11 @@ def bound(counts: Counts, launches: float, peaks: Peaks = H200) -> dict[str, Any
     }
 
 
+#: Kernels of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_substep`.
+SUBSTEPS = ("substep_in_small_room", "substep_in_large_room")
+NODE_PASSES = ("nodes_in_small_room", "nodes_in_large_room")
+
+
 def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
     """Bytes that one launch of a kernel must move; None where no formula is known.
 
@@ -152,6 +157,10 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
         "update_grid": 2 * sums + nodes * NODE_BYTES,
         # x, F, vk and velocities in; x, u, C, F out
         "grid_to_particles": particles * (60 + WRITTEN_BYTES) + nodes * NODE_BYTES,
+        # a body's grid stays in shared memory: what the scatter reads, and x, F and vk once more; x, u, C, F out
+        **dict.fromkeys(SUBSTEPS, particles * (STATE_BYTES + constants + 60 + WRITTEN_BYTES)),
+        # velocities or sums out
+        **dict.fromkeys(NODE_PASSES, particles * (STATE_BYTES + constants) + nodes * NODE_BYTES),
         # x, u in; vk, pull, lean out; of flesh that is not inert and bodies that are held
         "drive_particles": particles * 5 * 12,
         # x, u, pull in; u out
@@ -164,4 +173,5 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
 
 def kernel_additions(kernel: str, counts: Counts) -> int | None:
     """Records that one launch of a kernel adds to nodes if it adds each particle's by itself; None for others."""
-    return counts.particles * STENCIL if kernel in ("particles_to_grid", "runs_to_grid") else None
+    scatters = ("particles_to_grid", "runs_to_grid", *SUBSTEPS, *NODE_PASSES)
+    return counts.particles * STENCIL if kernel in scatters else None

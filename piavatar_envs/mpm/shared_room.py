@@ -57,9 +57,14 @@ def suits_shared(device: str, field: np.ndarray, max_slots: int) -> bool:
 
 
 def has_large_room(model: Model) -> bool:
-    """Whether the room of a part takes a multiprocessor."""
-    share = most_particles(model.particles.field.numpy()) / model.num_particles
-    return share * model.max_slots > MOST_SLOTS_SMALL
+    """Whether the room of a part takes a multiprocessor: its nodes need it, or there are enough of them.
+
+    A large room has more threads, and what they add up are integers: the result is the same.
+    """
+    field = model.particles.field.numpy()
+    if most_particles(field) / model.num_particles * model.max_slots > MOST_SLOTS_SMALL:
+        return True
+    return model.num_envs * len(parts_of(field)) <= wp.get_device(model.device).sm_count
 
 
 def plan_room(model: Model) -> Room:

@@ -109,7 +109,7 @@ def test_timed_reports_every_kernel(simulate):
     each = scatter | {"update_grid", "grid_to_particles"}
     if sim.model.scatter == "shared":
         once |= {"forget_speeds"}
-        each = {"substep_in_small_room"}
+        each = {"substep_in_large_room"}
     assert set(seconds) == once | each
     assert all(value > 0.0 for value in seconds.values())
     marks = {"forget_blocks", "free_slots", "mark_particles", "freeze"}  # at the start, and after 8, 16 and 24 substeps
