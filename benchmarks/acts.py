@@ -10,7 +10,7 @@ from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.motion import list_motions, load_motion
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key, animate
 from piavatar_envs.envs.config import AvatarConfig, PropConfig, RegionConfig, SceneConfig
-from piavatar_envs.envs.simulation import Domain
+from piavatar_envs.envs.domain import Domain
 
 BALL_RADIUS = 0.11
 CAN_SPEED = 3.0  # [m/s], a fall of 46 cm

@@ -16,7 +16,8 @@ from piavatar_envs.avatar.motion import Motion
 from piavatar_envs.avatar.motion.interpolation import ease
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index, skin
 from piavatar_envs.envs.config import DriveConfig, EnvConfig, PhysicsConfig, RenderConfig, SceneConfig
-from piavatar_envs.envs.simulation import Domain, Simulation
+from piavatar_envs.envs.domain import Domain
+from piavatar_envs.envs.simulation import Simulation
 from piavatar_envs.mpm.program import Program
 
 #: A pose: rotation vectors of the joints relative to their parents (22, 3) [rad], and the pelvis joint (3,) [m].

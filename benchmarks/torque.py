@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks import runner, timing
 from benchmarks.poses import random_pose
 from benchmarks.rig import Rig, World
-from piavatar_envs.avatar import articulated, cholesky, joint_momentum, joint_motion, mass_matrix
+from piavatar_envs.avatar import articulated, cholesky, joint_momentum, joint_motion, joint_torques, mass_matrix
 from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.rigid_fit import sum_moments
@@ -31,7 +31,7 @@ FLAIL_EVERY = 5  # control steps after which it is given another pose
 STIFFNESSES = (50.0, 200.0, 1000.0)  # of all joints of a body with stretched arms [N m/rad]
 HOLD = 1e5, 1e4  # spring and damper of a held pelvis, of its place and of its turn [SI units]
 RATE = 300.0  # of the pulls that hold flesh to bones [1/s]
-MODULES = (articulated, cholesky, joint_momentum, joint_motion, mass_matrix)
+MODULES = (articulated, cholesky, joint_momentum, joint_motion, joint_torques, mass_matrix)
 
 
 @dataclass(frozen=True)
@@ -66,25 +66,23 @@ class Limbs:
         self.body = ArticulatedBody(self.rig.points, self.rig.avatar.body, self.rig.model, none, none, rates)
         local, joints = Rotation.from_rotvec(rotations), self.rig.points.joints[0].astype(float)
         world_rotations, positions = forward_kinematics(local.as_matrix(), joints[0], joints)
-        self.body.rotation.assign(Rotation.from_matrix(world_rotations).as_quat()[None].astype(np.float32))
-        self.body.position.assign(positions[None].astype(np.float32))
+        self.body.state.rotation.assign(Rotation.from_matrix(world_rotations).as_quat()[None].astype(np.float32))
+        self.body.state.position.assign(positions[None].astype(np.float32))
         self.body.target.root.assign(positions[None, 0].astype(np.float32))
         self.aim(rotations)
-        self._run("record_refresh", fit=False)
+        self._run("record_mass")
         self.program = self._record(options.refresh)
 
-    def _run(self, part: str, **options: Any) -> None:
+    def _run(self, part: str) -> None:
         program = Program(self.rig.model.device)
-        getattr(self.body, part)(program, self.rig.state, **options)
+        getattr(self.body, part)(program, self.rig.state)
         program.run()
 
     def _record(self, refresh: int) -> Program:
         rig, program = self.rig, Program(self.rig.model.device)
         record_begin(program, rig.model, rig.state, rig.scratch)
         for step in range(rig.model.num_substeps):
-            if step % refresh == 0:
-                self.body.record_refresh(program, rig.state)
-            self.body.record_substep(program, rig.state)
+            self.body.record_substep(program, rig.state, refresh=step % refresh == 0)
             record_substep(program, rig.model, rig.state, rig.scratch, step)
         record_end(program, rig.model, rig.state, rig.scratch)
         return program
@@ -103,12 +101,12 @@ class Limbs:
 
     def inertia(self) -> np.ndarray:
         """Mean moment of inertia of all that each joint but the pelvis carries [kg m^2], shape ``(21,)``."""
-        diagonal = np.diagonal(self.body.mass.numpy()[0])
+        diagonal = np.diagonal(self.body.mass.matrix.numpy()[0])
         return diagonal[6:].reshape(-1, 3).mean(1).astype(float)
 
     def arm(self, side: str) -> np.ndarray:
         """From shoulder to wrist [m]."""
-        position = self.body.position.numpy()[0]
+        position = self.body.state.position.numpy()[0]
         return (position[joint_index(f"{side}_wrist")] - position[joint_index(f"{side}_shoulder")]).astype(float)
 
     def gaps(self) -> np.ndarray:

@@ -4,16 +4,25 @@ The velocity of a particle is ``v = u + J qdot``: what the joints cannot do, and
 Jacobian ``J`` at the particles. Every substep gives the joints what they can take over of the physical velocity, and
 lets torques act on them:
 
-    dq = M^-1 J^T m u,   u <- u - J dq,   qdot <- qdot + dq
-    (M + dt D + dt^2 K) d = dt (K e - (D + dt K) qdot + tau),   qdot <- qdot + d
-    vk = J qdot
+    dq = M^-1 J^T m u,   qdot <- qdot + dq,   u <- u - J dq,   c <- c + dq
+    (M + A) d = dt (K e + tau) - A (qdot + c),   A = dt D + dt^2 K
+    qdot <- qdot + d + c,   u <- u - J c,   vk = J qdot
 
-``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each; the
-pelvis may be held by springs from outside. The first line moves velocity from one share to the other and changes no
-particle's, whatever the mass matrix. Torques between bones must change neither momentum nor angular momentum. With the
-mass matrix of this moment they would not; it may be a few substeps old, so what rigid motion ``J d`` has too much comes
-off, found from the bones' moments as they are. When the mass matrix is built anew the pose is fitted to the particles,
-too (``dq = M^-1 J^T m (x - LBS)``).
+``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each.
+``c`` is what all else, contact, weight and flesh, did to the joints in the last substep, and is expected to do again.
+The springs know of it, see :mod:`piavatar_envs.avatar.joint_torques`, and so does the split: the joints go on with
+the velocity that will be left of their push, and the rest of the push, ``-J c``, waits in ``u`` for what is to stop
+it. A free limb has ``c = 0``; of one that stands on the ground nothing moves. (All of ``d`` put into ``qdot``, the
+push of a foot and the answer of the ground are two large opposite velocities, of which one strains the foot: it is
+torn to pieces. All of it put into ``u``, the grid blurs it, and light limbs shake.) If what is expected does not
+come, ``-J c`` is taken over in the next substep: nothing is lost.
+
+Muscles have limits. The pelvis may be held by springs from outside.
+
+The first line moves velocity from one share to the other and changes no particle's, whatever the mass matrix. Torques
+between bones must change neither momentum nor angular momentum. With the mass matrix of this moment they would not; it
+may be a few substeps old, so what rigid motion ``J d`` has too much comes off, found from the bones' moments as they
+are. When the mass matrix is built anew the pose is fitted to the particles, too (``dq = M^-1 J^T m (x - LBS)``).
 
 Flesh may be held to the bones by a pull, implicit and critically damped, ``u' = (u + dt w^2 d)/(1 + dt w)^2`` with
 ``d`` from the particle to its skinned place; the joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, with
@@ -22,147 +31,95 @@ exactly its momentum.
 Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
 of more than some 5 ms ago makes fast limbs unstable.
-
-No environment is driven this way yet.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.cholesky import factorize, solve
+from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_momentum import balance, gather_momentum
 from piavatar_envs.avatar.joint_motion import (
     attach_flesh,
     find_displacement,
     hand_back,
     move_joints,
-    part_of,
-    set_part,
     spread_motion,
     take_over,
 )
-from piavatar_envs.avatar.lanes import warp_threads
-from piavatar_envs.avatar.mass_matrix import (
-    NUM_DOF,
-    build_pairs,
-    compose_moments,
-    fill_mass_matrix,
-    place_pairs,
-    sum_pairs,
+from piavatar_envs.avatar.joint_torques import (
+    Springs,
+    Strength,
+    Target,
+    Tissue,
+    find_given,
+    implicit_diagonals,
+    joint_impulse,
+    limit_torques,
 )
+from piavatar_envs.avatar.lanes import warp_threads
+from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.rigid_fit import BLOCK, sum_moments
-from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
-from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
+from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec16
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.types import Model, State, group, row
+from piavatar_envs.mpm.types import Model, State, group
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
-
-@wp.struct
-class Springs:
-    """Springs and dampers: of the pelvis' place, then of all joints, ``(1 or num_envs, 1 + bones)``.
-
-    Those of the pelvis, ``[:, :2]``, act from outside: a body that nobody holds has none.
-    """
-
-    stiffness: wp.array2d(dtype=float)  # [N/m], then [N m/rad]
-    damping: wp.array2d(dtype=float)  # [N s/m], then [N m s/rad]
-
-
-@wp.struct
-class Target:
-    """Where springs pull to; ``(num_envs, bones)`` and ``(num_envs,)``."""
-
-    rotation: wp.array2d(dtype=wp.quat)  # local; of the pelvis in the world
-    root: wp.array(dtype=wp.vec3)  # of the pelvis joint [m]
+#: What limits nothing.
+UNBOUNDED = 1.0e30
+#: Inertia of a joint that does not move: much more than any body has [kg m^2].
+LOCK = 1.0e6
 
 
 @wp.kernel
-def add_change(change: wp.array2d(dtype=float), q: wp.array2d(dtype=float)):
-    """``q += change``."""
-    e, i = wp.tid()
-    q[e, i] = q[e, i] + change[e, i]
-
-
-@wp.kernel
-def torque_impulse(
-    body: Body,
-    dt: float,
-    gravity: wp.vec3,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    target: Target,
-    springs: Springs,
-    torque: wp.array2d(dtype=wp.vec3),
-    q: wp.array2d(dtype=float),
-    # out
-    impulse: wp.array2d(dtype=float),
-):
-    """``dt (K e - (D + dt K) qdot + tau)`` of the pelvis' place, then of all joints; over ``(num_envs, 1 + bones)``.
-
-    ``torque`` [N m] is in the world's axes; that of the pelvis, which would come from outside, is not asked for. The
-    fall of this substep is still to come and counts as velocity: else a held body would rise as fast as it falls, and
-    its damper would resist that.
-    """
-    e, n = wp.tid()
-    r = row(e, springs.stiffness.shape[0])
-    K = springs.stiffness[r, n]
-    D = springs.damping[r, n]
-    error = target.root[e] - position[e, 0]
-    push = wp.vec3()
-    v = part_of(q, e, 3 * n)
-    if n == 0:
-        v += dt * gravity
-    else:
-        c = n - 1
-        above = wp.quat(0.0, 0.0, 0.0, 1.0)
-        if c > 0:
-            above = rotation[e, body.parent[c]]
-            push = torque[e, c]
-        error = wp.quat_rotate(
-            above, quat_log(target.rotation[e, c] * wp.quat_inverse(wp.quat_inverse(above) * rotation[e, c]))
-        )
-    push += K * error - (D + dt * K) * v
-    set_part(impulse, e, 3 * n, dt * push)
-
-
-@wp.kernel
-def implicit_diagonal(dt: float, springs: Springs, diagonal: wp.array2d(dtype=float)):
-    """``dt D + dt^2 K``; launched over ``(rows, 1 + bones)``."""
-    r, n = wp.tid()
-    value = dt * springs.damping[r, n] + dt * dt * springs.stiffness[r, n]
-    set_part(diagonal, r, 3 * n, wp.vec3(value))
-
-
-@wp.kernel
-def find_support(
-    impulse: wp.array2d(dtype=float),
-    diagonal: wp.array2d(dtype=float),
+def add_change(
     change: wp.array2d(dtype=float),
-    # out
-    support: wp.array2d(dtype=float),
+    failure: wp.array(dtype=int),
+    # in and out
+    q: wp.array2d(dtype=float),
+    outside: wp.array2d(dtype=float),
 ):
-    """What the pelvis' springs really give, implicit as they are: the only impulse from outside; ``(num_envs, 6)``."""
+    """What the particles did to the joints: it was not the joints' own doing."""
     e, i = wp.tid()
-    support[e, i] = impulse[e, i] - diagonal[row(e, diagonal.shape[0]), i] * change[e, i]
+    if failure[e] == 0:
+        q[e, i] = q[e, i] + change[e, i]
+        outside[e, i] = outside[e, i] + change[e, i]
+
+
+@wp.kernel
+def go_on(
+    change: wp.array2d(dtype=float),
+    outside: wp.array2d(dtype=float),
+    failure: wp.array(dtype=int),
+    # in and out
+    q: wp.array2d(dtype=float),
+    taken: wp.array2d(dtype=float),
+):
+    """The velocity that joints will have if all else does again what it did; what this takes from the particles."""
+    e, i = wp.tid()
+    if failure[e] == 0:
+        q[e, i] = q[e, i] + change[e, i] + outside[e, i]
+        taken[e, i] = taken[e, i] + outside[e, i]
 
 
 class ArticulatedBody:
     """Joints of one avatar in every environment, and what moves them.
 
     Attributes:
-        rotation, position: pose of the bones in the world, ``(num_envs, 22)`` quaternions and [m].
-        velocity: generalised velocity, ``(num_envs, 69)``: the pelvis' [m/s], then spins of the joints [rad/s].
-        target: where the springs pull to.
-        torque: torques on the joints, ``(num_envs, 22)`` vectors in the world's axes [N m]; that of the pelvis is none.
+        state: pose of the bones, generalised velocity and torques; what a checkpoint holds.
+        target: where the springs pull to, and the torques.
         springs: of the pelvis and of all joints.
+        strength: limits of what springs and torques of the joints do; none until :meth:`set_strength`.
+        tissue: what resists in the joints; nothing until :meth:`set_tissue`.
         attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s], or None.
-        mass: the mass matrix, ``(num_envs, 69, 69)``.
+        mass: the mass matrix.
+        impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` is what held the pelvis.
     """
 
     def __init__(
@@ -174,7 +131,7 @@ class ArticulatedBody:
         damping: np.ndarray,
         attachment: np.ndarray | None = None,
     ) -> None:
-        """Allocate; :meth:`record_refresh` must run before anything else.
+        """Allocate.
 
         Args:
             points: the body as its drive was built from it.
@@ -197,119 +154,166 @@ class ArticulatedBody:
             if not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
         self.body, self.model, self.threads = body, model, warp_threads(device)
-        self.pairs = build_pairs(points, device)
-        self.springs = group(
-            Springs,
-            stiffness=wp.array(stiffness.astype(np.float32), dtype=float, device=device),
-            damping=wp.array(damping.astype(np.float32), dtype=float, device=device),
-        )
-        self.attachment = None
-        if attachment is not None:
-            self.attachment = wp.array(attachment.astype(np.float32), dtype=float, device=device)
+        self.springs = group(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
+        self.attachment = None if attachment is None else self._upload(attachment)
 
         def zeros(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
 
         bones = (n, NUM_JOINTS)
-        self.rotation = zeros(bones, wp.quat)
-        self.target = group(Target, rotation=zeros(bones, wp.quat), root=zeros(n, wp.vec3))
+        self.state = JointState(
+            rotation=zeros(bones, wp.quat),
+            position=zeros(bones, wp.vec3),
+            velocity=zeros((n, NUM_DOF), float),
+            outside=zeros((n, NUM_DOF), float),
+            torque=zeros(bones, wp.vec3),
+        )
+        self.pose = group(Pose, rotation=self.state.rotation, position=self.state.position)
+        target = {"rotation": zeros(bones, wp.quat), "root": zeros(n, wp.vec3)}
+        self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
         self.target.rotation.fill_(wp.quat_identity())
-        self.position, self.torque = zeros(bones, wp.vec3), zeros(bones, wp.vec3)
-        self.velocity, self.mass = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF, NUM_DOF), float)
-        self._factor, self._driven = zeros(self.mass.shape, float), zeros(self.mass.shape, float)
-        self._none, self._diagonal = zeros((1, NUM_DOF), float), zeros((len(stiffness), NUM_DOF), float)
+        self.mass = JointMass(points, body, model)
+        self._factor, self._driven, self._cut = (zeros((n, NUM_DOF, NUM_DOF), float) for _ in range(3))
+        self._diagonal = zeros((n, NUM_DOF), float)
         self._right, self._change = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF), float)
-        self._support, self._nothing = zeros((n, 6), float), zeros((n, 6), float)
-        self._taken, self._moving = zeros(bones, vec8), zeros(bones, vec8)
+        self._left, self._limited = zeros((n, NUM_DOF), float), zeros(n, int)
+        self._muscle, self.impulse = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF), float)
+        self._stop, self._nothing = zeros(bones, float), zeros((n, NUM_DOF), float)
+        self._taken = zeros((n, NUM_DOF), float)
+        self._leaving, self._moving = zeros(bones, vec8), zeros(bones, vec8)
         self._linear, self._angular = zeros(bones, wp.vec3), zeros(bones, wp.vec3)
         self._displacement = zeros((n, model.num_particles), wp.vec3)
         self._chunks, self._bones = zeros((n, body.chunk_bone.shape[0]), vec16), zeros(bones, vec16)
-        self._pair_sums = zeros((n, len(self.pairs.entry_start) - 1), vec12)
-        self._pair_moments = zeros((n, NUM_JOINTS * NUM_JOINTS), vec16)
+        without, everywhere = np.zeros((NUM_JOINTS, 3)), np.full((NUM_JOINTS, 3), UNBOUNDED)
+        self.set_strength(-everywhere, everywhere, 1)
+        self.set_tissue(without[:, 0], without[:, 0], -everywhere, everywhere, [])
 
-    def record_refresh(self, program: Program, state: State, fit: bool = True) -> None:
-        """Append: fit the pose to the particles (``fit``), and build the mass matrix where they are.
+    def _upload(self, value: np.ndarray, dtype: type = float) -> wp.array:
+        return wp.array(np.ascontiguousarray(value, np.float32), dtype=dtype, device=self.model.device)
 
-        No velocity changes; what those of the joints do from here :meth:`record_substep` finds. The pose can be fitted
-        once there is a mass matrix.
+    def set_strength(self, lower: np.ndarray, upper: np.ndarray, rows: int) -> None:
+        """Limit the torques of the joints: bounds ``(22, 3)`` [N m] and a factor on them, in ``rows`` rows.
+
+        To be called before anything is recorded, as :meth:`set_tissue`.
         """
-        n = self.model.num_envs
-        if fit:
-            pose = [self.rotation, self.position]
-            program.launch(find_displacement, (n, self.body.count), [self.body, state.x, *pose], [self._displacement])
-            self._record_share(program, state, self._displacement)
-            program.launch(spread_motion, n, [self.body, self.position, self._change], [self._taken])
-            program.launch(move_joints, n, [self.body, 1.0, self._taken], pose)
-        self._record_mass(program, state)
-
-    def _record_mass(self, program: Program, state: State) -> None:
-        n, m = self.model.num_envs, self.model
-        program.launch(
-            sum_pairs,
-            (*self._pair_sums.shape, self.threads),
-            [self.body, self.pairs, m.particles, state.x, self.position, self.threads],
-            [self._pair_sums],
+        self.strength = group(
+            Strength,
+            lower=self._upload(lower, wp.vec3),
+            upper=self._upload(upper, wp.vec3),
+            factor=self._upload(np.ones(rows)),
         )
-        moments = self._pair_moments
-        program.launch(place_pairs, moments.shape, [self.pairs, self._pair_sums, self.position], [moments])
-        for columns in (0, 1):
-            program.launch(compose_moments, (n, NUM_JOINTS), [self.body, self.position, columns], [moments])
-        program.launch(fill_mass_matrix, moments.shape, [moments], [self.mass])
-        program.launch(implicit_diagonal, self.springs.stiffness.shape, [m.step.dt, self.springs], [self._diagonal])
-        for diagonal, factor in ((self._none, self._factor), (self._diagonal, self._driven)):
-            program.launch(factorize, (n, self.threads), [self.mass, diagonal, self.threads], [factor])
 
-    def _record_share(self, program: Program, state: State, vectors: wp.array) -> None:
+    def set_tissue(
+        self, damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int]
+    ) -> None:
+        """Let joints resist.
+
+        Args:
+            damping: of all joints, shape ``(22,)`` [N m s/rad].
+            stop: stiffness beyond their ranges, shape ``(22,)`` [N m/rad].
+            lower: of the ranges of the rotation vectors, shape ``(22, 3)`` [rad].
+            upper: likewise.
+            locked: joints that do not move: what they carry belongs to their parents.
+        """
+        lock = np.zeros(NUM_JOINTS)
+        lock[list(locked)] = LOCK
+        self._locks = self._upload(np.r_[np.zeros(3), np.repeat(lock, 3)][None])
+        self.tissue = group(
+            Tissue,
+            damping=self._upload(damping),
+            stop=self._upload(stop),
+            lower=self._upload(lower, wp.vec3),
+            upper=self._upload(upper, wp.vec3),
+            lock=self._upload(lock),
+        )
+
+    def record_mass(self, program: Program, state: State) -> None:
+        """Append: build the mass matrix where particles and joints are, and what follows from it."""
+        self.mass.record(program, state, self.state.position)
+        inputs = [self.body, self.model.step.dt, self.pose, self.springs, self.tissue]
+        outputs = [self._stop, self._diagonal]
+        program.launch(implicit_diagonals, (self.model.num_envs, 1 + NUM_JOINTS), inputs, outputs)
+        self.mass.record_factor(program, self._locks, self._factor)
+        self.mass.record_factor(program, self._diagonal, self._driven)
+
+    def _record_fit(self, program: Program, state: State) -> None:
+        """Append: fit the pose to the particles. No velocity changes."""
+        n, s = self.model.num_envs, self.state
+        pose = [s.rotation, s.position]
+        program.launch(find_displacement, (n, self.body.count), [self.body, state.x, *pose], [self._displacement])
+        self._record_share(program, state, self._displacement, self._change)
+        program.launch(spread_motion, n, [self.body, s.position, self._change], [self._moving])
+        program.launch(move_joints, n, [self.body, 1.0, self._moving, state.failure], pose)
+
+    def _record_share(self, program: Program, state: State, vectors: wp.array, share: wp.array) -> None:
         """Append: the share ``dq = M^-1 J^T m v`` that the joints can take of vectors at the particles."""
-        n = self.model.num_envs
+        n, position = self.model.num_envs, self.state.position
         program.launch(
             sum_moments,
             (*self._chunks.shape, self.threads),
-            [self.body, self.model.particles, state.x, vectors, self.position, state.failure, self.threads],
+            [self.body, self.model.particles, state.x, vectors, position, state.failure, self.threads],
             [self._chunks],
             block_dim=BLOCK,
         )
         outputs = [self._linear, self._angular, self._bones, self._right]
-        program.launch(gather_momentum, n, [self.body, self.position, self._chunks], outputs)
-        program.launch(solve, (n, self.threads), [self._factor, self._right, self.threads], [self._change])
+        program.launch(gather_momentum, n, [self.body, position, self._chunks], outputs)
+        self.mass.record_solve(program, self._factor, self._right, share)
 
     def _record_attachment(self, program: Program, state: State) -> None:
         """Append: flesh is pulled to the bones, and the bones to the flesh."""
-        n, points = self.model.num_envs, (self.model.num_envs, self.body.count)
-        pose = [self.rotation, self.position]
-        program.launch(find_displacement, points, [self.body, state.x, *pose], [self._displacement])
+        n, s, points = self.model.num_envs, self.state, (self.model.num_envs, self.body.count)
+        inputs = [self.body, state.x, s.rotation, s.position]
+        program.launch(find_displacement, points, inputs, [self._displacement])
         inputs = [self.body, self.model.step.dt, self.attachment, state.failure]
         program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
-        self._record_share(program, state, self._displacement)
-        program.launch(spread_motion, n, [self.body, self.position, self._change], [self._moving])
-        inputs = [self.position, self._bones, 1.0, self._nothing, self._moving]
+        self._record_share(program, state, self._displacement, self._change)
+        program.launch(spread_motion, n, [self.body, s.position, self._change], [self._moving])
+        inputs = [s.position, self._bones, 1.0, self._nothing, self._moving]
         program.launch(balance, n, inputs, [self._change])
-        program.launch(add_change, (n, NUM_DOF), [self._change], [self.velocity])
+        program.launch(add_change, (n, NUM_DOF), [self._change, state.failure], [s.velocity, s.outside])
 
-    def record_substep(self, program: Program, state: State) -> None:
-        """Append what the joints do before an MPM substep: take over, act, and move the pose on."""
-        n, dt, pose = self.model.num_envs, self.model.step.dt, [self.rotation, self.position]
-        program.launch(spread_motion, n, [self.body, self.position, self.velocity], [self._moving])
-        inputs = [self.body, state.x, self.position, self._moving, state.failure]
-        program.launch(hand_back, (n, self.body.count), inputs, [state.u, state.vk])
+    def _record_torques(self, program: Program, state: State) -> None:
+        """Append: springs, torques and tissue change the velocity of the joints."""
+        n, s, dt, each = self.model.num_envs, self.state, self.model.step.dt, (self.model.num_envs, 1 + NUM_JOINTS)
+        inputs = [self.body, dt, self.pose, self.target, self.springs, self.tissue, self._stop]
+        outputs = [self._muscle, self.impulse, self._limited]
+        program.launch(joint_impulse, each, [*inputs, s.velocity, s.outside], outputs)
+        self.mass.record_solve(program, self._driven, self.impulse, self._change)
+        inputs = [self.body, dt, self.pose, self.springs, self.strength, self._muscle, self._diagonal, self._change]
+        program.launch(limit_torques, each, inputs, [self.impulse, self._left, self._limited])
+        self.mass.record_factor(program, self._left, self._cut, self._limited)
+        self.mass.record_solve(program, self._cut, self.impulse, self._change, self._limited)
+        program.launch(find_given, (n, NUM_DOF), [self._left, self._change], [self.impulse])
+        program.launch(spread_motion, n, [self.body, s.position, self._change], [self._moving])
+        inputs = [s.position, self._bones, 0.0, self.impulse, self._moving]
+        program.launch(balance, n, inputs, [self._change])
+
+    def record_substep(self, program: Program, state: State, refresh: bool) -> None:
+        """Append what the joints do before an MPM substep: take over, act, and move the pose on.
+
+        Args:
+            program: records.
+            state: of the particles.
+            refresh: build the mass matrix anew, and fit the pose to the particles; to be done in the first substep of a
+                program and every few milliseconds.
+        """
+        n, s, pose = self.model.num_envs, self.state, [self.state.rotation, self.state.position]
+        points = (n, self.body.count)
+        if refresh:
+            self.record_mass(program, state)
+            self._record_fit(program, state)
+        program.launch(spread_motion, n, [self.body, s.position, s.velocity], [self._moving])
+        inputs = [self.body, state.x, s.position, self._moving, state.failure]
+        program.launch(hand_back, points, inputs, [state.u, state.vk])
         if self.attachment is not None:
             self._record_attachment(program, state)
-        self._record_share(program, state, state.u)
-        program.launch(spread_motion, n, [self.body, self.position, self._change], [self._taken])
-        program.launch(add_change, (n, NUM_DOF), [self._change], [self.velocity])
-        program.launch(
-            torque_impulse,
-            (n, 1 + NUM_JOINTS),
-            [self.body, dt, self.model.step.gravity, *pose, self.target, self.springs, self.torque, self.velocity],
-            [self._right],
-        )
-        program.launch(solve, (n, self.threads), [self._driven, self._right, self.threads], [self._change])
-        program.launch(spread_motion, n, [self.body, self.position, self._change], [self._moving])
-        program.launch(find_support, (n, 6), [self._right, self._diagonal, self._change], [self._support])
-        inputs = [self.position, self._bones, 0.0, self._support, self._moving]
-        program.launch(balance, n, inputs, [self._change])
-        program.launch(add_change, (n, NUM_DOF), [self._change], [self.velocity])
-        program.launch(spread_motion, n, [self.body, self.position, self.velocity], [self._moving])
-        inputs = [self.body, state.x, self.position, self._taken, self._moving, state.failure]
-        program.launch(take_over, (n, self.body.count), inputs, [state.u, state.vk])
-        program.launch(move_joints, n, [self.body, dt, self._moving], pose)
+        self._record_share(program, state, state.u, self._taken)
+        program.launch(add_change, (n, NUM_DOF), [self._taken, state.failure], [s.velocity, s.outside])
+        self._record_torques(program, state)
+        inputs = [self._change, s.outside, state.failure]
+        program.launch(go_on, (n, NUM_DOF), inputs, [s.velocity, self._taken])
+        program.launch(spread_motion, n, [self.body, s.position, self._taken], [self._leaving])
+        program.launch(spread_motion, n, [self.body, s.position, s.velocity], [self._moving])
+        inputs = [self.body, state.x, s.position, self._leaving, self._moving, state.failure]
+        program.launch(take_over, points, inputs, [state.u, state.vk])
+        program.launch(move_joints, n, [self.body, self.model.step.dt, self._moving, state.failure], pose)

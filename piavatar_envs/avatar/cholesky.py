@@ -1,6 +1,7 @@
 """Cholesky factors of small dense matrices, one an environment, and what is solved with them.
 
 The threads of a warp share a matrix on a GPU; on a CPU one thread has it to itself (``threads = 1``).
+What is not ``wanted`` ``(num_envs,)`` stays as it is.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 def factorize(
     matrix: wp.array3d(dtype=float),
     diagonal: wp.array2d(dtype=float),
+    wanted: wp.array(dtype=int),
     threads: int,
     # out
     factor: wp.array3d(dtype=float),
@@ -26,6 +28,8 @@ def factorize(
     ``diagonal`` is ``(1 or num_envs, N)``. Columns are taken off the rest one after the other (right-looking).
     """
     e, thread = wp.tid()
+    if wanted[e] == 0:
+        return
     size = matrix.shape[1]
     r = wp.min(e, diagonal.shape[0] - 1)
     for i in range(thread, size, threads):
@@ -50,12 +54,15 @@ def factorize(
 def solve(
     factor: wp.array3d(dtype=float),
     right: wp.array2d(dtype=float),
+    wanted: wp.array(dtype=int),
     threads: int,
     # out
     x: wp.array2d(dtype=float),
 ):
     """``x`` with ``L L^T x = right``, ``L`` the ``factor``; launched over ``(num_envs, threads)``."""
     e, thread = wp.tid()
+    if wanted[e] == 0:
+        return
     size = factor.shape[1]
     for i in range(thread, size, threads):
         x[e, i] = right[e, i]

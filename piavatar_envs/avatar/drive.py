@@ -1,6 +1,7 @@
 """The drive of an avatar: records tracking, control steps and resets as launches of a program.
 
-A control step tracks nothing itself; it starts from the pose tracked at the end of the one before.
+A control step tracks nothing itself; it starts from the pose tracked at the end of the one before. An avatar whose
+joints move under torques has a :class:`~piavatar_envs.avatar.joint_drive.JointDrive` to do that instead.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import warp as wp
 
 from piavatar_envs.avatar import posing
 from piavatar_envs.avatar.body import BodyPoints, build_body
+from piavatar_envs.avatar.joint_drive import JointDrive, JointSettings
 from piavatar_envs.avatar.kabsch import local_rotations, track_bones
 from piavatar_envs.avatar.lanes import chunk_threads, warp_threads
 from piavatar_envs.avatar.settings import DriveSettings
@@ -33,9 +35,17 @@ class AvatarDrive:
     Attributes:
         state: what a checkpoint holds.
         tracked: the bones as Kabsch sees them.
+        joints: what turns the joints where torques do; None where the pose is driven.
     """
 
-    def __init__(self, points: BodyPoints, first: int, model: Model, settings: DriveSettings) -> None:
+    def __init__(
+        self,
+        points: BodyPoints,
+        first: int,
+        model: Model,
+        settings: DriveSettings,
+        joints: JointSettings | None = None,
+    ) -> None:
         self.model, self.settings = model, settings
         self.body = build_body(points, first, model.device)
         self.drive = settings.kernel_parameters(model)
@@ -51,6 +61,7 @@ class AvatarDrive:
         self.groups = Groups(self.scratch, self.state)
         for rotation in (self.state.command_rotation, self.state.goal_rotation, self.tracked.rotation):
             rotation.fill_(wp.quat_identity())
+        self.joints = JointDrive(points, self, joints) if joints else None
 
     def _allocate(self, cls):
         """Zeroed arrays for a dataclass of arrays, by the name's ending."""
@@ -119,12 +130,17 @@ class AvatarDrive:
             [mask, self.body, s.bone_from],
             [state.x, state.u, state.C, state.F, state.vk, d.motion, state.failure],
         )
+        if self.joints:
+            self.joints.record_reset(program, mask)
 
     def record_begin(self, program: Program) -> None:
         """Append what begins a control step: from the tracked pose towards ``state.goal_*``."""
         s, d, t = self.scratch, self.state, self.tracked
         program.launch(clear_vectors, d.wrench_force.size, [d.wrench_force])
         program.launch(clear_vectors, d.wrench_torque.size, [d.wrench_torque])
+        if self.joints:
+            self.joints.record_begin(program)
+            return
         program.launch(
             posing.begin_control,
             (self.model.num_envs, NUM_JOINTS),
@@ -134,8 +150,10 @@ class AvatarDrive:
         record_pose(self, program, 0.0, *self.start_pose(), s.increment, self.groups.pose)
 
     def record_end(self, program: Program, state: State) -> None:
-        """Append what ends a control step: the goal has been commanded."""
+        """Append what ends a control step: the goal has been commanded. Where torques act, nothing is."""
         d = self.state
+        if self.joints:
+            return
         program.launch(
             posing.end_control,
             (self.model.num_envs, NUM_JOINTS),
@@ -163,7 +181,10 @@ def record_control_step(
             record_injection(avatar, program, state)
     for step in range(model.num_substeps):
         for avatar in () if injected else avatars:
-            record_drive(avatar, program, state, step)
+            if avatar.joints:
+                avatar.joints.record_substep(program, state, step)
+            else:
+                record_drive(avatar, program, state, step)
         record_substep(program, model, state, scratch, step)
     record_end(program, model, state, scratch)
     for avatar in avatars:

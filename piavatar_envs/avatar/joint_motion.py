@@ -63,7 +63,7 @@ def take_over(
     body: Body,
     x: wp.array2d(dtype=wp.vec3),
     position: wp.array2d(dtype=wp.vec3),
-    taken: wp.array2d(dtype=vec8),
+    leaving: wp.array2d(dtype=vec8),
     moving: wp.array2d(dtype=vec8),
     failure: wp.array(dtype=int),
     # in and out
@@ -71,12 +71,12 @@ def take_over(
     # out
     vk: wp.array2d(dtype=wp.vec3),
 ):
-    """Take ``J dq`` from the physical velocity, and write ``J qdot``."""
+    """Take from the physical velocity what leaves it for the joints, and write ``J qdot``."""
     e, p = wp.tid()
     if failure[e] != 0:
         return
     arm = x[e, body.first + p] - position[e, 0]
-    u[e, body.first + p] = u[e, body.first + p] - skinned_motion(body, taken, e, p, arm)
+    u[e, body.first + p] = u[e, body.first + p] - skinned_motion(body, leaving, e, p, arm)
     vk[e, body.first + p] = skinned_motion(body, moving, e, p, arm)
 
 
@@ -154,12 +154,15 @@ def move_joints(
     body: Body,
     dt: float,
     field: wp.array2d(dtype=vec8),
+    failure: wp.array(dtype=int),
     # in and out
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
     """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together."""
     e = wp.tid()
+    if failure[e] != 0:
+        return
     r = row(e, body.rest_joint.shape[0])
     for b in range(BONES):
         s = field[e, b]

@@ -8,13 +8,17 @@ rounded to 5 degrees and split evenly over the joints of the spine.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from piavatar_envs.avatar.skeleton import JOINT_NAMES
 
+Bounds = tuple[tuple[float, float], ...]
+
 # Degrees about x (bending forward is positive for the trunk, backward for hip and knee), y and z, for the left side.
 _SPINE = ((-10.0, 30.0), (-15.0, 15.0), (-15.0, 15.0))
-_LEFT_DEGREES: dict[str, tuple[tuple[float, float], ...]] = {
+_LEFT_DEGREES: dict[str, Bounds] = {
     "hip": ((-120.0, 30.0), (-45.0, 30.0), (-45.0, 45.0)),
     "knee": ((-5.0, 140.0), (-5.0, 5.0), (-15.0, 15.0)),
     "ankle": ((-20.0, 50.0), (-30.0, 20.0), (-20.0, 20.0)),
@@ -24,7 +28,7 @@ _LEFT_DEGREES: dict[str, tuple[tuple[float, float], ...]] = {
     "elbow": ((-140.0, 20.0), (-60.0, 60.0), (-140.0, 20.0)),
     "wrist": ((-70.0, 70.0), (-70.0, 70.0), (-70.0, 70.0)),
 }
-_CENTER_DEGREES: dict[str, tuple[tuple[float, float], ...]] = {
+_CENTER_DEGREES: dict[str, Bounds] = {
     "spine1": _SPINE,
     "spine2": _SPINE,
     "spine3": _SPINE,
@@ -33,22 +37,35 @@ _CENTER_DEGREES: dict[str, tuple[tuple[float, float], ...]] = {
 }
 
 
+def left_and_right(
+    center: Mapping[str, Bounds], left: Mapping[str, Bounds], root: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of all joints about x, y and z, each ``(22, 3)``, from those of the middle and of the left side.
+
+    Args:
+        center: by joint.
+        left: by joint without its side.
+        root: of the pelvis, about every axis.
+    """
+    bounds = np.zeros((len(JOINT_NAMES), 3, 2))
+    for index, name in enumerate(JOINT_NAMES):
+        side, _, joint = name.partition("_")
+        if name == "pelvis":
+            bounds[index] = root
+        elif name in center:
+            bounds[index] = center[name]
+        else:
+            bounds[index] = left[joint]
+            if side == "right":
+                # mirrored in x: rotations about y and z change sign
+                bounds[index, 1:] = -bounds[index, 1:, ::-1]
+    return bounds[..., 0], bounds[..., 1]
+
+
 def joint_limits() -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds of the joints' rotation vectors [rad], each of shape ``(22, 3)``.
 
     The root is unbounded here; tasks bound its speed.
     """
-    limits = np.zeros((len(JOINT_NAMES), 3, 2))
-    for index, name in enumerate(JOINT_NAMES):
-        side, _, joint = name.partition("_")
-        if name == "pelvis":
-            limits[index] = (-180.0, 180.0)
-        elif name in _CENTER_DEGREES:
-            limits[index] = _CENTER_DEGREES[name]
-        else:
-            limits[index] = _LEFT_DEGREES[joint]
-            if side == "right":
-                # mirrored in x: rotations about y and z change sign
-                limits[index, 1:] = -limits[index, 1:, ::-1]
-    radians = np.radians(limits)
-    return radians[..., 0], radians[..., 1]
+    lower, upper = left_and_right(_CENTER_DEGREES, _LEFT_DEGREES, (-180.0, 180.0))
+    return np.radians(lower), np.radians(upper)

@@ -50,6 +50,7 @@ class ParticleSet:
         anchor_vertices: corners of the skin triangle nearest to each particle, shape ``(P, 3)`` int32.
         anchor_weights: barycentric coordinates of the nearest point in it, shape ``(P, 3)`` float32.
         shell: particles that follow their nearest skin point when the shape changes, shape ``(P,)`` bool.
+        depth: below the skin of the mean shape [m], shape ``(P,)`` float32.
     """
 
     spacing: float
@@ -62,6 +63,7 @@ class ParticleSet:
     anchor_vertices: np.ndarray
     anchor_weights: np.ndarray
     shell: np.ndarray
+    depth: np.ndarray
 
     def __len__(self) -> int:
         return len(self.rest_positions)
@@ -115,6 +117,7 @@ def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rin
         anchors,
         coordinates,
         shell,
+        np.maximum(-distance, 0.0),
     )
     for array in arrays:
         array.setflags(write=False)

@@ -149,6 +149,18 @@ class DriveState:
 
 
 @dataclass
+class JointState:
+    """What a checkpoint holds of joints that move under torques, besides the drive's own state."""
+
+    rotation: wp.array  # (num_envs, bones) world rotation
+    position: wp.array  # (num_envs, bones) joint position [m]
+    velocity: wp.array  # (num_envs, 69) the pelvis' [m/s], then spins of all joints in the world's axes [rad/s]
+    outside: wp.array  # (num_envs, 69) how all but the joints themselves changed it in the last substep
+    # (num_envs, bones) torques about the axes of the rest pose, as the parent has turned them, of the reference adult [N m]
+    torque: wp.array
+
+
+@dataclass
 class Tracked:
     """Kabsch-tracked bones: recomputed from the particles whenever they have moved."""
 

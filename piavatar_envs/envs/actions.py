@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.muscles import LOCKED_JOINTS
 from piavatar_envs.avatar.rotation import quat_exp, quat_log, turn_about_z
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.mpm.types import FAILURE_ACTION
@@ -55,6 +56,19 @@ class ActionSpec:
     def size(self) -> int:
         """Length of the action vector."""
         return 3 * len(self.joints) + 3 * self.root
+
+    def under(self, control: str) -> ActionSpec:
+        """The same under ``control``: where torques move the body, nothing moves its root, and its toes are stiff.
+
+        Raises:
+            ValueError: no joint is left.
+        """
+        if control == "pose":
+            return self
+        joints = tuple(name for name in self.joints if name not in LOCKED_JOINTS)
+        if not joints:
+            raise ValueError(f"joints={list(self.joints)} do not move under control={control!r}; name others")
+        return replace(self, joints=joints, root=False)
 
     def names(self) -> list[str]:
         """A name for every component, such as ``left_elbow.x``."""

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.drive import AvatarDrive
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.envs.actions import apply_actions, refuse_nonfinite
 from piavatar_envs.envs.episodes import begin_episode, count_episodes, end_agent, end_step, find_ended, retire
+from piavatar_envs.envs.joint_actions import apply_targets, apply_torques, follow_reference
 from piavatar_envs.envs.observer import Observer
 from piavatar_envs.envs.simulation import Simulation
 from piavatar_envs.mpm.program import Program
@@ -48,7 +50,11 @@ class BatchEnv:
             task.config, num_envs, device, task.domain(), task.scene, avatar_names=task.agent_names
         )
         self.device, self.num_agents = self.simulation.device, len(self.simulation.avatars)
-        self.action_spec = task.action_spec()
+        self.control = task.config.drive.control
+        self.action_spec = task.action_spec().under(self.control)
+        if self.control == "torque":
+            for avatar in self.simulation.avatars:
+                avatar.joints.release([joint_index(name) for name in self.action_spec.joints])
         self.observer = Observer(self.simulation, task)
         self.layout = self.observer.layout
         self.max_steps = max(1, round(task.config.episode_seconds / task.config.physics.control_dt))
@@ -107,12 +113,7 @@ class BatchEnv:
             program.launch(
                 refuse_nonfinite, (n, self.action_spec.size), [self.action, agent, self.alive], [self.failure]
             )
-            program.launch(
-                apply_actions,
-                (n, NUM_JOINTS),
-                [self.action_map, self.action, agent, self.alive, *reference, avatar.tracked.rotation],
-                [avatar.state.goal_rotation, avatar.state.goal_root],
-            )
+            self._record_actions(program, agent, avatar, reference)
             if self.num_agents > 1:
                 program.launch(retire, n, [agent, self.alive], [avatar.state.let_go])
         sim.record_control_step(program)
@@ -126,6 +127,22 @@ class BatchEnv:
             )
         program.launch(end_step, n, [self.max_steps, self.terminated], [self.step_count, self.truncated])
         self._record_observation(program)
+
+    def _record_actions(self, program: Program, agent: int, avatar: AvatarDrive, reference: tuple) -> None:
+        """Append what an agent's action makes of its goal, counted from the reference pose."""
+        bones, goal = (self.num_envs, NUM_JOINTS), [avatar.state.goal_rotation, avatar.state.goal_root]
+        acting = [self.action_map, self.action, agent, self.alive]
+        if self.control == "pose":
+            program.launch(apply_actions, bones, [*acting, *reference, avatar.tracked.rotation], goal)
+            return
+        command = [avatar.state.command_rotation, avatar.state.command_root]
+        inputs = [int(not self.task.targets_about_reference), *reference, self.failure]
+        program.launch(follow_reference, bones, inputs, [*command, *goal])
+        if self.control == "pd":
+            program.launch(apply_targets, bones, acting, goal[:1])
+        else:
+            joints = avatar.joints
+            program.launch(apply_torques, bones, [*acting, joints.body.strength], [joints.state.torque])
 
     def _record_observation(self, program: Program) -> None:
         """Append what writes the observation; it changes nothing else."""
@@ -204,6 +221,23 @@ class BatchEnv:
                 rng = np.random.default_rng([*key, avatar] if avatar else key)
                 parameters = self.simulation.flesh[avatar].draw_parameters(rng)
                 self.simulation.set_shape(int(env), parameters, avatar)
+
+    def assist_root(self, share: float | np.ndarray) -> None:
+        """Help the pelvis from now on, as ``drive.root_assist`` says; for ``control="pd"`` and ``"torque"``.
+
+        Args:
+            share: from 0, none, to 1; of all environments, or of each, shape ``(num_envs,)``. Resets leave it.
+
+        Raises:
+            ValueError: it is out of range, of another shape, or the pose is driven.
+        """
+        if self.control == "pose":
+            raise ValueError('control="pose" has a root wrench; root_assist is for "pd" and "torque"')
+        values = np.asarray(share, np.float32)
+        if values.shape not in ((), (self.num_envs,)) or not ((values >= 0.0) & (values <= 1.0)).all():
+            raise ValueError(f"root_assist={share} must be in [0, 1], one number or {self.num_envs}")
+        for avatar in self.simulation.avatars:
+            avatar.joints.assist.assign(np.broadcast_to(values, (self.num_envs,)).copy())
 
     def step(self) -> None:
         """Advance every environment by one control step under :attr:`action`."""

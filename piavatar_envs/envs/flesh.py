@@ -9,6 +9,8 @@ import numpy as np
 
 from piavatar_envs.avatar.asset import AvatarAsset
 from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.joint_drive import JointSettings
+from piavatar_envs.avatar.muscles import attachment_rates, make_muscles
 from piavatar_envs.avatar.sampling import ParticleSet, morph
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import BODY_PARTS, body_part_of_joint, joint_index
@@ -58,8 +60,11 @@ class Flesh:
         """Shape the body.
 
         Raises:
-            ConfigError: an avatar's own setting is unknown or out of range, or a region holds nothing.
+            ConfigError: an avatar's own setting is unknown, out of range or cannot be its own, or a region holds
+                nothing.
         """
+        if "control" in avatar.drive:
+            raise ConfigError("scene.avatars: drive.control cannot differ between avatars; set it for the environment")
         strange = [name for name in avatar.physics if name not in OF_FLESH]
         if strange:
             raise ConfigError(
@@ -128,6 +133,28 @@ class Flesh:
             inert=inert_share(self.drive.soft_tissue, self._softness(rest))[None],
         )
         return points, volume[None]
+
+    def joint_settings(self) -> JointSettings | None:
+        """How its joints are driven; None where its pose is.
+
+        Raises:
+            ConfigError: torques with a scheme of one velocity.
+        """
+        d = self.drive
+        if d.control == "pose":
+            return None
+        if self.physics.decoupling in ("paper", "none"):
+            raise ConfigError(
+                f"drive.control={d.control!r} needs two velocities: physics.decoupling={self.physics.decoupling!r} has "
+                "one; use split or no_stress"
+            )
+        sampled = self.sampled
+        distance = bone_distance(sampled.rest_positions, sampled.bone)
+        return JointSettings(
+            muscles=make_muscles(d.joint_stiffness, d.joint_damping, d.strength),
+            assist=d.root_assist,
+            attachment=attachment_rates(sampled.depth, distance, *d.flesh_rate),
+        )
 
     def masses(self, volume: np.ndarray) -> np.ndarray:
         """Nominal masses [kg] of particles of these volumes [m^3], shape ``(rows, P)``."""

@@ -70,10 +70,25 @@ class PhysicsConfig(BaseModel):
 
 
 class DriveConfig(BaseModel):
-    """How commanded poses move the body, and what holds it up."""
+    """How actions move the body, and what holds it up."""
 
     model_config = FROZEN
 
+    control: Literal["pose", "pd", "torque"] = Field(
+        "pose",
+        description="what actions are: pose (increments of a pose that moves the body), pd (joint targets of springs "
+        "with limited torques) or torque (torques of the joints); root_assist to flesh_rate are for pd and torque, all "
+        "other settings of this section for pose",
+    )
+    root_assist: float = Field(
+        0.0, ge=0.0, le=1.0, description="help for the pelvis from outside: 0 none, 1 springs that nearly hold it [-]"
+    )
+    joint_stiffness: float = Field(1.0, ge=0.0, description="factor on the stiffness of the joints' springs [-]")
+    joint_damping: float = Field(1.0, ge=0.0, description="factor on the damping of the joints' springs [-]")
+    strength: float = Field(1.0, ge=0.0, description="factor on the greatest torques of the joints [-]")
+    flesh_rate: tuple[float, float] = Field(
+        (30.0, 500.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
+    )
     drive: Literal["increment", "target"] = Field(
         "increment",
         description="increment (the tracked pose plus the command's change) or target (to the command's absolute pose; "

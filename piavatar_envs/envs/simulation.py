@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 import warp as wp
@@ -11,53 +12,30 @@ import warp as wp
 from piavatar_envs.avatar.asset import AvatarAsset, load_body
 from piavatar_envs.avatar.body import bone_masses
 from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
+from piavatar_envs.avatar.joint_drive import LONGEST_SUBSTEP
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.envs.bodies import Bodies, BodyPool
 from piavatar_envs.envs.config import AvatarConfig, EnvConfig, SceneConfig
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.flesh import Flesh, drive_settings, shape_ranges
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.props import PropSet
 from piavatar_envs.envs.randomize import Randomization, fastest_wave
 from piavatar_envs.envs.subjects import assemble, prop_matter, prop_points
-from piavatar_envs.mpm.boundaries import Collider, make_boundaries, place_colliders
-from piavatar_envs.mpm.build import build_model, make_grid
+from piavatar_envs.mpm.boundaries import make_boundaries, place_colliders
+from piavatar_envs.mpm.build import build_model, choose_num_substeps, make_grid
 from piavatar_envs.mpm.impulses import clear_masked_sensors
 from piavatar_envs.mpm.memory import allocate, estimate_slots
 from piavatar_envs.mpm.program import Program
 
 #: Grid spacings in a standing mean body, by fidelity; "fine" is the paper's scale, about 1 cm.
-GRID_PER_HEIGHT: dict[str, float] = {"tiny": 12.0, "coarse": 32.0, "medium": 64.0, "fine": 166.0}
-
-
-@dataclass(frozen=True)
-class Domain:
-    """Box in which particles may move [m]; leaving it is a failure.
-
-    The default holds a body with outstretched limbs wherever its root may be before it lets go.
-    """
-
-    lower: tuple[float, float, float] = (-1.6, -1.6, -0.3)
-    upper: tuple[float, float, float] = (1.6, 1.6, 2.6)
-
-    def around(self, places: Sequence[Sequence[float]]) -> Domain:
-        """The box moved to every one of ``places`` (x, y) [m], and what holds them all."""
-        at = np.array([(*place[:2], 0.0) for place in places])
-        lower, upper = np.array(self.lower) + at.min(0), np.array(self.upper) + at.max(0)
-        return Domain(tuple(lower.tolist()), tuple(upper.tolist()))
-
-    def including(self, *points: Sequence[float]) -> Domain:
-        """The smallest box that holds this one and ``points`` [m]."""
-        every = np.array([self.lower, self.upper, *points])
-        return Domain(tuple(every.min(0).tolist()), tuple(every.max(0).tolist()))
-
-    def walls(self) -> tuple[Collider, ...]:
-        """Smooth planes at the sides and the top of the box."""
-        walls = []
-        for axis in range(3):
-            normal = np.eye(3)[axis]
-            walls += [Collider.plane(normal, self.lower[axis])] if axis < 2 else []
-            walls += [Collider.plane(-normal, -self.upper[axis])]
-        return tuple(walls)
+GRID_PER_HEIGHT: dict[str, float] = {
+    "tiny": 12.0,
+    "coarse": 32.0,
+    "medium": 64.0,
+    "fine": 166.0,
+}  #: More room for bodies that nothing holds up: as far as one reaches when it falls [m].
+FALL = 1.2
 
 
 class Simulation:
@@ -112,24 +90,26 @@ class Simulation:
         matter = [prop_matter(p, points, physics) for p, points in zip(self.scene.props, solids, strict=True)]
         own_rows = bool(solids) or any(flesh.shape.randomize for flesh in self.flesh)
         rows = num_envs if own_rows else 1
-        domain = domain or Domain().around([avatar.position for avatar in avatars])
+        joints = [flesh.joint_settings() for flesh in self.flesh]
+        domain = (domain or Domain().around([a.position for a in avatars])).wider(FALL if any(joints) else 0.0)
         walls = domain.walls() if (solids or len(avatars) > 1) and self.scene.walls else ()
         self.subjects = assemble(self.scene, physics, names, self.flesh, matter, walls, rows)
         rest = np.concatenate([*(flesh.points.rest[0] for flesh in self.flesh), *(points.rest for points in solids)])
+        wave = fastest_wave(config.randomize, [flesh.matter() for flesh in self.flesh])
         self.model = build_model(
             self.subjects.matter,
             make_grid(domain.lower, domain.upper, self.dx),
             num_envs=num_envs,
             device=self.device,
             control_dt=physics.control_dt,
-            num_substeps=physics.num_substeps,
+            num_substeps=physics.num_substeps or self._substeps(wave, any(joints)),
             cfl=physics.cfl,
             gravity=(0.0, 0.0, -physics.gravity),
             decoupling=physics.decoupling,
             colliders=self.subjects.colliders,
             fields=self.subjects.fields,
             max_slots=estimate_slots(rest, self.subjects.matter.field, self.dx),
-            sound_speed=fastest_wave(config.randomize, [flesh.matter() for flesh in self.flesh]),
+            sound_speed=wave,
         )
         self.state, self.scratch = allocate(self.model)
         self.sensors = self.scratch.sensors
@@ -137,7 +117,7 @@ class Simulation:
         self.collider_spawn = make_boundaries(self.subjects.colliders, *rows, self.device)
         first, count = self.subjects.first, len(self.flesh)
         self.avatars = [
-            AvatarDrive(flesh.points, first[index], self.model, drive_settings(flesh.drive))
+            AvatarDrive(flesh.points, first[index], self.model, drive_settings(flesh.drive), joints[index])
             for index, flesh in enumerate(self.flesh)
         ]
         # before anything is recorded: it gives what varies rows of its own
@@ -151,6 +131,12 @@ class Simulation:
     def avatar(self) -> AvatarDrive:
         """The first avatar's drive."""
         return self.avatars[0]
+
+    def _substeps(self, wave: float, torques: bool) -> int:
+        """Fewest substeps of a control step that are stable for waves of this speed [m/s], and under torques."""
+        physics = self.config.physics
+        by_torques = math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9) if torques else 1
+        return max(choose_num_substeps(physics.control_dt, self.dx, wave, physics.cfl), by_torques)
 
     def set_shape(self, env: int, parameters: np.ndarray, avatar: int = 0) -> None:
         """Give an avatar of environment ``env`` another body; takes effect when it is placed again.
@@ -263,7 +249,11 @@ class Simulation:
         """Every array of a checkpoint, by name."""
         found = {f"particles.{field.name}": getattr(self.state, field.name) for field in fields(self.state)}
         for index, (avatar, flesh) in enumerate(zip(self.avatars, self.flesh, strict=True)):
-            for group, value in (("drive", avatar.state), ("tracked", avatar.tracked)):
+            groups = {"drive": avatar.state, "tracked": avatar.tracked}
+            if avatar.joints:
+                groups["joints"] = avatar.joints.state
+                found[f"joints_{index}.assist"] = avatar.joints.assist
+            for group, value in groups.items():
                 found |= {f"{group}_{index}.{f.name}": getattr(value, f.name) for f in fields(value)}
             if flesh.shape.randomize:
                 names = ("rest", "rest_joint", "rest_center", "bone_mass", "inert")

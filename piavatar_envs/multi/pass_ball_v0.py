@@ -14,9 +14,9 @@ from pydantic import Field
 from piavatar_envs.api.pettingzoo import AvatarParallelEnv
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import EnvConfig, SceneConfig, replace
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.multi.passing import PassRule, Play, Serve, judge, keep_near, observe_game, serve_ball
 from piavatar_envs.multi.together import record_fall_together, record_shift
 from piavatar_envs.multi.versus import Referee, on_circle

@@ -15,8 +15,8 @@ from piavatar_envs.api.pettingzoo import AvatarParallelEnv
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import ConfigError, EnvConfig, SceneConfig
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm
-from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.multi.versus import (
     NUM_PARTS,

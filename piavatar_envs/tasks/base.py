@@ -15,8 +15,8 @@ import warp as wp
 from piavatar_envs.avatar.limits import joint_limits
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
-from piavatar_envs.envs.simulation import Domain
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
@@ -36,6 +36,8 @@ class Task:
         metrics: names of other numbers reported in ``info``.
         observes_contact: whether agents feel the impulses of other bodies on their body parts.
         observes_others: whether agents see each other.
+        targets_about_reference: whether, under ``control="pd"``, targets are counted from the reference pose; else from
+            the rest pose.
         camera_position, camera_target: the eye and what it looks at [m], from the ground below the agents' middle, or
             from the origin if the camera does not follow them (``camera_follows``).
         cost_terms: names of what is summed in ``info["cost"]``, for constrained learning; not part of the reward.
@@ -64,6 +66,7 @@ class Task:
 
     observes_contact: ClassVar[bool] = False
     observes_others: ClassVar[bool] = False
+    targets_about_reference: ClassVar[bool] = False
 
     camera_position: ClassVar[tuple[float, float, float]] = (1.75, -3.75, 1.62)
     camera_target: ClassVar[tuple[float, float, float]] = (0.0, -0.04, 0.86)

@@ -12,9 +12,9 @@ from pydantic import Field
 
 from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.config import EnvConfig, PropConfig, SceneConfig, replace
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.hits import Hits
 from piavatar_envs.tasks.place import PlaceRule, judge_pose, keep_place, observe_home

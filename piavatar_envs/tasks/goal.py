@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Protocol
 import warp as wp
 
 from piavatar_envs.envs.config import PropConfig, SceneConfig
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import Drawn, component
-from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.gate import Ball, Course, Gate, draw_gate, judge_ball, measure_ball, observe_gate
 
 if TYPE_CHECKING:

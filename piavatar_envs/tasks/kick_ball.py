@@ -11,10 +11,10 @@ from pydantic import Field
 from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.envs.config import DriveConfig, EnvConfig, SceneConfig, replace
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.draws import STREAM_BALL, generator
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS, Ball, turn_and_weigh
 from piavatar_envs.tasks.goal import (

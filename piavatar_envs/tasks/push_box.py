@@ -12,9 +12,9 @@ from pydantic import Field
 
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import ConfigError, EnvConfig, PropConfig, SceneConfig, replace
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.leash import record_leash
 from piavatar_envs.tasks.pushing import Push, draw_push, find_hands, judge, observe, observe_lead

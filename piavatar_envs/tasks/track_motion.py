@@ -16,9 +16,9 @@ from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
 from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.config import EnvConfig
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_rotation, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.simulation import Domain
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.clip import Clip, advance_reference, draw_start, read_clip
 from piavatar_envs.tasks.disturb import apply_impulse, draw_impulse, draw_offset
@@ -119,6 +119,7 @@ class TrackMotionTask(Task):
         ObservationTerm("reference_turns", 3 * NUM_ACTUATED, "rad", "bone", "rotation vectors to the clip's next pose"),
     )
     reward_terms = ("position", "rotation", "control")
+    targets_about_reference = True
     metrics = ("mpjpe", "rotation_error_deg", "root_error", "impulse")
 
     summary = """The avatar moves as a clip does, and every `impulse_interval` an impulse of 0.3 to 1 times `impulse`

@@ -8,7 +8,8 @@ import pytest
 from piavatar_envs.avatar.limbs import LIMB_GROUPS
 from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES
 from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
-from piavatar_envs.envs.simulation import Domain, Simulation
+from piavatar_envs.envs.domain import Domain
+from piavatar_envs.envs.simulation import Simulation
 from piavatar_envs.mpm.materials import MATERIALS
 
 BALL = {"name": "ball", "mass": 0.5, "position": [0.0, -1.0, 1.0]}

@@ -1,0 +1,220 @@
+"""A drive whose joints move under torques: joint targets or torques in, forces of muscles out, nothing held by magic.
+
+The other way to drive an avatar; see :mod:`piavatar_envs.avatar.drive`. Gravity, the ground and other bodies act on the
+whole body, and only torques between its bones act back. An assisting spring may help the pelvis, as a curriculum: at
+``assist`` 1 it nearly holds the pelvis alone, at 0 there is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.articulated import ArticulatedBody
+from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.joint_torques import Springs, Target
+from piavatar_envs.avatar.muscles import FASTEST, LOCKED_JOINTS, REFERENCE_HEIGHT, REFERENCE_MASS, Muscles, spring_rows
+from piavatar_envs.avatar.settings import ROOT_RATE
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.types import State, group, row
+
+if TYPE_CHECKING:
+    from piavatar_envs.avatar.drive import AvatarDrive
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+#: Age that a mass matrix may reach [s]: a little older, and fast limbs are unstable.
+LONGEST_REFRESH = 0.005
+#: Longest substep with joints under torques [s].
+LONGEST_SUBSTEP = 0.004
+#: Of the assisting spring that turns the pelvis upright [N m/rad].
+ASSIST_TORQUE = 1500.0
+_FASTEST = wp.constant(FASTEST)
+_ASSIST_TORQUE, _ASSIST_RATE = wp.constant(ASSIST_TORQUE), wp.constant(ROOT_RATE)
+_HEAD, _FOOT = wp.constant(joint_index("head")), wp.constant(joint_index("left_foot"))
+
+
+@dataclass(frozen=True, eq=False)
+class JointSettings:
+    """How the joints of an avatar are driven.
+
+    Attributes:
+        muscles: of the reference adult; those of the body follow from its weight times its height.
+        assist: of the pelvis at first, 0 to 1.
+        attachment: rates of the pulls that hold flesh to bones, shape ``(P,)`` [1/s].
+    """
+
+    muscles: Muscles
+    assist: float
+    attachment: np.ndarray
+
+
+@wp.kernel
+def set_springs(
+    body: Body,
+    gains: Springs,
+    body_mass: wp.array(dtype=float),
+    per_size: float,
+    assist: wp.array(dtype=float),
+    let_go: wp.array(dtype=int),
+    torque: wp.array2d(dtype=wp.vec3),
+    # out
+    factor: wp.array(dtype=float),
+    springs: Springs,
+):
+    """Strength and springs of every body, by its weight times its height; over ``(num_envs, 1 + bones)``.
+
+    A muscle that shortens at its greatest speed has no force left: what a torque loses to speed is a damper. The pelvis
+    is assisted where it has not been let go.
+    """
+    e, n = wp.tid()
+    m = body_mass[row(e, body_mass.shape[0])]
+    r = row(e, body.rest_joint.shape[0])
+    size = per_size * m * (body.rest_joint[r, _HEAD][2] - body.rest_joint[r, _FOOT][2])
+    K = size * gains.stiffness[0, n]
+    D = size * gains.damping[0, n]
+    if n == 0:
+        factor[e] = size
+    if n < 2:
+        K = wp.where(n == 0, m * _ASSIST_RATE * _ASSIST_RATE, _ASSIST_TORQUE)
+        K *= wp.where(let_go[e] != 0, 0.0, assist[e])
+        D = 2.0 * K / _ASSIST_RATE
+    else:
+        share = wp.abs(torque[e, n - 1])
+        D += size * wp.max(share[0], wp.max(share[1], share[2])) / _FASTEST
+    springs.stiffness[e, n] = K
+    springs.damping[e, n] = D
+
+
+@wp.kernel
+def reset_joints(
+    mask: wp.array(dtype=wp.bool),
+    pose_rotation: wp.array2d(dtype=wp.quat),
+    pose_position: wp.array2d(dtype=wp.vec3),
+    # out
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    torque: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=float),
+    outside: wp.array2d(dtype=float),
+):
+    """Joints of the masked environments into a pose, at rest; launched over ``(num_envs, 1 + bones)``."""
+    e, n = wp.tid()
+    if not mask[e]:
+        return
+    for i in range(3):
+        velocity[e, 3 * n + i] = 0.0
+        outside[e, 3 * n + i] = 0.0
+    if n > 0:
+        rotation[e, n - 1] = pose_rotation[e, n - 1]
+        position[e, n - 1] = pose_position[e, n - 1]
+        torque[e, n - 1] = wp.vec3(0.0)
+
+
+@wp.kernel
+def note_support(
+    share: float,
+    impulse: wp.array2d(dtype=float),
+    failure: wp.array(dtype=int),
+    # in and out
+    force: wp.array(dtype=wp.vec3),
+    torque: wp.array(dtype=wp.vec3),
+):
+    """Add the assisting force and torque of a substep to their mean; ``share`` is that of an impulse [1/s]."""
+    e = wp.tid()
+    if failure[e] != 0:
+        return
+    force[e] = force[e] + share * wp.vec3(impulse[e, 0], impulse[e, 1], impulse[e, 2])
+    torque[e] = torque[e] + share * wp.vec3(impulse[e, 3], impulse[e, 4], impulse[e, 5])
+
+
+class JointDrive:
+    """What turns the joints of one avatar in every environment.
+
+    Attributes:
+        body: the joints.
+        assist: of the pelvis, ``(num_envs,)``, 0 to 1; what is written here holds until it is written again.
+        gains: springs and dampers of the reference adult's joints, ``(1, 23)``.
+    """
+
+    def __init__(self, points: BodyPoints, drive: AvatarDrive, settings: JointSettings) -> None:
+        """Allocate.
+
+        Args:
+            points: the body as its drive was built from it.
+            drive: the avatar's, whose goals the springs pull to.
+            settings: of the joints.
+        """
+        n, model, muscles = drive.model.num_envs, drive.model, settings.muscles
+        self.drive = drive
+        attachment = settings.attachment[None] if settings.attachment.any() else None
+        rows = np.zeros((n, 1 + NUM_JOINTS))
+        self.body = ArticulatedBody(points, drive.body, model, rows, rows, attachment)
+        self.body.set_strength(muscles.lower, muscles.upper, n)
+        ranges = muscles.range_lower, muscles.range_upper
+        locked = [joint_index(name) for name in LOCKED_JOINTS]
+        self.body.set_tissue(muscles.tissue_damping, muscles.stop, *ranges, locked)
+        goal = {"rotation": drive.state.goal_rotation, "root": drive.state.goal_root}
+        torques = {"torque": self.state.torque, "factor": self.body.strength.factor}
+        self.body.target = group(Target, **goal, **torques)
+        gains = [spring_rows(values).astype(np.float32) for values in (muscles.stiffness, muscles.damping)]
+        stiffness, damping = (wp.array(values, dtype=float, device=model.device) for values in gains)
+        self.gains = group(Springs, stiffness=stiffness, damping=damping)
+        self.assist = wp.full(n, settings.assist, dtype=float, device=model.device)
+        # the height that goes with the joints' span in the first body
+        joints, rest = points.joints[0], points.rest[0]
+        span = float(joints[joint_index("head"), 2] - joints[joint_index("left_foot"), 2])
+        self._per_size = float(np.ptp(rest[:, 2])) / span / (REFERENCE_MASS * REFERENCE_HEIGHT)
+        self.refresh = max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6))
+
+    @property
+    def state(self):
+        """What a checkpoint holds."""
+        return self.body.state
+
+    def release(self, joints: list[int]) -> None:
+        """Take the springs from joints, by index, that torques alone shall move."""
+        for array in (self.gains.stiffness, self.gains.damping):
+            values = array.numpy()
+            values[0, [1 + joint for joint in joints]] = 0.0
+            array.assign(values)
+
+    def record_reset(self, program: Program, mask: wp.array) -> None:
+        """Append: joints of the masked environments into the pose that the drive has posed them in."""
+        s, posed = self.state, self.drive.scratch
+        program.launch(
+            reset_joints,
+            (self.drive.model.num_envs, 1 + NUM_JOINTS),
+            [mask, posed.pose_rotation, posed.pose_position],
+            [s.rotation, s.position, s.torque, s.velocity, s.outside],
+        )
+
+    def record_begin(self, program: Program) -> None:
+        """Append what begins a control step: strength and springs of the bodies as they are."""
+        drive, body = self.drive, self.body
+        program.launch(
+            set_springs,
+            (drive.model.num_envs, 1 + NUM_JOINTS),
+            [
+                drive.body,
+                self.gains,
+                drive.body_mass,
+                self._per_size,
+                self.assist,
+                drive.state.let_go,
+                self.state.torque,
+            ],
+            [body.strength.factor, body.springs],
+        )
+
+    def record_substep(self, program: Program, state: State, step: int) -> None:
+        """Append what the joints do before substep ``step`` of a control step."""
+        self.body.record_substep(program, state, refresh=step % self.refresh == 0)
+        n, share = self.drive.model.num_envs, 1.0 / self.drive.model.control_dt
+        d = self.drive.state
+        program.launch(note_support, n, [share, self.body.impulse, state.failure], [d.wrench_force, d.wrench_torque])

@@ -1,0 +1,68 @@
+"""The mass matrix of an avatar's joints in every environment: recorded, factorised, solved with."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.cholesky import factorize, solve
+from piavatar_envs.avatar.lanes import warp_threads
+from piavatar_envs.avatar.mass_matrix import (
+    NUM_DOF,
+    build_pairs,
+    compose_moments,
+    fill_mass_matrix,
+    place_pairs,
+    sum_pairs,
+)
+from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.types import Body, vec12, vec16
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.types import Model, State
+
+
+class JointMass:
+    """``M = J^T m J`` of one avatar; see :mod:`piavatar_envs.avatar.mass_matrix`.
+
+    Attributes:
+        matrix: the mass matrix, ``(num_envs, 69, 69)``.
+    """
+
+    def __init__(self, points: BodyPoints, body: Body, model: Model) -> None:
+        n, device = model.num_envs, model.device
+        self.body, self.model, self.threads = body, model, warp_threads(device)
+        self.pairs = build_pairs(points, device)
+        self.matrix = wp.zeros((n, NUM_DOF, NUM_DOF), dtype=float, device=device)
+        self._every = wp.full(n, 1, dtype=int, device=device)
+        self._sums = wp.zeros((n, len(self.pairs.entry_start) - 1), dtype=vec12, device=device)
+        self._moments = wp.zeros((n, NUM_JOINTS * NUM_JOINTS), dtype=vec16, device=device)
+
+    def record(self, program: Program, state: State, position: wp.array) -> None:
+        """Append: build the matrix for joints at ``position`` [m]."""
+        program.launch(
+            sum_pairs,
+            (*self._sums.shape, self.threads),
+            [self.body, self.pairs, self.model.particles, state.x, position, self.threads],
+            [self._sums],
+        )
+        moments = self._moments
+        program.launch(place_pairs, moments.shape, [self.pairs, self._sums, position], [moments])
+        for columns in (0, 1):
+            inputs = [self.body, position, columns]
+            program.launch(compose_moments, (self.model.num_envs, NUM_JOINTS), inputs, [moments])
+        program.launch(fill_mass_matrix, moments.shape, [moments], [self.matrix])
+
+    def record_factor(
+        self, program: Program, diagonal: wp.array, factor: wp.array, wanted: wp.array | None = None
+    ) -> None:
+        """Append: the Cholesky factor of the matrix and a diagonal, of all environments or of those ``wanted``."""
+        wanted = self._every if wanted is None else wanted
+        inputs = [self.matrix, diagonal, wanted, self.threads]
+        program.launch(factorize, (self.model.num_envs, self.threads), inputs, [factor])
+
+    def record_solve(
+        self, program: Program, factor: wp.array, right: wp.array, x: wp.array, wanted: wp.array | None = None
+    ) -> None:
+        """Append: solve with a factor, in all environments or in those ``wanted``."""
+        wanted = self._every if wanted is None else wanted
+        program.launch(solve, (self.model.num_envs, self.threads), [factor, right, wanted, self.threads], [x])

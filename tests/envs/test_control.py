@@ -1,0 +1,195 @@
+"""Environments whose joints move under torques: every task, both kinds of action, the same promises."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.limits import joint_limits
+from piavatar_envs.avatar.muscles import LOCKED_JOINTS, joint_torques
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS, joint_index
+from piavatar_envs.envs.config import ConfigError
+
+CONTROLS = ("pd", "torque")
+REACH = "PIAvatar/Reach-v0"
+
+
+@pytest.fixture(params=CONTROLS)
+def control(request) -> str:
+    return request.param
+
+
+def actions(env, count: int, seed: int = 0) -> np.ndarray:
+    return 0.3 * np.random.default_rng(seed).uniform(-1.0, 1.0, (count, *env.action_space.shape)).astype(np.float32)
+
+
+def run(env, rows) -> list:
+    return [env.step(action)[:4] for action in rows]
+
+
+def alike(equal, first, second) -> bool:
+    return all(equal(a[0], b[0]) and equal(a[1], b[1]) and a[2:] == b[2:] for a, b in zip(first, second, strict=True))
+
+
+def test_gymnasiums_checker(make_env, env_id, control):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of unbounded spaces
+        check_env(make_env(env_id, control=control), skip_render_check=True)
+
+
+def test_a_run_repeats_and_is_taken_up_again(make_env, env_id, control, equal):
+    env = make_env(env_id, control=control)
+    rows = actions(env, 12)
+    env.reset(seed=3)
+    first = run(env, rows[:6])
+    state = env.get_state()
+    last = run(env, rows[6:])
+    env.reset(seed=3)
+    assert alike(equal, first, run(env, rows[:6]))
+    env.reset(seed=4)
+    run(env, rows[:2])
+    env.set_state(state)
+    assert alike(equal, last, run(env, rows[6:]))
+
+
+def test_environment_i_is_the_single_one_and_a_masked_reset_spares_the_others(make_env, make_batch, control, equal):
+    settings = {"control": control, "shape.randomize": True, "mass_factor": (0.7, 1.4)}
+    batch, single = make_batch(REACH, 3, **settings), make_env(REACH, **settings)
+    rows = np.stack([actions(single, 8, seed) for seed in range(3)], axis=1)
+    batch.reset(seeds=[5, 6, 7])
+    seen = []
+    for step, row in enumerate(rows):
+        if step == 5:
+            before = batch.get_state()
+            batch.reset(env_mask=np.array([False, True, False]))
+            after = batch.get_state()
+            spared = [before[name][[0, 2]].tobytes() == after[name][[0, 2]].tobytes() for name in before]
+            assert all(spared)
+            assert not after["joints_0.velocity"][1].any() and before["joints_0.velocity"][1].any()
+        batch.action.assign(row[:, None])
+        batch.step()
+        seen.append(batch.observation.numpy()[:, 0].copy())
+    for i in (0, 2):
+        single.reset(seed=5 + i)
+        for step in range(len(rows)):
+            assert equal(single.step(rows[step, i])[0], seen[step][i])
+    batch.action.zero_()
+
+
+def test_bad_actions_are_refused_and_a_failure_freezes(make_env, control):
+    env = make_env(REACH, control=control)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="must be finite"):
+        env.step(np.full(env.action_space.shape, np.nan, np.float32))
+    state = env.get_state()
+    state["particles.u"][0, 0] = 1e6
+    env.set_state(state)
+    assert env.step(np.zeros(env.action_space.shape))[4]["failure"] == "cfl"
+    frozen = env.get_state()
+    env.step(np.ones(env.action_space.shape))
+    after = env.get_state()
+    names = [name for name in frozen if name.startswith(("joints_0", "particles"))]
+    assert all(frozen[name].tobytes() == after[name].tobytes() for name in names if name != "joints_0.torque")
+    env.reset(seed=0)
+    assert env.step(np.zeros(env.action_space.shape))[4]["failure"] is None
+
+
+def angles(env) -> np.ndarray:
+    """Rotation vectors of the joints [rad], ``(22, 3)``."""
+    world = Rotation.from_quat(env.batch.simulation.avatar.joints.state.rotation.numpy()[0].astype(float))
+    return np.stack([(world[max(PARENTS[b], 0)].inv() * world[b]).as_rotvec() for b in range(len(JOINT_NAMES))])
+
+
+@pytest.mark.parametrize(("component", "share"), [("left_shoulder.x", -0.4), ("right_elbow.z", 0.3), ("neck.z", 1.0)])
+def test_a_target_is_absolute(make_env, component, share):
+    """The same action again does not turn the joint on; half of an axis' range is half of it."""
+    env = make_env(REACH, control="pd", root_assist=1.0, gravity=0.0, pose_noise=0.0, joints=None)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, np.float32)
+    action[env.action_names.index(component)] = share
+    for _ in range(60):
+        env.step(action)
+    joint, axis = component.split(".")
+    lower, upper = joint_limits()
+    expected = np.zeros(3)
+    bound = upper if share > 0.0 else -lower
+    expected["xyz".index(axis)] = share * bound[joint_index(joint), "xyz".index(axis)]
+    assert np.abs(angles(env)[joint_index(joint)] - expected).max() < 0.03
+
+
+def test_torques_are_shares_of_the_joints_strength(make_env):
+    """Of the mean body, and scaled by weight times height; an agent's torque never exceeds the table."""
+    env = make_env(REACH, control="torque", joints=None)
+    env.reset(seed=0)
+    joints = env.batch.simulation.avatar.joints
+    lower, upper = joint_torques()
+    for share in (1.0, -0.5):
+        env.step(np.full(env.action_space.shape, share, np.float32))
+        expected = share * (upper if share > 0.0 else -lower)
+        np.testing.assert_allclose(joints.state.torque.numpy()[0], expected, rtol=1e-5)
+    size = joints.body.strength.factor.numpy()[0]
+    mass = env.batch.simulation.avatar.body_mass.numpy()[0]
+    rest = env.batch.simulation.flesh[0].points.rest[0]
+    assert size == pytest.approx(mass * np.ptp(rest[:, 2]) / (75.0 * 1.75), rel=1e-4)
+
+
+def test_toes_do_not_act_and_do_not_move(make_env, control):
+    env = make_env(REACH, control=control, joints=None, pose_noise=0.0)
+    assert not any(name.startswith(LOCKED_JOINTS) for name in env.action_names)
+    env.reset(seed=1)
+    run(env, actions(env, 5))
+    toes = [joint_index(name) for name in LOCKED_JOINTS]
+    assert np.abs(angles(env)[toes]).max() < 1e-3
+
+
+def test_nobody_holds_the_root_unless_asked(make_env, make_batch):
+    """Without assistance nothing acts from outside, and the body falls; with it the pelvis stays where it was."""
+    heights = {}
+    for assist in (0.0, 1.0):
+        env = make_env(REACH, control="torque", root_assist=assist, pose_noise=0.0)
+        env.reset(seed=0)
+        rows = [env.step(np.zeros(env.action_space.shape)) for _ in range(40)]
+        assert all(np.any(row[4]["root_force"]) == (assist > 0.0) for row in rows)
+        assert not any(row[2] for row in rows)  # nothing lets go
+        heights[assist] = env.batch.simulation.avatar.tracked.position.numpy()[0, 0, 2]
+    assert heights[0.0] < 0.5 < 0.75 < heights[1.0]
+    batch = make_batch(REACH, 2, control="torque", pose_noise=0.0)
+    batch.reset(seeds=[0, 0])
+    batch.assist_root(np.array([0.0, 1.0]))
+    for _ in range(40):
+        batch.step()
+    fallen, held = batch.simulation.avatar.tracked.position.numpy()[:, 0, 2]
+    assert (fallen, held) == pytest.approx((heights[0.0], heights[1.0]), abs=1e-6)
+    batch.assist_root(0.0)
+    for bad in (1.5, np.zeros(3), np.nan):
+        with pytest.raises(ValueError, match="root_assist="):
+            batch.assist_root(bad)
+
+
+def test_an_assisted_avatar_stands_still(make_env):
+    env = make_env(REACH, control="pd", root_assist=1.0, pose_noise=0.0, episode_seconds=20.0)
+    env.reset(seed=0)
+    for _ in range(150):
+        *_, info = env.step(np.zeros(env.action_space.shape))
+    state = env.batch.simulation.state
+    speed = np.linalg.norm(state.u.numpy()[0] + state.vk.numpy()[0], axis=1)
+    assert info["failure"] is None
+    assert speed.max() < 0.02
+    assert np.degrees(np.linalg.norm(angles(env)[1:], axis=1)).max() < 6.0
+
+
+def test_what_torques_cannot_do_is_refused(device):
+    import gymnasium
+
+    with pytest.raises(ConfigError, match=r"needs two velocities.*split"):
+        gymnasium.make(REACH, device=device, fidelity="tiny", control="pd", decoupling="paper")
+    with pytest.raises(ConfigError, match=r"drive\.control cannot differ"):
+        avatars = [{"drive": {"control": "pd"}}]
+        gymnasium.make(REACH, device=device, fidelity="tiny", scene={"avatars": avatars})
+    env = gymnasium.make(REACH, device=device, fidelity="tiny").unwrapped
+    with pytest.raises(ValueError, match="root wrench"):
+        env.batch.assist_root(0.5)
