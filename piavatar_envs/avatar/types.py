@@ -156,7 +156,7 @@ class JointState:
     position: wp.array  # (num_envs, bones) joint position [m]
     velocity: wp.array  # (num_envs, 69) the pelvis' [m/s], then spins of all joints in the world's axes [rad/s]
     outside: wp.array  # (num_envs, 69) how all but the joints themselves changed it in the last substep
-    # (num_envs, bones) torques about the axes of the rest pose, as the parent has turned them, of the reference adult [N m]
+    # (num_envs, bones) torques, of the reference adult, about the rest pose's axes as the parent has turned them [N m]
     torque: wp.array
 
 
