@@ -91,6 +91,13 @@ CONTACT_TERMS: tuple[ObservationTerm, ...] = (
     ObservationTerm("contact_impulse", 3 * len(BODY_PARTS), "N s", "root", "impulse of other bodies on each body part"),
 )
 
+#: What avatars add whose joints move under torques.
+JOINT_TERMS: tuple[ObservationTerm, ...] = (
+    ObservationTerm("root_spin", 3, "rad/s", "root", "angular velocity of the pelvis"),
+    ObservationTerm("joint_velocities", 3 * NUM_ACTUATED, "rad/s", "parent", "angular velocities of the joints"),
+    ObservationTerm("ground_impulse", 3, "N s", "root", "impulse of ground, walls and colliders in the last step"),
+)
+
 
 class ObservationLayout(dict[str, PlacedTerm]):
     """Terms by name, in the order of the flat vector."""
@@ -203,6 +210,29 @@ def observe_contact(
         if s != agent:
             total += sensors.part_impulse[e, agent * _NUM_PARTS + part, s]
     write_vector(observation, e, agent, start + 3 * part, wp.quat_rotate(wp.quat_inverse(rotation[e, 0]), total))
+
+
+@wp.kernel
+def observe_joints(
+    agent: int,
+    start: int,
+    body: Body,
+    rotation: wp.array2d(dtype=wp.quat),
+    velocity: wp.array2d(dtype=float),
+    sensors: Sensors,
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """The terms of ``JOINT_TERMS``, from component ``start``; over ``(num_envs, bones)``."""
+    e, b = wp.tid()
+    frame = rotation[e, 0]
+    if b > 0:
+        frame = rotation[e, body.parent[b]]
+    spin = wp.vec3(velocity[e, 3 + 3 * b], velocity[e, 4 + 3 * b], velocity[e, 5 + 3 * b])
+    write_vector(observation, e, agent, start + 3 * b, wp.quat_rotate_inv(frame, spin))
+    if b == 0:
+        impulse = wp.quat_rotate_inv(frame, sensors.boundary_impulse[e, agent])
+        write_vector(observation, e, agent, start + 3 * rotation.shape[1], impulse)
 
 
 @wp.kernel

@@ -9,12 +9,14 @@ import warp as wp
 from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_JOINTS
 from piavatar_envs.envs.observations import (
     CONTACT_TERMS,
+    JOINT_TERMS,
     SELF_TERMS,
     ObservationLayout,
     clean_observation,
     clear_stress,
     observe_body,
     observe_contact,
+    observe_joints,
     observe_stress,
     tracked_arrays,
 )
@@ -31,9 +33,9 @@ if TYPE_CHECKING:
 class Observer:
     """Layout of the observation, and how it comes about.
 
-    Every agent observes itself, then (where the task says so) contact, props and the other agents, then the task's own
-    terms and, if the configuration says so, what the episode has drawn. The others are counted on from oneself, so that
-    all agents see the world alike.
+    Every agent observes itself, then (where the task says so) contact, (under torques) its joints' velocities,
+    props and the other agents, then the task's own terms and, if the configuration says so, what the episode has
+    drawn. The others are counted on from oneself, so that all agents see the world alike.
 
     Attributes:
         layout: of the flat observation.
@@ -47,6 +49,8 @@ class Observer:
         terms = [*SELF_TERMS]
         if task.observes_contact:
             terms += CONTACT_TERMS
+        if task.config.drive.control != "pose":
+            terms += JOINT_TERMS
         self._first_prop = sum(term.size for term in terms)
         for name in task.observed_props():
             terms += prop_terms(name)
@@ -80,6 +84,10 @@ class Observer:
             program.launch(
                 observe_contact, (n, len(BODY_PARTS)), [agent, at, avatar.tracked.rotation, sim.sensors], [observation]
             )
+        if avatar.joints:
+            at, joints = self.layout[JOINT_TERMS[0].name].slice.start, avatar.joints.state
+            inputs = [agent, at, avatar.body, joints.rotation, joints.velocity, sim.sensors]
+            program.launch(observe_joints, (n, NUM_JOINTS), inputs, [observation])
         self._record_others(program, agent, observation)
 
     def _record_others(self, program: Program, agent: int, observation: wp.array) -> None:

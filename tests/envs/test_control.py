@@ -193,3 +193,24 @@ def test_what_torques_cannot_do_is_refused(device):
     env = gymnasium.make(REACH, device=device, fidelity="tiny").unwrapped
     with pytest.raises(ValueError, match="root wrench"):
         env.batch.assist_root(0.5)
+
+
+def test_joints_are_observed(make_env, control):
+    """Velocities are those that joints turn with, in the parent's frame; the ground's impulse bears the weight."""
+    env = make_env(REACH, control=control, joints=None, root_assist=0.5, pose_noise=0.0)
+    layout, elbow = env.observation_layout, joint_index("left_elbow")
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, np.float32)
+    action[env.action_names.index("left_elbow.x")] = -0.2
+    turned, seen, weight = [angles(env)[elbow]], [np.zeros(3)], []
+    for _ in range(10):
+        observation, *_ = env.step(action)
+        turned.append(angles(env)[elbow])
+        seen.append(observation[layout["joint_velocities"].slice].reshape(-1, 3)[elbow - 1])
+        weight.append(observation[layout["ground_impulse"].slice])
+    rates = 30.0 * np.diff(turned, axis=0)
+    means = 0.5 * (np.array(seen[1:]) + np.array(seen[:-1]))  # of both ends of a step
+    assert np.abs(rates).max() > 0.5
+    assert np.abs(rates - means)[2:].max() < 0.2 * np.abs(rates).max()
+    mass = env.batch.simulation.avatar.body_mass.numpy()[0]
+    assert 0.3 < np.mean(weight[4:], axis=0)[2] / (mass * 9.81 / 30.0) < 1.3
