@@ -1,0 +1,170 @@
+"""Joints that push: what a blocked limb transmits, what limits and ends of ranges do, how flesh is held."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.articulated import UNBOUNDED, ArticulatedBody
+from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.muscles import attachment_rates, joint_torques, make_muscles
+from piavatar_envs.avatar.sampling import sample_particles, spacing_for
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.soft_tissue import bone_distance
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
+from tests.avatar.test_articulated import Joints
+
+ANKLES = [joint_index("left_ankle"), joint_index("right_ankle")]
+TOES = [joint_index("left_foot"), joint_index("right_foot")]
+EVERYWHERE = np.full((NUM_JOINTS, 3), UNBOUNDED)
+
+
+class Held(Joints):
+    """A body whose pelvis is held and whose joints are stiff, but for one pair that a test is about.
+
+    Attributes:
+        program: a control step.
+    """
+
+    def __init__(self, rig, joints, stiffness: float, damping: float):
+        self.rig, self.model, self.state, self.joints = rig, rig.model, rig.state, list(joints)
+        springs, dampers = np.full((1, 1 + NUM_JOINTS), 3000.0), np.full((1, 1 + NUM_JOINTS), 100.0)
+        springs[0, :2], dampers[0, :2] = 1e5, 1e4
+        springs[0, 1 + np.array(self.joints)], dampers[0, 1 + np.array(self.joints)] = stiffness, damping
+        self.body = ArticulatedBody(
+            rig.points, rig.drive.body, rig.model, springs, dampers, np.full((1, len(rig.mass)), 300.0)
+        )
+        nothing = np.zeros(NUM_JOINTS)
+        self.body.set_tissue(nothing, nothing, -EVERYWHERE, EVERYWHERE, TOES)
+
+    def start(self):
+        """In the rest pose, where the pelvis is held."""
+        self.pose(np.zeros((NUM_JOINTS, 3)))
+        self.body.target.root.assign(self.body.state.position.numpy()[:, 0])
+        rig, self.program = self.rig, Program(self.model.device)
+        record_begin(self.program, rig.model, rig.state, rig.scratch)
+        for step in range(rig.model.num_substeps):
+            self.body.record_substep(self.program, rig.state, refresh=True)
+            record_substep(self.program, rig.model, rig.state, rig.scratch, step)
+        record_end(self.program, rig.model, rig.state, rig.scratch)
+        return self
+
+    def aim(self, rotvec) -> None:
+        """Let the springs of the pair pull to a rotation vector."""
+        target = np.zeros((NUM_JOINTS, 3))
+        target[self.joints] = rotvec
+        self.body.target.rotation.assign(Rotation.from_rotvec(target).as_quat()[None].astype(np.float32))
+
+    def local(self) -> np.ndarray:
+        """Rotation vectors of the pair, ``(2, 3)`` [rad]."""
+        world = Rotation.from_quat(self.body.state.rotation.numpy()[0].astype(float))
+        return np.stack([(world[PARENTS[b]].inv() * world[b]).as_rotvec() for b in self.joints])
+
+    def torque(self) -> np.ndarray:
+        """Torques that the pair got in the last substep, in the frame of the parents, ``(2, 3)`` [N m]."""
+        impulse = self.body.impulse.numpy()[0].astype(float).reshape(-1, 3)[1:] / self.model.step.dt
+        world = Rotation.from_quat(self.body.state.rotation.numpy()[0].astype(float))
+        return np.stack([world[PARENTS[b]].inv().apply(impulse[b]) for b in self.joints])
+
+
+@pytest.fixture(scope="module")
+def pressed(make_rig) -> dict[float, dict[str, np.ndarray]]:
+    """Feet that press their toes on the floor, by the damping of the ankles; nothing weighs anything."""
+    found = {}
+    for damping in (2.0, 20.0, 200.0):
+        held = Held(make_rig(cells=24, floor=True), ANKLES, 300.0, damping).start()
+        held.aim([0.3, 0.0, 0.0])
+        for _ in range(60 if damping < 100.0 else 200):  # it creeps to its rest in D / K = 0.67 s
+            held.program.run()
+        assert held.state.failure.numpy().sum() == 0
+        found[damping] = {
+            "error": 0.3 - held.local()[:, 0],
+            "torque": held.torque()[:, 0],
+            "speed": np.abs(held.total).max(),
+            "floor": held.rig.scratch.sensors.boundary_impulse.numpy()[0, 0, 2] / held.model.control_dt,
+            "held": held.body.impulse.numpy()[0, 2] / held.model.step.dt,
+        }
+    return found
+
+
+@pytest.mark.parametrize("damping", [2.0, 20.0, 200.0])
+def test_a_blocked_foot_transmits_its_spring(pressed, damping):
+    """``tau = K e``, and the floor pushes back at the lever of the foot, whatever the damper."""
+    seen = pressed[damping]
+    assert seen["speed"] < 0.02
+    assert seen["error"].min() > 0.05  # it is blocked
+    np.testing.assert_allclose(seen["torque"], 300.0 * seen["error"], rtol=0.03)
+    assert seen["floor"] == pytest.approx(-seen["held"], rel=0.03)  # what the pelvis is held down with
+    assert 0.08 < seen["torque"].sum() / seen["floor"] < 0.22  # from the ankle to where toes press [m]
+
+
+def test_what_a_foot_presses_with_does_not_depend_on_its_damper(pressed):
+    forces = [seen["floor"] for seen in pressed.values()]
+    assert max(forces) < 1.05 * min(forces)
+
+
+@pytest.mark.parametrize("limit", [2.0, 15.0])
+def test_muscles_give_no_more_than_they_have(make_rig, limit):
+    """An arm is asked to rise by a spring that its weight and the limit do not let it follow."""
+    shoulders = [joint_index("left_shoulder"), joint_index("right_shoulder")]
+    held = Held(make_rig(cells=16, gravity=9.81), shoulders, 1000.0, 30.0)
+    lower, upper = -EVERYWHERE.copy(), EVERYWHERE.copy()
+    lower[shoulders], upper[shoulders] = -limit, limit
+    held.body.set_strength(lower, upper, 1)
+    held.start().aim([-1.0, 0.0, 0.0])
+    most = 0.0
+    for _ in range(30):
+        held.program.run()
+        most = max(most, np.abs(held.torque()).max())
+    assert held.state.failure.numpy().sum() == 0
+    assert most == pytest.approx(limit, rel=0.02)  # read in the frame of a moment later
+    # 15 N m hold an arm of 3 kg out in front; 2 N m do not
+    assert (held.local()[0, 0] < -0.8) == (limit > 10.0)
+
+
+def test_a_joint_is_stopped_at_the_end_of_its_range(make_rig):
+    """A torque of 10 N m turns an elbow out of its range by what its stop gives, and no further."""
+    elbows = [joint_index("left_elbow"), joint_index("right_elbow")]
+    held = Held(make_rig(cells=16), elbows, 0.0, 0.5)
+    lower, upper, stop = -EVERYWHERE.copy(), EVERYWHERE.copy(), np.zeros(NUM_JOINTS)
+    upper[elbows], stop[elbows] = 0.3, 200.0
+    nothing = np.zeros(NUM_JOINTS)
+    held.body.set_tissue(nothing, stop, lower, upper, TOES)
+    held.start()
+    torque = np.zeros((1, NUM_JOINTS, 3), np.float32)
+    torque[0, elbows, 0] = 10.0
+    held.body.state.torque.assign(torque)
+    for _ in range(40):
+        held.program.run()
+    np.testing.assert_allclose(held.local()[:, 0], 0.3 + 10.0 / 200.0, atol=0.01)
+
+
+def test_flesh_is_held_the_faster_the_deeper_it_lies():
+    particles = sample_particles(load_body(), spacing_for(0.07))
+    distance = bone_distance(particles.rest_positions, particles.bone)
+    rates = attachment_rates(particles.depth, distance, 30.0, 500.0)
+    assert rates[particles.bone >= 0] == pytest.approx(500.0)
+    assert rates.min() >= 30.0 and rates[particles.depth == 0.0] == pytest.approx(30.0)
+    for fixed in (0.02, 0.05):  # deeper at the same distance from the bone, nearer to it at the same depth
+        steps = np.linspace(0.001, 0.1, 20)
+        assert (np.diff(attachment_rates(steps, np.full(20, fixed), 30.0, 500.0)) > 0.0).all()
+        assert (np.diff(attachment_rates(np.full(20, fixed), steps, 30.0, 500.0)) < 0.0).all()
+    assert not attachment_rates(particles.depth, distance, 0.0, 500.0).any()
+    # depth is what sampling has measured: bone particles of the thigh lie deeper than its skin's
+    assert particles.depth[particles.shell].max() < particles.depth[particles.bone == joint_index("left_hip")].mean()
+
+
+def test_muscles_are_mirrored_and_follow_their_factors():
+    lower, upper = joint_torques()
+    left, right = joint_index("left_elbow"), joint_index("right_elbow")
+    assert (lower[left, 0], upper[left, 0]) == (lower[right, 0], upper[right, 0])
+    assert (lower[left, 2], upper[left, 2]) == (-upper[right, 2], -lower[right, 2])
+    assert (lower <= 0.0).all() and (upper >= 0.0).all() and not lower[0].any()
+    one, other = make_muscles(), make_muscles(2.0, 3.0, 0.5)
+    np.testing.assert_allclose(other.stiffness, 2.0 * one.stiffness)
+    np.testing.assert_allclose(other.damping, 3.0 * one.damping)
+    np.testing.assert_allclose(other.upper, 0.5 * one.upper)
+    # Anderson et al., table 3: the knee extends with 0.163 of weight times height
+    assert -lower[joint_index("left_knee"), 0] == pytest.approx(0.163 * 75.0 * 9.81 * 1.75, rel=0.01)
