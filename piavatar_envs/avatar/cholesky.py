@@ -1,20 +1,49 @@
-"""Cholesky factors of small dense matrices, one an environment, and what is solved with them.
+"""Cholesky factors of small sparse matrices, one an environment, and what is solved with them.
 
-The threads of a warp share a matrix on a GPU; on a CPU one thread has it to itself (``threads = 1``).
-What is not ``wanted`` ``(num_envs,)`` stays as it is.
+The matrix is ``L^T L`` with a lower triangle ``L``: rows are eliminated from the last one up. Where rows are joints
+in an order that has children after their parents, limbs go before what they hang on, and of two limbs neither fills
+the rows of the other (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6.5). Which entries are not zero is
+found once, on the host. The threads of a warp share a matrix on a GPU; on a CPU one thread has it to itself
+(``threads = 1``). What is not ``wanted`` ``(num_envs,)`` stays as it is.
 """
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.lanes import meet_threads
+from piavatar_envs.avatar.lanes import meet_threads, sum_threads
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
+@wp.struct
+class Pattern:
+    """Entries of ``L`` before the diagonal that need not be zero: row ``k`` has ``column[start[k] : start[k + 1]]``."""
+
+    start: wp.array(dtype=int)  # (rows + 1,)
+    column: wp.array(dtype=int)  # in a row from the first to the last
+
+
+def find_pattern(filled: np.ndarray, device: str) -> Pattern:
+    """Where ``L`` has entries, by elimination, from where the matrix has: ``filled``, shape ``(N, N)`` bool."""
+    filled = filled | filled.T
+    columns = []
+    for k in reversed(range(len(filled))):
+        found = np.flatnonzero(filled[k, :k])
+        filled[np.ix_(found, found)] = True
+        columns.append(found)
+    columns.reverse()
+    pattern = Pattern()
+    start = np.cumsum([0, *map(len, columns)])
+    pattern.start = wp.array(start.astype(np.int32), dtype=int, device=device)
+    pattern.column = wp.array(np.concatenate(columns).astype(np.int32), dtype=int, device=device)
+    return pattern
+
+
 @wp.kernel
 def factorize(
+    pattern: Pattern,
     matrix: wp.array3d(dtype=float),
     diagonal: wp.array2d(dtype=float),
     wanted: wp.array(dtype=int),
@@ -22,36 +51,46 @@ def factorize(
     # out
     factor: wp.array3d(dtype=float),
 ):
-    """Lower triangular ``L`` with ``L L^T = matrix + diag(diagonal)``; launched over ``(num_envs, threads)``.
+    """``L`` of ``L^T L = matrix + diag(diagonal)``; launched over ``(num_envs, threads)``.
 
-    Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, and only that of ``factor`` is written.
-    ``diagonal`` is ``(1 or num_envs, N)``. Columns are taken off the rest one after the other (right-looking).
+    Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, and only that of ``factor`` is written, both
+    where the pattern says. ``diagonal`` is ``(1 or num_envs, N)``.
     """
     e, thread = wp.tid()
     if wanted[e] == 0:
         return
     size = matrix.shape[1]
     r = wp.min(e, diagonal.shape[0] - 1)
-    for i in range(thread, size, threads):
-        for j in range(i):
-            factor[e, i, j] = matrix[e, i, j]
-        factor[e, i, i] = matrix[e, i, i] + diagonal[r, i]
+    for k in range(thread, size, threads):
+        for n in range(pattern.start[k], pattern.start[k + 1]):
+            factor[e, k, pattern.column[n]] = matrix[e, k, pattern.column[n]]
+        factor[e, k, k] = matrix[e, k, k] + diagonal[r, k]
     meet_threads(threads)
-    for j in range(size):
-        pivot = wp.sqrt(factor[e, j, j])
+    for row in range(size):
+        k = size - 1 - row
+        first = pattern.start[k]
+        last = pattern.start[k + 1]
+        pivot = wp.sqrt(factor[e, k, k])
         meet_threads(threads)
-        for i in range(j + thread, size, threads):
-            factor[e, i, j] = factor[e, i, j] / pivot
+        for n in range(first + thread, last, threads):
+            i = pattern.column[n]
+            factor[e, k, i] = factor[e, k, i] / pivot
+        if thread == 0:
+            factor[e, k, k] = pivot
         meet_threads(threads)
-        for i in range(j + 1 + thread, size, threads):
-            share = factor[e, i, j]
-            for k in range(j + 1, i + 1):
-                factor[e, i, k] = factor[e, i, k] - share * factor[e, k, j]
+        for n in range(first + thread, last, threads):
+            i = pattern.column[n]
+            share = factor[e, k, i]
+            for m in range(first, n):
+                j = pattern.column[m]
+                factor[e, i, j] = factor[e, i, j] - share * factor[e, k, j]
+            factor[e, i, i] = factor[e, i, i] - share * share
         meet_threads(threads)
 
 
 @wp.kernel
 def solve(
+    pattern: Pattern,
     factor: wp.array3d(dtype=float),
     right: wp.array2d(dtype=float),
     wanted: wp.array(dtype=int),
@@ -59,7 +98,7 @@ def solve(
     # out
     x: wp.array2d(dtype=float),
 ):
-    """``x`` with ``L L^T x = right``, ``L`` the ``factor``; launched over ``(num_envs, threads)``."""
+    """``x`` with ``L^T L x = right``, ``L`` the ``factor``; launched over ``(num_envs, threads)``."""
     e, thread = wp.tid()
     if wanted[e] == 0:
         return
@@ -67,20 +106,22 @@ def solve(
     for i in range(thread, size, threads):
         x[e, i] = right[e, i]
     meet_threads(threads)
-    for j in range(size):
-        y = x[e, j] / factor[e, j, j]
+    for row in range(size):
+        k = size - 1 - row
+        y = x[e, k] / factor[e, k, k]
         meet_threads(threads)
         if thread == 0:
-            x[e, j] = y
-        for i in range(j + 1 + thread, size, threads):
-            x[e, i] = x[e, i] - factor[e, i, j] * y
+            x[e, k] = y
+        for n in range(pattern.start[k] + thread, pattern.start[k + 1], threads):
+            i = pattern.column[n]
+            x[e, i] = x[e, i] - factor[e, k, i] * y
         meet_threads(threads)
-    for n in range(size):
-        j = size - 1 - n
-        y = x[e, j] / factor[e, j, j]
-        meet_threads(threads)
+    for k in range(size):
+        part = float(0.0)
+        for n in range(pattern.start[k] + thread, pattern.start[k + 1], threads):
+            i = pattern.column[n]
+            part += factor[e, k, i] * x[e, i]
+        part = sum_threads(part, threads)
         if thread == 0:
-            x[e, j] = y
-        for i in range(thread, j, threads):
-            x[e, i] = x[e, i] - factor[e, j, i] * y
+            x[e, k] = (x[e, k] - part) / factor[e, k, k]
         meet_threads(threads)

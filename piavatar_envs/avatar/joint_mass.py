@@ -5,13 +5,14 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.cholesky import factorize, solve
+from piavatar_envs.avatar.cholesky import factorize, find_pattern, solve
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import (
     NUM_DOF,
     build_pairs,
     compose_moments,
     fill_mass_matrix,
+    filled_entries,
     place_pairs,
     sum_pairs,
 )
@@ -33,6 +34,7 @@ class JointMass:
         self.body, self.model, self.threads = body, model, warp_threads(device)
         self.pairs = build_pairs(points, device)
         self.matrix = wp.zeros((n, NUM_DOF, NUM_DOF), dtype=float, device=device)
+        self.pattern = find_pattern(filled_entries(self.pairs), device)
         self._every = wp.full(n, 1, dtype=int, device=device)
         self._sums = wp.zeros((n, len(self.pairs.entry_start) - 1), dtype=vec12, device=device)
         self._moments = wp.zeros((n, NUM_JOINTS * NUM_JOINTS), dtype=vec16, device=device)
@@ -57,7 +59,7 @@ class JointMass:
     ) -> None:
         """Append: the Cholesky factor of the matrix and a diagonal, of all environments or of those ``wanted``."""
         wanted = self._every if wanted is None else wanted
-        inputs = [self.matrix, diagonal, wanted, self.threads]
+        inputs = [self.pattern, self.matrix, diagonal, wanted, self.threads]
         program.launch(factorize, (self.model.num_envs, self.threads), inputs, [factor])
 
     def record_solve(
@@ -65,4 +67,5 @@ class JointMass:
     ) -> None:
         """Append: solve with a factor, in all environments or in those ``wanted``."""
         wanted = self._every if wanted is None else wanted
-        program.launch(solve, (self.model.num_envs, self.threads), [factor, right, wanted, self.threads], [x])
+        inputs = [self.pattern, factor, right, wanted, self.threads]
+        program.launch(solve, (self.model.num_envs, self.threads), inputs, [x])

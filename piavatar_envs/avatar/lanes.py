@@ -34,15 +34,21 @@ return value;
 """
 
 
+@wp.func_native(_SUM.replace("for (int c = 0; c < %d; ++c) value[c]", "value").replace("value[c]", "value"))
+def sum_threads(value: float, threads: int) -> float:
+    """Sum over ``threads`` threads, told to all of them."""
+    ...
+
+
 @wp.func_native(_SUM % 12)
 def sum_threads12(value: vec12, threads: int) -> vec12:
-    """Sum over ``threads`` threads, told to all of them."""
+    """:func:`sum_threads` of twelve numbers."""
     ...
 
 
 @wp.func_native(_SUM % 16)
 def sum_threads16(value: vec16, threads: int) -> vec16:
-    """:func:`sum_threads12` of sixteen numbers."""
+    """:func:`sum_threads` of sixteen numbers."""
     ...
 
 

@@ -25,7 +25,7 @@ import warp as wp
 from piavatar_envs.avatar.body import CHUNK, BodyPoints
 from piavatar_envs.avatar.lanes import store_sum12
 from piavatar_envs.avatar.rigid_fit import symmetric
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
 from piavatar_envs.mpm.types import Particles, row
 
@@ -88,6 +88,19 @@ def build_pairs(points: BodyPoints, device: str) -> Pairs:
         setattr(pairs, name, wp.array(np.asarray(numbers, np.int32), dtype=int, device=device))
     pairs.entry_weight = wp.array(np.concatenate(entry_weights).astype(np.float32), dtype=float, device=device)
     return pairs
+
+
+def filled_entries(pairs: Pairs) -> np.ndarray:
+    """Where the mass matrix need not be zero, shape ``(69, 69)`` bool: where two joints carry what moves with both."""
+    shared = pairs.of.numpy().reshape(NUM_JOINTS, NUM_JOINTS) >= 0
+    for columns in (False, True):
+        for bone in range(NUM_JOINTS - 1, 0, -1):  # children come after their parents
+            view = shared.T if columns else shared
+            view[PARENTS[bone]] |= view[bone]
+    joints = np.kron(shared, np.ones((3, 3), bool))
+    filled = np.ones((NUM_DOF, NUM_DOF), bool)
+    filled[3:, 3:] = joints
+    return filled
 
 
 @wp.kernel

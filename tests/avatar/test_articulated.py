@@ -9,7 +9,7 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.articulated import ArticulatedBody
-from piavatar_envs.avatar.cholesky import factorize, solve
+from piavatar_envs.avatar.cholesky import factorize, find_pattern, solve
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
@@ -102,19 +102,26 @@ def joints(make_rig, wild_pose):
     return build
 
 
-def test_factors_solve(device):
+@pytest.mark.parametrize("sparse", [False, True])
+def test_factors_solve(device, sparse):
     rng, size, n, threads = np.random.default_rng(0), 37, 3, warp_threads(device)
     root = rng.normal(size=(n, size, size))
-    matrix = (root @ root.transpose(0, 2, 1) + 2.0 * np.eye(size)).astype(np.float32)
+    filled = np.ones((size, size), bool)
+    if sparse:  # two limbs on a trunk, of which the first is entered by what the elimination of a finger fills
+        filled[10:20, 20:] = filled[20:, 10:20] = False
+        filled[3, 12] = filled[12, 3] = False
+    matrix = np.where(filled, root @ root.transpose(0, 2, 1), 0.0)
+    matrix = (matrix + (2.0 + np.abs(matrix).sum(2).max()) * np.eye(size)).astype(np.float32)
     diagonal, right = rng.uniform(0.0, 3.0, (1, size)), rng.normal(size=(n, size))
     arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in (matrix, diagonal, right)]
     factor, x = wp.zeros((n, size, size), dtype=float, device=device), wp.zeros((n, size), dtype=float, device=device)
     wanted = wp.full(n, 1, dtype=int, device=device)
-    wp.launch(factorize, (n, threads), [*arrays[:2], wanted, threads], [factor], device=device)
-    wp.launch(solve, (n, threads), [factor, arrays[2], wanted, threads], [x], device=device)
+    pattern = find_pattern(filled, device)
+    wp.launch(factorize, (n, threads), [pattern, *arrays[:2], wanted, threads], [factor], device=device)
+    wp.launch(solve, (n, threads), [pattern, factor, arrays[2], wanted, threads], [x], device=device)
     whole = matrix + np.diag(diagonal[0])
     L = np.tril(factor.numpy().astype(float))
-    np.testing.assert_allclose(L @ L.transpose(0, 2, 1), whole, atol=1e-5 * np.abs(whole).max())
+    np.testing.assert_allclose(L.transpose(0, 2, 1) @ L, whole, atol=1e-5 * np.abs(whole).max())
     np.testing.assert_allclose(x.numpy(), np.linalg.solve(whole, right[..., None])[..., 0], atol=1e-4)
 
 
