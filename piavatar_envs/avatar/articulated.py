@@ -63,6 +63,7 @@ from piavatar_envs.avatar.joint_torques import (
 )
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
+from piavatar_envs.avatar.posing import rest_matrices
 from piavatar_envs.avatar.rigid_fit import BLOCK, sum_moments
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec16
@@ -180,6 +181,7 @@ class ArticulatedBody:
         self._muscle, self.impulse = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF), float)
         self._stop, self._nothing = zeros(bones, float), zeros((n, NUM_DOF), float)
         self._taken = zeros((n, NUM_DOF), float)
+        self._place = zeros(bones, wp.mat44)
         self._leaving, self._moving = zeros(bones, vec8), zeros(bones, vec8)
         self._linear, self._angular = zeros(bones, wp.vec3), zeros(bones, wp.vec3)
         self._displacement = zeros((n, model.num_particles), wp.vec3)
@@ -240,10 +242,17 @@ class ArticulatedBody:
         """Append: fit the pose to the particles. No velocity changes."""
         n, s = self.model.num_envs, self.state
         pose = [s.rotation, s.position]
-        program.launch(find_displacement, (n, self.body.count), [self.body, state.x, *pose], [self._displacement])
+        self._record_place(program)
+        inputs = [self.body, state.x, self._place]
+        program.launch(find_displacement, (n, self.body.count), inputs, [self._displacement])
         self._record_share(program, state, self._displacement, self._change)
         program.launch(spread_motion, n, [self.body, s.position, self._change], [self._moving])
         program.launch(move_joints, n, [self.body, 1.0, self._moving, state.failure], pose)
+
+    def _record_place(self, program: Program) -> None:
+        """Append: matrices that take the bones from rest to where they are."""
+        inputs = [self.body, self.state.rotation, self.state.position]
+        program.launch(rest_matrices, self._place.shape, inputs, [self._place])
 
     def _record_share(self, program: Program, state: State, vectors: wp.array, share: wp.array) -> None:
         """Append: the share ``dq = M^-1 J^T m v`` that the joints can take of vectors at the particles."""
@@ -260,12 +269,12 @@ class ArticulatedBody:
         self.mass.record_solve(program, self._factor, self._right, share)
 
     def _record_attachment(self, program: Program, state: State) -> None:
-        """Append: flesh is pulled to the bones, and the bones to the flesh."""
+        """Append: hand back, then flesh is pulled to the bones, and the bones to the flesh."""
         n, s, points = self.model.num_envs, self.state, (self.model.num_envs, self.body.count)
-        inputs = [self.body, state.x, s.rotation, s.position]
-        program.launch(find_displacement, points, inputs, [self._displacement])
-        inputs = [self.body, self.model.step.dt, self.attachment, state.failure]
-        program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
+        self._record_place(program)
+        where = [state.x, s.position, self._place, self._moving]
+        inputs = [self.body, self.model.step.dt, *where, self.attachment, state.failure]
+        program.launch(attach_flesh, points, inputs, [state.u, state.vk, self._displacement])
         self._record_share(program, state, self._displacement, self._change)
         program.launch(spread_motion, n, [self.body, s.position, self._change], [self._moving])
         inputs = [s.position, self._bones, 1.0, self._nothing, self._moving]
@@ -303,10 +312,11 @@ class ArticulatedBody:
             self.record_mass(program, state)
             self._record_fit(program, state)
         program.launch(spread_motion, n, [self.body, s.position, s.velocity], [self._moving])
-        inputs = [self.body, state.x, s.position, self._moving, state.failure]
-        program.launch(hand_back, points, inputs, [state.u, state.vk])
         if self.attachment is not None:
             self._record_attachment(program, state)
+        else:
+            inputs = [self.body, state.x, s.position, self._moving, state.failure]
+            program.launch(hand_back, points, inputs, [state.u, state.vk])
         self._record_share(program, state, state.u, self._taken)
         program.launch(add_change, (n, NUM_DOF), [self._taken, state.failure], [s.velocity, s.outside])
         self._record_torques(program, state)

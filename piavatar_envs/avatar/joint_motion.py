@@ -12,7 +12,7 @@ import warp as wp
 from piavatar_envs.avatar.blending import blend_changes, motion_at
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.pulls import implicit_velocity
-from piavatar_envs.avatar.rotation import quat_exp
+from piavatar_envs.avatar.rotation import apply_point, quat_exp
 from piavatar_envs.avatar.types import Body, vec8
 from piavatar_envs.mpm.types import row
 
@@ -100,53 +100,63 @@ def hand_back(
     vk[e, body.first + p] = v
 
 
+@wp.func
+def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int):
+    """Where linear blend skinning has a particle [m]; ``place`` takes bones from rest to where they are."""
+    joint = body.joint[p]
+    weight = body.weight[p]
+    A = weight[0] * place[e, joint[0]]
+    for n in range(1, 4):
+        if weight[n] > 0.0:
+            A += weight[n] * place[e, joint[n]]
+    return apply_point(A, body.rest[row(e, body.rest.shape[0]), p])
+
+
 @wp.kernel
 def find_displacement(
     body: Body,
     x: wp.array2d(dtype=wp.vec3),
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    place: wp.array2d(dtype=wp.mat44),
     # out
     displacement: wp.array2d(dtype=wp.vec3),
 ):
     """Of the particles from where the pose has them by linear blend skinning [m], at their places in the world."""
     e, p = wp.tid()
-    r = row(e, body.rest_joint.shape[0])
-    rest = body.rest[row(e, body.rest.shape[0]), p]
-    joint = body.joint[p]
-    weight = body.weight[p]
-    at = wp.vec3()
-    for n in range(4):
-        if weight[n] <= 0.0:
-            continue
-        b = joint[n]
-        at += weight[n] * (wp.quat_rotate(rotation[e, b], rest - body.rest_joint[r, b]) + position[e, b])
-    displacement[e, body.first + p] = x[e, body.first + p] - at
+    displacement[e, body.first + p] = x[e, body.first + p] - skinned_place(body, place, e, p)
 
 
 @wp.kernel
 def attach_flesh(
     body: Body,
     dt: float,
+    x: wp.array2d(dtype=wp.vec3),
+    position: wp.array2d(dtype=wp.vec3),
+    place: wp.array2d(dtype=wp.mat44),
+    moving: wp.array2d(dtype=vec8),
     rate: wp.array2d(dtype=float),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
-    away: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    # out
+    lost: wp.array2d(dtype=wp.vec3),
 ):
-    """Pull every particle to its place on the bones, implicit in time and critically damped.
+    """:func:`hand_back`, and pull every particle to its place on the bones, implicit in time and critically damped.
 
-    ``away`` is the displacement from there [m], and then what the pull has taken of the velocity [m/s].
+    ``lost`` is what the pull has taken of the velocity [m/s].
     """
     e, p = wp.tid()
+    q = body.first + p
     if failure[e] != 0:
-        away[e, body.first + p] = wp.vec3(0.0)
+        lost[e, q] = wp.vec3(0.0)
         return
-    before = u[e, body.first + p]
-    w = rate[row(e, rate.shape[0]), p]
-    after = implicit_velocity(w, dt, -away[e, body.first + p], before)
-    u[e, body.first + p] = after
-    away[e, body.first + p] = before - after
+    v = skinned_motion(body, moving, e, p, x[e, q] - position[e, 0])
+    before = u[e, q] + vk[e, q] - v
+    way = skinned_place(body, place, e, p) - x[e, q]
+    after = implicit_velocity(rate[row(e, rate.shape[0]), p], dt, way, before)
+    vk[e, q] = v
+    u[e, q] = after
+    lost[e, q] = before - after
 
 
 @wp.kernel
