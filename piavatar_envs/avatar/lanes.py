@@ -27,26 +27,31 @@ _SUM = """
 #if defined(__CUDA_ARCH__)
 const unsigned group = threads >= 32 ? 0xffffffffu : ((1u << threads) - 1u) << (threadIdx.x & 31 & -threads);
 for (int distance = threads >> 1; distance > 0; distance >>= 1)
-#pragma unroll
-    for (int c = 0; c < %d; ++c) value[c] += __shfl_xor_sync(group, value[c], distance);
+%s;
 #endif
 return value;
 """
+_SUM_ONE = _SUM % "    value += __shfl_xor_sync(group, value, distance)"
+_SUM_MANY = (
+    _SUM
+    % """#pragma unroll
+    for (int c = 0; c < %d; ++c) value[c] += __shfl_xor_sync(group, value[c], distance)"""
+)
 
 
-@wp.func_native(_SUM.replace("for (int c = 0; c < %d; ++c) value[c]", "value").replace("value[c]", "value"))
+@wp.func_native(_SUM_ONE)
 def sum_threads(value: float, threads: int) -> float:
     """Sum over ``threads`` threads, told to all of them."""
     ...
 
 
-@wp.func_native(_SUM % 12)
+@wp.func_native(_SUM_MANY % 12)
 def sum_threads12(value: vec12, threads: int) -> vec12:
     """:func:`sum_threads` of twelve numbers."""
     ...
 
 
-@wp.func_native(_SUM % 16)
+@wp.func_native(_SUM_MANY % 16)
 def sum_threads16(value: vec16, threads: int) -> vec16:
     """:func:`sum_threads` of sixteen numbers."""
     ...

@@ -240,16 +240,20 @@ def fill_mass_matrix(
     # out
     mass: wp.array3d(dtype=float),
 ):
-    """Blocks of all pairs of joints, and those of the pelvis' velocity; launched over ``(num_envs, bones * bones)``."""
+    """Blocks of all pairs of joints, and those of the pelvis' velocity; launched over ``(num_envs, bones * bones)``.
+
+    Only those of the lower triangle.
+    """
     e, n = wp.tid()
     c = n // BONES
     d = n % BONES
+    if d > c:
+        return
     s = moments[e, n]
     both = second_moment(s)
     set_block(mass, e, 3 + 3 * c, 3 + 3 * d, wp.trace(both) * I3 - both)
     if d == 0:
         lever = -wp.skew(wp.vec3(s[1], s[2], s[3]))  # v_0 . (w x a)
-        set_block(mass, e, 0, 3 + 3 * c, lever)
         set_block(mass, e, 3 + 3 * c, 0, wp.transpose(lever))
         if c == 0:
             set_block(mass, e, 0, 0, s[0] * I3)

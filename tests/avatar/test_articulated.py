@@ -76,6 +76,12 @@ class Joints:
         return J
 
     @property
+    def mass(self) -> np.ndarray:
+        """The mass matrix, of which the lower triangle is built, shape ``(69, 69)``."""
+        lower = np.tril(self.body.mass.matrix.numpy()[0].astype(float))
+        return lower + np.tril(lower, -1).T
+
+    @property
     def total(self) -> np.ndarray:
         """Velocity of the particles [m/s]."""
         return self.rig.read("u") + self.rig.read("vk")
@@ -131,8 +137,8 @@ def test_mass_matrix_is_that_of_the_jacobian(joints, seed):
     J, m = made.jacobian, made.rig.mass
     expected = np.einsum("p,pia,pib->ab", m, J, J)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-    assert (np.abs(made.body.mass.matrix.numpy()[0] - expected) / scale).max() < 1e-5
-    assert np.linalg.eigvalsh(made.body.mass.matrix.numpy()[0].astype(float)).min() > 0.0
+    assert (np.abs(made.mass - expected) / scale).max() < 1e-5
+    assert np.linalg.eigvalsh(made.mass).min() > 0.0
 
 
 def test_joints_take_over_all_they_can_and_change_no_velocity(joints):
@@ -214,7 +220,7 @@ def test_refresh_fits_the_pose_and_keeps_velocities(joints, wild_pose):
 def test_a_mode_swings_at_its_frequency(make_rig):
     """Small swings of the softest springs: ``K x = omega^2 M x``, in a body that nothing holds."""
     made = Joints(make_rig(cells=16), stiffness=60.0).pose(np.zeros((NUM_JOINTS, 3)))
-    M = made.body.mass.matrix.numpy()[0].astype(float)
+    M = made.mass
     K = np.diag(np.r_[np.zeros(6), np.full(NUM_DOF - 6, 60.0)])
     values, modes = eigh(K, M)
     omega, mode = np.sqrt(values[6]), modes[:, 6]  # six rigid motions come first
