@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from piavatar_envs.avatar.limits import Bounds, joint_limits, left_and_right
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
 
 REFERENCE_MASS = 75.0  # [kg]
 REFERENCE_HEIGHT = 1.75  # [m]
@@ -55,6 +55,10 @@ _CENTER_TORQUES: dict[str, Bounds] = {
 
 #: Joints that do not move under torques: toes are smaller than a cell of the grid through which the ground pushes.
 LOCKED_JOINTS = ("left_foot", "right_foot")
+
+#: Bones of these fill their flesh: a foot must bear the body. As soft as the rest, it turns about its bones by 1 rad
+#: under some 70 N m, an eighth of what standing takes.
+FIRM_JOINTS = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 
 #: Error at which a spring asks for the greatest torque of its joint [rad].
 FULL_TORQUE_ANGLE = 0.3
@@ -127,7 +131,14 @@ def make_muscles(stiffness: float = 1.0, damping: float = 1.0, strength: float =
     )
 
 
-def attachment_rates(depth: np.ndarray, bone_distance: np.ndarray, skin: float, core: float) -> np.ndarray:
+def firmness(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
+    """Share of particles in :data:`FIRM_JOINTS`, shape ``(P,)``, from joints and weights ``(P, 4)`` of each."""
+    return np.where(np.isin(skin_joints, [joint_index(name) for name in FIRM_JOINTS]), skin_weights, 0.0).sum(1)
+
+
+def attachment_rates(
+    depth: np.ndarray, bone_distance: np.ndarray, firm: np.ndarray, skin: float, core: float
+) -> np.ndarray:
     """Rates of the pulls that hold flesh to bones [1/s], shape ``(P,)``: ``skin`` at the skin, ``core`` at the bone.
 
     Between them they grow geometrically with the share of the way from the skin to the bone, so that a thin wrist is
@@ -136,13 +147,14 @@ def attachment_rates(depth: np.ndarray, bone_distance: np.ndarray, skin: float, 
     Args:
         depth: of particles below the skin [m], shape ``(P,)``.
         bone_distance: from the nearest bone particle [m], shape ``(P,)``.
+        firm: share that is held as bone all through, shape ``(P,)``.
         skin: rate at the skin [1/s]; 0 for no pull at all.
         core: rate at the bone [1/s].
     """
     if skin == 0.0:
         return np.zeros(len(depth))
     share = depth / np.maximum(depth + bone_distance, 1e-9)
-    return skin * (core / skin) ** share
+    return skin * (core / skin) ** (1.0 - (1.0 - share) * (1.0 - np.clip(firm, 0.0, 1.0)))
 
 
 def spring_rows(joints: np.ndarray) -> np.ndarray:

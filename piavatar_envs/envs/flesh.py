@@ -10,7 +10,7 @@ import numpy as np
 from piavatar_envs.avatar.asset import AvatarAsset
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.joint_drive import JointSettings
-from piavatar_envs.avatar.muscles import attachment_rates, make_muscles
+from piavatar_envs.avatar.muscles import attachment_rates, firmness, make_muscles
 from piavatar_envs.avatar.sampling import ParticleSet, morph
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import BODY_PARTS, body_part_of_joint, joint_index
@@ -150,10 +150,11 @@ class Flesh:
             )
         sampled = self.sampled
         distance = bone_distance(sampled.rest_positions, sampled.bone)
+        firm = firmness(sampled.skin_joints, sampled.skin_weights)
         return JointSettings(
             muscles=make_muscles(d.joint_stiffness, d.joint_damping, d.strength),
             assist=d.root_assist,
-            attachment=attachment_rates(sampled.depth, distance, *d.flesh_rate),
+            attachment=attachment_rates(sampled.depth, distance, firm, *d.flesh_rate),
         )
 
     def masses(self, volume: np.ndarray) -> np.ndarray:

@@ -87,7 +87,7 @@ class DriveConfig(BaseModel):
     joint_damping: float = Field(1.0, ge=0.0, description="factor on the damping of the joints' springs [-]")
     strength: float = Field(1.0, ge=0.0, description="factor on the greatest torques of the joints [-]")
     flesh_rate: tuple[float, float] = Field(
-        (30.0, 500.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
+        (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
     )
     drive: Literal["increment", "target"] = Field(
         "increment",

@@ -102,7 +102,7 @@ class Simulation:
             num_envs=num_envs,
             device=self.device,
             control_dt=physics.control_dt,
-            num_substeps=physics.num_substeps or self._substeps(wave, any(joints)),
+            num_substeps=self._substeps(wave),
             cfl=physics.cfl,
             gravity=(0.0, 0.0, -physics.gravity),
             decoupling=physics.decoupling,
@@ -132,10 +132,13 @@ class Simulation:
         """The first avatar's drive."""
         return self.avatars[0]
 
-    def _substeps(self, wave: float, torques: bool) -> int:
-        """Fewest substeps of a control step that are stable for waves of this speed [m/s], and under torques."""
+    def _substeps(self, wave: float) -> int | None:
+        """Substeps of a control step as configured; under torques as few as they and such a wave [m/s] allow."""
         physics = self.config.physics
-        by_torques = math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9) if torques else 1
+        if physics.num_substeps is not None or self.config.drive.control == "pose":
+            return physics.num_substeps
+        wave = max(wave, self.subjects.matter.sound_speed())
+        by_torques = math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
         return max(choose_num_substeps(physics.control_dt, self.dx, wave, physics.cfl), by_torques)
 
     def set_shape(self, env: int, parameters: np.ndarray, avatar: int = 0) -> None:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.articulated import UNBOUNDED, ArticulatedBody
 from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.muscles import attachment_rates, joint_torques, make_muscles
+from piavatar_envs.avatar.muscles import attachment_rates, firmness, joint_torques, make_muscles
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.soft_tissue import bone_distance
@@ -144,14 +144,19 @@ def test_a_joint_is_stopped_at_the_end_of_its_range(make_rig):
 def test_flesh_is_held_the_faster_the_deeper_it_lies():
     particles = sample_particles(load_body(), spacing_for(0.07))
     distance = bone_distance(particles.rest_positions, particles.bone)
-    rates = attachment_rates(particles.depth, distance, 30.0, 500.0)
+    firm = firmness(particles.skin_joints, particles.skin_weights)
+    assert attachment_rates(particles.depth, distance, firm, 30.0, 500.0)[firm > 0.999] == pytest.approx(
+        500.0, rel=0.01
+    )
+    nowhere = np.zeros(len(distance))
+    rates = attachment_rates(particles.depth, distance, nowhere, 30.0, 500.0)
     assert rates[particles.bone >= 0] == pytest.approx(500.0)
     assert rates.min() >= 30.0 and rates[particles.depth == 0.0] == pytest.approx(30.0)
     for fixed in (0.02, 0.05):  # deeper at the same distance from the bone, nearer to it at the same depth
         steps = np.linspace(0.001, 0.1, 20)
-        assert (np.diff(attachment_rates(steps, np.full(20, fixed), 30.0, 500.0)) > 0.0).all()
-        assert (np.diff(attachment_rates(np.full(20, fixed), steps, 30.0, 500.0)) < 0.0).all()
-    assert not attachment_rates(particles.depth, distance, 0.0, 500.0).any()
+        assert (np.diff(attachment_rates(steps, np.full(20, fixed), nowhere[:20], 30.0, 500.0)) > 0.0).all()
+        assert (np.diff(attachment_rates(np.full(20, fixed), steps, nowhere[:20], 30.0, 500.0)) < 0.0).all()
+    assert not attachment_rates(particles.depth, distance, nowhere, 0.0, 500.0).any()
     # depth is what sampling has measured: bone particles of the thigh lie deeper than its skin's
     assert particles.depth[particles.shell].max() < particles.depth[particles.bone == joint_index("left_hip")].mean()
 
