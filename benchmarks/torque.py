@@ -1,7 +1,8 @@
 """Bodies whose joints move under torques (:mod:`piavatar_envs.avatar.articulated`): momentum, sag, gaps and cost.
 
-``python -m benchmarks.torque --out FILE.json``. So far the parts that need no balance: a body that flails in empty
-space, and one whose pelvis is held while it stretches its arms out.
+``python -m benchmarks.torque --out FILE.json``. The parts that need no balance: a body that flails in empty space, one
+whose pelvis is held while it stretches its arms out or presses its toes on the floor, and one that is asked for the
+rest pose (``control="pd"``, zero actions), with an assisted pelvis and without.
 """
 
 from __future__ import annotations
@@ -21,14 +22,21 @@ from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.rigid_fit import sum_moments
 from piavatar_envs.avatar.settings import DriveSettings
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
+from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.config import load_config
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
+from piavatar_envs.tasks import load_task
 
-FLAILING = 100.0, 3.0  # springs and dampers of a flailing body [N m/rad, N m s/rad]
+FLAILING = 100.0, 10.0  # springs and dampers of a flailing body [N m/rad, N m s/rad]
 FLAIL_EVERY = 5  # control steps after which it is given another pose
 STIFFNESSES = (50.0, 200.0, 1000.0)  # of all joints of a body with stretched arms [N m/rad]
+PRESSING = 300.0  # stiffness of ankles that press [N m/rad]
+DAMPINGS = (2.0, 20.0, 200.0)  # of the same [N m s/rad]
+ANKLES = ("left_ankle", "right_ankle")
+STAND_SECONDS, FALLEN = 10.0, 30.0  # how long a body is to stand [s], and the tilt of the pelvis at which it has not
 HOLD = 1e5, 1e4  # spring and damper of a held pelvis, of its place and of its turn [SI units]
 RATE = 300.0  # of the pulls that hold flesh to bones [1/s]
 MODULES = (articulated, cholesky, joint_momentum, joint_motion, joint_torques, mass_matrix)
@@ -55,9 +63,13 @@ class Limbs:
         program: a control step.
     """
 
-    def __init__(self, options: Options, gravity: float, rotations: np.ndarray, rate: float = 0.0) -> None:
+    def __init__(
+        self, options: Options, gravity: float, rotations: np.ndarray, rate: float = 0.0, ground: bool = False
+    ) -> None:
         """Build it in a pose of rotation vectors ``(22, 3)``; ``rate`` holds flesh to bones, where it is not zero."""
-        world = World(fidelity=options.fidelity, num_substeps=None, gravity=gravity, device=options.device)
+        world = World(
+            fidelity=options.fidelity, num_substeps=None, gravity=gravity, ground=ground, device=options.device
+        )
         asset = load_body()
         self.rig = Rig(world, DriveSettings(), asset.parameters()[None])
         self.rig.reset(rotations[None])
@@ -163,6 +175,56 @@ def stretch_arms(options: Options, stiffness: float) -> dict[str, Any]:
     }
 
 
+def press(options: Options, damping: float) -> dict[str, Any]:
+    """Ankles press the toes of a held, weightless body on the floor: what of their springs' torque arrives."""
+    limbs, ankles = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), RATE, ground=True), [*map(joint_index, ANKLES)]
+    limbs.set_springs(3000.0, 100.0, held=True)
+    springs = limbs.body.springs
+    for array, value in ((springs.stiffness, PRESSING), (springs.damping, damping)):
+        values = array.numpy()
+        values[0, [1 + ankle for ankle in ankles]] = value
+        array.assign(values)
+    rotations = np.zeros((NUM_JOINTS, 3))
+    rotations[ankles, 0] = 0.3
+    limbs.aim(rotations)
+    for _ in range(3 * options.steps):
+        limbs.program.run()
+    world = Rotation.from_quat(limbs.body.state.rotation.numpy()[0].astype(float))
+    impulse = limbs.body.impulse.numpy()[0].astype(float).reshape(-1, 3)[1:] / limbs.rig.model.step.dt
+    turned = np.array([(world[PARENTS[b]].inv() * world[b]).as_rotvec()[0] for b in ankles])
+    torque = np.array([world[PARENTS[b]].inv().apply(impulse[b])[0] for b in ankles])
+    return {
+        "case": f"press_kd_{damping:g}",
+        "torque_nm": float(torque.mean()),
+        "torque_over_spring": float((torque / (PRESSING * (0.3 - turned))).mean()),
+        "floor_n": float(limbs.rig.scratch.sensors.boundary_impulse.numpy()[0, 0, 2] / limbs.rig.model.control_dt),
+        "failed": bool(limbs.rig.state.failure.numpy()[0]),
+    }
+
+
+def stand(options: Options, assist: float) -> dict[str, Any]:
+    """Ten seconds of zero actions under ``control="pd"``, in the default environment of that resolution."""
+    task = load_task("PIAvatar/Reach-v0")
+    settings = {"control": "pd", "root_assist": assist, "fidelity": options.fidelity, "pose_noise": 0.0}
+    env = BatchEnv(task(load_config(task.Config, None, settings)), 1, options.device)
+    env.reset(seeds=[0])
+    tracked, state, dt = env.simulation.avatar.tracked, env.simulation.state, env.config.physics.control_dt
+    stood = 0.0
+    for _ in range(round(STAND_SECONDS / dt)):
+        env.step()
+        up = Rotation.from_quat(tracked.rotation.numpy()[0, 0].astype(float)).apply([0.0, 0.0, 1.0])[2]
+        if up < np.cos(np.radians(FALLEN)):
+            break
+        stood += dt
+    return {
+        "case": f"stand_assist_{assist:g}",
+        "stood_s": stood,
+        "tilt_deg": float(np.degrees(np.arccos(min(1.0, up)))),
+        "speed_m_s": float(np.abs(state.u.numpy() + state.vk.numpy()).max()),
+        "failed": bool(env.failure.numpy()[0]),
+    }
+
+
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1.0, 1.0))))
 
@@ -180,11 +242,15 @@ def cost(options: Options) -> dict[str, Any]:
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Free float with flesh loose and attached, stretched arms by stiffness, the cost."""
+    """Free float with flesh loose and attached, arms by stiffness, pressing toes by damping, standing, the cost."""
     for rate in (0.0, RATE):
         yield flail(options, rate)
     for stiffness in STIFFNESSES:
         yield stretch_arms(options, stiffness)
+    for damping in DAMPINGS:
+        yield press(options, damping)
+    for assist in (0.0, 1.0):
+        yield stand(options, assist)
     yield cost(options)
 
 
