@@ -10,6 +10,7 @@ import numpy as np
 
 from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES, joint_index
 from piavatar_envs.envs.actions import ActionSpec
+from piavatar_envs.envs.observations import JOINT_TERMS
 from piavatar_envs.mpm.types import FAILURE_NAMES
 from scripts.pages.entries import ROOT, Entry, Facts
 from scripts.pages.markdown import code, listed, number, page, sentence, table
@@ -158,7 +159,21 @@ def _actions(facts: Facts) -> str:
             table(("slice", "components", "at 1, a step", "range of x [deg]", "of y [deg]", "of z [deg]"), joints),
             "The commanded root moves, too:" if root else "",
             table(("slice", "component", "at 1, a step", "direction"), root) if root else "",
+            _under_torques(facts),
         ]
+    )
+
+
+def _under_torques(facts: Facts) -> str:
+    """What actions are where torques move the body."""
+    size = facts.task.action_spec().under("pd").size
+    about = "the task's reference pose" if facts.task.targets_about_reference else "the rest pose"
+    terms = ", ".join(f"{code(term.name)} ({term.size}, {term.unit})" for term in JOINT_TERMS)
+    return (
+        f'With `control="pd"` or `"torque"` there are {size} components: neither the root nor the toes act. Under '
+        f'`"pd"` a component asks for an angle: 0 is {about}, 1 and -1 are the ends of the ranges above. Under '
+        '`"torque"` it is a share of the greatest torque of the joint about that axis. Nothing holds the body then but '
+        f"the ground and what `root_assist` gives, no root lets go, and {terms} are observed, too."
     )
 
 
