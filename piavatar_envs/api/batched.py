@@ -243,6 +243,19 @@ class BatchedEpisodes:
         self.api.end()
         self.ready = True
 
+    def assist_root(self, share: float | np.ndarray) -> None:
+        """Help the pelvis from now on; see :meth:`BatchEnv.assist_root`.
+
+        Raises:
+            ValueError: as there; nothing has changed then.
+        """
+        values = np.asarray(share, np.float32)
+        if values.shape not in ((), (self.num_envs,)) or not ((values >= 0.0) & (values <= 1.0)).all():
+            raise ValueError(f"root_assist={share} must be in [0, 1], one number or {self.num_envs}")
+        parts = np.split(np.broadcast_to(values, (self.num_envs,)), self._splits)
+        for group, part in zip(self.groups, parts, strict=True):
+            group.assist_root(part)
+
     def group_of(self, env: int) -> tuple[BatchEnv, int]:
         """The batch in which environment ``env`` lives, and its number there."""
         group = int(np.searchsorted(self._splits, env, side="right"))

@@ -103,6 +103,14 @@ class AvatarEnv(gym.Env):
         """Free the renderer's window."""
         self._episode.close()
 
+    def assist_root(self, share: float) -> None:
+        """Help the pelvis from now on, by a share in [0, 1]; for ``control="pd"`` and ``"torque"``.
+
+        Raises:
+            ValueError: it is out of range, or the pose is driven.
+        """
+        self.batch.assist_root(share)
+
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on; :meth:`set_state` restores it, bit for bit."""
         return self.batch.get_state()

@@ -245,6 +245,14 @@ class AvatarVectorEnv(VectorEnv):
         self._pictures.close()
         self.episodes.close()
 
+    def assist_root(self, share: float | np.ndarray) -> None:
+        """Help the pelvis from now on: one share in [0, 1], or one an environment; ``control="pd"`` or ``"torque"``.
+
+        Raises:
+            ValueError: it is out of range, of another shape, or the pose is driven.
+        """
+        self.episodes.assist_root(share)
+
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on; :meth:`set_state` restores it, bit for bit.
 

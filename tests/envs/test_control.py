@@ -214,3 +214,19 @@ def test_joints_are_observed(make_env, control):
     assert np.abs(rates - means)[2:].max() < 0.2 * np.abs(rates).max()
     mass = env.batch.simulation.avatar.body_mass.numpy()[0]
     assert 0.3 < np.mean(weight[4:], axis=0)[2] / (mass * 9.81 / 30.0) < 1.3
+
+
+def test_each_environment_of_a_vector_is_assisted_by_itself(device):
+    import gymnasium
+
+    settings = {"control": "torque", "fidelity": "tiny", "pose_noise": 0.0}
+    vector = gymnasium.make_vec(REACH, num_envs=3, device=device, num_threads=2, **settings)
+    vector.reset(seed=0)
+    vector.assist_root(np.array([1.0, 0.0, 1.0]))
+    for _ in range(40):
+        observations, *_ = vector.step(np.zeros(vector.action_space.shape, np.float32))
+    heights = np.asarray(observations)[:, 0]
+    assert heights[1] < 0.5 and heights[0] == heights[2] > 0.75
+    with pytest.raises(ValueError, match="root_assist="):
+        vector.assist_root(np.zeros(2))
+    vector.close()
