@@ -52,14 +52,15 @@ from piavatar_envs.avatar.joint_motion import (
     take_over,
 )
 from piavatar_envs.avatar.joint_torques import (
+    UNBOUNDED,
     Springs,
-    Strength,
     Target,
-    Tissue,
     find_given,
     implicit_diagonals,
     joint_impulse,
     limit_torques,
+    make_strength,
+    make_tissue,
 )
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
@@ -71,11 +72,6 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import Model, State, group
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
-
-#: What limits nothing.
-UNBOUNDED = 1.0e30
-#: Inertia of a joint that does not move: much more than any body has [kg m^2].
-LOCK = 1.0e6
 
 
 @wp.kernel
@@ -194,40 +190,16 @@ class ArticulatedBody:
         return wp.array(np.ascontiguousarray(value, np.float32), dtype=dtype, device=self.model.device)
 
     def set_strength(self, lower: np.ndarray, upper: np.ndarray, rows: int) -> None:
-        """Limit the torques of the joints: bounds ``(22, 3)`` [N m] and a factor on them, in ``rows`` rows.
-
-        To be called before anything is recorded, as :meth:`set_tissue`.
-        """
-        self.strength = group(
-            Strength,
-            lower=self._upload(lower, wp.vec3),
-            upper=self._upload(upper, wp.vec3),
-            factor=self._upload(np.ones(rows)),
-        )
+        """Limit the torques of the joints; see :func:`make_strength`. To be called before anything is recorded."""
+        self.strength = make_strength(lower, upper, rows, self.model.device)
 
     def set_tissue(
         self, damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int]
     ) -> None:
-        """Let joints resist.
-
-        Args:
-            damping: of all joints, shape ``(22,)`` [N m s/rad].
-            stop: stiffness beyond their ranges, shape ``(22,)`` [N m/rad].
-            lower: of the ranges of the rotation vectors, shape ``(22, 3)`` [rad].
-            upper: likewise.
-            locked: joints that do not move: what they carry belongs to their parents.
-        """
-        lock = np.zeros(NUM_JOINTS)
-        lock[list(locked)] = LOCK
-        self._locks = self._upload(np.r_[np.zeros(3), np.repeat(lock, 3)][None])
-        self.tissue = group(
-            Tissue,
-            damping=self._upload(damping),
-            stop=self._upload(stop),
-            lower=self._upload(lower, wp.vec3),
-            upper=self._upload(upper, wp.vec3),
-            lock=self._upload(lock),
-        )
+        """Let joints resist; see :func:`make_tissue`. To be called before anything is recorded."""
+        self.tissue = make_tissue(damping, stop, lower, upper, locked, self.model.device)
+        locks = np.r_[np.zeros(3), np.repeat(self.tissue.lock.numpy(), 3)]
+        self._locks = self._upload(locks[None])
 
     def record_mass(self, program: Program, state: State) -> None:
         """Append: build the mass matrix where particles and joints are, and what follows from it."""
@@ -246,8 +218,13 @@ class ArticulatedBody:
         inputs = [self.body, state.x, self._place]
         program.launch(find_displacement, (n, self.body.count), inputs, [self._displacement])
         self._record_share(program, state, self._displacement, self._change)
-        program.launch(spread_motion, n, [self.body, s.position, self._change], [self._moving])
+        self._record_spread(program, self._change, self._moving)
         program.launch(move_joints, n, [self.body, 1.0, self._moving, state.failure], pose)
+
+    def _record_spread(self, program: Program, q: wp.array, field: wp.array) -> None:
+        """Append: motion of the bones under a generalised velocity."""
+        inputs = [self.body, self.state.position, q, self.threads]
+        program.launch(spread_motion, (self.model.num_envs, self.threads), inputs, [field])
 
     def _record_place(self, program: Program) -> None:
         """Append: matrices that take the bones from rest to where they are."""
@@ -276,7 +253,7 @@ class ArticulatedBody:
         inputs = [self.body, self.model.step.dt, *where, self.attachment, state.failure]
         program.launch(attach_flesh, points, inputs, [state.u, state.vk, self._displacement])
         self._record_share(program, state, self._displacement, self._change)
-        program.launch(spread_motion, n, [self.body, s.position, self._change], [self._moving])
+        self._record_spread(program, self._change, self._moving)
         inputs = [s.position, self._bones, 1.0, self._nothing, self._moving]
         program.launch(balance, n, inputs, [self._change])
         program.launch(add_change, (n, NUM_DOF), [self._change, state.failure], [s.velocity, s.outside])
@@ -293,7 +270,7 @@ class ArticulatedBody:
         self.mass.record_factor(program, self._left, self._cut, self._limited)
         self.mass.record_solve(program, self._cut, self.impulse, self._change, self._limited)
         program.launch(find_given, (n, NUM_DOF), [self._left, self._change], [self.impulse])
-        program.launch(spread_motion, n, [self.body, s.position, self._change], [self._moving])
+        self._record_spread(program, self._change, self._moving)
         inputs = [s.position, self._bones, 0.0, self.impulse, self._moving]
         program.launch(balance, n, inputs, [self._change])
 
@@ -311,7 +288,7 @@ class ArticulatedBody:
         if refresh:
             self.record_mass(program, state)
             self._record_fit(program, state)
-        program.launch(spread_motion, n, [self.body, s.position, s.velocity], [self._moving])
+        self._record_spread(program, s.velocity, self._moving)
         if self.attachment is not None:
             self._record_attachment(program, state)
         else:
@@ -322,8 +299,8 @@ class ArticulatedBody:
         self._record_torques(program, state)
         inputs = [self._change, s.outside, state.failure]
         program.launch(go_on, (n, NUM_DOF), inputs, [s.velocity, self._taken])
-        program.launch(spread_motion, n, [self.body, s.position, self._taken], [self._leaving])
-        program.launch(spread_motion, n, [self.body, s.position, s.velocity], [self._moving])
+        self._record_spread(program, self._taken, self._leaving)
+        self._record_spread(program, s.velocity, self._moving)
         inputs = [self.body, state.x, s.position, self._leaving, self._moving, state.failure]
         program.launch(take_over, points, inputs, [state.u, state.vk])
         program.launch(move_joints, n, [self.body, self.model.step.dt, self._moving, state.failure], pose)

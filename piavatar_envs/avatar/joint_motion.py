@@ -10,6 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import blend_changes, motion_at
+from piavatar_envs.avatar.lanes import meet_threads
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.rotation import apply_point, quat_exp
@@ -32,24 +33,46 @@ def set_part(q: wp.array2d(dtype=float), e: int, first: int, v: wp.vec3):
         q[e, first + i] = v[i]
 
 
+@wp.func
+def spread_to_bone(
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    q: wp.array2d(dtype=float),
+    e: int,
+    b: int,
+    field: wp.array2d(dtype=vec8),
+):
+    """Rigid motion of one bone, whose parent's is known."""
+    w = part_of(q, e, 3 + 3 * b)
+    v = part_of(q, e, 0)
+    if b > 0:
+        above = field[e, body.parent[b]]
+        v = wp.vec3(above[0], above[1], above[2]) + wp.cross(w, position[e, 0] - position[e, b])
+        w += wp.vec3(above[3], above[4], above[5])
+    field[e, b] = vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
+
+
 @wp.kernel
 def spread_motion(
     body: Body,
     position: wp.array2d(dtype=wp.vec3),
     q: wp.array2d(dtype=float),
+    threads: int,
     # out
     field: wp.array2d(dtype=vec8),
 ):
-    """Rigid motion of every bone under a generalised velocity: velocity where the pelvis joint is, and spin."""
-    e = wp.tid()
-    for b in range(BONES):
-        w = part_of(q, e, 3 + 3 * b)
-        v = part_of(q, e, 0)
-        if b > 0:
-            above = field[e, body.parent[b]]
-            v = wp.vec3(above[0], above[1], above[2]) + wp.cross(w, position[e, 0] - position[e, b])
-            w += wp.vec3(above[3], above[4], above[5])
-        field[e, b] = vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
+    """Rigid motion of every bone under a generalised velocity: velocity where the pelvis joint is, and spin.
+
+    Launched over ``(num_envs, threads)``: a thread that is alone goes through the bones in their order, parents first;
+    the threads of a warp do so level by level.
+    """
+    e, thread = wp.tid()
+    levels = wp.where(threads > 1, body.levels, 1)
+    for level in range(levels):
+        for b in range(thread, BONES, threads):
+            if threads == 1 or body.depth[b] == level:
+                spread_to_bone(body, position, q, e, b, field)
+        meet_threads(threads)
 
 
 @wp.func

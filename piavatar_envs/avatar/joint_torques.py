@@ -17,15 +17,22 @@ blow up.)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.joint_motion import part_of, set_part
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.types import Body, Pose
-from piavatar_envs.mpm.types import row
+from piavatar_envs.mpm.types import group, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
+#: What limits nothing.
+UNBOUNDED = 1.0e30
+#: Inertia of a joint that does not move: much more than any body has [kg m^2].
+LOCK = 1.0e6
 #: Damping of a joint at the end of its range, over the stiffness of that end [s].
 STOP_TIME = wp.constant(0.03)
 
@@ -70,6 +77,38 @@ class Tissue:
     lower: wp.array(dtype=wp.vec3)  # range of the rotation vector relative to the rest pose [rad]
     upper: wp.array(dtype=wp.vec3)
     lock: wp.array(dtype=float)  # inertia of what does not move at all, else 0 [kg m^2]
+
+
+def make_strength(lower: np.ndarray, upper: np.ndarray, rows: int, device: str) -> Strength:
+    """Limits of the torques, each ``(22, 3)`` [N m], and a factor of 1 on them in ``rows`` rows."""
+    return group(
+        Strength,
+        lower=wp.array(lower.astype(np.float32), dtype=wp.vec3, device=device),
+        upper=wp.array(upper.astype(np.float32), dtype=wp.vec3, device=device),
+        factor=wp.full(rows, 1.0, dtype=float, device=device),
+    )
+
+
+def make_tissue(
+    damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int], device: str
+) -> Tissue:
+    """What resists passively.
+
+    Args:
+        damping: of all joints, shape ``(22,)`` [N m s/rad].
+        stop: stiffness beyond their ranges, shape ``(22,)`` [N m/rad].
+        lower: of the ranges of the rotation vectors, shape ``(22, 3)`` [rad].
+        upper: likewise.
+        locked: joints that do not move: what they carry belongs to their parents.
+        device: Warp device.
+    """
+    lock = np.zeros(len(damping))
+    lock[list(locked)] = LOCK
+    numbers = {"damping": damping, "stop": stop, "lock": lock}
+    arrays = {name: wp.array(v.astype(np.float32), dtype=float, device=device) for name, v in numbers.items()}
+    for name, bound in (("lower", lower), ("upper", upper)):
+        arrays[name] = wp.array(bound.astype(np.float32), dtype=wp.vec3, device=device)
+    return group(Tissue, **arrays)
 
 
 @wp.func

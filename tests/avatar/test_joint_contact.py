@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.articulated import UNBOUNDED, ArticulatedBody
+from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.joint_torques import UNBOUNDED
 from piavatar_envs.avatar.muscles import attachment_rates, firmness, joint_torques, make_muscles
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
