@@ -219,7 +219,8 @@ class ArticulatedBody:
         program.launch(find_displacement, (n, self.body.count), inputs, [self._displacement])
         self._record_share(program, state, self._displacement, self._change)
         self._record_spread(program, self._change, self._moving)
-        program.launch(move_joints, n, [self.body, 1.0, self._moving, state.failure], pose)
+        inputs = [self.body, 1.0, self._moving, state.failure, self.threads]
+        program.launch(move_joints, (n, self.threads), inputs, pose)
 
     def _record_spread(self, program: Program, q: wp.array, field: wp.array) -> None:
         """Append: motion of the bones under a generalised velocity."""
@@ -242,7 +243,8 @@ class ArticulatedBody:
             block_dim=BLOCK,
         )
         outputs = [self._linear, self._angular, self._bones, self._right]
-        program.launch(gather_momentum, n, [self.body, position, self._chunks], outputs)
+        inputs = [self.body, position, self._chunks, self.threads]
+        program.launch(gather_momentum, (n, self.threads), inputs, outputs)
         self.mass.record_solve(program, self._factor, self._right, share)
 
     def _record_attachment(self, program: Program, state: State) -> None:
@@ -254,8 +256,8 @@ class ArticulatedBody:
         program.launch(attach_flesh, points, inputs, [state.u, state.vk, self._displacement])
         self._record_share(program, state, self._displacement, self._change)
         self._record_spread(program, self._change, self._moving)
-        inputs = [s.position, self._bones, 1.0, self._nothing, self._moving]
-        program.launch(balance, n, inputs, [self._change])
+        inputs = [s.position, self._bones, 1.0, self._nothing, self._moving, self.threads]
+        program.launch(balance, (n, self.threads), inputs, [self._change])
         program.launch(add_change, (n, NUM_DOF), [self._change, state.failure], [s.velocity, s.outside])
 
     def _record_torques(self, program: Program, state: State) -> None:
@@ -271,8 +273,8 @@ class ArticulatedBody:
         self.mass.record_solve(program, self._cut, self.impulse, self._change, self._limited)
         program.launch(find_given, (n, NUM_DOF), [self._left, self._change], [self.impulse])
         self._record_spread(program, self._change, self._moving)
-        inputs = [s.position, self._bones, 0.0, self.impulse, self._moving]
-        program.launch(balance, n, inputs, [self._change])
+        inputs = [s.position, self._bones, 0.0, self.impulse, self._moving, self.threads]
+        program.launch(balance, (n, self.threads), inputs, [self._change])
 
     def record_substep(self, program: Program, state: State, refresh: bool) -> None:
         """Append what the joints do before an MPM substep: take over, act, and move the pose on.
@@ -303,4 +305,5 @@ class ArticulatedBody:
         self._record_spread(program, s.velocity, self._moving)
         inputs = [self.body, state.x, s.position, self._leaving, self._moving, state.failure]
         program.launch(take_over, points, inputs, [state.u, state.vk])
-        program.launch(move_joints, n, [self.body, self.model.step.dt, self._moving, state.failure], pose)
+        inputs = [self.body, self.model.step.dt, self._moving, state.failure, self.threads]
+        program.launch(move_joints, (n, self.threads), inputs, pose)

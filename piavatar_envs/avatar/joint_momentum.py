@@ -6,6 +6,7 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import motion_at
 from piavatar_envs.avatar.joint_motion import part_of, set_part
+from piavatar_envs.avatar.lanes import meet_threads, sum_threads16
 from piavatar_envs.avatar.mass_matrix import BONES, I3
 from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body, vec8, vec16
@@ -18,6 +19,7 @@ def gather_momentum(
     body: Body,
     position: wp.array2d(dtype=wp.vec3),
     moments: wp.array2d(dtype=vec16),
+    threads: int,
     # scratch
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
@@ -25,15 +27,21 @@ def gather_momentum(
     bones: wp.array2d(dtype=vec16),
     momentum: wp.array2d(dtype=float),
 ):
-    """``J^T m u`` from the moments of the bones about their joints: each joint has what all beyond it have."""
-    e = wp.tid()
-    for b in range(BONES):
+    """``J^T m u`` from the moments of the bones about their joints: each joint has what all beyond it have.
+
+    Launched over ``(num_envs, threads)``: threads share the bones' chunks, one of them goes down the tree.
+    """
+    e, thread = wp.tid()
+    for b in range(thread, BONES, threads):
         s = vec16()
         for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
             s += moments[e, c]
         bones[e, b] = s
         linear[e, b] = wp.vec3(s[4], s[5], s[6])
         angular[e, b] = wp.vec3(s[13], s[14], s[15])
+    meet_threads(threads)
+    if thread > 0:
+        return
     for n in range(BONES - 1):
         b = BONES - 1 - n  # children come after their parents
         a = body.parent[b]
@@ -51,6 +59,7 @@ def balance(
     reaction: float,
     support: wp.array2d(dtype=float),
     field: wp.array2d(dtype=vec8),
+    threads: int,
     # in and out
     change: wp.array2d(dtype=float),
 ):
@@ -58,15 +67,15 @@ def balance(
 
     That is ``support``, an impulse and its moment about the pelvis joint, and with ``reaction`` 1 what the bones' sums
     say. A rigid motion of the body makes up the difference. The blend of the bones' motions has the momenta of the
-    bones' own sums, because weights add up to one.
+    bones' own sums, because weights add up to one. Launched over ``(num_envs, threads)``.
     """
-    e = wp.tid()
+    e, thread = wp.tid()
     m = float(0.0)
     first = wp.vec3()
     I = wp.mat33()
-    P = -part_of(support, e, 0)
-    L = -part_of(support, e, 3)
-    for b in range(BONES):
+    P = wp.vec3()
+    L = wp.vec3()
+    for b in range(thread, BONES, threads):
         s = bones[e, b]
         arm = position[e, b] - position[e, 0]
         d = wp.vec3(s[1], s[2], s[3])  # first moment about the joint, as are the others
@@ -81,9 +90,23 @@ def balance(
         first += d + s[0] * arm
         I += inertia + point_inertia(s[0], arm)
         I += 2.0 * wp.dot(d, arm) * I3 - wp.outer(d, arm) - wp.outer(arm, d)
-    center = first / m
-    W = spin_of(I - point_inertia(m, center), L - wp.cross(center, P))
-    V = P / m - wp.cross(W, center)
+    # fmt: off
+    t = sum_threads16(
+        vec16(
+            m, first[0], first[1], first[2], P[0], P[1], P[2], L[0], L[1], L[2],
+            I[0, 0], I[1, 1], I[2, 2], I[1, 2], I[2, 0], I[0, 1],
+        ),
+        threads,
+    )
+    # fmt: on
+    if thread > 0:
+        return
+    center = wp.vec3(t[1], t[2], t[3]) / t[0]
+    P = wp.vec3(t[4], t[5], t[6]) - part_of(support, e, 0)
+    L = wp.vec3(t[7], t[8], t[9]) - part_of(support, e, 3)
+    I = symmetric(wp.vec3(t[10], t[11], t[12]), wp.vec3(t[13], t[14], t[15]))
+    W = spin_of(I - point_inertia(t[0], center), L - wp.cross(center, P))
+    V = P / t[0] - wp.cross(W, center)
     for i in range(3):
         change[e, i] = change[e, i] - V[i]
         change[e, 3 + i] = change[e, 3 + i] - W[i]

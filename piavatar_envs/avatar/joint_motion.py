@@ -182,28 +182,48 @@ def attach_flesh(
     lost[e, q] = before - after
 
 
+@wp.func
+def move_bone(
+    body: Body,
+    dt: float,
+    s: vec8,
+    e: int,
+    b: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+):
+    """Turn one bone, whose parent has been moved, by its spin over ``dt``."""
+    if b == 0:
+        position[e, b] = position[e, b] + dt * wp.vec3(s[0], s[1], s[2])
+    else:
+        a = body.parent[b]
+        r = row(e, body.rest_joint.shape[0])
+        offset = body.rest_joint[r, b] - body.rest_joint[r, a]
+        position[e, b] = position[e, a] + wp.quat_rotate(rotation[e, a], offset)
+    rotation[e, b] = wp.normalize(quat_exp(dt * wp.vec3(s[3], s[4], s[5])) * rotation[e, b])
+
+
 @wp.kernel
 def move_joints(
     body: Body,
     dt: float,
     field: wp.array2d(dtype=vec8),
     failure: wp.array(dtype=int),
+    threads: int,
     # in and out
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together."""
-    e = wp.tid()
+    """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together.
+
+    Launched as :func:`spread_motion`.
+    """
+    e, thread = wp.tid()
     if failure[e] != 0:
         return
-    r = row(e, body.rest_joint.shape[0])
-    for b in range(BONES):
-        s = field[e, b]
-        if b == 0:
-            position[e, b] = position[e, b] + dt * wp.vec3(s[0], s[1], s[2])
-        else:
-            a = body.parent[b]
-            offset = body.rest_joint[r, b] - body.rest_joint[r, a]
-            position[e, b] = position[e, a] + wp.quat_rotate(rotation[e, a], offset)
-        turn = quat_exp(dt * wp.vec3(s[3], s[4], s[5]))
-        rotation[e, b] = wp.normalize(turn * rotation[e, b])
+    levels = wp.where(threads > 1, body.levels, 1)
+    for level in range(levels):
+        for b in range(thread, BONES, threads):
+            if threads == 1 or body.depth[b] == level:
+                move_bone(body, dt, field[e, b], e, b, rotation, position)
+        meet_threads(threads)
