@@ -137,10 +137,12 @@ for (int i = 0; i < 3; ++i) {
     const int b00 = far ? bricks[4] : bricks[0], b01 = far ? bricks[5] : bricks[1];
     const int b10 = far ? bricks[6] : bricks[2], b11 = far ? bricks[7] : bricks[3];
     int* const plane = room + ((px + i) & 1) * 28;
+    int over = 0;
 #pragma unroll
     for (int j = 0; j < 3; ++j) {
         int* const line = plane + word_y[j];
         const int first = upper_y[j] ? b10 : b00, last = upper_y[j] ? b11 : b01;
+        const int of_first = first == trash ? 0 : -1, of_last = last == trash ? 0 : -1;
         const float w = wi * weight_y[j];
         float at[3];
         for (int c = 0; c < 3; ++c) at[c] = q[c] + at_y[j] * along[c][1];
@@ -148,21 +150,30 @@ for (int i = 0; i < 3; ++i) {
         for (int l = 0; l < 3; ++l) {
             int* const node = line + (upper_z[l] ? last : first) + word_z[l];
             const float wl = w * weight_z[l];
-            atomicAdd(node, __float2int_rn(wl * m));
+            // a sum of masses that runs over is negative for 2^31, which nobody adds at once: somebody sees it
+            over |= atomicAdd(node, __float2int_rn(wl * m)) & (upper_z[l] ? of_last : of_first);
             for (int c = 0; c < 3; ++c) {
                 atomicAdd(node + 1 + c, __float2int_rn(wl * (at[c] + at_z[l] * along[c][2])));
                 atomicAdd(node + 4 + c, __float2int_rn(wl * k[c]));
             }
         }
     }
+    if (over < 0) room[3] = 1;  // CROWDED
     for (int c = 0; c < 3; ++c) q[c] += along[c][0];
 }
 """)
 )
 def add_to_bricks(
-    bricks: vec8i, s: Scattered, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, per_mass: float, per_momentum: float
+    bricks: vec8i,
+    trash: int,
+    s: Scattered,
+    wx: wp.vec3,
+    wy: wp.vec3,
+    wz: wp.vec3,
+    per_mass: float,
+    per_momentum: float,
 ):
-    """Add a particle to the 27 nodes of its stencil, in eight bricks that begin at those words."""
+    """Add a particle to the 27 nodes of its stencil, in bricks that begin at those words; one may be ``trash``."""
     ...
 
 

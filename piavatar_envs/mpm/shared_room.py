@@ -13,7 +13,7 @@ from piavatar_envs.mpm.shared_grid import BLOCK_BRICKS, BRICK_WORDS, HEADER, PLA
 from piavatar_envs.mpm.types import Model, Room
 
 #: Words of a room of which two fit into a multiprocessor, and of one that takes it all; with what stores take of it.
-SMALL_ROOM, LARGE_ROOM = 27_136, 54_528
+SMALL_ROOM, LARGE_ROOM = 27_008, 54_272
 #: Threads of their CUDA blocks.
 SMALL_THREADS, LARGE_THREADS = 320, 640
 #: Slots of a part up to which the small one does: they are more than will be used, and half of their nodes.

@@ -75,7 +75,7 @@ _NONFINITE = wp.constant(FAILURE_NONFINITE)
 #: Slowest speed that momenta are counted at [m/s].
 SLOWEST = wp.constant(2.0**-20)
 #: Units of mass in a field's heaviest particle where places are told.
-PLACE_UNITS = wp.constant(2.0**23)
+PLACE_UNITS = wp.constant(2.0**20)
 #: A particle that goes or is driven further than this in a substep [grid spacings] has failed, and is not added up.
 MOST_CELLS = wp.constant(8.0)
 
@@ -235,7 +235,7 @@ def scatter_momenta(
             if fault != 0:
                 wp.atomic_or(failure, e, fault)
                 or_word(FAULTS, fault)
-            elif speed * step.dt > MOST_CELLS * grid.dx:  # the others go on in this substep; it would blur their sums
+            elif speed * step.dt > MOST_CELLS * grid.dx:  # it would blur the sums of the others
                 wp.atomic_or(failure, e, _CFL)
             else:
                 raise_to(FASTEST + field, speed)
@@ -243,7 +243,8 @@ def scatter_momenta(
                     n = bricks_around(grid, blocks, room, e, field, s.base, first)
                     per_mass = 1.0 / unit_of_mass(field)
                     per_momentum = per_mass / number(SPEED + field)
-                    add_to_bricks(n, s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_mass, per_momentum)
+                    trash = room.bricks + BRICK_WORDS * room.capacity
+                    add_to_bricks(n, trash, s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_mass, per_momentum)
         else:
             or_word(FAULTS, _NONFINITE)
     meet()

@@ -178,12 +178,16 @@ def run_substep(
     if not gathers:
         clear_untouched(grid, blocks, room, node_velocity, sensors, e, part)
     meet()
-    for n in range((count + room.capacity - 1) // room.capacity):
-        first = n * room.capacity
-        if word(TOLD) != 0:
+    rounds = (count + room.capacity - 1) // room.capacity
+    passes = wp.where(rounds > 1, 2 * rounds, rounds)  # the first ones to find units that hold in all
+    for n in range(passes):
+        first = (n % rounds) * room.capacity
+        settles = n >= passes - rounds
+        if settles and word(TOLD) != 0:
             scatter_places(grid, particles, blocks, room, e, part, first, moved.x, sums)
         scatter_round(grid, step, particles, moved, blocks, room, sums, failure, e, part, first)
-        update_bricks(grid, step, boundaries, contact, blocks, room, sums, node_velocity, sensors, e, first, writes)
+        if settles:
+            update_bricks(grid, step, boundaries, contact, blocks, room, sums, node_velocity, sensors, e, first, writes)
         meet()
     fails = word(FAULTS) != 0
     if t == 0 and gathers:
