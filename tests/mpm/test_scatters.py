@@ -160,7 +160,7 @@ def test_a_crowd_is_counted_in_larger_units(simulate, device, copies):
     box = simulate(spacing=0.05).rest
     rest = np.concatenate([np.repeat(box[:1], copies, axis=0), box[1:]])
     moved = []
-    for capacity in (None, 30, 10):
+    for capacity in (None, 12, 7):
         sim = simulate(rest=rest, scatter="shared", max_slots=SLOTS).set(u=(0.3, -0.2, 0.1))
         sim.scratch.room.capacity = capacity or sim.scratch.room.capacity
         sim.run(3)
