@@ -47,9 +47,9 @@ from piavatar_envs.mpm.shared_memory import (
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_corner, grid_position, spline
 from piavatar_envs.mpm.transfer import (
     Scattered,
-    near_boundary,
     prepare,
     scatters,
+    tells_place,
 )
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
@@ -112,12 +112,7 @@ def lay_out(
         n = places_around(grid, blocks, e, field, base)
         for b in range(8):
             set_half_word(room.numbers, n[b], 1)
-        tells = near_boundary(grid, boundaries, e, at)
-        if contact.num_fields > 1 and not tells:
-            for b in range(8):
-                block = blocks.held[e, n[b] // BLOCK_BRICKS] % grid.num_blocks
-                tells = tells or blocks.fields[e, block] != (1 << field)
-        if tells:
+        if tells_place(grid, particles, boundaries, contact, blocks, e, p, at, base):
             or_word(room.told + p // 32, 1 << (p % 32))
             set_word(TOLD, 1)
     meet()
