@@ -1,0 +1,112 @@
+"""One body whose joints move under torques, without a task: built, held, aimed, measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks import runner
+from benchmarks.rig import Rig, World
+from piavatar_envs.avatar.articulated import ArticulatedBody
+from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.settings import DriveSettings
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, forward_kinematics, joint_index
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
+
+HOLD = 1e5, 1e4  # spring and damper of a held pelvis, of its place and of its turn [SI units]
+
+
+@dataclass(frozen=True)
+class Options(runner.Options):
+    """Options of the torque benchmark."""
+
+    #: resolution of the body
+    fidelity: str = "coarse"
+    #: control steps of each case
+    steps: int = 45
+    #: substeps between two mass matrices
+    refresh: int = 2
+    #: halvings of the interval in which a largest stable value lies
+    halvings: int = 6
+    #: poses that a body is asked for wherever its stability is tried
+    poses: int = 2
+
+
+class Limbs:
+    """One body whose joints move under torques, at rest in a pose.
+
+    Attributes:
+        rig: the world; its own drive does not act.
+        body: the joints.
+        program: a control step.
+    """
+
+    def __init__(
+        self, options: Options, gravity: float, rotations: np.ndarray, rate: float = 0.0, ground: bool = False
+    ) -> None:
+        """Build it in a pose of rotation vectors ``(22, 3)``; ``rate`` holds flesh to bones, where it is not zero."""
+        world = World(
+            fidelity=options.fidelity, num_substeps=None, gravity=gravity, ground=ground, device=options.device
+        )
+        asset = load_body()
+        self.rig = Rig(world, DriveSettings(), asset.parameters()[None])
+        self.rig.reset(rotations[None])
+        rates = np.full((1, self.rig.points.num_points), rate) if rate > 0.0 else None
+        none = np.zeros((1, 1 + NUM_JOINTS))
+        self.body = ArticulatedBody(self.rig.points, self.rig.avatar.body, self.rig.model, none, none, rates)
+        local, joints = Rotation.from_rotvec(rotations), self.rig.points.joints[0].astype(float)
+        world_rotations, positions = forward_kinematics(local.as_matrix(), joints[0], joints)
+        self.body.state.rotation.assign(Rotation.from_matrix(world_rotations).as_quat()[None].astype(np.float32))
+        self.body.state.position.assign(positions[None].astype(np.float32))
+        self.body.target.root.assign(positions[None, 0].astype(np.float32))
+        self.aim(rotations)
+        self._run("record_mass")
+        self.program = self._record(options.refresh)
+
+    def _run(self, part: str) -> None:
+        program = Program(self.rig.model.device)
+        getattr(self.body, part)(program, self.rig.state)
+        program.run()
+
+    def _record(self, refresh: int) -> Program:
+        rig, program = self.rig, Program(self.rig.model.device)
+        record_begin(program, rig.model, rig.state, rig.scratch)
+        for step in range(rig.model.num_substeps):
+            self.body.record_substep(program, rig.state, refresh=step % refresh == 0)
+            record_substep(program, rig.model, rig.state, rig.scratch, step)
+        record_end(program, rig.model, rig.state, rig.scratch)
+        return program
+
+    def set_springs(self, stiffness: float, damping: np.ndarray | float, held: bool = False) -> None:
+        """Springs and dampers of all joints; those of the pelvis hold it, or are none."""
+        values = np.zeros((2, 1, 1 + NUM_JOINTS), np.float32)
+        values[0, 0, 2:], values[1, 0, 2:] = stiffness, damping
+        values[:, 0, :2] = np.array(HOLD)[:, None] * held
+        self.body.springs.stiffness.assign(values[0])
+        self.body.springs.damping.assign(values[1])
+
+    def aim(self, rotations: np.ndarray) -> None:
+        """Let the springs pull to a pose, rotation vectors ``(22, 3)``."""
+        self.body.target.rotation.assign(Rotation.from_rotvec(rotations).as_quat()[None].astype(np.float32))
+
+    def arm(self, side: str) -> np.ndarray:
+        """From shoulder to wrist [m]."""
+        position = self.body.state.position.numpy()[0]
+        return (position[joint_index(f"{side}_wrist")] - position[joint_index(f"{side}_shoulder")]).astype(float)
+
+    def gaps(self) -> np.ndarray:
+        """How far tracked joints are from where their parents have them [m], shape ``(21,)``."""
+        program = Program(self.rig.model.device)
+        self.rig.avatar.record_tracking(program, self.rig.state)
+        program.run()
+        return self.rig.pose_errors()["relative_translation"][0]
+
+
+def critical_damping(body: ArticulatedBody, stiffness: float) -> np.ndarray:
+    """Of all joints but the pelvis, by the inertia of what each carries [N m s/rad], shape ``(21,)``."""
+    diagonal = np.diagonal(body.mass.matrix.numpy()[0])
+    inertia = diagonal[6:].reshape(-1, 3).mean(1).astype(float)
+    return 2.0 * np.sqrt(stiffness * inertia)
