@@ -8,7 +8,7 @@ one that is not is halved, so "largest" means below the failure that was found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +24,7 @@ from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.envs.config import SceneConfig
 from piavatar_envs.mpm import build
 from piavatar_envs.mpm.diagnostics import totals
+from piavatar_envs.mpm.types import failure_name
 
 SECONDS, CALM = 1.0, 1.0  # how long a body is watched [s], and what it may have left [J]
 GRAVITY = 9.81
@@ -47,7 +48,7 @@ class Trial:
         reach: share of the joints' ranges in which poses lie.
         young: Young's modulus [Pa].
         substeps: a control step; None for the environments' own.
-        control_dt: [s]
+        control_dt: time between two looks at the energy [s].
     """
 
     grounded: bool = False
@@ -75,8 +76,8 @@ class Trial:
         )
         return Stage(act, options.fidelity, options.device)
 
-    def is_stable(self, options: Options, seed: int) -> bool:
-        """Whether it is, as the module has it."""
+    def fault(self, options: Options, seed: int) -> str | None:
+        """Why it is not stable, as the module has it: a failure by name, ``"energy"``, ``"hum"``; None where it is."""
         pose = random_pose(np.random.default_rng(seed), self.reach)[0] * (np.arange(NUM_JOINTS) > 0)[:, None]
         stage = self.stage(options, pose * (not self.grounded))
         simulation, joints = stage.simulation, stage.simulation.avatar.joints
@@ -88,31 +89,56 @@ class Trial:
         start, kinetic = potential(), np.inf
         for _ in range(round(SECONDS / stage.dt)):
             stage.step()
-            if state.failure.numpy()[0]:
-                return False
+            if failure := int(state.failure.numpy()[0]):
+                return failure_name(failure)
             error = np.linalg.norm(pose, axis=1)[1:] * (not self.grounded)
             held = 0.5 * float(joints.body.springs.stiffness.numpy()[0, 2:] @ error**2)
             now = totals(simulation.model, state)
             kinetic = now.kinetic
             if kinetic + now.elastic > held + start - potential() + CALM:
-                return False
-        return kinetic < CALM
+                return "energy"
+        return None if kinetic < CALM else "hum"
 
 
-def halve(stable: Callable[[float], bool], low: float, high: float, halvings: int) -> tuple[float, float | None]:
-    """The largest value found stable and the least found not to be (None if ``high`` is stable), on a log scale.
+@dataclass(frozen=True)
+class Edge:
+    """Between what is stable and what is not.
+
+    Attributes:
+        stable: the largest value found stable.
+        unstable: the least found not to be; None if none was.
+        fault: of that.
+    """
+
+    stable: float
+    unstable: float | None = None
+    fault: str | None = None
+
+
+def halve(fault: Callable[[float], str | None], low: float, high: float, halvings: int) -> Edge:
+    """The edge between ``low`` and ``high``, on a logarithmic scale; ``fault(value)`` is None where it is stable.
 
     Raises:
         RuntimeError: ``low`` is not stable.
     """
-    if stable(high):
-        return high, None
-    if not stable(low):
-        raise RuntimeError(f"{low:g} is not stable: look for the limit below it")
+    why = fault(high)
+    if why is None:
+        return Edge(high)
+    if (found := fault(low)) is not None:
+        raise RuntimeError(f"{low:g} is not stable ({found}): look for the edge below it")
     for _ in range(halvings):
         middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if stable(middle) else (low, middle)
-    return low, high
+        if (found := fault(middle)) is None:
+            low = middle
+        else:
+            high, why = middle, found
+    return Edge(low, high, why)
+
+
+def first_fault(trials: Iterable[Trial], options: Options) -> str | None:
+    """The first fault of trials, each with as many poses as the options have; None without any."""
+    pairs = [(trial, seed) for trial in trials for seed in range(1 if trial.grounded else options.poses)]
+    return next(filter(None, (trial.fault(options, seed) for trial, seed in pairs)), None)
 
 
 @contextmanager
@@ -130,19 +156,20 @@ def longest_step(options: Options, name: str, grounded: bool, young: float) -> d
     def substeps(courant: float) -> int:
         return max(1, round(LONG * speed / (courant * dx)))
 
-    def stable(courant: float) -> bool:
+    def fault(courant: float) -> str | None:
         trial = Trial(grounded, young=young, substeps=substeps(courant), control_dt=LONG)
-        return all(trial.is_stable(options, seed) for seed in range(1 if grounded else options.poses))
+        return first_fault([trial], options)
 
     with unrefused():
-        found, failed = halve(stable, *COURANT, options.halvings)
-    dt = LONG / substeps(found)
-    beyond = None if failed is None else LONG / substeps(failed)
+        edge = halve(fault, *COURANT, options.halvings)
+    dt = LONG / substeps(edge.stable)
+    beyond = None if edge.unstable is None else LONG / substeps(edge.unstable)
     return {
         "case": f"longest_step_{name}",
         "stable_dt_ms": 1e3 * dt,
         "stable_c_dt_over_dx": speed * dt / dx,
         "unstable_c_dt_over_dx": beyond and speed * beyond / dx,
+        "fault": edge.fault,
         "refused_from_c_dt_over_dx": build.CFL_STABLE,
         "chosen_dt_ms": 1e3 * first.model.step.dt,
     }
@@ -157,19 +184,17 @@ def largest_gains(options: Options, kind: str, limited: bool) -> dict[str, Any]:
         gains = factor if on_stiffness else 1.0, factor if on_damping else 1.0
         return Trial(grounded, *gains, strength, reach)
 
-    def stable(factor: float) -> bool:
-        return trial(factor, True).is_stable(options, 0) and all(
-            trial(factor, False).is_stable(options, seed) for seed in range(options.poses)
-        )
-
-    found, failed = halve(stable, 1.0, MOST, options.halvings)
-    stage = trial(found, False).stage(options, np.zeros((NUM_JOINTS, 3)))
+    edge = halve(
+        lambda factor: first_fault([trial(factor, True), trial(factor, False)], options), 1.0, MOST, options.halvings
+    )
+    stage = trial(edge.stable, False).stage(options, np.zeros((NUM_JOINTS, 3)))
     stage.step()
     springs, hip = stage.simulation.avatar.joints.body.springs, 1 + joint_index("left_hip")
     return {
         "case": f"largest_{kind}_{'limited' if limited else 'boundless'}",
-        "stable_factor": found,
-        "unstable_factor": failed,
+        "stable_factor": edge.stable,
+        "unstable_factor": edge.unstable,
+        "fault": edge.fault,
         "hip_stiffness_nm_rad": float(springs.stiffness.numpy()[0, hip]),
         "hip_damping_nms_rad": float(springs.damping.numpy()[0, hip]),
         "dt_ms": 1e3 * stage.simulation.model.step.dt,

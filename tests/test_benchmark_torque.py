@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
 import pytest
 
-from benchmarks import stability, torque
+from benchmarks import runner, stability, torque
 from benchmarks.limbs import Options
 
+RESULTS = runner.ROOT / "benchmarks" / "results" / "torque.json"
 FLOATS = [f"free_float_{how}" for how in ("loose", "attached", "pd_loose", "pd_attached")]
 KICKS = [f"kick_{mass}_{how}" for mass in ("0.45", "1.5", "8") for how in ("floating", "held")]
 CASES = {
@@ -36,6 +38,11 @@ def test_every_case_is_measured(rows):
     numbers = [v for row in rows.values() for v in row.values() if isinstance(v, (int, float, np.number))]
     assert all(math.isfinite(value) for value in numbers)
     assert not any(row.get("failed") for row in rows.values())
+
+
+def test_the_committed_results_are_complete():
+    report = json.loads(RESULTS.read_text(encoding="utf-8"))
+    assert report["complete"] and {row["case"] for row in report["results"]} == CASES
 
 
 @pytest.mark.parametrize("case", FLOATS)
@@ -83,16 +90,16 @@ def test_heavier_balls_take_more_and_fly_slower(rows):
 def test_halving_finds_an_edge():
     tried = []
 
-    def stable(value):
+    def fault(value):
         tried.append(value)
-        return value < 0.7
+        return None if value < 0.7 else f"beyond {value:g}"
 
-    low, high = stability.halve(stable, 0.1, 10.0, 8)
-    assert low < 0.7 <= high and high / low == pytest.approx(100.0 ** (1.0 / 256.0))
-    assert len(tried) == 10
-    assert stability.halve(stable, 0.1, 0.5, 8) == (0.5, None)
+    edge = stability.halve(fault, 0.1, 10.0, 8)
+    assert edge.stable < 0.7 <= edge.unstable and edge.unstable / edge.stable == pytest.approx(100.0 ** (1.0 / 256.0))
+    assert len(tried) == 10 and edge.fault == f"beyond {edge.unstable:g}"
+    assert stability.halve(fault, 0.1, 0.5, 8) == stability.Edge(0.5)
     with pytest.raises(RuntimeError, match="not stable"):
-        stability.halve(stable, 1.0, 10.0, 8)
+        stability.halve(fault, 1.0, 10.0, 8)
 
 
 def test_stable_values_are_found_below_unstable_ones(rows):
@@ -108,5 +115,5 @@ def test_stable_values_are_found_below_unstable_ones(rows):
 def test_a_body_that_hums_is_not_stable(device):
     """Without any damping but the tissue's it still moves after a second; with the environments' it is at rest."""
     options = Options(device=device, fidelity="tiny")
-    assert stability.Trial().is_stable(options, 0)
-    assert not stability.Trial(damping=0.0).is_stable(options, 0)
+    assert stability.Trial().fault(options, 0) is None
+    assert stability.Trial(damping=0.0).fault(options, 0) == "hum"
