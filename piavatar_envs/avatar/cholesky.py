@@ -41,6 +41,68 @@ def find_pattern(filled: np.ndarray, device: str) -> Pattern:
     return pattern
 
 
+# Rows as plain pointers: on a CPU, finding an entry's address costs more than what is done with it.
+_ROW = """
+const int* const at = column.data;
+const float* const row = &wp::index(factor, e, k, 0);
+"""
+
+
+@wp.func_native(
+    _ROW + "float* const to = &wp::index(factor, e, i, 0);\n"
+    "for (int n = first; n < last; ++n) to[at[n]] -= share * row[at[n]];"
+)
+def subtract_row(
+    column: wp.array(dtype=int),
+    first: int,
+    last: int,
+    factor: wp.array3d(dtype=float),
+    e: int,
+    k: int,
+    i: int,
+    share: float,
+):
+    """Take ``share`` of row ``k`` of a factor from row ``i``, in columns ``first`` to ``last`` of the pattern."""
+    ...
+
+
+@wp.func_native(
+    _ROW + "float* const to = &wp::index(x, e, 0);\n"
+    "for (int n = first; n < last; n += threads) to[at[n]] -= row[at[n]] * y;"
+)
+def subtract_column(
+    column: wp.array(dtype=int),
+    first: int,
+    last: int,
+    threads: int,
+    factor: wp.array3d(dtype=float),
+    e: int,
+    k: int,
+    y: float,
+    x: wp.array2d(dtype=float),
+):
+    """Take ``y`` times row ``k`` of a factor from a vector, every ``threads``-th of its columns."""
+    ...
+
+
+@wp.func_native(
+    _ROW + "const float* const from = &wp::index(x, e, 0);\nfloat sum = 0.0f;\n"
+    "for (int n = first; n < last; n += threads) sum += row[at[n]] * from[at[n]];\nreturn sum;"
+)
+def dot_row(
+    column: wp.array(dtype=int),
+    first: int,
+    last: int,
+    threads: int,
+    factor: wp.array3d(dtype=float),
+    e: int,
+    k: int,
+    x: wp.array2d(dtype=float),
+) -> float:
+    """Product of row ``k`` of a factor, every ``threads``-th of its columns, and a vector."""
+    ...
+
+
 @wp.kernel
 def factorize(
     pattern: Pattern,
@@ -81,9 +143,7 @@ def factorize(
         for n in range(first + thread, last, threads):
             i = pattern.column[n]
             share = factor[e, k, i]
-            for m in range(first, n):
-                j = pattern.column[m]
-                factor[e, i, j] = factor[e, i, j] - share * factor[e, k, j]
+            subtract_row(pattern.column, first, n, factor, e, k, i, share)
             factor[e, i, i] = factor[e, i, i] - share * share
         meet_threads(threads)
 
@@ -112,15 +172,12 @@ def solve(
         meet_threads(threads)
         if thread == 0:
             x[e, k] = y
-        for n in range(pattern.start[k] + thread, pattern.start[k + 1], threads):
-            i = pattern.column[n]
-            x[e, i] = x[e, i] - factor[e, k, i] * y
+        first = pattern.start[k] + thread
+        subtract_column(pattern.column, first, pattern.start[k + 1], threads, factor, e, k, y, x)
         meet_threads(threads)
     for k in range(size):
-        part = float(0.0)
-        for n in range(pattern.start[k] + thread, pattern.start[k + 1], threads):
-            i = pattern.column[n]
-            part += factor[e, k, i] * x[e, i]
+        first = pattern.start[k] + thread
+        part = dot_row(pattern.column, first, pattern.start[k + 1], threads, factor, e, k, x)
         part = sum_threads(part, threads)
         if thread == 0:
             x[e, k] = (x[e, k] - part) / factor[e, k, k]
