@@ -64,18 +64,20 @@ class Limbs:
         self.body.target.root.assign(positions[None, 0].astype(np.float32))
         self.aim(rotations)
         self._run("record_mass")
-        self.program = self._record(options.refresh)
+        self.program = self.record(options.refresh)
 
     def _run(self, part: str) -> None:
         program = Program(self.rig.model.device)
         getattr(self.body, part)(program, self.rig.state)
         program.run()
 
-    def _record(self, refresh: int) -> Program:
+    def record(self, refresh: int | None) -> Program:
+        """A control step, with a mass matrix every ``refresh`` substeps; without joints where that is None."""
         rig, program = self.rig, Program(self.rig.model.device)
         record_begin(program, rig.model, rig.state, rig.scratch)
         for step in range(rig.model.num_substeps):
-            self.body.record_substep(program, rig.state, refresh=step % refresh == 0)
+            if refresh is not None:
+                self.body.record_substep(program, rig.state, refresh=step % refresh == 0)
             record_substep(program, rig.model, rig.state, rig.scratch, step)
         record_end(program, rig.model, rig.state, rig.scratch)
         return program
