@@ -10,7 +10,15 @@ import pytest
 import yaml
 from pydantic import BaseModel, Field, ValidationError
 
-from piavatar_envs.envs.config import ConfigError, EnvConfig, dump_yaml, load_config, parse_assignments, replace
+from piavatar_envs.envs.config import (
+    ConfigError,
+    DriveConfig,
+    EnvConfig,
+    dump_yaml,
+    load_config,
+    parse_assignments,
+    replace,
+)
 from piavatar_envs.envs.config_io import setting_keys
 
 
@@ -184,3 +192,15 @@ def test_every_setting_is_described_with_its_unit():
     assert not undescribed and not unitless
     bare = [name.rpartition(".")[2] for name in setting_keys(EnvConfig)]
     assert len(bare) == len(set(bare)), "a bare name would be ambiguous as a keyword of gym.make"
+
+
+def test_a_part_of_a_section_leaves_the_tasks_own_defaults_of_the_rest():
+    class Own(EnvConfig):
+        drive: DriveConfig = Field(
+            default_factory=lambda: DriveConfig(control="pd", tone=0.4), description="how actions move the body"
+        )
+
+    config = load_config(Own, None, {"root_assist": 0.5, "drive.tone": 0.7})
+    assert (config.drive.control, config.drive.root_assist, config.drive.tone) == ("pd", 0.5, 0.7)
+    again = replace(config, {"drive.root_assist": 0.25})
+    assert (again.drive.control, again.drive.root_assist, again.drive.tone) == ("pd", 0.25, 0.7)

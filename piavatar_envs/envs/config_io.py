@@ -58,6 +58,7 @@ def load_config(
     path = source if isinstance(source, (str, Path)) else None
     base = _read_yaml(Path(path)) if path is not None else source
     merged = _merge(_expand(cls, base or {}), _expand(cls, overrides or {}))
+    merged = _merge(_own_defaults(cls, merged), merged)
     try:
         # JSON is what YAML, keywords and command lines have in common: a list may be a tuple, a string is no number.
         return cls.model_validate_json(json.dumps(merged, default=_plain))
@@ -173,6 +174,16 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
         both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
         merged[key] = _merge(merged[key], value) if both else value
     return merged
+
+
+def _own_defaults(cls: type[BaseModel], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Defaults by ``cls`` of the sections of which ``settings`` has some: a task's may not be the section's own."""
+    sections = {name: field for name, field in cls.model_fields.items() if _section(field.annotation)}
+    return {
+        name: field.get_default(call_default_factory=True).model_dump(mode="json")
+        for name, field in sections.items()
+        if isinstance(settings.get(name), Mapping) and not field.is_required()
+    }
 
 
 def _flat_keys(nested: Mapping[str, Any], prefix: str = "") -> list[str]:
