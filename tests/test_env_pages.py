@@ -109,17 +109,17 @@ def test_steps_of_actions_are_what_the_kernels_take(made, name):
     table, action_map = rows(entry_page(ENTRIES[name], facts), "Actions"), env.batch.action_map
     offset, scale = action_map.offset.numpy(), action_map.scale.numpy()
     lower, upper = np.degrees(action_map.lower.numpy()), np.degrees(action_map.upper.numpy())
+    posed = facts.config.drive.control == "pose"
     acting = [b for b in np.argsort(offset) if offset[b] >= 0]
     assert [row[1].split(".")[0].strip("`") for row in table[: len(acting)]] == [JOINT_NAMES[b] for b in acting]
     for row, b in zip(table, acting, strict=False):
-        assert row[0] == f"`{offset[b]}:{offset[b] + 3}`"
-        assert float(row[2].split()[0]) == pytest.approx(scale[b], rel=1e-3) and row[2].endswith(" rad")
-        ranges = [[float(bound) for bound in cell.split(" to ")] for cell in row[3:]]
+        assert row[0] == f"`{offset[b]}:{offset[b] + 3}`" and len(row) == (6 if posed else 5)
+        if posed:
+            assert float(row[2].split()[0]) == pytest.approx(scale[b], rel=1e-3) and row[2].endswith(" rad")
+        ranges = [[float(bound) for bound in cell.split(" to ")] for cell in row[-3:]]
         assert ranges == pytest.approx(np.stack([lower[b], upper[b]], -1), rel=1e-3)
     root = table[len(acting) :]
-    assert len(root) == (3 if action_map.root_offset >= 0 else 0) and facts.task.action_spec().size == 3 * len(
-        acting
-    ) + len(root)
+    assert len(root) == (3 if action_map.root_offset >= 0 else 0) and facts.actions.size == 3 * len(acting) + len(root)
     for n, (row, step) in enumerate(zip(root, (action_map.root_step,) * 2 + (action_map.root_turn,), strict=False)):
         assert row[0] == f"`{action_map.root_offset + n}:{action_map.root_offset + n + 1}`"
         assert float(row[2].split()[0]) == pytest.approx(step, rel=1e-3)

@@ -19,6 +19,7 @@ import gymnasium
 import numpy as np
 
 import piavatar_envs  # noqa: F401 - registers the ids
+from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.config import EnvConfig
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task, task_modules
@@ -77,6 +78,11 @@ class Facts:
     def config(self) -> EnvConfig:
         """The default settings."""
         return self.task.config
+
+    @property
+    def actions(self) -> ActionSpec:
+        """What acts at the default settings."""
+        return self.task.action_spec().under(self.config.drive.control)
 
 
 def single_entries() -> list[Entry]:

@@ -30,4 +30,4 @@ def index_page(found: Sequence[tuple[Entry, Facts]]) -> str:
 
 def _index_row(entry: Entry, facts: Facts) -> tuple[str, str, str, str]:
     link = f"[{code(entry.title)}]({entry.name}.md)"
-    return link, entry.task.description, str(facts.task.action_spec().size), str(facts.layout.size)
+    return link, entry.task.description, str(facts.actions.size), str(facts.layout.size)

@@ -8,10 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES, joint_index
-from piavatar_envs.envs.actions import ActionSpec
-from piavatar_envs.envs.observations import JOINT_TERMS
+from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES
 from piavatar_envs.mpm.types import FAILURE_NAMES
+from scripts.pages.actions import actions_section
 from scripts.pages.entries import ROOT, Entry, Facts
 from scripts.pages.markdown import code, listed, number, page, sentence, table
 from scripts.pages.scene import scene_section
@@ -77,7 +76,7 @@ def entry_page(entry: Entry, facts: Facts) -> str:
             _overview(entry, facts),
             _agents(facts),
             scene_section(facts.task.scene, facts.task.agent_names),
-            _actions(facts),
+            actions_section(facts),
             _observations(facts),
             _parameters(facts),
             _reward(entry),
@@ -114,7 +113,7 @@ def _duration(seconds: float) -> str:
 def _overview(entry: Entry, facts: Facts) -> str:
     dt, seconds = facts.config.physics.control_dt, facts.config.episode_seconds
     rows = [
-        ("action", code(f"Box(-1, 1, ({facts.task.action_spec().size},), float32)")),
+        ("action", code(f"Box(-1, 1, ({facts.actions.size},), float32)")),
         (
             "observation",
             f'{code(f"Box(-inf, inf, ({facts.layout.size},), float32)")}, or a `Dict` with `obs_mode="dict"`',
@@ -133,54 +132,6 @@ def _agents(facts: Facts) -> str:
         "`env.agents`; its avatar stays in the scene, no longer held up by its root wrench, and the others go on."
     )
     return page(["## Agents", text])
-
-
-def _actions(facts: Facts) -> str:
-    spec, dt = facts.task.action_spec(), facts.config.physics.control_dt
-    lower, upper = np.degrees(facts.task.limits())
-    joints, root = [], []
-    for n, joint in enumerate(spec.joints):
-        b = joint_index(joint)
-        ranges = [f"{number(lower[b, axis])} to {number(upper[b, axis])}" for axis in range(3)]
-        joints.append(
-            (code(f"{3 * n}:{3 * n + 3}"), code(f"{joint}.x .y .z"), f"{number(spec.joint_speed * dt)} rad", *ranges)
-        )
-    for n, (name, limit, text) in enumerate(_root_components(spec, dt) if spec.root else (), 3 * len(joints)):
-        root.append((code(f"{n}:{n + 1}"), code(name), limit, text))
-    text = (
-        "Components are clipped to [-1, 1]. Each joint has three: the rotation vector by which its local rotation is "
-        "turned in the step, in the bone's own axes. In the rest pose these are the world's: the avatar faces -y, its "
-        "left is +x. `joint_speed_limit` scales them, and the joint's whole rotation vector is kept within its range."
-    )
-    return page(
-        [
-            "## Actions",
-            text,
-            table(("slice", "components", "at 1, a step", "range of x [deg]", "of y [deg]", "of z [deg]"), joints),
-            "The commanded root moves, too:" if root else "",
-            table(("slice", "component", "at 1, a step", "direction"), root) if root else "",
-            _under_torques(facts),
-        ]
-    )
-
-
-def _under_torques(facts: Facts) -> str:
-    """What actions are where torques move the body."""
-    size = facts.task.action_spec().under("pd").size
-    about = "the task's reference pose" if facts.task.targets_about_reference else "the rest pose"
-    terms = ", ".join(f"{code(term.name)} ({term.size}, {term.unit})" for term in JOINT_TERMS)
-    return (
-        f'With `control="pd"` or `"torque"` there are {size} components: neither the root nor the toes act. Under '
-        f'`"pd"` a component asks for an angle: 0 is {about}, 1 and -1 are the ends of the ranges above. Under '
-        '`"torque"` it is a share of the greatest torque of the joint about that axis. Nothing holds the body then but '
-        f"the ground and what `root_assist` gives, no root lets go, and {terms} are observed, too."
-    )
-
-
-def _root_components(spec: ActionSpec, dt: float) -> list[tuple[str, str, str]]:
-    way, turn = f"{number(spec.root_speed * dt)} m", f"{number(spec.root_turn_speed * dt)} rad"
-    directions = ("to the avatar's left", "to its back: forward is negative", "turn about the vertical, to the left")
-    return list(zip(spec.names()[-3:], (way, way, turn), directions, strict=True))
 
 
 def _observations(facts: Facts) -> str:
@@ -238,7 +189,7 @@ def _episode(entry: Entry, facts: Facts) -> str:
     task, config = entry.task, facts.config
     drive = config.drive
     ends = [task.termination_doc] if task.termination_doc else []
-    if drive.root == "wrench":
+    if drive.root == "wrench" and drive.control == "pose":
         ends.append(
             f"the root wrench lets go: the pelvis is off its commanded pose by {number(np.degrees(drive.let_go_tilt))} "
             f"degrees of tilt (`let_go_tilt`), {number(drive.let_go_distance)} m horizontally (`let_go_distance`) or "

@@ -106,7 +106,7 @@ def test_dictionary_is_the_flat_vector_by_name(make_env, env_id, equal):
 
 
 def test_info_says_what_held_the_body(make_env, env_id):
-    env = make_env(env_id)
+    env = make_env(env_id, control="pose")
     env.reset(seed=0)
     infos = [env.step(np.zeros(env.action_space.shape))[4] for _ in range(20)]
     weight = 9.81 * float(env.batch.simulation.flesh[0].points.mass.sum())

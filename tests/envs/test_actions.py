@@ -164,7 +164,7 @@ def test_increments_are_composed_on_the_right(make_env):
 
 def test_held_actions_end_at_the_joint_limits(make_env, env_id):
     """Rotation vectors that are commanded stay in their box under every corner of the action space."""
-    env = make_env(env_id)
+    env = make_env(env_id, control="pose")
     lower, upper = (bound[1:] for bound in joint_limits())
     rng = np.random.default_rng(1)
     reached = np.zeros((NUM_JOINTS - 1, 3), bool)

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS
-from piavatar_envs.envs.observations import CONTACT_TERMS, SELF_TERMS, ObservationLayout, ObservationTerm
+from piavatar_envs.envs.observations import (
+    CONTACT_TERMS,
+    JOINT_TERMS,
+    SELF_TERMS,
+    ObservationLayout,
+    ObservationTerm,
+)
 from piavatar_envs.envs.others import prop_terms
 
 
@@ -125,6 +131,7 @@ def test_layout_tiles_the_vector_and_explains_it(make_env, env_id):
     assert list(layout)[: len(SELF_TERMS)] == [term.name for term in SELF_TERMS]
     task = env.batch.task
     seen = [term.name for term in CONTACT_TERMS] if task.observes_contact else []
+    seen += [term.name for term in JOINT_TERMS] if task.config.drive.control != "pose" else []
     seen += [term.name for prop in task.observed_props() for term in prop_terms(prop)]
     assert list(layout)[len(SELF_TERMS) :] == seen + [term.name for term in task.terms()]
 

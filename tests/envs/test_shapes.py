@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 #: The mean body is 1.65 m or so; the asset's own tests hold the range of its shapes.
 SHORTEST, TALLEST, LIGHTEST, HEAVIEST = 1.2, 2.1, 25.0, 160.0
 
 
 def body_of(env, index: int = 0) -> dict[str, float | np.ndarray]:
-    """What one sees of a body at rest: height [m], mass [kg], parameters."""
+    """What one sees of a body at rest: height along its own axis [m], mass [kg], parameters."""
     simulation = env.batch.simulation
     own = slice(0, simulation.avatar.num_points)  # props come after the avatar
     x = simulation.state.x.numpy()[index, own]
+    up = Rotation.from_quat(simulation.avatar.tracked.rotation.numpy()[index, 0].astype(float)).apply([0.0, 0.0, 1.0])
     return {
-        "height": float(np.ptp(x[:, 2])),
+        "height": float(np.ptp(x @ up)),
         "mass": float(simulation.model.particles.mass.numpy()[index, own].sum()),
         "parameters": simulation.flesh[0].shape_parameters[index].copy(),
     }
