@@ -15,12 +15,14 @@ from piavatar_envs.tasks import NAMESPACE, task_modules
 UNBOUNDED = r".*A Box observation space (minimum|maximum) value is -?infinity.*"
 
 #: Terms that may stay nearly the same, and the components that do. The pelvis hangs in the root wrench, so that it
-#: keeps its height and hardly tilts, and three joints are fixed to it by bone; a command leads what something blocks.
+#: keeps its height and hardly tilts, and three joints are fixed to it by bone; a command leads what something blocks;
+#: toes are stiff under torques.
 ALMOST_CONSTANT = {
     "root_height": (0,),
     "root_orientation": (0, 2, 4, 5),
     "bone_positions": range(9),
     "command_lead": (0, 1),
+    "joint_velocities": range(27, 33),
 }
 
 

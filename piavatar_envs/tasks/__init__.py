@@ -15,15 +15,18 @@ _NOT_TASKS = {
     "disturb",
     "gate",
     "goal",
+    "ground",
     "hands",
     "hits",
     "leash",
     "place",
+    "pushes",
     "pushing",
     "ranges",
     "rewards",
     "spawn",
     "throws",
+    "upright",
 }
 NAMESPACE = "PIAvatar"
 

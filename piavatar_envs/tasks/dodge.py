@@ -21,11 +21,11 @@ from piavatar_envs.tasks.place import PlaceRule, judge_pose, keep_place, observe
 from piavatar_envs.tasks.ranges import check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 from piavatar_envs.tasks.throws import (
-    catching_distance,
     draw_balls,
     make_throws,
     observe_throws,
     throw_balls,
+    throwing_domain,
     waiting_places,
 )
 
@@ -138,11 +138,7 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
         return ActionSpec(self.joints, root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
 
     def domain(self) -> Domain:
-        """Room for balls to wait in, and to fly past the waiting ones before they are caught."""
-        x, y, _ = self.place
-        out = catching_distance(self.config) + self.config.ball_radius
-        out += 0.1 + 1.5 * self.config.throw_speed[1] * self.config.physics.control_dt
-        return Domain().around([self.place]).including((x - out, y - out, 0.0), (x + out, y + out, 0.0))
+        return throwing_domain(self.config, self.place)
 
     def allocate(self, env) -> None:
         n, device, config = env.num_envs, env.device, self.config

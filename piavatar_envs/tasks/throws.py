@@ -13,11 +13,15 @@ import warp as wp
 
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.draws import STREAM_BALL, generator
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
     from piavatar_envs.tasks.dodge import DodgeConfig
+    from piavatar_envs.tasks.push_recovery import PushRecoveryConfig
+
+    ThrowConfig = DodgeConfig | PushRecoveryConfig
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,7 +35,6 @@ MAX_SPIN = wp.constant(6.0)
 CLEARANCE = wp.constant(0.4)
 #: Draw 0 of the stream is the time of the first throw; then come the balls' masses, one a ball, then the throws.
 _MASSES = wp.constant(1)
-_CHEST, _HEAD = wp.constant(joint_index("spine3")), wp.constant(joint_index("head"))
 
 
 @wp.struct
@@ -45,20 +48,22 @@ class Throws:
     height: wp.vec2  # of the origins [m]
     angle: float  # greatest azimuth of the origins from the front [rad]
     speed: wp.vec2  # distance to the aim over the time of flight [m/s]
-    spread: float  # greatest distance of the aim from the line between chest and head, along each axis [m]
+    aim: wp.vec2i  # joints; balls are thrown at the line between them
+    spread: float  # greatest distance of the aim from that line, along each axis [m]
     gravity: float  # [m/s^2]
     mass: wp.vec2  # [kg]
+    log_mass: int  # whether it is drawn uniformly in its logarithm
     volume: float  # of a ball [m^3]
     reach: float  # distance from the place beyond which balls are caught [m]
     rest: wp.array(dtype=wp.vec3)  # (num_balls,) where balls wait [m]
 
 
-def catching_distance(config: DodgeConfig) -> float:
+def catching_distance(config: ThrowConfig) -> float:
     """Distance from the avatar's place beyond which a ball that flies on is caught [m]."""
     return config.throw_distance[1] + 0.1
 
 
-def waiting_places(place: Sequence[float], config: DodgeConfig) -> np.ndarray:
+def waiting_places(place: Sequence[float], config: ThrowConfig) -> np.ndarray:
     """Where balls wait: on the floor behind the avatar, side by side, shape ``(num_balls, 3)`` [m].
 
     Args:
@@ -72,8 +77,32 @@ def waiting_places(place: Sequence[float], config: DodgeConfig) -> np.ndarray:
     return away + np.array([place[0], place[1], config.ball_radius])
 
 
-def make_throws(config: DodgeConfig, place: Sequence[float], waiting: np.ndarray, env: BatchEnv) -> Throws:
-    """Kernel argument; the balls are the first props of ``env``."""
+def throwing_domain(config: ThrowConfig, place: Sequence[float]) -> Domain:
+    """Room for balls to wait in, and to fly past the waiting ones before they are caught."""
+    x, y, _ = place
+    out = catching_distance(config) + config.ball_radius
+    out += 0.1 + 1.5 * config.throw_speed[1] * config.physics.control_dt
+    return Domain().around([place]).including((x - out, y - out, 0.0), (x + out, y + out, 0.0))
+
+
+def make_throws(
+    config: ThrowConfig,
+    place: Sequence[float],
+    waiting: np.ndarray,
+    env: BatchEnv,
+    aim: tuple[str, str] = ("spine3", "head"),
+    log_mass: bool = False,
+) -> Throws:
+    """Kernel argument; the balls are the first props of ``env``.
+
+    Args:
+        config: how many balls of which size and mass, from where and how fast.
+        place: of the avatar, x, y [m] and yaw [rad].
+        waiting: where balls wait [m], shape ``(num_balls, 3)``.
+        env: the batch.
+        aim: joints; balls are thrown at the line between them.
+        log_mass: whether masses are drawn uniformly in their logarithm.
+    """
     throws = Throws()
     throws.num_balls = config.num_balls
     throws.interval = max(1, round(config.throw_interval / config.physics.control_dt))
@@ -81,6 +110,7 @@ def make_throws(config: DodgeConfig, place: Sequence[float], waiting: np.ndarray
     throws.distance, throws.height = wp.vec2(*config.throw_distance), wp.vec2(*HEIGHT)
     throws.angle, throws.spread = config.throw_angle, config.aim_spread
     throws.speed, throws.gravity = wp.vec2(*config.throw_speed), config.physics.gravity
+    throws.aim, throws.log_mass = wp.vec2i(*map(joint_index, aim)), int(log_mass)
     throws.mass, throws.volume = wp.vec2(*config.ball_mass), float(env.simulation.props.volume[0])
     throws.reach = catching_distance(config)
     throws.rest = wp.array(waiting.astype(np.float32), dtype=wp.vec3, device=env.device)
@@ -123,6 +153,30 @@ def out_of_the_body(joints: wp.array2d(dtype=wp.vec3), e: int, start: wp.vec3, o
     return start + further * outwards
 
 
+@wp.func
+def draw_throw(throws: Throws, random: wp.uint32, e: int, joints: wp.array2d(dtype=wp.vec3)):
+    """Where a ball is thrown from [m], how fast [m/s], to meet the body where that is now, and its spin [rad/s]."""
+    turn = quat_exp(wp.vec3(0.0, 0.0, throws.place[2] + wp.randf(random, -throws.angle, throws.angle)))
+    away = wp.quat_rotate(turn, wp.vec3(0.0, -1.0, 0.0))
+    start = wp.vec3(throws.place[0], throws.place[1], wp.randf(random, throws.height[0], throws.height[1]))
+    start += wp.randf(random, throws.distance[0], throws.distance[1]) * away
+    start = out_of_the_body(joints, e, start, away)
+    aim = wp.lerp(joints[e, throws.aim[0]], joints[e, throws.aim[1]], wp.randf(random))
+    aim += 2.0 * throws.spread * wp.sample_unit_cube(random)
+    speed = wp.randf(random, throws.speed[0], throws.speed[1])
+    spin = 2.0 * MAX_SPIN * wp.sample_unit_cube(random)
+    return start, launch_velocity(start, aim, speed, throws.gravity), spin
+
+
+@wp.func
+def flies_on(throws: Throws, position: wp.vec3, velocity: wp.vec3):
+    """Whether a ball moves outwards beyond the catching radius."""
+    out = position - wp.vec3(throws.place[0], throws.place[1], 0.0)
+    out[2] = 0.0
+    distance = wp.length(out)
+    return distance > throws.reach and wp.dot(velocity, out) > OUTWARDS * distance
+
+
 @wp.kernel
 def draw_balls(
     mask: wp.array(dtype=wp.bool),
@@ -140,7 +194,11 @@ def draw_balls(
     if not mask[e]:
         return
     random = generator(seed[e], episode[e], STREAM_BALL, _MASSES + ball)
-    density[e, ball] = wp.randf(random, throws.mass[0], throws.mass[1]) / throws.volume
+    mass = wp.randf(random, throws.mass[0], throws.mass[1])
+    if throws.log_mass != 0:
+        share = (mass - throws.mass[0]) / wp.max(throws.mass[1] - throws.mass[0], 1.0e-9)
+        mass = throws.mass[0] * wp.pow(throws.mass[1] / throws.mass[0], share)
+    density[e, ball] = mass / throws.volume
     position[e, ball] = throws.rest[ball]
     velocity[e, ball] = wp.vec3(0.0)
     spin[e, ball] = wp.vec3(0.0)
@@ -176,22 +234,12 @@ def throw_balls(
         placed[e, ball] = True
         number = (step_count[e] - first) // throws.interval
         random = generator(seed[e], episode[e], STREAM_BALL, _MASSES + throws.num_balls + number)
-        turn = quat_exp(wp.vec3(0.0, 0.0, throws.place[2] + wp.randf(random, -throws.angle, throws.angle)))
-        away = wp.quat_rotate(turn, wp.vec3(0.0, -1.0, 0.0))
-        start = wp.vec3(throws.place[0], throws.place[1], wp.randf(random, throws.height[0], throws.height[1]))
-        start += wp.randf(random, throws.distance[0], throws.distance[1]) * away
-        start = out_of_the_body(joints, e, start, away)
-        aim = wp.lerp(joints[e, _CHEST], joints[e, _HEAD], wp.randf(random))
-        aim += 2.0 * throws.spread * wp.sample_unit_cube(random)
-        speed = wp.randf(random, throws.speed[0], throws.speed[1])
-        position[e, ball] = start
-        velocity[e, ball] = launch_velocity(start, aim, speed, throws.gravity)
-        spin[e, ball] = 2.0 * MAX_SPIN * wp.sample_unit_cube(random)
+        at, way, turning = draw_throw(throws, random, e, joints)
+        position[e, ball] = at
+        velocity[e, ball] = way
+        spin[e, ball] = turning
         return
-    out = ball_position[e, ball] - wp.vec3(throws.place[0], throws.place[1], 0.0)
-    out[2] = 0.0
-    distance = wp.length(out)
-    if distance > throws.reach and wp.dot(ball_velocity[e, ball], out) > OUTWARDS * distance:
+    if flies_on(throws, ball_position[e, ball], ball_velocity[e, ball]):
         placed[e, ball] = True
         position[e, ball] = throws.rest[ball]
         velocity[e, ball] = wp.vec3(0.0)

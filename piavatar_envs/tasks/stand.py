@@ -1,0 +1,80 @@
+"""Stand: keep one's balance under gravity, by the strength of one's own joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+from pydantic import Field
+
+from piavatar_envs.envs.config import DriveConfig, EnvConfig
+from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.ground import Grounding
+from piavatar_envs.tasks.spawn import record_standing
+from piavatar_envs.tasks.upright import (
+    FALL_DOC,
+    METRIC_DOCS,
+    METRICS,
+    REWARD_DOCS,
+    REWARD_TERMS,
+    STANDING_DOC,
+    UPRIGHT_TERMS,
+    UprightConfig,
+    record_fall,
+    record_observe_upright,
+    record_standing_outcome,
+    upright_rule,
+)
+
+
+class StandConfig(EnvConfig):
+    """Settings of Stand."""
+
+    drive: DriveConfig = Field(
+        default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
+    )
+    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
+    episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
+    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
+
+
+class StandTask(Task):
+    """Stand still in the rest pose."""
+
+    Config = StandConfig
+    description = "keep one's balance by the strength of one's own joints"
+    observation_terms = UPRIGHT_TERMS
+    reward_terms = REWARD_TERMS
+    metrics = METRICS
+
+    summary = """The avatar stands on the ground with its joints a little bent at random (`pose_noise`), and nothing
+holds it but what its joints can do: actions are joint targets (`control="pd"`) or torques, and `root_assist` is 0. A
+rest pose that is merely asked for tips over within two seconds: ankles must press with the balls of the feet or with
+the heels, and hips must give way, before the body's weight has left the soles. Where it stands does not matter."""
+    reward_docs: ClassVar[Mapping[str, str]] = REWARD_DOCS
+    metric_docs: ClassVar[Mapping[str, str]] = METRIC_DOCS
+    success_doc = STANDING_DOC
+    termination_doc = FALL_DOC
+    picture_seconds = 0.5
+    picture_actions = "zero"
+
+    config: StandConfig
+
+    def allocate(self, env) -> None:
+        self.rule = upright_rule(self.config.upright, self.config.control_cost)
+        self.grounding = Grounding(env)
+
+    def record_reset(self, env, program) -> None:
+        record_standing(env, program, self.config.pose_noise)
+        self.grounding.record_reset(env, program)
+
+    def record_outcome(self, env, program) -> None:
+        record_standing_outcome(env, program, self.rule)
+        record_fall(env, program, self.rule)
+
+    def record_observe(self, env, program, agent: int, start: int) -> None:
+        record_observe_upright(env, program, agent, start)
+
+
+TASK = StandTask

@@ -1,0 +1,220 @@
+"""Standing upright by one's own strength: what is seen of it, what it is worth, and what counts as a fall.
+
+Heights are shares of those in the rest pose of the body at hand, so that they mean the same for small and tall ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import warp as wp
+from pydantic import BaseModel, Field
+
+from piavatar_envs.avatar.rotation import quat_log
+from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.envs.config import FROZEN
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.mpm.types import row
+from piavatar_envs.tasks.rewards import mean_square_action, tolerance
+
+if TYPE_CHECKING:
+    from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.mpm.program import Program
+
+wp.set_module_options({"enable_backward": False})
+
+_HEAD, _CHEST = wp.constant(joint_index("head")), wp.constant(joint_index("spine3"))
+
+UPRIGHT_TERMS = (ObservationTerm("gravity_direction", 3, "-", "root", "where down is: a unit vector"),)
+REWARD_TERMS = ("height", "upright", "still", "pose", "control")
+REWARD_DOCS: Mapping[str, str] = {
+    "height": "0.3 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that has "
+    "fallen to 0.03 after another `upright.height_margin` of that height",
+    "upright": "0.3 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.03 after "
+    "another `upright.tilt_margin`",
+    "still": "0.2 while the pelvis is no faster than 0.05 m/s; beyond it a Gaussian that has fallen to 0.02 after "
+    "another `upright.speed_margin`; all times `height` / 0.3",
+    "pose": "0.2 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian that "
+    "has fallen to 0.02 after another `upright.pose_margin`; all times `height` / 0.3",
+    "control": "`-control_cost` times the mean of the squared action components",
+}
+METRICS = ("head_height", "pelvis_height", "tilt_deg", "speed")
+METRIC_DOCS: Mapping[str, str] = {
+    "head_height": "height of the head joint over that in the rest pose [-]",
+    "pelvis_height": "height of the pelvis joint over that in the rest pose [-]",
+    "tilt_deg": "angle of the chest from the vertical, as it is in the rest pose [deg]",
+    "speed": "speed of the pelvis [m/s]",
+}
+STANDING_DOC = "the head is no lower than `upright.stand_head` of its height in the rest pose"
+FALL_DOC = (
+    "the avatar falls: its head is lower than `upright.fall_head`, or its pelvis lower than `upright.fall_pelvis`, of "
+    "its height in the rest pose (of the mean body 1.46 and 0.91 m)"
+)
+
+
+class UprightConfig(BaseModel):
+    """What counts as standing, and as a fall; where rewards end."""
+
+    model_config = FROZEN
+
+    stand_head: float = Field(0.85, gt=0.0, le=1.0, description="head height that counts as standing, a share [-]")
+    fall_head: float = Field(0.7, ge=0.0, lt=1.0, description="head height below which it has fallen, likewise [-]")
+    fall_pelvis: float = Field(0.6, ge=0.0, lt=1.0, description="pelvis height below which it has, likewise [-]")
+    height_margin: float = Field(0.25, gt=0.0, description="missing height at which the reward is 0.1, likewise [-]")
+    tilt_margin: float = Field(0.6, gt=0.0, description="tilt at which it is, likewise [rad]")
+    speed_margin: float = Field(1.0, gt=0.0, description="speed at which it is, likewise [m/s]")
+    pose_margin: float = Field(0.4, gt=0.0, description="mean joint angle at which it is, likewise [rad]")
+
+
+@wp.struct
+class Upright:
+    """Constants of standing; heights are shares of those in the rest pose."""
+
+    stand_head: float
+    fall_head: float
+    fall_pelvis: float
+    height_margin: float
+    tilt_margin: float  # [rad]
+    speed_margin: float  # [m/s]
+    pose_margin: float  # [rad]
+    control_cost: float
+
+
+@wp.struct
+class Posture:
+    """How a body stands now."""
+
+    head: float  # height over that in the rest pose
+    pelvis: float  # likewise
+    tilt: float  # of the chest [rad]
+    high: float  # reward of height, in [0, 1]
+    straight: float  # reward of the tilt, in [0, 1]
+
+
+def upright_rule(config: UprightConfig, control_cost: float) -> Upright:
+    """Kernel argument."""
+    rule = Upright()
+    for name in UprightConfig.model_fields:
+        setattr(rule, name, getattr(config, name))
+    rule.control_cost = control_cost
+    return rule
+
+
+@wp.func
+def posture_of(
+    rule: Upright, body: Body, e: int, rotation: wp.array2d(dtype=wp.quat), position: wp.array2d(dtype=wp.vec3)
+):
+    """Heights and tilt of a body, and what they are worth."""
+    r = row(e, body.rest_joint.shape[0])
+    now = Posture()
+    now.head = position[e, _HEAD][2] / body.rest_joint[r, _HEAD][2]
+    now.pelvis = position[e, 0][2] / body.rest_joint[r, 0][2]
+    up = wp.quat_rotate(rotation[e, _CHEST], wp.vec3(0.0, 0.0, 1.0))
+    now.tilt = wp.acos(wp.clamp(up[2], -1.0, 1.0))
+    now.high = tolerance(1.0 - now.head, 0.05, rule.height_margin)
+    now.straight = tolerance(now.tilt, 0.1, rule.tilt_margin)
+    return now
+
+
+@wp.func
+def has_fallen(rule: Upright, now: Posture):
+    """Whether head or pelvis are too low."""
+    return now.head < rule.fall_head or now.pelvis < rule.fall_pelvis
+
+
+@wp.func
+def write_posture(now: Posture, e: int, metrics: wp.array3d(dtype=float)):
+    """The first three of :data:`METRICS`."""
+    metrics[e, 0, 0] = now.head
+    metrics[e, 0, 1] = now.pelvis
+    metrics[e, 0, 2] = wp.degrees(now.tilt)
+
+
+@wp.kernel
+def judge_standing(
+    rule: Upright,
+    body: Body,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    local: wp.array2d(dtype=wp.quat),
+    action: wp.array3d(dtype=float),
+    # out
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
+):
+    """Reward of standing still in the rest pose, wherever, and its cost."""
+    e = wp.tid()
+    now = posture_of(rule, body, e, rotation, position)
+    speed = wp.length(velocity[e, 0])
+    angle = float(0.0)
+    for b in range(1, local.shape[1]):
+        angle += wp.length(quat_log(local[e, b])) / float(local.shape[1] - 1)
+    terms[e, 0, 0] = 0.3 * now.high
+    terms[e, 0, 1] = 0.3 * now.straight
+    terms[e, 0, 2] = 0.2 * now.high * tolerance(speed, 0.05, rule.speed_margin)
+    terms[e, 0, 3] = 0.2 * now.high * tolerance(angle, 0.05, rule.pose_margin)
+    terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
+    write_posture(now, e, metrics)
+    metrics[e, 0, 3] = speed
+    success[e, 0] = now.head >= rule.stand_head
+
+
+@wp.kernel
+def find_fall(
+    rule: Upright,
+    body: Body,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    # out
+    terminated: wp.array2d(dtype=wp.bool),
+):
+    """Terminate who has fallen."""
+    e = wp.tid()
+    terminated[e, 0] = has_fallen(rule, posture_of(rule, body, e, rotation, position))
+
+
+@wp.kernel
+def observe_upright(
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Terms of :data:`UPRIGHT_TERMS`, from component ``start``."""
+    e = wp.tid()
+    write_vector(observation, e, agent, start, wp.quat_rotate_inv(rotation[e, 0], wp.vec3(0.0, 0.0, -1.0)))
+
+
+def record_standing_outcome(env: BatchEnv, program: Program, rule: Upright) -> None:
+    """Append: terms, metrics and success of standing."""
+    avatar = env.simulation.avatar
+    t = avatar.tracked
+    program.launch(
+        judge_standing,
+        env.num_envs,
+        [rule, avatar.body, t.rotation, t.position, t.velocity, t.local, env.action],
+        [env.terms, env.metrics, env.success],
+    )
+
+
+def record_fall(env: BatchEnv, program: Program, rule: Upright) -> None:
+    """Append: terminate environments whose avatar has fallen."""
+    avatar = env.simulation.avatar
+    program.launch(
+        find_fall,
+        env.num_envs,
+        [rule, avatar.body, avatar.tracked.rotation, avatar.tracked.position],
+        [env.terminated],
+    )
+
+
+def record_observe_upright(env: BatchEnv, program: Program, agent: int, start: int) -> int:
+    """Append: write :data:`UPRIGHT_TERMS` from component ``start``; returns the one after them."""
+    rotation = env.simulation.avatars[agent].tracked.rotation
+    program.launch(observe_upright, env.num_envs, [agent, start, rotation], [env.observation])
+    return start + sum(term.size for term in UPRIGHT_TERMS)

@@ -1,0 +1,228 @@
+"""Walk: go straight ahead at a given speed, on one's own feet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+import warp as wp
+from pydantic import Field
+
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.envs.config import DriveConfig, EnvConfig
+from piavatar_envs.envs.domain import Domain
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.ground import Grounding, forward_of
+from piavatar_envs.tasks.place import PlaceRule, home
+from piavatar_envs.tasks.rewards import mean_square_action, tolerance
+from piavatar_envs.tasks.spawn import record_standing
+from piavatar_envs.tasks.upright import (
+    FALL_DOC,
+    METRIC_DOCS,
+    UPRIGHT_TERMS,
+    Upright,
+    UprightConfig,
+    has_fallen,
+    posture_of,
+    record_observe_upright,
+    upright_rule,
+    write_posture,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+#: Mean speed over the target's that no walker shall exceed: the domain ends there.
+FASTEST = 1.5
+
+
+class WalkConfig(EnvConfig):
+    """Settings of Walk."""
+
+    drive: DriveConfig = Field(
+        default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
+    )
+    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as a fall")
+    episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
+    target_speed: float = Field(1.0, gt=0.0, le=5.0, description="how fast to go [m/s]")
+    lane: float = Field(1.0, gt=0.0, le=2.0, description="distance aside of the way at which the episode ends [m]")
+    heading_margin: float = Field(0.8, gt=0.0, description="angle off the way at which the reward is 0.1 [rad]")
+    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
+
+
+@wp.struct
+class Way:
+    """Constants of the way."""
+
+    start: PlaceRule  # where it begins: only its place is used
+    speed: float  # [m/s]
+    lane: float  # [m]
+    length: float  # [m]
+    heading_margin: float  # [rad]
+    control_dt: float  # [s]
+
+
+@wp.func
+def way_gone(way: Way, body: Body, e: int, pelvis: wp.vec3):
+    """How far along the way and how far to its left a pelvis is [m]."""
+    off = pelvis - home(way.start, body, e)
+    ahead = forward_of(way.start.place[2])
+    left = wp.cross(wp.vec3(0.0, 0.0, 1.0), ahead)
+    return wp.vec2(wp.dot(off, ahead), wp.dot(off, left))
+
+
+@wp.kernel
+def judge_walk(
+    way: Way,
+    rule: Upright,
+    body: Body,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    step_count: wp.array(dtype=int),
+    action: wp.array3d(dtype=float),
+    # out
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
+    terminated: wp.array2d(dtype=wp.bool),
+):
+    """Reward of going ahead upright, and its cost. The step counter has not moved yet."""
+    e = wp.tid()
+    now = posture_of(rule, body, e, rotation, position)
+    ahead = forward_of(way.start.place[2])
+    speed = wp.dot(velocity[e, 0], ahead)
+    facing = wp.quat_rotate(rotation[e, 0], wp.vec3(0.0, -1.0, 0.0))
+    facing[2] = 0.0
+    off_way = wp.acos(wp.clamp(wp.dot(wp.normalize(facing), ahead), -1.0, 1.0))
+    gone = way_gone(way, body, e, position[e, 0])
+    mean_speed = gone[0] / (way.control_dt * float(step_count[e] + 1))
+    terms[e, 0, 0] = 0.4 * now.high * tolerance(wp.abs(speed - way.speed), 0.1 * way.speed, way.speed)
+    terms[e, 0, 1] = 0.2 * now.high * tolerance(off_way, 0.1, way.heading_margin)
+    terms[e, 0, 2] = 0.2 * now.high
+    terms[e, 0, 3] = 0.2 * now.straight
+    terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
+    write_posture(now, e, metrics)
+    metrics[e, 0, 3] = speed
+    metrics[e, 0, 4] = mean_speed
+    metrics[e, 0, 5] = gone[0]
+    standing = now.head >= rule.stand_head
+    success[e, 0] = standing and mean_speed >= 0.9 * way.speed and gone[0] >= way.speed
+    terminated[e, 0] = has_fallen(rule, now) or wp.abs(gone[1]) > way.lane or wp.abs(gone[0]) > way.length
+
+
+@wp.kernel
+def observe_walk(
+    way: Way,
+    body: Body,
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """The way's direction and the distance from it, from component ``start``."""
+    e = wp.tid()
+    write_vector(observation, e, agent, start, wp.quat_rotate_inv(rotation[e, 0], forward_of(way.start.place[2])))
+    observation[e, agent, start + 3] = way_gone(way, body, e, position[e, 0])[1]
+
+
+class WalkTask(Task):
+    """Walk straight ahead."""
+
+    Config = WalkConfig
+    description = "walk straight ahead at 1 m/s by the strength of one's own joints"
+    observation_terms = (
+        *UPRIGHT_TERMS,
+        ObservationTerm("way_direction", 3, "-", "root", "where to go: a unit vector"),
+        ObservationTerm("way_offset", 1, "m", "world", "distance of the pelvis from the way, to the left"),
+    )
+    reward_terms = ("speed", "heading", "height", "upright", "control")
+    metrics = ("head_height", "pelvis_height", "tilt_deg", "speed", "mean_speed", "distance")
+
+    summary = """The avatar stands on the ground with its joints a little bent at random (`pose_noise`) and shall walk
+straight ahead at `target_speed`, where it faces at first; nothing holds it but what its joints can do. Faster is no
+better than slower. The way is as long as one comes in an episode at 1.5 times the target; it ends at `lane` to either
+side."""
+    reward_docs: ClassVar[Mapping[str, str]] = {
+        "speed": "0.4 while the pelvis moves ahead at `target_speed` give or take a tenth; beyond it a Gaussian that "
+        "has fallen to 0.04 after another `target_speed`; all times `height` / 0.2",
+        "heading": "0.2 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.02 "
+        "after another `heading_margin`; all times `height` / 0.2",
+        "height": "0.2 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that "
+        "has fallen to 0.02 after another `upright.height_margin` of that height",
+        "upright": "0.2 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.02 after "
+        "another `upright.tilt_margin`",
+        "control": "`-control_cost` times the mean of the squared action components",
+    }
+    metric_docs: ClassVar[Mapping[str, str]] = {
+        **METRIC_DOCS,
+        "speed": "of the pelvis ahead [m/s]",
+        "mean_speed": "distance over the time of the episode so far [m/s]",
+        "distance": "that the pelvis has come ahead [m]",
+    }
+    success_doc = (
+        "`mean_speed` is at least 0.9 `target_speed`, over at least as many metres as the target goes in a second, and "
+        "the head is no lower than `upright.stand_head` of its height in the rest pose"
+    )
+    termination_doc = f"{FALL_DOC};\n- the pelvis is more than `lane` aside of the way, or beyond its end"
+    picture_seconds = 0.3
+    picture_actions: ClassVar[Mapping[str, float]] = {
+        "left_hip.x": 0.4, "left_knee.x": 0.1, "right_hip.x": -0.22, "right_knee.x": 0.15, "left_shoulder.x": -0.2,
+        "right_shoulder.x": 0.3,
+    }  # fmt: skip
+
+    config: WalkConfig
+
+    def domain(self) -> Domain:
+        """Room on the whole way and beside it."""
+        x, y, yaw = self._place()
+        ahead = np.array([np.sin(yaw), -np.cos(yaw)]) * self._length()
+        return Domain().around([(x, y), (x + ahead[0], y + ahead[1])])
+
+    def _place(self) -> tuple[float, float, float]:
+        avatar = self.scene.avatars[0]
+        return (*avatar.position, avatar.yaw)
+
+    def _length(self) -> float:
+        return FASTEST * self.config.target_speed * self.config.episode_seconds
+
+    def allocate(self, env) -> None:
+        config, way = self.config, Way()
+        self.rule = upright_rule(config.upright, config.control_cost)
+        self.grounding = Grounding(env)
+        start = PlaceRule()
+        start.place = wp.vec3(*self._place())
+        way.start, way.speed, way.lane, way.length = start, config.target_speed, config.lane, self._length()
+        way.heading_margin, way.control_dt = config.heading_margin, config.physics.control_dt
+        self.way = way
+
+    def record_reset(self, env, program) -> None:
+        record_standing(env, program, self.config.pose_noise)
+        self.grounding.record_reset(env, program)
+
+    def record_outcome(self, env, program) -> None:
+        avatar = env.simulation.avatar
+        t = avatar.tracked
+        program.launch(
+            judge_walk,
+            env.num_envs,
+            [self.way, self.rule, avatar.body, t.rotation, t.position, t.velocity, env.step_count, env.action],
+            [env.terms, env.metrics, env.success, env.terminated],
+        )
+
+    def record_observe(self, env, program, agent: int, start: int) -> None:
+        avatar = env.simulation.avatars[agent]
+        at = record_observe_upright(env, program, agent, start)
+        program.launch(
+            observe_walk,
+            env.num_envs,
+            [self.way, avatar.body, agent, at, avatar.tracked.rotation, avatar.tracked.position],
+            [env.observation],
+        )
+
+
+TASK = WalkTask
