@@ -84,7 +84,7 @@ def test_absurd_stiffness_at_a_forced_time_step(make_env, env_id, equal, stiffne
 
 def test_huge_increments(make_env, env_id, equal):
     """Joints commanded at 50 rad/s, an order beyond a human, cross more than a cell a substep: said, and mended."""
-    env = make_env(env_id, joint_speed_limit=50.0)
+    env = make_env(env_id, control="pose", joint_speed_limit=50.0)
     expected = [(env.reset(seed=1)[0], 0.0), *(row[:2] for row in steps(env, 5))]
     env.reset(seed=0)
     rng = np.random.default_rng(3)
