@@ -272,7 +272,7 @@ class Simulation:
             names = ("position", "rotation", "velocity", "spin")
             found |= {f"colliders.{name}": getattr(self.model.boundaries, name) for name in names}
         found |= self.randomization.arrays()
-        sensors = ("boundary_impulse", "pair_impulse", "part_impulse", "penetration")
+        sensors = ("boundary_impulse", "boundary_moment", "pair_impulse", "part_impulse", "penetration")
         found |= {f"sensors.{name}": getattr(self.sensors, name) for name in sensors}
         return found | self.props.arrays()
 

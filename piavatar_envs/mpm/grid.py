@@ -7,7 +7,7 @@ import warp as wp
 from piavatar_envs.mpm.blocks import first_record, has_field, held_by, shared_by, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_SLAB, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.contact import touch_all
-from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, read_change, write_change
+from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry, read_change, write_change
 from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import clear_offset, offset_at, read_record, take_sum, write_record
@@ -56,7 +56,9 @@ def meet_boundaries(
     v = wp.vec3(total[1], total[2], total[3])
     dv = boundary_contact(boundaries, e, f, matter, v, CONTACT_GATE * grid.dx) - v
     if wp.length_sq(dv) > 0.0:
-        add_impulse(sensors, e, boundary_entry(sensors, contact.subject[f]), total[0] * dv)
+        subject = contact.subject[f]
+        add_impulse(sensors, e, boundary_entry(sensors, subject), total[0] * dv)
+        add_impulse(sensors, e, moment_entry(sensors, subject), wp.cross(at, total[0] * dv))
     return total + vec8(0.0, dv[0], dv[1], dv[2], 0.0, 0.0, 0.0, 0.0)
 
 

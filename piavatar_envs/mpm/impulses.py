@@ -1,7 +1,7 @@
 """Impulses of contact, added up over a control step in fixed point: in whatever order they come, the sum is the same.
 
-A list an environment: of the colliders on every subject, of every pair of subjects, and of every subject on every
-contact sensor.
+A list an environment: of the colliders on every subject, of every pair of subjects, of every subject on every contact
+sensor, and the moments of the colliders' impulses.
 """
 
 from __future__ import annotations
@@ -36,6 +36,12 @@ def part_entry(sensors: Sensors, sensor: int, giver: int):
 
 
 @wp.func
+def moment_entry(sensors: Sensors, subject: int):
+    """Place of the moment of the colliders' impulse on a subject."""
+    return part_entry(sensors, sensors.part_impulse.shape[1], 0) + subject
+
+
+@wp.func
 def add_impulse(sensors: Sensors, e: int, entry: int, J: wp.vec3):
     """Add an impulse [N s] to an entry."""
     for axis in range(3):
@@ -58,6 +64,7 @@ def forget(e: int, sensors: Sensors):
         sensors.sums[e, n] = wp.int64(0)
     for s in range(sensors.boundary_impulse.shape[1]):
         sensors.boundary_impulse[e, s] = wp.vec3(0.0)
+        sensors.boundary_moment[e, s] = wp.vec3(0.0)
         sensors.penetration[e, s] = 0.0
     for s in range(sensors.pair_impulse.shape[1]):
         sensors.pair_impulse[e, s] = wp.vec3(0.0)
@@ -111,6 +118,7 @@ def read_impulses(sensors: Sensors):
     e = wp.tid()
     for s in range(sensors.boundary_impulse.shape[1]):
         sensors.boundary_impulse[e, s] = impulse_at(sensors, e, boundary_entry(sensors, s))
+        sensors.boundary_moment[e, s] = impulse_at(sensors, e, moment_entry(sensors, s))
     for s in range(sensors.pair_impulse.shape[1]):
         sensors.pair_impulse[e, s] = impulse_at(sensors, e, pair_entry(sensors, s))
     for i in range(sensors.part_impulse.shape[1]):

@@ -176,11 +176,12 @@ def allocate_sensors(model: Model, records: tuple[int, int]) -> Sensors:
     """Zeroed contact sensors, with ``records`` at the nodes."""
     n, subjects = model.num_envs, model.contact.num_subjects
     rows = max(1, model.num_sensors)
-    entries = subjects * (1 + subjects + rows)
+    entries = subjects * (2 + subjects + rows)
     return group(
         Sensors,
         sums=_zeros(model, (n, 3 * entries), wp.int64),
         boundary_impulse=_zeros(model, (n, subjects), wp.vec3),
+        boundary_moment=_zeros(model, (n, subjects), wp.vec3),
         pair_impulse=_zeros(model, (n, subjects * subjects), wp.vec3),
         part_impulse=_zeros(model, (n, rows, subjects), wp.vec3),
         node=_zeros(model, records, wp.vec4),

@@ -110,6 +110,7 @@ class Sensors:
 
     sums: wp.array2d(dtype=wp.int64)  # (num_envs, 3 * entries) see :mod:`piavatar_envs.mpm.impulses`
     boundary_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S) impulse of the colliders on a subject [N s]
+    boundary_moment: wp.array2d(dtype=wp.vec3)  # (num_envs, S) moment of that about the world's origin [N m s]
     pair_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S * S) on a by b, only a < b [N s]
     part_impulse: wp.array3d(dtype=wp.vec3)  # (num_envs, sensors, S) on the particles of a sensor, by subject [N s]
     # (num_envs, records) change of velocity by other subjects and the one that did most of it; of shared blocks

@@ -16,7 +16,7 @@ from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.config import FROZEN
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
-from piavatar_envs.mpm.types import row
+from piavatar_envs.mpm.types import Sensors, row
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 
 if TYPE_CHECKING:
@@ -26,8 +26,18 @@ if TYPE_CHECKING:
 wp.set_module_options({"enable_backward": False})
 
 _HEAD, _CHEST = wp.constant(joint_index("head")), wp.constant(joint_index("spine3"))
+_LEFT, _RIGHT = wp.constant(joint_index("left_ankle")), wp.constant(joint_index("right_ankle"))
 
-UPRIGHT_TERMS = (ObservationTerm("gravity_direction", 3, "-", "root", "where down is: a unit vector"),)
+UPRIGHT_TERMS = (
+    ObservationTerm("gravity_direction", 3, "-", "root", "where down is: a unit vector"),
+    ObservationTerm(
+        "foot_impulses",
+        2,
+        "N s",
+        "-",
+        "what left and right foot bear of the ground's upward impulse in the last step",
+    ),
+)
 REWARD_TERMS = ("height", "upright", "still", "pose", "control")
 REWARD_DOCS: Mapping[str, str] = {
     "height": "0.3 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that has "
@@ -177,17 +187,36 @@ def find_fall(
     terminated[e, 0] = has_fallen(rule, posture_of(rule, body, e, rotation, position))
 
 
+@wp.func
+def foot_share(left: wp.vec3, right: wp.vec3, impulse: wp.vec3, moment: wp.vec3):
+    """Share of the left foot, from 0 to 1, of an upward impulse whose moment about the origin is given [N m s].
+
+    Where only two points bear, levers share the load: the centre of pressure ``(-M_y, M_x) / J_z`` lies between them.
+    """
+    if impulse[2] < 1.0e-6:
+        return 0.5
+    apart = wp.vec2(left[0] - right[0], left[1] - right[1])
+    center = wp.vec2(-moment[1] / impulse[2] - right[0], moment[0] / impulse[2] - right[1])
+    return wp.clamp(wp.dot(center, apart) / wp.max(wp.length_sq(apart), 1.0e-6), 0.0, 1.0)
+
+
 @wp.kernel
 def observe_upright(
     agent: int,
     start: int,
     rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    sensors: Sensors,
     # out
     observation: wp.array3d(dtype=float),
 ):
     """Terms of :data:`UPRIGHT_TERMS`, from component ``start``."""
     e = wp.tid()
     write_vector(observation, e, agent, start, wp.quat_rotate_inv(rotation[e, 0], wp.vec3(0.0, 0.0, -1.0)))
+    J = sensors.boundary_impulse[e, agent]
+    share = foot_share(position[e, _LEFT], position[e, _RIGHT], J, sensors.boundary_moment[e, agent])
+    observation[e, agent, start + 3] = share * J[2]
+    observation[e, agent, start + 4] = (1.0 - share) * J[2]
 
 
 def record_standing_outcome(env: BatchEnv, program: Program, rule: Upright) -> None:
@@ -215,6 +244,11 @@ def record_fall(env: BatchEnv, program: Program, rule: Upright) -> None:
 
 def record_observe_upright(env: BatchEnv, program: Program, agent: int, start: int) -> int:
     """Append: write :data:`UPRIGHT_TERMS` from component ``start``; returns the one after them."""
-    rotation = env.simulation.avatars[agent].tracked.rotation
-    program.launch(observe_upright, env.num_envs, [agent, start, rotation], [env.observation])
+    tracked = env.simulation.avatars[agent].tracked
+    program.launch(
+        observe_upright,
+        env.num_envs,
+        [agent, start, tracked.rotation, tracked.position, env.simulation.sensors],
+        [env.observation],
+    )
     return start + sum(term.size for term in UPRIGHT_TERMS)

@@ -71,6 +71,19 @@ def test_impulse_is_the_change_of_momentum(simulate, decoupling):
     assert impulse[2] > 0.5 * n * dt * now.mass * 9.81
 
 
+def test_ground_presses_below_the_middle(simulate):
+    """At rest the moment of the ground's impulse is that of the weight: its centre of pressure is below the body's."""
+    at = np.array([0.13, -0.08])
+    block = {**BLOCK, "lower": (*(at - 0.1), 0.0), "upper": (*(at + 0.1), 0.1)}
+    sim = simulate(**block, gravity=(0.0, 0.0, -9.81), planes=[(GROUND, 0.0, 0.5)]).run(30)
+    sim.scratch.sensors.sums.zero_()
+    sensors = sim.run(30).scratch.sensors
+    impulse, moment = sensors.boundary_impulse.numpy()[0, 0], sensors.boundary_moment.numpy()[0, 0]
+    middle = sim.get("x").mean(0)[:2]
+    assert np.abs(middle - at).max() < 1e-3
+    assert np.array([-moment[1], moment[0]]) / impulse[2] == pytest.approx(middle, abs=1e-3)
+
+
 def test_ground_bears_the_weight(simulate):
     sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=[(GROUND, 0.0, 0.5)]).run(30)
     sim.scratch.sensors.sums.zero_()

@@ -55,7 +55,7 @@ def test_sensors_forget(meet):
     sensors = sim.scratch.sensors
     assert sensors.pair_impulse.numpy().any() and sensors.part_impulse.numpy().any()
     sim.set(x=sim.rest, u=0.0, C=0.0, F=np.eye(3)).run()
-    for name in ("pair_impulse", "part_impulse", "penetration", "boundary_impulse"):
+    for name in ("pair_impulse", "part_impulse", "penetration", "boundary_impulse", "boundary_moment"):
         assert not getattr(sensors, name).numpy().any(), name
 
 

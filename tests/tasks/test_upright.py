@@ -62,6 +62,27 @@ def test_the_ground_bears_the_body_and_feet_neither_sink_nor_hover(make_env):
     assert ground + info["root_force"][2] == pytest.approx(weight, rel=0.01) and ground > 0.5 * weight
 
 
+def test_feet_share_the_load(make_env):
+    """Upright both bear the same; a body whose trunk is bent to a side loads that foot, as the lever of its weight."""
+    env = make_env(STAND, root_assist=0.3, pose_noise=0.0)
+    loads, rest = {}, env.batch.simulation.flesh[0].points
+    for bend in (0.0, 0.6, -0.6):
+        env.reset(seed=0)
+        action = still(env)
+        for name in ("spine1.y", "spine2.y", "spine3.y"):
+            action[env.action_names.index(name)] = bend
+        for _ in range(40):
+            observation = env.step(action)[0]
+        loads[bend] = seen(env, observation, "foot_impulses")
+        ground = env.batch.simulation.sensors.boundary_impulse.numpy()[0, 0, 2]
+        assert loads[bend].sum() == pytest.approx(ground, rel=1e-5) and (loads[bend] >= 0.0).all()
+    assert loads[0.0][0] == pytest.approx(loads[0.0][1], rel=0.05) and loads[0.0].min() > 1.0
+    leaning = (loads[0.6] - loads[-0.6]) / loads[0.6].sum()
+    # about y a positive turn takes the head to the left
+    assert leaning[0] > 0.1 and leaning[1] == pytest.approx(-leaning[0], rel=0.2)
+    assert rest.joints[0, joint_index("left_ankle"), 0] > 0.0
+
+
 @pytest.mark.parametrize("task", [STAND, PUSH])
 def test_reward_metrics_and_falls_are_what_the_joints_say(make_env, task):
     env = make_env(task, throw_interval=60.0) if task == PUSH else make_env(task)
