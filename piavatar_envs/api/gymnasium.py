@@ -17,7 +17,8 @@ class AvatarEnv(gym.Env):
     """One soft avatar and a task.
 
     Observations are a flat float32 vector, or a dictionary with ``obs_mode="dict"``; ``observation_layout`` says what
-    lies where. Actions are in [-1, 1]: increments of the joints' rotations, see ``action_names``.
+    lies where. Actions are in [-1, 1], see ``action_names``: increments of the joints' rotations, their
+    targets or torques on them, as ``control`` says.
 
     ``info`` holds the reward's terms (``info["reward_terms"]``), the task's metrics, ``success``, ``failure`` (None, or
     why the simulation gave up: then ``terminated`` is True and the next reset starts afresh), and the root wrench used.

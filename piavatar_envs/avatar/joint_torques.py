@@ -23,7 +23,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.joint_motion import part_of, set_part
-from piavatar_envs.avatar.rotation import quat_log
+from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_log
 from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.mpm.types import group, row
 
@@ -133,9 +133,14 @@ def above(body: Body, rotation: wp.array2d(dtype=wp.quat), e: int, b: int):
 
 @wp.func
 def beyond(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
-    """Rotation vector back into the range [rad]; zero within it."""
+    """Rotation vector back into the range [rad]; zero within it.
+
+    A corner of the box may be further than half a turn from its middle, where rotation vectors jump and a stop would
+    push on: the range ends before.
+    """
     v = quat_log(local)
-    return wp.max(lower, wp.min(v, upper)) - v
+    within = wp.max(lower, wp.min(v, upper))
+    return within * wp.min(1.0, MAX_ANGLE / wp.max(wp.length(within), 1.0e-6)) - v
 
 
 @wp.kernel

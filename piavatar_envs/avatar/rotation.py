@@ -6,6 +6,9 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+#: Largest rotation of a joint from its rest pose [rad]. Rotation vectors jump at pi: a joint must not get there.
+MAX_ANGLE = wp.constant(2.6)
+
 
 @wp.func
 def quat_exp(v: wp.vec3):

@@ -9,15 +9,13 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.muscles import LOCKED_JOINTS
-from piavatar_envs.avatar.rotation import quat_exp, quat_log, turn_about_z
+from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log, turn_about_z
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.mpm.types import FAILURE_ACTION
 
 wp.set_module_options({"enable_backward": False})
 
 _ACTION = wp.constant(FAILURE_ACTION)
-#: Largest rotation of a joint from its rest pose [rad]. Rotation vectors jump at pi: a joint must not get there.
-MAX_ANGLE = wp.constant(2.6)
 
 
 @wp.struct

@@ -11,8 +11,8 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.joint_torques import Strength
-from piavatar_envs.avatar.rotation import quat_exp, quat_log
-from piavatar_envs.envs.actions import MAX_ANGLE, ActionMap, bounded
+from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log
+from piavatar_envs.envs.actions import ActionMap, bounded
 
 wp.set_module_options({"enable_backward": False})
 

@@ -5,7 +5,8 @@ alone: nothing waits for the host, and environment ``i`` of a batch draws what a
 multiplies all constants that follow from it, each from its nominal value, so that none of them drifts or disagrees:
 
 - *mass*: an avatar's density: the mass of its particles and of its bones, hence the inertia that the drive fits, the
-  limits of the root wrench (which are in body weights), and the reference density of its velocity fields;
+  limits of the root wrench (which are in body weights), the strength and the springs of its joints under torques (a
+  heavier body is a stronger one), and the reference density of its velocity fields;
 - *stiffness*: its moduli;
 - *ground friction*: coefficients on the ground, walls and colliders; *body friction*: those between bodies.
 

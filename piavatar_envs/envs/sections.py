@@ -32,6 +32,14 @@ class FrozenDict(dict):
 ShapeValue = Annotated[float, Field(ge=-1.0, le=1.0)]
 
 
+def _check_flesh_rate(rates: tuple[float, float]) -> tuple[float, float]:
+    """Refuse rates that are no growing pull from skin to bone; two zeros are none at all."""
+    skin, bone = rates
+    if not (0.0 < skin <= bone or skin == bone == 0.0):
+        raise ValueError(f"the skin's rate {skin:g} must be positive and at most the bone's {bone:g}, as in (30, 1000)")
+    return rates
+
+
 class PhysicsConfig(BaseModel):
     """The continuum: resolution, material, coupling and time step."""
 
@@ -83,10 +91,12 @@ class DriveConfig(BaseModel):
     root_assist: float = Field(
         0.0, ge=0.0, le=1.0, description="help for the pelvis from outside: 0 none, 1 springs that nearly hold it [-]"
     )
-    joint_stiffness: float = Field(1.0, ge=0.0, description="factor on the stiffness of the joints' springs [-]")
-    joint_damping: float = Field(1.0, ge=0.0, description="factor on the damping of the joints' springs [-]")
-    strength: float = Field(1.0, ge=0.0, description="factor on the greatest torques of the joints [-]")
-    flesh_rate: tuple[float, float] = Field(
+    joint_stiffness: float = Field(
+        1.0, ge=0.0, le=1.0e4, description="factor on the stiffness of the joints' springs [-]"
+    )
+    joint_damping: float = Field(1.0, ge=0.0, le=1.0e4, description="factor on the damping of the joints' springs [-]")
+    strength: float = Field(1.0, ge=0.0, le=1.0e4, description="factor on the greatest torques of the joints [-]")
+    flesh_rate: Annotated[tuple[float, float], AfterValidator(_check_flesh_rate)] = Field(
         (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
     )
     drive: Literal["increment", "target"] = Field(

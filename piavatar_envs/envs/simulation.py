@@ -15,7 +15,7 @@ from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
 from piavatar_envs.avatar.joint_drive import LONGEST_SUBSTEP
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.envs.bodies import Bodies, BodyPool
-from piavatar_envs.envs.config import AvatarConfig, EnvConfig, SceneConfig
+from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.flesh import Flesh, drive_settings, shape_ranges
 from piavatar_envs.envs.observations import Parameter
@@ -34,7 +34,8 @@ GRID_PER_HEIGHT: dict[str, float] = {
     "coarse": 32.0,
     "medium": 64.0,
     "fine": 166.0,
-}  #: More room for bodies that nothing holds up: as far as one reaches when it falls [m].
+}
+#: More room for bodies that nothing holds up: as far as one reaches when it falls [m].
 FALL = 1.2
 
 
@@ -133,12 +134,23 @@ class Simulation:
         return self.avatars[0]
 
     def _substeps(self, wave: float) -> int | None:
-        """Substeps of a control step as configured; under torques as few as they and such a wave [m/s] allow."""
-        physics = self.config.physics
-        if physics.num_substeps is not None or self.config.drive.control == "pose":
-            return physics.num_substeps
-        wave = max(wave, self.subjects.matter.sound_speed())
+        """Substeps of a control step as configured; under torques as few as they and such a wave [m/s] allow.
+
+        Raises:
+            ConfigError: as configured they are too long for torques.
+        """
+        physics, control, asked = self.config.physics, self.config.drive.control, self.config.physics.num_substeps
+        if control == "pose":
+            return asked
         by_torques = math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
+        if asked is not None:
+            if asked < by_torques:
+                raise ConfigError(
+                    f"physics.num_substeps={asked}: substeps of {1e3 * physics.control_dt / asked:.3g} ms are too long "
+                    f"for drive.control={control!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {by_torques}"
+                )
+            return asked
+        wave = max(wave, self.subjects.matter.sound_speed())
         return max(choose_num_substeps(physics.control_dt, self.dx, wave, physics.cfl), by_torques)
 
     def set_shape(self, env: int, parameters: np.ndarray, avatar: int = 0) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.rotation import quat_log, turn_about_z
+from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_log, turn_about_z
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.actions import MAX_ANGLE, ActionMap, keep_within
+from piavatar_envs.envs.actions import ActionMap, keep_within
 from piavatar_envs.envs.draws import STREAM_TASK, generator
 from piavatar_envs.mpm.types import row
 

@@ -203,7 +203,7 @@ def test_refresh_fits_the_pose_and_keeps_velocities(joints, wild_pose):
     root = made.body.state.position.numpy()[0, 0] + (0.01, -0.02, 0.015)
     made.state.x.assign(made.rig.skinned(turned.as_matrix(), root)[None].astype(np.float32))
     before = made.total
-    for _ in range(3):
+    for _ in range(40):  # a fit takes away a share
         made.run("record_mass")
         made.run("_record_fit")
     np.testing.assert_allclose(made.total, before, atol=5e-5)

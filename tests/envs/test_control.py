@@ -193,6 +193,38 @@ def test_what_torques_cannot_do_is_refused(device):
     env = gymnasium.make(REACH, device=device, fidelity="tiny").unwrapped
     with pytest.raises(ValueError, match="root wrench"):
         env.batch.assist_root(0.5)
+    with pytest.raises(ConfigError, match=r"num_substeps=5: substeps of 6.67 ms.*at least 9"):
+        gymnasium.make(REACH, device=device, fidelity="tiny", control="pd", num_substeps=5)
+    for rates in ((30.0, -1.0), (-30.0, 100.0), (30.0, 0.0), (0.0, 100.0), (200.0, 100.0)):
+        with pytest.raises(ConfigError, match=r"flesh_rate.*positive and at most"):
+            gymnasium.make(REACH, device=device, fidelity="tiny", control="pd", flesh_rate=rates)
+
+
+def test_a_stop_does_not_let_a_joint_turn_round(make_env):
+    """The corner of an elbow's range is over half a turn from its middle, where rotation vectors jump."""
+    env = make_env(REACH, control="torque", gravity=0.0, root_assist=1.0)
+    env.reset(seed=0)
+    action, names = np.zeros(env.action_space.shape, np.float32), env.unwrapped.action_names
+    for component in ("left_elbow.x", "left_elbow.z"):
+        action[names.index(component)] = -1.0
+    elbow, above = joint_index("left_elbow"), joint_index("left_shoulder")
+    for step in range(60):
+        *_, info = env.step(action)
+        assert info["failure"] is None
+        world = Rotation.from_quat(env.unwrapped.batch.simulation.avatar.joints.state.rotation.numpy()[0].astype(float))
+        turn = (world[above].inv() * world[elbow]).magnitude()
+        assert turn < 3.0, f"step {step}: {turn:.2f} rad"
+
+
+def test_random_corners_do_not_break_a_body(make_env):
+    """Every target of every joint at an end of its range, another one every step."""
+    env, rng = make_env(REACH, control="pd", pose_noise=0.0), np.random.default_rng(0)
+    env.reset(seed=0)
+    for _ in range(150):
+        *_, terminated, truncated, info = env.step(rng.choice([-1.0, 1.0], env.action_space.shape).astype(np.float32))
+        assert info["failure"] is None
+        if terminated or truncated:
+            env.reset()
 
 
 def test_joints_are_observed(make_env, control):
