@@ -32,8 +32,8 @@ class BatchEnv:
         metrics: ``(num_envs, num_agents, metrics)`` float32.
         terminated, success: ``(num_envs, num_agents)`` bool.
         alive: ``(num_envs, num_agents)`` bool. Where there are several agents, one that has terminated stays in the
-            world as a passive body: its actions count as zero (targets: the rest pose), nothing holds its root, its reward
-            is zero.
+            world as a passive body: its actions count as zero (targets: the rest pose), nothing holds its root, its
+            reward is zero.
         truncated: ``(num_envs,)`` bool, the clock has run out for those still alive.
         failure: ``(num_envs,)`` int32, bits ``FAILURE_*``.
     """
