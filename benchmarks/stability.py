@@ -21,6 +21,7 @@ from benchmarks.limbs import Options
 from benchmarks.poses import JOINT_RANGE, random_pose
 from benchmarks.stage import Act, Stage, standing
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
+from piavatar_envs.envs import simulation
 from piavatar_envs.envs.config import SceneConfig
 from piavatar_envs.mpm import build
 from piavatar_envs.mpm.diagnostics import totals
@@ -143,8 +144,8 @@ def first_fault(trials: Iterable[Trial], options: Options) -> str | None:
 
 @contextmanager
 def unrefused() -> Iterator[None]:
-    """Time steps that :func:`~piavatar_envs.mpm.build.check_num_substeps` refuses are built."""
-    with mock.patch.object(build, "CFL_STABLE", np.inf):
+    """Time steps are built that :func:`~piavatar_envs.mpm.build.check_num_substeps` or torques would refuse."""
+    with mock.patch.object(build, "CFL_STABLE", np.inf), mock.patch.object(simulation, "LONGEST_SUBSTEP", np.inf):
         yield
 
 

@@ -92,10 +92,10 @@ class DriveConfig(BaseModel):
         0.0, ge=0.0, le=1.0, description="help for the pelvis from outside: 0 none, 1 springs that nearly hold it [-]"
     )
     joint_stiffness: float = Field(
-        1.0, ge=0.0, le=1.0e4, description="factor on the stiffness of the joints' springs [-]"
+        1.0, ge=0.0, le=1.0e6, description="factor on the stiffness of the joints' springs [-]"
     )
-    joint_damping: float = Field(1.0, ge=0.0, le=1.0e4, description="factor on the damping of the joints' springs [-]")
-    strength: float = Field(1.0, ge=0.0, le=1.0e4, description="factor on the greatest torques of the joints [-]")
+    joint_damping: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the damping of the joints' springs [-]")
+    strength: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the greatest torques of the joints [-]")
     flesh_rate: Annotated[tuple[float, float], AfterValidator(_check_flesh_rate)] = Field(
         (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
     )
