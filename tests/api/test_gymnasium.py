@@ -31,7 +31,7 @@ def refusal(env_id: str, settings: dict) -> str:
         ({"device": "tpu"}, ["device='tpu'", "cpu"]),
         ({"task": "Fly-v0"}, ["'Fly-v0'", "PIAvatar/Reach-v0", "PIAvatar/TrackMotion-v0"]),
         ({"shape.parameters": {"tallness": 0.5}}, ["'tallness'", "height"]),
-        ({"young_modulus": 1e9, "num_substeps": 4}, ["CFL limit", "num_substeps >= "]),
+        ({"young_modulus": 1e9, "num_substeps": 4, "control": "pose"}, ["CFL limit", "num_substeps >= "]),
     ],
 )
 def test_bad_settings_are_refused_in_one_line_with_what_is_allowed(device, env_id, settings, told):
