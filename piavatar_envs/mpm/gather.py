@@ -10,7 +10,6 @@ from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline, stencil_inside
 from piavatar_envs.mpm.sums import first_of_records, read_record_from
 from piavatar_envs.mpm.types import (
-    FAILURE_BLOCKS,
     FAILURE_CFL,
     FAILURE_NONFINITE,
     FAILURE_OUT_OF_GRID,
@@ -31,7 +30,6 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
 _CFL = wp.constant(FAILURE_CFL)
-_BLOCKS = wp.constant(FAILURE_BLOCKS)
 
 
 @wp.func

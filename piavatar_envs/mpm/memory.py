@@ -126,13 +126,15 @@ def allocate(model: Model) -> tuple[State, Scratch]:
     records = (model.num_envs, int(BLOCK_NODES) * model.max_slots)
     shared = records if model.contact.num_fields > 1 else (1, 1)
     velocity = _zeros(model, records, vec8)
+    room, large_room = plan_room(model)
     scratch = Scratch(
         blocks=allocate_blocks(model),
         sums=allocate_sums(model, velocity),
         velocity=velocity,
         facing=_zeros(model, shared, wp.vec3),
         sensors=allocate_sensors(model, shared),
-        room=plan_room(model),
+        room=room,
+        large_room=large_room,
     )
     return state, scratch
 

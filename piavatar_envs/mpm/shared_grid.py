@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.shared_memory import native
+from piavatar_envs.mpm.shared_memory import native, word
 from piavatar_envs.mpm.transfer import Scattered
 from piavatar_envs.mpm.types import Blocks, Grid, Room, vec8, vec8i
 
@@ -25,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 
 #: Words of a node: mass, physical and kinematic momentum; odd, for the banks. Later: whether a boundary is near, and
 #: the velocities.
-NODE_WORDS = 7
+NODE_WORDS = wp.constant(7)
 #: Words of a brick of 2 x 2 x 2 nodes.
 BRICK_WORDS = wp.constant(8 * NODE_WORDS)
 #: Bricks of a block of 4 x 4 x 4 nodes.
@@ -45,8 +45,15 @@ NO_BRICK = wp.constant(0xFFFF)
 PLACES = wp.constant(0x4000)
 
 
+def _native(cuda: str, otherwise: str = "") -> str:
+    """A snippet that knows the header's words and the strides of the nodes of a brick."""
+    z = int(NODE_WORDS)
+    strides = f"constexpr int ALONG_Z = {z}, ALONG_Y = {2 * z}, ALONG_X = {4 * z}, BRICK = {8 * z};\n"
+    return native(f"constexpr int COUNT = {int(COUNT)}, CROWDED = {int(CROWDED)};\n{strides}{cuda}", otherwise)
+
+
 @wp.func_native(
-    native("""
+    _native("""
 unsigned short* const number = reinterpret_cast<unsigned short*>(room + numbers);
 unsigned short* const place = reinterpret_cast<unsigned short*>(room + places);
 if (threadIdx.x < 32) {
@@ -59,13 +66,25 @@ if (threadIdx.x < 32) {
         if (touched) place[own] = n;
         count += __popc(all);
     }
-    if (threadIdx.x == 0) room[0] = count;
+    if (threadIdx.x == 0) room[COUNT] = count;
 }
 """)
 )
 def number_bricks(numbers: int, places: int, most: int):
     """Number the bricks whose half word is not 0, of ``most``, and note their places."""
     ...
+
+
+@wp.func
+def bricks_of_round(room: Room, first: int):
+    """How many bricks there are in a round of those from the ``first`` on."""
+    return wp.min(word(COUNT) - first, room.capacity)
+
+
+@wp.func
+def node_word(room: Room, n: int):
+    """Word at which node ``n`` of a round begins, eight a brick."""
+    return room.bricks + BRICK_WORDS * (n // 8) + NODE_WORDS * (n % 8)
 
 
 _AROUND = """
@@ -83,19 +102,19 @@ for (int i = 0; i < 2; ++i)
 """
 
 
-@wp.func_native(native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
+@wp.func_native(_native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
 def places_around(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i) -> vec8i:
     """Where the bricks of a stencil have their half words: 8 slot + brick in block, for x, y and z lower and upper."""
     ...
 
 
 @wp.func_native(
-    native(
+    _native(
         _AROUND
         + """
 const unsigned short* const number = reinterpret_cast<const unsigned short*>(room + layout.numbers);
 for (int b = 0; b < 8; ++b)  // the last brick takes what is not of this round
-    n[b] = layout.bricks + 56 * (int)min((unsigned)(number[n[b]] - first), (unsigned)layout.capacity);
+    n[b] = layout.bricks + BRICK * (int)min((unsigned)(number[n[b]] - first), (unsigned)layout.capacity);
 return n;
 """,
         "return wp::vec_t<8, wp::int32>();",
@@ -107,7 +126,7 @@ def bricks_around(grid: Grid, blocks: Blocks, layout: Room, e: int, field: int, 
 
 
 @wp.func_native(
-    native("""
+    _native("""
 const int px = s.base[0] & 1, py = s.base[1] & 1, pz = s.base[2] & 1;
 const float m = s.at_base[0] * per_mass;
 float q[3], k[3], along[3][3];
@@ -126,7 +145,7 @@ for (int n = 0; n < 3; ++n) {
     weight_y[n] = j == 0 ? wy[0] : j == 1 ? wy[1] : wy[2];
     weight_z[n] = l == 0 ? wz[0] : l == 1 ? wz[1] : wz[2];
     at_y[n] = (float)j, at_z[n] = (float)l;
-    word_y[n] = ((py + j) & 1) * 14, word_z[n] = ((pz + l) & 1) * 7;
+    word_y[n] = ((py + j) & 1) * ALONG_Y, word_z[n] = ((pz + l) & 1) * ALONG_Z;
     upper_y[n] = py + j > 1, upper_z[n] = pz + l > 1;
     j = j == 2 ? 0 : j + 1, l = l == 2 ? 0 : l + 1;
 }
@@ -136,7 +155,7 @@ for (int i = 0; i < 3; ++i) {
     const bool far = px + i > 1;
     const int b00 = far ? bricks[4] : bricks[0], b01 = far ? bricks[5] : bricks[1];
     const int b10 = far ? bricks[6] : bricks[2], b11 = far ? bricks[7] : bricks[3];
-    int* const plane = room + ((px + i) & 1) * 28;
+    int* const plane = room + ((px + i) & 1) * ALONG_X;
     int over = 0;
 #pragma unroll
     for (int j = 0; j < 3; ++j) {
@@ -158,7 +177,7 @@ for (int i = 0; i < 3; ++i) {
             }
         }
     }
-    if (over < 0) room[3] = 1;  // CROWDED
+    if (over < 0) room[CROWDED] = 1;
     for (int c = 0; c < 3; ++c) q[c] += along[c][0];
 }
 """)
@@ -178,7 +197,7 @@ def add_to_bricks(
 
 
 @wp.func_native(
-    native("""
+    _native("""
 const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
 const float g[3] = {wx[1] + 2.0f * wx[2], wy[1] + 2.0f * wy[2], wz[1] + 2.0f * wz[2]};  // where it is, from the lowest
 #pragma unroll 1
@@ -186,7 +205,8 @@ for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j)
         for (int l = 0; l < 3; ++l) {
             const int b = (px + i > 1 ? 4 : 0) + (py + j > 1 ? 2 : 0) + (pz + l > 1 ? 1 : 0);
-            int* const node = room + bricks[b] + ((px + i) & 1) * 28 + ((py + j) & 1) * 14 + ((pz + l) & 1) * 7;
+            const int in_plane = ((py + j) & 1) * ALONG_Y + ((pz + l) & 1) * ALONG_Z;
+            int* const node = room + bricks[b] + ((px + i) & 1) * ALONG_X + in_plane;
             const float m = wx[i] * wy[j] * wz[l] * mass;
             atomicAdd(node, __float2int_rn(m * ((float)i - g[0])));
             atomicAdd(node + 1, __float2int_rn(m * ((float)j - g[1])));
@@ -201,14 +221,15 @@ def add_place(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.ve
 
 
 @wp.func_native(
-    native(
+    _native(
         """
 const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
 const bool far = px + i > 1, upper = py + j > 1;
 const int first = far ? (upper ? bricks[6] : bricks[4]) : (upper ? bricks[2] : bricks[0]);
 const int last = far ? (upper ? bricks[7] : bricks[5]) : (upper ? bricks[3] : bricks[1]);
-const int line = ((px + i) & 1) * 28 + ((py + j) & 1) * 14;
-return wp::vec3i(line + first + pz * 7, line + (pz ? last : first) + (pz ? 0 : 7), line + last + pz * 7);
+const int line = ((px + i) & 1) * ALONG_X + ((py + j) & 1) * ALONG_Y;
+const int second = pz ? last : first + ALONG_Z;
+return wp::vec3i(line + first + pz * ALONG_Z, line + second, line + last + pz * ALONG_Z);
 """,
         "return wp::vec3i();",
     )
@@ -219,7 +240,7 @@ def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
 
 
 @wp.func_native(
-    native(
+    _native(
         """
 const float* const node = reinterpret_cast<const float*>(room + at);
 wp::vec_t<8, wp::float32> value;
@@ -237,7 +258,7 @@ def node_record(at: int) -> vec8:
 
 
 @wp.func_native(
-    native("""
+    _native("""
 float* const node = reinterpret_cast<float*>(room + at);
 node[0] = value[7];
 for (int c = 1; c < 7; ++c) node[c] = value[c];

@@ -56,32 +56,32 @@ def suits_shared(device: str, field: np.ndarray, max_slots: int) -> bool:
     return target.max_shared_memory_per_block >= 227 * 1024 and fits
 
 
-def has_large_room(model: Model) -> bool:
-    """Whether the room of a part takes a multiprocessor: its nodes need it, or there are enough of them.
+def has_large_room(model: Model, parts: list[tuple[int, int, int]]) -> bool:
+    """Whether rooms of these ``parts`` take a multiprocessor each: nodes need it, or there are enough of them.
 
     A large room has more threads, and what they add up are integers: the result is the same.
     """
-    field = model.particles.field.numpy()
-    if most_particles(field) / model.num_particles * model.max_slots > MOST_SLOTS_SMALL:
+    share = max(end - first for first, end, _ in parts) / model.num_particles
+    if share * model.max_slots > MOST_SLOTS_SMALL:
         return True
-    return model.num_envs * len(parts_of(field)) <= wp.get_device(model.device).sm_count
+    return model.num_envs * len(parts) <= wp.get_device(model.device).sm_count
 
 
-def plan_room(model: Model) -> Room:
-    """Where things lie in a room."""
+def plan_room(model: Model) -> tuple[Room, bool]:
+    """Where things lie in a room, and whether it is a large one."""
     room = Room()
     if model.scatter != "shared":
-        return room
-    words = LARGE_ROOM if has_large_room(model) else SMALL_ROOM
+        return room, False
+    parts = parts_of(model.particles.field.numpy())
+    large = has_large_room(model, parts)
     room.numbers = int(HEADER)
     room.told = room.numbers + int(BLOCK_BRICKS) * model.max_slots // 2
     room.places = _multiple_of_4(room.told + -(-model.num_particles // 32))
     room.bricks = _multiple_of_4(room.places + int(BLOCK_BRICKS) * model.max_slots // 2)
-    room.capacity = (words - room.bricks) // int(BRICK_WORDS) - 1
-    parts = np.array(parts_of(model.particles.field.numpy()), np.int32)
-    room.part = wp.array(parts, dtype=wp.vec3i, device=model.device)
+    room.capacity = ((LARGE_ROOM if large else SMALL_ROOM) - room.bricks) // int(BRICK_WORDS) - 1
+    room.part = wp.array(np.array(parts, np.int32), dtype=wp.vec3i, device=model.device)
     room.speed = wp.zeros((model.num_envs, model.contact.num_fields), dtype=float, device=model.device)
-    return room
+    return room, large
 
 
 def _multiple_of_4(words: int) -> int:

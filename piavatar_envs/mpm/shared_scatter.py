@@ -8,24 +8,24 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import has_field, slots_used
+from piavatar_envs.mpm.blocks import slots_used
 from piavatar_envs.mpm.grid import SLAB_NODES, slab_is_near
 from piavatar_envs.mpm.runs import fault_of_sums
 from piavatar_envs.mpm.shared_grid import (
     BLOCK_BRICKS,
     BRICK_WORDS,
     COUNT,
-    CROWDED,
     FASTEST,
     FAULTS,
     HEAVIEST,
     PLACES,
     SPEED,
     TOLD,
-    UNITS,
     add_place,
     add_to_bricks,
     bricks_around,
+    bricks_of_round,
+    node_word,
     number_bricks,
     places_around,
 )
@@ -35,18 +35,16 @@ from piavatar_envs.mpm.shared_memory import (
     meet,
     number,
     or_word,
-    power_of_two,
     raise_to,
     set_half_word,
-    set_number,
     set_word,
     thread_of_block,
     threads_of_block,
     word,
 )
+from piavatar_envs.mpm.shared_units import correct_units, speed_of, speeds_known, sums_hold, unit_of_mass, unit_of_place
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_corner, grid_position, spline
 from piavatar_envs.mpm.transfer import (
-    Scattered,
     prepare,
     scatters,
     tells_place,
@@ -72,10 +70,6 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 _BLOCKS = wp.constant(FAILURE_BLOCKS)
 _CFL = wp.constant(FAILURE_CFL)
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
-#: Slowest speed that momenta are counted at [m/s].
-SLOWEST = wp.constant(2.0**-20)
-#: Units of mass in a field's heaviest particle where places are told.
-PLACE_UNITS = wp.constant(2.0**20)
 #: A particle that goes or is driven further than this in a substep [grid spacings] has failed, and is not added up.
 MOST_CELLS = wp.constant(8.0)
 
@@ -144,7 +138,7 @@ def scatter_places(
 ):
     """Where particles are, to the nodes' offsets, from those that tell it."""
     t = thread_of_block()
-    clear_words(room.bricks, BRICK_WORDS * wp.min(word(COUNT) - first, room.capacity))
+    clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
     meet()
     for p in range(part[0] + t, part[1], threads_of_block()):
         if ((word(room.told + p // 32) >> (p % 32)) & 1) != 0:
@@ -156,26 +150,14 @@ def scatter_places(
             n = bricks_around(grid, blocks, room, e, field, base, first)
             add_place(n, base, spline(f[0]), spline(f[1]), spline(f[2]), m, particles.seam[p])
     meet()
-    for n in range(t, 8 * wp.min(word(COUNT) - first, room.capacity), threads_of_block()):
-        at = room.bricks + BRICK_WORDS * (n // 8) + 7 * (n % 8)
+    for n in range(t, 8 * bricks_of_round(room, first), threads_of_block()):
+        at = node_word(room, n)
         place = half_word(room.places, first + n // 8) % PLACES
         if word(at) != 0 or word(at + 1) != 0 or word(at + 2) != 0 or word(at + 3) != 0:
             unit = unit_of_place(blocks.held[e, place // BLOCK_BRICKS] // grid.num_blocks)
             o = (grid.dx * unit) * wp.vec3(float(word(at)), float(word(at + 1)), float(word(at + 2)))
             sums.offset[e, record_of_place(place, n % 8)] = wp.vec4(o[0], o[1], o[2], unit * float(word(at + 3)))
     meet()
-
-
-@wp.func
-def unit_of_mass(field: int):
-    """Mass that a word counts [kg], a power of two."""
-    return power_of_two(number(HEAVIEST + field)) / number(UNITS)
-
-
-@wp.func
-def unit_of_place(field: int):
-    """Mass that a word of places counts [kg]: more than it does of masses, for they are seen to after these."""
-    return power_of_two(number(HEAVIEST + field)) / PLACE_UNITS
 
 
 @wp.func
@@ -186,17 +168,6 @@ def record_of_place(place: int, node: int):
     j = (((brick >> 1) & 1) << 1) + ((node >> 1) & 1)
     k = ((brick & 1) << 1) + (node & 1)
     return BLOCK_NODES * (place // BLOCK_BRICKS) + 16 * i + 4 * j + k
-
-
-@wp.func
-def speed_of(s: Scattered):
-    """A bound of the momenta that a particle adds, by its mass [m/s]."""
-    most = float(0.0)
-    for c in range(3):
-        reach = wp.abs(s.A[c, 0]) + wp.abs(s.A[c, 1]) + wp.abs(s.A[c, 2])
-        center = s.at_base[1 + c] + s.A[c, 0] + s.A[c, 1] + s.A[c, 2]
-        most = wp.max(most, wp.max(wp.abs(center) + reach, wp.abs(s.at_base[4 + c])))
-    return most / s.at_base[0]
 
 
 @wp.func
@@ -219,7 +190,7 @@ def scatter_momenta(
     if t < room.speed.shape[1]:
         set_word(FASTEST + t, 0)
     if adds:
-        clear_words(room.bricks, BRICK_WORDS * wp.min(word(COUNT) - first, room.capacity))
+        clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
     meet()
     for p in range(part[0] + t, part[1], threads_of_block()):
         if scatters(blocks, moving, e, p, failure):
@@ -242,57 +213,6 @@ def scatter_momenta(
                     add_to_bricks(n, trash, s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_mass, per_momentum)
         else:
             or_word(FAULTS, _NONFINITE)
-    meet()
-
-
-@wp.func
-def speed_for(fastest: float):
-    """A power of two that the fastest particle will not exceed, if it does not gain a quarter at once."""
-    return wp.max(SLOWEST, power_of_two(1.25 * fastest))
-
-
-@wp.func
-def speeds_known(room: Room, part: wp.vec3i):
-    """Whether there is a speed at which to count the momenta of every field."""
-    known = bool(True)
-    for f in range(room.speed.shape[1]):
-        known = known and (number(SPEED + f) > 0.0 or not has_field(part[2], f))
-    return known
-
-
-@wp.func
-def sums_hold(room: Room, part: wp.vec3i, first: int):
-    """Whether momenta have been counted at speeds that no particle exceeds, and no word counts more than it can.
-
-    All threads come here.
-    """
-    known = speeds_known(room, part)
-    if known:
-        for n in range(thread_of_block(), 8 * wp.min(word(COUNT) - first, room.capacity), threads_of_block()):
-            if word(room.bricks + BRICK_WORDS * (n // 8) + 7 * (n % 8)) < 0:
-                set_word(CROWDED, 1)
-    meet()
-    hold = known and word(CROWDED) == 0
-    for f in range(room.speed.shape[1]):
-        hold = hold and (number(FASTEST + f) <= number(SPEED + f) or not has_field(part[2], f))
-    return hold
-
-
-@wp.func
-def correct_units(room: Room, part: wp.vec3i):
-    """Count the momenta of fields that were too fast at higher speeds, and in larger units if words were too small.
-
-    All threads come here.
-    """
-    f = thread_of_block()
-    meet()
-    if f == 0 and word(CROWDED) != 0:
-        set_number(UNITS, number(UNITS) / 8.0)
-        set_word(CROWDED, 0)
-    if f < room.speed.shape[1]:
-        slow = number(SPEED + f) == 0.0 or number(FASTEST + f) > number(SPEED + f)
-        if slow and has_field(part[2], f):
-            set_number(SPEED + f, speed_for(number(FASTEST + f)))
     meet()
 
 

@@ -19,7 +19,6 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.shared_gather import gather_all
 from piavatar_envs.mpm.shared_grid import (
     BLOCK_BRICKS,
-    BRICK_WORDS,
     COUNT,
     FASTEST,
     FAULTS,
@@ -29,6 +28,8 @@ from piavatar_envs.mpm.shared_grid import (
     SPEED,
     TOLD,
     UNITS,
+    bricks_of_round,
+    node_word,
     set_node_record,
 )
 from piavatar_envs.mpm.shared_memory import (
@@ -41,15 +42,14 @@ from piavatar_envs.mpm.shared_memory import (
     threads_of_block,
     word,
 )
-from piavatar_envs.mpm.shared_room import LARGE_ROOM, LARGE_THREADS, SMALL_ROOM, SMALL_THREADS, has_large_room
+from piavatar_envs.mpm.shared_room import LARGE_ROOM, LARGE_THREADS, SMALL_ROOM, SMALL_THREADS
 from piavatar_envs.mpm.shared_scatter import (
     lay_out,
     record_of_place,
     scatter_places,
     scatter_round,
-    speed_for,
-    unit_of_mass,
 )
+from piavatar_envs.mpm.shared_units import speed_for, unit_of_mass
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner
 from piavatar_envs.mpm.sums import write_record
 from piavatar_envs.mpm.types import (
@@ -94,8 +94,8 @@ def update_bricks(
     In blocks with several fields they stay sums.
     """
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    for n in range(thread_of_block(), 8 * wp.min(word(COUNT) - first, room.capacity), threads_of_block()):
-        at = room.bricks + BRICK_WORDS * (n // 8) + 7 * (n % 8)
+    for n in range(thread_of_block(), 8 * bricks_of_round(room, first), threads_of_block()):
+        at = node_word(room, n)
         marked = half_word(room.places, first + n // 8)
         place = marked % PLACES
         r = record_of_place(place, n % 8)
@@ -253,11 +253,10 @@ def forget_speeds(room: Room):
 
 def record_in_block(program: Program, model: Model, state: State, scratch: Scratch, moving: Moving) -> None:
     """Append the substep: all of it where there is one field, else up to contact."""
-    large = has_large_room(model)
-    threads = LARGE_THREADS if large else SMALL_THREADS
+    threads = LARGE_THREADS if scratch.large_room else SMALL_THREADS
     gathers = model.contact.num_fields == 1
     program.launch(
-        substep_kernel(large, gathers),
+        substep_kernel(scratch.large_room, gathers),
         (model.num_envs, scratch.room.part.shape[0] * threads),
         [model.grid, model.step, model.particles, model.boundaries, model.contact, scratch.room],
         [scratch.blocks, moving, state.failure, scratch.sums, scratch.velocity, scratch.sensors],

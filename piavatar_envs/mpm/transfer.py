@@ -14,9 +14,7 @@ from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
-    FAILURE_CFL,
     FAILURE_NONFINITE,
-    FAILURE_OUT_OF_GRID,
     NO_STRESS,
     Blocks,
     Boundaries,
@@ -34,8 +32,6 @@ from piavatar_envs.mpm.types import (
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
-_OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
-_CFL = wp.constant(FAILURE_CFL)
 _BLOCKS = wp.constant(FAILURE_BLOCKS)
 
 

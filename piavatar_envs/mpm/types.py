@@ -267,6 +267,7 @@ class Scratch:
         facing: vec3: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`; of blocks with
             several fields only.
         sensors: what contact did in this control step.
+        room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
     """
 
     blocks: Blocks
@@ -275,3 +276,4 @@ class Scratch:
     facing: wp.array
     sensors: Sensors
     room: Room
+    large_room: bool

@@ -7,7 +7,7 @@ import pytest
 
 from piavatar_envs.mpm.memory import estimate_slots
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.shared_room import has_large_room, parts_of
+from piavatar_envs.mpm.shared_room import parts_of
 from piavatar_envs.mpm.solver import record_marks, record_scatter
 from piavatar_envs.mpm.sums import units
 from piavatar_envs.mpm.types import SCATTERS
@@ -128,10 +128,10 @@ def test_a_large_room_gives_the_same(simulate, equal, device, monkeypatch):
         pytest.skip("shared memory is a GPU's")
     start = {"u": (0.3, -0.2, 0.1), "C": np.diag([1.0, -2.0, 0.5])}
     large = simulate(scatter="shared", max_slots=SLOTS // 2).set(**start)
-    assert has_large_room(large.model)
-    monkeypatch.setattr("piavatar_envs.mpm.shared_substep.has_large_room", lambda model: False)
+    assert large.scratch.large_room
+    monkeypatch.setattr("piavatar_envs.mpm.shared_room.has_large_room", lambda model, parts: False)
     small = simulate(scatter="shared", max_slots=SLOTS // 2, control_dt=large.model.control_dt).set(**start)
-    small.scratch.room.capacity = 300
+    assert not small.scratch.large_room
     for array in ARRAYS:
         assert equal(large.run(2).get(array), small.run(2).get(array)), array
 
