@@ -23,7 +23,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.joint_motion import part_of, set_part
-from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_log
+from piavatar_envs.avatar.rotation import quat_log, short_of_pi
 from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.mpm.types import group, row
 
@@ -139,8 +139,7 @@ def beyond(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
     push on: the range ends before.
     """
     v = quat_log(local)
-    within = wp.max(lower, wp.min(v, upper))
-    return within * wp.min(1.0, MAX_ANGLE / wp.max(wp.length(within), 1.0e-6)) - v
+    return short_of_pi(wp.max(lower, wp.min(v, upper))) - v
 
 
 @wp.kernel

@@ -36,6 +36,12 @@ def quat_log(q: wp.quat):
 
 
 @wp.func
+def short_of_pi(v: wp.vec3):
+    """Rotation vector ``v``, its angle at most ``MAX_ANGLE`` [rad]."""
+    return v * wp.min(1.0, MAX_ANGLE / wp.max(wp.length(v), 1.0e-6))
+
+
+@wp.func
 def turn_about_z(q: wp.quat):
     """The part of ``q`` that turns about the vertical (its twist); the identity where that is undefined."""
     n = wp.sqrt(q[2] * q[2] + q[3] * q[3])

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.muscles import LOCKED_JOINTS
-from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log, turn_about_z
+from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log, short_of_pi, turn_about_z
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.mpm.types import FAILURE_ACTION
 
@@ -139,7 +139,7 @@ def bounded(action: wp.array3d(dtype=float), e: int, agent: int, n: int):
 def keep_within(goal: wp.quat, lower: wp.vec3, upper: wp.vec3, allowed: wp.vec3):
     """``goal`` with its rotation vector between limits that are widened as far as ``allowed`` exceeds them [rad]."""
     v = wp.max(wp.min(allowed, lower), wp.min(quat_log(goal), wp.max(allowed, upper)))
-    return quat_exp(v * wp.min(1.0, MAX_ANGLE / wp.max(wp.length(v), 1.0e-6)))
+    return quat_exp(short_of_pi(v))
 
 
 @wp.func

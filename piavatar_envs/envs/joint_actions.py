@@ -11,7 +11,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.joint_torques import Strength
-from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log
+from piavatar_envs.avatar.rotation import quat_exp, quat_log, short_of_pi
 from piavatar_envs.envs.actions import ActionMap, bounded
 
 wp.set_module_options({"enable_backward": False})
@@ -79,7 +79,7 @@ def apply_targets(
     lower = wp.min(action_map.lower[b] - v, wp.vec3(0.0))
     upper = wp.max(action_map.upper[b] - v, wp.vec3(0.0))
     v += share_of(action_vector(action, e, agent, n), lower, upper)
-    goal_rotation[e, b] = quat_exp(v * wp.min(1.0, MAX_ANGLE / wp.max(wp.length(v), 1.0e-6)))
+    goal_rotation[e, b] = quat_exp(short_of_pi(v))
 
 
 @wp.kernel
