@@ -14,14 +14,17 @@ from typing import Any
 import numpy as np
 import torch
 from pydantic import BaseModel, Field
+from rsl_rl.algorithms import PPO
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.log_writer import LogWriter
+from tensordict import TensorDict
 from torch.utils.tensorboard import SummaryWriter
 
 from agents.batches import BatchTraining, Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, set_random_states
 from agents.curve import Curve
 from agents.evaluate import Agent
+from agents.mirror import Mirror
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
 from piavatar_envs.envs.config import FROZEN
 from piavatar_envs.tasks import load_task
@@ -41,6 +44,12 @@ class RslPPOSettings(BaseModel):
         0.01, gt=0.0, description="divergence of an update to which the learning rate adapts [-]; null for a fixed rate"
     )
     discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
+    reward_scale: float = Field(
+        1.0,
+        gt=0.0,
+        description="factor on what the networks see of a reward [-]; the critic follows by clip_range a step, so "
+        "discounted returns should be about 1",
+    )
     gae_lambda: float = Field(0.8, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
     clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
     value_weight: float = Field(1.0, ge=0.0, description="weight of the critic's squared error [-]")
@@ -48,6 +57,7 @@ class RslPPOSettings(BaseModel):
     largest_gradient: float = Field(1.0, gt=0.0, description="norm to which gradients are clipped [-]")
     action_std: float = Field(0.6, gt=0.0, description="standard deviation of the first actions [-]")
     normalize_observation: bool = Field(False, description="whether networks see observations by running statistics")
+    mirrored: bool = Field(False, description="whether it also learns from every step as it is in a mirror")
     hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of both networks")
 
 
@@ -56,6 +66,21 @@ class RslTraining(BatchTraining):
 
     env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
     ppo: RslPPOSettings = Field(default_factory=RslPPOSettings, description="the algorithm")
+
+
+class ScaledPPO(PPO):
+    """rsl_rl's PPO, which learns from scaled rewards; what is logged are the environment's own."""
+
+    def __init__(self, *args: Any, reward_scale: float, **settings: Any) -> None:
+        """As rsl_rl's, and the factor."""
+        super().__init__(*args, **settings)
+        self.reward_scale = reward_scale
+
+    def process_env_step(
+        self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, torch.Tensor]
+    ) -> None:
+        """Record a step."""
+        super().process_env_step(obs, self.reward_scale * rewards, dones, extras)
 
 
 class CurveWriter(LogWriter):
@@ -102,7 +127,7 @@ class Runner(OnPolicyRunner):
         if saved:
             self.curve.load(saved["curve"])
         self._begun = time.monotonic() - self.curve.seconds
-        settings = runner_settings(config) | {
+        settings = runner_settings(config, env) | {
             "logger": {
                 "class_name": CurveWriter,
                 "steps_an_iteration": config.num_envs * config.ppo.rollout_steps,
@@ -158,8 +183,12 @@ class Runner(OnPolicyRunner):
         set_random_states(saved["random"])
 
 
-def runner_settings(config: RslTraining) -> dict[str, Any]:
-    """The configuration as rsl_rl's runner takes it."""
+def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
+    """The configuration as rsl_rl's runner takes it.
+
+    Raises:
+        ConfigError: steps cannot be mirrored.
+    """
     ppo = config.ppo
     network = {
         "class_name": "MLPModel",
@@ -175,7 +204,8 @@ def runner_settings(config: RslTraining) -> dict[str, Any]:
         "actor": {**network, "distribution_cfg": spread},
         "critic": network,
         "algorithm": {
-            "class_name": "PPO",
+            "class_name": ScaledPPO,
+            "reward_scale": ppo.reward_scale,
             "num_learning_epochs": ppo.epochs,
             "num_mini_batches": ppo.minibatches,
             "learning_rate": ppo.learning_rate,
@@ -187,8 +217,24 @@ def runner_settings(config: RslTraining) -> dict[str, Any]:
             "value_loss_coef": ppo.value_weight,
             "entropy_coef": ppo.entropy_weight,
             "max_grad_norm": ppo.largest_gradient,
+            "symmetry_cfg": _symmetry(env) if ppo.mirrored else None,
         },
     }
+
+
+def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
+    """The settings by which rsl_rl appends mirrored steps to every minibatch."""
+    terms = [env.observation_layout[name] for name in env.groups["policy"]]
+    mirror = Mirror(terms, env.episodes.groups[0].action_spec.joints, env.device)
+
+    def append(
+        env: AvatarRslEnv, obs: TensorDict | None = None, actions: torch.Tensor | None = None
+    ) -> tuple[TensorDict | None, torch.Tensor | None]:
+        if obs is not None:
+            obs = torch.cat([obs, obs.apply(mirror.observations)])
+        return obs, None if actions is None else torch.cat([actions, mirror.actions(actions)])
+
+    return {"data_augmentation_func": append, "use_data_augmentation": True}
 
 
 def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:

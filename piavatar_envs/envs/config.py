@@ -65,6 +65,9 @@ class EnvConfig(BaseModel):
     scene: SceneConfig = Field(default_factory=SceneConfig, description="what is in the world, and how it touches")
     render: RenderConfig = Field(default_factory=RenderConfig, description="pictures")
     episode_seconds: float = Field(5.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
+    joints: tuple[str, ...] | None = Field(
+        None, description="joints that act, the others do what they would do anyway; null for all 21"
+    )
     observe_parameters: bool = Field(
         False, description="observe what the episode has drawn (randomize, random shapes, the task) and its clock"
     )

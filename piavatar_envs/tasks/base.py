@@ -53,7 +53,7 @@ class Task:
 
     Attributes:
         config: the settings.
-        joints: names of those that act: all, unless a task says otherwise.
+        joints: names of those that act.
         scene: what is in the world.
     """
 
@@ -85,7 +85,7 @@ class Task:
 
     def __init__(self, config: EnvConfig) -> None:
         self.config = config
-        self.joints = select_joints(None)
+        self.joints = select_joints(config.joints)
         self.scene = self.build_scene()
 
     def build_scene(self) -> SceneConfig:

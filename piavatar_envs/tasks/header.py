@@ -10,7 +10,6 @@ from pydantic import Field
 
 from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.envs.config import DriveConfig, EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.draws import STREAM_BALL, generator
@@ -178,7 +177,6 @@ that all of them but the control cost add up to at most 1, half of it for the go
     def __init__(self, config: HeaderConfig) -> None:
         check_ranges(config, "ball_height", "target_distance", "ball_mass")
         super().__init__(config)
-        self.joints = select_joints(config.joints)
 
     def build_scene(self) -> SceneConfig:
         scene, config = super().build_scene(), self.config

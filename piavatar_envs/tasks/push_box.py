@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.config import ConfigError, EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
@@ -120,7 +120,6 @@ of the root, too, which is never more than 0.1 m and 0.3 rad ahead of it."""
                 f"into the avatar; use at least {least:.2f} m"
             )
         super().__init__(config)
-        self.joints = select_joints(config.joints)
 
     def build_scene(self) -> SceneConfig:
         scene, config = super().build_scene(), self.config

@@ -11,7 +11,6 @@ from pydantic import Field
 
 from piavatar_envs.avatar.skeleton import JOINT_NAMES
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.envs.config import EnvConfig
 from piavatar_envs.envs.draws import STREAM_TASK, generator
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
@@ -32,7 +31,6 @@ SLOWEST, TURN = wp.constant(0.3), wp.constant(6.2831853)
 class ReachConfig(EnvConfig):
     """Settings of Reach."""
 
-    joints: tuple[str, ...] | None = Field(None, description="joints that act; null for all 21")
     radius: float = Field(0.45, gt=0.0, le=1.0, description="radius of the target's sphere about the chest [m]")
     target_speed: float = Field(0.3, ge=0.0, le=5.0, description="greatest speed of the target [m/s]")
     target_radius: float = Field(0.08, gt=0.0, le=0.5, description="distance that counts as reached [m]")
@@ -192,10 +190,6 @@ middle of either hand to the target and stay with it."""
     }  # fmt: skip
 
     config: ReachConfig
-
-    def __init__(self, config: ReachConfig) -> None:
-        super().__init__(config)
-        self.joints = select_joints(config.joints)
 
     def drawn(self) -> tuple[Parameter, ...]:
         return (

@@ -1,0 +1,107 @@
+"""Left and right changed over: what a body sees and does, seen in a mirror.
+
+A body is the same on both sides, and so is what it can do: whatever is a good action here is, mirrored, a good action
+in the mirrored state. An algorithm that is told so learns from every step twice (Mittal, Rudin, Klemm, Allshire &
+Hutter, "Symmetry considerations for learning task symmetric robot policies", ICRA 2024).
+
+The mirror is the plane x = 0, in which a body that faces -y looks straight ahead. Vectors change their x; spins and
+rotation vectors keep it and change y and z; a rotation matrix becomes ``S R S`` with ``S = diag(-1, 1, 1)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES
+from piavatar_envs.envs.config import ConfigError
+
+if TYPE_CHECKING:
+    from piavatar_envs.envs.observations import ObservationTerm
+
+#: Signs in the mirror of one scalar, of a scalar that counts to the left, and of the kinds above.
+_SCALAR, _ASIDE = (1.0,), (-1.0,)
+_VECTOR, _SPIN = (-1.0, 1.0, 1.0), (1.0, -1.0, -1.0)
+_ROTATION = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # two columns
+_SIDES, _BODY, _JOINTS, _PARTS = ("left", "right"), JOINT_NAMES, JOINT_NAMES[1:], tuple(BODY_PARTS)
+
+#: What terms of observations hold: the signs of one item, and the names of the items.
+_TERMS: Mapping[str, tuple[tuple[float, ...], Sequence[str]]] = {
+    "root_height": (_SCALAR, ("root",)),
+    "root_orientation": (_ROTATION, ("root",)),
+    "joint_rotations": (_ROTATION, _JOINTS),
+    "bone_positions": (_VECTOR, _JOINTS),
+    "bone_velocities": (_VECTOR, _BODY),
+    "stress": (_SCALAR, _PARTS),
+    "contact_impulse": (_VECTOR, _PARTS),
+    "root_spin": (_SPIN, ("root",)),
+    "joint_velocities": (_SPIN, _JOINTS),
+    "ground_impulse": (_VECTOR, ("root",)),
+    "gravity_direction": (_VECTOR, ("root",)),
+    "foot_impulses": (_SCALAR, _SIDES),
+    "ball_position": (_VECTOR, ("ball",)),
+    "ball_velocity": (_VECTOR, ("ball",)),
+    "way_direction": (_VECTOR, ("way",)),
+    "way_offset": (_ASIDE, ("way",)),
+}
+
+
+def other_side(name: str) -> str:
+    """The name of what is on the other side; of what is in the middle, its own."""
+    side, underscore, rest = name.partition("_")
+    return {"left": "right", "right": "left"}.get(side, side) + underscore + rest
+
+
+class Mirror:
+    """Mirrors observations and actions; both as tensors whose last dimension are the components."""
+
+    def __init__(self, terms: Iterable[ObservationTerm], joints: Sequence[str], device: str | torch.device) -> None:
+        """Find where every component comes from.
+
+        Args:
+            terms: of the observation, in order.
+            joints: names of those that act, in order.
+            device: of the tensors.
+
+        Raises:
+            ConfigError: a term of which it is not known what it becomes, or a joint acts and its other side does not.
+        """
+        pairs: list[tuple[np.ndarray, np.ndarray]] = []
+        for term in terms:
+            signs, items = _TERMS.get(term.name, (_SCALAR, ()))
+            if len(signs) * len(items) != term.size:
+                raise ConfigError(f"the mirror knows no observation term {term.name!r} of size {term.size}; do without")
+            pairs.append(_changed_over(items, signs))
+        lonely = [joint for joint in joints if other_side(joint) not in joints]
+        if lonely:
+            raise ConfigError(f"{lonely[0]!r} acts, but {other_side(lonely[0])!r} does not; do without the mirror")
+        self._seen = _joined(pairs, device)
+        self._done = _joined([_changed_over(joints, _SPIN)], device)
+
+    def observations(self, seen: torch.Tensor) -> torch.Tensor:
+        """What is seen in the mirrored state."""
+        source, sign = self._seen
+        return seen[..., source] * sign
+
+    def actions(self, done: torch.Tensor) -> torch.Tensor:
+        """What is done there: rotation vectors or torques, as shares of ranges that are mirrored, too."""
+        source, sign = self._done
+        return done[..., source] * sign
+
+
+def _changed_over(items: Sequence[str], signs: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Where the components of items come from, and their signs."""
+    first = len(signs) * np.array([items.index(other_side(item)) for item in items])
+    return (first[:, None] + np.arange(len(signs))).ravel(), np.tile(signs, len(items))
+
+
+def _joined(
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]], device: str | torch.device
+) -> tuple[torch.Tensor, torch.Tensor]:
+    starts = np.cumsum([0, *(len(source) for source, _ in pairs)])
+    source = np.concatenate([start + own for start, (own, _) in zip(starts, pairs, strict=False)])
+    sign = np.concatenate([own for _, own in pairs])
+    return torch.as_tensor(source, device=device), torch.as_tensor(sign, dtype=torch.float32, device=device)
