@@ -52,17 +52,17 @@ def test_mirrored_actions_have_mirrored_consequences(control, device):
     mirror = mirror_of(episodes)
     episodes.reset([0, 0])
     generator = torch.Generator().manual_seed(0)
-    for _ in range(4):
+    for _ in range(3):
         action = torch.rand(1, 1, episodes.action_size, generator=generator).to(episodes.api.device) - 0.5
         episodes.step(torch.cat([action, mirror.actions(action)]))
     seen, mirrored = episodes.observation()[:, 0]
     expected = mirror.observations(seen)
     for name, term in episodes.layout.items():
-        size = float(expected[term.slice].norm())
-        # the points of a coarse body are not quite symmetric
-        assert float((mirrored - expected)[term.slice].norm()) < 0.05 * size, name
+        off = float((mirrored - expected)[term.slice].norm())
+        # the points of so small a body are not quite symmetric
+        assert off < 5.0e-4 + 0.05 * float(expected[term.slice].norm()), name
         if name in ("joint_rotations", "joint_velocities", "bone_velocities", "root_spin", "way_offset"):
-            assert float((mirrored - seen)[term.slice].norm()) > 0.2 * size, name
+            assert off < 0.1 * float((mirrored - seen)[term.slice].norm()), name
     episodes.close()
 
 
