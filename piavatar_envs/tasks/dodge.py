@@ -21,9 +21,9 @@ from piavatar_envs.tasks.place import PlaceRule, judge_pose, keep_place, observe
 from piavatar_envs.tasks.ranges import check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 from piavatar_envs.tasks.throws import (
-    draw_balls,
     make_throws,
     observe_throws,
+    record_balls,
     throw_balls,
     throwing_domain,
     waiting_places,
@@ -157,13 +157,7 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
 
     def record_reset(self, env, program) -> None:
         record_standing(env, program, self.config.pose_noise)
-        props, balls = env.simulation.props, (env.num_envs, self.config.num_balls)
-        program.launch(
-            draw_balls,
-            balls,
-            [env.mask, env.seed, env.episode, self.throws],
-            [props.spawn.position, props.spawn.velocity, props.spawn.spin, props.density],
-        )
+        record_balls(env, program, self.throws)
         self.hits.record_reset(env, program)
 
     def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:

@@ -9,7 +9,7 @@ import warp as wp
 from piavatar_envs.envs.draws import STREAM_BALL, STREAM_DISTURBANCE, generator
 from piavatar_envs.envs.observations import write_vector
 from piavatar_envs.mpm.types import Sensors
-from piavatar_envs.tasks.throws import Throws, draw_balls, draw_throw, flies_on
+from piavatar_envs.tasks.throws import Throws, record_balls, throw_or_catch
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
@@ -68,17 +68,11 @@ def throw_push(
     if failure[e] != 0:
         return
     number = step_count[e] // throws.interval
-    if step_count[e] == moment_of(throws, seed[e], episode[e], number):
-        placed[e] = True
-        at, way, turning = draw_throw(throws, generator(seed[e], episode[e], STREAM_BALL, _THROWS + number), e, joints)
-        position[e, _BALL] = at
-        velocity[e, _BALL] = way
-        spin[e, _BALL] = turning
-    elif flies_on(throws, ball_position[e, _BALL], ball_velocity[e, _BALL]):
-        placed[e] = True
-        position[e, _BALL] = throws.rest[_BALL]
-        velocity[e, _BALL] = wp.vec3(0.0)
-        spin[e, _BALL] = wp.vec3(0.0)
+    due = step_count[e] == moment_of(throws, seed[e], episode[e], number)
+    random = generator(seed[e], episode[e], STREAM_BALL, _THROWS + number)
+    placed[e] = throw_or_catch(
+        throws, due, random, e, _BALL, joints, ball_position, ball_velocity, position, velocity, spin
+    )
 
 
 @wp.kernel
@@ -173,13 +167,7 @@ class Pushes:
 
     def record_reset(self, env: BatchEnv, program: Program) -> None:
         """Append: in the masked environments the ball is given its mass, and waits."""
-        props = env.simulation.props
-        program.launch(
-            draw_balls,
-            (env.num_envs, 1),
-            [env.mask, env.seed, env.episode, self.throws],
-            [props.spawn.position, props.spawn.velocity, props.spawn.spin, props.density],
-        )
+        record_balls(env, program, self.throws)
         program.launch(forget_pushes, env.num_envs, [env.mask], [self.flying, self.push, self.strongest])
 
     def record_throw(self, env: BatchEnv, program: Program) -> None:

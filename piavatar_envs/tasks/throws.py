@@ -18,6 +18,7 @@ from piavatar_envs.envs.draws import STREAM_BALL, generator
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.mpm.program import Program
     from piavatar_envs.tasks.dodge import DodgeConfig
     from piavatar_envs.tasks.push_recovery import PushRecoveryConfig
 
@@ -177,6 +178,50 @@ def flies_on(throws: Throws, position: wp.vec3, velocity: wp.vec3):
     return distance > throws.reach and wp.dot(velocity, out) > OUTWARDS * distance
 
 
+@wp.func
+def rest_ball(
+    throws: Throws,
+    e: int,
+    ball: int,
+    # out
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+):
+    """Let a ball lie where it waits."""
+    position[e, ball] = throws.rest[ball]
+    velocity[e, ball] = wp.vec3(0.0)
+    spin[e, ball] = wp.vec3(0.0)
+
+
+@wp.func
+def throw_or_catch(
+    throws: Throws,
+    due: bool,
+    random: wp.uint32,
+    e: int,
+    ball: int,
+    joints: wp.array2d(dtype=wp.vec3),
+    ball_position: wp.array2d(dtype=wp.vec3),
+    ball_velocity: wp.array2d(dtype=wp.vec3),
+    # out
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+):
+    """Whether a ball is placed anew, and how: thrown if it is due, caught if it flies on."""
+    if due:
+        at, way, turning = draw_throw(throws, random, e, joints)
+        position[e, ball] = at
+        velocity[e, ball] = way
+        spin[e, ball] = turning
+        return True
+    if flies_on(throws, ball_position[e, ball], ball_velocity[e, ball]):
+        rest_ball(throws, e, ball, position, velocity, spin)
+        return True
+    return False
+
+
 @wp.kernel
 def draw_balls(
     mask: wp.array(dtype=wp.bool),
@@ -199,9 +244,7 @@ def draw_balls(
         share = (mass - throws.mass[0]) / wp.max(throws.mass[1] - throws.mass[0], 1.0e-9)
         mass = throws.mass[0] * wp.pow(throws.mass[1] / throws.mass[0], share)
     density[e, ball] = mass / throws.volume
-    position[e, ball] = throws.rest[ball]
-    velocity[e, ball] = wp.vec3(0.0)
-    spin[e, ball] = wp.vec3(0.0)
+    rest_ball(throws, e, ball, position, velocity, spin)
 
 
 @wp.kernel
@@ -230,20 +273,12 @@ def throw_balls(
     if failure[e] != 0:
         return
     first = first_throw(throws, seed[e], episode[e])
-    if steps_to_throw(throws, first, step_count[e], ball) == 0:
-        placed[e, ball] = True
-        number = (step_count[e] - first) // throws.interval
-        random = generator(seed[e], episode[e], STREAM_BALL, _MASSES + throws.num_balls + number)
-        at, way, turning = draw_throw(throws, random, e, joints)
-        position[e, ball] = at
-        velocity[e, ball] = way
-        spin[e, ball] = turning
-        return
-    if flies_on(throws, ball_position[e, ball], ball_velocity[e, ball]):
-        placed[e, ball] = True
-        position[e, ball] = throws.rest[ball]
-        velocity[e, ball] = wp.vec3(0.0)
-        spin[e, ball] = wp.vec3(0.0)
+    due = steps_to_throw(throws, first, step_count[e], ball) == 0
+    number = (step_count[e] - first) // throws.interval
+    random = generator(seed[e], episode[e], STREAM_BALL, _MASSES + throws.num_balls + number)
+    placed[e, ball] = throw_or_catch(
+        throws, due, random, e, ball, joints, ball_position, ball_velocity, position, velocity, spin
+    )
 
 
 @wp.kernel
@@ -265,3 +300,14 @@ def observe_throws(
     steps = steps_to_throw(throws, first, step_count[e], ball)
     observation[e, agent, start + ball] = control_dt * float(steps)
     observation[e, agent, start + throws.num_balls + ball] = throws.volume * density[e, ball]
+
+
+def record_balls(env: BatchEnv, program: Program, throws: Throws) -> None:
+    """Append, at reset: in the masked environments every ball is given its mass, and waits."""
+    props = env.simulation.props
+    program.launch(
+        draw_balls,
+        (env.num_envs, throws.num_balls),
+        [env.mask, env.seed, env.episode, throws],
+        [props.spawn.position, props.spawn.velocity, props.spawn.spin, props.density],
+    )

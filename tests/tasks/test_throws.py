@@ -9,7 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.tasks.throws import CLEARANCE, HEIGHT, catching_distance, out_of_the_body, waiting_places
+from piavatar_envs.tasks.throws import (
+    CLEARANCE,
+    HEIGHT,
+    Throws,
+    catching_distance,
+    out_of_the_body,
+    throw_or_catch,
+    waiting_places,
+)
 
 DODGE = "PIAvatar/Dodge-v0"
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -200,6 +208,61 @@ def test_a_ball_does_not_begin_in_a_limb_that_reaches_out(device):
     assert (after > CLEARANCE - 1e-5).all() and (before < CLEARANCE).sum() > 50
     # no farther than to the last limb's clearance
     assert after[moved @ outwards > 0.0] == pytest.approx(CLEARANCE, abs=1e-5) and not moved[0].any()
+
+
+@wp.kernel
+def play(
+    throws: Throws,
+    due: wp.array(dtype=wp.bool),
+    joints: wp.array2d(dtype=wp.vec3),
+    at: wp.array2d(dtype=wp.vec3),
+    moving: wp.array2d(dtype=wp.vec3),
+    placed: wp.array(dtype=wp.bool),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+):
+    e = wp.tid()
+    random = wp.rand_init(7, e)
+    placed[e] = throw_or_catch(throws, due[e], random, e, 1, joints, at, moving, position, velocity, spin)
+
+
+def test_a_ball_is_thrown_when_due_caught_beyond_the_radius_and_else_left_alone(make_env, device):
+    """Its turn wins over catching; what lies far out, or comes back, is no ball that flies on."""
+    env = make_env(DODGE)
+    env.reset(seed=0)
+    out, still_there = [0.0, 1.2 * catching_distance(env.config), 0.5], [0.0, 0.0, 0.0]
+    cases = [  # due, where, how fast -> thrown, caught
+        (True, still_there, still_there, True, False),
+        (True, out, [0.0, 3.0, 0.0], True, False),
+        (False, out, [0.0, 3.0, 0.0], False, True),
+        (False, out, still_there, False, False),
+        (False, out, [0.0, -3.0, 0.0], False, False),
+        (False, [0.0, 0.5, 0.5], [0.0, 3.0, 0.0], False, False),
+    ]
+    n, nowhere = len(cases), np.full((len(cases), 2, 3), np.nan, np.float32)
+
+    def vectors(rows) -> wp.array:
+        return wp.array(np.repeat(np.array(rows, np.float32)[:, None], 2, axis=1), dtype=wp.vec3, device=device)
+
+    due, at, moving, thrown, caught = (list(column) for column in zip(*cases, strict=True))
+    body = wp.array(np.repeat(joints(env)[None], n, axis=0), dtype=wp.vec3, device=device)
+    placed = wp.zeros(n, dtype=wp.bool, device=device)
+    spawn = [wp.array(nowhere, dtype=wp.vec3, device=device) for _ in range(3)]
+    due = wp.array(due, dtype=wp.bool, device=device)
+    inputs = [env.batch.task.throws, due, body, vectors(at), vectors(moving)]
+    wp.launch(play, n, inputs, [placed, *spawn], device=device)
+    position, velocity, spin = (array.numpy() for array in spawn)
+    rest = waiting_places((0.0, 0.0, 0.0), env.config)[1]
+    assert placed.numpy().tolist() == [a or b for a, b in zip(thrown, caught, strict=True)]
+    for e in range(n):
+        if thrown[e]:
+            assert np.hypot(*position[e, 1, :2]) > 1.29 and np.linalg.norm(velocity[e, 1]) > 3.0 and spin[e, 1].any()
+        elif caught[e]:
+            assert position[e, 1] == pytest.approx(rest) and not velocity[e, 1].any() and not spin[e, 1].any()
+        else:
+            assert np.isnan(position[e, 1]).all() and np.isnan(velocity[e, 1]).all() and np.isnan(spin[e, 1]).all()
+    assert all(np.isnan(array[:, 0]).all() for array in (position, velocity, spin))  # the other ball's
 
 
 def test_a_ball_that_has_flown_past_is_caught_and_waits(make_env):
