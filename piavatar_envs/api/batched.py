@@ -14,6 +14,7 @@ from gymnasium.utils import seeding
 
 from piavatar_envs.api import spaces
 from piavatar_envs.api.arrays import Array, find_array_api
+from piavatar_envs.avatar.joint_drive import checked_assist
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.simulation import check_device
 from piavatar_envs.tasks.base import Task
@@ -249,10 +250,7 @@ class BatchedEpisodes:
         Raises:
             ValueError: as there; nothing has changed then.
         """
-        values = np.asarray(share, np.float32)
-        if values.shape not in ((), (self.num_envs,)) or not ((values >= 0.0) & (values <= 1.0)).all():
-            raise ValueError(f"root_assist={share} must be in [0, 1], one number or {self.num_envs}")
-        parts = np.split(np.broadcast_to(values, (self.num_envs,)), self._splits)
+        parts = np.split(checked_assist(share, self.num_envs), self._splits)
         for group, part in zip(self.groups, parts, strict=True):
             group.assist_root(part)
 

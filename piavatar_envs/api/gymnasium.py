@@ -107,6 +107,8 @@ class AvatarEnv(gym.Env):
     def assist_root(self, share: float) -> None:
         """Help the pelvis from now on, by a share in [0, 1]; for ``control="pd"`` and ``"torque"``.
 
+        Resets leave it.
+
         Raises:
             ValueError: it is out of range, or the pose is driven.
         """

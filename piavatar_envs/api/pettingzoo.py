@@ -184,6 +184,16 @@ class AvatarParallelEnv(ParallelEnv):
         """Free the renderer's window."""
         self._episode.close()
 
+    def assist_root(self, share: float) -> None:
+        """Help the pelvis of every avatar from now on, by a share in [0, 1]; for ``control="pd"`` and ``"torque"``.
+
+        Resets leave it.
+
+        Raises:
+            ValueError: it is out of range, or the pose is driven.
+        """
+        self.batch.assist_root(share)
+
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on; :meth:`set_state` restores it, bit for bit."""
         return self.batch.get_state()

@@ -15,8 +15,8 @@ from typing import Any
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.api.episode import Settings
 from piavatar_envs.api.same_step import means, step_and_reset
+from piavatar_envs.api.view import BatchedView
 from piavatar_envs.envs.config import ConfigError, load_config
-from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task
 
 try:
@@ -27,7 +27,7 @@ except ImportError as error:
     raise ImportError("this view needs rsl_rl; install it with: pip install 'piavatar-envs[rsl]'") from error
 
 
-class AvatarRslEnv(VecEnv):
+class AvatarRslEnv(BatchedView, VecEnv):
     """One avatar in each environment, for rsl_rl's runners.
 
     There is an episode from the start: runners never reset. An environment that ends is reset in the same step; what
@@ -99,11 +99,6 @@ class AvatarRslEnv(VecEnv):
     def unwrapped(self) -> AvatarRslEnv:
         """Itself."""
         return self
-
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """Name, slice, unit and frame of everything in the flat observation."""
-        return self.episodes.layout
 
     @property
     def step_dt(self) -> float:

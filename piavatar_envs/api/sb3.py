@@ -119,6 +119,16 @@ class SB3VecEnv(VecEnv):
                 }
         return observation, reward.astype(np.float32), ended, rows
 
+    def assist_root(self, share: float | np.ndarray) -> None:
+        """Help the pelvis from now on: one share in [0, 1], or one an environment; ``control="pd"`` or ``"torque"``.
+
+        Resets leave it.
+
+        Raises:
+            ValueError: it is out of range, of another shape, or the pose is driven.
+        """
+        self.vector.assist_root(share)
+
     def close(self) -> None:
         """Free what the environments hold."""
         self.vector.close()

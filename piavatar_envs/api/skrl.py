@@ -24,13 +24,13 @@ from piavatar_envs.api.arrays import Array
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.api.episode import Settings
 from piavatar_envs.api.same_step import Transition, means, step_and_reset
+from piavatar_envs.api.view import BatchedView
 from piavatar_envs.envs.config import load_config
-from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
 
-class AvatarSkrlEnv:
+class AvatarSkrlEnv(BatchedView):
     """One avatar in each environment, as skrl's wrapper ``"isaaclab-single-agent"`` wants it.
 
     An environment that ends is reset in the same step: the observation returned is the first of its next episode, and
@@ -81,11 +81,6 @@ class AvatarSkrlEnv:
     def unwrapped(self) -> AvatarSkrlEnv:
         """Itself."""
         return self
-
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """Name, slice, unit and frame of everything in the flat observation."""
-        return self.episodes.layout
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin an episode in every environment.
@@ -138,7 +133,7 @@ class AvatarSkrlEnv:
         self.episodes.close()
 
 
-class AvatarSkrlMultiEnv:
+class AvatarSkrlMultiEnv(BatchedView):
     """Several avatars in each environment, dictionaries by agent, as skrl's ``"isaaclab-multi-agent"`` wants them.
 
     All agents are always there, because the batch is: an agent that is out keeps its rows while the others of its world
@@ -210,11 +205,6 @@ class AvatarSkrlMultiEnv:
     def num_agents(self) -> int:
         """Number of agents."""
         return len(self.possible_agents)
-
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """Name, slice, unit and frame of everything in an agent's flat observation."""
-        return self.episodes.layout
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin an episode in every world.

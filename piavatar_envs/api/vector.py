@@ -15,12 +15,12 @@ from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.api.episode import RENDER_MODES, Settings, check_render_mode
 from piavatar_envs.api.infos import outcome, standing, vector_format
 from piavatar_envs.api.picture import Pictures
+from piavatar_envs.api.view import BatchedView
 from piavatar_envs.envs.config import load_config
-from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task
 
 
-class AvatarVectorEnv(VectorEnv):
+class AvatarVectorEnv(BatchedView, VectorEnv):
     """Many worlds of one soft avatar and a task, stepped at once.
 
     Environment ``i`` is the single environment of seed ``seed + i``, bit for bit. Its ``info`` is the single
@@ -94,11 +94,6 @@ class AvatarVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._pictures = Pictures(self.episodes.group_of, self.config.render)
-
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """Name, slice, unit and frame of everything in the flat observation of an environment."""
-        return self.episodes.layout
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -244,14 +239,6 @@ class AvatarVectorEnv(VectorEnv):
         """Free the renderer's windows and end the threads."""
         self._pictures.close()
         self.episodes.close()
-
-    def assist_root(self, share: float | np.ndarray) -> None:
-        """Help the pelvis from now on: one share in [0, 1], or one an environment; ``control="pd"`` or ``"torque"``.
-
-        Raises:
-            ValueError: it is out of range, of another shape, or the pose is driven.
-        """
-        self.episodes.assist_root(share)
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on; :meth:`set_state` restores it, bit for bit.

@@ -218,3 +218,15 @@ class JointDrive:
         n, share = self.drive.model.num_envs, 1.0 / self.drive.model.control_dt
         d = self.drive.state
         program.launch(note_support, n, [share, self.body.impulse, state.failure], [d.wrench_force, d.wrench_torque])
+
+
+def checked_assist(share: float | np.ndarray, num_envs: int) -> np.ndarray:
+    """Help for the pelvis in every environment, ``(num_envs,)`` float32, from one share or as many.
+
+    Raises:
+        ValueError: it is out of range, or of another shape.
+    """
+    shares = np.asarray(share, np.float32)
+    if shares.shape not in ((), (num_envs,)) or not ((shares >= 0.0) & (shares <= 1.0)).all():
+        raise ValueError(f"root_assist={share} must be in [0, 1], one number or {num_envs}")
+    return np.broadcast_to(shares, num_envs).copy()

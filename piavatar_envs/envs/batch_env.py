@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.drive import AvatarDrive
+from piavatar_envs.avatar.joint_drive import checked_assist
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.envs.actions import apply_actions, refuse_nonfinite
 from piavatar_envs.envs.episodes import begin_episode, count_episodes, end_agent, end_step, find_ended, retire
@@ -147,6 +148,7 @@ class BatchEnv:
 
     def _record_observation(self, program: Program) -> None:
         """Append what writes the observation; it changes nothing else."""
+        self.observer.record_settings(program)
         for agent in range(self.num_agents):
             self.observer.record(program, agent, self.observation)
             if self.task.terms():
@@ -234,11 +236,9 @@ class BatchEnv:
         """
         if self.control == "pose":
             raise ValueError('control="pose" has a root wrench; root_assist is for "pd" and "torque"')
-        values = np.asarray(share, np.float32)
-        if values.shape not in ((), (self.num_envs,)) or not ((values >= 0.0) & (values <= 1.0)).all():
-            raise ValueError(f"root_assist={share} must be in [0, 1], one number or {self.num_envs}")
+        shares = checked_assist(share, self.num_envs)
         for avatar in self.simulation.avatars:
-            avatar.joints.assist.assign(np.broadcast_to(values, (self.num_envs,)).copy())
+            avatar.joints.assist.assign(shares)
 
     def step(self) -> None:
         """Advance every environment by one control step under :attr:`action`."""

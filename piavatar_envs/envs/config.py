@@ -69,7 +69,9 @@ class EnvConfig(BaseModel):
         None, description="joints that act, the others do what they would do anyway; null for all 21"
     )
     observe_parameters: bool = Field(
-        False, description="observe what the episode has drawn (randomize, random shapes, the task) and its clock"
+        False,
+        description="observe what the episode has drawn (randomize, random shapes, the task), under pd and torque "
+        "root_assist as it is now, and the episode's clock",
     )
     obs_mode: Literal["flat", "dict"] = Field(
         "flat", description="observations as one float32 vector (flat) or by name (dict)"

@@ -21,7 +21,7 @@ _NUM_PARTS = wp.constant(len(BODY_PARTS))
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that every episode draws from a range.
+    """A number that every episode draws from a range, or that may be set to anything in it.
 
     Attributes:
         name: by which it is told.

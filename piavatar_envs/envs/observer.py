@@ -126,6 +126,11 @@ class Observer:
         if self.parameters:
             self.parameters.record_reset(program, mask)
 
+    def record_settings(self, program: Program) -> None:
+        """Append, before anybody observes: look at what may have been changed since."""
+        if self.parameters:
+            self.parameters.record_settings(program)
+
     def record_parameters(self, program: Program, env: BatchEnv, agent: int) -> None:
         """Append: write what the episode has drawn for ``agent``. Changes nothing else."""
         if self.parameters:

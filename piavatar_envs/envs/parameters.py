@@ -2,7 +2,8 @@
 
 Parameters are written once a reset, normalised to [-1, 1] over the range they were drawn from. An agent sees the
 world's, its own avatar's, those of the others, counted on from itself, then the task's, and last the episode's clock,
-by which what has been drawn for later is known, too.
+by which what has been drawn for later is known, too. Under torques an avatar's own end with what may be changed at any
+time: the help for its pelvis, as it is now.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 #: Name of the term.
 PARAMETERS = "parameters"
+ASSIST = Parameter("root_assist", "-", 0.0, 1.0, "help for the pelvis from outside, as it is now")
 CLOCK = Parameter("clock", "-", 0.0, 1.0, "time since the reset over episode_seconds")
 
 
@@ -65,7 +67,9 @@ class Parameters:
         self.simulation = simulation
         world, own = simulation.randomization.parameters()
         shape = [parameter for parameter, _ in simulation.drawn_shape(0).values()]
-        self._world, self._own, self._task = (_ranging(group) for group in (world, (*own, *shape), task.drawn()))
+        settings = [ASSIST] if simulation.avatar.joints else []
+        own = *own, *shape, *settings
+        self._world, self._own, self._task = (_ranging(group) for group in (world, own, task.drawn()))
         others = [
             replace(parameter, name=f"other_{index}_{parameter.name}")
             for index in range(len(simulation.avatars) - 1)
@@ -73,7 +77,7 @@ class Parameters:
         ]
         seen = (*self._world, *self._own, *others, *self._task, CLOCK)
         self.term = ObservationTerm(
-            PARAMETERS, len(seen), "-", "-", f"what the episode has drawn: {_told(seen)}", parameters=seen
+            PARAMETERS, len(seen), "-", "-", f"{_meaning(settings)}: {_told(seen)}", parameters=seen
         )
         self.values: wp.array | None = None
 
@@ -83,15 +87,17 @@ class Parameters:
         random, device = simulation.randomization, simulation.device
         sources = [(parameter, Drawn(random.column(parameter.name))) for parameter in self._world]
         for index in range(count):
-            shape = {name: column for name, (_, column) in simulation.drawn_shape(index).items()}
+            known = {name: column for name, (_, column) in simulation.drawn_shape(index).items()}
+            if ASSIST in self._own:
+                known[ASSIST.name] = simulation.avatars[index].joints.assist
             for parameter in self._own:
-                known = parameter.name in shape
-                column = shape[parameter.name] if known else random.column(parameter.name, index)
-                sources.append((parameter, Drawn(column)))
+                column = known.get(parameter.name)
+                sources.append((parameter, Drawn(random.column(parameter.name, index) if column is None else column)))
         of_task = zip(env.task.drawn(), env.task.drawn_values(env), strict=True)
         sources += [(parameter, drawn) for parameter, drawn in of_task if parameter in self._task]
         self._sources = sources
         self.values = wp.zeros((env.num_envs, max(1, len(sources))), dtype=float, device=device)
+        self._everywhere = wp.full(env.num_envs, True, dtype=wp.bool, device=device)
         self._columns = [wp.array(self._columns_of(agent, count), dtype=int, device=device) for agent in range(count)]
 
     def _columns_of(self, agent: int, count: int) -> np.ndarray:
@@ -102,13 +108,24 @@ class Parameters:
 
     def record_reset(self, program: Program, mask: wp.array) -> None:
         """Append, when all has been drawn: normalise the parameters of the masked environments."""
-        for column, (parameter, drawn) in enumerate(self._sources):
-            program.launch(
-                normalize if drawn.values.dtype is wp.float32 else normalize_count,
-                len(mask),
-                [mask, drawn.values, drawn.scale, parameter.low, parameter.high, int(parameter.log), column],
-                [self.values],
-            )
+        for column, (parameter, _) in enumerate(self._sources):
+            if parameter != ASSIST:
+                self._record(program, mask, column)
+
+    def record_settings(self, program: Program) -> None:
+        """Append, before anybody observes: normalise what may have been changed in any environment."""
+        for column, (parameter, _) in enumerate(self._sources):
+            if parameter == ASSIST:
+                self._record(program, self._everywhere, column)
+
+    def _record(self, program: Program, mask: wp.array, column: int) -> None:
+        parameter, drawn = self._sources[column]
+        program.launch(
+            normalize if drawn.values.dtype is wp.float32 else normalize_count,
+            len(mask),
+            [mask, drawn.values, drawn.scale, parameter.low, parameter.high, int(parameter.log), column],
+            [self.values],
+        )
 
     def record_observe(self, program: Program, env: BatchEnv, agent: int) -> None:
         """Append: write the term for ``agent``. Changes nothing else."""
@@ -130,6 +147,11 @@ class Parameters:
 def _ranging(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """Those that have a range: the others are not drawn."""
     return tuple(parameter for parameter in parameters if parameter.low < parameter.high)
+
+
+def _meaning(settings: Sequence[Parameter]) -> str:
+    """What the term is, in a few words."""
+    return "what the episode has drawn" + ", and the help for the pelvis" * bool(settings)
 
 
 def _told(parameters: Sequence[Parameter]) -> str:

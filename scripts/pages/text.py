@@ -157,7 +157,8 @@ def _parameters(facts: Facts) -> str:
     text = (
         "With `observe_parameters=True` the observation ends with the term `parameters`, all that the episode has "
         "drawn, each from its range to [-1, 1]: the factors of `randomize` and the parameters of random shapes"
-        f"{others}, then what the task draws, and last `clock`, the share of the episode that is over."
+        f"{others}, then what the task draws, and last `clock`, the share of the episode that is over. With "
+        '`control="pd"` or `"torque"` each avatar\'s own end with `root_assist`, as it is now.'
     )
     drawn = [p for p in facts.task.drawn() if p.low < p.high]
     rows = [

@@ -13,7 +13,7 @@ import warp as wp
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import ConfigError, load_config
 from piavatar_envs.envs.observations import Parameter
-from piavatar_envs.envs.parameters import PARAMETERS
+from piavatar_envs.envs.parameters import ASSIST, PARAMETERS
 from piavatar_envs.envs.randomize import OF_AVATAR, OF_WORLD, draw_factors
 from piavatar_envs.mpm.build import CFL_STABLE
 from piavatar_envs.tasks import load_task
@@ -376,6 +376,11 @@ def test_parameters_are_not_observed_unless_asked_for(make_batch, env_id):
     assert not any(term.parameters for term in batch.layout.values())
 
 
+def is_setting(parameter: Parameter) -> bool:
+    """Whether it is not drawn, but set for all episodes."""
+    return parameter.name.endswith(ASSIST.name)
+
+
 def check_term(batch, mask: np.ndarray) -> None:
     """What holds for every task: last in the layout, in range, differs between seeds, as the arrays say, constant."""
     term = batch.layout[PARAMETERS]
@@ -387,7 +392,7 @@ def check_term(batch, mask: np.ndarray) -> None:
     assert (np.abs(first) <= 1.0).all() and (first[..., -1] == -1.0).all() and term.parameters[-1].name == "clock"
     for agent in range(batch.num_agents):
         spread = np.ptp(first[:, agent, :-1], axis=0)
-        constant = [p.name for p, s in zip(term.parameters, spread, strict=False) if s == 0.0]
+        constant = {p.name for p, s in zip(term.parameters, spread, strict=False) if s == 0.0 and not is_setting(p)}
         assert not constant, f"{constant} do not differ between seeds"
     factors = factors_of(batch)
     for agent in range(batch.num_agents):
@@ -416,7 +421,8 @@ def check_term(batch, mask: np.ndarray) -> None:
     batch.reset(env_mask=mask)
     after = seen(batch)
     assert np.array_equal(after[~mask], now[~mask]) and (after[mask][..., -1] == -1.0).all()
-    assert (after[mask] != now[mask]).mean() > 0.9, "an environment that was reset must draw anew"
+    drawn = [not is_setting(p) for p in term.parameters]
+    assert (after[mask] != now[mask])[..., drawn].mean() > 0.9, "an environment that was reset must draw anew"
 
 
 def test_parameters_are_what_was_drawn(observed):
@@ -426,7 +432,41 @@ def test_parameters_are_what_was_drawn(observed):
 def test_without_ranges_only_the_task_and_the_clock_are_told(make_batch, env_id):
     batch = make_batch(env_id, 3, observe_parameters=True)
     drawn = [p.name for p in batch.task.drawn() if p.low < p.high]
-    assert [p.name for p in batch.layout[PARAMETERS].parameters] == [*drawn, "clock"]
+    settings = [] if batch.control == "pose" else [ASSIST.name]
+    assert [p.name for p in batch.layout[PARAMETERS].parameters] == [*settings, *drawn, "clock"]
+
+
+@pytest.mark.parametrize("control", ["pd", "torque"])
+def test_help_for_the_pelvis_is_told_as_it_is_now(make_batch, control):
+    """From the first observation after it has changed, in every environment its own, through resets and restoring."""
+    batch = make_batch(REACH, 3, observe_parameters=True, control=control, root_assist=0.25, **VARIED)
+    batch.assist_root(0.25)  # the batch may have been used before
+    batch.reset(seeds=[1, 2, 3])
+    name = ASSIST.name
+    assert by_name(batch)[name] == pytest.approx(0.25)
+    shares = np.array([0.0, 0.6, 1.0])
+    batch.assist_root(shares)
+    before = by_name(batch)
+    batch.step()
+    told = by_name(batch)
+    assert told[name] == pytest.approx(shares, abs=1e-6)
+    assert all(np.array_equal(told[other], before[other]) for other in told if other not in (name, "clock"))
+    state = batch.get_state()
+    batch.reset(env_mask=np.array([True, True, False]))
+    assert by_name(batch)[name] == pytest.approx(shares, abs=1e-6)
+    batch.assist_root(1.0)
+    batch.reset()
+    assert by_name(batch)[name] == pytest.approx(1.0)
+    batch.set_state(state)
+    assert by_name(batch)[name] == pytest.approx(shares, abs=1e-6)
+    assert name not in by_name_of_poses(make_batch)
+
+
+def by_name_of_poses(make_batch) -> dict[str, np.ndarray]:
+    """What is told where a wrench holds the root."""
+    batch = make_batch(REACH, 3, observe_parameters=True, **VARIED)
+    batch.reset(seeds=[1, 2, 3])
+    return by_name(batch)
 
 
 def test_masses_of_props_are_told(observed):
