@@ -19,6 +19,7 @@ from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.multi.blows import Scale, Tally, begin_bout, count_points, leads
 from piavatar_envs.multi.versus import (
+    FIGHT_FALL,
     RING_CENTRE,
     Referee,
     Stance,
@@ -31,6 +32,7 @@ from piavatar_envs.multi.versus import (
     record_others_in,
 )
 from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.leash import record_leash
 from piavatar_envs.tasks.rewards import mean_square_action
 
@@ -74,6 +76,7 @@ class BoxingConfig(EnvConfig):
     head_points: float = Field(1.0, ge=0.0, description="points of a full blow on the head [-]")
     torso_points: float = Field(0.4, ge=0.0, description="points of a full blow on the trunk [-]")
     taken_weight: float = Field(0.8, ge=0.0, description="cost of the points that others score on oneself [-]")
+    fall: FallConfig = Field(FIGHT_FALL, description="what counts as a knock-down under torques")
     win_reward: float = Field(5.0, ge=0.0, description="reward of the last one on the feet [-]")
     down_cost: float = Field(5.0, ge=0.0, description="what it costs to be knocked down [-]")
     control_cost: float = Field(0.01, ge=0.0, description="weight of the mean squared action [-]")
@@ -153,7 +156,8 @@ class BoxingTask(Task):
 root act. A blow is an impulse on the other's head or trunk, in one control step, that one's own arms have felt as well.
 It is worth nothing up to `blow_impulse` and `head_points` or `torso_points` from twice that on. A contact counts once,
 by its strongest step, and is over when the impulse has fallen below half of `blow_impulse`: leaning scores nothing
-more. Who is knocked down is out, and its body stays where it fell; the last one on the feet has won. A good agent
+more. Who is knocked down is out, and its body stays where it fell; the last one on the feet has won. Under torques, who
+kneels or can reach the ground with the hands is down. A good agent
 strikes fast, at the head, and withdraws."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "hit": "the points of this step's blows, at most `head_points + torso_points` for each other agent",
@@ -168,7 +172,7 @@ strikes fast, at the head, and withdraws."""
         "taken_impulse": "greatest impulse of another's arms on one's own head or trunk in this step [N s]",
     }
     success_doc = "all others are down, or the clock has run out and nobody else on the feet has as many points"
-    termination_doc = "all others are down"
+    termination_doc = f"all others are down;\n- {UNDER_TORQUES_DOC}"
     picture_seconds = 0.33
     picture_actions: ClassVar[Mapping[str, float]] = {
         "right_shoulder.y": 0.42, "right_shoulder.z": 0.85, "right_elbow.x": 0.65, "right_elbow.z": -0.58,
@@ -212,7 +216,7 @@ strikes fast, at the head, and withdraws."""
         tally.impulse, tally.peak = (wp.zeros(pairs, dtype=wp.vec2, device=env.device) for _ in range(2))
         tally.points = wp.zeros(pairs, dtype=float, device=env.device)
         tally.score = wp.zeros(pairs[:2], dtype=float, device=env.device)
-        self.scale, self.rules, self.tally, self.referee = scale, rules, tally, Referee(env)
+        self.scale, self.rules, self.tally, self.referee = scale, rules, tally, Referee(env, config.fall)
 
     def arrays(self) -> dict[str, wp.array]:
         return {"peak": self.tally.peak, "score": self.tally.score}

@@ -18,7 +18,9 @@ from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.multi.slap import Hands, SlapRule, draw_slap, judge, locate_hand, observe_draws, observe_hands
 from piavatar_envs.multi.together import record_fall_together, record_shift
+from piavatar_envs.multi.versus import Referee
 from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.ranges import check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 
@@ -49,6 +51,7 @@ class HighFiveConfig(EnvConfig):
     approach_weight: float = Field(0.2, ge=0.0, description="greatest reward of a step without a slap [-]")
     slap_bonus: float = Field(20.0, ge=0.0, description="reward of a slap that counts [-]")
     control_cost: float = Field(0.02, ge=0.0, description="weight of the mean squared action [-]")
+    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall under torques")
 
 
 class HighFiveTask(Task):
@@ -91,7 +94,10 @@ Holding the hands together is not enough: they must swing, at the same moment.""
         "`slap_impulse` is between the episode's `impulse` and `impulse_window` times that, while `distance` is at "
         "most `reach`, `hand_height` at least `least_height` and `hand_upright` at least `upright`"
     )
-    termination_doc = "both agents' ends with a success, with a blow above the upper bound, and when either falls"
+    termination_doc = (
+        "both agents' ends with a success, with a blow above the upper bound, and when either falls;\n- "
+        f"{UNDER_TORQUES_DOC}"
+    )
     picture_seconds = 0.3
     picture_actions: ClassVar[Mapping[str, float]] = {
         "right_shoulder.x": -0.68, "right_shoulder.y": -0.61, "right_shoulder.z": 0.65, "right_elbow.x": -0.33,
@@ -142,7 +148,7 @@ Holding the hands together is not enough: they must swing, at the same moment.""
         hands.middle, hands.direction, hands.velocity = (
             wp.zeros((n, 2), dtype=wp.vec3, device=device) for _ in range(3)
         )
-        self.rule, self.hands = rule, hands
+        self.rule, self.hands, self.referee = rule, hands, Referee(env, config.fall)
         self.side, self.least = wp.zeros(n, dtype=int, device=device), wp.zeros(n, dtype=float, device=device)
 
     def arrays(self) -> dict[str, wp.array]:
@@ -176,7 +182,8 @@ Holding the hands together is not enough: they must swing, at the same moment.""
             [self.rule, self.side, self.least, self.hands, env.simulation.sensors, env.action],
             [env.terms, env.metrics, env.success, env.terminated],
         )
-        record_fall_together(env, program)
+        self.referee.record(env, program)
+        record_fall_together(env, program, self.referee.out)
 
     def record_observe(self, env, program, agent: int, start: int) -> None:
         self._record_hands(env, program)

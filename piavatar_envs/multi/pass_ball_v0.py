@@ -21,6 +21,7 @@ from piavatar_envs.multi.passing import PassRule, Play, Serve, judge, keep_near,
 from piavatar_envs.multi.together import record_fall_together, record_shift
 from piavatar_envs.multi.versus import Referee, on_circle
 from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.goal import BALL, ball_config
 from piavatar_envs.tasks.kick_ball import observe_feet
 from piavatar_envs.tasks.leash import record_leash
@@ -53,6 +54,7 @@ class PassBallConfig(EnvConfig):
     progress_weight: float = Field(1.0, ge=0.0, description="reward for a metre of the ball's way to its goal [1/m]")
     pass_bonus: float = Field(2.0, ge=0.0, description="reward of a completed pass [-]")
     control_cost: float = Field(0.01, ge=0.0, description="weight of the mean squared action [-]")
+    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall under torques")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
     place_noise: float = Field(0.05, ge=0.0, le=0.3, description="greatest displacement of each along x and y [m]")
 
@@ -90,7 +92,8 @@ from its place, so that the ball must be sent, not carried. All are paid alike, 
     success_doc = "there have been `goal_passes` passes"
     termination_doc = (
         "all agents' ends when the ball is slower than `dead_speed` and farther than `reach + roam` from everybody, "
-        "when it is 0.5 m outside the circle, and when one of them falls"
+        "when it is 0.5 m outside the circle, and when one of them falls;\n- "
+        f"{UNDER_TORQUES_DOC}"
     )
     picture_seconds = 0.4
     picture_actions = "zero"
@@ -153,7 +156,7 @@ from its place, so that the ball must be sent, not carried. All are paid alike, 
             setattr(play, name, wp.zeros(n, dtype=int, device=device))
         play.gap = wp.zeros(n, dtype=float, device=device)
         play.contact, play.touches = (wp.zeros((n, env.num_agents), dtype=int, device=device) for _ in range(2))
-        self.serve, self.rule, self.play, self.referee = serve, rule, play, Referee(env)
+        self.serve, self.rule, self.play, self.referee = serve, rule, play, Referee(env, self.config.fall)
         places = [(*avatar.position, 0.0) for avatar in self.scene.avatars]
         self.places = wp.array(places, dtype=wp.vec3, device=device)
         self.reference_root = [wp.zeros(n, dtype=wp.vec3, device=device) for _ in places]
@@ -193,7 +196,7 @@ from its place, so that the ball must be sent, not carried. All are paid alike, 
             ],
             [self.play, env.terms, env.metrics, env.success, env.terminated],
         )  # fmt: skip
-        record_fall_together(env, program)
+        record_fall_together(env, program, self.referee.out)
 
     def record_observe(self, env, program, agent: int, start: int) -> None:
         self.referee.record(env, program)

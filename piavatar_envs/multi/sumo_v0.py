@@ -19,6 +19,7 @@ from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.multi.versus import (
+    FIGHT_FALL,
     NUM_PARTS,
     RING_CENTRE,
     Referee,
@@ -34,6 +35,7 @@ from piavatar_envs.multi.versus import (
     record_others_in,
 )
 from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.leash import record_leash
 from piavatar_envs.tasks.rewards import mean_square_action
 
@@ -66,6 +68,7 @@ class SumoConfig(EnvConfig):
     root_speed: float = Field(1.5, gt=0.0, le=5.0, description="speed of the root at action 1 [m/s]")
     leash: float = Field(0.12, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body [m]")
     leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning [rad]")
+    fall: FallConfig = Field(FIGHT_FALL, description="what counts as being pushed over under torques")
     win_reward: float = Field(10.0, ge=0.0, description="reward of the last one standing [-]")
     out_cost: float = Field(10.0, ge=0.0, description="what it costs to be out [-]")
     push_weight: float = Field(0.02, ge=0.0, description="weight of being nearer to the centre than the others [-]")
@@ -161,8 +164,9 @@ class SumoTask(Task):
     summary = """`num_agents` avatars crouch `start_distance` apart around the centre of a ring of `ring_radius`, facing
 it, each displaced by up to `place_noise`. The trunk, the arms and the root act: a root that walks into another body
 pushes it, the harder the farther the command is ahead of the body, up to `leash`. Who has the pelvis beyond the ring,
-or has been pushed over, is out, and its body stays where it fell. The last one in has won; when the clock runs out it
-is a draw. A good agent keeps to the centre, gets the others off it and does not lose its balance."""
+or has been pushed over, is out, and its body stays where it fell. Under torques, who kneels or can reach the ground
+with the hands has been pushed over. The last one in has won; when the clock runs out it is a draw. A good agent keeps
+to the centre, gets the others off it and does not lose its balance."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "win": "`win_reward` for the last one in, once",
         "out": "`-out_cost` when one is out, once; also for all who go out in the same step",
@@ -176,7 +180,7 @@ is a draw. A good agent keeps to the centre, gets the others off it and does not
         "standing": "number of agents that are still in [-]",
     }
     success_doc = "all others are out"
-    termination_doc = "the pelvis is beyond `ring_radius`, or all others are out"
+    termination_doc = f"the pelvis is beyond `ring_radius`, or all others are out;\n- {UNDER_TORQUES_DOC}"
     picture_seconds = 0.6
     picture_actions: ClassVar[Mapping[str, float]] = {"root.y": -1.0}
     picture_settings: ClassVar[Mapping[str, Any]] = {"place_noise": 0.0}
@@ -212,7 +216,7 @@ is a draw. A good agent keeps to the centre, gets the others off it and does not
         config, ring = self.config, Ring()
         ring.radius, ring.win_reward, ring.out_cost = config.ring_radius, config.win_reward, config.out_cost
         ring.push_weight, ring.control_cost = config.push_weight, config.control_cost
-        self.ring, self.referee = ring, Referee(env, config.ring_radius)
+        self.ring, self.referee = ring, Referee(env, config.fall, config.ring_radius)
 
     def record_reset(self, env, program) -> None:
         self.stance.record(env, program, self.config.pose_noise, self.config.place_noise)

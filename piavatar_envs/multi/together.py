@@ -23,10 +23,9 @@ def record_shift(env: BatchEnv, program: Program, noise: float) -> None:
         )
 
 
-def record_fall_together(env: BatchEnv, program: Program) -> None:
-    """Append, after the physics: where one agent's root has let go, the episode is over for all."""
-    for avatar in env.simulation.avatars:
-        program.launch(fall_together, env.num_envs, [avatar.state.let_go], [env.terminated])
+def record_fall_together(env: BatchEnv, program: Program, out: wp.array) -> None:
+    """Append, after the judging: where one is ``out``, ``(num_envs, num_agents)``, the episode is over for all."""
+    program.launch(fall_together, env.num_envs, [out], [env.terminated])
 
 
 @wp.kernel
@@ -49,12 +48,14 @@ def shift_root(
 
 @wp.kernel
 def fall_together(
-    let_go: wp.array(dtype=int),
-    # out
+    out: wp.array2d(dtype=wp.bool),
+    # in and out
     terminated: wp.array2d(dtype=wp.bool),
 ):
-    """Terminate all agents of an environment in which one's root has let go."""
+    """Terminate all agents of an environment in which one is out."""
     e = wp.tid()
-    if let_go[e] != 0:
-        for agent in range(terminated.shape[1]):
-            terminated[e, agent] = True
+    fallen = bool(False)
+    for agent in range(out.shape[1]):
+        fallen = fallen or out[e, agent]
+    for agent in range(out.shape[1]):
+        terminated[e, agent] = terminated[e, agent] or fallen

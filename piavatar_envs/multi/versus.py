@@ -17,6 +17,7 @@ from piavatar_envs.envs.config import AvatarConfig, ConfigError, SceneConfig, re
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.mpm.types import Sensors, row
 from piavatar_envs.multi.together import record_shift
+from piavatar_envs.tasks.fall import FallConfig, heights_of, is_down, least_heights
 from piavatar_envs.tasks.spawn import record_standing
 
 if TYPE_CHECKING:
@@ -108,23 +109,29 @@ class Stance:
             )
 
 
+#: Who ducks is not down: so low is a head only when the hands can reach the ground.
+FIGHT_FALL = FallConfig(fall_head=0.5)
+
+
 class Referee:
     """Sees where everybody is, and who is out.
 
     Attributes:
         pelvis: tracked pelvis joints [m], ``(num_envs, num_agents)``.
-        out: whether the root has let go, or the pelvis is too far from the origin, ``(num_envs, num_agents)``.
+        out: whether the root has let go, somebody has fallen, or the pelvis is too far from the origin, ``(num_envs,
+            num_agents)``.
     """
 
-    def __init__(self, env: BatchEnv, radius: float = math.inf) -> None:
+    def __init__(self, env: BatchEnv, fall: FallConfig, radius: float = math.inf) -> None:
         """Allocate.
 
         Args:
             env: the batch.
+            fall: what counts as a fall under torques.
             radius: horizontal distance from the origin beyond which a pelvis is out [m].
         """
         agents = env.num_envs, env.num_agents
-        self.radius = radius
+        self.radius, self.least = radius, least_heights(env.config, fall)
         self.pelvis = wp.zeros(agents, dtype=wp.vec3, device=env.device)
         self.out = wp.zeros(agents, dtype=wp.bool, device=env.device)
 
@@ -134,7 +141,7 @@ class Referee:
             program.launch(
                 look,
                 env.num_envs,
-                [agent, self.radius, avatar.tracked.position, avatar.state.let_go],
+                [agent, self.radius, self.least, avatar.body, avatar.tracked.position, avatar.state.let_go],
                 [self.pelvis, self.out],
             )
 
@@ -203,16 +210,19 @@ def from_centre(at: wp.vec3):
 def look(
     agent: int,
     radius: float,
+    least: wp.vec2,
+    body: Body,
     position: wp.array2d(dtype=wp.vec3),
     let_go: wp.array(dtype=int),
     # out
     pelvis: wp.array2d(dtype=wp.vec3),
     out: wp.array2d(dtype=wp.bool),
 ):
-    """Where an agent is, and whether it is down or beyond ``radius`` [m]."""
+    """Where an agent is, and whether it is down (lower than ``least``) or beyond ``radius`` [m]."""
     e = wp.tid()
     pelvis[e, agent] = position[e, 0]
-    out[e, agent] = let_go[e] != 0 or from_centre(position[e, 0]) > radius
+    down = let_go[e] != 0 or is_down(heights_of(body, e, position), least)
+    out[e, agent] = down or from_centre(position[e, 0]) > radius
 
 
 @wp.func

@@ -13,6 +13,7 @@ _NOT_TASKS = {
     "base",
     "clip",
     "disturb",
+    "fall",
     "gate",
     "goal",
     "ground",

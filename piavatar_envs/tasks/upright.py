@@ -1,7 +1,4 @@
-"""Standing upright by one's own strength: what is seen of it, what it is worth, and what counts as a fall.
-
-Heights are shares of those in the rest pose of the body at hand, so that they mean the same for small and tall ones.
-"""
+"""Standing upright by one's own strength: what is seen of it, and what it is worth."""
 
 from __future__ import annotations
 
@@ -9,14 +6,14 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import warp as wp
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.config import FROZEN
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
-from piavatar_envs.mpm.types import Sensors, row
+from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.tasks.fall import FallConfig, fall_doc, heights_of, is_down
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 
 if TYPE_CHECKING:
@@ -25,7 +22,7 @@ if TYPE_CHECKING:
 
 wp.set_module_options({"enable_backward": False})
 
-_HEAD, _CHEST = wp.constant(joint_index("head")), wp.constant(joint_index("spine3"))
+_CHEST = wp.constant(joint_index("spine3"))
 _LEFT, _RIGHT = wp.constant(joint_index("left_ankle")), wp.constant(joint_index("right_ankle"))
 
 UPRIGHT_TERMS = (
@@ -58,20 +55,13 @@ METRIC_DOCS: Mapping[str, str] = {
     "speed": "speed of the pelvis [m/s]",
 }
 STANDING_DOC = "the head is no lower than `upright.stand_head` of its height in the rest pose"
-FALL_DOC = (
-    "the avatar falls: its head is lower than `upright.fall_head`, or its pelvis lower than `upright.fall_pelvis`, of "
-    "its height in the rest pose (of the mean body 1.46 and 0.91 m)"
-)
+FALL_DOC = f"the avatar falls: {fall_doc('upright')}"
 
 
-class UprightConfig(BaseModel):
+class UprightConfig(FallConfig):
     """What counts as standing, and as a fall; where rewards end."""
 
-    model_config = FROZEN
-
-    stand_head: float = Field(0.85, gt=0.0, le=1.0, description="head height that counts as standing, a share [-]")
-    fall_head: float = Field(0.7, ge=0.0, lt=1.0, description="head height below which it has fallen, likewise [-]")
-    fall_pelvis: float = Field(0.6, ge=0.0, lt=1.0, description="pelvis height below which it has, likewise [-]")
+    stand_head: float = Field(0.85, gt=0.0, le=1.0, description="head height that counts as standing, likewise [-]")
     height_margin: float = Field(0.25, gt=0.0, description="missing height at which the reward is 0.1, likewise [-]")
     tilt_margin: float = Field(0.6, gt=0.0, description="tilt at which it is, likewise [rad]")
     speed_margin: float = Field(1.0, gt=0.0, description="speed at which it is, likewise [m/s]")
@@ -117,10 +107,10 @@ def posture_of(
     rule: Upright, body: Body, e: int, rotation: wp.array2d(dtype=wp.quat), position: wp.array2d(dtype=wp.vec3)
 ):
     """Heights and tilt of a body, and what they are worth."""
-    r = row(e, body.rest_joint.shape[0])
     now = Posture()
-    now.head = position[e, _HEAD][2] / body.rest_joint[r, _HEAD][2]
-    now.pelvis = position[e, 0][2] / body.rest_joint[r, 0][2]
+    heights = heights_of(body, e, position)
+    now.head = heights[0]
+    now.pelvis = heights[1]
     up = wp.quat_rotate(rotation[e, _CHEST], wp.vec3(0.0, 0.0, 1.0))
     now.tilt = wp.acos(wp.clamp(up[2], -1.0, 1.0))
     now.high = tolerance(1.0 - now.head, 0.05, rule.height_margin)
@@ -131,7 +121,7 @@ def posture_of(
 @wp.func
 def has_fallen(rule: Upright, now: Posture):
     """Whether head or pelvis are too low."""
-    return now.head < rule.fall_head or now.pelvis < rule.fall_pelvis
+    return is_down(wp.vec2(now.head, now.pelvis), wp.vec2(rule.fall_head, rule.fall_pelvis))
 
 
 @wp.func
