@@ -9,16 +9,24 @@ import numpy as np
 
 from piavatar_envs.mpm.boundaries import Collider
 
+#: More room for bodies that nothing holds up: as far as one reaches when it falls [m].
+FALL = 1.2
+
 
 @dataclass(frozen=True)
 class Domain:
     """Box in which particles may move [m]; leaving it is a failure.
 
     The default holds a body with outstretched limbs wherever its root may be before it lets go.
+
+    Attributes:
+        lower, upper: corners [m].
+        fenced: whether the walls belong to the world, such as ropes around a ring: where there are any, they stay.
     """
 
     lower: tuple[float, float, float] = (-1.6, -1.6, -0.3)
     upper: tuple[float, float, float] = (1.6, 1.6, 2.6)
+    fenced: bool = False
 
     def around(self, places: Sequence[Sequence[float]]) -> Domain:
         """The box moved to every one of ``places`` (x, y) [m], and what holds them all."""
@@ -31,9 +39,11 @@ class Domain:
         every = np.array([self.lower, self.upper, *points])
         return Domain(tuple(every.min(0).tolist()), tuple(every.max(0).tolist()))
 
-    def wider(self, room: float) -> Domain:
-        """The box with ``room`` [m] more on every side."""
-        aside = np.array([room, room, 0.0])
+    def for_falls(self, walled: bool) -> Domain:
+        """The box for bodies that nothing holds up; ``walled`` says whether walls stand around it."""
+        if walled and self.fenced:
+            return self
+        aside = np.array([FALL, FALL, 0.0])
         return Domain(tuple((np.array(self.lower) - aside).tolist()), tuple((np.array(self.upper) + aside).tolist()))
 
     def walls(self) -> tuple[Collider, ...]:

@@ -22,7 +22,7 @@ from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.props import PropSet
 from piavatar_envs.envs.randomize import Randomization, fastest_wave
 from piavatar_envs.envs.subjects import assemble, prop_matter, prop_points
-from piavatar_envs.mpm.boundaries import make_boundaries, place_colliders
+from piavatar_envs.mpm.boundaries import Collider, make_boundaries, place_colliders
 from piavatar_envs.mpm.build import build_model, choose_num_substeps, make_grid
 from piavatar_envs.mpm.impulses import clear_masked_sensors
 from piavatar_envs.mpm.memory import allocate, estimate_slots
@@ -35,8 +35,6 @@ GRID_PER_HEIGHT: dict[str, float] = {
     "medium": 64.0,
     "fine": 166.0,
 }
-#: More room for bodies that nothing holds up: as far as one reaches when it falls [m].
-FALL = 1.2
 
 
 class Simulation:
@@ -92,8 +90,8 @@ class Simulation:
         own_rows = bool(solids) or any(flesh.shape.randomize for flesh in self.flesh)
         rows = num_envs if own_rows else 1
         joints = [flesh.joint_settings() for flesh in self.flesh]
-        domain = (domain or Domain().around([a.position for a in avatars])).wider(FALL if any(joints) else 0.0)
-        walls = domain.walls() if (solids or len(avatars) > 1) and self.scene.walls else ()
+        domain = domain or Domain().around([a.position for a in avatars])
+        domain, walls = self._room(domain, bool(solids), any(joints))
         self.subjects = assemble(self.scene, physics, names, self.flesh, matter, walls, rows)
         rest = np.concatenate([*(flesh.points.rest[0] for flesh in self.flesh), *(points.rest for points in solids)])
         wave = fastest_wave(config.randomize, [flesh.matter() for flesh in self.flesh])
@@ -132,6 +130,12 @@ class Simulation:
     def avatar(self) -> AvatarDrive:
         """The first avatar's drive."""
         return self.avatars[0]
+
+    def _room(self, domain: Domain, solid: bool, driven: bool) -> tuple[Domain, tuple[Collider, ...]]:
+        """The domain, wider where joints are driven by torques, and the walls around it; ``solid``: there are props."""
+        walled = self.scene.walls and (solid or len(self.flesh) > 1)
+        domain = domain.for_falls(walled) if driven else domain
+        return domain, domain.walls() if walled else ()
 
     def _substeps(self, wave: float) -> int | None:
         """Substeps of a control step as configured; under torques as few as they and such a wave [m/s] allow.

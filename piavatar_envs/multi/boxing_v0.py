@@ -205,7 +205,7 @@ strikes fast, at the head, and withdraws."""
     def domain(self) -> Domain:
         """The ring; the walls of the domain are the ropes."""
         side, box = 0.5 * self.config.ring_size, Domain()
-        return Domain((-side, -side, box.lower[2]), (side, side, box.upper[2]))
+        return Domain((-side, -side, box.lower[2]), (side, side, box.upper[2]), fenced=True)
 
     def allocate(self, env) -> None:
         config, scale, rules, tally = self.config, Scale(), Rules(), Tally()

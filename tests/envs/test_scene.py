@@ -8,7 +8,7 @@ import pytest
 from piavatar_envs.avatar.limbs import LIMB_GROUPS
 from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES
 from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
-from piavatar_envs.envs.domain import Domain
+from piavatar_envs.envs.domain import FALL, Domain
 from piavatar_envs.envs.simulation import Simulation
 from piavatar_envs.mpm.materials import MATERIALS
 
@@ -34,6 +34,13 @@ def test_as_many_avatars_as_the_scene_says(device, count):
         assert (field[first[index] : first[index + 1]] == index).all()
     upper = np.asarray(simulation.model.grid.origin) + simulation.dx * (np.asarray(simulation.model.grid.nodes) - 2)
     assert upper[0] >= Domain().upper[0] + 0.8 * (count - 1) - 1e-3
+
+
+@pytest.mark.parametrize(("fenced", "walled", "stays"), [(1, 1, True), (1, 0, False), (0, 1, False), (0, 0, False)])
+def test_only_ropes_that_stand_there_take_the_room_to_fall(fenced, walled, stays):
+    domain = Domain(fenced=bool(fenced))
+    room = np.array(domain.for_falls(bool(walled)).upper) - domain.upper
+    assert room == pytest.approx([0.0] * 3 if stays else [FALL, FALL, 0.0])
 
 
 def test_avatars_have_settings_of_their_own(device):

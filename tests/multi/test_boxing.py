@@ -242,6 +242,22 @@ def test_the_ropes_hold(make_world, play):
     assert 1.1 - dx < np.abs(x[:, 1]).max() < 1.1 + 0.5 * dx
 
 
+@pytest.mark.parametrize("control", ["pd", "torque"])
+def test_the_ropes_hold_who_is_thrown_into_them(make_world, play, control):
+    """Also where nothing holds a body up, which needs more room to fall where there are no ropes."""
+    world = make_world(BOXING, ring_size=2.2, control=control, **{"fall.fall_head": 0.0, "fall.fall_pelvis": 0.0})
+    world.reset(seed=0)
+    state, body = world.get_state(), world.batch.simulation.avatars[0].body
+    state["particles.u"][0, body.first : body.first + body.count] = [0.0, 3.0, 0.0]  # away from the middle
+    world.set_state(state)
+    dx, farthest = world.batch.simulation.dx, []
+    for _ in range(45):
+        [(*_, infos)] = play(world, 1)
+        assert infos["agent_0"]["failure"] is None
+        farthest.append(np.abs(world.batch.simulation.state.x.numpy()[0, :, :2]).max())
+    assert 1.1 - dx < max(farthest) < 1.1 + 0.5 * dx
+
+
 def test_impossible_rings_are_refused(make_world):
     with pytest.raises(ValueError, match=r"num_agents=8 .* need a ring of .* use ring_size >= 3.5"):
         make_world(BOXING, num_agents=8)
