@@ -7,6 +7,7 @@ already, while some (the height of a root that is held up) hardly vary, and divi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import gymnasium as gym
 import torch
@@ -18,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.rollouts import PlayedBuffer
 from piavatar_envs.envs.config import FROZEN
 
-#: Seeds of training episodes that belong to a run's seed.
+#: Seeds of training episodes that belong to a run's seed, at least.
 EPISODE_SEEDS = 1000
 
 
@@ -51,6 +52,21 @@ class SelectTerms(BaseFeaturesExtractor):
         return observations[:, self.components]
 
 
+def networks(hidden: Sequence[int], components: Sequence[int]) -> dict[str, Any]:
+    """What the networks of a policy of stable-baselines3 see, and how wide their hidden layers are."""
+    return {
+        "net_arch": list(hidden),
+        "features_extractor_class": SelectTerms,
+        "features_extractor_kwargs": {"components": list(components)},
+    }
+
+
+def seed_episodes(venv: VecEnv, seed: int) -> None:
+    """Give a run's environments their episodes: no two runs of as many environments share any."""
+    # environment i plays the episodes of this seed plus i
+    venv.seed(max(EPISODE_SEEDS, venv.num_envs) * seed)
+
+
 def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: int) -> PPO:
     """An untrained agent on the CPU.
 
@@ -73,14 +89,12 @@ def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: 
         rollout_buffer_class=PlayedBuffer,
         ent_coef=settings.entropy_weight,
         policy_kwargs={
-            "net_arch": list(settings.hidden),
+            **networks(settings.hidden, components),
             "activation_fn": torch.nn.Tanh,
             "log_std_init": settings.log_std,
-            "features_extractor_class": SelectTerms,
-            "features_extractor_kwargs": {"components": list(components)},
         },
         seed=seed,
         device="cpu",
     )
-    venv.seed(EPISODE_SEEDS * seed)  # worker i plays the episodes of this seed plus i: no two runs share any
+    seed_episodes(venv, seed)
     return model

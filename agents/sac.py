@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.ppo import EPISODE_SEEDS, SelectTerms
+from agents.ppo import networks, seed_episodes
 from piavatar_envs.envs.config import FROZEN
 
 
@@ -55,13 +55,9 @@ def build(settings: SACSettings, venv: VecEnv, components: Sequence[int], seed: 
         learning_rate=settings.learning_rate,
         gamma=settings.discount,
         tau=settings.averaging,
-        policy_kwargs={
-            "net_arch": list(settings.hidden),
-            "features_extractor_class": SelectTerms,
-            "features_extractor_kwargs": {"components": list(components)},
-        },
+        policy_kwargs=networks(settings.hidden, components),
         seed=seed,
         device="cpu",
     )
-    venv.seed(EPISODE_SEEDS * seed)  # worker i plays the episodes of this seed plus i: no two runs share any
+    seed_episodes(venv, seed)
     return model
