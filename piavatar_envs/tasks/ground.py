@@ -11,6 +11,7 @@ from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.types import row
+from piavatar_envs.tasks.spawn import record_standing
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
@@ -30,6 +31,11 @@ class Grounding:
         self._rotation = wp.zeros(bones, dtype=wp.quat, device=device)
         self._position, self._still = (wp.zeros(bones, dtype=wp.vec3, device=device) for _ in range(2))
         self._lowest = wp.zeros((n, 2), dtype=float, device=device)
+
+    def record_standing(self, env: BatchEnv, program: Program, noise: float) -> None:
+        """Append: bodies of the masked environments stand on the ground, joints turned by up to ``noise`` [rad]."""
+        record_standing(env, program, noise)
+        self.record_reset(env, program)
 
     def record_reset(self, env: BatchEnv, program: Program) -> None:
         """Append, when the masked environments' first poses are commanded: put them on the ground.

@@ -16,7 +16,6 @@ from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.ground import Grounding
 from piavatar_envs.tasks.pushes import Pushes
 from piavatar_envs.tasks.ranges import check_ranges
-from piavatar_envs.tasks.spawn import record_standing
 from piavatar_envs.tasks.throws import make_throws, throwing_domain, waiting_places
 from piavatar_envs.tasks.upright import (
     FALL_DOC,
@@ -134,8 +133,7 @@ greatest impulse of the episode so far: of all episodes, the share that lasts ma
         return self.pushes.arrays()
 
     def record_reset(self, env, program) -> None:
-        record_standing(env, program, self.config.pose_noise)
-        self.grounding.record_reset(env, program)
+        self.grounding.record_standing(env, program, self.config.pose_noise)
         self.pushes.record_reset(env, program)
 
     def record_references(self, env, program) -> list:

@@ -10,7 +10,6 @@ from pydantic import Field
 from piavatar_envs.envs.config import DriveConfig, EnvConfig
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.ground import Grounding
-from piavatar_envs.tasks.spawn import record_standing
 from piavatar_envs.tasks.upright import (
     FALL_DOC,
     METRIC_DOCS,
@@ -66,8 +65,7 @@ the heels, and hips must give way, before the body's weight has left the soles. 
         self.grounding = Grounding(env)
 
     def record_reset(self, env, program) -> None:
-        record_standing(env, program, self.config.pose_noise)
-        self.grounding.record_reset(env, program)
+        self.grounding.record_standing(env, program, self.config.pose_noise)
 
     def record_outcome(self, env, program) -> None:
         record_standing_outcome(env, program, self.rule)

@@ -17,7 +17,6 @@ from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.ground import Grounding, forward_of
 from piavatar_envs.tasks.place import PlaceRule, home
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
-from piavatar_envs.tasks.spawn import record_standing
 from piavatar_envs.tasks.upright import (
     FALL_DOC,
     METRIC_DOCS,
@@ -201,8 +200,7 @@ side."""
         self.way = way
 
     def record_reset(self, env, program) -> None:
-        record_standing(env, program, self.config.pose_noise)
-        self.grounding.record_reset(env, program)
+        self.grounding.record_standing(env, program, self.config.pose_noise)
 
     def record_outcome(self, env, program) -> None:
         avatar = env.simulation.avatar
