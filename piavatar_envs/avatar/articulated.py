@@ -44,8 +44,10 @@ from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_momentum import balance, gather_momentum
 from piavatar_envs.avatar.joint_motion import (
+    add_change,
     attach_flesh,
     find_displacement,
+    go_on,
     hand_back,
     move_joints,
     spread_motion,
@@ -71,42 +73,9 @@ from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec16
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import Model, State, group
 
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
-
 #: Share of what the pose is off the particles that one fit takes away. Those of a fast, light joint (a head, a hand)
 #: are not where it has them for other reasons, too: to follow them at once throws it about.
 FIT_SHARE = 0.2
-
-
-@wp.kernel
-def add_change(
-    change: wp.array2d(dtype=float),
-    failure: wp.array(dtype=int),
-    # in and out
-    q: wp.array2d(dtype=float),
-    outside: wp.array2d(dtype=float),
-):
-    """What the particles did to the joints: it was not the joints' own doing."""
-    e, i = wp.tid()
-    if failure[e] == 0:
-        q[e, i] = q[e, i] + change[e, i]
-        outside[e, i] = outside[e, i] + change[e, i]
-
-
-@wp.kernel
-def go_on(
-    change: wp.array2d(dtype=float),
-    outside: wp.array2d(dtype=float),
-    failure: wp.array(dtype=int),
-    # in and out
-    q: wp.array2d(dtype=float),
-    taken: wp.array2d(dtype=float),
-):
-    """The velocity that joints will have if all else does again what it did; what this takes from the particles."""
-    e, i = wp.tid()
-    if failure[e] == 0:
-        q[e, i] = q[e, i] + change[e, i] + outside[e, i]
-        taken[e, i] = taken[e, i] + outside[e, i]
 
 
 class ArticulatedBody:

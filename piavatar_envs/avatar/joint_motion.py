@@ -227,3 +227,34 @@ def move_joints(
             if threads == 1 or body.depth[b] == level:
                 move_bone(body, dt, field[e, b], e, b, rotation, position)
         meet_threads(threads)
+
+
+@wp.kernel
+def add_change(
+    change: wp.array2d(dtype=float),
+    failure: wp.array(dtype=int),
+    # in and out
+    q: wp.array2d(dtype=float),
+    outside: wp.array2d(dtype=float),
+):
+    """What the particles did to the joints: it was not the joints' own doing."""
+    e, i = wp.tid()
+    if failure[e] == 0:
+        q[e, i] = q[e, i] + change[e, i]
+        outside[e, i] = outside[e, i] + change[e, i]
+
+
+@wp.kernel
+def go_on(
+    change: wp.array2d(dtype=float),
+    outside: wp.array2d(dtype=float),
+    failure: wp.array(dtype=int),
+    # in and out
+    q: wp.array2d(dtype=float),
+    taken: wp.array2d(dtype=float),
+):
+    """The velocity that joints will have if all else does again what it did; what this takes from the particles."""
+    e, i = wp.tid()
+    if failure[e] == 0:
+        q[e, i] = q[e, i] + change[e, i] + outside[e, i]
+        taken[e, i] = taken[e, i] + outside[e, i]
