@@ -206,24 +206,10 @@ class BatchEnv:
 
     def _begin(self) -> wp.array:
         self.count_program.run()
-        self._draw_shapes()
+        self.simulation.shapes.draw(self.mask, self.seed, self.episode)
         self.reset_program.run()
-        for flesh in self.simulation.flesh:
-            flesh.fall_behind()
+        self.simulation.shapes.fall_behind()
         return self.observation
-
-    def _draw_shapes(self) -> None:
-        """Random bodies for the environments that begin, from seed and episode, for avatars whose shape is random."""
-        avatars = self._random_shapes()
-        if not avatars:
-            return
-        seeds, episodes = self.seed.numpy().view(np.uint32), self.episode.numpy()
-        for env in np.flatnonzero(self.mask.numpy()):
-            key = [int(seeds[env]), int(episodes[env])]
-            for avatar in avatars:
-                rng = np.random.default_rng([*key, avatar] if avatar else key)
-                parameters = self.simulation.flesh[avatar].draw_parameters(rng)
-                self.simulation.set_shape(int(env), parameters, avatar)
 
     def assist_root(self, share: float | np.ndarray) -> None:
         """Help the pelvis from now on, as ``drive.root_assist`` says; for ``control="pd"`` and ``"torque"``.
@@ -259,13 +245,9 @@ class BatchEnv:
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on, as copies on the host."""
         state = {name: array.numpy().copy() for name, array in self.arrays().items()}
-        for avatar in self._random_shapes():
+        for avatar in self.simulation.shapes.of_host:
             state[f"shape.{avatar}"] = self.simulation.flesh[avatar].shape_parameters.copy()
         return state
-
-    def _random_shapes(self) -> list[int]:
-        """Avatars whose shape is drawn on the host."""
-        return [index for index, flesh in enumerate(self.simulation.flesh) if flesh.drawn_on_host]
 
     def set_state(self, state: dict[str, np.ndarray]) -> None:
         """Restore what :meth:`get_state` returned; the observation follows. On the CPU the future is bit-identical.
@@ -285,10 +267,9 @@ class BatchEnv:
                 )
         for name, array in self.arrays().items():
             array.assign(state[name])
-        for avatar in self._random_shapes():
-            self.simulation.adopt_shapes(avatar, state[f"shape.{avatar}"])
-        for flesh in self.simulation.flesh:
-            flesh.fall_behind()
+        for avatar in self.simulation.shapes.of_host:
+            self.simulation.shapes.adopt(avatar, state[f"shape.{avatar}"])
+        self.simulation.shapes.fall_behind()
         self.observe_program.run()
 
 

@@ -66,7 +66,7 @@ class Parameters:
     def __init__(self, simulation: Simulation, task: Task) -> None:
         self.simulation = simulation
         world, own = simulation.randomization.parameters()
-        shape = [parameter for parameter, _ in simulation.drawn_shape(0).values()]
+        shape = [parameter for parameter, _ in simulation.shapes.drawn(0).values()]
         settings = [ASSIST] if simulation.avatar.joints else []
         own = *own, *shape, *settings
         self._world, self._own, self._task = (_ranging(group) for group in (world, own, task.drawn()))
@@ -87,7 +87,7 @@ class Parameters:
         random, device = simulation.randomization, simulation.device
         sources = [(parameter, Drawn(random.column(parameter.name))) for parameter in self._world]
         for index in range(count):
-            known = {name: column for name, (_, column) in simulation.drawn_shape(index).items()}
+            known = {name: column for name, (_, column) in simulation.shapes.drawn(index).items()}
             if ASSIST in self._own:
                 known[ASSIST.name] = simulation.avatars[index].joints.assist
             for parameter in self._own:

@@ -10,17 +10,15 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.asset import AvatarAsset, load_body
-from piavatar_envs.avatar.body import bone_masses
 from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
 from piavatar_envs.avatar.joint_drive import LONGEST_SUBSTEP
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
-from piavatar_envs.envs.bodies import Bodies, BodyPool
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig
 from piavatar_envs.envs.domain import Domain
-from piavatar_envs.envs.flesh import Flesh, drive_settings, shape_ranges
-from piavatar_envs.envs.observations import Parameter
+from piavatar_envs.envs.flesh import Flesh, drive_settings
 from piavatar_envs.envs.props import PropSet
 from piavatar_envs.envs.randomize import Randomization, fastest_wave
+from piavatar_envs.envs.shapes import Shapes
 from piavatar_envs.envs.subjects import assemble, prop_matter, prop_points
 from piavatar_envs.mpm.boundaries import Collider, make_boundaries, place_colliders
 from piavatar_envs.mpm.build import build_model, choose_num_substeps, make_grid
@@ -46,6 +44,7 @@ class Simulation:
         flesh: matter of every avatar (NumPy); avatars: their drives.
         props: the soft props.
         randomization: factors on mass, stiffness and friction, and what follows from them.
+        shapes: bodies of random shape.
         collider_spawn: poses and velocities that a reset gives the colliders.
         subjects: names and particles of both, avatars first.
     """
@@ -121,8 +120,7 @@ class Simulation:
         ]
         # before anything is recorded: it gives what varies rows of its own
         self.randomization = Randomization(config.randomize, self.model, self.avatars)
-        self._shapes = self._upload_shapes()
-        self._connect_pools()
+        self.shapes = Shapes(self.flesh, self.avatars, self.model, self.randomization)
         columns = [self.subjects.fields.subject.index(count + index) for index in range(len(solids))]
         self.props = PropSet(self.scene.props, solids, matter, first[count:-1], columns, self.model)
 
@@ -157,90 +155,9 @@ class Simulation:
         wave = max(wave, self.subjects.matter.sound_speed())
         return max(choose_num_substeps(physics.control_dt, self.dx, wave, physics.cfl), by_torques)
 
-    def set_shape(self, env: int, parameters: np.ndarray, avatar: int = 0) -> None:
-        """Give an avatar of environment ``env`` another body; takes effect when it is placed again.
-
-        Raises:
-            ValueError: the configuration has one shape for all environments, or a pool of them, or a parameter is out
-                of range.
-        """
-        flesh, drive = self.flesh[avatar], self.avatars[avatar]
-        if not flesh.shape.randomize:
-            raise ValueError("all environments share one body; set shape.randomize=True to give each its own")
-        if flesh.pool:
-            raise ValueError(f"bodies are drawn from a pool of {flesh.shape.pool}; set shape.pool=None to give others")
-        points, volume = flesh.shaped(parameters)
-        mass, center = bone_masses(points)
-        body, particles = drive.body, self.model.particles
-        own = slice(body.first, body.first + body.count)
-        rows = [
-            (body.rest[env], points.rest),
-            (body.rest_joint[env], points.joints),
-            (body.rest_center[env], center),
-            (body.inert[env], points.inert),
-            (body.bone_mass[env], mass),
-            (particles.mass[env][own], points.mass),
-            (particles.volume[env][own], volume),
-        ]
-        for array, value in rows:
-            array.assign(np.ascontiguousarray(value[0], np.float32))
-        drive.body_mass[env : env + 1].assign(points.mass.sum(1).astype(np.float32))
-        self.randomization.set_nominal_mass(avatar, env, points.mass[0], mass[0])
-        for name in ("rest", "mass", "joints"):
-            getattr(flesh.points, name)[env] = getattr(points, name)[0]
-        flesh.shape_parameters[env] = parameters
-        if self._shapes:
-            self._shapes[avatar][env].assign(flesh.shape_parameters[env].astype(np.float32))
-
-    def adopt_shapes(self, avatar: int, parameters: np.ndarray) -> None:
-        """Make the host's copy follow bodies whose arrays were restored on the device, with their shape parameters."""
-        flesh, body = self.flesh[avatar], self.avatars[avatar].body
-        own = slice(body.first, body.first + body.count)
-        flesh.points.rest[:], flesh.points.joints[:] = body.rest.numpy(), body.rest_joint.numpy()
-        flesh.points.mass[:] = flesh.masses(self.model.particles.volume.numpy()[:, own])
-        flesh.shape_parameters[:] = parameters
-        if self._shapes:
-            self._shapes[avatar].assign(flesh.shape_parameters.astype(np.float32))
-
-    def _upload_shapes(self) -> list[wp.array]:
-        """Shape parameters of every avatar on the device, ``(num_envs, S)``; none where no shape is random."""
-        if not shape_ranges(self.flesh):
-            return []
-        return [wp.array(f.shape_parameters.astype(np.float32), dtype=float, device=self.device) for f in self.flesh]
-
-    def _connect_pools(self) -> None:
-        """Shape the bodies of pools, and say what follows them; masses that a factor scales follow nominally."""
-        particles, known = self.model.particles, {}
-        for index, (flesh, avatar) in enumerate(zip(self.flesh, self.avatars, strict=True)):
-            if not flesh.shape.randomize or flesh.drawn_on_host:
-                continue
-            if flesh.settings not in known:
-                known[flesh.settings] = Bodies.shaped(flesh, flesh.shape.pool)
-            flesh.pool = BodyPool(known[flesh.settings], index, self.num_envs, self.device)
-            body = avatar.body
-            own = slice(body.first, body.first + body.count)
-            shape = {"shape": self._shapes[index]} if self._shapes else {}
-            flesh.pool.connect(
-                rest=body.rest,
-                joints=body.rest_joint,
-                rest_center=body.rest_center,
-                inert=body.inert,
-                volume=particles.volume[:, own],
-                **self.randomization.nominal_mass(index),
-                **shape,
-            )
-
-    def drawn_shape(self, avatar: int) -> dict[str, tuple[Parameter, wp.array]]:
-        """Parameters of an avatar's shape by name, with their values in every environment; those that may differ."""
-        names = self.asset.shape_names
-        ranges = shape_ranges(self.flesh)
-        return {p.name: (p, self._shapes[avatar][:, names.index(name)]) for name, p in ranges.items()}
-
     def record_draws(self, program: Program, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
         """Append: the masked environments draw bodies from pools, then the factors on what those are made of."""
-        for flesh in self.flesh:
-            if flesh.pool:
-                flesh.pool.record_reset(program, mask, seed, episode)
+        self.shapes.record_draws(program, mask, seed, episode)
         self.randomization.record_reset(program, mask, seed, episode)
 
     def record_reset(self, program: Program, mask: wp.array) -> None:
@@ -267,27 +184,17 @@ class Simulation:
     def arrays(self) -> dict[str, wp.array]:
         """Every array of a checkpoint, by name."""
         found = {f"particles.{field.name}": getattr(self.state, field.name) for field in fields(self.state)}
-        for index, (avatar, flesh) in enumerate(zip(self.avatars, self.flesh, strict=True)):
+        for index, avatar in enumerate(self.avatars):
             groups = {"drive": avatar.state, "tracked": avatar.tracked}
             if avatar.joints:
                 groups["joints"] = avatar.joints.state
                 found[f"joints_{index}.assist"] = avatar.joints.assist
             for group, value in groups.items():
                 found |= {f"{group}_{index}.{f.name}": getattr(value, f.name) for f in fields(value)}
-            if flesh.shape.randomize:
-                names = ("rest", "rest_joint", "rest_center", "bone_mass", "inert")
-                found |= {f"body_{index}.{name}": getattr(avatar.body, name) for name in names}
-                found[f"body_{index}.body_mass"] = avatar.body_mass
-            if flesh.pool:
-                found[f"body_{index}.index"] = flesh.pool.index
-            if flesh.pool and self._shapes:
-                found[f"body_{index}.shape"] = self._shapes[index]
-        if any(flesh.shape.randomize for flesh in self.flesh):
-            found |= {f"matter.{name}": getattr(self.model.particles, name) for name in ("mass", "volume")}
         if self.model.moving_boundaries:
             names = ("position", "rotation", "velocity", "spin")
             found |= {f"colliders.{name}": getattr(self.model.boundaries, name) for name in names}
-        found |= self.randomization.arrays()
+        found |= self.shapes.arrays() | self.randomization.arrays()
         sensors = ("boundary_impulse", "boundary_moment", "pair_impulse", "part_impulse", "penetration")
         found |= {f"sensors.{name}": getattr(self.sensors, name) for name in sensors}
         return found | self.props.arrays()

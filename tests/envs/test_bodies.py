@@ -85,7 +85,7 @@ def test_the_host_takes_no_part_until_it_asks(make_batch, monkeypatch):
         raise AssertionError("a body is shaped in a reset")
 
     monkeypatch.setattr(type(flesh), "shaped", refuse)
-    monkeypatch.setattr(batch.simulation, "set_shape", refuse)
+    monkeypatch.setattr(batch.simulation.shapes, "give", refuse)
     for _ in range(4):
         batch.reset()
         assert np.array_equal(flesh._shape_parameters, before), "the host has looked"
@@ -157,7 +157,7 @@ def test_a_pool_is_not_written_into(make_batch):
     batch = make_batch(REACH, 2, **POOL)
     flesh = batch.simulation.flesh[0]
     with pytest.raises(ValueError, match=r"pool of 3; set shape.pool=None"):
-        batch.simulation.set_shape(0, flesh.base_parameters)
+        batch.simulation.shapes.give(0, flesh.base_parameters)
     with pytest.raises(ConfigError, match=r"shape.pool=0 must be >= 1"):
         load_config(load_task(REACH).Config, None, {"shape.pool": 0})
 

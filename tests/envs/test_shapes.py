@@ -107,7 +107,7 @@ def test_a_fixed_shape_is_the_same_in_every_episode(make_env):
 def test_without_randomize_no_other_body_is_taken(make_env):
     env = make_env("PIAvatar/Reach-v0")
     with pytest.raises(ValueError, match=r"shape\.randomize=True"):
-        env.batch.simulation.set_shape(0, env.batch.simulation.flesh[0].base_parameters)
+        env.batch.simulation.shapes.give(0, env.batch.simulation.flesh[0].base_parameters)
 
 
 def test_a_restored_state_brings_its_body_back(make_env, env_id):
