@@ -8,12 +8,12 @@ import gymnasium as gym
 import numpy as np
 
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
+from piavatar_envs.api.view import EpisodeView
 from piavatar_envs.envs.config import load_config
-from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task
 
 
-class AvatarEnv(gym.Env):
+class AvatarEnv(EpisodeView, gym.Env):
     """One soft avatar and a task.
 
     Observations are a flat float32 vector, or a dictionary with ``obs_mode="dict"``; ``observation_layout`` says what
@@ -57,11 +57,6 @@ class AvatarEnv(gym.Env):
         self.action_space = self._episode.action_space()
         self.observation_space = self._episode.observation_space()
 
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """Name, slice, unit and frame of everything in the flat observation."""
-        return self.batch.layout
-
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode.
 
@@ -90,33 +85,6 @@ class AvatarEnv(gym.Env):
         episode.advance(episode.check_action(action)[None])
         outcome = episode.reward(0), episode.terminated(0), episode.truncated()
         return episode.observation(0), *outcome, episode.step_info(0)
-
-    def render(self) -> np.ndarray | None:
-        """The scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``, else None.
-
-        Raises:
-            ImportError: the extra ``render`` is not installed.
-            gymnasium.error.ResetNeeded: before the first reset.
-        """
-        return self._episode.render()
-
-    def close(self) -> None:
-        """Free the renderer's window."""
-        self._episode.close()
-
-    def assist_root(self, share: float) -> None:
-        """Help the pelvis from now on, by a share in [0, 1]; for ``control="pd"`` and ``"torque"``.
-
-        Resets leave it.
-
-        Raises:
-            ValueError: it is out of range, or the pose is driven.
-        """
-        self.batch.assist_root(share)
-
-    def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on; :meth:`set_state` restores it, bit for bit."""
-        return self.batch.get_state()
 
     def set_state(self, state: dict[str, np.ndarray]) -> Any:
         """Restore what :meth:`get_state` returned; returns the observation.

@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
+from piavatar_envs.api.view import EpisodeView
 from piavatar_envs.envs.config import load_config, replace
-from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks.base import Task
 
 try:
@@ -19,7 +19,7 @@ except ImportError as error:
     raise ImportError("several agents need PettingZoo; install it with: pip install 'piavatar-envs[multi]'") from error
 
 
-class AvatarParallelEnv(ParallelEnv):
+class AvatarParallelEnv(EpisodeView, ParallelEnv):
     """Several soft avatars and a task; each avatar is an agent.
 
     Observations and actions are as those of :class:`~piavatar_envs.api.gymnasium.AvatarEnv`, by agent, and so is
@@ -79,11 +79,6 @@ class AvatarParallelEnv(ParallelEnv):
         self.action_spaces = {name: self._episode.action_space() for name in self.possible_agents}
         self.observation_spaces = {name: self._episode.observation_space() for name in self.possible_agents}
         self.state_space = self._episode.state_space()
-
-    @property
-    def observation_layout(self) -> ObservationLayout:
-        """Name, slice, unit and frame of everything in an agent's flat observation."""
-        return self.batch.layout
 
     def observation_space(self, agent: str) -> gym.Space:
         """Space of what ``agent`` sees: always the same object."""
@@ -170,33 +165,6 @@ class AvatarParallelEnv(ParallelEnv):
     def state(self) -> np.ndarray:
         """The flat observations of all agents one after the other, also of those who have left, for central critics."""
         return self._episode.flat_observations()
-
-    def render(self) -> np.ndarray | None:
-        """The scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``, else None.
-
-        Raises:
-            ImportError: the extra ``render`` is not installed.
-            gymnasium.error.ResetNeeded: before the first reset.
-        """
-        return self._episode.render()
-
-    def close(self) -> None:
-        """Free the renderer's window."""
-        self._episode.close()
-
-    def assist_root(self, share: float) -> None:
-        """Help the pelvis of every avatar from now on, by a share in [0, 1]; for ``control="pd"`` and ``"torque"``.
-
-        Resets leave it.
-
-        Raises:
-            ValueError: it is out of range, or the pose is driven.
-        """
-        self.batch.assist_root(share)
-
-    def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on; :meth:`set_state` restores it, bit for bit."""
-        return self.batch.get_state()
 
     def set_state(self, state: dict[str, np.ndarray]) -> dict[str, Any]:
         """Restore what :meth:`get_state` returned, and who plays; returns the observations of these.

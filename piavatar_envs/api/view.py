@@ -1,4 +1,4 @@
-"""What the views of many environments do alike."""
+"""What the views of one environment do alike, and those of many."""
 
 from __future__ import annotations
 
@@ -8,7 +8,46 @@ if TYPE_CHECKING:
     import numpy as np
 
     from piavatar_envs.api.batched import BatchedEpisodes
+    from piavatar_envs.api.episode import Episode
     from piavatar_envs.envs.observations import ObservationLayout
+
+
+class EpisodeView:
+    """Passes on to the only environment what has nothing to do with how it is shown."""
+
+    _episode: Episode
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """Name, slice, unit and frame of everything in the flat observation of an agent."""
+        return self._episode.batch.layout
+
+    def render(self) -> np.ndarray | None:
+        """The scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``, else None.
+
+        Raises:
+            ImportError: the extra ``render`` is not installed.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        return self._episode.render()
+
+    def close(self) -> None:
+        """Free the renderer's window."""
+        self._episode.close()
+
+    def assist_root(self, share: float) -> None:
+        """Help the pelvis of every avatar from now on: a share in [0, 1]; ``control="pd"`` or ``"torque"``.
+
+        Resets leave it.
+
+        Raises:
+            ValueError: it is out of range, or the pose is driven.
+        """
+        self._episode.batch.assist_root(share)
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that the future depends on; ``set_state()`` restores it, bit for bit."""
+        return self._episode.batch.get_state()
 
 
 class BatchedView:
