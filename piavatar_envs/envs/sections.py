@@ -74,7 +74,7 @@ class PhysicsConfig(BaseModel):
         "deformation-gradient decoupling), none (velocity injected, strain and all), no_stress (no elasticity)",
     )
     gravity: float = Field(9.81, ge=0.0, le=100.0, description="gravitational acceleration, along -z [m/s^2]")
-    friction: float = Field(0.8, ge=0.0, le=10.0, description="Coulomb coefficient of the ground and the walls [-]")
+    friction: float = Field(0.8, ge=0.0, le=10.0, description="Coulomb coefficient of the ground; walls are smooth [-]")
 
 
 class DriveConfig(BaseModel):

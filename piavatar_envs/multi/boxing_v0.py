@@ -157,8 +157,8 @@ root act. A blow is an impulse on the other's head or trunk, in one control step
 It is worth nothing up to `blow_impulse` and `head_points` or `torso_points` from twice that on. A contact counts once,
 by its strongest step, and is over when the impulse has fallen below half of `blow_impulse`: leaning scores nothing
 more. Who is knocked down is out, and its body stays where it fell; the last one on the feet has won. Under torques, who
-kneels or can reach the ground with the hands is down. A good agent
-strikes fast, at the head, and withdraws."""
+kneels or can reach the ground with the hands is down, and it takes legs that act (`joints=None`) to stay up. A good
+agent strikes fast, at the head, and withdraws."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "hit": "the points of this step's blows, at most `head_points + torso_points` for each other agent",
         "taken": "`-taken_weight` times the points that others have scored on oneself",

@@ -165,8 +165,9 @@ class SumoTask(Task):
 it, each displaced by up to `place_noise`. The trunk, the arms and the root act: a root that walks into another body
 pushes it, the harder the farther the command is ahead of the body, up to `leash`. Who has the pelvis beyond the ring,
 or has been pushed over, is out, and its body stays where it fell. Under torques, who kneels or can reach the ground
-with the hands has been pushed over. The last one in has won; when the clock runs out it is a draw. A good agent keeps
-to the centre, gets the others off it and does not lose its balance."""
+with the hands has been pushed over, and it takes legs that act (`joints=None`) to stay up. The last one in has won;
+when the clock runs out it is a draw. A good agent keeps to the centre, gets the others off it and does not lose its
+balance."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "win": "`win_reward` for the last one in, once",
         "out": "`-out_cost` when one is out, once; also for all who go out in the same step",
