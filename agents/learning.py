@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -38,6 +39,20 @@ class Events(TensorBoardOutputFormat):
         """
         self.writer = SummaryWriter(log_dir=str(folder), purge_step=steps + 1 if steps else None)
         self._is_closed = False
+
+
+class ScaledMonitor(VecMonitor):
+    """Books the environments' own rewards, and hands on scaled ones."""
+
+    def __init__(self, venv: VecEnv, reward_scale: float) -> None:
+        """Watch environments."""
+        super().__init__(venv)
+        self.reward_scale = reward_scale
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """The end of a step."""
+        observations, rewards, dones, infos = super().step_wait()
+        return observations, self.reward_scale * rewards, dones, infos
 
 
 class Progress(BaseCallback):
@@ -85,9 +100,8 @@ def begin(config: TrainingConfig, venv: VecEnv, facts: EnvFacts) -> BaseAlgorith
         facts: of their environment.
     """
     seen = components(facts.layout, config.observe)
-    if config.sac is not None:
-        return sac.build(config.sac, VecMonitor(venv), seen, config.seed)
-    return ppo.build(config.ppo, VecMonitor(venv), seen, config.seed)
+    build, settings = (ppo.build, config.ppo) if config.sac is None else (sac.build, config.sac)
+    return build(settings, ScaledMonitor(venv, settings.reward_scale), seen, config.seed)
 
 
 def learn(

@@ -33,6 +33,9 @@ class PPOSettings(BaseModel):
     epochs: int = Field(10, ge=1, description="passes over a rollout")
     learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's learning rate [-]")
     discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
+    reward_scale: float = Field(
+        1.0, gt=0.0, description="factor on what the networks see of a reward [-]; discounted returns should be about 1"
+    )
     gae_lambda: float = Field(0.8, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
     clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
     entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
@@ -58,6 +61,14 @@ def networks(hidden: Sequence[int], components: Sequence[int]) -> dict[str, Any]
         "net_arch": list(hidden),
         "features_extractor_class": SelectTerms,
         "features_extractor_kwargs": {"components": list(components)},
+    }
+
+
+def policy_settings(settings: PPOSettings, components: Sequence[int]) -> dict[str, Any]:
+    """The policy as stable-baselines3 takes it."""
+    return networks(settings.hidden, components) | {
+        "activation_fn": torch.nn.Tanh,
+        "log_std_init": settings.log_std,
     }
 
 
@@ -88,11 +99,7 @@ def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: 
         clip_range=settings.clip_range,
         rollout_buffer_class=PlayedBuffer,
         ent_coef=settings.entropy_weight,
-        policy_kwargs={
-            **networks(settings.hidden, components),
-            "activation_fn": torch.nn.Tanh,
-            "log_std_init": settings.log_std,
-        },
+        policy_kwargs=policy_settings(settings, components),
         seed=seed,
         device="cpu",
     )

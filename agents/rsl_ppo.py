@@ -11,61 +11,22 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from pydantic import BaseModel, Field
 from rsl_rl.algorithms import PPO
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.log_writer import LogWriter
 from tensordict import TensorDict
 from torch.utils.tensorboard import SummaryWriter
 
-from agents.batches import BatchTraining, Learned, iterations_of, run
+from agents.batches import Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, set_random_states
 from agents.curve import Curve
-from agents.evaluate import Agent
 from agents.mirror import Mirror
+from agents.rsl_policy import RslTraining, actor_settings, mean_agent, network_settings
+from agents.workers import components
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
-from piavatar_envs.envs.config import FROZEN
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
-
-
-class RslPPOSettings(BaseModel):
-    """Hyper-parameters of rsl_rl's PPO."""
-
-    model_config = FROZEN
-
-    rollout_steps: int = Field(32, ge=2, description="steps of every environment between two updates")
-    epochs: int = Field(8, ge=1, description="passes over a rollout")
-    minibatches: int = Field(4, ge=1, description="minibatches in a pass")
-    learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's first learning rate [-]")
-    desired_kl: float | None = Field(
-        0.01, gt=0.0, description="divergence of an update to which the learning rate adapts [-]; null for a fixed rate"
-    )
-    discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
-    reward_scale: float = Field(
-        1.0,
-        gt=0.0,
-        description="factor on what the networks see of a reward [-]; the critic follows by clip_range a step, so "
-        "discounted returns should be about 1",
-    )
-    gae_lambda: float = Field(0.8, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
-    clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
-    value_weight: float = Field(1.0, ge=0.0, description="weight of the critic's squared error [-]")
-    entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
-    largest_gradient: float = Field(1.0, gt=0.0, description="norm to which gradients are clipped [-]")
-    action_std: float = Field(0.6, gt=0.0, description="standard deviation of the first actions [-]")
-    normalize_observation: bool = Field(False, description="whether networks see observations by running statistics")
-    mirrored: bool = Field(False, description="whether it also learns from every step as it is in a mirror")
-    hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of both networks")
-
-
-class RslTraining(BatchTraining):
-    """Everything that a training with rsl_rl depends on."""
-
-    env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
-    ppo: RslPPOSettings = Field(default_factory=RslPPOSettings, description="the algorithm")
 
 
 class ScaledPPO(PPO):
@@ -190,19 +151,12 @@ def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
         ConfigError: steps cannot be mirrored.
     """
     ppo = config.ppo
-    network = {
-        "class_name": "MLPModel",
-        "hidden_dims": list(ppo.hidden),
-        "activation": "tanh",
-        "obs_normalization": ppo.normalize_observation,
-    }
-    spread = {"class_name": "GaussianDistribution", "init_std": ppo.action_std, "std_type": "log"}
     return {
         "num_steps_per_env": ppo.rollout_steps,
         "save_interval": config.checkpoint_every,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
-        "actor": {**network, "distribution_cfg": spread},
-        "critic": network,
+        "actor": actor_settings(ppo),
+        "critic": network_settings(ppo),
         "algorithm": {
             "class_name": ScaledPPO,
             "reward_scale": ppo.reward_scale,
@@ -255,20 +209,10 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
     seed_all(config.seed)
     runner = Runner(env, config, folder, checkpoint)
     runner.train(config.iterations)
-    OnPolicyRunner.save(runner, str(folder / "policy.pt"))  # without another checkpoint
+    actor = runner.get_inference_policy(str(env.device))
+    torch.save(actor.state_dict(), folder / "policy.pt")
     env.close()
-    return Learned(mean_agent(runner, env), runner.curve)
-
-
-def mean_agent(runner: OnPolicyRunner, env: AvatarRslEnv) -> Agent:
-    """The policy's mean actions, from observations ``(n, 1, size)`` to ``(n, 1, action_size)``."""
-    policy = runner.get_inference_policy(str(env.device))
-
-    def act(observation: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return policy(env.grouped(torch.as_tensor(observation, device=env.device)))[:, None].cpu().numpy()
-
-    return act
+    return Learned(mean_agent(actor, components(env.observation_layout, config.observe), str(env.device)), runner.curve)
 
 
 def main(args: list[str] | None = None) -> None:

@@ -31,6 +31,9 @@ class SACSettings(BaseModel):
     minibatches: int = Field(1, ge=1, description="minibatches in an update")
     learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's learning rate [-]")
     discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
+    reward_scale: float = Field(
+        1.0, gt=0.0, description="factor on what the networks see of a reward [-]; discounted returns should be about 1"
+    )
     averaging: float = Field(0.01, gt=0.0, le=1.0, description="share of the critics in an update of their average [-]")
     hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of all networks")
 

@@ -15,6 +15,7 @@ for needed in ("rsl_rl", "tensordict", "git"):
 from agents import rsl_ppo  # noqa: E402
 from agents.batches import load_batched, new_task  # noqa: E402
 from agents.checkpoint import Checkpoint  # noqa: E402
+from agents.rsl_policy import RslTraining  # noqa: E402
 from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 from tests.agents.killing import flat, run_killed  # noqa: E402
@@ -42,7 +43,7 @@ def test_published_configurations_train_and_leave_their_results(path, device, tm
     assert np.isfinite([row["return_mean"] for row in results["results"]]).all()
     steps = [line.split(",")[0] for line in (tmp_path / "curve.csv").read_text().split()[1:]]
     assert steps == ["16", "32", "48"]
-    again = load_batched(rsl_ppo.RslTraining, load_task, tmp_path / "config.yaml")
+    again = load_batched(RslTraining, load_task, tmp_path / "config.yaml")
     assert again.iterations == 3 and again.env["physics"]["fidelity"] == "tiny"
 
 
@@ -53,13 +54,13 @@ def test_training_changes_the_policy_repeats_and_depends_on_its_seed(device, tmp
         overrides[name] = value if name == "env.fidelity" else json.loads(value)
     actors, agents = {}, {}
     for name, extra in (("a", {}), ("b", {}), ("c", {"seed": 1}), ("short", {"iterations": 1})):
-        config = load_batched(rsl_ppo.RslTraining, load_task, None, overrides | extra)
+        config = load_batched(RslTraining, load_task, None, overrides | extra)
         folder = tmp_path / name
         folder.mkdir()
         checkpoint = Checkpoint(folder, "rsl_ppo", config, device, resume=False)
         agents[name] = rsl_ppo.learn(config, new_task(config, load_task), folder, device, checkpoint).agent
         saved = torch.load(folder / "policy.pt", weights_only=True, map_location="cpu")
-        actors[name] = {key: value for key, value in saved["actor_state_dict"].items() if "weight" in key}
+        actors[name] = {key: value for key, value in saved.items() if "weight" in key}
 
     def apart(one: str, other: str) -> float:
         return max((actors[one][key] - actors[other][key]).abs().max().item() for key in actors[one])

@@ -1,0 +1,148 @@
+"""Let what a training has left play again: ``python -m agents.play runs/stand_rsl --film stand.gif``.
+
+Takes the folder of a run with one agent, by ``agents.rsl_ppo`` (policy.pt) or ``agents.train`` (policy.zip), builds the
+environment of its config.yaml, and plays the episodes of its evaluation. Nothing in the files is unpickled.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from agents.batches import in_every_seat, play
+from agents.config import EvaluationSettings, load_training
+from agents.evaluate import Agent
+from agents.film import film
+from agents.report import show_table, versions, write_results
+from agents.workers import EnvFactory
+from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.doctor import quiet_warp
+from piavatar_envs.envs.config import ConfigError, load_config, parse_assignments
+from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.tasks import load_task
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a training has left.
+
+    Attributes:
+        env_id: registered id.
+        env: settings of the environment, resolved.
+        evaluation: of the training.
+        make_agent: the agent, from the layout of the observation and the length of an action; its observations are
+            ``(num_envs, 1, size)``.
+    """
+
+    env_id: str
+    env: dict[str, Any]
+    evaluation: EvaluationSettings
+    make_agent: Callable[[ObservationLayout, int], Agent]
+
+
+def open_run(folder: Path, device: str = "cpu") -> Run:
+    """A run from its folder.
+
+    Args:
+        folder: with config.yaml and policy.pt or policy.zip.
+        device: torch's, where a policy of rsl_rl computes.
+
+    Raises:
+        ConfigError: the folder holds no such run, or the files do not fit each other.
+    """
+    settings, kinds = folder / "config.yaml", {"policy.pt": _open_rsl, "policy.zip": _open_sb3}
+    found = [name for name in kinds if (folder / name).is_file()]
+    if not settings.is_file() or not found:
+        raise ConfigError(f"{folder} must hold config.yaml and {' or '.join(kinds)}, as a training leaves them")
+    return kinds[found[0]](settings, folder / found[0], device)
+
+
+def _open_rsl(settings: Path, policy: Path, device: str) -> Run:
+    from agents.batches import load_batched
+    from agents.rsl_policy import RslTraining, load_agent  # needs the extra rsl
+
+    config = load_batched(RslTraining, load_task, settings)
+    return Run(
+        config.env_id,
+        dict(config.env),
+        config.evaluation,
+        lambda layout, size: load_agent(policy, config, layout, size, device),
+    )
+
+
+def _open_sb3(settings: Path, policy: Path, _device: str) -> Run:
+    from agents.sb3_policy import load_agent
+
+    config = load_training(settings)
+    if config.is_multi:
+        raise ConfigError(f"{settings}: env_id={config.env_id!r} is a world of several agents; this plays one")
+    return Run(
+        config.env_id,
+        dict(config.env),
+        config.evaluation,
+        lambda layout, size: in_every_seat(load_agent(policy, config, layout, size)),
+    )
+
+
+@dataclass(frozen=True)
+class Options:
+    """Let what a training has left play again."""
+
+    #: folder of the run
+    run: tyro.conf.Positional[Path]
+    #: settings of the environment that win over the run's: fidelity=tiny drive.root_assist=0.1
+    settings: tyro.conf.Positional[tuple[str, ...]] = ()
+    #: episodes to play, by default as many as the training's evaluation has
+    episodes: int | None = None
+    #: seed of the first episode, by default that of the training's evaluation
+    first_seed: int | None = None
+    #: where to simulate
+    device: str = "cpu"
+    #: JSON file for the figures
+    out: Path | None = None
+    #: video to write, .mp4 or .gif
+    film: Path | None = None
+    #: episodes in the video
+    film_episodes: int = 1
+    #: control steps between two of its pictures
+    film_every: int = 1
+
+
+def main(args: list[str] | None = None) -> None:
+    """The command line."""
+    options = tyro.cli(Options, prog="python -m agents.play", args=args)
+    quiet_warp()
+    try:
+        run = open_run(options.run, options.device)
+        task_class = load_task(run.env_id)
+        config = load_config(task_class.Config, run.env, parse_assignments(options.settings))
+        episodes = options.episodes or run.evaluation.episodes
+        batch = BatchedEpisodes(task_class(config), episodes, options.device)
+        agent = run.make_agent(batch.layout, batch.action_size)
+    except (ConfigError, ValueError) as error:
+        sys.exit(f"error: {error}")
+    first = run.evaluation.first_seed if options.first_seed is None else options.first_seed
+    evaluation = play("trained", agent, batch, first)
+    batch.close()
+    console = Console(highlight=False, soft_wrap=True)
+    if episodes > 1:
+        show_table([evaluation], console)
+    if options.out:
+        about = versions("play", options.device) | {"run": options.run.name, "env": config.model_dump(mode="json")}
+        write_results(options.out, about, [evaluation], {"num_envs": episodes})
+    if options.film:
+        make = EnvFactory(run.env_id, config.model_dump(mode="json"), options.device)
+        alone = {options.run.name: lambda observation: agent(observation[:, None])[:, 0]}
+        seeds = range(first, first + options.film_episodes)
+        film(options.film, make, alone, seeds, 1.0 / config.physics.control_dt, options.film_every)
+        console.print(f"wrote {options.film}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""Agents out of what trainings with stable-baselines3 leave."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.sac.policies import SACPolicy
+
+from agents import ppo
+from agents.config import TrainingConfig
+from agents.evaluate import Agent, policy_agent
+from agents.workers import components
+from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.envs.observations import ObservationLayout
+
+#: The policy's parameters within ``policy.zip``.
+_MEMBER = "policy.pth"
+
+
+def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, action_size: int) -> Agent:
+    """The agent of an earlier training: the mean action of its policy, on the CPU.
+
+    Only parameters are read, into a policy that is built as the configuration says. Nothing is unpickled, as
+    stable-baselines3's own ``load`` would.
+
+    Args:
+        path: of its ``policy.zip``.
+        config: resolved, of one agent.
+        layout: of the observation.
+        action_size: length of an action.
+
+    Raises:
+        ConfigError: the file holds no policy of that configuration.
+    """
+    policy = _untrained(config, layout, action_size)
+    try:
+        with zipfile.ZipFile(path) as content, content.open(_MEMBER) as file:
+            policy.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
+    except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, RuntimeError, TypeError) as error:
+        raise ConfigError(f"{path} holds no policy of its config.yaml: {str(error).splitlines()[0]}") from None
+    return policy_agent(policy.eval())
+
+
+def _untrained(config: TrainingConfig, layout: ObservationLayout, action_size: int) -> BasePolicy:
+    seen = gym.spaces.Box(-np.inf, np.inf, (layout.size,), np.float32)
+    done = gym.spaces.Box(-1.0, 1.0, (action_size,), np.float32)
+    shown = components(layout, config.observe)
+    if config.sac:
+        return SACPolicy(seen, done, lambda _: 0.0, **ppo.networks(config.sac.hidden, shown))
+    return ActorCriticPolicy(seen, done, lambda _: 0.0, **ppo.policy_settings(config.ppo, shown))

@@ -1,0 +1,87 @@
+"""Letting what trainings have left play again."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra train")
+pytest.importorskip("stable_baselines3", reason="needs the extra train")
+
+from agents import play, train  # noqa: E402
+from agents.play import open_run  # noqa: E402
+from piavatar_envs.envs.config import ConfigError  # noqa: E402
+
+QUICK = ("env.fidelity=tiny", "env.episode_seconds=0.2", "evaluation.episodes=3")
+SB3 = {
+    "ppo": ("configs/sb3/reach_sb3.yaml", "total_steps=16", "num_workers=2", "ppo.rollout_steps=8", "ppo.batch_size=8"),
+    "sac": ("configs/sb3/reach_sac.yaml", "total_steps=16", "num_workers=2", "sac.first_random=4", "sac.batch_size=4"),
+}
+
+
+def run_of(kind: str, folder, device: str) -> None:
+    """A short training."""
+    if kind == "rsl":
+        for needed in ("rsl_rl", "tensordict", "git"):
+            pytest.importorskip(needed, reason="needs the extra rsl")
+        from agents import rsl_ppo
+
+        few = ("num_envs=2", "iterations=2", "ppo.rollout_steps=4", "ppo.minibatches=1", "ppo.epochs=1")
+        rsl_ppo.main(["configs/rsl_rl/reach_rsl.yaml", *QUICK, *few, "--out", str(folder), "--device", device])
+    else:
+        train.main([*SB3[kind], *QUICK, "--out", str(folder), "--device", device])
+
+
+@pytest.mark.parametrize("kind", ["rsl", *SB3])
+def test_what_was_trained_plays_as_it_did(kind, device, tmp_path, capsys):
+    run_of(kind, tmp_path / "run", device)
+    play.main([str(tmp_path / "run"), "--device", device, "--out", str(tmp_path / "again.json")])
+    then, now = (json.loads((tmp_path / name).read_text()) for name in ("run/results.json", "again.json"))
+    (trained,) = (row for row in then["results"] if row["case"] == "trained")
+    assert now["results"] == [trained], "the same episodes, the same actions"
+    untrained = next(row for row in then["results"] if row["case"] == "zero")
+    assert trained["return_mean"] != untrained["return_mean"]
+
+
+def test_settings_win_and_a_film_is_written(device, tmp_path, capsys):
+    pytest.importorskip("pyvista", reason="needs the extra render")
+    run_of("ppo", tmp_path / "run", device)
+    film = tmp_path / "film.gif"
+    small = ("episode_seconds=0.1", "render.width=64", "render.height=64")
+    play.main([str(tmp_path / "run"), *small, "--episodes", "1", "--film", str(film), "--device", device])
+    from PIL import Image
+
+    with Image.open(film) as pictures:
+        assert pictures.n_frames == 3 and pictures.size == (64, 64)
+
+
+def test_folders_without_a_run_are_refused(device, tmp_path, capsys):
+    with pytest.raises(ConfigError, match=r"must hold config\.yaml and policy\.pt or policy\.zip"):
+        open_run(tmp_path)
+    with pytest.raises(SystemExit, match=r"must hold config\.yaml"):
+        play.main([str(tmp_path)])
+
+
+def test_nothing_is_unpickled(device, tmp_path, capsys):
+    """A file that would run code when it is unpickled is refused, and does not."""
+
+    class Trap:
+        def __reduce__(self):
+            return (np.save, (str(tmp_path / "sprung"), np.zeros(1)))
+
+    run_of("ppo", tmp_path / "run", device)
+    policy = tmp_path / "run" / "policy.zip"
+    with zipfile.ZipFile(policy) as whole:
+        members = {name: whole.read(name) for name in whole.namelist()}
+    members["policy.pth"] = pickle.dumps(Trap())
+    members["data"] = b"no JSON at all, and never read"
+    with zipfile.ZipFile(policy, "w") as changed:
+        for name, content in members.items():
+            changed.writestr(name, content)
+    with pytest.raises(SystemExit, match=r"holds no policy of its config\.yaml"):
+        play.main([str(tmp_path / "run"), "--device", device])
+    assert not (tmp_path / "sprung.npy").exists()
