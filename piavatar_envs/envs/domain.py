@@ -21,7 +21,8 @@ class Domain:
 
     Attributes:
         lower, upper: corners [m].
-        fenced: whether the walls belong to the world, such as ropes around a ring: where there are any, they stay.
+        fenced: whether walls belong to the world, such as ropes around a ring: they stand there also for one body
+            alone, and where nothing holds bodies up.
     """
 
     lower: tuple[float, float, float] = (-1.6, -1.6, -0.3)

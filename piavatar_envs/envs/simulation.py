@@ -131,7 +131,7 @@ class Simulation:
 
     def _room(self, domain: Domain, solid: bool, driven: bool) -> tuple[Domain, tuple[Collider, ...]]:
         """The domain, wider where joints are driven by torques, and the walls around it; ``solid``: there are props."""
-        walled = self.scene.walls and (solid or len(self.flesh) > 1)
+        walled = self.scene.walls and (solid or len(self.flesh) > 1 or domain.fenced)
         domain = domain.for_falls(walled) if driven else domain
         return domain, domain.walls() if walled else ()
 

@@ -231,12 +231,13 @@ def test_among_three_the_bout_goes_on(make_world, play):
     assert not any(info["success"] for info in infos.values())
 
 
-def test_the_ropes_hold(make_world, play):
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_ropes_hold(make_world, play, count):
     """Walking backwards for as long as it takes: nobody leaves the ring, nobody falls, nothing fails."""
-    world = make_world(BOXING, ring_size=2.2)
+    world = make_world(BOXING, num_agents=count, ring_size=2.2)
     world.reset(seed=0)
     rows = play(world, 40, **{"root.y": 1.0})
-    assert len(world.agents) == 2 and rows[-1][4]["agent_0"]["failure"] is None
+    assert len(world.agents) == count and rows[-1][4]["agent_0"]["failure"] is None
     x = world.batch.simulation.state.x.numpy()[0]
     dx = world.batch.simulation.dx
     assert 1.1 - dx < np.abs(x[:, 1]).max() < 1.1 + 0.5 * dx
