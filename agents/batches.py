@@ -40,6 +40,10 @@ from piavatar_envs.tasks.base import Task
 _FIRST_SEED, _SEEDS_A_RUN = 2**30, 2**16
 
 
+#: Metrics of tasks that evaluations sum up.
+TOLD = ("distance", "strongest_push")
+
+
 class BatchTraining(BaseModel):
     """What a training on a batch depends on; a library's settings come in a subclass."""
 
@@ -100,7 +104,7 @@ def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Ev
     """
     episodes = [Episode(first_seed + env) for env in range(batch.num_envs)]
     batch.reset([episode.seed for episode in episodes])
-    distance = batch.task.metrics.index("distance") if "distance" in batch.task.metrics else None
+    told = {name: batch.task.metrics.index(name) for name in TOLD if name in batch.task.metrics}
     success = np.zeros((batch.num_envs, batch.num_agents), bool)
     playing = np.ones(batch.num_envs, bool)
     begin_round(agent, batch.num_envs)
@@ -111,13 +115,13 @@ def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Ev
         success = np.where(acted, batch.read(lambda group: group.success), success)
         metrics = batch.read(lambda group: group.metrics)
         rewards, failures = batch.reward(), batch.read(lambda group: group.failure)
+        over = batch.read(lambda group: group.terminated).all(axis=1)
         for env in np.flatnonzero(playing):
             info: dict[str, Any] = {"success": success[env].all(), "failure": failure_name(int(failures[env]))}
-            if distance is not None:
-                info["distance"] = float(metrics[env, acted[env], distance].mean())
+            info |= {name: float(metrics[env, acted[env], place].mean()) for name, place in told.items()}
             if batch.num_agents > 1:
                 info |= {"rewards": rewards[env].astype(np.float64), "successes": success[env].copy()}
-            episodes[env].book(float(rewards[env].mean()), info)
+            episodes[env].book(float(rewards[env].mean()), info, bool(over[env]))
         playing &= ~batch.find_ended()
     return Evaluation(name, episodes)
 
@@ -212,7 +216,8 @@ def run(
     bands = {result.agent: result.estimate() for result in results}
     draw_curve(folder / "curve.png", learned.curve.steps, learned.curve.returns, bands, config.env_id)
     about = versions(name, options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
-    extra = {"training_s": learned.curve.seconds, "num_envs": config.num_envs, "agents": task.agent_names}
+    cost = {"training_s": learned.curve.seconds, "train_steps": learned.curve.last_step}
+    extra = {**cost, "num_envs": config.num_envs, "agents": task.agent_names}
     write_results(folder / "results.json", about, results, extra)
     console = Console(highlight=False, soft_wrap=True)
     show_table(results, console)

@@ -21,6 +21,11 @@ class Curve:
     returns: list[float] = field(default_factory=list)
     seconds: float = 0.0
 
+    @property
+    def last_step(self) -> int:
+        """Control steps taken when the last episode ended."""
+        return self.steps[-1] if self.steps else 0
+
     def save(self, path: Path) -> None:
         """Write it as CSV."""
         rows = [f"{step},{value:.6g}" for step, value in zip(self.steps, self.returns, strict=True)]

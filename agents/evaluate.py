@@ -18,13 +18,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy import stats
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
+from agents.intervals import share_interval, share_interval_over_seeds
 from benchmarks.runner import Estimate, mean_and_interval
 
 Agent = Callable[[np.ndarray], np.ndarray]
+#: Width of a class of pushes [N s].
+PUSH_CLASS = 5.0
 
 
 @dataclass
@@ -37,7 +39,9 @@ class Episode:
         steps: its length.
         successes: steps in which the task was fulfilled.
         success_at_end: whether it was in the last step.
+        terminated: whether it ended before its time, as by a fall.
         distance: mean over the steps of the task's ``distance`` [m], where it has one.
+        push: greatest impulse of a push [N s], where the task pushes, or None.
         failure: why the simulation gave up, or None.
         agent_totals: undiscounted return of every agent of a world, shape ``(agents,)``; None where there is one.
         agent_success: whether each had fulfilled its task in its last step, shape ``(agents,)``, or None.
@@ -48,18 +52,22 @@ class Episode:
     steps: int = 0
     successes: int = 0
     success_at_end: bool = False
+    terminated: bool = False
     distance: float = 0.0
+    push: float | None = None
     failure: str | None = None
     agent_totals: np.ndarray | None = None
     agent_success: np.ndarray | None = None
 
-    def book(self, reward: float, info: dict[str, Any]) -> None:
+    def book(self, reward: float, info: dict[str, Any], terminated: bool = False) -> None:
         """Add a step."""
+        self.terminated = terminated
         self.total += reward
         self.steps += 1
         self.success_at_end = bool(info.get("success", False))
         self.successes += self.success_at_end
         self.distance += (float(info.get("distance", np.nan)) - self.distance) / self.steps
+        self.push = info.get("strongest_push")
         self.failure = info.get("failure")
         if "rewards" in info:
             self.agent_totals = info["rewards"] + (0.0 if self.agent_totals is None else self.agent_totals)
@@ -107,6 +115,8 @@ class Evaluation:
             "episodes": len(self.episodes),
             "first_seed": self.episodes[0].seed,
         }
+        if self.episodes[0].push is not None:
+            row["by_push"] = by_push(self.episodes)
         if self.episodes[0].agent_totals is not None:
             of_agents = [mean_and_interval(totals) for totals in np.transpose([e.agent_totals for e in self.episodes])]
             row["agent_return_mean"] = [one.mean for one in of_agents]
@@ -114,46 +124,27 @@ class Evaluation:
         return row
 
 
-def share_interval(outcomes: Sequence[bool]) -> list[float]:
-    """Wilson's 95 % interval of the share of episodes with an outcome: not empty where all or none had it."""
-    return wilson(float(np.mean(outcomes)), len(outcomes), float(stats.norm.ppf(0.975)))
+def by_push(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+    """How many episodes lasted, by the greatest impulse of a push in them.
 
-
-def wilson(share: float, size: float, quantile: float) -> list[float]:
-    """The interval of a share whose ends differ from it by ``quantile`` of their own standard errors.
-
-    Wilson, "Probable inference, the law of succession, and statistical inference", J. Am. Stat. Assoc. 22, 1927.
-
-    Args:
-        share: that was found, in [0, 1].
-        size: of the sample; need not be whole.
-        quantile: of the normal, or of Student's distribution.
+    A push that fells a body counts with what it has given until then. Classes are :data:`PUSH_CLASS` wide; empty ones
+    are left out.
     """
-    if np.isinf(quantile):
-        return [0.0, 1.0]
-    square = quantile**2 / size
-    centre = (share + square / 2.0) / (1.0 + square)
-    half = np.sqrt(square * (share * (1.0 - share) + square / 4.0)) / (1.0 + square)
-    return [max(0.0, float(centre - half)), min(1.0, float(centre + half))]
+    classes: dict[int, list[bool]] = {}
+    for episode in episodes:
+        classes.setdefault(int(episode.push // PUSH_CLASS), []).append(not episode.terminated)
+    return [
+        _push_row((PUSH_CLASS * place, PUSH_CLASS * (place + 1)), lasted) for place, lasted in sorted(classes.items())
+    ]
 
 
-def share_interval_over_seeds(shares: Sequence[float], episodes: int) -> list[float]:
-    """The 95 % interval of a share that trainings of several seeds have on average.
-
-    Episodes of one training are alike, so all of them together are worth fewer: as many as would scatter as much as the
-    seeds' own shares do (Wilson's interval with the effective sample size; Franco, Little, Louis & Slud, "Comparative
-    study of confidence intervals for proportions in complex sample surveys", J. Survey Stat. Methodol. 7, 2019). The
-    quantile is Student's, of one degree of freedom less than there are seeds.
-
-    Args:
-        shares: of every seed.
-        episodes: of every seed.
-    """
-    seeds, mean = len(shares), float(np.mean(shares))
-    size, alone = float(seeds * episodes), mean * (1.0 - mean)
-    if seeds > 1 and alone > 0.0:
-        size = min(size, alone / max(float(np.var(shares, ddof=1)) / seeds, 1e-12))
-    return wilson(mean, size, float(stats.t.ppf(0.975, seeds - 1)) if seeds > 1 else np.inf)
+def _push_row(bounds: tuple[float, float], lasted: Sequence[bool]) -> dict[str, Any]:
+    return {
+        "impulse_n_s": list(bounds),
+        "episodes": len(lasted),
+        "lasted": float(np.mean(lasted)),
+        "lasted_interval": share_interval(lasted),
+    }
 
 
 def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -181,7 +172,19 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for name in ("success_once", "success_at_end"):
         shares = [row[name] for row in rows]
         summed |= {name: float(np.mean(shares)), f"{name}_interval": share_interval_over_seeds(shares, episodes)}
+    if "by_push" in rows[0]:
+        summed["by_push"] = _pooled([push for row in rows for push in row["by_push"]])
     return summed | {"failures": sum(row["failures"] for row in rows)}
+
+
+def _pooled(pushes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Classes of pushes of several trainings; their episodes count as if one training had played them all."""
+    classes: dict[tuple[float, float], list[bool]] = {}
+    for push in pushes:
+        lasted = round(push["lasted"] * push["episodes"])
+        own = [True] * lasted + [False] * (push["episodes"] - lasted)
+        classes.setdefault(tuple(push["impulse_n_s"]), []).extend(own)
+    return [_push_row(bounds, lasted) for bounds, lasted in sorted(classes.items())]
 
 
 def evaluate(
@@ -219,7 +222,8 @@ def _play_round(agent: Agent, venv: VecEnv, first_seed: int) -> list[Episode]:
     while playing.any():
         observation, rewards, dones, infos = venv.step(np.asarray(agent(observation), np.float32))
         for env in np.flatnonzero(playing):
-            episodes[env].book(float(rewards[env]), infos[env])
+            ended = bool(dones[env]) and not infos[env].get("TimeLimit.truncated", False)
+            episodes[env].book(float(rewards[env]), infos[env], ended)
         playing &= ~dones
     return episodes
 

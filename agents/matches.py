@@ -12,7 +12,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.config import TrainingConfig
-from agents.evaluate import Agent, Episode, Evaluation, evaluate, policy_agent, random_agent, share_interval, zero_agent
+from agents.evaluate import Agent, Episode, Evaluation, evaluate, policy_agent, random_agent, zero_agent
+from agents.intervals import share_interval
 from agents.selfplay import Pool
 from benchmarks.runner import mean_and_interval
 

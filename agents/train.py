@@ -134,7 +134,8 @@ def main(args: list[str] | None = None) -> None:
     bands = {result.agent: result.estimate() for result in results if isinstance(result, Evaluation)}
     draw_curve(folder / "curve.png", curve.steps, curve.returns, bands, config.env_id)
     about = versions("train", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
-    write_results(folder / "results.json", about, results, {"training_s": curve.seconds, "agents": facts.agents})
+    cost = {"training_s": curve.seconds, "train_steps": curve.last_step}
+    write_results(folder / "results.json", about, results, {**cost, "agents": facts.agents})
     (show_matches if config.selfplay else show_table)(results, console)
     files = "policy.zip, curve.png, curve.csv, config.yaml, results.json, checkpoints/, tensorboard/"
     console.print(f"in {folder}: {files}{', pool/' if config.selfplay else ''}")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from agents.batches import BatchTraining, load_batched, play
-from agents.evaluate import Episode
+from agents.batches import BatchTraining, in_every_seat, load_batched, play
+from agents.evaluate import Episode, zero_agent
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.envs.config import ConfigError, load_config
 from piavatar_envs.tasks import load_task
@@ -88,3 +88,20 @@ def test_the_command_line_wins_over_the_file(tmp_path):
     config = load_batched(Training, load_task, path, {"env.tone": 0.25, "iterations": 3})
     assert config.iterations == 3 and config.env["drive"]["tone"] == 0.25
     assert config.env["physics"]["density"] == 1000.0, "defaults are said, too"
+
+
+def test_falls_and_pushes_are_told(device):
+    """Without any action a body falls, before its time."""
+    task = load_task("PIAvatar/PushRecovery-v0")
+    config = load_config(task.Config, {"fidelity": "tiny", "throw_interval": 0.4, "episode_seconds": 3.0})
+    batch = BatchedEpisodes(task(config), 4, device)
+    found = play("zero", in_every_seat(zero_agent(batch.action_size)), batch, first_seed=3)
+    assert all(episode.terminated and episode.steps < 90 for episode in found.episodes)
+    assert sum(row["episodes"] for row in found.row()["by_push"]) == 4
+    assert max(episode.push for episode in found.episodes) > config.hit_impulse
+    short = load_config(task.Config, {"fidelity": "tiny", "episode_seconds": 0.1})
+    still = BatchedEpisodes(task(short), 2, device)
+    for episode in play("zero", in_every_seat(zero_agent(batch.action_size)), still, first_seed=3).episodes:
+        assert not episode.terminated and episode.steps == 3 and episode.push == 0.0
+    batch.close()
+    still.close()

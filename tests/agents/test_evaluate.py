@@ -10,15 +10,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from agents.evaluate import (
     Episode,
     Evaluation,
+    by_push,
     evaluate,
     over_seeds,
     random_agent,
     separated,
-    share_interval,
-    share_interval_over_seeds,
-    wilson,
     zero_agent,
 )
+from agents.intervals import share_interval, share_interval_over_seeds, wilson
 from agents.matches import seated
 
 
@@ -164,3 +163,18 @@ def test_random_actions_fill_the_action_space_and_repeat():
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
     assert first.min() < -0.9 and first.max() > 0.9 and np.abs(first).max() <= 1.0
+
+
+def test_pushes_fall_into_classes_and_pool_over_seeds():
+    pushes = [(0.0, False), (4.9, False), (5.0, True), (12.0, False), (13.0, True), (14.0, True)]
+    episodes = [Episode(i, steps=1, push=push, terminated=fell) for i, (push, fell) in enumerate(pushes)]
+    rows = by_push(episodes)
+    assert [(row["impulse_n_s"], row["episodes"]) for row in rows] == [([0, 5], 2), ([5, 10], 1), ([10, 15], 3)]
+    assert [row["lasted"] for row in rows] == pytest.approx([1.0, 0.0, 1.0 / 3.0])
+    assert rows[2]["lasted_interval"] == share_interval([True, False, False])
+    one = Evaluation("x", episodes).row()
+    assert one["by_push"] == rows
+    pooled = over_seeds([one, one])["by_push"]
+    assert [row["episodes"] for row in pooled] == [4, 2, 6]
+    assert [row["lasted"] for row in pooled] == pytest.approx([1.0, 0.0, 1.0 / 3.0])
+    assert pooled[2]["lasted_interval"] == share_interval([True, False, False] * 2)

@@ -1,0 +1,168 @@
+"""A table of scores out of many runs: ``python -m agents.scores runs/* --out benchmarks/results/NAME.json``.
+
+Every run is a folder with the ``results.json`` of ``agents.train``, ``agents.rsl_ppo`` or ``agents.pid_agent``. Runs of
+one configuration that differ in their seed become one row (:mod:`agents.compare`), runs of one environment one table;
+what no training changes (zero and random actions) stands in it once, unless an environment's settings change what an
+action means. Beside the JSON file comes the same as Markdown.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.markdown import Markdown
+
+from agents import compare
+from benchmarks.runner import describe_run, plain, write_json
+
+#: Agents that are not trained: the same in all runs of an environment.
+UNTRAINED = ("zero", "random")
+_COLUMNS = ("agent", "seeds", "return", "succeeds at the end", "at some time", "steps", "trained for")
+#: Returns of the same actions in the same episodes, on another device.
+_ALIKE = 1.0e-3
+
+
+def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of the table, by environment and then by agent.
+
+    Args:
+        runs: contents of their ``results.json``, by name of the folder.
+
+    Returns:
+        A row for each agent in each environment: ``env_id``, ``agent``, the names of its ``runs``, ``train_steps`` and
+        ``training_s`` of one of them on average, and the figures as in :func:`agents.evaluate.over_seeds`.
+
+    Raises:
+        ValueError: no runs; or runs of one script and environment, not all of the same settings but for the seed.
+    """
+    if not runs:
+        raise ValueError("there are no runs; give folders with a results.json")
+    groups: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
+    for name, run in runs.items():
+        groups.setdefault((run["config"]["env_id"], run["benchmark"]), {})[name] = run
+    rows: list[dict[str, Any]] = []
+    for (env_id, script), group in sorted(groups.items()):
+        for row in _rows(group):
+            agent = row["case"] if row["case"] != "trained" else script
+            if agent in UNTRAINED:
+                twins = [r for r in rows if r["env_id"] == env_id and r["agent"].startswith(agent)]
+                if any(math.isclose(r["return_mean"], row["return_mean"], rel_tol=_ALIKE) for r in twins):
+                    continue
+                # other settings of the environment, where an action means something else
+                agent = f"{agent}, as {script}" if twins else agent
+            else:
+                row = {"runs": list(group), **_cost(group), **row}
+            rows.append({"env_id": env_id, "agent": agent} | {key: row[key] for key in row if key != "case"})
+    return sorted(rows, key=lambda row: (row["env_id"], "runs" in row, row["agent"]))
+
+
+def _rows(group: Mapping[str, Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
+    """Of the runs of one script in one environment."""
+    if len(group) > 1:
+        return compare.summarize(group)["results"]
+    (run,) = group.values()
+    return [row | {"seeds": None if row["case"] in UNTRAINED else 1} for row in run["results"]]
+
+
+def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """What a training took on average; None where nothing is trained."""
+    seconds = [run.get("training_s") for run in group.values()]
+    steps = [run.get("train_steps") for run in group.values()]
+    return {
+        "training_s": None if None in seconds else sum(seconds) / len(seconds),
+        "train_steps": None if None in steps else sum(steps) / len(steps),
+    }
+
+
+def markdown(rows: Sequence[Mapping[str, Any]], about: str) -> str:
+    """The rows as Markdown: a table an environment, and one of pushes where there are any."""
+    lines = ["# Scores", "", about, ""]
+    for env_id in sorted({row["env_id"] for row in rows}):
+        own = [row for row in rows if row["env_id"] == env_id]
+        lines += [f"## {env_id}", "", _line(_COLUMNS), _line(["---"] * len(_COLUMNS))]
+        lines += [_line(_cells(row)) for row in own]
+        pushed = [row for row in own if row.get("by_push")]
+        if pushed:
+            lines += ["", *_pushes(pushed)]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    trained = "" if row.get("training_s") is None else f"{row['training_s']:.0f} s"
+    if row.get("train_steps"):
+        trained = f"{row['train_steps'] / 1e6:.2g} M steps, {trained}"
+    return [
+        row["agent"],
+        str(row["seeds"] or ""),
+        _with(row["return_mean"], row["return_interval"], ".1f"),
+        _with(row["success_at_end"], row["success_at_end_interval"], ".0%"),
+        _with(row["success_once"], row["success_once_interval"], ".0%"),
+        _with(row["mean_steps"], row["steps_interval"], ".0f"),
+        trained,
+    ]
+
+
+def _pushes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Share of episodes that lasted, by the greatest impulse of a push."""
+    classes = sorted({tuple(push["impulse_n_s"]) for row in rows for push in row["by_push"]})
+    lines = [_line(["strongest push [N s]", *(row["agent"] for row in rows)]), _line(["---"] * (1 + len(rows)))]
+    for bounds in classes:
+        cells = [f"{bounds[0]:g} to {bounds[1]:g}"]
+        for row in rows:
+            push = next((push for push in row["by_push"] if tuple(push["impulse_n_s"]) == bounds), None)
+            cells.append("" if push is None else f"{push['lasted']:.0%} of {push['episodes']}")
+        lines.append(_line(cells))
+    return ["Episodes that lasted, by the strongest push in them:", "", *lines]
+
+
+def _with(mean: float, interval: Sequence[float] | None, form: str) -> str:
+    return f"{mean:{form}}" if interval is None else f"{mean:{form}} ({interval[0]:{form}} to {interval[1]:{form}})"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Sum up runs of several agents, environments and seeds in a table."""
+
+    #: folders of the runs
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    #: JSON file to write; the table comes beside it, as .md
+    out: Path | None = None
+
+
+def main(args: list[str] | None = None) -> None:
+    """The command line."""
+    options = tyro.cli(Options, prog="python -m agents.scores", args=args)
+    try:
+        runs = {path.name: json.loads((path / "results.json").read_text(encoding="utf-8")) for path in options.runs}
+        rows = scores(runs)
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    devices = sorted({run["device"]["name"] for run in runs.values()})
+    commits = sorted({str(run["commit"])[:12] for run in runs.values()})
+    about = (
+        f"{', '.join(devices)}; commits {', '.join(commits)}. Brackets are 95 % intervals: over seeds where there are "
+        "several, else over episodes."
+    )
+    text = markdown(rows, about)
+    if options.out is not None:
+        report = {**describe_run("scores", "cpu"), "devices": devices, "commits": commits, "results": rows}
+        write_json(options.out, plain(report, "scores"))
+        options.out.with_suffix(".md").write_text(text, encoding="utf-8")
+    Console(soft_wrap=True).print(Markdown(text))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""Runs of several agents, environments and seeds in one table."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import pytest
+
+from agents import scores
+
+
+def row(case: str, value: float, **more) -> dict:
+    """An agent's figures over 10 episodes."""
+    return {
+        "case": case, "return_mean": value, "return_interval": [value - 1.0, value + 1.0], "return_std": 1.0,
+        "success_once": 1.0, "success_once_interval": [0.7, 1.0], "success_at_end": 0.5,
+        "success_at_end_interval": [0.2, 0.8], "mean_steps": 30.0, "steps_interval": [20.0, 40.0], "failures": 0,
+        "episodes": 10, "first_seed": 7, **more,
+    }  # fmt: skip
+
+
+def run(script: str, env_id: str, seed: int, *rows: dict, seconds: float = 60.0) -> dict:
+    return {
+        "benchmark": script, "commit": "abc", "device": {"name": "some GPU"}, "versions": {}, "seed": seed,
+        "config": {"env_id": env_id, "seed": seed, "ppo": {"epochs": 5}},
+        "training_s": seconds, "train_steps": 2_000_000,
+        "results": [row("zero", 3.0), row("random", 2.0), *rows],
+    }  # fmt: skip
+
+
+@pytest.fixture
+def runs() -> dict[str, dict]:
+    """Two seeds and another script in one environment, and one run in another."""
+    pushes = {"by_push": [{"impulse_n_s": [0.0, 5.0], "episodes": 10, "lasted": 0.5, "lasted_interval": [0.2, 0.8]}]}
+    return {
+        "stand_0": run("rsl_ppo", "Stand-v0", 0, row("trained", 80.0)),
+        "stand_1": run("rsl_ppo", "Stand-v0", 1, row("trained", 90.0), seconds=80.0),
+        "stand_pid": run("pid_agent", "Stand-v0", 0, row("PID", 40.0)),
+        "push": run("train", "Push-v0", 0, row("trained", 10.0, **pushes)),
+    }
+
+
+def test_seeds_become_one_row_and_the_untrained_stand_once(runs):
+    rows = scores.scores(runs)
+    assert [(r["env_id"], r["agent"], r["seeds"]) for r in rows] == [
+        ("Push-v0", "random", None), ("Push-v0", "zero", None), ("Push-v0", "train", 1),
+        ("Stand-v0", "random", None), ("Stand-v0", "zero", None), ("Stand-v0", "PID", 1), ("Stand-v0", "rsl_ppo", 2),
+    ]  # fmt: skip
+    trained = rows[-1]
+    assert (
+        trained["return_mean"] == 85.0 and trained["training_s"] == 70.0 and trained["runs"] == ["stand_0", "stand_1"]
+    )
+    # Student's t of one degree of freedom: 12.7 standard errors, of 5 each
+    assert trained["return_interval"] == pytest.approx([85.0 - 12.706 * 5.0, 85.0 + 12.706 * 5.0], rel=1e-3)
+    assert rows[2]["by_push"][0]["lasted"] == 0.5
+
+
+def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
+    for name, content in runs.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.json").write_text(json.dumps(content))
+    scores.main([*(str(tmp_path / name) for name in runs), "--out", str(tmp_path / "table.json")])
+    report = json.loads((tmp_path / "table.json").read_text())
+    assert len(report["results"]) == 7 and report["devices"] == ["some GPU"] and report["commits"] == ["abc"]
+    text = (tmp_path / "table.md").read_text()
+    assert text.index("## Push-v0") < text.index("## Stand-v0")
+    assert "| rsl_ppo | 2 | 85.0 (21.5 to 148.5) |" in text and "2 M steps, 70 s" in text
+    assert "| 0 to 5 | 50% of 10 |" in text
+    with pytest.raises(SystemExit, match=r"error: .*nowhere"):
+        scores.main([str(tmp_path / "nowhere")])
+
+
+def test_untrained_agents_stand_twice_where_actions_mean_something_else(runs):
+    runs["stand_pid"]["results"][0]["return_mean"] = 3.0001  # rounding, on another device
+    runs["stand_pid"]["results"][1]["return_mean"] = 2.5
+    agents = [r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
+    assert agents == ["random", "random, as rsl_ppo", "zero", "PID", "rsl_ppo"]
+
+
+def test_other_settings_are_refused(runs):
+    other = copy.deepcopy(runs)
+    other["stand_1"]["config"]["ppo"]["epochs"] = 6
+    with pytest.raises(ValueError, match=r"ppo\.epochs=6"):
+        scores.scores(other)
+    with pytest.raises(ValueError, match="there are no runs"):
+        scores.scores({})
