@@ -15,6 +15,7 @@ from tensordict import TensorDict
 
 from agents.batches import BatchTraining
 from agents.evaluate import Agent
+from agents.help import HelpSettings
 from agents.workers import components
 from piavatar_envs.envs.config import FROZEN, ConfigError
 from piavatar_envs.envs.observations import ObservationLayout
@@ -55,6 +56,7 @@ class RslTraining(BatchTraining):
 
     env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
     ppo: RslPPOSettings = Field(default_factory=RslPPOSettings, description="the algorithm")
+    help: HelpSettings | None = Field(None, description="help for the pelvis that wanes; null for what env says")
 
 
 def network_settings(ppo: RslPPOSettings) -> dict[str, Any]:

@@ -21,10 +21,12 @@ from torch.utils.tensorboard import SummaryWriter
 from agents.batches import Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, set_random_states
 from agents.curve import Curve
+from agents.help import HelpedEnv
 from agents.mirror import Mirror
 from agents.rsl_policy import RslTraining, actor_settings, mean_agent, network_settings
 from agents.workers import components
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
+from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
@@ -142,6 +144,8 @@ class Runner(OnPolicyRunner):
             own.copy_(sums)
         log.tot_timesteps, log.tot_time = saved["logged"]
         set_random_states(saved["random"])
+        if isinstance(self.env, HelpedEnv):
+            self.env.steps = self.iterations * self.env.rollout_steps
 
 
 def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
@@ -191,6 +195,21 @@ def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
     return {"data_augmentation_func": append, "use_data_augmentation": True}
 
 
+def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
+    """The environments to learn in.
+
+    Raises:
+        ConfigError: there is no such term to observe, or nothing to be helped.
+    """
+    if config.help is not None and task.config.drive.control == "pose":
+        raise ConfigError('help is for bodies under torques, and env.drive.control="pose"; use "pd" or "torque"')
+    groups = None if config.observe is None else {"policy": config.observe}
+    about = (config.env_id, config.num_envs, device, task.config, groups, config.first_seed)
+    if config.help is None:
+        return AvatarRslEnv(*about)
+    return HelpedEnv(config.help, config.ppo.rollout_steps, *about)
+
+
 def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:
     """Train an agent.
 
@@ -202,10 +221,9 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
         checkpoint: from which to go on, and which to keep up.
 
     Raises:
-        ConfigError: there is no such term to observe, or the checkpoint has had more iterations than are asked for.
+        ConfigError: what is asked for does not fit the environment, or the checkpoint has had more iterations.
     """
-    groups = None if config.observe is None else {"policy": config.observe}
-    env = AvatarRslEnv(config.env_id, config.num_envs, device, task.config, groups, config.first_seed)
+    env = make_env(config, task, device)
     seed_all(config.seed)
     runner = Runner(env, config, folder, checkpoint)
     runner.train(config.iterations)

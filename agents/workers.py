@@ -98,7 +98,8 @@ def start_vector(config: TrainingConfig, device: str = "cpu") -> VecEnv:
     Raises:
         ValueError: an unknown device, or a batch that does not fit.
     """
-    torch.set_num_threads(1)  # the environments have the cores; the networks are small
+    if device == "cpu":
+        torch.set_num_threads(1)  # the environments have the cores; the networks are small
     return SB3VecEnv(config.env_id, config.num_workers, device=device, config=dict(config.env))
 
 
