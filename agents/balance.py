@@ -37,7 +37,8 @@ class Stance:
     Attributes:
         mass: of the body [kg].
         height: of its centre of mass over the ankles [m].
-        behind: from the ankles to the heels [m].
+        behind: from the ankles to the hindmost place that bears, such as the heels [m]; negative where that lies ahead
+            of the ankles.
         ahead: from the ankles to the balls of the toes [m].
         beside: from the midst of the ankles to the outer edge of a foot [m].
         foot_width: of one foot, whose ankle is in its midst [m].
@@ -54,11 +55,13 @@ class Stance:
         """Refuse lengths and masses that are none.
 
         Raises:
-            ValueError: a value that is not positive.
+            ValueError: a value that is not positive, or feet that bear nowhere.
         """
         for name, value in vars(self).items():
-            if not value > 0.0:
+            if name != "behind" and not value > 0.0:
                 raise ValueError(f"{name}={value} must be > 0")
+        if not self.behind > -self.ahead:
+            raise ValueError(f"behind={self.behind} must be > -ahead={-self.ahead}, or the feet have no length")
 
     @property
     def rate(self) -> float:

@@ -18,7 +18,8 @@ kept as a torque, so that a change of gains does not jump either (section 11.5).
 
 Torques that are held for a control step of 1/30 s allow only weak gains. Where the inertia that a joint moves is given,
 error and rate are those that the end of the step will have (Tan, Liu & Turk, "Stable Proportional-Derivative
-Controllers", 2011), and gains may be as high as one likes.
+Controllers", 2011), and gains may be as high as one likes. That is right of one joint. Those of a body answer together:
+``ahead`` of :meth:`PID.step` takes the place of the division by inertias (:func:`agents.bones.answered`).
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+#: From torques if nothing moved and what springs and dampers add to the inertia to the torques that are given.
+Ahead = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 #: A number for all, or an array that broadcasts against ``(n, joints, 3)`` or ``(n, dof)``.
 PerJoint = float | np.ndarray
@@ -123,6 +127,7 @@ class PID:
         target_rate: np.ndarray | float = 0.0,
         feedforward: np.ndarray | float = 0.0,
         factor: np.ndarray | float = 1.0,
+        ahead: Ahead | None = None,
     ) -> np.ndarray:
         """Torques for the next ``dt`` [N m].
 
@@ -132,6 +137,8 @@ class PID:
             target_rate: of the target [rad/s].
             feedforward: torque on top, within the limit [N m].
             factor: on the gains [-], from a schedule.
+            ahead: how the body answers springs and dampers within the step; None where every degree of freedom answers
+                alone, by the inertia of the gains, or none does.
 
         Raises:
             ValueError: an error or a rate of another shape than the controller's.
@@ -139,17 +146,20 @@ class PID:
         for name, value in (("error", error), ("rate", rate)):
             if np.shape(value) != self.integral.shape:
                 raise ValueError(f"{name} has shape {np.shape(value)}, expected {self.integral.shape}")
-        raw = self._proportional(error, target_rate - rate, factor) + self.integral + feedforward
+        raw = self._proportional(error, target_rate - rate, factor, ahead) + self.integral + feedforward
         limited = np.clip(raw, -self._limit, self._limit)
         self.integral += self.dt * factor * self._ki * error + self._give_way * (limited - raw)
         return limited
 
-    def _proportional(self, error: np.ndarray, closing: np.ndarray, factor: np.ndarray | float) -> np.ndarray:
-        """``kp e + kd e'``, now or, where the inertia is known, as they will be after the step."""
+    def _proportional(
+        self, error: np.ndarray, closing: np.ndarray, factor: np.ndarray | float, ahead: Ahead | None
+    ) -> np.ndarray:
+        """``kp e + kd e'``, now or, where it is known how bodies answer, as they will be after the step."""
         kp, kd, dt = factor * self._kp, factor * self._kd, self.dt
-        if self.gains.inertia is None:
+        if ahead is None and self.gains.inertia is None:
             return kp * error + kd * closing
-        return (kp * (error + dt * closing) + kd * closing) / (1.0 + dt * (kd + dt * kp) / self.gains.inertia)
+        still, added = kp * (error + dt * closing) + kd * closing, dt * (kd + dt * kp)
+        return still / (1.0 + added / self.gains.inertia) if ahead is None else ahead(still, added)
 
 
 class PosePID:
@@ -191,6 +201,7 @@ class PosePID:
         target_rate: np.ndarray | float = 0.0,
         feedforward: np.ndarray | float = 0.0,
         factor: np.ndarray | float = 1.0,
+        ahead: Ahead | None = None,
     ) -> np.ndarray:
         """Torques of all joints for the next step [N m], ``(n, joints, 3)``.
 
@@ -201,12 +212,13 @@ class PosePID:
             target_rate: of the target, in the axes that its bones have in the target [rad/s].
             feedforward: torque on top, within the limit [N m].
             factor: on the gains [-], from a schedule, ``(n, joints, 1)`` or a number.
+            ahead: how the body answers, see :meth:`PID.step`.
         """
         target = np.broadcast_to(target, rotation.shape)
         error = difference(rotation, target)
         closing = target_rate if np.ndim(target_rate) == 0 else turned(error, np.broadcast_to(target_rate, error.shape))
         rate = self._found_rate(rotation) if rate is None else rate
-        return self.pid.step(error, rate, closing, feedforward, factor)
+        return self.pid.step(error, rate, closing, feedforward, factor, ahead)
 
     def _found_rate(self, rotation: np.ndarray) -> np.ndarray:
         """Rates from two rotations, through a filter of first order; zero in a first step."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from agents.gains import LoadSchedule, PhaseSchedule, gains_for, subtrees
+from agents.gains import LoadSchedule, PhaseSchedule, gains_by_strength, gains_for, subtrees
 from agents.pid import PID, Gains, PosePID, difference, follow, motion_poses, turned
 
 M, L, G = 2.0, 0.5, 9.81
@@ -195,6 +195,20 @@ def test_with_the_inertia_known_strong_gains_do_not_shake_at_thirty_steps_a_seco
     assert np.abs(blunt).max() > 10.0
 
 
+def test_what_looks_ahead_sees_the_step_as_an_inertia_does():
+    """Given the same answer as a function, M / (M + A), the law is the same; and the integral is not touched by it."""
+    gains = dict(kp=400.0, kd=30.0, ki=20.0, limit=100.0)
+    alone = PID(Gains(**gains, inertia=INERTIA), 0.02, (2, 3))
+    told = PID(Gains(**gains), 0.02, (2, 3))
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        error, rate = 0.1 * rng.normal(size=(2, 2, 3))
+        ahead = told.step(error, rate, ahead=lambda still, added: still * INERTIA / (INERTIA + added))
+        np.testing.assert_allclose(ahead, alone.step(error, rate))
+        np.testing.assert_allclose(told.integral, alone.integral)
+    assert np.abs(told.integral).max() > 0.0
+
+
 def test_environments_know_nothing_of_each_other_and_reset_alone():
     gains, shape = Gains(30.0, 2.0, 10.0, 20.0), (3, 4, 3)
     rng = np.random.default_rng(1)
@@ -276,6 +290,16 @@ def test_gains_follow_from_what_hangs_on_a_joint():
     np.testing.assert_allclose(flat.inertia, [2.0 + 3.0 * 4.0, 3.0 * 4.0])
     with pytest.raises(ValueError, match="joint 0 comes before its parent 1"):
         subtrees((1, -1), masses[:2], centres[:2], positions[:2])
+
+
+def test_gains_by_strength_ask_for_the_whole_torque_at_one_angle():
+    limit = np.array([[100.0, 40.0, 10.0], [8.0, 20.0, 4.0]])
+    gains = gains_by_strength(limit, stiffness=2.0, damping_time=0.1, integral_time=4.0)
+    np.testing.assert_allclose(gains.kp * 0.5, [[100.0], [20.0]])  # at 1 / stiffness, about the strongest axis
+    np.testing.assert_allclose(gains.kd, 0.1 * gains.kp)
+    np.testing.assert_allclose(gains.ki, gains.kp / 4.0)
+    strong = PID(gains, 0.01, (1, 2, 3)).step(np.full((1, 2, 3), 0.6), np.zeros((1, 2, 3)))
+    np.testing.assert_allclose(strong[0], limit)
 
 
 def test_a_phase_schedule_is_a_closed_line_through_its_knots():

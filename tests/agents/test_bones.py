@@ -1,0 +1,138 @@
+"""The tree of rigid bones against mechanics: energy, virtual work, pendulums and springs in chains."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from agents.bones import BEYOND, NUM_DOF, Bones, Posture, answered, force_moments, in_bones
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
+
+GRAVITY = 9.81
+STEP = 1e-6
+
+
+@pytest.fixture(scope="module")
+def bones() -> Bones:
+    """A body of random bones."""
+    rng = np.random.default_rng(0)
+    joints = rng.normal(scale=0.3, size=(NUM_JOINTS, 3))
+    spread = rng.normal(scale=0.1, size=(NUM_JOINTS, 3, 3))
+    mass = rng.uniform(0.5, 8.0, NUM_JOINTS)
+    inertia = mass[:, None, None] * (spread @ np.swapaxes(spread, 1, 2) + 1e-3 * np.eye(3))
+    return Bones(mass, joints, joints + rng.normal(scale=0.1, size=(NUM_JOINTS, 3)), inertia)
+
+
+@pytest.fixture(scope="module")
+def local() -> np.ndarray:
+    """Two random poses."""
+    rng = np.random.default_rng(1)
+    turns = Rotation.from_rotvec(rng.normal(scale=0.5, size=(2 * NUM_JOINTS, 3)))
+    return turns.as_matrix().reshape(2, NUM_JOINTS, 3, 3)
+
+
+def moved(bones: Bones, local: np.ndarray, velocity: np.ndarray, time: float) -> Posture:
+    """The posture after ``time`` of a generalised velocity, about the bones' own axes."""
+    turns = Rotation.from_rotvec(time * velocity[3:].reshape(-1, 3)).as_matrix()
+    now = bones.posture(local @ turns)
+    shift = time * velocity[:3]
+    return Posture(now.rotation, now.joints + shift, now.centres + shift)
+
+
+def rates(bones: Bones, local: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities of the centres and spins of all bones, by differences."""
+    before, after = (moved(bones, local, velocity, sign * STEP) for sign in (-0.5, 0.5))
+    turn = after.rotation @ np.swapaxes(before.rotation, -1, -2)
+    spin = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(turn.shape[:2] + (3,))
+    return (after.centres - before.centres) / STEP, spin / STEP
+
+
+def test_what_hangs_on_a_joint_is_what_its_turn_moves():
+    for joint in range(NUM_JOINTS):
+        for bone in range(NUM_JOINTS):
+            above = bone
+            while above not in (joint, -1):
+                above = PARENTS[above]
+            assert BEYOND[joint, bone] == (above == joint)
+
+
+def test_the_mass_matrix_gives_the_kinetic_energy(bones, local):
+    velocity = np.random.default_rng(2).normal(size=NUM_DOF)
+    linear, spin = rates(bones, local, velocity)
+    rotation = bones.posture(local).rotation
+    inertia = rotation @ bones.inertia @ np.swapaxes(rotation, -1, -2)
+    wanted = 0.5 * np.einsum("b,nbi,nbi->n", bones.mass, linear, linear)
+    wanted += 0.5 * np.einsum("nbi,nbij,nbj->n", spin, inertia, spin)
+    matrix = bones.mass_matrix(bones.posture(local))
+    np.testing.assert_allclose(0.5 * np.einsum("i,nij,j->n", velocity, matrix, velocity), wanted, rtol=1e-6)
+    np.testing.assert_allclose(matrix, np.swapaxes(matrix, 1, 2), atol=1e-12)
+
+
+def test_moments_of_weight_and_of_forces_do_the_work_that_they_do(bones, local):
+    """Power of a moment about the bone's own axes is that of the force at what moves: virtual work."""
+    velocity = np.random.default_rng(3).normal(size=NUM_DOF)
+    velocity[:6] = 0.0  # the pelvis is held
+    linear, spin = rates(bones, local, velocity)
+    now = bones.posture(local)
+    own = velocity[6:].reshape(-1, 3)
+
+    weight = in_bones(now, bones.weight_moments(now, GRAVITY))[:, 1:]
+    power = -GRAVITY * np.einsum("b,nb->n", bones.mass, linear[..., 2])
+    np.testing.assert_allclose(np.einsum("nbi,bi->n", weight, own), power, rtol=1e-6)
+
+    foot, force = joint_index("left_ankle"), np.array([[30.0, -20.0, 400.0], [-3.0, 5.0, 7.0]])
+    place = now.centres[:, foot] + [0.02, -0.1, -0.03]
+    speed = linear[:, foot] + np.cross(spin[:, foot], place - now.centres[:, foot])
+    moments = in_bones(now, force_moments(now, foot, place, force))[:, 1:]
+    np.testing.assert_allclose(np.einsum("nbi,bi->n", moments, own), (force * speed).sum(1), rtol=1e-6)
+
+
+def test_joints_that_carry_the_weight_by_their_moments_stay_as_they_are(bones, local):
+    """Held at the pelvis, gravity and the moments against it leave no acceleration: no joint is forgotten."""
+    now = bones.posture(local)
+    matrix, moments = bones.mass_matrix(now), in_bones(now, bones.weight_moments(now, GRAVITY))
+    pull = np.einsum("nij,j->ni", matrix[:, :, :3], [0.0, 0.0, -GRAVITY])  # all bones fall alike
+    np.testing.assert_allclose(pull[:, 6:], moments[:, 1:].reshape(2, -1), atol=1e-9)
+
+
+def test_of_a_free_joint_that_answers_alone_the_known_share_is_left():
+    """M / (M + A), which is what Gains with an inertia leave, of a bone much lighter than all others."""
+    joints = np.zeros((NUM_JOINTS, 3))
+    mass, inertia = np.full(NUM_JOINTS, 1e6), np.tile(1e6 * np.eye(3), (NUM_JOINTS, 1, 1))
+    wrist = joint_index("left_wrist")
+    mass[wrist], inertia[wrist] = 1e-3, 0.2 * np.eye(3)
+    light = Bones(mass, joints, joints, inertia)
+    matrix = light.mass_matrix(light.posture(np.tile(np.eye(3), (1, NUM_JOINTS, 1, 1))))
+    torque, added = np.zeros((1, NUM_JOINTS - 1, 3)), np.zeros((1, NUM_JOINTS - 1, 3))
+    torque[0, wrist - 1], added[0, wrist - 1] = [1.0, 2.0, 3.0], [0.1, 0.2, 0.3]
+    left = answered(matrix, torque, added)[0, wrist - 1]
+    np.testing.assert_allclose(left, [1.0 * 0.2 / 0.3, 2.0 * 0.2 / 0.4, 3.0 * 0.2 / 0.5], rtol=1e-5)
+
+
+def energies(bones: Bones, local: np.ndarray, together: bool, steps: int = 60, dt: float = 1.0 / 30.0) -> np.ndarray:
+    """Kinetic energy about a pose, under strong dampers whose torque is held for a step, ``(steps + 1,)``."""
+    matrix = bones.mass_matrix(bones.posture(local))[:1]
+    damping = 40.0
+    added = np.full((1, NUM_JOINTS - 1, 3), dt * damping)
+    velocity = np.zeros((1, NUM_DOF))
+    velocity[0, 6:] = 0.1
+    found = [0.5 * velocity[0] @ matrix[0] @ velocity[0]]
+    for _ in range(steps):
+        torque = -damping * velocity[:, 6:].reshape(1, -1, 3)
+        if together:
+            torque = answered(matrix, torque, added)
+        else:
+            own = np.diagonal(matrix, axis1=1, axis2=2)[:, 6:].reshape(torque.shape)
+            torque = torque / (1.0 + added / own)
+        force = np.concatenate([np.zeros((1, 6)), torque.reshape(1, -1)], axis=1)
+        velocity = velocity + dt * np.linalg.solve(matrix, force[..., None])[..., 0]
+        found.append(0.5 * velocity[0] @ matrix[0] @ velocity[0])
+    return np.array(found)
+
+
+def test_dampers_that_know_of_their_own_inertia_only_drive_a_chain(bones, local):
+    """Held for a step they give it energy, each right for itself; those that answer together only take it."""
+    alone, together = (energies(bones, local, together) for together in (False, True))
+    assert alone[-1] > 1e6 * alone[0]
+    assert (np.diff(together) < 0.0).all()
