@@ -1,0 +1,262 @@
+"""An agent for bodies that stand by joint torques (``control="torque"``), such as PIAvatar/Stand-v0: PID and balance.
+
+It sees what any agent sees, the observation, and knows the body as its designer would: masses, lengths and strengths.
+Four parts add up to the torques of a step::
+
+    balance      where the centre of pressure has to be (:mod:`agents.balance`): the force of the ground on both feet
+    feet         what the joints of the legs give for it, J^T f, from the soles up
+    weight       what all joints give to carry what hangs on them
+    PID          what they give besides to hold a pose, or to follow a clip (:class:`~agents.pid.PosePID`)
+
+The joints of a body move each other, and torques are held for a control step: gains that know of one joint's inertia
+only throw the short, light bones of the spine to and fro from step to step, the muscles saturate and the body folds.
+The PID therefore looks ahead with the mass matrix of the whole body (:func:`~agents.bones.answered`).
+
+:func:`make_pid_agent` makes one for a task; it is called with observations ``(n, observation_size)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from agents.balance import FRONTAL, GRAVITY, Balance, Effort, Stance
+from agents.bones import NUM_DOF, Bones, Posture, answered, force_moments, in_bones
+from agents.gains import gains_by_strength
+from agents.pid import PID, PosePID, follow
+from piavatar_envs.avatar.muscles import REFERENCE_HEIGHT, REFERENCE_MASS, make_muscles
+from piavatar_envs.avatar.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
+from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.config import load_config
+from piavatar_envs.tasks import load_task
+
+SIDES = ("left", "right")
+HIPS, ANKLES = ([joint_index(f"{side}_{joint}") for side in SIDES] for joint in ("hip", "ankle"))
+#: Time over which the load of the feet is averaged [s].
+LOAD_TIME = 0.02
+#: Share of the weight on the feet from which on legs push with all of it.
+BEARING = 0.5
+
+
+@dataclass(frozen=True)
+class Design:
+    """Numbers of the controller. Lengths are of a body at grid spacings of 5 cm, ``fidelity="coarse"``.
+
+    Attributes:
+        stiffness: of the joints by their strength [1/rad], see :func:`~agents.gains.gains_by_strength`.
+        damping_time: ``kd / kp`` [s].
+        integral_time: ``kp / ki`` [s].
+        support: from the ankles to the hindmost and to the foremost place of the centre of pressure that ankles can
+            hold [m]. Feet that are pressed further back roll over their heels.
+        foot_width: within which ankles can hold it sideways [m].
+        gain: of the balance, see :class:`~agents.balance.Balance`.
+        hip_threshold, hip_gain: of the hip strategy, see :class:`~agents.balance.Balance`.
+        hip_share: share of the strength of both hips that it has [-].
+        knee, hip: bend of knees and hips in the pose that is held if no other is given [rad]. What puts the feet under
+            the body widens what a push may do.
+    """
+
+    stiffness: float = 1.75
+    damping_time: float = 0.06
+    integral_time: float = 2.0
+    support: tuple[float, float] = (0.010, 0.112)
+    foot_width: float = 0.04
+    gain: float = 0.72
+    hip_threshold: float = 0.77
+    hip_gain: float = 6.0
+    hip_share: float = 0.6
+    knee: float = 0.15
+    hip: float = -0.03
+
+    def pose(self) -> np.ndarray:
+        """The pose that is held if no other is given, ``(21, 3)`` [rad]."""
+        pose = np.zeros((NUM_JOINTS, 3))
+        for side in SIDES:
+            pose[joint_index(f"{side}_knee"), 0], pose[joint_index(f"{side}_hip"), 0] = self.knee, self.hip
+        return pose[1:]
+
+
+class PIDAgent:
+    """Keeps its balance in a pose, or while it follows a clip.
+
+    Attributes:
+        bones: the body.
+        balance: the strategy of its ankles and hips.
+        effort: what the balance asked for in the last step.
+    """
+
+    def __init__(
+        self,
+        env: BatchEnv,
+        design: Design = Design(),
+        poses: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> None:
+        """Design the controller.
+
+        Args:
+            env: a batch of the task, of any size; its body, layout and time step are read, not its state.
+            design: numbers of the controller.
+            poses: what to follow, from times since the episode began [s] ``(n,)`` to rotation vectors of all joints but
+                the root ``(n, 21, 3)``, such as :func:`~agents.pid.motion_poses` gives; None to hold the design's pose.
+
+        Raises:
+            ValueError: joints that are not moved by torques.
+        """
+        if env.control != "torque":
+            raise ValueError(f'control={env.control!r}; the PID agent gives torques: make it with control="torque"')
+        self.design, self.layout, self.dt = design, env.layout, env.config.physics.control_dt
+        self.friction = env.config.physics.friction
+        points = env.simulation.flesh[0].points
+        self.bones, self.acting = Bones.of(points), [joint_index(name) for name in env.action_spec.joints]
+        size = self.bones.mass.sum() * np.ptp(points.rest[0][:, 2]) / (REFERENCE_MASS * REFERENCE_HEIGHT)
+        muscles = make_muscles(strength=env.config.drive.strength)
+        self.lower, self.upper = size * muscles.lower, size * muscles.upper
+        # what tissue resists within a step, as an inertia: that of a hand is less
+        self._resisting = np.repeat(self.dt * muscles.tissue_damping[1:], 3)
+        self.balance = self._balance()
+        self.poses = poses or _held(design.pose())
+        self.begin(0)
+
+    def _balance(self) -> Balance:
+        """The strategy of a body that stands in its rest pose."""
+        bones, design = self.bones, self.design
+        height = float(bones.mean(bones.centres[None])[0, 2] - bones.joints[ANKLES, 2].mean())
+        beside = float(np.ptp(bones.joints[ANKLES, 0]) + design.foot_width) / 2.0
+        back, front = design.support
+        stance = Stance(float(bones.mass.sum()), height, -back, front, beside, design.foot_width)
+        limit = 2.0 * design.hip_share * np.minimum(self.upper, -self.lower)[HIPS[0], :2]
+        return Balance(
+            stance, design.gain, hip_threshold=design.hip_threshold, hip_gain=design.hip_gain, hip_limit=tuple(limit)
+        )
+
+    def begin(self, n: int) -> None:
+        """``n`` episodes begin: forget the last ones."""
+        design, limit = self.design, np.maximum(-self.lower, self.upper)[1:]
+        stiff = np.ones((NUM_JOINTS, 3))
+        stiff[ANKLES, 0] = 0.0  # ankles press the ground; the PID keeps feet from turning over
+        gains = gains_by_strength(np.maximum(limit, 1e-6), design.stiffness, design.damping_time, design.integral_time)
+        self.pid = PosePID(PID(gains, self.dt, (n, NUM_ACTUATED, 3)))
+        self.effort: Effort | None = None
+        self._stiff, self._time, self._load = np.tile(stiff[1:], (n, 1, 1)), np.zeros(n), np.zeros(n)
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Actions ``(n, action_size)`` for observations ``(n, observation_size)``."""
+        n = len(observation)
+        if n != len(self._time):
+            self.begin(n)
+        observation = np.asarray(observation, float)
+        seen, now = self.layout.split(observation), self.posture(observation)
+        local = _matrices(seen["joint_rotations"].reshape(n, NUM_ACTUATED, 6))
+        rate = np.einsum("nbij,nbi->nbj", local, seen["joint_velocities"].reshape(n, NUM_ACTUATED, 3))
+        moments = self.bones.weight_moments(now, GRAVITY) + self._ground_moments(seen, now)
+        target, target_rate = follow(self.poses, self._time, self.dt)
+        matrix = self._answer(now)
+        vectors = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(n, NUM_ACTUATED, 3)
+        torque = self.pid.step(
+            vectors,
+            target,
+            rate,
+            target_rate,
+            feedforward=-in_bones(now, moments)[:, 1:],
+            factor=self._stiff,
+            ahead=lambda still, added: answered(matrix, still, added),
+        )
+        self._time += self.dt
+        return self.actions(np.einsum("nbij,nbj->nbi", local, torque))
+
+    def actions(self, torque: np.ndarray) -> np.ndarray:
+        """Shares of the greatest torques that give ``torque`` ``(n, 21, 3)``, in the parents' axes [N m]."""
+        torque, lower, upper = torque[:, [j - 1 for j in self.acting]], self.lower[self.acting], self.upper[self.acting]
+        return np.clip(np.where(torque > 0.0, torque / upper, -torque / lower), -1.0, 1.0).reshape(len(torque), -1)
+
+    def posture(self, observation: np.ndarray) -> Posture:
+        """Where the bones are, from the pelvis joint, as is observed ``(n, observation_size)``."""
+        n, seen = len(observation), self.layout.split(observation)
+        root, local = (_matrices(seen[name].reshape(n, -1, 6)) for name in ("root_orientation", "joint_rotations"))
+        places = np.concatenate([np.zeros((n, 1, 3)), seen["bone_positions"].reshape(n, NUM_ACTUATED, 3)], axis=1)
+        return self.bones.posture(np.concatenate([root, local], axis=1), _world(root[:, 0], places))
+
+    def _answer(self, now: Posture) -> np.ndarray:
+        """The mass matrix, with what tissue adds to it."""
+        matrix, joints = self.bones.mass_matrix(now), np.arange(NUM_DOF - len(self._resisting), NUM_DOF)
+        matrix[:, joints, joints] += self._resisting
+        return matrix
+
+    def _ground_moments(self, seen: Mapping[str, np.ndarray], now: Posture) -> np.ndarray:
+        """Moments of what the ground is to do to the feet, about all joints [N m], ``(n, 22, 3)``."""
+        root, stance = now.rotation[:, 0], self.balance.stance
+        feet = now.joints[:, ANKLES]
+        left = (feet[:, 0] - feet[:, 1]) * [1.0, 1.0, 0.0]
+        apart = np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-6)
+        left = left / apart
+        ahead = np.stack([left[:, 1], -left[:, 0], np.zeros(len(left))], axis=1)
+        offset = self.bones.mean(now.centres) - feet.mean(1)
+        velocity = self.bones.mean(_world(root, seen["bone_velocities"].reshape(-1, NUM_JOINTS, 3)))
+        planes = np.stack([ahead, left], axis=1)
+        effort = self.balance.step(*(np.einsum("nai,ni->na", planes, part) for part in (offset, velocity)))
+        self.effort = effort
+        weight = stance.mass * GRAVITY
+        height = np.maximum(offset[:, 2:], 0.5 * stance.height)
+        pressed = np.einsum("na,nai->ni", effort.pressure, planes)
+        push = weight * (offset - pressed)
+        push = push / height * self._bearing(seen, root, offset[:, 2])[:, None]
+        turn = -np.einsum("na,nai->ni", effort.hip, planes) / height
+        # the legs share the load as levers do; what they cannot, a foot does by its width
+        half = apart[:, 0] / 2.0
+        share = np.clip(0.5 + effort.pressure[:, FRONTAL] / (2.0 * half), 0.0, 1.0)
+        edge = stance.foot_width / 2.0
+        within = np.clip(effort.pressure[:, FRONTAL] - (2.0 * share - 1.0) * half, -edge, edge)
+        place = effort.pressure[:, :1] * ahead + within[:, None] * left
+        return sum(
+            force_moments(now, ankle, feet[:, side] + place, (push + turn) * part[:, None])
+            for side, (ankle, part) in enumerate(zip(ANKLES, (share, 1.0 - share), strict=True))
+        )
+
+    def _bearing(self, seen: Mapping[str, np.ndarray], root: np.ndarray, height: np.ndarray) -> np.ndarray:
+        """How much of the weight the legs may push with, ``(n,)``: little while the feet bear little."""
+        stance = self.balance.stance
+        force = _world(root, seen["ground_impulse"][:, None])[:, 0, 2] / (self.dt * stance.mass * GRAVITY)
+        self._load += (1.0 - np.exp(-self.dt / LOAD_TIME)) * (np.clip(force, 0.0, 1.0) - self._load)
+        return np.clip(self._load / BEARING, 0.0, 1.0) * (height > 0.5 * stance.height)
+
+
+def make_pid_agent(
+    task: str = "Stand-v0",
+    settings: Mapping[str, Any] | None = None,
+    design: Design = Design(),
+    poses: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> PIDAgent:
+    """An agent for a task.
+
+    Args:
+        task: id, with or without the namespace.
+        settings: those that the environments are made with, ``control="torque"`` among them.
+        design: numbers of the controller.
+        poses: what to follow, see :class:`PIDAgent`.
+
+    Raises:
+        ConfigError: a setting that is unknown, of the wrong type or out of range.
+        ValueError: an unknown task, or joints that are not moved by torques.
+    """
+    kind = load_task(task)
+    return PIDAgent(BatchEnv(kind(load_config(kind.Config, None, dict(settings or {})))), design, poses)
+
+
+def _held(pose: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """A clip that stands still."""
+    return lambda times: np.broadcast_to(pose, (len(times), *pose.shape))
+
+
+def _matrices(columns: np.ndarray) -> np.ndarray:
+    """Rotations of their first two columns ``(..., 6)``."""
+    x, y = columns[..., :3], columns[..., 3:]
+    return np.stack([x, y, np.cross(x, y)], axis=-1)
+
+
+def _world(root: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Vectors ``(n, k, 3)`` of the pelvis' axes in the world's."""
+    return np.einsum("nij,nkj->nki", root, vectors)

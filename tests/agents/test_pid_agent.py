@@ -1,0 +1,160 @@
+"""The PID agent in the simulation: it asks for what joints get, goes where it is told, and stands where others fall."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import agents.pid_agent
+from agents.pid_agent import Design, PIDAgent, make_pid_agent
+from piavatar_envs.avatar.limits import joint_limits
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS
+from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.config import load_config
+from piavatar_envs.tasks import load_task
+
+#: Seeds of Stand whose first pose has the centre of mass 16 and 13 mm behind the ankles, and one 32 mm ahead of them.
+SEEDS = np.array([9, 1, 0])
+ABOVE = [name for name in JOINT_NAMES[1:] if not name.endswith(("hip", "knee", "ankle", "foot"))]
+
+
+def make(num_envs: int, device: str, task: str = "Stand-v0", **settings) -> BatchEnv:
+    """A batch of a task under torques."""
+    kind = load_task(task)
+    return BatchEnv(kind(load_config(kind.Config, None, {"control": "torque", **settings})), num_envs, device)
+
+
+def play(env: BatchEnv, agent, seconds: float, seeds: np.ndarray) -> np.ndarray:
+    """Times at which environments ended [s]; ``seconds`` for those that did not."""
+    env.reset(seeds=seeds)
+    if isinstance(agent, PIDAgent):
+        agent.begin(env.num_envs)
+    dt = env.config.physics.control_dt
+    ended = np.full(env.num_envs, seconds)
+    for step in range(round(seconds / dt)):
+        env.action.assign(agent(env.observation.numpy()[:, 0]).astype(np.float32)[:, None])
+        env.step()
+        ended = np.where(env.terminated.numpy()[:, 0], np.minimum(ended, (step + 1) * dt), ended)
+        if (ended < seconds).all():
+            break
+    assert not env.failure.numpy().any()
+    return ended
+
+
+@pytest.fixture(scope="module")
+def standing(device):
+    """Stand at the resolution that the agent is designed for."""
+    return make(len(SEEDS), device)
+
+
+@pytest.fixture(scope="module")
+def held(device):
+    """A body whose pelvis is held."""
+    return make(1, device, fidelity="tiny", root_assist=1.0, pose_noise=0.0)
+
+
+def alone(matrix: np.ndarray, torque: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+    """Every joint by its own inertia."""
+    own = np.diagonal(matrix, axis1=1, axis2=2)[:, 6:].reshape(torque.shape)
+    return torque / (1.0 + stiffness / own)
+
+
+def test_it_stands_where_no_torque_and_joints_for_themselves_fall(standing, monkeypatch):
+    agent = PIDAgent(standing)
+    assert play(standing, agent, 2.0, SEEDS).min() == 2.0
+    assert (standing.metrics.numpy()[:, 0, 0] > 0.9).all()  # the head's height over that in the rest pose
+    assert (agent.effort.margin > 0.0).all()  # caught: within the feet
+    limp = np.zeros((len(SEEDS), standing.action_spec.size))
+    assert play(standing, lambda _: limp, 1.0, SEEDS).max() < 0.7
+    monkeypatch.setattr(agents.pid_agent, "answered", alone)
+    assert play(standing, agent, 2.0, SEEDS).max() < 1.8
+
+
+def test_it_knows_where_the_centre_of_mass_is_from_what_it_observes(standing):
+    agent = PIDAgent(standing)
+    play(standing, agent, 0.3, SEEDS)
+    observation = standing.observation.numpy()[:, 0].astype(float)
+    now = agent.posture(observation)
+    sim = standing.simulation
+    mass, x = sim.model.particles.mass.numpy(), sim.state.x.numpy()
+    true = (mass[..., None] * x).sum(1) / mass.sum(1)[:, None] - sim.avatar.tracked.position.numpy()[:, 0]
+    np.testing.assert_allclose(agent.bones.mean(now.centres), true, atol=0.01)
+    assert agent.bones.mass.sum() == pytest.approx(mass[0].sum(), rel=1e-5)
+
+
+def test_joints_get_the_torques_that_it_asks_for(standing):
+    """Of this body, in the parents' axes, and no more than they have."""
+    agent, rng = PIDAgent(standing), np.random.default_rng(0)
+    wanted = rng.uniform(1.5 * agent.lower[1:], 1.5 * agent.upper[1:], (len(SEEDS), NUM_JOINTS - 1, 3))
+    standing.reset(seeds=SEEDS)
+    standing.action.assign(agent.actions(wanted).astype(np.float32)[:, None])
+    standing.step()
+    joints = standing.simulation.avatar.joints
+    given = joints.state.torque.numpy()[:, 1:] * joints.body.strength.factor.numpy()[:, None, None]
+    np.testing.assert_allclose(given, np.clip(wanted, agent.lower[1:], agent.upper[1:]), rtol=1e-3, atol=1e-2)
+
+
+def test_joints_go_to_the_pose_that_is_asked_for_and_follow_one_that_moves(held):
+    """Every joint about all its axes at once, under gravity: the frames of rotations, rates and torques are right."""
+    places = [JOINT_NAMES.index(name) - 1 for name in ABOVE]
+    lower, upper = (bound[1:] for bound in joint_limits())
+    goal = np.zeros((NUM_JOINTS - 1, 3))
+    goal[places] = np.random.default_rng(0).uniform(0.5 * lower, 0.5 * upper)[places]
+
+    def errors(target: np.ndarray) -> np.ndarray:
+        local = Rotation.from_quat(held.simulation.avatar.tracked.local.numpy()[0, 1:])
+        return (local.inv() * Rotation.from_rotvec(target)).magnitude()[places]
+
+    def share(times: np.ndarray) -> np.ndarray:
+        return 1.0 - np.cos(np.minimum(times, 1.5) * np.pi / 1.5)  # there and back is one second and a half each
+
+    agent = PIDAgent(held, poses=lambda times: np.broadcast_to(goal, (len(times), *goal.shape)))
+    play(held, agent, 2.0, np.array([0]))
+    assert errors(0.0 * goal).mean() > 0.4
+    assert errors(goal).mean() < 0.1 and errors(goal).max() < 0.25
+    moving = PIDAgent(held, poses=lambda times: 0.5 * share(times)[:, None, None] * goal)
+    play(held, moving, 0.9, np.array([0]))
+    now = 0.5 * share(np.array([0.9]))[0] * goal
+    assert errors(now).mean() < 0.15 < 0.3 < errors(0.0 * goal).mean()
+
+
+def test_bodies_know_nothing_of_each_other_and_rounds_begin_anew(standing):
+    many = PIDAgent(standing)
+    ones = [PIDAgent(standing) for _ in SEEDS]
+    standing.reset(seeds=SEEDS)
+    seen = []
+    for _ in range(4):
+        seen.append(standing.observation.numpy()[:, 0].copy())
+        action = many(seen[-1])
+        for row, one in enumerate(ones):
+            np.testing.assert_allclose(one(seen[-1][row : row + 1])[0], action[row], atol=1e-9)
+        standing.action.assign(action.astype(np.float32)[:, None])
+        standing.step()
+    first = PIDAgent(standing)(seen[0])
+    assert np.abs(many(seen[0]) - first).max() > 1e-3  # it remembers
+    many.begin(len(SEEDS))
+    np.testing.assert_array_equal(many(seen[0]), first)
+
+
+@pytest.mark.parametrize("task", ["PushRecovery-v0", "GetUp-v0", "Walk-v0", "TrackMotion-v0"])
+def test_it_plays_every_task_of_torques(task, device):
+    settings = {"control": "torque", "fidelity": "tiny"}
+    agent = make_pid_agent(task, settings)
+    env = make(2, device, task, fidelity="tiny")
+    play(env, agent, 0.2, np.array([3, 4]))
+    action = agent(env.observation.numpy()[:, 0])
+    assert action.shape == (2, env.action_spec.size)
+    assert np.isfinite(action).all() and 0.0 < np.abs(action).max() <= 1.0
+
+
+def test_what_moves_by_poses_is_refused():
+    with pytest.raises(ValueError, match="control='pd'; the PID agent gives torques"):
+        make_pid_agent("Stand-v0", {"fidelity": "tiny"})
+
+
+def test_the_pose_that_is_held_bends_knees_back_and_hips_forward():
+    pose = Design(knee=0.2, hip=-0.1).pose()
+    assert pose.shape == (NUM_JOINTS - 1, 3)
+    moved = {JOINT_NAMES[1 + joint]: pose[joint, axis] for joint, axis in np.argwhere(pose)}
+    assert moved == {"left_hip": -0.1, "right_hip": -0.1, "left_knee": 0.2, "right_knee": 0.2}
