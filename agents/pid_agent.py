@@ -49,35 +49,27 @@ class Design:
     Attributes:
         stiffness: of the joints by their strength [1/rad], see :func:`~agents.gains.gains_by_strength`.
         damping_time: ``kd / kp`` [s].
-        integral_time: ``kp / ki`` [s].
+        integral_time: ``kp / ki`` [s]; infinite for no integral. Two legs on the ground are a closed chain: errors that
+            friction does not let them undo wind up the integrals of both, against each other, until a foot slips (at
+            2 s after some 15 s). They are for bodies whose pelvis is held.
         support: from the ankles to the hindmost and to the foremost place of the centre of pressure that ankles can
-            hold [m]. Feet that are pressed further back roll over their heels.
+            hold [m]. A foot that is pressed further back rolls over its heel, up to the stop of its ankle; the rest
+            pose has the centre of mass just 12 mm ahead of the ankles.
         foot_width: within which ankles can hold it sideways [m].
         gain: of the balance, see :class:`~agents.balance.Balance`.
         hip_threshold, hip_gain: of the hip strategy, see :class:`~agents.balance.Balance`.
         hip_share: share of the strength of both hips that it has [-].
-        knee, hip: bend of knees and hips in the pose that is held if no other is given [rad]. What puts the feet under
-            the body widens what a push may do.
     """
 
     stiffness: float = 1.75
     damping_time: float = 0.06
-    integral_time: float = 2.0
+    integral_time: float = np.inf
     support: tuple[float, float] = (0.010, 0.112)
     foot_width: float = 0.04
     gain: float = 0.72
     hip_threshold: float = 0.77
     hip_gain: float = 6.0
     hip_share: float = 0.6
-    knee: float = 0.15
-    hip: float = -0.03
-
-    def pose(self) -> np.ndarray:
-        """The pose that is held if no other is given, ``(21, 3)`` [rad]."""
-        pose = np.zeros((NUM_JOINTS, 3))
-        for side in SIDES:
-            pose[joint_index(f"{side}_knee"), 0], pose[joint_index(f"{side}_hip"), 0] = self.knee, self.hip
-        return pose[1:]
 
 
 class PIDAgent:
@@ -101,7 +93,7 @@ class PIDAgent:
             env: a batch of the task, of any size; its body, layout and time step are read, not its state.
             design: numbers of the controller.
             poses: what to follow, from times since the episode began [s] ``(n,)`` to rotation vectors of all joints but
-                the root ``(n, 21, 3)``, such as :func:`~agents.pid.motion_poses` gives; None to hold the design's pose.
+                the root ``(n, 21, 3)``, such as :func:`~agents.pid.motion_poses` gives; None to hold the rest pose.
 
         Raises:
             ValueError: joints that are not moved by torques.
@@ -118,7 +110,7 @@ class PIDAgent:
         # what tissue resists within a step, as an inertia: that of a hand is less
         self._resisting = np.repeat(self.dt * muscles.tissue_damping[1:], 3)
         self.balance = self._balance()
-        self.poses = poses or _held(design.pose())
+        self.poses = poses or _rest
         self.begin(0)
 
     def _balance(self) -> Balance:
@@ -246,9 +238,9 @@ def make_pid_agent(
     return PIDAgent(BatchEnv(kind(load_config(kind.Config, None, dict(settings or {})))), design, poses)
 
 
-def _held(pose: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """A clip that stands still."""
-    return lambda times: np.broadcast_to(pose, (len(times), *pose.shape))
+def _rest(times: np.ndarray) -> np.ndarray:
+    """A clip that stands still in the rest pose."""
+    return np.zeros((len(times), NUM_ACTUATED, 3))
 
 
 def _matrices(columns: np.ndarray) -> np.ndarray:

@@ -109,7 +109,8 @@ def test_joints_go_to_the_pose_that_is_asked_for_and_follow_one_that_moves(held)
     def share(times: np.ndarray) -> np.ndarray:
         return 1.0 - np.cos(np.minimum(times, 1.5) * np.pi / 1.5)  # there and back is one second and a half each
 
-    agent = PIDAgent(held, poses=lambda times: np.broadcast_to(goal, (len(times), *goal.shape)))
+    design = Design(integral_time=2.0)
+    agent = PIDAgent(held, design, lambda times: np.broadcast_to(goal, (len(times), *goal.shape)))
     play(held, agent, 2.0, np.array([0]))
     assert errors(0.0 * goal).mean() > 0.4
     assert errors(goal).mean() < 0.1 and errors(goal).max() < 0.25
@@ -151,10 +152,3 @@ def test_it_plays_every_task_of_torques(task, device):
 def test_what_moves_by_poses_is_refused():
     with pytest.raises(ValueError, match="control='pd'; the PID agent gives torques"):
         make_pid_agent("Stand-v0", {"fidelity": "tiny"})
-
-
-def test_the_pose_that_is_held_bends_knees_back_and_hips_forward():
-    pose = Design(knee=0.2, hip=-0.1).pose()
-    assert pose.shape == (NUM_JOINTS - 1, 3)
-    moved = {JOINT_NAMES[1 + joint]: pose[joint, axis] for joint, axis in np.argwhere(pose)}
-    assert moved == {"left_hip": -0.1, "right_hip": -0.1, "left_knee": 0.2, "right_knee": 0.2}
