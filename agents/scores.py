@@ -1,6 +1,6 @@
 """A table of scores out of many runs: ``python -m agents.scores runs/* --out benchmarks/results/NAME.json``.
 
-Every run is a folder with the ``results.json`` of ``agents.train``, ``agents.rsl_ppo`` or ``agents.pid_agent``. Runs of
+Every run is a folder with the ``results.json`` of ``agents.train``, ``agents.rsl_ppo`` or ``agents.score_pid``. Runs of
 one configuration that differ in their seed become one row (:mod:`agents.compare`), runs of one environment one table;
 what no training changes (zero and random actions) stands in it once, unless an environment's settings change what an
 action means. Beside the JSON file comes the same as Markdown.

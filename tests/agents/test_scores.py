@@ -36,7 +36,7 @@ def runs() -> dict[str, dict]:
     return {
         "stand_0": run("rsl_ppo", "Stand-v0", 0, row("trained", 80.0)),
         "stand_1": run("rsl_ppo", "Stand-v0", 1, row("trained", 90.0), seconds=80.0),
-        "stand_pid": run("pid_agent", "Stand-v0", 0, row("PID", 40.0)),
+        "stand_pid": run("score_pid", "Stand-v0", 0, row("PID", 40.0)),
         "push": run("train", "Push-v0", 0, row("trained", 10.0, **pushes)),
     }
 

@@ -1,0 +1,81 @@
+"""Scores of the PID agent on a task: ``python -m agents.score_pid PIAvatar/Stand-v0 --film stand.gif``.
+
+Plays the episodes that trained agents are evaluated in, beside zero and random torques, and leaves ``results.json``,
+which ``agents.scores`` takes as it takes those of trainings.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from agents.batches import in_every_seat, play
+from agents.config import EvaluationSettings
+from agents.evaluate import baselines
+from agents.film import film
+from agents.pid_agent import make_pid_agent
+from agents.report import show_table, versions, write_results
+from agents.workers import EnvFactory
+from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.doctor import quiet_warp
+from piavatar_envs.envs.config import ConfigError, dump_yaml, load_config, parse_assignments
+from piavatar_envs.tasks import load_task
+
+
+@dataclass(frozen=True)
+class Options:
+    """Score the PID agent on a task with one avatar."""
+
+    #: registered id
+    env_id: tyro.conf.Positional[str]
+    #: settings of the environment: physics.fidelity=coarse drive.root_assist=0.1
+    settings: tyro.conf.Positional[tuple[str, ...]] = ()
+    #: how many episodes, and from which seed on
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    #: folder to write to; by default runs/pid_ and the name of the task
+    out: Path | None = None
+    #: where to simulate
+    device: str = "cpu"
+    #: video of the first episode to write, .mp4 or .gif
+    film: Path | None = None
+    #: control steps between two of its pictures
+    film_every: int = 1
+
+
+def main(args: list[str] | None = None) -> None:
+    """The command line."""
+    options = tyro.cli(Options, prog="python -m agents.score_pid", args=args)
+    quiet_warp()
+    episodes, first = options.evaluation.episodes, options.evaluation.first_seed
+    try:
+        task_class = load_task(options.env_id)
+        config = load_config(task_class.Config, {"control": "torque"}, parse_assignments(options.settings))
+        batch = BatchedEpisodes(task_class(config), episodes, options.device)
+        agent = make_pid_agent(options.env_id, config.model_dump(mode="json"))
+    except (ConfigError, ValueError) as error:
+        sys.exit(f"error: {error}")
+    players = {**baselines(batch.action_size, first), "PID": agent}
+    results = [play(name, in_every_seat(player), batch, first) for name, player in players.items()]
+    batch.close()
+    name = options.env_id.rpartition("/")[2].removesuffix("-v0")
+    folder = options.out or Path("runs") / f"pid_{name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = {"env_id": options.env_id, "env": config.model_dump(mode="json")}
+    (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
+    about = versions("score_pid", options.device) | {"seed": 0, "config": settings}
+    write_results(folder / "results.json", about, results, {})
+    console = Console(highlight=False, soft_wrap=True)
+    show_table(results, console)
+    console.print(f"in {folder}: config.yaml, results.json")
+    if options.film:
+        make = EnvFactory(options.env_id, config.model_dump(mode="json"), options.device)
+        film(options.film, make, {"PID": agent}, [first], 1.0 / config.physics.control_dt, options.film_every)
+        console.print(f"wrote {options.film}")
+
+
+if __name__ == "__main__":
+    main()
