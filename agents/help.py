@@ -28,7 +28,7 @@ class HelpedEnv(AvatarRslEnv):
     """Environments whose help for the pelvis wanes while an agent learns.
 
     At any time environment ``i`` of ``n`` has ``i / (n - 1)`` of the greatest help, so that some have next to none from
-    the start, and what is learned with help is tried without. Evaluations have none.
+    the start, and what is learned with help is tried without; a single one has all of it. Evaluations have none.
 
     Attributes:
         steps: control steps of every environment so far; to be set where a training goes on.
@@ -38,6 +38,7 @@ class HelpedEnv(AvatarRslEnv):
         """Build the environments; all but the first two arguments are those of the base."""
         super().__init__(*args, **kwargs)
         self.settings, self.rollout_steps, self.steps = settings, rollout_steps, 0
+        self._spread = np.linspace(0.0, 1.0, self.num_envs, dtype=np.float32) if self.num_envs > 1 else np.ones(1)
 
     def share(self) -> float:
         """The greatest help in the current rollout."""
@@ -46,6 +47,6 @@ class HelpedEnv(AvatarRslEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Advance by one control step; help changes before the first of a rollout."""
         if self.steps % self.rollout_steps == 0:
-            self.assist_root(self.share() * np.linspace(0.0, 1.0, self.num_envs, dtype=np.float32))
+            self.assist_root(self.share() * self._spread)
         self.steps += 1
         return super().step(actions)

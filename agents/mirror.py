@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 #: Signs in the mirror of one scalar, of a scalar that counts to the left, and of the kinds above.
 _SCALAR, _ASIDE = (1.0,), (-1.0,)
 _VECTOR, _SPIN = (-1.0, 1.0, 1.0), (1.0, -1.0, -1.0)
+_ROOT = (-1.0, 1.0, -1.0)  # x, y, yaw
 _ROTATION = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # two columns
 _SIDES, _BODY, _JOINTS, _PARTS = ("left", "right"), JOINT_NAMES, JOINT_NAMES[1:], tuple(BODY_PARTS)
 
@@ -58,12 +59,15 @@ def other_side(name: str) -> str:
 class Mirror:
     """Mirrors observations and actions; both as tensors whose last dimension are the components."""
 
-    def __init__(self, terms: Iterable[ObservationTerm], joints: Sequence[str], device: str | torch.device) -> None:
+    def __init__(
+        self, terms: Iterable[ObservationTerm], joints: Sequence[str], device: str | torch.device, root: bool = False
+    ) -> None:
         """Find where every component comes from.
 
         Args:
             terms: of the observation, in order.
             joints: names of those that act, in order.
+            root: whether x, y and yaw of the root follow.
             device: of the tensors.
 
         Raises:
@@ -79,7 +83,8 @@ class Mirror:
         if lonely:
             raise ConfigError(f"{lonely[0]!r} acts, but {other_side(lonely[0])!r} does not; do without the mirror")
         self._seen = _joined(pairs, device)
-        self._done = _joined([_changed_over(joints, _SPIN)], device)
+        acts = [_changed_over(joints, _SPIN)] + ([_changed_over(("root",), _ROOT)] if root else [])
+        self._done = _joined(acts, device)
 
     def observations(self, seen: torch.Tensor) -> torch.Tensor:
         """What is seen in the mirrored state."""

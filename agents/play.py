@@ -119,10 +119,14 @@ def main(args: list[str] | None = None) -> None:
     options = tyro.cli(Options, prog="python -m agents.play", args=args)
     quiet_warp()
     try:
+        if options.film_every < 1:
+            raise ConfigError(f"film_every={options.film_every} must be >= 1")
         run = open_run(options.run, options.device)
         task_class = load_task(run.env_id)
-        config = load_config(task_class.Config, run.env, parse_assignments(options.settings))
-        episodes = options.episodes or run.evaluation.episodes
+        config = load_config(task_class.Config, run.env, parse_assignments(options.settings) | {"obs_mode": "flat"})
+        episodes = run.evaluation.episodes if options.episodes is None else options.episodes
+        if episodes < 2:
+            raise ConfigError(f"episodes={episodes} must be >= 2: of one there is no interval")
         batch = BatchedEpisodes(task_class(config), episodes, options.device)
         agent = run.make_agent(batch.layout, batch.action_size)
     except (ConfigError, ValueError) as error:
@@ -131,8 +135,7 @@ def main(args: list[str] | None = None) -> None:
     evaluation = play("trained", agent, batch, first)
     batch.close()
     console = Console(highlight=False, soft_wrap=True)
-    if episodes > 1:
-        show_table([evaluation], console)
+    show_table([evaluation], console)
     if options.out:
         about = versions("play", options.device) | {"run": options.run.name, "env": config.model_dump(mode="json")}
         write_results(options.out, about, [evaluation], {"num_envs": episodes})

@@ -95,8 +95,9 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
     actor = network(shown, {"actor": ["policy"]}, "actor", action_size, **settings).to(device)
     try:
         actor.load_state_dict(torch.load(path, map_location=device, weights_only=True))
-    except (pickle.UnpicklingError, RuntimeError, AttributeError, TypeError) as error:
-        raise ConfigError(f"{path} holds no policy of its config.yaml: {str(error).splitlines()[0]}") from None
+    except (pickle.UnpicklingError, EOFError, RuntimeError, AttributeError, TypeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigError(f"{path} holds no policy of its config.yaml: {reason}") from None
     return mean_agent(actor.eval(), seen, device)
 
 

@@ -183,7 +183,8 @@ def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
 def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
     """The settings by which rsl_rl appends mirrored steps to every minibatch."""
     terms = [env.observation_layout[name] for name in env.groups["policy"]]
-    mirror = Mirror(terms, env.episodes.groups[0].action_spec.joints, env.device)
+    spec = env.episodes.groups[0].action_spec
+    mirror = Mirror(terms, spec.joints, env.device, spec.root)
 
     def append(
         env: AvatarRslEnv, obs: TensorDict | None = None, actions: torch.Tensor | None = None
@@ -203,6 +204,10 @@ def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
     """
     if config.help is not None and task.config.drive.control == "pose":
         raise ConfigError('help is for bodies under torques, and env.drive.control="pose"; use "pd" or "torque"')
+    if config.help is not None and task.config.drive.root_assist > 0.0:
+        raise ConfigError(
+            f"help wanes to nothing, and env.drive.root_assist={task.config.drive.root_assist} stays; give one of them"
+        )
     groups = None if config.observe is None else {"policy": config.observe}
     about = (config.env_id, config.num_envs, device, task.config, groups, config.first_seed)
     if config.help is None:

@@ -42,8 +42,9 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
     try:
         with zipfile.ZipFile(path) as content, content.open(_MEMBER) as file:
             policy.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
-    except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, RuntimeError, TypeError) as error:
-        raise ConfigError(f"{path} holds no policy of its config.yaml: {str(error).splitlines()[0]}") from None
+    except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError, TypeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigError(f"{path} holds no policy of its config.yaml: {reason}") from None
     return policy_agent(policy.eval())
 
 

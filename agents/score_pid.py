@@ -52,6 +52,8 @@ def main(args: list[str] | None = None) -> None:
     quiet_warp()
     episodes, first = options.evaluation.episodes, options.evaluation.first_seed
     try:
+        if options.film_every < 1:
+            raise ConfigError(f"film_every={options.film_every} must be >= 1")
         task_class = load_task(options.env_id)
         config = load_config(task_class.Config, {"control": "torque"}, parse_assignments(options.settings))
         batch = BatchedEpisodes(task_class(config), episodes, options.device)

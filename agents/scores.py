@@ -34,7 +34,7 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the table, by environment and then by agent.
 
     Args:
-        runs: contents of their ``results.json``, by name of the folder.
+        runs: contents of their ``results.json``, by folder.
 
     Returns:
         A row for each agent in each environment: ``env_id``, ``agent``, the names of its ``runs``, ``train_steps`` and
@@ -132,6 +132,15 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def _read(path: Path) -> dict[str, Any]:
+    run = json.loads(path.read_text(encoding="utf-8"))
+    missing = [name for name in ("benchmark", "config", "seed", "results") if name not in run]
+    if missing or not all("success_once" in row for row in run["results"]):
+        what = f"has no {missing[0]!r}" if missing else "holds matches of competing agents"
+        raise ValueError(f"{path} {what}; give runs of agents.train with one aim, agents.rsl_ppo or agents.score_pid")
+    return run
+
+
 @dataclass(frozen=True)
 class Options:
     """Sum up runs of several agents, environments and seeds in a table."""
@@ -146,7 +155,7 @@ def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = tyro.cli(Options, prog="python -m agents.scores", args=args)
     try:
-        runs = {path.name: json.loads((path / "results.json").read_text(encoding="utf-8")) for path in options.runs}
+        runs = {str(path): _read(path / "results.json") for path in options.runs}
         rows = scores(runs)
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")

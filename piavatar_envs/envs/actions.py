@@ -11,6 +11,7 @@ import warp as wp
 from piavatar_envs.avatar.muscles import LOCKED_JOINTS
 from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log, short_of_pi, turn_about_z
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.envs.config_io import ConfigError
 from piavatar_envs.mpm.types import FAILURE_ACTION
 
 wp.set_module_options({"enable_backward": False})
@@ -59,13 +60,13 @@ class ActionSpec:
         """The same under ``control``: where torques move the body, nothing moves its root, and its toes are stiff.
 
         Raises:
-            ValueError: no joint is left.
+            ConfigError: no joint is left.
         """
         if control == "pose":
             return self
         joints = tuple(name for name in self.joints if name not in LOCKED_JOINTS)
         if not joints:
-            raise ValueError(f"joints={list(self.joints)} do not move under control={control!r}; name others")
+            raise ConfigError(f"joints={list(self.joints)} do not move under control={control!r}; name others")
         return replace(self, joints=joints, root=False)
 
     def names(self) -> list[str]:
@@ -96,13 +97,13 @@ def select_joints(names: Sequence[str] | None) -> tuple[str, ...]:
     """Acting joints in skeleton order; all but the root if ``names`` is None.
 
     Raises:
-        ValueError: an unknown or repeated joint, or the root.
+        ConfigError: an unknown or repeated joint, or the root.
     """
     if names is None:
         return JOINT_NAMES[1:]
     unknown = [name for name in names if name not in JOINT_NAMES[1:]]
     if unknown or len(set(names)) != len(names) or not names:
-        raise ValueError(
+        raise ConfigError(
             f"joints={list(names)}: {unknown[0]!r} is not a joint; use some of {', '.join(JOINT_NAMES[1:])}"
             if unknown
             else f"joints={list(names)} must name each joint once and at least one"

@@ -29,6 +29,10 @@ def test_it_falls_in_equal_steps_and_some_have_none(device):
     expected = [0.8] * 3 + [0.4] * 3 + [0.0] * 3
     np.testing.assert_allclose(had, np.outer(expected, [0.0, 0.5, 1.0]), atol=1e-7)
     env.close()
+    alone = HelpedEnv(settings, 3, "Stand-v0", 1, device, {"fidelity": "tiny"})
+    alone.step(still[:1])
+    assert alone.episodes.groups[0].simulation.avatars[0].joints.assist.numpy().tolist() == pytest.approx([0.8])
+    alone.close()
 
 
 def test_a_resumed_training_has_the_help_that_it_would_have_had(device, tmp_path, capsys):
@@ -45,7 +49,12 @@ def test_a_resumed_training_has_the_help_that_it_would_have_had(device, tmp_path
     assert not all(torch.equal(whole[name], alone[name]) for name in whole)
 
 
-def test_poses_are_not_helped(device, tmp_path, capsys):
+def test_what_cannot_be_helped_is_refused(device, tmp_path, capsys):
     posed = ("env.drive.control=pose", "help={first: 0.5, rollouts: 3}", "iterations=1")
     with pytest.raises(SystemExit, match=r"help is for bodies under torques"):
         rsl_ppo.main([*FEW, *posed, "--device", device, "--out", str(tmp_path)])
+    both = ("env.drive.root_assist=0.1", "help={first: 0.5, rollouts: 3}", "iterations=1")
+    with pytest.raises(SystemExit, match=r"root_assist=0.1 stays; give one of them"):
+        rsl_ppo.main([*FEW, *both, "--device", device, "--out", str(tmp_path)])
+    with pytest.raises(SystemExit, match=r"error: .*'tail' is not a joint"):
+        rsl_ppo.main([*FEW, "env.joints=[tail]", "--device", device, "--out", str(tmp_path)])

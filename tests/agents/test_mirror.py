@@ -66,6 +66,12 @@ def test_mirrored_actions_have_mirrored_consequences(control, device):
     episodes.close()
 
 
+def test_a_root_that_acts_goes_to_the_other_side():
+    mirror = Mirror(SELF_TERMS, ("left_hip", "right_hip"), "cpu", root=True)
+    done = torch.arange(1.0, 10.0)
+    assert mirror.actions(done).tolist() == [4.0, -5.0, -6.0, 1.0, -2.0, -3.0, -7.0, 8.0, -9.0]
+
+
 def test_what_cannot_be_mirrored_is_refused():
     terms = (*SELF_TERMS, *JOINT_TERMS, *CONTACT_TERMS)
     Mirror(terms, JOINT_NAMES[1:], "cpu")

@@ -52,7 +52,7 @@ def test_settings_win_and_a_film_is_written(device, tmp_path, capsys):
     run_of("ppo", tmp_path / "run", device)
     film = tmp_path / "film.gif"
     small = ("episode_seconds=0.1", "render.width=64", "render.height=64")
-    play.main([str(tmp_path / "run"), *small, "--episodes", "1", "--film", str(film), "--device", device])
+    play.main([str(tmp_path / "run"), *small, "--episodes", "2", "--film", str(film), "--device", device])
     from PIL import Image
 
     with Image.open(film) as pictures:
@@ -64,6 +64,31 @@ def test_folders_without_a_run_are_refused(device, tmp_path, capsys):
         open_run(tmp_path)
     with pytest.raises(SystemExit, match=r"must hold config\.yaml"):
         play.main([str(tmp_path)])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--episodes", "1"), r"episodes=1 must be >= 2"),
+        (("--episodes", "0"), r"episodes=0 must be >= 2"),
+        (("--film-every", "0"), r"film_every=0 must be >= 1"),
+        (("joints=[tail]",), r"'tail' is not a joint"),
+    ],
+)
+def test_what_cannot_be_played_is_refused(options, words, device, tmp_path, capsys):
+    run_of("ppo", tmp_path / "run", device)
+    with pytest.raises(SystemExit, match=f"error: .*{words}"):
+        play.main([str(tmp_path / "run"), *options, "--device", device])
+
+
+@pytest.mark.parametrize("kind", ["rsl", "ppo"])
+def test_empty_policies_are_refused(kind, device, tmp_path, capsys):
+    run_of(kind, tmp_path / "run", device)
+    for name in ("policy.pt", "policy.zip"):
+        if (tmp_path / "run" / name).exists():
+            (tmp_path / "run" / name).write_bytes(b"")
+    with pytest.raises(SystemExit, match=r"error: .* holds no policy of its config\.yaml"):
+        play.main([str(tmp_path / "run"), "--device", device])
 
 
 def test_nothing_is_unpickled(device, tmp_path, capsys):

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the extra train")
 
-from agents import score_pid, scores  # noqa: E402
+from agents import score_pid, scores
 
 SHORT = ("PIAvatar/Stand-v0", "fidelity=tiny", "episode_seconds=0.2")
 
@@ -28,5 +28,5 @@ def test_scores_are_those_of_the_episodes_and_go_into_the_table(device, tmp_path
 def test_bodies_that_no_torques_move_are_refused():
     with pytest.raises(SystemExit, match="error: control='pose'"):
         score_pid.main([*SHORT, "drive.control=pose"])
-    with pytest.raises(SystemExit, match="error: .*Fly-v0"):
+    with pytest.raises(SystemExit, match=r"error: .*Fly-v0"):
         score_pid.main(["PIAvatar/Fly-v0"])

@@ -71,11 +71,32 @@ def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
         scores.main([str(tmp_path / "nowhere")])
 
 
+def test_runs_of_one_name_in_other_folders_all_count(runs, tmp_path, capsys):
+    folders = [tmp_path / f"seed{seed}" / "stand" for seed in range(2)]
+    for folder, name in zip(folders, ("stand_0", "stand_1"), strict=True):
+        folder.mkdir(parents=True)
+        (folder / "results.json").write_text(json.dumps(runs[name]))
+    scores.main([*map(str, folders), "--out", str(tmp_path / "table.json")])
+    trained = json.loads((tmp_path / "table.json").read_text())["results"][-1]
+    assert trained["seeds"] == 2 and trained["runs"] == [str(folder) for folder in folders]
+
+
+def test_other_files_are_refused(runs, tmp_path):
+    path = tmp_path / "results.json"
+    for broken, words in (
+        ({key: value for key, value in runs["push"].items() if key != "config"}, "has no 'config'"),
+        (runs["push"] | {"results": [{"case": "a against b", "win_rate": 0.5}]}, "holds matches of competing agents"),
+    ):
+        path.write_text(json.dumps(broken))
+        with pytest.raises(SystemExit, match=f"error: .*results.json {words}"):
+            scores.main([str(tmp_path)])
+
+
 def test_untrained_agents_stand_twice_where_actions_mean_something_else(runs):
     runs["stand_pid"]["results"][0]["return_mean"] = 3.0001  # rounding, on another device
     runs["stand_pid"]["results"][1]["return_mean"] = 2.5
     agents = [r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
-    assert agents == ["random", "random, as rsl_ppo", "zero", "PID", "rsl_ppo"]
+    assert agents == ["random", "random, as score_pid", "zero", "PID", "rsl_ppo"]
 
 
 def test_other_settings_are_refused(runs):
