@@ -69,7 +69,8 @@ def _rows(group: Mapping[str, Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]
     if len(group) > 1:
         return compare.summarize(group)["results"]
     (run,) = group.values()
-    return [row | {"seeds": None if row["case"] in UNTRAINED else 1} for row in run["results"]]
+    trained = "training_s" in run
+    return [row | {"seeds": 1 if trained and row["case"] not in UNTRAINED else None} for row in run["results"]]
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
