@@ -108,8 +108,7 @@ class Checkpoint:
         try:
             content = torch.load(self.path, map_location="cpu", weights_only=True)
         except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ConfigError(f"{self.path} cannot be read ({reason}); delete it to begin anew") from None
+            raise ConfigError(f"{self.path} cannot be read ({first_line(error)}); delete it to begin anew") from None
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             found = content.get("format") if isinstance(content, dict) else None
             raise ConfigError(f"{self.path} has format={found}, this reads {FORMAT}; delete it to begin anew")
@@ -140,6 +139,11 @@ class Checkpoint:
                 "go on otherwise than it would have",
                 stacklevel=4,
             )
+
+
+def first_line(error: Exception) -> str:
+    """What an error says first; of one that says nothing, its name."""
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from agents.evaluate import Agent, begin_round
 from agents.workers import EnvFactory, start_workers
+from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.render import label, side_by_side, write_video
 
 
@@ -40,6 +41,16 @@ def film(
         return write_video(path, _frames(halves, agents, seeds, every), fps / every)
     finally:
         halves.close()
+
+
+def check_every(every: int) -> None:
+    """Refuse a video without pictures, before there is anything to film.
+
+    Raises:
+        ConfigError: ``every`` is less than 1.
+    """
+    if every < 1:
+        raise ConfigError(f"film_every={every} must be >= 1")
 
 
 def _frames(halves: VecEnv, agents: dict[str, Agent], seeds: Sequence[int], every: int) -> Iterator[np.ndarray]:

@@ -18,7 +18,7 @@ from rich.console import Console
 from agents.batches import in_every_seat, play
 from agents.config import EvaluationSettings, load_training
 from agents.evaluate import Agent
-from agents.film import film
+from agents.film import check_every, film
 from agents.report import show_table, versions, write_results
 from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
@@ -119,8 +119,7 @@ def main(args: list[str] | None = None) -> None:
     options = tyro.cli(Options, prog="python -m agents.play", args=args)
     quiet_warp()
     try:
-        if options.film_every < 1:
-            raise ConfigError(f"film_every={options.film_every} must be >= 1")
+        check_every(options.film_every)
         run = open_run(options.run, options.device)
         task_class = load_task(run.env_id)
         config = load_config(task_class.Config, run.env, parse_assignments(options.settings) | {"obs_mode": "flat"})

@@ -14,6 +14,7 @@ from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
 from agents.batches import BatchTraining
+from agents.checkpoint import first_line
 from agents.evaluate import Agent
 from agents.help import HelpSettings
 from agents.workers import components
@@ -96,8 +97,7 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
     try:
         actor.load_state_dict(torch.load(path, map_location=device, weights_only=True))
     except (pickle.UnpicklingError, EOFError, RuntimeError, AttributeError, TypeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ConfigError(f"{path} holds no policy of its config.yaml: {reason}") from None
+        raise ConfigError(f"{path} holds no policy of its config.yaml: {first_line(error)}") from None
     return mean_agent(actor.eval(), seen, device)
 
 

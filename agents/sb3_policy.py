@@ -13,6 +13,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.sac.policies import SACPolicy
 
 from agents import ppo
+from agents.checkpoint import first_line
 from agents.config import TrainingConfig
 from agents.evaluate import Agent, policy_agent
 from agents.workers import components
@@ -43,8 +44,7 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
         with zipfile.ZipFile(path) as content, content.open(_MEMBER) as file:
             policy.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
     except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError, TypeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ConfigError(f"{path} holds no policy of its config.yaml: {reason}") from None
+        raise ConfigError(f"{path} holds no policy of its config.yaml: {first_line(error)}") from None
     return policy_agent(policy.eval())
 
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from agents.batches import in_every_seat, play
 from agents.config import EvaluationSettings
 from agents.evaluate import baselines
-from agents.film import film
+from agents.film import check_every, film
 from agents.pid_agent import make_pid_agent
 from agents.report import show_table, versions, write_results
 from agents.workers import EnvFactory
@@ -52,8 +52,7 @@ def main(args: list[str] | None = None) -> None:
     quiet_warp()
     episodes, first = options.evaluation.episodes, options.evaluation.first_seed
     try:
-        if options.film_every < 1:
-            raise ConfigError(f"film_every={options.film_every} must be >= 1")
+        check_every(options.film_every)
         task_class = load_task(options.env_id)
         config = load_config(task_class.Config, {"control": "torque"}, parse_assignments(options.settings))
         batch = BatchedEpisodes(task_class(config), episodes, options.device)
