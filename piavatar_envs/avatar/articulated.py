@@ -143,7 +143,7 @@ class ArticulatedBody:
         self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
         self.target.rotation.fill_(wp.quat_identity())
         self.mass = JointMass(points, body, model)
-        self._factor, self._driven, self._cut = (zeros((n, NUM_DOF, NUM_DOF), float) for _ in range(3))
+        self._factor, self._driven, self._cut = (self.mass.make_factor() for _ in range(3))
         self._diagonal = zeros((n, NUM_DOF), float)
         self._right, self._change = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF), float)
         self._left, self._limited = zeros((n, NUM_DOF), float), zeros(n, int)

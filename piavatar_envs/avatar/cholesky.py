@@ -3,8 +3,12 @@
 The matrix is ``L^T L`` with a lower triangle ``L``: rows are eliminated from the last one up. Where rows are joints
 in an order that has children after their parents, limbs go before what they hang on, and of two limbs neither fills
 the rows of the other (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6.5). Which entries are not zero is
-found once, on the host. The threads of a warp share a matrix on a GPU; on a CPU one thread has it to itself
-(``threads = 1``). What is not ``wanted`` ``(num_envs,)`` stays as it is.
+found once, on the host; rows come in threes, the axes of a joint. What is not ``wanted`` ``(num_envs,)`` stays as it
+is.
+
+A factor's rows lie one after the other, row ``k`` from entry ``k (k + 1) / 2`` on. On a CPU one thread has a matrix to
+itself (``threads = 1``). On a GPU a warp has it, in shared memory (:mod:`piavatar_envs.avatar.warp_cholesky`): each row
+needs the one before, and would wait for global memory every time.
 """
 
 from __future__ import annotations
@@ -12,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.lanes import meet_threads, sum_threads
+from piavatar_envs.avatar.warp_cholesky import MOST_ROWS, factorize_together, solve_together
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -26,8 +30,15 @@ class Pattern:
 
 
 def find_pattern(filled: np.ndarray, device: str) -> Pattern:
-    """Where ``L`` has entries, by elimination, from where the matrix has: ``filled``, shape ``(N, N)`` bool."""
+    """Where ``L`` has entries, by elimination, from where the matrix has: ``filled``, shape ``(N, N)`` bool.
+
+    Raises:
+        ValueError: it is not made of filled and empty blocks of 3 x 3, or has too many rows.
+    """
     filled = filled | filled.T
+    joints = filled[::3, ::3]
+    if len(filled) > MOST_ROWS or not np.array_equal(np.kron(joints, np.ones((3, 3), bool)), filled):
+        raise ValueError(f"filled has shape {filled.shape}, expected at most {MOST_ROWS} rows, in blocks of 3 x 3")
     columns = []
     for k in reversed(range(len(filled))):
         found = np.flatnonzero(filled[k, :k])
@@ -41,22 +52,33 @@ def find_pattern(filled: np.ndarray, device: str) -> Pattern:
     return pattern
 
 
+def factor_size(rows: int) -> int:
+    """Numbers of a factor, in whole records of four."""
+    return -(-rows * (rows + 1) // 2 // 4) * 4
+
+
+@wp.func
+def start_of_row(k: int):
+    """First entry of row ``k`` of a factor."""
+    return k * (k + 1) // 2
+
+
 # Rows as plain pointers: on a CPU, finding an entry's address costs more than what is done with it.
 _ROW = """
 const int* const at = column.data;
-const float* const row = &wp::index(factor, e, k, 0);
+const float* const row = &wp::index(factor, e, k * (k + 1) / 2);
 """
 
 
 @wp.func_native(
-    _ROW + "float* const to = &wp::index(factor, e, i, 0);\n"
+    _ROW + "float* const to = &wp::index(factor, e, i * (i + 1) / 2);\n"
     "for (int n = first; n < last; ++n) to[at[n]] -= share * row[at[n]];"
 )
 def subtract_row(
     column: wp.array(dtype=int),
     first: int,
     last: int,
-    factor: wp.array3d(dtype=float),
+    factor: wp.array2d(dtype=float),
     e: int,
     k: int,
     i: int,
@@ -67,40 +89,83 @@ def subtract_row(
 
 
 @wp.func_native(
-    _ROW + "float* const to = &wp::index(x, e, 0);\n"
-    "for (int n = first; n < last; n += threads) to[at[n]] -= row[at[n]] * y;"
+    _ROW + "float* const to = &wp::index(x, e, 0);\nfor (int n = first; n < last; ++n) to[at[n]] -= row[at[n]] * y;"
 )
 def subtract_column(
     column: wp.array(dtype=int),
     first: int,
     last: int,
-    threads: int,
-    factor: wp.array3d(dtype=float),
+    factor: wp.array2d(dtype=float),
     e: int,
     k: int,
     y: float,
     x: wp.array2d(dtype=float),
 ):
-    """Take ``y`` times row ``k`` of a factor from a vector, every ``threads``-th of its columns."""
+    """Take ``y`` times row ``k`` of a factor from a vector."""
     ...
 
 
 @wp.func_native(
     _ROW + "const float* const from = &wp::index(x, e, 0);\nfloat sum = 0.0f;\n"
-    "for (int n = first; n < last; n += threads) sum += row[at[n]] * from[at[n]];\nreturn sum;"
+    "for (int n = first; n < last; ++n) sum += row[at[n]] * from[at[n]];\nreturn sum;"
 )
 def dot_row(
     column: wp.array(dtype=int),
     first: int,
     last: int,
-    threads: int,
-    factor: wp.array3d(dtype=float),
+    factor: wp.array2d(dtype=float),
     e: int,
     k: int,
     x: wp.array2d(dtype=float),
 ) -> float:
-    """Product of row ``k`` of a factor, every ``threads``-th of its columns, and a vector."""
+    """Product of row ``k`` of a factor and a vector."""
     ...
+
+
+@wp.func
+def factorize_alone(
+    pattern: Pattern,
+    matrix: wp.array3d(dtype=float),
+    diagonal: wp.array2d(dtype=float),
+    e: int,
+    r: int,
+    factor: wp.array2d(dtype=float),
+):
+    """:func:`factorize` for one thread; row ``r`` of the ``diagonal`` is the environment's."""
+    size = matrix.shape[1]
+    for k in range(size):
+        at = start_of_row(k)
+        for n in range(pattern.start[k], pattern.start[k + 1]):
+            factor[e, at + pattern.column[n]] = matrix[e, k, pattern.column[n]]
+        factor[e, at + k] = matrix[e, k, k] + diagonal[r, k]
+    for row in range(size):
+        k = size - 1 - row
+        at = start_of_row(k)
+        first = pattern.start[k]
+        last = pattern.start[k + 1]
+        pivot = wp.sqrt(factor[e, at + k])
+        factor[e, at + k] = pivot
+        for n in range(first, last):
+            i = pattern.column[n]
+            share = factor[e, at + i] / pivot
+            factor[e, at + i] = share
+            subtract_row(pattern.column, first, n, factor, e, k, i, share)
+            own = start_of_row(i) + i
+            factor[e, own] = factor[e, own] - share * share
+
+
+@wp.func
+def solve_alone(pattern: Pattern, factor: wp.array2d(dtype=float), e: int, x: wp.array2d(dtype=float)):
+    """:func:`solve` for one thread; ``x`` has the right-hand side at first."""
+    size = x.shape[1]
+    for row in range(size):
+        k = size - 1 - row
+        y = x[e, k] / factor[e, start_of_row(k) + k]
+        x[e, k] = y
+        subtract_column(pattern.column, pattern.start[k], pattern.start[k + 1], factor, e, k, y, x)
+    for k in range(size):
+        part = dot_row(pattern.column, pattern.start[k], pattern.start[k + 1], factor, e, k, x)
+        x[e, k] = (x[e, k] - part) / factor[e, start_of_row(k) + k]
 
 
 @wp.kernel
@@ -111,74 +176,40 @@ def factorize(
     wanted: wp.array(dtype=int),
     threads: int,
     # out
-    factor: wp.array3d(dtype=float),
+    factor: wp.array2d(dtype=float),
 ):
-    """``L`` of ``L^T L = matrix + diag(diagonal)``; launched over ``(num_envs, threads)``.
+    """``L`` of ``L^T L = matrix + diag(diagonal)``; launched over ``(num_envs, threads)`` in blocks of ``threads``.
 
-    Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, and only that of ``factor`` is written, both
-    where the pattern says. ``diagonal`` is ``(1 or num_envs, N)``.
+    Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, zero where the pattern has nothing, and
+    ``factor`` ``(num_envs, factor_size(N))`` is written where the pattern says. ``diagonal`` is ``(1 or num_envs, N)``.
     """
-    e, thread = wp.tid()
+    e, _ = wp.tid()
     if wanted[e] == 0:
         return
-    size = matrix.shape[1]
     r = wp.min(e, diagonal.shape[0] - 1)
-    for k in range(thread, size, threads):
-        for n in range(pattern.start[k], pattern.start[k + 1]):
-            factor[e, k, pattern.column[n]] = matrix[e, k, pattern.column[n]]
-        factor[e, k, k] = matrix[e, k, k] + diagonal[r, k]
-    meet_threads(threads)
-    for row in range(size):
-        k = size - 1 - row
-        first = pattern.start[k]
-        last = pattern.start[k + 1]
-        pivot = wp.sqrt(factor[e, k, k])
-        meet_threads(threads)
-        for n in range(first + thread, last, threads):
-            i = pattern.column[n]
-            factor[e, k, i] = factor[e, k, i] / pivot
-        if thread == 0:
-            factor[e, k, k] = pivot
-        meet_threads(threads)
-        for n in range(first + thread, last, threads):
-            i = pattern.column[n]
-            share = factor[e, k, i]
-            subtract_row(pattern.column, first, n, factor, e, k, i, share)
-            factor[e, i, i] = factor[e, i, i] - share * share
-        meet_threads(threads)
+    if threads == 1:
+        factorize_alone(pattern, matrix, diagonal, e, r, factor)
+    else:
+        factorize_together(pattern.start, pattern.column, matrix, diagonal, e, r, factor)
 
 
 @wp.kernel
 def solve(
     pattern: Pattern,
-    factor: wp.array3d(dtype=float),
+    factor: wp.array2d(dtype=float),
     right: wp.array2d(dtype=float),
     wanted: wp.array(dtype=int),
     threads: int,
     # out
     x: wp.array2d(dtype=float),
 ):
-    """``x`` with ``L^T L x = right``, ``L`` the ``factor``; launched over ``(num_envs, threads)``."""
+    """``x`` with ``L^T L x = right``, ``L`` the ``factor``; launched as :func:`factorize`."""
     e, thread = wp.tid()
     if wanted[e] == 0:
         return
-    size = factor.shape[1]
-    for i in range(thread, size, threads):
+    for i in range(thread, x.shape[1], threads):
         x[e, i] = right[e, i]
-    meet_threads(threads)
-    for row in range(size):
-        k = size - 1 - row
-        y = x[e, k] / factor[e, k, k]
-        meet_threads(threads)
-        if thread == 0:
-            x[e, k] = y
-        first = pattern.start[k] + thread
-        subtract_column(pattern.column, first, pattern.start[k + 1], threads, factor, e, k, y, x)
-        meet_threads(threads)
-    for k in range(size):
-        first = pattern.start[k] + thread
-        part = dot_row(pattern.column, first, pattern.start[k + 1], threads, factor, e, k, x)
-        part = sum_threads(part, threads)
-        if thread == 0:
-            x[e, k] = (x[e, k] - part) / factor[e, k, k]
-        meet_threads(threads)
+    if threads == 1:
+        solve_alone(pattern, factor, e, x)
+    else:
+        solve_together(factor, e, x)

@@ -5,17 +5,10 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.cholesky import factorize, find_pattern, solve
+from piavatar_envs.avatar.cholesky import factor_size, factorize, find_pattern, solve
 from piavatar_envs.avatar.lanes import warp_threads
-from piavatar_envs.avatar.mass_matrix import (
-    NUM_DOF,
-    build_pairs,
-    compose_moments,
-    fill_mass_matrix,
-    filled_entries,
-    place_pairs,
-    sum_pairs,
-)
+from piavatar_envs.avatar.mass_matrix import NUM_DOF, compose_mass, filled_entries
+from piavatar_envs.avatar.mass_pairs import build_pairs, sum_pairs
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
 from piavatar_envs.mpm.program import Program
@@ -37,7 +30,8 @@ class JointMass:
         self.pattern = find_pattern(filled_entries(self.pairs), device)
         self._every = wp.full(n, 1, dtype=int, device=device)
         self._sums = wp.zeros((n, len(self.pairs.entry_start) - 1), dtype=vec12, device=device)
-        self._moments = wp.zeros((n, NUM_JOINTS * NUM_JOINTS), dtype=vec16, device=device)
+        alone = n if self.threads == 1 else 1  # threads that share a matrix do so in shared memory
+        self._scratch = wp.zeros((alone, NUM_JOINTS * NUM_JOINTS), dtype=vec16, device=device)
 
     def record(self, program: Program, state: State, position: wp.array) -> None:
         """Append: build the matrix for joints at ``position`` [m]."""
@@ -47,12 +41,12 @@ class JointMass:
             [self.body, self.pairs, self.model.particles, state.x, position, self.threads],
             [self._sums],
         )
-        moments = self._moments
-        program.launch(place_pairs, moments.shape, [self.pairs, self._sums, position], [moments])
-        for columns in (0, 1):
-            inputs = [self.body, position, columns]
-            program.launch(compose_moments, (self.model.num_envs, NUM_JOINTS), inputs, [moments])
-        program.launch(fill_mass_matrix, moments.shape, [moments], [self.matrix])
+        inputs = [self.body, self.pairs, self._sums, position, self.threads, self._scratch]
+        program.launch(compose_mass, (self.model.num_envs, self.threads), inputs, [self.matrix], block_dim=self.threads)
+
+    def make_factor(self) -> wp.array:
+        """Room for a Cholesky factor in every environment."""
+        return wp.zeros((self.model.num_envs, factor_size(NUM_DOF)), dtype=float, device=self.model.device)
 
     def record_factor(
         self, program: Program, diagonal: wp.array, factor: wp.array, wanted: wp.array | None = None
@@ -60,7 +54,7 @@ class JointMass:
         """Append: the Cholesky factor of the matrix and a diagonal, of all environments or of those ``wanted``."""
         wanted = self._every if wanted is None else wanted
         inputs = [self.pattern, self.matrix, diagonal, wanted, self.threads]
-        program.launch(factorize, (self.model.num_envs, self.threads), inputs, [factor])
+        program.launch(factorize, (self.model.num_envs, self.threads), inputs, [factor], block_dim=self.threads)
 
     def record_solve(
         self, program: Program, factor: wp.array, right: wp.array, x: wp.array, wanted: wp.array | None = None
@@ -68,4 +62,4 @@ class JointMass:
         """Append: solve with a factor, in all environments or in those ``wanted``."""
         wanted = self._every if wanted is None else wanted
         inputs = [self.pattern, factor, right, wanted, self.threads]
-        program.launch(solve, (self.model.num_envs, self.threads), inputs, [x])
+        program.launch(solve, (self.model.num_envs, self.threads), inputs, [x], block_dim=self.threads)

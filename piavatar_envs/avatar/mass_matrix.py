@@ -22,12 +22,11 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.body import CHUNK, BodyPoints
-from piavatar_envs.avatar.lanes import store_sum12
+from piavatar_envs.avatar.lanes import meet_threads
+from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.rigid_fit import symmetric
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
-from piavatar_envs.mpm.types import Particles, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -35,59 +34,6 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 NUM_DOF = 3 + 3 * NUM_JOINTS
 BONES = wp.constant(NUM_JOINTS)
 I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
-
-
-@wp.struct
-class Pairs:
-    """Particles that two bones move, or one: lists in chunks, as those of :class:`piavatar_envs.avatar.types.Body`."""
-
-    of: wp.array(dtype=int)  # (bones * bones,) pair of two bones; -1 where they have no particle in common
-    first: wp.array(dtype=int)  # (pairs,) one of the bones of a pair, about whose joint its moments are
-    chunk_pair: wp.array(dtype=int)  # (chunks,)
-    # pair q owns chunks chunk_start[q] : chunk_start[q + 1], chunk c holds entries entry_start[c] : entry_start[c + 1]
-    chunk_start: wp.array(dtype=int)
-    entry_start: wp.array(dtype=int)
-    entry: wp.array(dtype=int)
-    entry_weight: wp.array(dtype=float)  # product of the two weights
-
-
-def build_pairs(points: BodyPoints, device: str) -> Pairs:
-    """Lists of all pairs of bones that have particles in common, a bone with itself among them."""
-    weights = points.skin_weights / points.skin_weights.sum(1, keepdims=True)
-    particles: dict[tuple[int, int], list[np.ndarray]] = {}
-    products: dict[tuple[int, int], list[np.ndarray]] = {}
-    for i in range(4):
-        for j in range(i, 4):
-            product = weights[:, i] * weights[:, j]
-            bones = np.sort(points.skin_joints[:, [i, j]], axis=1)
-            for a, b in np.unique(bones[product > 0.0], axis=0):
-                found = np.flatnonzero((product > 0.0) & (bones[:, 0] == a) & (bones[:, 1] == b))
-                particles.setdefault((int(a), int(b)), []).append(found)
-                products.setdefault((int(a), int(b)), []).append(product[found])
-    of = np.full((NUM_JOINTS, NUM_JOINTS), -1)
-    chunk_pair, chunk_start, entry_start, entries, entry_weights = [], [0], [0], [], []
-    for pair, (a, b) in enumerate(sorted(particles)):
-        of[a, b] = of[b, a] = pair
-        found, product = np.concatenate(particles[a, b]), np.concatenate(products[a, b])
-        for begin in range(0, len(found), CHUNK):
-            entries.append(found[begin : begin + CHUNK])
-            entry_weights.append(product[begin : begin + CHUNK])
-            entry_start.append(entry_start[-1] + len(entries[-1]))
-            chunk_pair.append(pair)
-        chunk_start.append(len(entry_start) - 1)
-    pairs = Pairs()
-    lists = {
-        "of": of.ravel(),
-        "first": [a for a, _ in sorted(particles)],
-        "chunk_pair": chunk_pair,
-        "chunk_start": chunk_start,
-        "entry_start": entry_start,
-        "entry": np.concatenate(entries),
-    }
-    for name, numbers in lists.items():
-        setattr(pairs, name, wp.array(np.asarray(numbers, np.int32), dtype=int, device=device))
-    pairs.entry_weight = wp.array(np.concatenate(entry_weights).astype(np.float32), dtype=float, device=device)
-    return pairs
 
 
 def filled_entries(pairs: Pairs) -> np.ndarray:
@@ -101,41 +47,6 @@ def filled_entries(pairs: Pairs) -> np.ndarray:
     filled = np.ones((NUM_DOF, NUM_DOF), bool)
     filled[3:, 3:] = joints
     return filled
-
-
-@wp.kernel
-def sum_pairs(
-    body: Body,
-    pairs: Pairs,
-    particles: Particles,
-    x: wp.array2d(dtype=wp.vec3),
-    position: wp.array2d(dtype=wp.vec3),
-    threads: int,
-    # out
-    sums: wp.array2d(dtype=vec12),
-):
-    """Mass, first and second moment of one chunk about a joint; launched over ``(num_envs, chunks, threads)``.
-
-    ``position`` are those of the joints [m].
-    """
-    e, c, thread = wp.tid()
-    origin = position[e, pairs.first[pairs.chunk_pair[c]]]
-    r = row(e, particles.mass.shape[0])
-    m = float(0.0)
-    mx = wp.vec3()
-    diag = wp.vec3()
-    off = wp.vec3()
-    for n in range(pairs.entry_start[c] + thread, pairs.entry_start[c + 1], threads):
-        p = body.first + pairs.entry[n]
-        w = pairs.entry_weight[n] * particles.mass[r, p]
-        d = x[e, p] - origin
-        wd = w * d
-        m += w
-        mx += wd
-        diag += wp.cw_mul(wd, d)
-        off += wp.vec3(wd[1] * d[2], wd[2] * d[0], wd[0] * d[1])
-    total = vec12(m, mx[0], mx[1], mx[2], diag[0], diag[1], diag[2], off[0], off[1], off[2], 0.0, 0.0)
-    store_sum12(sums, e, c, total, threads)
 
 
 @wp.func
@@ -167,28 +78,69 @@ def moved(s: vec16, alpha: wp.vec3, beta: wp.vec3):
     return two_sided(m, first + m * alpha, both)
 
 
-@wp.kernel
-def place_pairs(
-    pairs: Pairs,
-    sums: wp.array2d(dtype=vec12),
-    position: wp.array2d(dtype=wp.vec3),
-    # out
-    moments: wp.array2d(dtype=vec16),
+# Records of the pairs of bones lie in shared memory on a GPU, word by word, rows an odd number of words apart: threads
+# read from different banks, whether theirs are the pairs of one bone or those of all with one.
+_ROW, _WORDS = NUM_JOINTS + 1 - NUM_JOINTS % 2, 13
+_WORD = _ROW * NUM_JOINTS
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+__shared__ float words[{_WORDS * _WORD}];
+return reinterpret_cast<wp::uint64>(words);
+#else
+return reinterpret_cast<wp::uint64>(&wp::index(scratch, e, 0));
+#endif
+""")
+def records_of(scratch: wp.array2d(dtype=vec16), e: int) -> wp.uint64:
+    """Where the records of an environment are: a CUDA block's own, or on a CPU ``scratch``."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+const float* const from = reinterpret_cast<const float*>(records) + {_ROW} * c + d;
+wp::vec_t<16, wp::float32> value;
+#pragma unroll
+for (int k = 0; k < {_WORDS}; ++k) value[k] = from[{_WORD} * k];
+return value;
+#else
+return reinterpret_cast<const wp::vec_t<16, wp::float32>*>(records)[{NUM_JOINTS} * c + d];
+#endif
+""")
+def read_pair(records: wp.uint64, c: int, d: int) -> vec16:
+    """The record of bones ``c`` and ``d``."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+float* const to = reinterpret_cast<float*>(records) + {_ROW} * c + d;
+#pragma unroll
+for (int k = 0; k < {_WORDS}; ++k) to[{_WORD} * k] = value[k];
+#else
+reinterpret_cast<wp::vec_t<16, wp::float32>*>(records)[{NUM_JOINTS} * c + d] = value;
+#endif
+""")
+def write_pair(records: wp.uint64, c: int, d: int, value: vec16):
+    """Write what :func:`read_pair` reads."""
+    ...
+
+
+@wp.func
+def place_pair(
+    pairs: Pairs, sums: wp.array2d(dtype=vec12), position: wp.array2d(dtype=wp.vec3), e: int, c: int, d: int
 ):
-    """Moments of every two bones, zero where they share nothing; launched over ``(num_envs, bones * bones)``."""
-    e, n = wp.tid()
-    pair = pairs.of[n]
+    """Moments of what two bones both move, about their joints; zero where they share nothing."""
+    pair = pairs.of[c * BONES + d]
     if pair < 0:
-        moments[e, n] = vec16()
-        return
+        return vec16()
     s = vec12()
-    for c in range(pairs.chunk_start[pair], pairs.chunk_start[pair + 1]):
-        s += sums[e, c]
+    for chunk in range(pairs.chunk_start[pair], pairs.chunk_start[pair + 1]):
+        s += sums[e, chunk]
     second = symmetric(wp.vec3(s[4], s[5], s[6]), wp.vec3(s[7], s[8], s[9]))
     origin = position[e, pairs.first[pair]]
-    alpha = origin - position[e, n // BONES]
-    beta = origin - position[e, n % BONES]
-    moments[e, n] = moved(two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second), alpha, beta)
+    return moved(two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second), origin - position[e, c], origin - position[e, d])
 
 
 @wp.func
@@ -204,26 +156,28 @@ def transposed(s: vec16, away: wp.vec3):
     return two_sided(s[0], wp.vec3(s[1], s[2], s[3]) + s[0] * away, wp.transpose(second_moment(s)))
 
 
-@wp.kernel
-def compose_moments(body: Body, position: wp.array2d(dtype=wp.vec3), columns: int, moments: wp.array2d(dtype=vec16)):
-    """Add what every bone has to what its parent has, for one side of the pairs; launched over ``(num_envs, bones)``.
+@wp.func
+def compose_rows(body: Body, position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, other: int):
+    """Add what every bone has in common with an ``other`` to what its parent has."""
+    for n in range(BONES - 1):
+        b = BONES - 1 - n  # children come after their parents
+        a = body.parent[b]
+        step = position[e, b] - position[e, a]
+        lifted = lift(read_pair(records, b, other), step, position[e, b] - position[e, other])
+        write_pair(records, a, other, read_pair(records, a, other) + lifted)
 
-    Children come after their parents in the order of the bones. With ``columns`` 0 and then 1, the moments of two bones
-    become those of all that two joints carry.
-    """
-    e, other = wp.tid()
+
+@wp.func
+def compose_columns(body: Body, position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, other: int):
+    """Likewise for the second bone of a pair, where the first is the ``other``."""
     for n in range(BONES - 1):
         b = BONES - 1 - n
         a = body.parent[b]
         step = position[e, b] - position[e, a]
-        if columns == 0:
-            lifted = lift(moments[e, b * BONES + other], step, position[e, b] - position[e, other])
-            moments[e, a * BONES + other] = moments[e, a * BONES + other] + lifted
-        else:
-            away = position[e, other] - position[e, b]
-            lifted = lift(transposed(moments[e, other * BONES + b], away), step, -away)
-            back = transposed(lifted, position[e, a] - position[e, other])
-            moments[e, other * BONES + a] = moments[e, other * BONES + a] + back
+        away = position[e, other] - position[e, b]
+        lifted = lift(transposed(read_pair(records, other, b), away), step, -away)
+        back = transposed(lifted, position[e, a] - position[e, other])
+        write_pair(records, other, a, read_pair(records, other, a) + back)
 
 
 @wp.func
@@ -234,22 +188,9 @@ def set_block(matrix: wp.array3d(dtype=float), e: int, i: int, j: int, block: wp
             matrix[e, i + a, j + b] = block[a, b]
 
 
-@wp.kernel
-def fill_mass_matrix(
-    moments: wp.array2d(dtype=vec16),
-    # out
-    mass: wp.array3d(dtype=float),
-):
-    """Blocks of all pairs of joints, and those of the pelvis' velocity; launched over ``(num_envs, bones * bones)``.
-
-    Only those of the lower triangle.
-    """
-    e, n = wp.tid()
-    c = n // BONES
-    d = n % BONES
-    if d > c:
-        return
-    s = moments[e, n]
+@wp.func
+def fill_blocks(s: vec16, e: int, c: int, d: int, mass: wp.array3d(dtype=float)):
+    """The block of two joints of the mass matrix; those of the pelvis' velocity with the first joint's."""
     both = second_moment(s)
     set_block(mass, e, 3 + 3 * c, 3 + 3 * d, wp.trace(both) * I3 - both)
     if d == 0:
@@ -257,3 +198,38 @@ def fill_mass_matrix(
         set_block(mass, e, 3 + 3 * c, 0, wp.transpose(lever))
         if c == 0:
             set_block(mass, e, 0, 0, s[0] * I3)
+
+
+@wp.kernel
+def compose_mass(
+    body: Body,
+    pairs: Pairs,
+    sums: wp.array2d(dtype=vec12),
+    position: wp.array2d(dtype=wp.vec3),
+    threads: int,
+    scratch: wp.array2d(dtype=vec16),
+    # out
+    mass: wp.array3d(dtype=float),
+):
+    """The mass matrix from the moments of pairs; of ``mass`` only the lower triangle is written.
+
+    Moments of every two bones become those of all that two joints carry: first for one side of the pairs, then for the
+    other. Launched over ``(num_envs, threads)``, a CUDA block an environment; threads share the bones.
+    """
+    e, thread = wp.tid()
+    records = records_of(scratch, e)
+    for n in range(thread, BONES * BONES, threads):
+        c = n // BONES
+        write_pair(records, c, n % BONES, place_pair(pairs, sums, position, e, c, n % BONES))
+    meet_threads(threads)
+    for other in range(thread, BONES, threads):
+        compose_rows(body, position, records, e, other)
+    meet_threads(threads)
+    for other in range(thread, BONES, threads):
+        compose_columns(body, position, records, e, other)
+    meet_threads(threads)
+    for n in range(thread, BONES * BONES, threads):
+        c = n // BONES
+        d = n % BONES
+        if d <= c:
+            fill_blocks(read_pair(records, c, d), e, c, d, mass)

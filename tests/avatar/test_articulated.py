@@ -9,7 +9,7 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.articulated import ArticulatedBody
-from piavatar_envs.avatar.cholesky import factorize, find_pattern, solve
+from piavatar_envs.avatar.cholesky import factor_size, factorize, find_pattern, solve
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
@@ -110,25 +110,36 @@ def joints(make_rig, wild_pose):
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_factors_solve(device, sparse):
-    rng, size, n, threads = np.random.default_rng(0), 37, 3, warp_threads(device)
+    rng, size, n, threads = np.random.default_rng(0), 39, 3, warp_threads(device)
     root = rng.normal(size=(n, size, size))
     filled = np.ones((size, size), bool)
     if sparse:  # two limbs on a trunk, of which the first is entered by what the elimination of a finger fills
-        filled[10:20, 20:] = filled[20:, 10:20] = False
-        filled[3, 12] = filled[12, 3] = False
+        filled[9:21, 21:] = filled[21:, 9:21] = False
+        filled[3:6, 12:15] = filled[12:15, 3:6] = False
     matrix = np.where(filled, root @ root.transpose(0, 2, 1), 0.0)
     matrix = (matrix + (2.0 + np.abs(matrix).sum(2).max()) * np.eye(size)).astype(np.float32)
     diagonal, right = rng.uniform(0.0, 3.0, (1, size)), rng.normal(size=(n, size))
     arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in (matrix, diagonal, right)]
-    factor, x = wp.zeros((n, size, size), dtype=float, device=device), wp.zeros((n, size), dtype=float, device=device)
+    factor, x = (wp.zeros((n, rows), dtype=float, device=device) for rows in (factor_size(size), size))
     wanted = wp.full(n, 1, dtype=int, device=device)
     pattern = find_pattern(filled, device)
-    wp.launch(factorize, (n, threads), [pattern, *arrays[:2], wanted, threads], [factor], device=device)
-    wp.launch(solve, (n, threads), [pattern, factor, arrays[2], wanted, threads], [x], device=device)
+    how = {"dim": (n, threads), "block_dim": threads, "device": device}
+    wp.launch(factorize, inputs=[pattern, *arrays[:2], wanted, threads], outputs=[factor], **how)
+    wp.launch(solve, inputs=[pattern, factor, arrays[2], wanted, threads], outputs=[x], **how)
     whole = matrix + np.diag(diagonal[0])
-    L = np.tril(factor.numpy().astype(float))
+    L = np.zeros((n, size, size))
+    rows, columns = np.tril_indices(size)
+    L[:, rows, columns] = factor.numpy()[:, : len(rows)]
     np.testing.assert_allclose(L.transpose(0, 2, 1) @ L, whole, atol=1e-5 * np.abs(whole).max())
     np.testing.assert_allclose(x.numpy(), np.linalg.solve(whole, right[..., None])[..., 0], atol=1e-4)
+
+
+def test_factors_of_odd_patterns_are_refused():
+    filled = np.ones((6, 6), bool)
+    filled[1, 4] = filled[4, 1] = False
+    for wrong in (filled, np.ones((75, 75), bool)):
+        with pytest.raises(ValueError, match="at most 72 rows, in blocks of 3 x 3"):
+            find_pattern(wrong, "cpu")
 
 
 @pytest.mark.parametrize("seed", range(3))

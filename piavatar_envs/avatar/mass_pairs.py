@@ -1,0 +1,105 @@
+"""What every two bones of an avatar move both: lists of particles, and their moments.
+
+See :mod:`piavatar_envs.avatar.mass_matrix`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.body import CHUNK, BodyPoints
+from piavatar_envs.avatar.lanes import store_sum12
+from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.types import Body, vec12
+from piavatar_envs.mpm.types import Particles, row
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.struct
+class Pairs:
+    """Particles that two bones move, or one: lists in chunks, as those of :class:`piavatar_envs.avatar.types.Body`."""
+
+    of: wp.array(dtype=int)  # (bones * bones,) pair of two bones; -1 where they have no particle in common
+    first: wp.array(dtype=int)  # (pairs,) one of the bones of a pair, about whose joint its moments are
+    chunk_pair: wp.array(dtype=int)  # (chunks,)
+    # pair q owns chunks chunk_start[q] : chunk_start[q + 1], chunk c holds entries entry_start[c] : entry_start[c + 1]
+    chunk_start: wp.array(dtype=int)
+    entry_start: wp.array(dtype=int)
+    entry: wp.array(dtype=int)
+    entry_weight: wp.array(dtype=float)  # product of the two weights
+
+
+def build_pairs(points: BodyPoints, device: str) -> Pairs:
+    """Lists of all pairs of bones that have particles in common, a bone with itself among them."""
+    weights = points.skin_weights / points.skin_weights.sum(1, keepdims=True)
+    particles: dict[tuple[int, int], list[np.ndarray]] = {}
+    products: dict[tuple[int, int], list[np.ndarray]] = {}
+    for i in range(4):
+        for j in range(i, 4):
+            product = weights[:, i] * weights[:, j]
+            bones = np.sort(points.skin_joints[:, [i, j]], axis=1)
+            for a, b in np.unique(bones[product > 0.0], axis=0):
+                found = np.flatnonzero((product > 0.0) & (bones[:, 0] == a) & (bones[:, 1] == b))
+                particles.setdefault((int(a), int(b)), []).append(found)
+                products.setdefault((int(a), int(b)), []).append(product[found])
+    of = np.full((NUM_JOINTS, NUM_JOINTS), -1)
+    chunk_pair, chunk_start, entry_start, entries, entry_weights = [], [0], [0], [], []
+    for pair, (a, b) in enumerate(sorted(particles)):
+        of[a, b] = of[b, a] = pair
+        found, product = np.concatenate(particles[a, b]), np.concatenate(products[a, b])
+        for begin in range(0, len(found), CHUNK):
+            entries.append(found[begin : begin + CHUNK])
+            entry_weights.append(product[begin : begin + CHUNK])
+            entry_start.append(entry_start[-1] + len(entries[-1]))
+            chunk_pair.append(pair)
+        chunk_start.append(len(entry_start) - 1)
+    pairs = Pairs()
+    lists = {
+        "of": of.ravel(),
+        "first": [a for a, _ in sorted(particles)],
+        "chunk_pair": chunk_pair,
+        "chunk_start": chunk_start,
+        "entry_start": entry_start,
+        "entry": np.concatenate(entries),
+    }
+    for name, numbers in lists.items():
+        setattr(pairs, name, wp.array(np.asarray(numbers, np.int32), dtype=int, device=device))
+    pairs.entry_weight = wp.array(np.concatenate(entry_weights).astype(np.float32), dtype=float, device=device)
+    return pairs
+
+
+@wp.kernel
+def sum_pairs(
+    body: Body,
+    pairs: Pairs,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    position: wp.array2d(dtype=wp.vec3),
+    threads: int,
+    # out
+    sums: wp.array2d(dtype=vec12),
+):
+    """Mass, first and second moment of one chunk about a joint; launched over ``(num_envs, chunks, threads)``.
+
+    ``position`` are those of the joints [m].
+    """
+    e, c, thread = wp.tid()
+    origin = position[e, pairs.first[pairs.chunk_pair[c]]]
+    r = row(e, particles.mass.shape[0])
+    m = float(0.0)
+    mx = wp.vec3()
+    diag = wp.vec3()
+    off = wp.vec3()
+    for n in range(pairs.entry_start[c] + thread, pairs.entry_start[c + 1], threads):
+        p = body.first + pairs.entry[n]
+        w = pairs.entry_weight[n] * particles.mass[r, p]
+        d = x[e, p] - origin
+        wd = w * d
+        m += w
+        mx += wd
+        diag += wp.cw_mul(wd, d)
+        off += wp.vec3(wd[1] * d[2], wd[2] * d[0], wd[0] * d[1])
+    total = vec12(m, mx[0], mx[1], mx[2], diag[0], diag[1], diag[2], off[0], off[1], off[2], 0.0, 0.0)
+    store_sum12(sums, e, c, total, threads)
