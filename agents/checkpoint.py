@@ -27,7 +27,7 @@ from piavatar_envs.envs.config import ConfigError
 
 NAME = "checkpoint.pt"
 #: Of the file's content; rises with every change.
-FORMAT = 1
+FORMAT = 2
 #: Settings that what has been learned so far does not depend on.
 FREE = ("total_steps", "iterations", "checkpoint_every", "evaluation")
 #: Packages whose version the arithmetic depends on.

@@ -3,7 +3,7 @@
 The counts are of the scheme, not of an implementation: each is the least that P2G, one grid pass and G2P need, with
 particles read and written once a substep, every node's sums written once and read once, velocities alike.
 
-    bytes    P (108 + 28 + 96) + N (4 * 32)   state and constants in, state out; sums and velocities of nodes
+    bytes    P (120 + 28 + 96) + N (4 * 32)   state and constants in, state out; sums and velocities of nodes
     flop     P * 1800 + N * 60                counted in the kernels' source, stress and both stencils; +- a third
     additions  27 * cells                     of 32-byte records, when all particles of a cell are summed first
     launch   of a captured graph's kernels, one after the other
@@ -22,8 +22,8 @@ import numpy as np
 
 from piavatar_envs.mpm.types import SCATTERS, Model, State
 
-#: x, u, vk (3 floats each), C, F (9 each); x, u, C, F are written; mass, volume, mu, lam, material, field, seam.
-STATE_BYTES, WRITTEN_BYTES, CONSTANT_BYTES = 108, 96, 28
+#: x, u, vk, spin (3 floats each), C, F (9 each); x, u, C, F are written; mass, volume, mu, lam, material, field, seam.
+STATE_BYTES, WRITTEN_BYTES, CONSTANT_BYTES = 120, 96, 28
 NODE_BYTES = 32  # mass, physical momentum, kinematic momentum, seam
 STENCIL = 27
 WORDS = 7  # of a record that are added to, 4 bytes each
@@ -155,14 +155,14 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
         "runs_to_grid": scatter,
         # sums in, sums cleared, velocities out
         "update_grid": 2 * sums + nodes * NODE_BYTES,
-        # x, F, vk and velocities in; x, u, C, F out
-        "grid_to_particles": particles * (60 + WRITTEN_BYTES) + nodes * NODE_BYTES,
-        # a body's grid stays in shared memory: what the scatter reads, and x, F and vk once more; x, u, C, F out
-        **dict.fromkeys(SUBSTEPS, particles * (STATE_BYTES + constants + 60 + WRITTEN_BYTES)),
+        # x, F, vk, spin and physical velocities in; x, u, C, F out
+        "grid_to_particles": particles * (72 + WRITTEN_BYTES) + nodes * NODE_BYTES // 2,
+        # a body's grid stays in shared memory: what the scatter reads, and x, F, vk and spin once more; x, u, C, F out
+        **dict.fromkeys(SUBSTEPS, particles * (STATE_BYTES + constants + 72 + WRITTEN_BYTES)),
         # velocities or sums out
         **dict.fromkeys(NODE_PASSES, particles * (STATE_BYTES + constants) + nodes * NODE_BYTES),
-        # x, u in; vk, pull, lean out; of flesh that is not inert and bodies that are held
-        "drive_particles": particles * 5 * 12,
+        # x, u in; vk, spin, pull, lean out; of flesh that is not inert and bodies that are held
+        "drive_particles": particles * 6 * 12,
         # x, u, pull in; u out
         "apply_corrections": particles * 4 * 12,
         "sum_moments": particles * 2 * 12,  # x, u

@@ -277,6 +277,6 @@ class ArticulatedBody:
         self._record_spread(program, self._taken, self._leaving)
         self._record_spread(program, s.velocity, self._moving)
         inputs = [self.body, state.x, s.position, self._leaving, self._moving, state.failure]
-        program.launch(take_over, points, inputs, [state.u, state.vk])
+        program.launch(take_over, points, inputs, [state.u, state.kinematic])
         inputs = [self.body, self.model.step.dt, self._moving, state.failure, self.threads]
         program.launch(move_joints, (n, self.threads), inputs, pose)

@@ -128,7 +128,7 @@ class AvatarDrive:
             place_particles,
             (n, self.num_points),
             [mask, self.body, s.bone_from],
-            [state.x, state.u, state.C, state.F, state.vk, d.motion, state.failure],
+            [state.x, state.u, state.C, state.F, state.kinematic, d.motion, state.failure],
         )
         if self.joints:
             self.joints.record_reset(program, mask)

@@ -29,12 +29,18 @@ from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull
 from piavatar_envs.avatar.rigid_fit import spin_of
 from piavatar_envs.avatar.types import Body, Drive, RemovedMotion, RigidFit, RigidFits, vec8, vec12, vec16, vec52
 from piavatar_envs.mpm.stores import store_vector
-from piavatar_envs.mpm.types import row
+from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: Threads of a block in all launches of this module.
 BLOCK = 128
+
+
+@wp.func
+def axial(K: wp.mat33):
+    """``sum a x b`` from ``K = sum a b^T``."""
+    return wp.vec3(K[1, 2] - K[2, 1], K[2, 0] - K[0, 2], K[0, 1] - K[1, 0])
 
 
 @wp.kernel(launch_bounds=(BLOCK, 7))
@@ -50,7 +56,7 @@ def drive_particles(
     u: wp.array2d(dtype=wp.vec3),
     motion: wp.array2d(dtype=wp.vec3),
     # out
-    vk: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
 ):
@@ -79,7 +85,8 @@ def drive_particles(
         if drive.free_motion == 0 and let_go[e] == 0:
             u[e, body.first + p] = before - inert * (k - motion[e, p])
         motion[e, p] = k
-    store_vector(vk, e, body.first + p, k, True)
+    store_vector(driven.vk, e, body.first + p, k, True)
+    store_vector(driven.spin, e, body.first + p, (0.5 / drive.dt) * -axial(blended_turn(s)), True)
     store_vector(pull, e, p, pulled + pull_gain(drive.tone_rate, drive.dt) * way, True)
     store_vector(lean, e, p, way, drive.tone_rate > 0.0)
 
@@ -152,12 +159,6 @@ def finite_turn(w: wp.vec3, dt: float):
     c = wp.cos(half)
     X = wp.skew(w)
     return (s * c) * X + (0.5 * dt * s * s) * (X * X)
-
-
-@wp.func
-def axial(K: wp.mat33):
-    """``sum a x b`` from ``K = sum a b^T``."""
-    return wp.vec3(K[1, 2] - K[2, 1], K[2, 0] - K[0, 2], K[0, 1] - K[1, 0])
 
 
 @wp.kernel
@@ -242,7 +243,7 @@ def apply_corrections(
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
-    vk: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
 ):
     """Change the physical velocity by the pulls and the bones' blended field; free the motion of its rigid part."""
     e, p = wp.tid()
@@ -252,6 +253,7 @@ def apply_corrections(
     field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - bones.center[e, 0])
     store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, e, p) + field, True)
     if drive.free_motion != 0 or let_go[e] != 0:
-        free = vector_at(vk, e, body.first + p) - removed.velocity[e]
+        free = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]
         free += removed.turn[e] * (at - removed.center[e] + drive.dt * free)
-        store_vector(vk, e, body.first + p, free, True)
+        store_vector(driven.vk, e, body.first + p, free, True)
+        driven.spin[e, body.first + p] = driven.spin[e, body.first + p] - 0.5 * axial(removed.turn[e])

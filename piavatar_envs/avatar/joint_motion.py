@@ -15,7 +15,7 @@ from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.rotation import apply_point, quat_exp
 from piavatar_envs.avatar.types import Body, vec8
-from piavatar_envs.mpm.types import row
+from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -92,7 +92,7 @@ def take_over(
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     # out
-    vk: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
 ):
     """Take from the physical velocity what leaves it for the joints, and write ``J qdot``."""
     e, p = wp.tid()
@@ -100,7 +100,9 @@ def take_over(
         return
     arm = x[e, body.first + p] - position[e, 0]
     u[e, body.first + p] = u[e, body.first + p] - skinned_motion(body, leaving, e, p, arm)
-    vk[e, body.first + p] = skinned_motion(body, moving, e, p, arm)
+    now = blend_changes(moving, e, body.joint, body.weight, p)
+    driven.vk[e, body.first + p] = motion_at(now, arm)
+    driven.spin[e, body.first + p] = wp.vec3(now[3], now[4], now[5])
 
 
 @wp.kernel

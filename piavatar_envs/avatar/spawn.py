@@ -6,7 +6,7 @@ import warp as wp
 
 from piavatar_envs.avatar.rotation import apply_point
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.mpm.types import row
+from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,7 +45,7 @@ def place_particles(
     u: wp.array2d(dtype=wp.vec3),
     C: wp.array2d(dtype=wp.mat33),
     F: wp.array2d(dtype=wp.mat33),
-    vk: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
     motion: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
 ):
@@ -62,7 +62,8 @@ def place_particles(
     q = body.first + p
     x[e, q] = apply_point(A, body.rest[row(e, body.rest.shape[0]), p])
     u[e, q] = wp.vec3(0.0)
-    vk[e, q] = wp.vec3(0.0)
+    driven.vk[e, q] = wp.vec3(0.0)
+    driven.spin[e, q] = wp.vec3(0.0)
     motion[e, p] = wp.vec3(0.0)
     C[e, q] = wp.mat33()
     F[e, q] = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)

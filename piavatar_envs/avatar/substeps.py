@@ -144,7 +144,7 @@ def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
         flesh.drive_particles,
         (n, drive.num_points),
         [drive.body, drive.drive, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure],
-        [state.u, drive.state.motion, state.vk, s.pull, s.lean],
+        [state.u, drive.state.motion, state.kinematic, s.pull, s.lean],
         block_dim=flesh.BLOCK,
     )
     if drive.drive.free_motion or drive.drive.root_rate > 0.0:  # a root that lets go leaves a free body
@@ -163,7 +163,7 @@ def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
         (n, drive.num_points),
         [drive.body, drive.drive, state.x, s.pull, g.bones, s.bone_change, g.removed, drive.state.let_go]
         + [state.failure],
-        [state.u, state.vk],
+        [state.u, state.kinematic],
         block_dim=flesh.BLOCK,
     )
 

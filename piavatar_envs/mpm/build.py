@@ -184,7 +184,7 @@ def build_model(
     check_num_substeps(num_substeps, control_dt, grid.dx, sound_speed)
     mu, lam = lame_parameters(points.young_modulus, points.poisson_ratio)
     max_slots = bound_slots(max_slots, points.fields, grid, fields.num_fields)
-    scatter = choose_scatter(scatter, device, points.fields, max_slots)
+    scatter = choose_scatter(scatter, device, points.fields, max_slots, decoupling)
     check_memory(num_envs, points.num_particles, max_slots, device, fields.num_fields, grid.num_blocks, scatter)
     step = Step()
     step.dt = control_dt / num_substeps
@@ -209,7 +209,7 @@ def build_model(
     )
 
 
-def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slots: int) -> str:
+def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slots: int, decoupling: str) -> str:
     """How particles of velocity fields ``field`` reach the nodes, on a device.
 
     Raises:
@@ -217,7 +217,8 @@ def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slot
     """
     target = wp.get_device(device)
     matches = target.is_cuda and target.arch >= 70
-    shared = suits_shared(device, field, max_slots)
+    # in shared memory nobody asks for the gradient of the kinematic velocity
+    shared = decoupling != "paper" and suits_shared(device, field, max_slots)
     if scatter is None:
         return "shared" if shared else "runs" if matches else "plain"
     if scatter not in SCATTERS:
@@ -227,7 +228,8 @@ def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slot
     if scatter == "shared" and not shared:
         raise ValueError(
             f"scatter='shared' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
-            f"particles a body (here {most_particles(field)}) and few slots ({max_slots}); {target} takes 'runs'"
+            f"particles a body (here {most_particles(field)}), few slots ({max_slots}) and another decoupling than "
+            f"'paper' ({decoupling!r}); {target} takes 'runs'"
         )
     return scatter
 

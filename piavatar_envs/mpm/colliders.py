@@ -31,10 +31,11 @@ COLLIDER_KINDS: dict[str, int] = {"plane": 0, "sphere": 1, "box": 2, "capsule": 
 
 #: Gap at which contact begins, in grid spacings.
 CONTACT_GATE = wp.constant(0.5)
-#: Particles closer than this [grid spacings] keep track of their position on the grid, for the gate.
-NEAR_PARTICLE = wp.constant(2.5)
+#: Particles closer than this [grid spacings] tell the nodes where they are, for the gate, and how they are driven: the
+#: gate and two stencils, so that of level surfaces all do whose nodes may be in contact.
+NEAR_PARTICLE = wp.constant(3.5)
 #: Slabs of nodes closer than this may hold such a position: NEAR_PARTICLE, a stencil and a slab's half diagonal.
-NEAR_SLAB = wp.constant(7.5)
+NEAR_SLAB = wp.constant(8.5)
 
 #: A direction shorter than this [m] is round-off, and another is taken for it.
 _NO_LENGTH = wp.constant(1.0e-9)

@@ -5,15 +5,16 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.blocks import line_of_records, mark_blocks, slab_records
-from piavatar_envs.mpm.colliders import CONTACT_GATE, remove_approach
+from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline, stencil_inside
-from piavatar_envs.mpm.sums import first_of_records, read_record_from
+from piavatar_envs.mpm.sums import first_of_records, read_half_from
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
     FAILURE_OUT_OF_GRID,
     NO_STRESS,
+    PAPER,
     SPLIT,
     Blocks,
     Boundaries,
@@ -55,50 +56,36 @@ class Gathered:
     F: wp.mat33
 
 
-@wp.func
-def advance(
-    grid: Grid,
-    step: Step,
-    boundaries: Boundaries,
-    moved: Moving,
-    e: int,
-    p: int,
-    mean: vec8,
-    grad_v: wp.mat33,
-    grad_vk: wp.mat33,
-):
-    """Particle ``p`` a substep later, from the ``mean`` of the nodes' records around it and the velocities' gradients.
-
-    It is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking exact
-    (1e-5 m against 1e-2 m). What the grid did not see is projected out of the boundaries.
-    """
-    velocity = wp.vec3(mean[1], mean[2], mean[3])
-    advection = velocity
-    if step.decoupling == SPLIT or step.decoupling == NO_STRESS:
-        unseen = moved.vk[e, p] - wp.vec3(mean[4], mean[5], mean[6])
-        seen = velocity + wp.vec3(mean[4], mean[5], mean[6])
-        if mean[7] > 0.0:
-            unseen = remove_approach(boundaries, e, moved.x[e, p], unseen, CONTACT_GATE * grid.dx)
-        advection = seen + unseen
-    s = Gathered()
-    s.u = velocity
-    s.C = grad_v
-    s.F = advance_deformation(
-        moved.F[e, p], grad_v, grad_vk, step.dt, wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
-    )
-    s.x = moved.x[e, p] + step.dt * advection
-    s.fault = fault_of(grid, step, s.F, advection, s.x)
-    return s
-
-
 @wp.struct
 class Gradients:
-    """Weighted sums of the records of a stencil's nodes, and those times the nodes' places from the lowest."""
+    """Weighted sums of a velocity of a stencil's nodes, in components 1 to 3, and those times the nodes' places."""
 
-    mean: vec8
-    along_x: vec8
-    along_y: vec8
-    along_z: vec8
+    mean: wp.vec4
+    along_x: wp.vec4  # by places from the lowest node [grid spacings]
+    along_y: wp.vec4
+    along_z: wp.vec4
+
+
+@wp.func
+def gradient_of(grid: Grid, g: Gradients, f: wp.vec3):
+    """Gradient of a velocity at a particle that is ``f`` from the lowest node: ``(4 / dx^2) sum w v (x_i - x_p)^T``.
+
+    That of quadratic splines, as APIC has it.
+    """
+    scale = 4.0 * grid.inv_dx
+    gx = scale * (g.along_x - f[0] * g.mean)
+    gy = scale * (g.along_y - f[1] * g.mean)
+    gz = scale * (g.along_z - f[2] * g.mean)
+    return wp.mat33(gx[1], gy[1], gz[1], gx[2], gy[2], gz[2], gx[3], gy[3], gz[3])
+
+
+@wp.func
+def asks_kinematic(grid: Grid, step: Step, boundaries: Boundaries, e: int, x: wp.vec3):
+    """Whether a particle must know the grid's kinematic velocity: a boundary is at hand, or the variant wants it."""
+    if step.decoupling == PAPER:
+        return True
+    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    return split and nearest_boundary(boundaries, e, x) < CONTACT_GATE * grid.dx
 
 
 @wp.func
@@ -112,19 +99,36 @@ def finish_gather(
     failure: wp.array(dtype=int),
     e: int,
     p: int,
-    g: Gradients,
+    physical: Gradients,
+    kinematic: Gradients,
     base: wp.vec3i,
     f: wp.vec3,
 ):
-    """Particle ``p``, which is ``f`` from node ``base``, a substep later; the blocks that it comes to are marked."""
-    # gradient of quadratic-spline APIC: (4 / dx^2) sum w v (x_i - x_p)^T
-    scale = 4.0 * grid.inv_dx
-    gx = scale * (g.along_x - f[0] * g.mean)
-    gy = scale * (g.along_y - f[1] * g.mean)
-    gz = scale * (g.along_z - f[2] * g.mean)
-    grad_v = wp.mat33(gx[1], gy[1], gz[1], gx[2], gy[2], gz[2], gx[3], gy[3], gz[3])
-    grad_vk = wp.mat33(gx[4], gy[4], gz[4], gx[5], gy[5], gz[5], gx[6], gy[6], gz[6])
-    s = advance(grid, step, boundaries, moved, e, p, g.mean, grad_v, grad_vk)
+    """Particle ``p``, which is ``f`` from node ``base``, a substep later; the blocks that it comes to are marked.
+
+    It is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking exact
+    (1e-5 m against 1e-2 m). What the grid did not see of it is projected out of the boundaries. ``kinematic`` has
+    nothing where :func:`asks_kinematic` does not ask for it.
+    """
+    x = moved.x[e, p]
+    advection = wp.vec3(physical.mean[1], physical.mean[2], physical.mean[3])
+    s = Gathered()
+    s.u = advection
+    s.C = gradient_of(grid, physical, f)
+    grad_vk = wp.mat33()
+    asked = asks_kinematic(grid, step, boundaries, e, x)
+    if step.decoupling == PAPER:
+        grad_vk = gradient_of(grid, kinematic, f)
+    elif step.decoupling == SPLIT or step.decoupling == NO_STRESS:
+        own = moved.vk[e, p]
+        if asked:
+            seen = wp.vec3(kinematic.mean[1], kinematic.mean[2], kinematic.mean[3])
+            own = seen + remove_approach(boundaries, e, x, own - seen, CONTACT_GATE * grid.dx)
+        advection += own
+    decoupling = wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
+    s.F = advance_deformation(moved.F[e, p], s.C, grad_vk, moved.spin[e, p], step.dt, decoupling)
+    s.x = x + step.dt * advection
+    s.fault = fault_of(grid, step, s.F, advection, s.x)
     if s.fault != 0:
         wp.atomic_or(failure, e, s.fault)
     else:
@@ -132,6 +136,70 @@ def finish_gather(
         if to[0] != base[0] or to[1] != base[1] or to[2] != base[2]:
             mark_blocks(grid, blocks, to, particles.field[p], e, failure)
     return s
+
+
+@wp.func
+def gather_physical(
+    grid: Grid,
+    blocks: Blocks,
+    nodes: wp.uint64,
+    e: int,
+    field: int,
+    base: wp.vec3i,
+    wx: wp.vec3,
+    wy: wp.vec3,
+    wz: wp.vec3,
+):
+    """Sums over a stencil of the nodes' physical velocity."""
+    g = Gradients()
+    slab = wp.vec4i()
+    planes = int(3)  # not a constant: a GPU has too few registers for the loads of all three at once
+    for i in range(planes):
+        wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
+        plane = wp.vec4()
+        if i == 0 or ((base[0] + i) & 3) == 0:
+            slab = slab_records(grid, blocks, e, field, base, i)
+        for j in range(3):
+            at_line = line_of_records(slab, base, i, j)
+            w = wi * wy[j]
+            second = (w * wz[1]) * read_half_from(nodes, at_line[1], 0)
+            third = (w * wz[2]) * read_half_from(nodes, at_line[2], 0)
+            line = (w * wz[0]) * read_half_from(nodes, at_line[0], 0) + second + third
+            plane += line
+            g.along_y += float(j) * line
+            g.along_z += second + 2.0 * third
+        g.mean += plane
+        g.along_x += float(i) * plane
+    return g
+
+
+@wp.func
+def gather_kinematic(
+    grid: Grid,
+    blocks: Blocks,
+    nodes: wp.uint64,
+    e: int,
+    field: int,
+    base: wp.vec3i,
+    wx: wp.vec3,
+    wy: wp.vec3,
+    wz: wp.vec3,
+):
+    """Sums over a stencil of the kinematic velocity; few particles ask for them, so they are as short as can be."""
+    g = Gradients()
+    lines = int(9)  # not a constant: Warp would write them all down
+    for n in range(lines):
+        i = n // 3
+        j = n % 3
+        at = line_of_records(slab_records(grid, blocks, e, field, base, i), base, i, j)
+        w = wx[i] * wy[j]
+        for l in range(3):
+            s = (w * wz[l]) * read_half_from(nodes, at[l], 1)
+            g.mean += s
+            g.along_x += float(i) * s
+            g.along_y += float(j) * s
+            g.along_z += float(l) * s
+    return g
 
 
 @wp.func
@@ -151,7 +219,8 @@ def gather(
 
     The blocks that it comes to are marked for the next substep.
     """
-    xg = grid_position(grid, moved.x[e, p])
+    x = moved.x[e, p]
+    xg = grid_position(grid, x)
     base = base_node(xg)
     f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
     wx = spline(f[0])
@@ -159,26 +228,13 @@ def gather(
     wz = spline(f[2])
     field = particles.field[p]
     nodes = first_of_records(node_velocity, e)
-    g = Gradients()
-    slab = wp.vec4i()
-    planes = int(3)  # not a constant: a GPU has too few registers for the loads of all three at once
-    for i in range(planes):
-        wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
-        plane = vec8()
-        if i == 0 or ((base[0] + i) & 3) == 0:
-            slab = slab_records(grid, blocks, e, field, base, i)
-        for j in range(3):
-            at_line = line_of_records(slab, base, i, j)
-            w = wi * wy[j]
-            second = (w * wz[1]) * read_record_from(nodes, at_line[1])
-            third = (w * wz[2]) * read_record_from(nodes, at_line[2])
-            line = (w * wz[0]) * read_record_from(nodes, at_line[0]) + second + third
-            plane += line
-            g.along_y += float(j) * line
-            g.along_z += second + 2.0 * third
-        g.mean += plane
-        g.along_x += float(i) * plane
-    return finish_gather(grid, step, particles, boundaries, blocks, moved, failure, e, p, g, base, f)
+    physical = gather_physical(grid, blocks, nodes, e, field, base, wx, wy, wz)
+    kinematic = Gradients()
+    if asks_kinematic(grid, step, boundaries, e, x):
+        kinematic = gather_kinematic(grid, blocks, nodes, e, field, base, wx, wy, wz)
+    return finish_gather(
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, base, f
+    )  # fmt: skip
 
 
 @wp.kernel

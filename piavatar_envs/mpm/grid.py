@@ -63,14 +63,13 @@ def meet_boundaries(
 
 
 @wp.func
-def physical_velocity(split: bool, near: bool, total: vec8):
-    """Mass, physical and kinematic velocity from mass, total and kinematic velocity; whether a boundary is near."""
+def physical_velocity(split: bool, total: vec8):
+    """Mass, physical and kinematic velocity from mass, total and kinematic velocity."""
     if total[0] <= MASS_MIN:
         return vec8()
-    flag = wp.where(near, 1.0, 0.0)
     if split:
-        return total - vec8(0.0, total[4], total[5], total[6], 0.0, 0.0, 0.0, -flag)
-    return total + vec8(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, flag)
+        return total - vec8(0.0, total[4], total[5], total[6], 0.0, 0.0, 0.0, 0.0)
+    return total
 
 
 @wp.func
@@ -172,7 +171,7 @@ def update_grid(
             if is_near:  # most skip all of that work
                 at = place_of(grid, corner, r % BLOCK_NODES)
                 total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
-            write_record(node_velocity, e, r, physical_velocity(split, is_near, total))
+            write_record(node_velocity, e, r, physical_velocity(split, total))
             # particles next to another field's block have left their offsets here, too
             if is_near or contact.num_fields > 1:
                 clear_offset(sums, e, r)
@@ -205,7 +204,7 @@ def settle_node(
                 # the trunk comes first: its velocity is final
                 t = first_record(grid, blocks, e, contact.trunk[f], block) + local
                 v = read_record(node_velocity, e, t)
-                write_record(node_velocity, e, r, vec8(0.0, v[1], v[2], v[3], v[4], v[5], v[6], v[7]))
+                write_record(node_velocity, e, r, vec8(0.0, v[1], v[2], v[3], v[4], v[5], v[6], 0.0))
                 change = read_change(sensors.node, e, t)
                 write_change(sensors.node, e, r, change)
                 if wp.length_sq(wp.vec3(change[0], change[1], change[2])) > 0.0:
@@ -214,7 +213,7 @@ def settle_node(
                 if near:
                     at = place_of(grid, corner, local)
                     total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
-                write_record(node_velocity, e, r, physical_velocity(split, near, total))
+                write_record(node_velocity, e, r, physical_velocity(split, total))
             clear_offset(sums, e, r)
 
 

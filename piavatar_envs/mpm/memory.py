@@ -76,13 +76,13 @@ def estimate_bytes(
 ) -> int:
     """Device memory of state and scratch [bytes].
 
-    108 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 28 more
+    120 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 28 more
     where there are several fields; the map of blocks.
     """
     sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter])
     node = sums + 32 + (16 + 12 if num_fields > 1 else 0)
     slots = max_slots * (BLOCK**3 * node + (8 if num_fields > 1 else 4))
-    return num_envs * (num_particles * 108 + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
+    return num_envs * (num_particles * 120 + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
 
 
 def check_memory(
@@ -121,6 +121,7 @@ def allocate(model: Model) -> tuple[State, Scratch]:
         C=_zeros(model, particles, wp.mat33),
         F=wp.array(np.ascontiguousarray(identity), dtype=wp.mat33, device=model.device),
         vk=_zeros(model, particles, wp.vec3),
+        spin=_zeros(model, particles, wp.vec3),
         failure=_zeros(model, model.num_envs, int),
     )
     records = (model.num_envs, int(BLOCK_NODES) * model.max_slots)

@@ -97,8 +97,9 @@ def runs_to_grid(
         if takes:
             field = particles.field[p]
             seam = particles.seam[p]
-            s = prepare(grid, step, particles, moving, e, p)
             near = near_boundary(grid, boundaries, e, moving.x[e, p])
+            # which blocks have other fields comes to light later
+            s = prepare(grid, step, particles, moving, e, p, near or contact.num_fields > 1)
             fault = fault_of_sums(s, sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field])
             if fault != 0:
                 wp.atomic_or(failure, e, fault)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.gather import Gathered, Gradients, finish_gather, gather
-from piavatar_envs.mpm.shared_grid import bricks_around, line_in_bricks, node_record
+from piavatar_envs.mpm.gather import Gathered, Gradients, asks_kinematic, finish_gather, gather
+from piavatar_envs.mpm.shared_grid import bricks_around, line_in_bricks, node_half
 from piavatar_envs.mpm.shared_memory import meet_warp, thread_of_block, threads_of_block
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
 from piavatar_envs.mpm.stores import store_particle
@@ -18,9 +18,47 @@ from piavatar_envs.mpm.types import (
     Room,
     Step,
     vec8,
+    vec8i,
 )
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.func
+def kinematic_from_bricks(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3):
+    """Kinematic velocity of a stencil's nodes, in components 1 to 3; few particles ask for it."""
+    mean = wp.vec4()
+    lines = int(9)  # not a constant: it is as short as can be
+    for n in range(lines):
+        at = line_in_bricks(bricks, base, n // 3, n % 3)
+        w = wx[n // 3] * wy[n % 3]
+        mean += w * (wz[0] * node_half(at[0], 1) + wz[1] * node_half(at[1], 1) + wz[2] * node_half(at[2], 1))
+    return mean
+
+
+@wp.func
+def physical_from_bricks(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3):
+    """Sums over a stencil, see :func:`piavatar_envs.mpm.gather.gather_physical`."""
+    g = Gradients()
+    planes = int(3)  # not a constant: too few registers for the loads of all three at once
+    for i in range(planes):
+        wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
+        plane = wp.vec4()
+        along_y = wp.vec4()
+        along_z = wp.vec4()
+        for j in range(3):
+            at = line_in_bricks(bricks, base, i, j)
+            second = node_half(at[1], 0)
+            third = node_half(at[2], 0)
+            line = wz[0] * node_half(at[0], 0) + wz[1] * second + wz[2] * third
+            plane += wy[j] * line
+            along_y += (float(j) * wy[j]) * line
+            along_z += (wy[j] * wz[1]) * second + (2.0 * wy[j] * wz[2]) * third
+        g.mean += wi * plane
+        g.along_x += (float(i) * wi) * plane
+        g.along_y += wi * along_y
+        g.along_z += wi * along_z
+    return g
 
 
 @wp.func
@@ -37,33 +75,21 @@ def gather_from_bricks(
     p: int,
 ):
     """Particle ``p`` from the nodes, see :func:`piavatar_envs.mpm.gather.gather`."""
-    xg = grid_position(grid, moved.x[e, p])
+    x = moved.x[e, p]
+    xg = grid_position(grid, x)
     base = base_node(xg)
     f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
     wx = spline(f[0])
     wy = spline(f[1])
     wz = spline(f[2])
     bricks = bricks_around(grid, blocks, room, e, particles.field[p], base, 0)
-    g = Gradients()
-    planes = int(3)  # not a constant: too few registers for the loads of all three at once
-    for i in range(planes):
-        wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
-        plane = vec8()
-        along_y = vec8()
-        along_z = vec8()
-        for j in range(3):
-            at = line_in_bricks(bricks, base, i, j)
-            second = node_record(at[1])
-            third = node_record(at[2])
-            line = wz[0] * node_record(at[0]) + wz[1] * second + wz[2] * third
-            plane += wy[j] * line
-            along_y += (float(j) * wy[j]) * line
-            along_z += (wy[j] * wz[1]) * second + (2.0 * wy[j] * wz[2]) * third
-        g.mean += wi * plane
-        g.along_x += (float(i) * wi) * plane
-        g.along_y += wi * along_y
-        g.along_z += wi * along_z
-    return finish_gather(grid, step, particles, boundaries, blocks, moved, failure, e, p, g, base, f)
+    physical = physical_from_bricks(bricks, base, wx, wy, wz)
+    kinematic = Gradients()
+    if asks_kinematic(grid, step, boundaries, e, x):
+        kinematic.mean = kinematic_from_bricks(bricks, base, wx, wy, wz)
+    return finish_gather(
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, base, f
+    )  # fmt: skip
 
 
 @wp.func

@@ -23,8 +23,7 @@ from piavatar_envs.mpm.types import Blocks, Grid, Room, vec8, vec8i
 
 wp.set_module_options({"enable_backward": False})
 
-#: Words of a node: mass, physical and kinematic momentum; odd, for the banks. Later: whether a boundary is near, and
-#: the velocities.
+#: Words of a node: mass, physical and kinematic momentum; odd, for the banks. Later: nothing, and the velocities.
 NODE_WORDS = wp.constant(7)
 #: Words of a brick of 2 x 2 x 2 nodes.
 BRICK_WORDS = wp.constant(8 * NODE_WORDS)
@@ -135,6 +134,7 @@ for (int c = 0; c < 3; ++c) {
     k[c] = s.at_base[4 + c] * per_momentum;
     for (int d = 0; d < 3; ++d) along[c][d] = s.A.data[c][d] * per_momentum;
 }
+const bool driven = k[0] != 0.0f || k[1] != 0.0f || k[2] != 0.0f;
 // threads that add to the same word wait for each other: neighbours, which are often in the same cell, take the nodes
 // of a plane in another order
 float weight_y[3], weight_z[3], at_y[3], at_z[3];
@@ -171,10 +171,10 @@ for (int i = 0; i < 3; ++i) {
             const float wl = w * weight_z[l];
             // a sum of masses that runs over is negative for 2^31, which nobody adds at once: somebody sees it
             over |= atomicAdd(node, __float2int_rn(wl * m)) & (upper_z[l] ? of_last : of_first);
-            for (int c = 0; c < 3; ++c) {
+            for (int c = 0; c < 3; ++c)
                 atomicAdd(node + 1 + c, __float2int_rn(wl * (at[c] + at_z[l] * along[c][2])));
-                atomicAdd(node + 4 + c, __float2int_rn(wl * k[c]));
-            }
+            if (driven)
+                for (int c = 0; c < 3; ++c) atomicAdd(node + 4 + c, __float2int_rn(wl * k[c]));
         }
     }
     if (over < 0) room[CROWDED] = 1;
@@ -242,28 +242,23 @@ def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
 @wp.func_native(
     _native(
         """
-const float* const node = reinterpret_cast<const float*>(room + at);
-wp::vec_t<8, wp::float32> value;
-value[0] = 0.0f;
-for (int c = 1; c < 7; ++c) value[c] = node[c];
-value[7] = node[0];
-return value;
+const float* const node = reinterpret_cast<const float*>(room + at + 3 * half);
+return wp::vec_t<4, wp::float32>(0.0f, node[1], node[2], node[3]);
 """,
-        "return wp::vec_t<8, wp::float32>();",
+        "return wp::vec_t<4, wp::float32>();",
     )
 )
-def node_record(at: int) -> vec8:
-    """Nothing, physical and kinematic velocity of the node at a word, 1 near boundaries."""
+def node_half(at: int, half: int) -> wp.vec4:
+    """Nothing, and the physical (``half`` 0) or the kinematic (1) velocity of the node at a word."""
     ...
 
 
 @wp.func_native(
     _native("""
 float* const node = reinterpret_cast<float*>(room + at);
-node[0] = value[7];
 for (int c = 1; c < 7; ++c) node[c] = value[c];
 """)
 )
 def set_node_record(at: int, value: vec8):
-    """Write what :func:`node_record` reads."""
+    """Write what :func:`node_half` reads."""
     ...

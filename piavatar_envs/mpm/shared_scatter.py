@@ -195,7 +195,8 @@ def scatter_momenta(
     for p in range(part[0] + t, part[1], threads_of_block()):
         if scatters(blocks, moving, e, p, failure):
             field = particles.field[p]
-            s = prepare(grid, step, particles, moving, e, p)
+            tells = ((word(room.told + p // 32) >> (p % 32)) & 1) != 0
+            s = prepare(grid, step, particles, moving, e, p, tells)
             fault = fault_of_sums(s, sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field])
             speed = speed_of(s)
             if fault != 0:

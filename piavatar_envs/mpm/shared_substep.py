@@ -114,7 +114,7 @@ def update_bricks(
             if near:
                 x = place_of(grid, block_corner(grid, block), r % BLOCK_NODES)
                 s = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, s, sensors)
-            s = physical_velocity(split, near, s)
+            s = physical_velocity(split, s)
             if near or contact.num_fields > 1:
                 sums.offset[e, r] = wp.vec4()
         if writes:

@@ -95,7 +95,7 @@ def record_scatter(program: Program, model: Model, state: State, scratch: Scratc
 
 
 def _moving(s: State) -> Moving:
-    return group(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk)
+    return group(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk, spin=s.spin)
 
 
 def record_begin(program: Program, model: Model, state: State, scratch: Scratch) -> None:

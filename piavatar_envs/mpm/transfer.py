@@ -16,6 +16,7 @@ from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
     FAILURE_NONFINITE,
     NO_STRESS,
+    PAPER,
     Blocks,
     Boundaries,
     Contact,
@@ -46,8 +47,13 @@ class Scattered:
 
 
 @wp.func
-def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int):
-    """What particle ``p`` of environment ``e`` scatters."""
+def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, tells: bool):
+    """What particle ``p`` of environment ``e`` scatters.
+
+    Kinematic momentum is for contact, which acts on the total velocity; elsewhere it would be added and taken off
+    again. So only particles add it that ``tell`` the nodes how they are driven. (The paper's variant needs its gradient
+    everywhere.)
+    """
     s = Scattered()
     xg = grid_position(grid, moving.x[e, p])
     s.base = base_node(xg)
@@ -65,7 +71,9 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
         affine -= (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
     s.A = grid.dx * affine
     q = m * moving.u[e, p] - s.A * s.f
-    k = m * moving.vk[e, p]
+    k = wp.vec3()
+    if tells or step.decoupling == PAPER:
+        k = m * moving.vk[e, p]
     s.at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
     return s
 
@@ -100,7 +108,7 @@ def tells_place(
     x: wp.vec3,
     base: wp.vec3i,
 ):
-    """Whether nodes must know where this particle is: another field or a boundary is near."""
+    """Whether nodes must know where this particle is and how it is driven: another field or a boundary is near."""
     if contact.num_fields > 1 and fields_around(grid, blocks, base, e) != (1 << particles.field[p]):
         return True
     return near_boundary(grid, boundaries, e, x)
@@ -141,8 +149,10 @@ def particles_to_grid(
     e, p = wp.tid()
     if not scatters(blocks, moving, e, p, failure):
         return
-    s = prepare(grid, step, particles, moving, e, p)
-    base = s.base
+    x = moving.x[e, p]
+    base = base_node(grid_position(grid, x))
+    tells = tells_place(grid, particles, boundaries, contact, blocks, e, p, x, base)
+    s = prepare(grid, step, particles, moving, e, p, tells)
     A = s.A
     along_x = vec8(0.0, A[0, 0], A[1, 0], A[2, 0], 0.0, 0.0, 0.0, 0.0)
     along_y = vec8(0.0, A[0, 1], A[1, 1], A[2, 1], 0.0, 0.0, 0.0, 0.0)
@@ -166,5 +176,5 @@ def particles_to_grid(
             wp.atomic_add(sums.value, e, at[2], wz[2] * (line + 2.0 * step_z))
             at_j += wx[i] * along_y
         at_i += along_x
-    if tells_place(grid, particles, boundaries, contact, blocks, e, p, moving.x[e, p], base):
+    if tells:
         scatter_offsets(grid, blocks, sums, e, field, particles.seam[p], s)

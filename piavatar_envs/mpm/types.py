@@ -190,6 +190,15 @@ class Moving:
     C: wp.array2d(dtype=wp.mat33)
     F: wp.array2d(dtype=wp.mat33)
     vk: wp.array2d(dtype=wp.vec3)
+    spin: wp.array2d(dtype=wp.vec3)
+
+
+@wp.struct
+class Kinematic:
+    """Prescribed motion of particles, each of shape ``(num_envs, num_particles)``; see :class:`State`."""
+
+    vk: wp.array2d(dtype=wp.vec3)
+    spin: wp.array2d(dtype=wp.vec3)
 
 
 def group(struct: wp.Struct, **arrays: wp.array):
@@ -246,7 +255,13 @@ class State:
     C: wp.array
     F: wp.array
     vk: wp.array  # kinematic velocity of the last substep: part of the total velocity u + vk
+    spin: wp.array  # kinematic spin in the last substep, by which the deformation turns [rad/s]
     failure: wp.array  # bits FAILURE_*; a failed environment is frozen until it is reset
+
+    @property
+    def kinematic(self) -> Kinematic:
+        """The prescribed motion."""
+        return group(Kinematic, vk=self.vk, spin=self.spin)
 
     def numpy(self) -> dict[str, np.ndarray]:
         """A copy of every array on the host."""

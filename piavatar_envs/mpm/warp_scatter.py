@@ -109,6 +109,7 @@ for (;;) {
                 for (int n = lane >> 3; n < count; n += 4) {
                     const float added = brick[c + place_of_node[n]];
                     const int record = record_of_node[n];
+                    if (added == 0.0f) continue;  // kinematic momentum, but near contact
                     if (sums.is_fixed) {
                         const float units = added * per_unit, part = high(units);
                         atomicAdd(fixed + 16 * record, (int)part);

@@ -108,6 +108,21 @@ def test_nothing_passes_a_plane(simulate, how, speed):
     assert 0.0 < total < speed  # restitution
 
 
+def test_what_tells_the_nodes_how_it_is_driven_goes_no_other_way(simulate):
+    """Kinematic momentum is for contact: a body just above the ground does what it does where there is none."""
+    spin = np.array([0.5, -1.0, 2.0])
+    free, told = (simulate(**BLOCK, planes=planes, num_substeps=15) for planes in ([], [(GROUND, -0.02, 0.5)]))
+    vk = np.cross(spin, free.rest) + [0.3, 0.0, 2.0]
+    stretch = np.diag([1.02, 0.99, 1.0])
+    for sim in (free, told):
+        sim.set(vk=vk, spin=spin, u=[0.0, 0.1, 0.5], F=stretch).run()
+        assert sim.failures == [0]
+    assert told.get("x")[:, 2].min() > 0.05  # it is on its way
+    for name, atol in (("x", 1e-6), ("u", 2e-5), ("F", 1e-5)):
+        np.testing.assert_allclose(told.get(name), free.get(name), atol=atol, err_msg=name)
+    assert told.scratch.sensors.boundary_impulse.numpy()[0, 0].tolist() == [0.0, 0.0, 0.0]
+
+
 def test_own_prescribed_motion_meets_the_ground_too(simulate):
     """The few that go down against the many that go up are lost in the grid's mean; none of them may go below."""
     sim = simulate(**BLOCK, planes=[(GROUND, 0.0, 0.5)], num_substeps=15)
