@@ -34,6 +34,9 @@ class RslPPOSettings(BaseModel):
     desired_kl: float | None = Field(
         0.01, gt=0.0, description="divergence of an update to which the learning rate adapts [-]; null for a fixed rate"
     )
+    final_kl: float | None = Field(
+        None, gt=0.0, description="what desired_kl falls to by the last update, in even steps; null for no change [-]"
+    )
     discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
     reward_scale: float = Field(
         1.0,

@@ -8,9 +8,11 @@ nothing had happened.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.runners import OnPolicyRunner
@@ -32,12 +34,32 @@ from piavatar_envs.tasks.base import Task
 
 
 class ScaledPPO(PPO):
-    """rsl_rl's PPO, which learns from scaled rewards; what is logged are the environment's own."""
+    """rsl_rl's PPO, which learns from scaled rewards, and in smaller and smaller updates.
 
-    def __init__(self, *args: Any, reward_scale: float, **settings: Any) -> None:
-        """As rsl_rl's, and the factor."""
+    What is logged are the environment's own rewards.
+
+    Attributes:
+        updates: how many there have been; to be set where a training goes on.
+    """
+
+    def __init__(self, *args: Any, reward_scale: float, kl_targets: Sequence[float], **settings: Any) -> None:
+        """As rsl_rl's.
+
+        Args:
+            args: of the base.
+            reward_scale: the factor.
+            kl_targets: of the first update and all that follow, in place of ``desired_kl``; none for a fixed one.
+            settings: of the base.
+        """
         super().__init__(*args, **settings)
-        self.reward_scale = reward_scale
+        self.reward_scale, self.kl_targets, self.updates = reward_scale, kl_targets, 0
+
+    def update(self) -> dict[str, float]:
+        """Learn from a rollout."""
+        if self.kl_targets:
+            self.desired_kl = self.kl_targets[min(self.updates, len(self.kl_targets) - 1)]
+        self.updates += 1
+        return super().update()
 
     def process_env_step(
         self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, torch.Tensor]
@@ -144,6 +166,7 @@ class Runner(OnPolicyRunner):
             own.copy_(sums)
         log.tot_timesteps, log.tot_time = saved["logged"]
         set_random_states(saved["random"])
+        self.alg.updates = self.iterations
         if isinstance(self.env, HelpedEnv):
             self.env.steps = self.iterations * self.env.rollout_steps
 
@@ -164,6 +187,7 @@ def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
         "algorithm": {
             "class_name": ScaledPPO,
             "reward_scale": ppo.reward_scale,
+            "kl_targets": kl_targets(config),
             "num_learning_epochs": ppo.epochs,
             "num_mini_batches": ppo.minibatches,
             "learning_rate": ppo.learning_rate,
@@ -178,6 +202,20 @@ def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
             "symmetry_cfg": _symmetry(env) if ppo.mirrored else None,
         },
     }
+
+
+def kl_targets(config: RslTraining) -> list[float]:
+    """Divergences that the updates of a training aim at; none where that does not change.
+
+    Raises:
+        ConfigError: there is a last one without a first one.
+    """
+    first, last = config.ppo.desired_kl, config.ppo.final_kl
+    if last is None:
+        return []
+    if first is None:
+        raise ConfigError(f"ppo.final_kl={last} is what ppo.desired_kl falls to, and there is none; give both")
+    return np.linspace(first, last, config.iterations).tolist()
 
 
 def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:

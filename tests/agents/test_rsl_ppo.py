@@ -78,11 +78,21 @@ def test_training_changes_the_policy_repeats_and_depends_on_its_seed(device, tmp
     assert not np.allclose(agents["a"](changed), actions, atol=1e-3)
 
 
+def test_updates_aim_at_smaller_and_smaller_divergences(tmp_path, monkeypatch, capsys):
+    aims, update = [], rsl_ppo.PPO.update
+    monkeypatch.setattr(rsl_ppo.PPO, "update", lambda self: aims.append(self.desired_kl) or update(self))
+    run = [str(CONFIGS[0]), *TINY, "help=null", "ppo.final_kl=0.01"]
+    rsl_ppo.main([*run, "ppo.desired_kl=0.02", "--out", str(tmp_path / "falls")])
+    assert aims == pytest.approx([0.02, 0.015, 0.01])
+    with pytest.raises(SystemExit, match="falls to, and there is none; give both"):
+        rsl_ppo.main([*run, "ppo.desired_kl=null", "--out", str(tmp_path / "none")])
+
+
 def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path, capsys):
     """With a rate that adapts and observations that are normalised, whose statistics must go on, too."""
     path = next(path for path in CONFIGS if path.stem == "kick_ball_rsl")
     longer = [setting for setting in TINY if not setting.startswith("iterations")]
-    longer += ["checkpoint_every=2", "ppo.normalize_observation=true", "ppo.desired_kl=0.01"]
+    longer += ["checkpoint_every=2", "ppo.normalize_observation=true", "ppo.desired_kl=0.01", "ppo.final_kl=0.002"]
     few, command = ([str(path), *longer, f"iterations={n}", "--device", device, "--out"] for n in (4, 6))
     rsl_ppo.main([*command, str(tmp_path / "whole")])
     parts = tmp_path / "parts"
