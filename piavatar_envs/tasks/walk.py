@@ -98,10 +98,10 @@ def judge_walk(
     off_way = wp.acos(wp.clamp(wp.dot(wp.normalize(facing), ahead), -1.0, 1.0))
     gone = way_gone(way, body, e, position[e, 0])
     mean_speed = gone[0] / (way.control_dt * float(step_count[e] + 1))
-    terms[e, 0, 0] = 0.4 * now.high * tolerance(wp.abs(speed - way.speed), 0.1 * way.speed, way.speed)
-    terms[e, 0, 1] = 0.2 * now.high * tolerance(off_way, 0.1, way.heading_margin)
-    terms[e, 0, 2] = 0.2 * now.high
-    terms[e, 0, 3] = 0.2 * now.straight
+    terms[e, 0, 0] = 0.7 * now.high * tolerance(wp.abs(speed - way.speed), 0.1 * way.speed, way.speed)
+    terms[e, 0, 1] = 0.1 * now.high * tolerance(off_way, 0.1, way.heading_margin)
+    terms[e, 0, 2] = 0.1 * now.high
+    terms[e, 0, 3] = 0.1 * now.straight
     terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
     write_posture(now, e, metrics)
     metrics[e, 0, 3] = speed
@@ -147,13 +147,13 @@ straight ahead at `target_speed`, where it faces at first; nothing holds it but 
 better than slower. The way is as long as one comes in an episode at 1.5 times the target; it ends at `lane` to either
 side."""
     reward_docs: ClassVar[Mapping[str, str]] = {
-        "speed": "0.4 while the pelvis moves ahead at `target_speed` give or take a tenth; beyond it a Gaussian that "
-        "has fallen to 0.04 after another `target_speed`; all times `height` / 0.2",
-        "heading": "0.2 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.02 "
-        "after another `heading_margin`; all times `height` / 0.2",
-        "height": "0.2 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that "
-        "has fallen to 0.02 after another `upright.height_margin` of that height",
-        "upright": "0.2 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.02 after "
+        "speed": "0.7 while the pelvis moves ahead at `target_speed` give or take a tenth; beyond it a Gaussian that "
+        "has fallen to 0.07 after another `target_speed`; all times `height` / 0.1",
+        "heading": "0.1 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.01 "
+        "after another `heading_margin`; all times `height` / 0.1",
+        "height": "0.1 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that "
+        "has fallen to 0.01 after another `upright.height_margin` of that height",
+        "upright": "0.1 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.01 after "
         "another `upright.tilt_margin`",
         "control": "`-control_cost` times the mean of the squared action components",
     }
