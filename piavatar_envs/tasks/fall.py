@@ -28,17 +28,19 @@ class FallConfig(BaseModel):
     fall_head: float = Field(0.7, ge=0.0, lt=1.0, description="head height below which it has fallen, a share [-]")
     fall_pelvis: float = Field(0.6, ge=0.0, lt=1.0, description="pelvis height below which it has, likewise [-]")
 
-
-def fall_doc(section: str) -> str:
-    """When somebody has fallen, by the settings in ``section``."""
-    return (
-        f"its head is lower than `{section}.fall_head`, or its pelvis lower than `{section}.fall_pelvis`, of its "
-        "height in the rest pose (of the mean body 1.46 and 0.91 m)"
-    )
+    @property
+    def least(self) -> wp.vec2:
+        """Shares of head and pelvis below which somebody has fallen."""
+        return wp.vec2(self.fall_head, self.fall_pelvis)
 
 
+#: When somebody has fallen, by the settings of a section ``fall``.
+FALLEN_DOC = (
+    "its head is lower than `fall.fall_head`, or its pelvis lower than `fall.fall_pelvis`, of its height in the rest "
+    "pose (of the mean body 1.46 and 0.91 m)"
+)
 #: What ends episodes, or the part of an agent in them, where :func:`least_heights` are asked of it.
-UNDER_TORQUES_DOC = f'under `control="pd"` or `"torque"` an avatar falls: {fall_doc("fall")}'
+UNDER_TORQUES_DOC = f'under `control="pd"` or `"torque"` an avatar falls: {FALLEN_DOC}'
 
 
 def least_heights(config: EnvConfig, fall: FallConfig) -> wp.vec2:
@@ -48,7 +50,7 @@ def least_heights(config: EnvConfig, fall: FallConfig) -> wp.vec2:
     """
     if config.drive.control == "pose":
         return wp.vec2(-math.inf, -math.inf)
-    return wp.vec2(fall.fall_head, fall.fall_pelvis)
+    return fall.least
 
 
 @wp.func

@@ -26,9 +26,11 @@ from piavatar_envs.tasks.upright import (
     REWARD_TERMS,
     STANDING_DOC,
     UPRIGHT_TERMS,
+    StillConfig,
     UprightConfig,
     record_observe_upright,
     record_standing_outcome,
+    still_rule,
     upright_rule,
 )
 
@@ -54,6 +56,7 @@ class GetUpConfig(EnvConfig):
         default_factory=lambda: UprightConfig(height_margin=0.85, tilt_margin=1.5),
         description="what counts as standing",
     )
+    still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     hold_seconds: float = Field(1.0, gt=0.0, description="how long it must stand [s]")
     face_up: float = Field(0.5, ge=0.0, le=1.0, description="share of episodes that begin face up [-]")
@@ -196,7 +199,7 @@ there is nothing to be learnt."""
 
     def allocate(self, env) -> None:
         n, device, config = env.num_envs, env.device, self.config
-        self.rule = upright_rule(config.upright, config.control_cost)
+        self.rule, self.still = upright_rule(config.upright, config.control_cost), still_rule(config.still)
         self.grounding = Grounding(env)
         self.steps = max(1, round(config.hold_seconds / config.physics.control_dt))
         self.held = wp.zeros(n, dtype=int, device=device)
@@ -240,7 +243,7 @@ there is nothing to be learnt."""
         return [(self.reference_rotation, self.reference_root)]
 
     def record_outcome(self, env, program) -> None:
-        record_standing_outcome(env, program, self.rule)
+        record_standing_outcome(env, program, self.rule, self.still)
         dt = self.config.physics.control_dt
         program.launch(
             judge_hold,

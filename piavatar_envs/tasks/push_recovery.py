@@ -13,6 +13,7 @@ from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.fall import FallConfig
 from piavatar_envs.tasks.ground import Grounding
 from piavatar_envs.tasks.pushes import Pushes
 from piavatar_envs.tasks.ranges import check_ranges
@@ -25,10 +26,12 @@ from piavatar_envs.tasks.upright import (
     REWARD_TERMS,
     STANDING_DOC,
     UPRIGHT_TERMS,
+    StillConfig,
     UprightConfig,
     record_fall,
     record_observe_upright,
     record_standing_outcome,
+    still_rule,
     upright_rule,
 )
 
@@ -42,6 +45,8 @@ class PushRecoveryConfig(EnvConfig):
         default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
     )
     upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
+    still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
+    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     ball_radius: float = Field(0.1, ge=0.06, le=0.2, description="radius of the ball [m]")
     ball_mass: tuple[float, float] = Field((0.5, 8.0), description="range of its mass, uniform in its log [kg]")
@@ -125,6 +130,7 @@ greatest impulse of the episode so far: of all episodes, the share that lasts ma
 
     def allocate(self, env) -> None:
         self.rule = upright_rule(self.config.upright, self.config.control_cost)
+        self.still = still_rule(self.config.still)
         self.grounding = Grounding(env)
         throws = make_throws(self.config, self.place, self.waiting, env, aim=("pelvis", "spine3"), log_mass=True)
         self.pushes = Pushes(env, throws)
@@ -141,9 +147,9 @@ greatest impulse of the episode so far: of all episodes, the share that lasts ma
         return super().record_references(env, program)
 
     def record_outcome(self, env, program) -> None:
-        record_standing_outcome(env, program, self.rule)
+        record_standing_outcome(env, program, self.rule, self.still)
         self.pushes.record_outcome(env, program, len(METRICS), self.config.hit_impulse)
-        record_fall(env, program, self.rule)
+        record_fall(env, program, self.config.fall)
 
     def record_observe(self, env, program, agent: int, start: int) -> None:
         self.pushes.record_observe(env, program, agent, record_observe_upright(env, program, agent, start))

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from piavatar_envs.envs.config import DriveConfig, EnvConfig
 from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.fall import FallConfig
 from piavatar_envs.tasks.ground import Grounding
 from piavatar_envs.tasks.upright import (
     FALL_DOC,
@@ -18,10 +19,12 @@ from piavatar_envs.tasks.upright import (
     REWARD_TERMS,
     STANDING_DOC,
     UPRIGHT_TERMS,
+    StillConfig,
     UprightConfig,
     record_fall,
     record_observe_upright,
     record_standing_outcome,
+    still_rule,
     upright_rule,
 )
 
@@ -33,6 +36,8 @@ class StandConfig(EnvConfig):
         default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
     )
     upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
+    still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
+    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
@@ -62,14 +67,15 @@ the heels, and hips must give way, before the body's weight has left the soles. 
 
     def allocate(self, env) -> None:
         self.rule = upright_rule(self.config.upright, self.config.control_cost)
+        self.still = still_rule(self.config.still)
         self.grounding = Grounding(env)
 
     def record_reset(self, env, program) -> None:
         self.grounding.record_standing(env, program, self.config.pose_noise)
 
     def record_outcome(self, env, program) -> None:
-        record_standing_outcome(env, program, self.rule)
-        record_fall(env, program, self.rule)
+        record_standing_outcome(env, program, self.rule, self.still)
+        record_fall(env, program, self.config.fall)
 
     def record_observe(self, env, program, agent: int, start: int) -> None:
         record_observe_upright(env, program, agent, start)

@@ -6,14 +6,15 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import warp as wp
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
+from piavatar_envs.envs.config import FROZEN
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.mpm.types import Sensors
-from piavatar_envs.tasks.fall import FallConfig, fall_doc, heights_of, is_down
+from piavatar_envs.tasks.fall import FALLEN_DOC, FallConfig, heights_of, is_down
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 
 if TYPE_CHECKING:
@@ -42,9 +43,9 @@ REWARD_DOCS: Mapping[str, str] = {
     "upright": "0.3 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.03 after "
     "another `upright.tilt_margin`",
     "still": "0.2 while the pelvis is no faster than 0.05 m/s; beyond it a Gaussian that has fallen to 0.02 after "
-    "another `upright.speed_margin`; all times `height` / 0.3",
+    "another `still.speed_margin`; all times `height` / 0.3",
     "pose": "0.2 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian that "
-    "has fallen to 0.02 after another `upright.pose_margin`; all times `height` / 0.3",
+    "has fallen to 0.02 after another `still.pose_margin`; all times `height` / 0.3",
     "control": "`-control_cost` times the mean of the squared action components",
 }
 METRICS = ("head_height", "pelvis_height", "tilt_deg", "speed")
@@ -55,31 +56,44 @@ METRIC_DOCS: Mapping[str, str] = {
     "speed": "speed of the pelvis [m/s]",
 }
 STANDING_DOC = "the head is no lower than `upright.stand_head` of its height in the rest pose"
-FALL_DOC = f"the avatar falls: {fall_doc('upright')}"
+FALL_DOC = f"the avatar falls: {FALLEN_DOC}"
 
 
-class UprightConfig(FallConfig):
-    """What counts as standing, and as a fall; where rewards end."""
+class UprightConfig(BaseModel):
+    """What counts as standing, and where the rewards of height and tilt end."""
 
-    stand_head: float = Field(0.85, gt=0.0, le=1.0, description="head height that counts as standing, likewise [-]")
-    height_margin: float = Field(0.25, gt=0.0, description="missing height at which the reward is 0.1, likewise [-]")
+    model_config = FROZEN
+
+    stand_head: float = Field(0.85, gt=0.0, le=1.0, description="head height that counts as standing, a share [-]")
+    height_margin: float = Field(0.25, gt=0.0, description="missing height at which a reward is a tenth, likewise [-]")
     tilt_margin: float = Field(0.6, gt=0.0, description="tilt at which it is, likewise [rad]")
-    speed_margin: float = Field(1.0, gt=0.0, description="speed at which it is, likewise [m/s]")
+
+
+class StillConfig(BaseModel):
+    """Where the rewards of standing still in the rest pose end."""
+
+    model_config = FROZEN
+
+    speed_margin: float = Field(1.0, gt=0.0, description="speed at which a reward is a tenth [m/s]")
     pose_margin: float = Field(0.4, gt=0.0, description="mean joint angle at which it is, likewise [rad]")
 
 
 @wp.struct
 class Upright:
-    """Constants of standing; heights are shares of those in the rest pose."""
+    """Constants of being upright; heights are shares of those in the rest pose."""
 
     stand_head: float
-    fall_head: float
-    fall_pelvis: float
     height_margin: float
     tilt_margin: float  # [rad]
+    control_cost: float
+
+
+@wp.struct
+class Still:
+    """Constants of standing still."""
+
     speed_margin: float  # [m/s]
     pose_margin: float  # [rad]
-    control_cost: float
 
 
 @wp.struct
@@ -96,9 +110,15 @@ class Posture:
 def upright_rule(config: UprightConfig, control_cost: float) -> Upright:
     """Kernel argument."""
     rule = Upright()
-    for name in UprightConfig.model_fields:
-        setattr(rule, name, getattr(config, name))
+    rule.stand_head, rule.height_margin, rule.tilt_margin = config.stand_head, config.height_margin, config.tilt_margin
     rule.control_cost = control_cost
+    return rule
+
+
+def still_rule(config: StillConfig) -> Still:
+    """Kernel argument."""
+    rule = Still()
+    rule.speed_margin, rule.pose_margin = config.speed_margin, config.pose_margin
     return rule
 
 
@@ -119,12 +139,6 @@ def posture_of(
 
 
 @wp.func
-def has_fallen(rule: Upright, now: Posture):
-    """Whether head or pelvis are too low."""
-    return is_down(wp.vec2(now.head, now.pelvis), wp.vec2(rule.fall_head, rule.fall_pelvis))
-
-
-@wp.func
 def write_posture(now: Posture, e: int, metrics: wp.array3d(dtype=float)):
     """The first three of :data:`METRICS`."""
     metrics[e, 0, 0] = now.head
@@ -135,6 +149,7 @@ def write_posture(now: Posture, e: int, metrics: wp.array3d(dtype=float)):
 @wp.kernel
 def judge_standing(
     rule: Upright,
+    still: Still,
     body: Body,
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
@@ -155,8 +170,8 @@ def judge_standing(
         angle += wp.length(quat_log(local[e, b])) / float(local.shape[1] - 1)
     terms[e, 0, 0] = 0.3 * now.high
     terms[e, 0, 1] = 0.3 * now.straight
-    terms[e, 0, 2] = 0.2 * now.high * tolerance(speed, 0.05, rule.speed_margin)
-    terms[e, 0, 3] = 0.2 * now.high * tolerance(angle, 0.05, rule.pose_margin)
+    terms[e, 0, 2] = 0.2 * now.high * tolerance(speed, 0.05, still.speed_margin)
+    terms[e, 0, 3] = 0.2 * now.high * tolerance(angle, 0.05, still.pose_margin)
     terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
     write_posture(now, e, metrics)
     metrics[e, 0, 3] = speed
@@ -165,16 +180,15 @@ def judge_standing(
 
 @wp.kernel
 def find_fall(
-    rule: Upright,
+    least: wp.vec2,
     body: Body,
-    rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
     # out
     terminated: wp.array2d(dtype=wp.bool),
 ):
-    """Terminate who has fallen."""
+    """Terminate whose head or pelvis are lower than ``least``."""
     e = wp.tid()
-    terminated[e, 0] = has_fallen(rule, posture_of(rule, body, e, rotation, position))
+    terminated[e, 0] = is_down(heights_of(body, e, position), least)
 
 
 @wp.func
@@ -209,27 +223,22 @@ def observe_upright(
     observation[e, agent, start + 4] = (1.0 - share) * J[2]
 
 
-def record_standing_outcome(env: BatchEnv, program: Program, rule: Upright) -> None:
+def record_standing_outcome(env: BatchEnv, program: Program, rule: Upright, still: Still) -> None:
     """Append: terms, metrics and success of standing."""
     avatar = env.simulation.avatar
     t = avatar.tracked
     program.launch(
         judge_standing,
         env.num_envs,
-        [rule, avatar.body, t.rotation, t.position, t.velocity, t.local, env.action],
+        [rule, still, avatar.body, t.rotation, t.position, t.velocity, t.local, env.action],
         [env.terms, env.metrics, env.success],
     )
 
 
-def record_fall(env: BatchEnv, program: Program, rule: Upright) -> None:
+def record_fall(env: BatchEnv, program: Program, config: FallConfig) -> None:
     """Append: terminate environments whose avatar has fallen."""
     avatar = env.simulation.avatar
-    program.launch(
-        find_fall,
-        env.num_envs,
-        [rule, avatar.body, avatar.tracked.rotation, avatar.tracked.position],
-        [env.terminated],
-    )
+    program.launch(find_fall, env.num_envs, [config.least, avatar.body, avatar.tracked.position], [env.terminated])
 
 
 def record_observe_upright(env: BatchEnv, program: Program, agent: int, start: int) -> int:

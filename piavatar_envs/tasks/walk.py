@@ -14,6 +14,7 @@ from piavatar_envs.envs.config import DriveConfig, EnvConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.fall import FallConfig, is_down
 from piavatar_envs.tasks.ground import Grounding, forward_of
 from piavatar_envs.tasks.place import PlaceRule, home
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
@@ -23,7 +24,6 @@ from piavatar_envs.tasks.upright import (
     UPRIGHT_TERMS,
     Upright,
     UprightConfig,
-    has_fallen,
     posture_of,
     record_observe_upright,
     upright_rule,
@@ -42,7 +42,8 @@ class WalkConfig(EnvConfig):
     drive: DriveConfig = Field(
         default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
     )
-    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as a fall")
+    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
+    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     target_speed: float = Field(1.0, gt=0.0, le=5.0, description="how fast to go [m/s]")
     lane: float = Field(1.0, gt=0.0, le=2.0, description="distance aside of the way at which the episode ends [m]")
@@ -53,7 +54,7 @@ class WalkConfig(EnvConfig):
 
 @wp.struct
 class Way:
-    """Constants of the way."""
+    """Constants of the way, and of falling on it."""
 
     start: PlaceRule  # where it begins: only its place is used
     speed: float  # [m/s]
@@ -61,6 +62,7 @@ class Way:
     length: float  # [m]
     heading_margin: float  # [rad]
     control_dt: float  # [s]
+    least: wp.vec2  # shares of head and pelvis below which it has fallen
 
 
 @wp.func
@@ -109,7 +111,8 @@ def judge_walk(
     metrics[e, 0, 5] = gone[0]
     standing = now.head >= rule.stand_head
     success[e, 0] = standing and mean_speed >= 0.9 * way.speed and gone[0] >= way.speed
-    terminated[e, 0] = has_fallen(rule, now) or wp.abs(gone[1]) > way.lane or wp.abs(gone[0]) > way.length
+    fallen = is_down(wp.vec2(now.head, now.pelvis), way.least)
+    terminated[e, 0] = fallen or wp.abs(gone[1]) > way.lane or wp.abs(gone[0]) > way.length
 
 
 @wp.kernel
@@ -197,6 +200,7 @@ side."""
         start.place = wp.vec3(*self._place())
         way.start, way.speed, way.lane, way.length = start, config.target_speed, config.lane, self._length()
         way.heading_margin, way.control_dt = config.heading_margin, config.physics.control_dt
+        way.least = config.fall.least
         self.way = way
 
     def record_reset(self, env, program) -> None:

@@ -86,7 +86,7 @@ def test_feet_share_the_load(make_env):
 @pytest.mark.parametrize("task", [STAND, PUSH])
 def test_reward_metrics_and_falls_are_what_the_joints_say(make_env, task):
     env = make_env(task, throw_interval=60.0) if task == PUSH else make_env(task)
-    rule, outcomes = env.config.upright, set()
+    rule, rest, fall, outcomes = env.config.upright, env.config.still, env.config.fall, set()
     observation, _ = env.reset(seed=1)
     for _ in range(60):
         observation, _, terminated, _, info = env.step(still(env))
@@ -100,9 +100,9 @@ def test_reward_metrics_and_falls_are_what_the_joints_say(make_env, task):
         angle = local.magnitude().mean()
         assert terms["height"] == pytest.approx(0.3 * high, abs=1e-4)
         assert terms["upright"] == pytest.approx(0.3 * tolerance(tilt, 0.1, rule.tilt_margin), abs=1e-3)
-        assert terms["still"] == pytest.approx(0.2 * high * tolerance(speed, 0.05, rule.speed_margin), abs=1e-4)
-        assert terms["pose"] == pytest.approx(0.2 * high * tolerance(angle, 0.05, rule.pose_margin), abs=1e-4)
-        assert terminated == (head < rule.fall_head or pelvis < rule.fall_pelvis)
+        assert terms["still"] == pytest.approx(0.2 * high * tolerance(speed, 0.05, rest.speed_margin), abs=1e-4)
+        assert terms["pose"] == pytest.approx(0.2 * high * tolerance(angle, 0.05, rest.pose_margin), abs=1e-4)
+        assert terminated == (head < fall.fall_head or pelvis < fall.fall_pelvis)
         assert info["success"] == (task == STAND and head >= rule.stand_head)
         turn = Rotation.from_quat(env.batch.simulation.avatar.tracked.rotation.numpy()[0, 0].astype(float))
         assert seen(env, observation, "gravity_direction") == pytest.approx(turn.inv().apply([0, 0, -1.0]), abs=1e-5)
