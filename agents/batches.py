@@ -17,6 +17,7 @@ import tyro
 from pydantic import AfterValidator, BaseModel, Field
 from rich.console import Console
 
+from agents import seeds
 from agents.checkpoint import Checkpoint
 from agents.config import EvaluationSettings, load_resolved
 from agents.curve import Curve
@@ -36,10 +37,6 @@ from piavatar_envs.envs.config import (
 from piavatar_envs.mpm.types import failure_name
 from piavatar_envs.tasks.base import Task
 
-#: Training episodes begin here, above those of evaluations, which no agent was trained on.
-_FIRST_SEED, _SEEDS_A_RUN = 2**30, 2**16
-
-
 #: Metrics of tasks that evaluations sum up.
 TOLD = ("distance", "strongest_push")
 
@@ -56,16 +53,16 @@ class BatchTraining(BaseModel):
     observe: tuple[str, ...] | None = Field(
         None, description="terms of the observation that the networks see; null for all of it"
     )
-    num_envs: int = Field(64, ge=1, le=_SEEDS_A_RUN, description="environments of the batch")
+    num_envs: int = Field(64, ge=1, le=seeds.MOST_ENVS, description="environments of the batch")
     iterations: int = Field(100, ge=1, description="rollouts, each followed by an update")
-    seed: int = Field(0, ge=0, lt=1000, description="of the networks, the actions and the training episodes")
+    seed: int = Field(0, ge=0, lt=seeds.MOST_RUNS, description="of the networks, the actions and the training episodes")
     checkpoint_every: int = Field(10, ge=1, description="iterations between two checkpoints")
     evaluation: EvaluationSettings = Field(default_factory=EvaluationSettings, description="how agents are compared")
 
     @property
     def first_seed(self) -> int:
         """Seed of the first environment's episodes; environment ``i`` plays those of ``first_seed + i``."""
-        return _FIRST_SEED + _SEEDS_A_RUN * self.seed
+        return seeds.first_seed(self.seed)
 
 
 Training = TypeVar("Training", bound=BatchTraining)

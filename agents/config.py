@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, Field
 
 from agents.ppo import PPOSettings
 from agents.sac import SACSettings
+from agents.seeds import FIRST_TRAINED, MOST_RUNS
 from agents.selfplay import SelfPlaySettings
 from piavatar_envs.envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
 from piavatar_envs.multi import multi_modules
@@ -27,9 +28,13 @@ class EvaluationSettings(BaseModel):
 
     model_config = FROZEN
 
-    episodes: int = Field(20, ge=2, description="episodes an agent plays")
+    # half of what lies before the training episodes each: their sum cannot reach those
+    episodes: int = Field(20, ge=2, le=FIRST_TRAINED // 2, description="episodes an agent plays")
     first_seed: int = Field(
-        1_000_000, ge=0, lt=2**30, description="seed of the first episode; each episode has its own, counted upwards"
+        1_000_000,
+        ge=0,
+        lt=FIRST_TRAINED // 2,
+        description="seed of the first episode; each episode has its own, counted upwards",
     )
 
 
@@ -58,7 +63,7 @@ class TrainingConfig(BaseModel):
     vector: bool = Field(
         False, description="step the environments as one batch (a GPU's, or on the threads of a CPU), not in processes"
     )
-    seed: int = Field(0, ge=0, lt=1000, description="of the networks, the actions and the training episodes")
+    seed: int = Field(0, ge=0, lt=MOST_RUNS, description="of the networks, the actions and the training episodes")
     checkpoint_every: int = Field(
         50_000, ge=1, description="control steps between two checkpoints; they are written between rollouts"
     )

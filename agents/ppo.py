@@ -17,10 +17,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.rollouts import PlayedBuffer
+from agents.seeds import first_seed
 from piavatar_envs.envs.config import FROZEN
-
-#: Seeds of training episodes that belong to a run's seed, at least.
-EPISODE_SEEDS = 1000
 
 
 class PPOSettings(BaseModel):
@@ -72,12 +70,6 @@ def policy_settings(settings: PPOSettings, components: Sequence[int]) -> dict[st
     }
 
 
-def seed_episodes(venv: VecEnv, seed: int) -> None:
-    """Give a run's environments their episodes: no two runs of as many environments share any."""
-    # environment i plays the episodes of this seed plus i
-    venv.seed(max(EPISODE_SEEDS, venv.num_envs) * seed)
-
-
 def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: int) -> PPO:
     """An untrained agent on the CPU.
 
@@ -85,7 +77,7 @@ def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: 
         settings: hyper-parameters.
         venv: environments to train in.
         components: of the flat observation, those that the networks see.
-        seed: of the networks and of the actions.
+        seed: of the networks, the actions and the training episodes.
     """
     model = PPO(
         "MlpPolicy",
@@ -103,5 +95,5 @@ def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: 
         seed=seed,
         device="cpu",
     )
-    seed_episodes(venv, seed)
+    venv.seed(first_seed(seed))
     return model

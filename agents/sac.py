@@ -13,7 +13,8 @@ from pydantic import BaseModel, Field
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.ppo import networks, seed_episodes
+from agents.ppo import networks
+from agents.seeds import first_seed
 from piavatar_envs.envs.config import FROZEN
 
 
@@ -45,7 +46,7 @@ def build(settings: SACSettings, venv: VecEnv, components: Sequence[int], seed: 
         settings: hyper-parameters.
         venv: environments to train in.
         components: of the flat observation, those that the networks see.
-        seed: of the networks and of the actions.
+        seed: of the networks, the actions and the training episodes.
     """
     model = SAC(
         "MlpPolicy",
@@ -62,5 +63,5 @@ def build(settings: SACSettings, venv: VecEnv, components: Sequence[int], seed: 
         seed=seed,
         device="cpu",
     )
-    seed_episodes(venv, seed)
+    venv.seed(first_seed(seed))
     return model

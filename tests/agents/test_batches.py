@@ -74,14 +74,6 @@ def test_errors_are_one_line_with_key_value_and_limit(settings, words):
     assert "\n" not in str(caught.value) and all(word in str(caught.value) for word in words), caught.value
 
 
-def test_seeds_of_training_and_evaluation_never_meet():
-    runs = [load_batched(Training, load_task, {"seed": seed, "num_envs": 2**16}) for seed in (0, 1, 999)]
-    played = [range(run.first_seed, run.first_seed + run.num_envs) for run in runs]
-    assert played[0].stop <= played[1].start and played[-1].stop < 2**32
-    with pytest.raises(ConfigError, match=r"evaluation\.first_seed"):
-        load_batched(Training, load_task, {"evaluation": {"first_seed": played[0].start}})
-
-
 def test_the_command_line_wins_over_the_file(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_text("iterations: 7\nenv: {fidelity: tiny, tone: 0.5}\n")

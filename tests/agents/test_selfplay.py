@@ -16,6 +16,7 @@ from agents.config import TrainingConfig, load_training
 from agents.evaluate import Episode, random_agent, zero_agent
 from agents.learning import begin, learn
 from agents.parallel import AgentVecEnv, WorldFactory
+from agents.seeds import first_seed
 from agents.selfplay import Opponents, Pool, SelfPlaySettings
 from agents.workers import factory, prepare
 from piavatar_envs.envs.config import ConfigError, dump_yaml
@@ -145,7 +146,7 @@ def test_snapshots_join_the_pool_between_rollouts_and_play(auction, tmp_path):
     assert all(snapshot < now for now, snapshot in watch.drawn)  # nobody plays before it exists
     # three slots, four rounds a game: two games and a duel end at a time
     assert curve.steps == [3 * step for step in range(4, 257, 4) for _ in range(3)]
-    assert watch.seeds == {3000, 3001}
+    assert watch.seeds == {first_seed(3), first_seed(3) + 1}
 
 
 def test_snapshots_wait_for_the_first_rollout_after_their_time(auction, tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from agents import demo, train
 from agents.config import load_training
 from agents.evaluate import evaluate, policy_agent
-from agents.ppo import seed_episodes
 from agents.workers import factory, prepare, start_vector, start_workers
 from piavatar_envs.envs.config import ConfigError, dump_yaml
 
@@ -59,26 +57,6 @@ def test_training_repeats_and_depends_on_its_seed(tiny, workers, facts, tmp_path
         weights.append(np.concatenate([p.detach().numpy().ravel() for p in model.policy.parameters()]))
     np.testing.assert_array_equal(weights[0], weights[1])
     assert not np.allclose(weights[0], weights[2])
-
-
-@pytest.mark.parametrize("num_envs", [4, 1000, 4096])
-def test_no_two_runs_play_the_same_episodes(num_envs):
-    """However many environments a run has; those of a few are told apart by thousands."""
-
-    class Worlds:
-        def __init__(self) -> None:
-            self.num_envs = num_envs
-
-        def seed(self, first: int) -> None:
-            self.episodes = range(first, first + num_envs)
-
-    runs = []
-    for seed in range(5):
-        worlds = Worlds()
-        seed_episodes(worlds, seed)
-        runs.append(worlds.episodes)
-    assert runs[0].start == 0 and all(a.stop <= b.start for a, b in pairwise(runs))
-    assert num_envs > 1000 or [run.start for run in runs] == [0, 1000, 2000, 3000, 4000]
 
 
 def test_networks_see_only_the_chosen_terms(workers, facts, tmp_path):
