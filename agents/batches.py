@@ -15,14 +15,13 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import tyro
 from pydantic import AfterValidator, BaseModel, Field
-from rich.console import Console
 
 from agents import seeds
 from agents.checkpoint import Checkpoint
 from agents.config import EvaluationSettings, load_resolved
 from agents.curve import Curve
 from agents.evaluate import Agent, Episode, Evaluation, baselines, begin_round
-from agents.report import draw_curve, show_table, versions, write_results
+from agents.report import conclude, draw_curve, versions
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.config import (
@@ -123,6 +122,12 @@ def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Ev
     return Evaluation(name, episodes)
 
 
+def play_beside_baselines(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> list[Evaluation]:
+    """What zero, random and the agent's actions come to, all in the same episodes; as :func:`play`."""
+    players = {other: in_every_seat(player) for other, player in baselines(batch.action_size, first_seed).items()}
+    return [play(player, act, batch, first_seed) for player, act in {**players, name: agent}.items()]
+
+
 @dataclass(frozen=True)
 class Learned:
     """What a library hands back.
@@ -203,11 +208,8 @@ def run(
         learned = learn(config, task, folder, options.device, checkpoint)
     except ConfigError as error:
         sys.exit(f"error: {error}")
-    first_seed = config.evaluation.first_seed
     batch = BatchedEpisodes(new_task(config, find_task), config.evaluation.episodes, options.device)
-    players = {name: in_every_seat(agent) for name, agent in baselines(batch.action_size, first_seed).items()}
-    players["trained"] = learned.agent
-    results = [play(player, agent, batch, first_seed) for player, agent in players.items()]
+    results = play_beside_baselines("trained", learned.agent, batch, config.evaluation.first_seed)
     batch.close()
     learned.curve.save(folder / "curve.csv")
     bands = {result.agent: result.estimate() for result in results}
@@ -215,10 +217,7 @@ def run(
     about = versions(name, options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
     cost = {"training_s": learned.curve.seconds, "train_steps": learned.curve.last_step}
     extra = {**cost, "num_envs": config.num_envs, "agents": task.agent_names}
-    write_results(folder / "results.json", about, results, extra)
-    console = Console(highlight=False, soft_wrap=True)
-    show_table(results, console)
-    console.print(f"in {folder}: policy.pt, curve.png, curve.csv, config.yaml, results.json")
+    conclude(folder, about, results, extra, "policy.pt, curve.png, curve.csv, config.yaml, results.json")
 
 
 def new_task(config: BatchTraining, find_task: FindTask) -> Task:

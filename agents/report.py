@@ -105,3 +105,26 @@ def write_results(
     """Write the evaluations as JSON, in the schema of the benchmarks."""
     rows = [evaluation.row() for evaluation in evaluations]
     write_json(path, plain({**run, **extra, "results": rows}, "results"))
+
+
+def conclude(
+    folder: Path,
+    run: Mapping[str, Any],
+    results: Sequence[Evaluation] | Sequence[Match],
+    extra: Mapping[str, Any],
+    files: str,
+) -> None:
+    """What scripts end with: leave ``results.json`` in their folder, print it, and say what else is there.
+
+    Args:
+        folder: of the run.
+        run: :func:`versions`, and the seed and the settings.
+        results: of all agents, or of all matches.
+        extra: other figures of the run.
+        files: names of what it has left.
+    """
+    write_results(folder / "results.json", run, results, extra)
+    console = Console(highlight=False, soft_wrap=True)
+    show = show_matches if isinstance(results[0], Match) else show_table
+    show(results, console)
+    console.print(f"in {folder}: {files}")

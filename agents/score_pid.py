@@ -11,14 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
-from rich.console import Console
 
-from agents.batches import in_every_seat, play
+from agents.batches import in_every_seat, play_beside_baselines
 from agents.config import EvaluationSettings
-from agents.evaluate import baselines
 from agents.film import check_every, film
 from agents.pid_agent import make_pid_agent
-from agents.report import show_table, versions, write_results
+from agents.report import conclude, versions
 from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
@@ -59,8 +57,7 @@ def main(args: list[str] | None = None) -> None:
         agent = make_pid_agent(options.env_id, config.model_dump(mode="json"))
     except (ConfigError, ValueError) as error:
         sys.exit(f"error: {error}")
-    players = {**baselines(batch.action_size, first), "PID": agent}
-    results = [play(name, in_every_seat(player), batch, first) for name, player in players.items()]
+    results = play_beside_baselines("PID", in_every_seat(agent), batch, first)
     batch.close()
     name = options.env_id.rpartition("/")[2].removesuffix("-v0")
     folder = options.out or Path("runs") / f"pid_{name}"
@@ -68,14 +65,11 @@ def main(args: list[str] | None = None) -> None:
     settings = {"env_id": options.env_id, "env": config.model_dump(mode="json")}
     (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
     about = versions("score_pid", options.device) | {"seed": 0, "config": settings}
-    write_results(folder / "results.json", about, results, {})
-    console = Console(highlight=False, soft_wrap=True)
-    show_table(results, console)
-    console.print(f"in {folder}: config.yaml, results.json")
+    conclude(folder, about, results, {}, "config.yaml, results.json")
     if options.film:
         make = EnvFactory(options.env_id, config.model_dump(mode="json"), options.device)
         film(options.film, make, {"PID": agent}, [first], 1.0 / config.physics.control_dt, options.film_every)
-        console.print(f"wrote {options.film}")
+        print(f"wrote {options.film}")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from rich.console import Console
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -25,7 +24,7 @@ from agents.curve import Curve
 from agents.evaluate import Evaluation, baselines, evaluate, policy_agent
 from agents.learning import begin, learn
 from agents.parallel import AgentVecEnv
-from agents.report import draw_curve, show_matches, show_table, versions, write_results
+from agents.report import conclude, draw_curve, versions
 from agents.workers import EnvFacts, components, factory, prepare, start_vector, start_workers
 from piavatar_envs.envs.config import ConfigError, dump_yaml, parse_assignments
 
@@ -111,7 +110,6 @@ class Options:
 def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = tyro.cli(Options, prog="python -m agents.train", args=args)
-    console = Console(highlight=False, soft_wrap=True)
     try:
         config = load_training(options.config, parse_assignments(options.settings))
         folder = options.out or Path("runs") / options.config.stem
@@ -135,10 +133,9 @@ def main(args: list[str] | None = None) -> None:
     draw_curve(folder / "curve.png", curve.steps, curve.returns, bands, config.env_id)
     about = versions("train", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
     cost = {"training_s": curve.seconds, "train_steps": curve.last_step}
-    write_results(folder / "results.json", about, results, {**cost, "agents": facts.agents})
-    (show_matches if config.selfplay else show_table)(results, console)
     files = "policy.zip, curve.png, curve.csv, config.yaml, results.json, checkpoints/, tensorboard/"
-    console.print(f"in {folder}: {files}{', pool/' if config.selfplay else ''}")
+    files += ", pool/" if config.selfplay else ""
+    conclude(folder, about, results, {**cost, "agents": facts.agents}, files)
 
 
 if __name__ == "__main__":
