@@ -27,6 +27,7 @@ _NOT_TASKS = {
     "rewards",
     "spawn",
     "throws",
+    "turns",
     "upright",
 }
 NAMESPACE = "PIAvatar"

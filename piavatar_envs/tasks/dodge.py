@@ -20,14 +20,8 @@ from piavatar_envs.tasks.hits import Hits
 from piavatar_envs.tasks.place import PlaceRule, judge_pose, keep_place, observe_home
 from piavatar_envs.tasks.ranges import check_ranges
 from piavatar_envs.tasks.spawn import record_standing
-from piavatar_envs.tasks.throws import (
-    make_throws,
-    observe_throws,
-    record_balls,
-    throw_balls,
-    throwing_domain,
-    waiting_places,
-)
+from piavatar_envs.tasks.throws import make_throws, record_balls, throwing_domain, waiting_places
+from piavatar_envs.tasks.turns import observe_throws, throw_balls
 
 #: Speed of the root at action 1 [m/s].
 ROOT_SPEED = 1.5

@@ -9,7 +9,8 @@ import warp as wp
 from piavatar_envs.avatar.skeleton import BODY_PARTS
 from piavatar_envs.envs.observations import clear_stress, observe_stress
 from piavatar_envs.mpm.types import Sensors
-from piavatar_envs.tasks.throws import Throws, first_throw, steps_to_throw
+from piavatar_envs.tasks.throws import Throws
+from piavatar_envs.tasks.turns import first_throw, steps_to_throw
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv

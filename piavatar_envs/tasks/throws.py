@@ -1,6 +1,7 @@
-"""Balls that are thrown at an avatar one after another, caught where they have flown past, and thrown again.
+"""Balls that are thrown at an avatar, caught where they have flown past, and thrown again.
 
-A throw depends on the episode's seed, its number and where the body is then; nothing has to be remembered for it.
+A throw depends on the episode's seed, its number and where the body is then; nothing has to be remembered for it. When
+balls are thrown is said in ``turns.py`` and ``pushes.py``.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ OUTWARDS = wp.constant(0.2)
 MAX_SPIN = wp.constant(6.0)
 #: Distance from every joint that a ball keeps where it is thrown: a hand's or a foot's length and its own radius [m].
 CLEARANCE = wp.constant(0.4)
-#: Draw 0 of the stream is the time of the first throw; then come the balls' masses, one a ball, then the throws.
-_MASSES = wp.constant(1)
+#: Of the balls' masses the first draw in their stream, one a ball; the draws around them are the schedule's.
+MASSES = wp.constant(1)
 
 
 @wp.struct
@@ -116,21 +117,6 @@ def make_throws(
     throws.reach = catching_distance(config)
     throws.rest = wp.array(waiting.astype(np.float32), dtype=wp.vec3, device=env.device)
     return throws
-
-
-@wp.func
-def first_throw(throws: Throws, seed: int, episode: int):
-    """Control step of an episode's first throw, in the first half of an interval."""
-    random = generator(seed, episode, STREAM_BALL, 0)
-    return wp.randi(random, 1, throws.interval // 2 + 2)
-
-
-@wp.func
-def steps_to_throw(throws: Throws, first: int, step: int, ball: int):
-    """Control steps from ``step`` to the next throw of a ball; 0 if it is thrown in this one."""
-    period = throws.interval * throws.num_balls
-    wait = (first + ball * throws.interval - step) % period
-    return wp.where(wait < 0, wait + period, wait)
 
 
 @wp.func
@@ -238,68 +224,13 @@ def draw_balls(
     e, ball = wp.tid()
     if not mask[e]:
         return
-    random = generator(seed[e], episode[e], STREAM_BALL, _MASSES + ball)
+    random = generator(seed[e], episode[e], STREAM_BALL, MASSES + ball)
     mass = wp.randf(random, throws.mass[0], throws.mass[1])
     if throws.log_mass != 0:
         share = (mass - throws.mass[0]) / wp.max(throws.mass[1] - throws.mass[0], 1.0e-9)
         mass = throws.mass[0] * wp.pow(throws.mass[1] / throws.mass[0], share)
     density[e, ball] = mass / throws.volume
     rest_ball(throws, e, ball, position, velocity, spin)
-
-
-@wp.kernel
-def throw_balls(
-    throws: Throws,
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    step_count: wp.array(dtype=int),
-    failure: wp.array(dtype=int),
-    joints: wp.array2d(dtype=wp.vec3),
-    ball_position: wp.array2d(dtype=wp.vec3),
-    ball_velocity: wp.array2d(dtype=wp.vec3),
-    # out
-    placed: wp.array2d(dtype=wp.bool),
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    spin: wp.array2d(dtype=wp.vec3),
-):
-    """Which balls are placed anew before this step, and how; over ``(E, num_balls)``.
-
-    One whose time has come is thrown from before the avatar at where its chest and head are now. One that has flown
-    past is caught, and waits.
-    """
-    e, ball = wp.tid()
-    placed[e, ball] = False
-    if failure[e] != 0:
-        return
-    first = first_throw(throws, seed[e], episode[e])
-    due = steps_to_throw(throws, first, step_count[e], ball) == 0
-    number = (step_count[e] - first) // throws.interval
-    random = generator(seed[e], episode[e], STREAM_BALL, _MASSES + throws.num_balls + number)
-    placed[e, ball] = throw_or_catch(
-        throws, due, random, e, ball, joints, ball_position, ball_velocity, position, velocity, spin
-    )
-
-
-@wp.kernel
-def observe_throws(
-    throws: Throws,
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    step_count: wp.array(dtype=int),
-    density: wp.array2d(dtype=float),
-    control_dt: float,
-    agent: int,
-    start: int,
-    # out
-    observation: wp.array3d(dtype=float),
-):
-    """Time to the next throw of every ball [s], then their masses [kg]; over ``(E, num_balls)``."""
-    e, ball = wp.tid()
-    first = first_throw(throws, seed[e], episode[e])
-    steps = steps_to_throw(throws, first, step_count[e], ball)
-    observation[e, agent, start + ball] = control_dt * float(steps)
-    observation[e, agent, start + throws.num_balls + ball] = throws.volume * density[e, ball]
 
 
 def record_balls(env: BatchEnv, program: Program, throws: Throws) -> None:
