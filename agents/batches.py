@@ -18,6 +18,7 @@ from pydantic import AfterValidator, BaseModel, Field
 
 from agents import seeds
 from agents.checkpoint import Checkpoint
+from agents.command import read_options
 from agents.config import EvaluationSettings, load_resolved
 from agents.curve import Curve
 from agents.evaluate import Agent, Episode, Evaluation, baselines, begin_round
@@ -196,7 +197,7 @@ def run(
             which to go on and which to keep up.
         args: command line, by default the process's own.
     """
-    options = tyro.cli(Options, prog=f"python -m agents.{name}", args=args)
+    options = read_options(Options, name, args)
     quiet_warp()
     try:
         config = load_batched(cls, find_task, options.config, parse_assignments(options.settings))

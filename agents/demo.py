@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from agents import ppo
+from agents.command import read_options
 from agents.config import TrainingConfig, load_training
 from agents.evaluate import Evaluation, baselines, evaluate, policy_agent, separated
 from agents.film import film
@@ -147,7 +148,7 @@ def _time_after(
 
 def main(args: list[str] | None = None) -> None:
     """The command line."""
-    options = tyro.cli(Options, prog="python -m agents.demo", args=args)
+    options = read_options(Options, "demo", args)
     console = Console(highlight=False, soft_wrap=True)
     try:
         outcome = run(options, console)

@@ -16,6 +16,7 @@ import tyro
 from rich.console import Console
 
 from agents.batches import in_every_seat, play
+from agents.command import read_options
 from agents.config import EvaluationSettings, load_training
 from agents.evaluate import Agent
 from agents.film import check_every, film
@@ -96,7 +97,7 @@ class Options:
 
     #: folder of the run
     run: tyro.conf.Positional[Path]
-    #: settings of the environment that win over the run's: fidelity=tiny drive.root_assist=0.1
+    #: settings of the environment that win over the run's: fidelity=tiny, or as for the training env.fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: episodes to play, by default as many as the training's evaluation has
     episodes: int | None = None
@@ -116,13 +117,14 @@ class Options:
 
 def main(args: list[str] | None = None) -> None:
     """The command line."""
-    options = tyro.cli(Options, prog="python -m agents.play", args=args)
+    options = read_options(Options, "play", args)
     quiet_warp()
     try:
         check_every(options.film_every)
         run = open_run(options.run, options.device)
         task_class = load_task(run.env_id)
-        config = load_config(task_class.Config, run.env, parse_assignments(options.settings) | {"obs_mode": "flat"})
+        settings = {name.removeprefix("env."): value for name, value in parse_assignments(options.settings).items()}
+        config = load_config(task_class.Config, run.env, settings | {"obs_mode": "flat"})
         episodes = run.evaluation.episodes if options.episodes is None else options.episodes
         if episodes < 2:
             raise ConfigError(f"episodes={episodes} must be >= 2: of one there is no interval")

@@ -13,6 +13,7 @@ from pathlib import Path
 import tyro
 
 from agents.batches import in_every_seat, play_beside_baselines
+from agents.command import read_options
 from agents.config import EvaluationSettings
 from agents.film import check_every, film
 from agents.pid_agent import make_pid_agent
@@ -46,7 +47,7 @@ class Options:
 
 def main(args: list[str] | None = None) -> None:
     """The command line."""
-    options = tyro.cli(Options, prog="python -m agents.score_pid", args=args)
+    options = read_options(Options, "score_pid", args)
     quiet_warp()
     episodes, first = options.evaluation.episodes, options.evaluation.first_seed
     try:

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents import matches, selfplay
 from agents.checkpoint import Checkpoint
+from agents.command import read_options
 from agents.config import TrainingConfig, load_training
 from agents.curve import Curve
 from agents.evaluate import Evaluation, baselines, evaluate, policy_agent
@@ -109,7 +110,7 @@ class Options:
 
 def main(args: list[str] | None = None) -> None:
     """The command line."""
-    options = tyro.cli(Options, prog="python -m agents.train", args=args)
+    options = read_options(Options, "train", args)
     try:
         config = load_training(options.config, parse_assignments(options.settings))
         folder = options.out or Path("runs") / options.config.stem

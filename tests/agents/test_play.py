@@ -51,8 +51,9 @@ def test_settings_win_and_a_film_is_written(device, tmp_path, capsys):
     pytest.importorskip("pyvista", reason="needs the extra render")
     run_of("ppo", tmp_path / "run", device)
     film = tmp_path / "film.gif"
-    small = ("episode_seconds=0.1", "render.width=64", "render.height=64")
-    play.main([str(tmp_path / "run"), *small, "--episodes", "2", "--film", str(film), "--device", device])
+    small = ("env.render.width=64", "render.height=64")
+    line = [str(tmp_path / "run"), "episode_seconds=0.1", "--episodes", "2", *small, "--film", str(film)]
+    play.main([*line, "--device", device])
     from PIL import Image
 
     with Image.open(film) as pictures:

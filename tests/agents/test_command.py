@@ -1,0 +1,49 @@
+"""Command lines: settings may stand anywhere among the options, and what is neither is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from agents import batches, demo, play, score_pid, train
+from agents.command import read_options
+
+#: Scripts that take settings, and what they want first.
+SCRIPTS = {play: ["run"], train: ["run.yaml"], batches: ["run.yaml"], score_pid: ["PIAvatar/Stand-v0"], demo: []}
+scripts = pytest.mark.parametrize(
+    ("script", "first"), [pytest.param(*pair, id=pair[0].__name__.partition(".")[2]) for pair in SCRIPTS.items()]
+)
+
+
+@scripts
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["a=1", "b=-2", "c=x", "--device", "cuda", "--out", "x=y"],
+        ["--device", "cuda", "--out", "x=y", "a=1", "b=-2", "c=x"],
+        ["a=1", "--device", "cuda", "b=-2", "--out=x=y", "c=x"],
+        ["--device", "cuda", "a=1", "b=-2", "--out", "x=y", "c=x"],
+    ],
+    ids=["before", "after", "around", "between"],
+)
+def test_settings_may_stand_anywhere(script, first, settings):
+    options = read_options(script.Options, "x", [*first, *settings])
+    assert options.settings == ("a=1", "b=-2", "c=x")
+    assert options.device == "cuda" and options.out == Path("x=y")
+
+
+@scripts
+@pytest.mark.parametrize(
+    "line", [["--nowhere", "a=1"], ["a=1", "--device", "cpu", "-x"], ["a=1", "--out", "b", "--no=1"]]
+)
+def test_options_that_there_are_not_are_refused(script, first, line, capsys):
+    with pytest.raises(SystemExit) as ended:
+        read_options(script.Options, "x", [*first, *line])
+    said = capsys.readouterr()
+    assert ended.value.code == 2 and "Unrecognized options" in said.out + said.err
+
+
+def test_what_is_no_setting_is_refused(tmp_path):
+    with pytest.raises(SystemExit, match=r"error: .*true.*KEY=VALUE"):
+        train.main(["configs/reach_ppo.yaml", "seed=1", "--resume", "true", "--out", str(tmp_path)])
