@@ -22,7 +22,6 @@ from piavatar_envs.tasks.ground import Grounding
 from piavatar_envs.tasks.upright import (
     METRIC_DOCS,
     METRICS,
-    REWARD_DOCS,
     REWARD_TERMS,
     STANDING_DOC,
     UPRIGHT_TERMS,
@@ -30,6 +29,7 @@ from piavatar_envs.tasks.upright import (
     UprightConfig,
     record_observe_upright,
     record_standing_outcome,
+    reward_docs_of,
     still_rule,
     upright_rule,
 )
@@ -42,6 +42,9 @@ _ARMS = {"left_shoulder": 0.4, "right_shoulder": 0.4}
 _FACE_DOWN = {**_ARMS, "left_ankle": 0.8, "right_ankle": 0.8, "neck": -0.2, "head": -0.2}
 _FACE_UP = {**_ARMS, "left_hip": 0.09, "right_hip": 0.09}
 _QUARTER, _HALF = wp.constant(0.5 * np.pi), wp.constant(np.pi)
+#: What height, tilt, speed and pose are worth a step. Who sits has a chest as straight as can be, and bends it again to
+#: get on its feet: that must not cost more than the height that it gains is worth.
+WEIGHTS = (0.6, 0.05, 0.15, 0.2)
 #: How far the assisted pelvis is led: upwards [m] and towards upright [rad].
 LEAD, LEAD_TURN = wp.constant(0.15), wp.constant(0.3)
 
@@ -180,7 +183,7 @@ of its joints, to the rest pose, and stay there for `hold_seconds`. Nothing but 
 time. Where it stands in the end does not matter. `root_assist` helps here in its own way: it leads the pelvis, from
 wherever it is, upwards and towards upright. With `control="pose"` the root wrench keeps the pelvis where it lies, and
 there is nothing to be learnt."""
-    reward_docs: ClassVar[Mapping[str, str]] = REWARD_DOCS
+    reward_docs: ClassVar[Mapping[str, str]] = reward_docs_of(WEIGHTS)
     metric_docs: ClassVar[Mapping[str, str]] = {
         **METRIC_DOCS,
         "held_seconds": "how long it has been standing without a break [s]",
@@ -199,7 +202,7 @@ there is nothing to be learnt."""
 
     def allocate(self, env) -> None:
         n, device, config = env.num_envs, env.device, self.config
-        self.rule, self.still = upright_rule(config.upright, config.control_cost), still_rule(config.still)
+        self.rule, self.still = upright_rule(config.upright, config.control_cost), still_rule(config.still, WEIGHTS)
         self.grounding = Grounding(env)
         self.steps = max(1, round(config.hold_seconds / config.physics.control_dt))
         self.held = wp.zeros(n, dtype=int, device=device)
