@@ -82,8 +82,8 @@ class Limbs:
         record_end(program, rig.model, rig.state, rig.scratch)
         return program
 
-    def set_springs(self, stiffness: float, damping: np.ndarray | float, held: bool = False) -> None:
-        """Springs and dampers of all joints; those of the pelvis hold it, or are none."""
+    def set_springs(self, stiffness: np.ndarray | float, damping: np.ndarray | float, held: bool = False) -> None:
+        """Springs and dampers of all joints but the pelvis, of one or ``(21,)``; the pelvis' hold it, or are none."""
         values = np.zeros((2, 1, 1 + NUM_JOINTS), np.float32)
         values[0, 0, 2:], values[1, 0, 2:] = stiffness, damping
         values[:, 0, :2] = np.array(HOLD)[:, None] * held
@@ -107,7 +107,7 @@ class Limbs:
         return self.rig.pose_errors()["relative_translation"][0]
 
 
-def critical_damping(body: ArticulatedBody, stiffness: float) -> np.ndarray:
+def critical_damping(body: ArticulatedBody, stiffness: np.ndarray | float) -> np.ndarray:
     """Of all joints but the pelvis, by the inertia of what each carries [N m s/rad], shape ``(21,)``."""
     diagonal = np.diagonal(body.mass.matrix.numpy()[0])
     inertia = diagonal[6:].reshape(-1, 3).mean(1).astype(float)

@@ -22,7 +22,7 @@ from benchmarks.stage import Pose, Stage, standing
 from piavatar_envs.avatar import articulated, cholesky, joint_momentum, joint_motion, joint_torques, mass_matrix
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.rigid_fit import sum_moments
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import DriveConfig, PhysicsConfig, load_config
 from piavatar_envs.mpm.diagnostics import totals
@@ -31,9 +31,11 @@ from piavatar_envs.tasks import load_task
 
 FLAILING = 100.0, 10.0  # springs and dampers of a flailing body [N m/rad, N m s/rad]
 FLAIL_EVERY = 5  # control steps after which it is given another pose
-STIFFNESSES = (50.0, 200.0, 1000.0)  # of all joints of a body with stretched arms [N m/rad]
+STIFFNESSES = (50.0, 200.0, 1000.0)  # of the joints of stretched arms [N m/rad]
+TRUNK = 1000.0  # of all others then: at 50 a trunk, which stands on its pelvis, would buckle [N m/rad]
 PRESSING = 300.0  # stiffness of ankles that press [N m/rad]
 DAMPINGS = (2.0, 20.0, 200.0)  # of the same [N m s/rad]
+ARM = ("collar", "shoulder", "elbow", "wrist")
 ANKLES = ("left_ankle", "right_ankle")
 STAND_SECONDS, FALLEN = 10.0, 30.0  # how long a body is to stand [s], and the tilt of the pelvis at which it has not
 RATE = 300.0  # of the pulls that hold flesh to bones [1/s]
@@ -93,7 +95,10 @@ def drift(options: Options, model: Model, state: State, step: Callable[[int], No
 
 
 def stretch_arms(options: Options, stiffness: float) -> dict[str, Any]:
-    """A body whose pelvis is held stretches its arms to the sides, under gravity and against springs alone."""
+    """A body whose pelvis is held stretches its arms to the sides, under gravity and against springs alone.
+
+    Only the springs of the arms have the ``stiffness`` [N m/rad]; those of trunk and legs have :data:`TRUNK`.
+    """
     joints, rotations = load_body().mean_body().joints.astype(float), np.zeros((NUM_JOINTS, 3))
     for side, outwards in (("left", 1.0), ("right", -1.0)):
         shoulder = joint_index(f"{side}_shoulder")
@@ -101,7 +106,9 @@ def stretch_arms(options: Options, stiffness: float) -> dict[str, Any]:
         turn, _ = Rotation.align_vectors([[outwards, 0.0, 0.0]], [hanging / np.linalg.norm(hanging)])
         rotations[shoulder] = turn.as_rotvec()
     limbs = Limbs(options, 9.81, rotations, RATE)
-    limbs.set_springs(stiffness, critical_damping(limbs.body, stiffness), held=True)
+    of_arms = np.isin(JOINT_NAMES[1:], [f"{side}_{name}" for side in ("left", "right") for name in ARM])
+    springs = np.where(of_arms, stiffness, TRUNK)
+    limbs.set_springs(springs, critical_damping(limbs.body, springs), held=True)
     before = {side: limbs.arm(side) for side in ("left", "right")}
     for _ in range(options.steps):
         limbs.program.run()
