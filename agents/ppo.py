@@ -14,6 +14,7 @@ import torch
 from pydantic import BaseModel, Field
 from stable_baselines3 import PPO
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.rollouts import PlayedBuffer
@@ -29,7 +30,10 @@ class PPOSettings(BaseModel):
     rollout_steps: int = Field(512, ge=2, description="steps a worker plays between two updates")
     batch_size: int = Field(128, ge=2, description="steps in a minibatch")
     epochs: int = Field(10, ge=1, description="passes over a rollout")
-    learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's learning rate [-]")
+    learning_rate: float = Field(7.0e-4, gt=0.0, description="Adam's first learning rate [-]")
+    final_learning_rate: float | None = Field(
+        None, gt=0.0, description="what it falls to by the last update, evenly; null for a fixed one [-]"
+    )
     discount: float = Field(0.9, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
     reward_scale: float = Field(
         1.0, gt=0.0, description="factor on what the networks see of a reward [-]; discounted returns should be about 1"
@@ -79,13 +83,14 @@ def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: 
         components: of the flat observation, those that the networks see.
         seed: of the networks, the actions and the training episodes.
     """
+    first, last = settings.learning_rate, settings.final_learning_rate
     model = PPO(
         "MlpPolicy",
         venv,
         n_steps=settings.rollout_steps,
         batch_size=settings.batch_size,
         n_epochs=settings.epochs,
-        learning_rate=settings.learning_rate,
+        learning_rate=first if last is None else LinearSchedule(first, last, 1.0),
         gamma=settings.discount,
         gae_lambda=settings.gae_lambda,
         clip_range=settings.clip_range,

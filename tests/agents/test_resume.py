@@ -42,7 +42,8 @@ def checkpoint_of(config, folder: Path, resume: bool = True, script: str = "trai
 
 def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path):
     path = tmp_path / "short.yaml"
-    settings = {"total_steps": 160, "checkpoint_every": 32, "seed": 5}
+    ppo = TINY["ppo"] | {"learning_rate": 1e-3, "final_learning_rate": 1e-4}
+    settings = {"total_steps": 160, "checkpoint_every": 32, "seed": 5, "ppo": ppo}
     path.write_text(dump_yaml(load_training(TINY | settings)))
     command = [str(path), "--device", device, "--out"]
     train.main([*command, str(tmp_path / "whole")])
@@ -66,6 +67,9 @@ def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path):
     # TensorBoard forgets what was logged after the checkpoint and lost
     events = EventAccumulator(str(parts / "tensorboard")).Reload()
     assert [event.step for event in events.Scalars("time/fps")] == [32, 64, 96, 128, 160]
+    events = EventAccumulator(str(tmp_path / "whole" / "tensorboard")).Reload()
+    rates = [event.value for event in events.Scalars("train/learning_rate")]  # the last update is not logged
+    np.testing.assert_allclose(rates, np.linspace(1e-3, 1e-4, 6)[1:-1], rtol=1e-5)
     whole, resumed = (networks(tmp_path / run / "policy.zip") for run in ("whole", "parts"))
     assert len(whole) > 20 and resumed == whole
 
