@@ -32,7 +32,7 @@ from piavatar_envs.tasks import load_task
 FLAILING = 100.0, 10.0  # springs and dampers of a flailing body [N m/rad, N m s/rad]
 FLAIL_EVERY = 5  # control steps after which it is given another pose
 STIFFNESSES = (50.0, 200.0, 1000.0)  # of the joints of stretched arms [N m/rad]
-TRUNK = 1000.0  # of all others then: at 50 a trunk, which stands on its pelvis, would buckle [N m/rad]
+TRUNK = 1000.0  # of all others then: at 50 the trunk, an inverted pendulum of 67, would buckle [N m/rad]
 PRESSING = 300.0  # stiffness of ankles that press [N m/rad]
 DAMPINGS = (2.0, 20.0, 200.0)  # of the same [N m s/rad]
 ARM = ("collar", "shoulder", "elbow", "wrist")
