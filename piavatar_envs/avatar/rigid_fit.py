@@ -21,6 +21,8 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: Threads of a block in all launches of this module.
 BLOCK = 128
+#: Groups of threads that share the chunks of a body, where it seldom has any.
+GROUPS = wp.constant(8)
 
 
 @wp.func
@@ -251,18 +253,22 @@ def sum_motion(
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in one chunk."""
-    e, c, thread = wp.tid()
+    """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in every chunk.
+
+    Launched over ``(num_envs, GROUPS, threads)``: most bodies have nothing to do here, and end few threads.
+    """
+    e, group, thread = wp.tid()
     if failure[e] != 0 or (drive.free_motion == 0 and let_go[e] == 0):
         return
-    origin = center[e, body.chunk_bone[c]]
     r = row(e, particles.mass.shape[0])
-    P = wp.vec3()
-    K = wp.mat33()
-    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
-        p = body.first + int_at(body.entry, n)
-        a = (float_at(body.entry_weight, n) * number_at(particles.mass, r, p)) * vector_at(vk, e, p)
-        P += a
-        K += wp.outer(vector_at(x, e, p) - origin, a)
-    total = vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2])
-    store_sum12(corrections, e, c, total, threads)
+    for c in range(group, body.chunk_bone.shape[0], GROUPS):
+        origin = center[e, body.chunk_bone[c]]
+        P = wp.vec3()
+        K = wp.mat33()
+        for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
+            p = body.first + int_at(body.entry, n)
+            a = (float_at(body.entry_weight, n) * number_at(particles.mass, r, p)) * vector_at(vk, e, p)
+            P += a
+            K += wp.outer(vector_at(x, e, p) - origin, a)
+        total = vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2])
+        store_sum12(corrections, e, c, total, threads)

@@ -174,7 +174,7 @@ def _record_free_motion(drive: AvatarDrive, program: Program, state: State) -> N
     body, particles = drive.body, drive.model.particles
     program.launch(
         rigid_fit.sum_motion,
-        (n, drive.num_chunks, drive.threads),
+        (n, int(rigid_fit.GROUPS), drive.threads),
         [body, drive.drive, particles, state.x, state.vk, s.bone_center, let_go, state.failure, drive.threads],
         [s.corrections],
         block_dim=rigid_fit.BLOCK,
