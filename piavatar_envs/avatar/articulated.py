@@ -225,8 +225,8 @@ class ArticulatedBody:
         n, s, points = self.model.num_envs, self.state, (self.model.num_envs, self.body.count)
         self._record_place(program)
         where = [state.x, s.position, self._place, self._moving]
-        inputs = [self.body, self.model.step.dt, *where, self.attachment, state.failure]
-        program.launch(attach_flesh, points, inputs, [state.u, state.vk, self._displacement])
+        inputs = [self.body, self.model.step.dt, *where, self.attachment, state.vk, state.failure]
+        program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
         self._record_share(program, state, self._displacement, self._change)
         self._record_spread(program, self._change, self._moving)
         inputs = [s.position, self._bones, 1.0, self._nothing, self._moving, self.threads]
@@ -267,8 +267,8 @@ class ArticulatedBody:
         if self.attachment is not None:
             self._record_attachment(program, state)
         else:
-            inputs = [self.body, state.x, s.position, self._moving, state.failure]
-            program.launch(hand_back, points, inputs, [state.u, state.vk])
+            inputs = [self.body, state.x, s.position, self._moving, state.vk, state.failure]
+            program.launch(hand_back, points, inputs, [state.u])
         self._record_share(program, state, state.u, self._taken)
         program.launch(add_change, (n, NUM_DOF), [self._taken, state.failure], [s.velocity, s.outside])
         self._record_torques(program, state)

@@ -111,18 +111,17 @@ def hand_back(
     x: wp.array2d(dtype=wp.vec3),
     position: wp.array2d(dtype=wp.vec3),
     moving: wp.array2d(dtype=vec8),
+    vk: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
-    vk: wp.array2d(dtype=wp.vec3),
 ):
-    """Write ``J qdot`` of a new pose; what it has changed goes to the physical velocity."""
+    """What a new pose has changed of ``J qdot`` goes to the physical velocity; :func:`take_over` writes the new one."""
     e, p = wp.tid()
     if failure[e] != 0:
         return
     v = skinned_motion(body, moving, e, p, x[e, body.first + p] - position[e, 0])
     u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
-    vk[e, body.first + p] = v
 
 
 @wp.func
@@ -159,10 +158,10 @@ def attach_flesh(
     place: wp.array2d(dtype=wp.mat44),
     moving: wp.array2d(dtype=vec8),
     rate: wp.array2d(dtype=float),
+    vk: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
-    vk: wp.array2d(dtype=wp.vec3),
     # out
     lost: wp.array2d(dtype=wp.vec3),
 ):
@@ -179,7 +178,6 @@ def attach_flesh(
     before = u[e, q] + vk[e, q] - v
     way = skinned_place(body, place, e, p) - x[e, q]
     after = implicit_velocity(rate[row(e, rate.shape[0]), p], dt, way, before)
-    vk[e, q] = v
     u[e, q] = after
     lost[e, q] = before - after
 
