@@ -256,4 +256,7 @@ def apply_corrections(
         free = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]
         free += removed.turn[e] * (at - removed.center[e] + drive.dt * free)
         store_vector(driven.vk, e, body.first + p, free, True)
-        driven.spin[e, body.first + p] = driven.spin[e, body.first + p] - 0.5 * axial(removed.turn[e])
+        # half the curl of that: one turn after the other, which is not their sum
+        w = driven.spin[e, body.first + p]
+        back = -0.5 * axial(removed.turn[e])
+        driven.spin[e, body.first + p] = w + back + (0.5 * drive.dt) * wp.cross(back, w)

@@ -166,6 +166,9 @@ def test_joints_take_over_all_they_can_and_change_no_velocity(joints):
     got = made.body.state.velocity.numpy()[0]
     assert np.linalg.norm(got - expected) < 2e-3 * np.linalg.norm(expected)
     np.testing.assert_allclose(made.rig.read("vk"), J @ got, atol=1e-4)
+    bones = carried_by().T @ got[3:].reshape(NUM_JOINTS, 3)  # a bone spins with all joints that carry it
+    weights = made.rig.weights / made.rig.weights.sum(1, keepdims=True)
+    np.testing.assert_allclose(made.rig.read("spin"), weights @ bones, atol=1e-4)
 
 
 @pytest.mark.parametrize("stale", [False, True], ids=["fresh", "stale"])

@@ -115,6 +115,21 @@ def test_random_poses_are_reached_and_strain_nothing(make_rig, wild_pose, mode, 
     assert rig.joint_errors().max() < 1e-4
 
 
+@pytest.mark.parametrize("settings", [{}, {"mode": "target"}, {"free_motion": True}], ids=["add", "target", "free"])
+def test_strain_turns_with_the_bones(make_rig, wild_pose, settings):
+    """``Q F Q^T`` of flesh that one bone moves; unstrained flesh would not tell by what it is turned."""
+    rig = make_rig(root="free", tone=0.0, alpha=0.0, decoupling="no_stress", num_substeps=60, **settings)
+    stretch = np.diag([1.2, 0.9, 1.0])
+    rig.state.F.assign(np.broadcast_to(stretch, (1, rig.points.num_points, 3, 3)).astype(np.float32).copy())
+    rig.command(wild_pose(np.random.default_rng(6), 0.4))
+    rig.step()
+    single = rig.weights.max(1) > 1.0 - 1e-6
+    R = rig.tracked_world()[0][rig.weights.argmax(1)[single]]
+    turned = R @ stretch @ np.swapaxes(R, 1, 2)
+    assert np.abs(turned - stretch).max() > 0.1 and len(np.unique(rig.weights.argmax(1)[single])) > 10
+    np.testing.assert_allclose(rig.read("F")[single], turned, atol=2e-4)
+
+
 def test_bodies_of_different_shape_reach_their_own_poses(make_rig, wild_pose):
     rng = np.random.default_rng(3)
     rig = make_rig(num_envs=2, shapes=[{"sex": 1.0, "weight": 0.8, "arms": 0.5}, {"height": -0.8, "belly": 0.5}])
