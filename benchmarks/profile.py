@@ -1,6 +1,6 @@
 """Where a step's time goes: every kernel's share, its launches, and the bandwidth it reaches where its bytes are known.
 
-``python -m benchmarks.profile --device cuda --case reach --num-envs 1024 --out benchmarks/results/profile_reach.json``
+``python -m benchmarks.profile --device cuda --num-envs 4096 --out benchmarks/results/profile_reach.json``
 writes a row a kernel and draws ``profile_reach.png`` beside it. The kernels are launched one by one to be timed; the
 first row has the captured step as a whole, which is what counts.
 """

@@ -215,7 +215,8 @@ def substep_kernel(large: bool, gathers: bool) -> wp.Kernel:
         name=name,
         module="unique",
         launch_bounds=(threads, at_once),
-        # an eighth faster: divisions and roots to two units in the last place, in a few instructions instead of calls
+        # an eighth faster: divisions and roots to two units in the last place, and logarithms to 4e-7, in a few
+        # instructions instead of calls
         module_options={"enable_backward": False, "default_grid_stride": False, "fast_math": True},
     )
     def substep_in_room(

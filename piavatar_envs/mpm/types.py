@@ -277,8 +277,8 @@ class Scratch:
     Attributes:
         blocks: which blocks hold matter in this control step, and their slots.
         sums: what particles have added up.
-        velocity: vec8: mass, physical velocity, kinematic velocity, 1 near boundaries. In blocks with several fields
-            the sums stand here until they have become velocities.
+        velocity: vec8: mass, physical velocity, kinematic velocity, nothing. In blocks with several fields the sums
+            stand here until they have become velocities.
         facing: vec3: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`; of blocks with
             several fields only.
         sensors: what contact did in this control step.
