@@ -30,6 +30,9 @@ NAME = "checkpoint.pt"
 FORMAT = 2
 #: Settings that what has been learned so far does not depend on.
 FREE = ("total_steps", "iterations", "checkpoint_every", "evaluation")
+#: Of these, how long a training is, and the settings that change with how much of it is over: where there is one, what
+#: has been learned so far does depend on the length.
+LENGTHS, FALLING = ("total_steps", "iterations"), ("ppo.final_kl", "ppo.final_learning_rate")
 #: Packages whose version the arithmetic depends on.
 PACKAGES = (
     "piavatar-envs", "numpy", "torch", "warp-lang", "gymnasium", "pettingzoo", "stable-baselines3", "rsl-rl-lib",
@@ -122,8 +125,9 @@ class Checkpoint:
             ("config", "give the same settings, or begin anew in another folder with --out"),
         ):
             before, now = flattened(was[section]), flattened(self._about[section])
+            falls = any(now.get(name) is not None for name in FALLING)
             for name in sorted(set(before) | set(now)):
-                free = section == "config" and name.partition(".")[0] in FREE
+                free = section == "config" and name.partition(".")[0] in FREE and not (falls and name in LENGTHS)
                 if not free and before.get(name) != now.get(name):
                     raise ConfigError(
                         f"{self.path} was written with {name}={before.get(name)}, now it is {now.get(name)}; {remedy}"

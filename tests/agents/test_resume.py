@@ -166,6 +166,15 @@ def test_other_versions_devices_and_scripts_are_refused(tiny, tmp_path, monkeypa
         checkpoint_of(tiny, tmp_path)
 
 
+def test_a_training_whose_updates_fall_keeps_its_length(tmp_path):
+    """A longer one would have begun with others, and would go on with greater ones than its last."""
+    config = load_training(TINY | {"total_steps": 64, "ppo": TINY["ppo"] | {"final_learning_rate": 1e-5}})
+    checkpoint_of(config, tmp_path).save({"steps": 64})
+    assert checkpoint_of(config.model_copy(update={"checkpoint_every": 7}), tmp_path).state == {"steps": 64}
+    with pytest.raises(ConfigError, match="was written with total_steps=64, now it is 128; give the same settings"):
+        checkpoint_of(config.model_copy(update={"total_steps": 128}), tmp_path)
+
+
 def test_a_file_that_is_no_checkpoint_is_refused_and_never_run(tiny, tmp_path):
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(b"not one")
