@@ -101,6 +101,7 @@ def finish_gather(
     p: int,
     physical: Gradients,
     kinematic: Gradients,
+    asked: bool,
     base: wp.vec3i,
     f: wp.vec3,
 ):
@@ -108,7 +109,7 @@ def finish_gather(
 
     It is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking exact
     (1e-5 m against 1e-2 m). What the grid did not see of it is projected out of the boundaries. ``kinematic`` has
-    nothing where :func:`asks_kinematic` does not ask for it.
+    nothing where it was not ``asked`` for, see :func:`asks_kinematic`.
     """
     x = moved.x[e, p]
     advection = wp.vec3(physical.mean[1], physical.mean[2], physical.mean[3])
@@ -116,7 +117,6 @@ def finish_gather(
     s.u = advection
     s.C = gradient_of(grid, physical, f)
     grad_vk = wp.mat33()
-    asked = asks_kinematic(grid, step, boundaries, e, x)
     if step.decoupling == PAPER:
         grad_vk = gradient_of(grid, kinematic, f)
     elif step.decoupling == SPLIT or step.decoupling == NO_STRESS:
@@ -230,10 +230,11 @@ def gather(
     nodes = first_of_records(node_velocity, e)
     physical = gather_physical(grid, blocks, nodes, e, field, base, wx, wy, wz)
     kinematic = Gradients()
-    if asks_kinematic(grid, step, boundaries, e, x):
+    asked = asks_kinematic(grid, step, boundaries, e, x)
+    if asked:
         kinematic = gather_kinematic(grid, blocks, nodes, e, field, base, wx, wy, wz)
     return finish_gather(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, base, f
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, base, f
     )  # fmt: skip
 
 

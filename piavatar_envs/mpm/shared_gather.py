@@ -85,10 +85,11 @@ def gather_from_bricks(
     bricks = bricks_around(grid, blocks, room, e, particles.field[p], base, 0)
     physical = physical_from_bricks(bricks, base, wx, wy, wz)
     kinematic = Gradients()
-    if asks_kinematic(grid, step, boundaries, e, x):
+    asked = asks_kinematic(grid, step, boundaries, e, x)
+    if asked:
         kinematic.mean = kinematic_from_bricks(bricks, base, wx, wy, wz)
     return finish_gather(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, base, f
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, base, f
     )  # fmt: skip
 
 
