@@ -124,6 +124,12 @@ def lay_out(
 
 
 @wp.func
+def was_told(room: Room, p: int):
+    """Whether particle ``p`` tells its place, as :func:`lay_out` has found."""
+    return ((word(room.told + p // 32) >> (p % 32)) & 1) != 0
+
+
+@wp.func
 def scatter_places(
     grid: Grid,
     particles: Particles,
@@ -141,7 +147,7 @@ def scatter_places(
     clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
     meet()
     for p in range(part[0] + t, part[1], threads_of_block()):
-        if ((word(room.told + p // 32) >> (p % 32)) & 1) != 0:
+        if was_told(room, p):
             field = particles.field[p]
             xg = grid_position(grid, x[e, p])
             base = base_node(xg)
@@ -195,8 +201,7 @@ def scatter_momenta(
     for p in range(part[0] + t, part[1], threads_of_block()):
         if scatters(blocks, moving, e, p, failure):
             field = particles.field[p]
-            tells = ((word(room.told + p // 32) >> (p % 32)) & 1) != 0
-            s = prepare(grid, step, particles, moving, e, p, tells)
+            s = prepare(grid, step, particles, moving, e, p, was_told(room, p))
             fault = fault_of_sums(s, sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field])
             speed = speed_of(s)
             if fault != 0:
