@@ -82,6 +82,20 @@ def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
 
 
 @wp.func
+def fields_beyond(grid: Grid, blocks: Blocks, corner: wp.vec3i, e: int):
+    """Fields with matter in any block that a stencil may lie in whose lowest node is in the block at ``corner``."""
+    mask = int(0)
+    for i in range(2):
+        for j in range(2):
+            for k in range(2):
+                x = wp.min(corner[0] + 4 * i, 4 * (grid.blocks[0] - 1))
+                y = wp.min(corner[1] + 4 * j, 4 * (grid.blocks[1] - 1))
+                z = wp.min(corner[2] + 4 * k, 4 * (grid.blocks[2] - 1))
+                mask = mask | blocks.fields[e, block_index(grid, x, y, z)]
+    return mask
+
+
+@wp.func
 def first_record(grid: Grid, blocks: Blocks, e: int, f: int, block: int):
     """Record of the first node of a block that holds matter of field ``f``."""
     return BLOCK_NODES * blocks.slot[e, f * grid.num_blocks + block]

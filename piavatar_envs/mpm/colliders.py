@@ -34,6 +34,8 @@ CONTACT_GATE = wp.constant(0.5)
 #: Particles closer than this [grid spacings] tell the nodes where they are, for the gate, and how they are driven: the
 #: gate and two stencils, so that of level surfaces all do whose nodes may be in contact.
 NEAR_PARTICLE = wp.constant(3.5)
+#: Blocks of nodes whose middle is closer may be the base of such a particle: NEAR_PARTICLE, and half a diagonal.
+NEAR_BLOCK = wp.constant(7.0)
 #: Slabs of nodes closer than this may hold such a position: NEAR_PARTICLE, a stencil and a slab's half diagonal.
 NEAR_SLAB = wp.constant(8.5)
 

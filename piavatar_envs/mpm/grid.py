@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.blocks import first_record, has_field, held_by, shared_by, slots_used
-from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_SLAB, boundary_contact, nearest_boundary
+from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_BLOCK, NEAR_SLAB, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.contact import touch_all
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry, read_change, write_change
 from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN
@@ -78,6 +78,13 @@ def slab_is_near(grid: Grid, boundaries: Boundaries, e: int, corner: wp.vec3i, l
     slab = local // SLAB_NODES
     center = node_position(grid, corner[0] + slab, corner[1], corner[2]) + grid.dx * wp.vec3(0.0, 1.5, 1.5)
     return nearest_boundary(boundaries, e, center) < NEAR_SLAB * grid.dx
+
+
+@wp.func
+def block_is_near(grid: Grid, boundaries: Boundaries, e: int, corner: wp.vec3i):
+    """Whether particles whose base is in the block at ``corner`` may be near enough to a boundary to tell it."""
+    center = node_position(grid, corner[0], corner[1], corner[2]) + wp.vec3(2.5 * grid.dx)
+    return nearest_boundary(boundaries, e, center) < NEAR_BLOCK * grid.dx
 
 
 @wp.func

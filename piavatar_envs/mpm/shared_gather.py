@@ -6,7 +6,7 @@ import warp as wp
 
 from piavatar_envs.mpm.gather import Gathered, Gradients, asks_kinematic, finish_gather, gather
 from piavatar_envs.mpm.shared_grid import bricks_around, line_in_bricks, node_half
-from piavatar_envs.mpm.shared_memory import meet_warp, thread_of_block, threads_of_block
+from piavatar_envs.mpm.shared_memory import has_bit, meet_warp, thread_of_block, threads_of_block
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
 from piavatar_envs.mpm.stores import store_particle
 from piavatar_envs.mpm.types import (
@@ -85,7 +85,9 @@ def gather_from_bricks(
     bricks = bricks_around(grid, blocks, room, e, particles.field[p], base, 0)
     physical = physical_from_bricks(bricks, base, wx, wy, wz)
     kinematic = Gradients()
-    asked = asks_kinematic(grid, step, boundaries, e, x)
+    asked = bool(False)
+    if has_bit(room.told, p):  # who is that near a boundary tells its place
+        asked = asks_kinematic(grid, step, boundaries, e, x)
     if asked:
         kinematic.mean = kinematic_from_bricks(bricks, base, wx, wy, wz)
     return finish_gather(

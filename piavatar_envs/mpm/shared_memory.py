@@ -58,6 +58,12 @@ def or_word(at: int, bits: int):
     ...
 
 
+@wp.func_native(native("return (room[bits + (n >> 5)] >> (n & 31)) & 1;", "return false;"))
+def has_bit(bits: int, n: int) -> bool:
+    """Bit ``n`` of those that begin at a word."""
+    ...
+
+
 @wp.func_native(native("return reinterpret_cast<const unsigned short*>(room + at)[n];", "return 0;"))
 def half_word(at: int, n: int) -> int:
     """Half word ``n`` after word ``at``."""

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import slots_used
-from piavatar_envs.mpm.grid import SLAB_NODES, slab_is_near
+from piavatar_envs.mpm.blocks import fields_beyond, slots_used
+from piavatar_envs.mpm.grid import SLAB_NODES, block_is_near, slab_is_near
 from piavatar_envs.mpm.runs import fault_of_sums
 from piavatar_envs.mpm.shared_grid import (
     BLOCK_BRICKS,
@@ -32,6 +32,7 @@ from piavatar_envs.mpm.shared_grid import (
 from piavatar_envs.mpm.shared_memory import (
     clear_words,
     half_word,
+    has_bit,
     meet,
     number,
     or_word,
@@ -75,6 +76,15 @@ MOST_CELLS = wp.constant(8.0)
 
 
 @wp.func
+def block_of(grid: Grid, contact: Contact, held: int):
+    """The block that a slot holds, of whatever field; a division, where there are several."""
+    block = held
+    if contact.num_fields > 1:
+        block = held % grid.num_blocks
+    return block
+
+
+@wp.func
 def lay_out(
     grid: Grid,
     particles: Particles,
@@ -95,6 +105,15 @@ def lay_out(
     most = BLOCK_BRICKS * slots_used(blocks, e)
     clear_words(0, room.places)
     meet()
+    for slot in range(t, slots_used(blocks, e), threads_of_block()):
+        block = block_of(grid, contact, blocks.held[e, slot])
+        corner = block_corner(grid, block)
+        near = block_is_near(grid, boundaries, e, corner)
+        if contact.num_fields > 1:
+            near = near or fields_beyond(grid, blocks, corner, e) != (1 << (blocks.held[e, slot] // grid.num_blocks))
+        if near:
+            or_word(room.near + slot // 32, 1 << (slot % 32))
+    meet()
     end = part[1]
     if blocks.frozen[e] != 0 or (failure[e] & _BLOCKS) != 0:
         end = part[0]  # they may be anywhere
@@ -106,27 +125,22 @@ def lay_out(
         n = places_around(grid, blocks, e, field, base)
         for b in range(8):
             set_half_word(room.numbers, n[b], 1)
-        if tells_place(grid, particles, boundaries, contact, blocks, e, p, at, base):
-            or_word(room.told + p // 32, 1 << (p % 32))
-            set_word(TOLD, 1)
+        if has_bit(room.near, n[0] // BLOCK_BRICKS):  # noqa: SIM102 - `and` would ask in any case
+            if tells_place(grid, particles, boundaries, contact, blocks, e, p, at, base):
+                or_word(room.told + p // 32, 1 << (p % 32))
+                set_word(TOLD, 1)
     meet()
     number_bricks(room.numbers, room.places, most)
     meet()
     for n in range(t, word(COUNT), threads_of_block()):
         place = half_word(room.places, n)
-        corner = block_corner(grid, blocks.held[e, place // BLOCK_BRICKS] % grid.num_blocks)
+        corner = block_corner(grid, block_of(grid, contact, blocks.held[e, place // BLOCK_BRICKS]))
         first = record_of_place(place, 0) % BLOCK_NODES
         for plane in range(2):
             if slab_is_near(grid, boundaries, e, corner, first + SLAB_NODES * plane):
                 place += PLACES << plane
         set_half_word(room.places, n, place)
     meet()
-
-
-@wp.func
-def was_told(room: Room, p: int):
-    """Whether particle ``p`` tells its place, as :func:`lay_out` has found."""
-    return ((word(room.told + p // 32) >> (p % 32)) & 1) != 0
 
 
 @wp.func
@@ -147,7 +161,7 @@ def scatter_places(
     clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
     meet()
     for p in range(part[0] + t, part[1], threads_of_block()):
-        if was_told(room, p):
+        if has_bit(room.told, p):
             field = particles.field[p]
             xg = grid_position(grid, x[e, p])
             base = base_node(xg)
@@ -201,7 +215,7 @@ def scatter_momenta(
     for p in range(part[0] + t, part[1], threads_of_block()):
         if scatters(blocks, moving, e, p, failure):
             field = particles.field[p]
-            s = prepare(grid, step, particles, moving, e, p, was_told(room, p))
+            s = prepare(grid, step, particles, moving, e, p, has_bit(room.told, p))
             fault = fault_of_sums(s, sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field])
             speed = speed_of(s)
             if fault != 0:

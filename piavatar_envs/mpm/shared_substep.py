@@ -44,6 +44,7 @@ from piavatar_envs.mpm.shared_memory import (
 )
 from piavatar_envs.mpm.shared_room import LARGE_ROOM, LARGE_THREADS, SMALL_ROOM, SMALL_THREADS
 from piavatar_envs.mpm.shared_scatter import (
+    block_of,
     lay_out,
     record_of_place,
     scatter_places,
@@ -100,8 +101,10 @@ def update_bricks(
         place = marked % PLACES
         r = record_of_place(place, n % 8)
         held = blocks.held[e, place // BLOCK_BRICKS]
-        f = held // grid.num_blocks
-        block = held % grid.num_blocks
+        block = block_of(grid, contact, held)
+        f = int(0)
+        if contact.num_fields > 1:
+            f = held // grid.num_blocks
         unit = unit_of_mass(f)
         q = unit * number(SPEED + f)
         s = vec8(

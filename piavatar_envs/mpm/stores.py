@@ -45,7 +45,7 @@ auto put = [&](auto& into, const auto& value) {
 #pragma unroll
         for (int c = 0; c < TURNS; ++c) {
             const int word = 32 * c + lane;
-            if (word < WORDS * AT_ONCE && (storing >> (begin + word / WORDS) & 1u))
+            if (word < WORDS * AT_ONCE && (storing == ALL || (storing >> (begin + word / WORDS) & 1u)))
                 first[WORDS * begin + word] = stage[word];
         }
         __syncwarp();

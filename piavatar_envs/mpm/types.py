@@ -174,6 +174,7 @@ class Room:
 
     numbers: int  # of the bricks, two a word
     told: int  # bits of particles that tell their place
+    near: int  # bits of slots that another field or a boundary is near
     places: int  # of the bricks: 8 slot + brick in block, two a word
     bricks: int
     capacity: int  # bricks that the room has; one more takes what is not of this round
