@@ -1,25 +1,26 @@
 """Everything that particles blend over their bones in a substep, in one record a bone.
 
-A particle is moved by up to four bones, of each of which it needs 51 numbers. On a GPU the record of a bone is read in
-thirteen loads of 16 bytes, and applied row by row as it comes: a thread that kept the sum of the records would need so
-many registers that few threads fit. On a CPU, which adds eight numbers at once, the sum is applied.
+A particle is moved by up to four bones, of each of which it needs 42 numbers. On a GPU the record of a bone is read in
+eleven loads of 16 bytes, which are what a particle's drive takes its time for: a bone's step is therefore the turn
+about where it is, which is there anyway, and a translation, not a matrix of its own.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.types import vec8, vec24, vec52
+from piavatar_envs.avatar.types import vec8, vec24, vec44
 
 wp.set_module_options({"enable_backward": False})
 
-#: Where in a record the parts begin: rows of three matrices 3 x 4 (place, step, lean), of the turn, 3 x 3, then the
-#: rigid motion of the bone: velocity where the pelvis' centre is, and spin.
-PLACE, STEP, LEAN, TURN = wp.constant(0), wp.constant(12), wp.constant(24), wp.constant(36)
-VELOCITY, SPIN = wp.constant(45), wp.constant(48)
-#: Where in what a particle has blended the same parts begin.
-AT_PLACE, AT_STEP, AT_LEAN = wp.constant(0), wp.constant(3), wp.constant(6)
-AT_VELOCITY, AT_SPIN = wp.constant(18), wp.constant(21)
+#: Where in a record the parts begin: rows of two matrices 3 x 4 (place, lean), of the turn's rate, 3 x 3, what is to be
+#: added to that of a place to get its velocity, then the rigid motion of the bone: velocity where the pelvis' centre
+#: is, and spin.
+PLACE, LEAN, TURN = wp.constant(0), wp.constant(12), wp.constant(24)
+STEP, VELOCITY, SPIN = wp.constant(33), wp.constant(36), wp.constant(39)
+#: Where in what a particle has blended the parts begin.
+AT_PLACE, AT_LEAN, AT_STEP = wp.constant(0), wp.constant(3), wp.constant(6)
+AT_TURN, AT_VELOCITY, AT_SPIN = wp.constant(9), wp.constant(18), wp.constant(21)
 
 # What a particle is skinned to, in loads of 16 bytes.
 _INFLUENCES = """
@@ -39,47 +40,54 @@ const auto& weights = weight.data[p];
     _INFLUENCES
     + """
 wp::vec_t<24, wp::float32> sum;
-const auto add = [&](const wp::float32* row, wp::float32 w) {
+const auto add = [&](const wp::float32* bone, wp::float32 w) {
+    wp::float32 at[3];
 #pragma unroll
-    for (int q = 0; q < 9; ++q, row += 4)
-        sum[q] += w * (row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3]);
+    for (int i = 0; i < 6; ++i) {  // place and lean
+        const wp::float32* const row = bone + 4 * i;
+        const wp::float32 value = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3];
+        if (i < 3) at[i] = value;
+        sum[i] += w * value;
+    }
 #pragma unroll
-    for (int q = 9; q < 24; ++q) sum[q] += w * row[q - 9];
+    for (int i = 0; i < 3; ++i) {
+        const wp::float32* const turn = bone + 24 + 3 * i;
+        sum[6 + i] += w * (turn[0] * at[0] + turn[1] * at[1] + turn[2] * at[2] + bone[33 + i]);
+    }
+#pragma unroll
+    for (int i = 0; i < 9; ++i) sum[9 + i] += w * bone[24 + i];
+#pragma unroll
+    for (int i = 0; i < 6; ++i) sum[18 + i] += w * bone[36 + i];
 };
 #if defined(__CUDA_ARCH__)
+// one bone at a time: a thread that read all of them at once would need so many registers that few threads fit
 #pragma unroll 1
 for (int n = 0; n < 4; ++n) {
     if (w4.x > 0.0f) {
         const float4* const from = reinterpret_cast<const float4*>(&wp::index(record, e, j4.x));
-        float4 bone[13];
+        float4 bone[11];
 #pragma unroll
-        for (int q = 0; q < 13; ++q) bone[q] = from[q];
+        for (int q = 0; q < 11; ++q) bone[q] = from[q];
         add(reinterpret_cast<const wp::float32*>(bone), w4.x);
     }
     j4 = make_int4(j4.y, j4.z, j4.w, 0);
     w4 = make_float4(w4.y, w4.z, w4.w, 0.0f);
 }
 #else
-wp::vec_t<52, wp::float32> bone;
-for (int n = 0; n < 4; ++n) {
-    if (weights[n] <= 0.0f) continue;
-    const auto& from = wp::index(record, e, bones[n]);
-    for (int c = 0; c < 52; ++c) bone[c] += weights[n] * from[c];
-}
-add(&bone[0], 1.0f);
+for (int n = 0; n < 4 && weights[n] > 0.0f; ++n) add(&wp::index(record, e, bones[n])[0], weights[n]);
 #endif
 return sum;
 """
 )
 def blend_records(
-    record: wp.array2d(dtype=vec52),
+    record: wp.array2d(dtype=vec44),
     e: int,
     joint: wp.array(dtype=wp.vec4i),
     weight: wp.array(dtype=wp.vec4),
     p: int,
     rest: wp.vec3,
 ) -> vec24:
-    """What particle ``p`` blends: the matrices of its bones' records applied to ``rest``, and the rest of them."""
+    """What particle ``p`` blends of its bones' places and velocities at ``rest``, and of the rest of their records."""
     ...
 
 
@@ -91,7 +99,7 @@ def blended_vector(s: vec24, first: int):
 
 @wp.func
 def blended_turn(s: vec24):
-    """The blended rotation matrix."""
+    """The blended rate ``(dR - I) / dt`` of a substep's rotation [1/s]."""
     return wp.mat33(s[9], s[10], s[11], s[12], s[13], s[14], s[15], s[16], s[17])
 
 
@@ -105,12 +113,12 @@ def blended_velocity(s: vec24, arm: wp.vec3):
 #if defined(__CUDA_ARCH__)
 float4* const to = reinterpret_cast<float4*>(&wp::index(record, e, b));
 #pragma unroll
-for (int q = 0; q < 13; ++q) to[q] = make_float4(value[4 * q], value[4 * q + 1], value[4 * q + 2], value[4 * q + 3]);
+for (int q = 0; q < 11; ++q) to[q] = make_float4(value[4 * q], value[4 * q + 1], value[4 * q + 2], value[4 * q + 3]);
 #else
 wp::index(record, e, b) = value;
 #endif
 """)
-def store_record(record: wp.array2d(dtype=vec52), e: int, b: int, value: vec52):
+def store_record(record: wp.array2d(dtype=vec44), e: int, b: int, value: vec44):
     """``record[e, b] = value``, 16 bytes at a time."""
     ...
 

@@ -21,7 +21,7 @@ from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.spawn import place_particles, reset_drive
 from piavatar_envs.avatar.substeps import Groups, record_drive, record_injection, record_pose
-from piavatar_envs.avatar.types import DriveScratch, DriveState, Tracked, vec8, vec12, vec16, vec52
+from piavatar_envs.avatar.types import DriveScratch, DriveState, Tracked, vec8, vec12, vec16, vec44
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import DECOUPLING, Model, Scratch, State
@@ -81,12 +81,12 @@ class AvatarDrive:
             "body_inertia": (n, wp.mat33),
             "bone_from": (bones, wp.mat44),
             "bone_step": (bones, wp.mat44),
-            "bone_record": (bones, vec52),
+            "bone_record": (bones, vec44),
             "bone_corrections": (bones, vec12),
             "bone_change": (bones, vec8),
             "removed_turn": (n, wp.mat33),
-            "pull": ((n, self.num_points), wp.vec3),
-            "lean": ((n, self.num_points), wp.vec3),
+            "pull": ((n, 3, self.num_points), float),
+            "lean": ((n, 3, self.num_points), float),
         }
         per_env = ("body_", "wrench_", "removed_")
         arrays = {}

@@ -24,10 +24,11 @@ from piavatar_envs.avatar.blending import (
     motion_at,
 )
 from piavatar_envs.avatar.lanes import sum_threads12, sum_threads16
-from piavatar_envs.avatar.loads import number_at, vector_at
+from piavatar_envs.avatar.loads import components_at, number_at, store_components, vector_at
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
-from piavatar_envs.avatar.types import Body, Drive, RemovedMotion, RigidFit, RigidFits, vec8, vec12, vec16, vec52
+from piavatar_envs.avatar.rotation import finite_turn
+from piavatar_envs.avatar.types import Body, Drive, RemovedMotion, RigidFit, RigidFits, vec8, vec12, vec16, vec44
 from piavatar_envs.mpm.stores import store_vector
 from piavatar_envs.mpm.types import Kinematic, row
 
@@ -48,7 +49,7 @@ def drive_particles(
     body: Body,
     drive: Drive,
     x: wp.array2d(dtype=wp.vec3),
-    record: wp.array2d(dtype=vec52),
+    record: wp.array2d(dtype=vec44),
     bones: RigidFits,
     let_go: wp.array(dtype=int),
     failure: wp.array(dtype=int),
@@ -57,8 +58,8 @@ def drive_particles(
     motion: wp.array2d(dtype=wp.vec3),
     # out
     driven: Kinematic,
-    pull: wp.array2d(dtype=wp.vec3),
-    lean: wp.array2d(dtype=wp.vec3),
+    pull: wp.array3d(dtype=float),
+    lean: wp.array3d(dtype=float),
 ):
     """Kinematic velocity of a particle, its pulls [m/s] and its way to the commanded pose [m].
 
@@ -74,7 +75,8 @@ def drive_particles(
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     s = blend_records(record, e, body.joint, body.weight, p, rest)
     displacement = at - blended_vector(s, AT_PLACE)
-    k = blended_vector(s, AT_STEP) + (1.0 / drive.dt) * (blended_turn(s) * displacement - displacement)
+    turn = blended_turn(s)
+    k = blended_vector(s, AT_STEP) + turn * displacement
     # the paper's shape preservation is part of the prescribed velocity
     k -= drive.kinematic_shape_rate * displacement
     relative = before - blended_velocity(s, at - bones.center[e, 0])
@@ -86,9 +88,10 @@ def drive_particles(
             u[e, body.first + p] = before - inert * (k - motion[e, p])
         motion[e, p] = k
     store_vector(driven.vk, e, body.first + p, k, True)
-    store_vector(driven.spin, e, body.first + p, (0.5 / drive.dt) * -axial(blended_turn(s)), True)
-    store_vector(pull, e, p, pulled + pull_gain(drive.tone_rate, drive.dt) * way, True)
-    store_vector(lean, e, p, way, drive.tone_rate > 0.0)
+    store_vector(driven.spin, e, body.first + p, -0.5 * axial(turn), True)
+    store_components(pull, e, p, pulled + pull_gain(drive.tone_rate, drive.dt) * way)
+    if drive.tone_rate > 0.0:
+        store_components(lean, e, p, way)
 
 
 @wp.func
@@ -147,18 +150,6 @@ def blend_corrections(
     rigid = bone_change(V, W, bones.center[e, 0] - whole.center[e])
     for b in range(thread, body.parent.shape[0], threads):
         change[e, b] = change[e, b] + rigid
-
-
-@wp.func
-def finite_turn(w: wp.vec3, dt: float):
-    """``(R - I) / dt`` of the rotation ``R = exp(dt w)``, without cancellation [1/s]."""
-    half = 0.5 * dt * wp.length(w)
-    s = 1.0 - half * half / 6.0
-    if half > 1.0e-2:
-        s = wp.sin(half) / half
-    c = wp.cos(half)
-    X = wp.skew(w)
-    return (s * c) * X + (0.5 * dt * s * s) * (X * X)
 
 
 @wp.kernel
@@ -235,7 +226,7 @@ def apply_corrections(
     body: Body,
     drive: Drive,
     x: wp.array2d(dtype=wp.vec3),
-    pull: wp.array2d(dtype=wp.vec3),
+    pull: wp.array3d(dtype=float),
     bones: RigidFits,
     change: wp.array2d(dtype=vec8),
     removed: RemovedMotion,
@@ -251,7 +242,7 @@ def apply_corrections(
         return
     at = vector_at(x, e, body.first + p)
     field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - bones.center[e, 0])
-    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, e, p) + field, True)
+    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + components_at(pull, e, p) + field, True)
     if drive.free_motion != 0 or let_go[e] != 0:
         free = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]
         free += removed.turn[e] * (at - removed.center[e] + drive.dt * free)

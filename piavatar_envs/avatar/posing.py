@@ -12,7 +12,7 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import LEAN, PLACE, SPIN, STEP, TURN, VELOCITY, store_record
 from piavatar_envs.avatar.lanes import meet_threads
-from piavatar_envs.avatar.rotation import quat_exp, quat_log, rigid_matrix, turn_about_z
+from piavatar_envs.avatar.rotation import finite_turn, quat_exp, quat_log, rigid_matrix, turn_about_z
 from piavatar_envs.avatar.types import (
     DRIVE_REFERENCE,
     DRIVE_TARGET,
@@ -23,7 +23,7 @@ from piavatar_envs.avatar.types import (
     RemovedMotion,
     RigidFit,
     RigidFits,
-    vec52,
+    vec44,
 )
 from piavatar_envs.mpm.types import row
 
@@ -198,12 +198,10 @@ def rest_matrices(
 
 
 @wp.func
-def carried_bone(body: Body, pose: Pose, carry: Carry, e: int, b: int):
-    """Rotation and skinning matrix of a bone in a pose, where contact has carried it to."""
-    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+def carried_bone(pose: Pose, carry: Carry, e: int, b: int):
+    """Rotation of a bone in a pose and the place of its joint, where contact has carried them to."""
     G = carry.rotation[e, b]
-    q = G * pose.rotation[e, b]
-    return q, rigid_matrix(q, rest, wp.quat_rotate(G, pose.position[e, b]) + carry.translation[e, b])
+    return G * pose.rotation[e, b], wp.quat_rotate(G, pose.position[e, b]) + carry.translation[e, b]
 
 
 @wp.kernel
@@ -219,10 +217,12 @@ def bone_matrices(
 ):
     """Skinning matrices of a step: where a bone is, and the velocity that takes it on."""
     e, b = wp.tid()
-    _, A = carried_bone(body, pose, carry, e, b)
-    _, B = carried_bone(body, next_pose, carry, e, b)
+    q, at = carried_bone(pose, carry, e, b)
+    q_next, at_next = carried_bone(next_pose, carry, e, b)
+    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+    A = rigid_matrix(q, rest, at)
     bone_from[e, b] = A
-    bone_step[e, b] = (B - A) / dt
+    bone_step[e, b] = (rigid_matrix(q_next, rest, at_next) - A) / dt
 
 
 @wp.kernel
@@ -238,7 +238,7 @@ def write_records(
     anchor_translation: wp.array(dtype=wp.vec3),
     gap: wp.array2d(dtype=wp.vec3),
     # out
-    record: wp.array2d(dtype=vec52),
+    record: wp.array2d(dtype=vec44),
 ):
     """All that particles blend of a bone in a substep: where it is, the velocity that takes it on, how far it turns.
 
@@ -246,26 +246,27 @@ def write_records(
     contact has torn off its parent is carried where the parent would have it; its way back is added.
     """
     e, b = wp.tid()
-    q, A = carried_bone(body, pose, carry, e, b)
-    q_next, B = carried_bone(body, next_pose, carry, e, b)
-    step = (B - A) / drive.dt
+    q, at = carried_bone(pose, carry, e, b)
+    q_next, at_next = carried_bone(next_pose, carry, e, b)
+    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+    A = rigid_matrix(q, rest, at)
+    turn = finite_turn(quat_log(q_next * wp.quat_inverse(q)) / drive.dt, drive.dt)
+    step = (at_next - at) / drive.dt - turn * at
     lean = wp.mat44()
     if drive.tone_rate > 0.0:
-        rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
-        at = wp.quat_rotate(anchor_rotation[e], command.position[e, b]) + anchor_translation[e]
+        goal = wp.quat_rotate(anchor_rotation[e], command.position[e, b]) + anchor_translation[e]
         back = wp.quat_rotate(carry.rotation[e, b], gap[e, b])
-        lean = rigid_matrix(anchor_rotation[e] * command.rotation[e, b], rest, at - back) - A
-    turn = wp.quat_to_matrix(q_next * wp.quat_inverse(q))
+        lean = rigid_matrix(anchor_rotation[e] * command.rotation[e, b], rest, goal - back) - A
     spin = bones.spin[e, b]
     velocity = bones.velocity[e, b] - wp.cross(spin, bones.center[e, b] - bones.center[e, 0])
-    s = vec52()
+    s = vec44()
     for i in range(3):
         for j in range(4):
             s[PLACE + 4 * i + j] = A[i, j]
-            s[STEP + 4 * i + j] = step[i, j]
             s[LEAN + 4 * i + j] = lean[i, j]
         for j in range(3):
             s[TURN + 3 * i + j] = turn[i, j]
+        s[STEP + i] = step[i]
         s[VELOCITY + i] = velocity[i]
         s[SPIN + i] = spin[i]
     store_record(record, e, b, s)

@@ -36,6 +36,18 @@ def quat_log(q: wp.quat):
 
 
 @wp.func
+def finite_turn(w: wp.vec3, dt: float):
+    """``(R - I) / dt`` of the rotation ``R = exp(dt w)``, without cancellation [1/s]."""
+    half = 0.5 * dt * wp.length(w)
+    s = 1.0 - half * half / 6.0
+    if half > 1.0e-2:
+        s = wp.sin(half) / half
+    c = wp.cos(half)
+    X = wp.skew(w)
+    return (s * c) * X + (0.5 * dt * s * s) * (X * X)
+
+
+@wp.func
 def short_of_pi(v: wp.vec3):
     """Rotation vector ``v``, its angle at most ``MAX_ANGLE`` [rad]."""
     return v * wp.min(1.0, MAX_ANGLE / wp.max(wp.length(v), 1.0e-6))

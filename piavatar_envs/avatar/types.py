@@ -17,7 +17,7 @@ vec16 = wp.types.vector(length=16, dtype=wp.float32)
 #: Partial sums of a chunk's corrections: momentum and angular momentum of the pulls (6), those of the lean alone (6).
 vec12 = wp.types.vector(length=12, dtype=wp.float32)
 #: All that a particle blends over its bones, and what it has blended, see :mod:`piavatar_envs.avatar.blending`.
-vec52 = wp.types.vector(length=52, dtype=wp.float32)
+vec44 = wp.types.vector(length=44, dtype=wp.float32)
 vec24 = wp.types.vector(length=24, dtype=wp.float32)
 #: Change of a bone's rigid motion: velocity where the pelvis' centre is (3), spin (3), padding to 32 bytes.
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
@@ -206,9 +206,10 @@ class DriveScratch:
     # only where poses are set or velocity is injected
     bone_from: wp.array  # (num_envs, bones) mat44: G T_s, rest world to world
     bone_step: wp.array  # (num_envs, bones) mat44: (G T_{s+1} - G T_s) / dt
-    bone_record: wp.array  # (num_envs, bones) vec52: all that particles blend of a bone
-    pull: wp.array  # (num_envs, count) velocity change by shape preservation and tone [m/s]
-    lean: wp.array  # (num_envs, count) displacement from the carried to the commanded pose [m]
+    bone_record: wp.array  # (num_envs, bones) vec44: all that particles blend of a bone
+    # of every particle, an array a component: threads that work together then read what lies together
+    pull: wp.array  # (num_envs, 3, count) velocity change by shape preservation and tone [m/s]
+    lean: wp.array  # (num_envs, 3, count) displacement from the carried to the commanded pose [m]
     corrections: wp.array  # (num_envs, chunks) vec12
     bone_corrections: wp.array  # (num_envs, bones) vec12: their sums
     bone_change: wp.array  # (num_envs, bones) vec8: correction field

@@ -15,7 +15,7 @@ from piavatar_envs.avatar.lanes import (
     sum_threads16,
     warp_threads,
 )
-from piavatar_envs.avatar.types import vec8, vec12, vec16, vec24, vec52
+from piavatar_envs.avatar.types import vec8, vec12, vec16, vec24, vec44
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,14 +55,14 @@ def store_up(
 
 
 @wp.kernel
-def copy_records(source: wp.array2d(dtype=vec52), out: wp.array2d(dtype=vec52)):
+def copy_records(source: wp.array2d(dtype=vec44), out: wp.array2d(dtype=vec44)):
     e, b = wp.tid()
     store_record(out, e, b, source[e, b])
 
 
 @wp.kernel
 def blend(
-    record: wp.array2d(dtype=vec52),
+    record: wp.array2d(dtype=vec44),
     change: wp.array2d(dtype=vec8),
     joint: wp.array(dtype=wp.vec4i),
     weight: wp.array(dtype=wp.vec4),
@@ -115,9 +115,9 @@ def test_a_thread_adds_about_two_chunks(device, chunks, threads):
 
 
 def test_particles_blend_the_records_of_their_bones(device):
-    """Matrices applied to the rest position, the other numbers as they are, weighted."""
+    """Of the rest position: its places on the bones and the velocities there. The other numbers as they are."""
     rng = np.random.default_rng(2)
-    record = rng.normal(size=(ROWS, BONES, 52)).astype(np.float32)
+    record = rng.normal(size=(ROWS, BONES, 44)).astype(np.float32)
     change = rng.normal(size=(ROWS, BONES, 8)).astype(np.float32)
     joint = rng.integers(0, BONES, size=(POINTS, 4)).astype(np.int32)
     weight = np.sort(rng.random((POINTS, 4)).astype(np.float32))[:, ::-1] * (
@@ -130,14 +130,16 @@ def test_particles_blend_the_records_of_their_bones(device):
 
     out = wp.zeros((ROWS, POINTS), dtype=vec24, device=device)
     out_change = wp.zeros((ROWS, POINTS), dtype=vec8, device=device)
-    stored = wp.zeros((ROWS, BONES), dtype=vec52, device=device)
-    wp.launch(copy_records, (ROWS, BONES), [upload(record, vec52)], [stored], device=device)
+    stored = wp.zeros((ROWS, BONES), dtype=vec44, device=device)
+    wp.launch(copy_records, (ROWS, BONES), [upload(record, vec44)], [stored], device=device)
     skin = [upload(joint, wp.vec4i), upload(weight.astype(np.float32), wp.vec4), upload(rest, wp.vec3)]
     wp.launch(blend, (ROWS, POINTS), [stored, upload(change, vec8), *skin], [out, out_change], device=device)
-    blended = np.einsum("pn,epnc->epc", weight.astype(float), record[:, joint].astype(float))
-    rows = blended[..., :36].reshape(ROWS, POINTS, 9, 4)
-    points = np.einsum("epqi,pi->epq", rows[..., :3], rest.astype(float)) + rows[..., 3]
-    np.testing.assert_allclose(out.numpy()[..., :9], points, atol=1e-5)
-    np.testing.assert_allclose(out.numpy()[..., 9:], blended[..., 36:51], atol=1e-5)
+    of = record[:, joint].astype(float)  # (ROWS, POINTS, 4, 44)
+    rows = of[..., :24].reshape(ROWS, POINTS, 4, 6, 4)
+    ends = np.einsum("epnqi,pi->epnq", rows[..., :3], rest.astype(float)) + rows[..., 3]
+    turn = of[..., 24:33].reshape(ROWS, POINTS, 4, 3, 3)
+    step = np.einsum("epnij,epnj->epni", turn, ends[..., :3]) + of[..., 33:36]
+    parts = np.concatenate([ends, step, of[..., 24:33], of[..., 36:42]], axis=-1)
+    np.testing.assert_allclose(out.numpy(), np.einsum("pn,epnc->epc", weight.astype(float), parts), atol=3e-5)
     expected = np.einsum("pn,epnc->epc", weight.astype(float), change[:, joint].astype(float))
     np.testing.assert_allclose(out_change.numpy()[..., :6], expected[..., :6], atol=1e-5)

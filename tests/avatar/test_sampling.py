@@ -57,6 +57,20 @@ def test_surface_distance_of_a_cube():
     assert np.allclose(np.linalg.norm(nearest - points, axis=1), np.abs(expected), atol=1e-5)
 
 
+def test_particles_of_few_bones_come_first(coarse):
+    """And those of as many by their first one, each with what is its own: links still join neighbours."""
+    bones = (coarse.skin_weights > 0.0).sum(axis=1)
+    assert set(bones) == {1, 2, 3, 4}
+    keys = NUM_JOINTS * bones + coarse.skin_joints[:, 0]
+    assert (np.diff(keys) >= 0).all()
+    a, b = coarse.rest_positions[coarse.links].transpose(1, 0, 2)
+    assert np.linalg.norm(a - b, axis=1).max() < 2.0 * coarse.spacing
+    corners = load_body().vertices[coarse.anchor_vertices]
+    on_skin = np.einsum("pc,pci->pi", coarse.anchor_weights, corners)
+    gap = np.linalg.norm(on_skin - coarse.rest_positions, axis=1)
+    np.testing.assert_allclose(gap[coarse.depth > 0.0], coarse.depth[coarse.depth > 0.0], atol=1e-5)
+
+
 def test_coarse_count(coarse):
     assert 2500 <= len(coarse) <= 3000
 
