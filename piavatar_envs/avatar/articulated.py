@@ -41,6 +41,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.bone_sums import BLOCK, sum_moments, sum_moments_of_both
 from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_momentum import balance, gather_momentum
 from piavatar_envs.avatar.joint_motion import (
@@ -67,9 +68,8 @@ from piavatar_envs.avatar.joint_torques import (
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.posing import rest_matrices
-from piavatar_envs.avatar.rigid_fit import BLOCK, sum_moments
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
-from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec16
+from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import Model, State, group
 
@@ -145,16 +145,19 @@ class ArticulatedBody:
         self.mass = JointMass(points, body, model)
         self._factor, self._driven, self._cut = (self.mass.make_factor() for _ in range(3))
         self._diagonal = zeros((n, NUM_DOF), float)
-        self._right, self._change = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF), float)
+        self._change, self._momentum = zeros((n, NUM_DOF), float), zeros((2, n, NUM_DOF), float)
+        self._momenta = [self._momentum[0], self._momentum[1]]
         self._left, self._limited = zeros((n, NUM_DOF), float), zeros(n, int)
         self._muscle, self.impulse = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF), float)
         self._stop, self._nothing = zeros(bones, float), zeros((n, NUM_DOF), float)
         self._taken = zeros((n, NUM_DOF), float)
         self._place = zeros(bones, wp.mat44)
         self._leaving, self._moving = zeros(bones, vec8), zeros(bones, vec8)
-        self._linear, self._angular = zeros(bones, wp.vec3), zeros(bones, wp.vec3)
+        self._linear, self._angular = zeros((2, *bones), wp.vec3), zeros((2, *bones), wp.vec3)
         self._displacement = zeros((n, model.num_particles), wp.vec3)
-        self._chunks, self._bones = zeros((n, body.chunk_bone.shape[0]), vec16), zeros(bones, vec16)
+        chunks = (n, body.chunk_bone.shape[0])
+        self._chunks, self._other_chunks = zeros(chunks, vec16), zeros(chunks, vec12)
+        self._bones = zeros(bones, vec16)
         without, everywhere = np.zeros((NUM_JOINTS, 3)), np.full((NUM_JOINTS, 3), UNBOUNDED)
         self.set_strength(-everywhere, everywhere, 1)
         self.set_tissue(without[:, 0], without[:, 0], -everywhere, everywhere, [])
@@ -190,7 +193,7 @@ class ArticulatedBody:
         self._record_place(program)
         inputs = [self.body, state.x, self._place]
         program.launch(find_displacement, (n, self.body.count), inputs, [self._displacement])
-        self._record_share(program, state, self._displacement, self._change)
+        self._record_shares(program, state, [self._displacement], [self._change])
         self._record_spread(program, self._change, self._moving)
         inputs = [self.body, FIT_SHARE, self._moving, state.failure, self.threads]
         program.launch(move_joints, (n, self.threads), inputs, pose)
@@ -205,29 +208,34 @@ class ArticulatedBody:
         inputs = [self.body, self.state.rotation, self.state.position]
         program.launch(rest_matrices, self._place.shape, inputs, [self._place])
 
-    def _record_share(self, program: Program, state: State, vectors: wp.array, share: wp.array) -> None:
-        """Append: the share ``dq = M^-1 J^T m v`` that the joints can take of vectors at the particles."""
+    def _record_shares(self, program: Program, state: State, vectors: Sequence[wp.array], shares: list) -> None:
+        """Append: the shares ``dq = M^-1 J^T m v`` that the joints can take of one or two vectors at the particles."""
         n, position = self.model.num_envs, self.state.position
+        sums = [self._chunks, self._other_chunks][: len(vectors)]
         program.launch(
-            sum_moments,
+            sum_moments if len(vectors) == 1 else sum_moments_of_both,
             (*self._chunks.shape, self.threads),
-            [self.body, self.model.particles, state.x, vectors, position, state.failure, self.threads],
-            [self._chunks],
+            [self.body, self.model.particles, state.x, *vectors, position, state.failure, self.threads],
+            sums,
             block_dim=BLOCK,
         )
-        outputs = [self._linear, self._angular, self._bones, self._right]
-        inputs = [self.body, position, self._chunks, self.threads]
-        program.launch(gather_momentum, (n, self.threads), inputs, outputs)
-        self.mass.record_solve(program, self._factor, self._right, share)
+        outputs = [self._linear, self._angular, self._bones, self._momentum]
+        inputs = [self.body, position, self._chunks, self._other_chunks, self.threads]
+        program.launch(gather_momentum, (len(vectors), n, self.threads), inputs, outputs)
+        for momentum, share in zip(self._momenta, shares, strict=False):
+            self.mass.record_solve(program, self._factor, momentum, share)
 
     def _record_attachment(self, program: Program, state: State) -> None:
-        """Append: hand back, then flesh is pulled to the bones, and the bones to the flesh."""
+        """Append: hand back, then flesh is pulled to the bones, and the bones to the flesh.
+
+        And what the joints can take of the velocity that this leaves: one pass over the particles sums both.
+        """
         n, s, points = self.model.num_envs, self.state, (self.model.num_envs, self.body.count)
         self._record_place(program)
         where = [state.x, s.position, self._place, self._moving]
         inputs = [self.body, self.model.step.dt, *where, self.attachment, state.vk, state.failure]
         program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
-        self._record_share(program, state, self._displacement, self._change)
+        self._record_shares(program, state, [self._displacement, state.u], [self._change, self._taken])
         self._record_spread(program, self._change, self._moving)
         inputs = [s.position, self._bones, 1.0, self._nothing, self._moving, self.threads]
         program.launch(balance, (n, self.threads), inputs, [self._change])
@@ -269,7 +277,7 @@ class ArticulatedBody:
         else:
             inputs = [self.body, state.x, s.position, self._moving, state.vk, state.failure]
             program.launch(hand_back, points, inputs, [state.u])
-        self._record_share(program, state, state.u, self._taken)
+            self._record_shares(program, state, [state.u], [self._taken])
         program.launch(add_change, (n, NUM_DOF), [self._taken, state.failure], [s.velocity, s.outside])
         self._record_torques(program, state)
         inputs = [self._change, s.outside, state.failure]

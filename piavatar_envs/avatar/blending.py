@@ -155,6 +155,41 @@ def blend_changes(
     ...
 
 
+@wp.func_native(
+    _INFLUENCES
+    + """
+wp::vec3 sum;
+#pragma unroll
+for (int n = 0; n < 4; ++n) {
+    const wp::float32 w = weights[n];
+    if (w <= 0.0f) continue;
+    const auto& bone = wp::index(place, e, bones[n]);
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+#if defined(__CUDA_ARCH__)
+        const float4 row = reinterpret_cast<const float4*>(&bone)[i];
+        sum[i] += w * (row.x * rest[0] + row.y * rest[1] + row.z * rest[2] + row.w);
+#else
+        const auto& row = bone.data[i];
+        sum[i] += w * (row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3]);
+#endif
+    }
+}
+return sum;
+"""
+)
+def blend_places(
+    place: wp.array2d(dtype=wp.mat44),
+    e: int,
+    joint: wp.array(dtype=wp.vec4i),
+    weight: wp.array(dtype=wp.vec4),
+    p: int,
+    rest: wp.vec3,
+) -> wp.vec3:
+    """``sum_n weight_n place[e, joint_n] (rest, 1)`` of particle ``p``: linear blend skinning."""
+    ...
+
+
 @wp.func
 def motion_at(change: vec8, arm: wp.vec3):
     """Velocity under a bone's change, or under a blend of them, ``arm`` from where the pelvis' velocity is [m/s]."""

@@ -12,7 +12,7 @@ from piavatar_envs.avatar.types import Body
 
 #: Entries of one chunk of a bone's particle list, which a warp sums on a GPU: few enough that one body keeps many warps
 #: busy, so many that adding up the threads' sums costs little.
-CHUNK = 128
+CHUNK = 256
 #: In large bodies chunks are longer, so that there are about so many: what they sum to is added up in turn.
 MOST_CHUNKS = 2048
 #: Fewest tracking particles from which a rotation is fitted reliably.

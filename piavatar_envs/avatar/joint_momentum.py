@@ -9,7 +9,7 @@ from piavatar_envs.avatar.joint_motion import part_of, set_part
 from piavatar_envs.avatar.lanes import meet_threads, sum_threads16
 from piavatar_envs.avatar.mass_matrix import BONES, I3
 from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of, symmetric
-from piavatar_envs.avatar.types import Body, vec8, vec16
+from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -19,37 +19,47 @@ def gather_momentum(
     body: Body,
     position: wp.array2d(dtype=wp.vec3),
     moments: wp.array2d(dtype=vec16),
+    other_moments: wp.array2d(dtype=vec12),
     threads: int,
     # scratch
-    linear: wp.array2d(dtype=wp.vec3),
-    angular: wp.array2d(dtype=wp.vec3),
+    linear: wp.array3d(dtype=wp.vec3),
+    angular: wp.array3d(dtype=wp.vec3),
     # out
     bones: wp.array2d(dtype=vec16),
-    momentum: wp.array2d(dtype=float),
+    momentum: wp.array3d(dtype=float),
 ):
     """``J^T m u`` from the moments of the bones about their joints: each joint has what all beyond it have.
 
-    Launched over ``(num_envs, threads)``: threads share the bones' chunks, one of them goes down the tree.
+    Of one velocity or of two, from :func:`piavatar_envs.avatar.bone_sums.sum_moments_of_both`. Launched over
+    ``(velocities, num_envs, threads)``: threads share the bones' chunks, one of them goes down the tree.
     """
-    e, thread = wp.tid()
+    n, e, thread = wp.tid()
     for b in range(thread, BONES, threads):
         s = vec16()
         for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
-            s += moments[e, c]
-        bones[e, b] = s
-        linear[e, b] = wp.vec3(s[4], s[5], s[6])
-        angular[e, b] = wp.vec3(s[13], s[14], s[15])
+            if n == 0:
+                s += moments[e, c]
+            else:
+                t = other_moments[e, c]
+                for i in range(3):
+                    s[4 + i] += t[i]
+                    s[13 + i] += t[3 + i]
+        if n == 0:
+            bones[e, b] = s
+        linear[n, e, b] = wp.vec3(s[4], s[5], s[6])
+        angular[n, e, b] = wp.vec3(s[13], s[14], s[15])
     meet_threads(threads)
     if thread > 0:
         return
-    for n in range(BONES - 1):
-        b = BONES - 1 - n  # children come after their parents
+    for back in range(BONES - 1):
+        b = BONES - 1 - back  # children come after their parents
         a = body.parent[b]
-        angular[e, a] = angular[e, a] + angular[e, b] + wp.cross(position[e, b] - position[e, a], linear[e, b])
-        linear[e, a] = linear[e, a] + linear[e, b]
-        set_part(momentum, e, 3 + 3 * b, angular[e, b])
-    set_part(momentum, e, 0, linear[e, 0])
-    set_part(momentum, e, 3, angular[e, 0])
+        arm = position[e, b] - position[e, a]
+        angular[n, e, a] = angular[n, e, a] + angular[n, e, b] + wp.cross(arm, linear[n, e, b])
+        linear[n, e, a] = linear[n, e, a] + linear[n, e, b]
+        set_part(momentum[n], e, 3 + 3 * b, angular[n, e, b])
+    set_part(momentum[n], e, 0, linear[n, e, 0])
+    set_part(momentum[n], e, 3, angular[n, e, 0])
 
 
 @wp.kernel

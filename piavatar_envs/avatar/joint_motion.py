@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_changes, motion_at
+from piavatar_envs.avatar.blending import blend_changes, blend_places, motion_at
 from piavatar_envs.avatar.lanes import meet_threads
+from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.pulls import implicit_velocity
-from piavatar_envs.avatar.rotation import apply_point, quat_exp
+from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body, vec8
+from piavatar_envs.mpm.stores import store_vector
 from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -98,11 +100,12 @@ def take_over(
     e, p = wp.tid()
     if failure[e] != 0:
         return
-    arm = x[e, body.first + p] - position[e, 0]
-    u[e, body.first + p] = u[e, body.first + p] - skinned_motion(body, leaving, e, p, arm)
+    q = body.first + p
+    arm = vector_at(x, e, q) - position[e, 0]
+    store_vector(u, e, q, vector_at(u, e, q) - skinned_motion(body, leaving, e, p, arm), True)
     now = blend_changes(moving, e, body.joint, body.weight, p)
-    driven.vk[e, body.first + p] = motion_at(now, arm)
-    driven.spin[e, body.first + p] = wp.vec3(now[3], now[4], now[5])
+    store_vector(driven.vk, e, q, motion_at(now, arm), True)
+    store_vector(driven.spin, e, q, wp.vec3(now[3], now[4], now[5]), True)
 
 
 @wp.kernel
@@ -127,13 +130,8 @@ def hand_back(
 @wp.func
 def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int):
     """Where linear blend skinning has a particle [m]; ``place`` takes bones from rest to where they are."""
-    joint = body.joint[p]
-    weight = body.weight[p]
-    A = weight[0] * place[e, joint[0]]
-    for n in range(1, 4):
-        if weight[n] > 0.0:
-            A += weight[n] * place[e, joint[n]]
-    return apply_point(A, body.rest[row(e, body.rest.shape[0]), p])
+    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+    return blend_places(place, e, body.joint, body.weight, p, rest)
 
 
 @wp.kernel
@@ -146,7 +144,8 @@ def find_displacement(
 ):
     """Of the particles from where the pose has them by linear blend skinning [m], at their places in the world."""
     e, p = wp.tid()
-    displacement[e, body.first + p] = x[e, body.first + p] - skinned_place(body, place, e, p)
+    q = body.first + p
+    store_vector(displacement, e, q, vector_at(x, e, q) - skinned_place(body, place, e, p), True)
 
 
 @wp.kernel
@@ -174,12 +173,12 @@ def attach_flesh(
     if failure[e] != 0:
         lost[e, q] = wp.vec3(0.0)
         return
-    v = skinned_motion(body, moving, e, p, x[e, q] - position[e, 0])
-    before = u[e, q] + vk[e, q] - v
-    way = skinned_place(body, place, e, p) - x[e, q]
-    after = implicit_velocity(rate[row(e, rate.shape[0]), p], dt, way, before)
-    u[e, q] = after
-    lost[e, q] = before - after
+    at = vector_at(x, e, q)
+    before = vector_at(u, e, q) + vector_at(vk, e, q) - skinned_motion(body, moving, e, p, at - position[e, 0])
+    way = skinned_place(body, place, e, p) - at
+    after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
+    store_vector(u, e, q, after, True)
+    store_vector(lost, e, q, before - after, True)
 
 
 @wp.func

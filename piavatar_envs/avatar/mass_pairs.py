@@ -10,6 +10,7 @@ import warp as wp
 
 from piavatar_envs.avatar.body import CHUNK, BodyPoints
 from piavatar_envs.avatar.lanes import store_sum12
+from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12
 from piavatar_envs.mpm.types import Particles, row
@@ -93,9 +94,9 @@ def sum_pairs(
     diag = wp.vec3()
     off = wp.vec3()
     for n in range(pairs.entry_start[c] + thread, pairs.entry_start[c + 1], threads):
-        p = body.first + pairs.entry[n]
-        w = pairs.entry_weight[n] * particles.mass[r, p]
-        d = x[e, p] - origin
+        p = body.first + int_at(pairs.entry, n)
+        w = float_at(pairs.entry_weight, n) * number_at(particles.mass, r, p)
+        d = vector_at(x, e, p) - origin
         wd = w * d
         m += w
         mx += wd

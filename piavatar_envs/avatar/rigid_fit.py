@@ -4,25 +4,22 @@ A fit is mass- and skinning-weighted least squares, so the blended field ``sum_b
 exactly the linear and angular momentum of the velocity it was fitted to, bone by bone. Everything the drive gives back
 or takes away goes through such fields, which is why it keeps momentum.
 
-Sums run over fixed lists of particles in chunks (no atomics): the result does not depend on the schedule. ``threads``
-threads share a chunk, the chunks of a bone, or the bones of a body.
+The particles' sums are :mod:`piavatar_envs.avatar.bone_sums`; ``threads`` threads share the chunks of a bone, or the
+bones of a body.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.lanes import store_sum12, store_sum16, sum_threads12, sum_threads16
-from piavatar_envs.avatar.loads import components_at, float_at, int_at, number_at, vector_at
-from piavatar_envs.avatar.types import Body, Drive, RigidFits, vec12, vec16
-from piavatar_envs.mpm.types import Particles, row
+from piavatar_envs.avatar.lanes import sum_threads12, sum_threads16
+from piavatar_envs.avatar.types import Body, RigidFits, vec12, vec16
+from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: Threads of a block in all launches of this module.
 BLOCK = 128
-#: Groups of threads that share the chunks of a body, where it seldom has any.
-GROUPS = wp.constant(8)
 
 
 @wp.func
@@ -51,52 +48,6 @@ def symmetric(diag: wp.vec3, off: wp.vec3):
 def point_inertia(mass: float, d: wp.vec3):
     """Inertia of a point mass at ``d``."""
     return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
-
-
-@wp.kernel(launch_bounds=(BLOCK, 10))
-def sum_moments(
-    body: Body,
-    particles: Particles,
-    x: wp.array2d(dtype=wp.vec3),
-    u: wp.array2d(dtype=wp.vec3),
-    reference: wp.array2d(dtype=wp.vec3),
-    failure: wp.array(dtype=int),
-    threads: int,
-    # out
-    moments: wp.array2d(dtype=vec16),
-):
-    """Moments of one chunk of a bone's particles about the bone's reference point (small numbers, small round-off)."""
-    e, c, thread = wp.tid()
-    if failure[e] != 0:
-        return
-    origin = reference[e, body.chunk_bone[c]]
-    r = row(e, particles.mass.shape[0])
-    m = float(0.0)
-    mx = wp.vec3()
-    mu = wp.vec3()
-    diag = wp.vec3()
-    off = wp.vec3()
-    spin = wp.vec3()
-    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
-        p = body.first + int_at(body.entry, n)
-        w = float_at(body.entry_weight, n) * number_at(particles.mass, r, p)
-        d = vector_at(x, e, p) - origin
-        v = vector_at(u, e, p)
-        wd = w * d
-        m += w
-        mx += wd
-        mu += w * v
-        diag += wp.cw_mul(wd, d)
-        off += wp.vec3(wd[1] * d[2], wd[2] * d[0], wd[0] * d[1])
-        spin += wp.cross(wd, v)
-    # fmt: off
-    total = vec16(
-        m, mx[0], mx[1], mx[2], mu[0], mu[1], mu[2],
-        diag[0], diag[1], diag[2], off[0], off[1], off[2],
-        spin[0], spin[1], spin[2],
-    )
-    # fmt: on
-    store_sum16(moments, e, c, total, threads)
 
 
 @wp.kernel
@@ -179,96 +130,3 @@ def fit_body(
         body_velocity[e] = wp.vec3(s[4], s[5], s[6]) / s[0]
         body_spin[e] = spin_of(I, wp.vec3(t[0], t[1], t[2]))
         body_inertia[e] = I
-
-
-@wp.kernel(launch_bounds=(BLOCK, 10))
-def sum_corrections(
-    body: Body,
-    particles: Particles,
-    x: wp.array2d(dtype=wp.vec3),
-    center: wp.array2d(dtype=wp.vec3),
-    pull: wp.array3d(dtype=float),
-    lean: wp.array3d(dtype=float),
-    failure: wp.array(dtype=int),
-    threads: int,
-    # out
-    corrections: wp.array2d(dtype=vec12),
-):
-    """Momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk."""
-    e, c, thread = wp.tid()
-    if failure[e] != 0:
-        return
-    origin = center[e, body.chunk_bone[c]]
-    r = row(e, particles.mass.shape[0])
-    p1 = wp.vec3()
-    l1 = wp.vec3()
-    p2 = wp.vec3()
-    l2 = wp.vec3()
-    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
-        p = int_at(body.entry, n)
-        w = float_at(body.entry_weight, n) * number_at(particles.mass, r, body.first + p)
-        d = vector_at(x, e, body.first + p) - origin
-        a = w * components_at(pull, e, p)
-        p1 += a
-        l1 += wp.cross(d, a)
-        a = w * components_at(lean, e, p)
-        p2 += a
-        l2 += wp.cross(d, a)
-    total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])
-    store_sum12(corrections, e, c, total, threads)
-
-
-@wp.kernel
-def add_chunks(
-    body: Body,
-    corrections: wp.array2d(dtype=vec12),
-    failure: wp.array(dtype=int),
-    threads: int,
-    # out
-    bone_corrections: wp.array2d(dtype=vec12),
-):
-    """Sum of the chunks of every bone."""
-    e, b, thread = wp.tid()
-    if failure[e] != 0:
-        return
-    s = vec12()
-    for c in range(body.chunk_start[b] + thread, body.chunk_start[b + 1], threads):
-        s += corrections[e, c]
-    s = sum_threads12(s, threads)
-    if thread == 0:
-        bone_corrections[e, b] = s
-
-
-@wp.kernel(launch_bounds=(BLOCK, 10))
-def sum_motion(
-    body: Body,
-    drive: Drive,
-    particles: Particles,
-    x: wp.array2d(dtype=wp.vec3),
-    vk: wp.array2d(dtype=wp.vec3),
-    center: wp.array2d(dtype=wp.vec3),
-    let_go: wp.array(dtype=int),
-    failure: wp.array(dtype=int),
-    threads: int,
-    # out
-    corrections: wp.array2d(dtype=vec12),
-):
-    """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in every chunk.
-
-    Launched over ``(num_envs, GROUPS, threads)``: most bodies have nothing to do here, and end few threads.
-    """
-    e, group, thread = wp.tid()
-    if failure[e] != 0 or (drive.free_motion == 0 and let_go[e] == 0):
-        return
-    r = row(e, particles.mass.shape[0])
-    for c in range(group, body.chunk_bone.shape[0], GROUPS):
-        origin = center[e, body.chunk_bone[c]]
-        P = wp.vec3()
-        K = wp.mat33()
-        for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
-            p = body.first + int_at(body.entry, n)
-            a = (float_at(body.entry_weight, n) * number_at(particles.mass, r, p)) * vector_at(vk, e, p)
-            P += a
-            K += wp.outer(vector_at(x, e, p) - origin, a)
-        total = vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2])
-        store_sum12(corrections, e, c, total, threads)

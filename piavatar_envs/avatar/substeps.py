@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from piavatar_envs.avatar import flesh, posing, rigid_fit
+from piavatar_envs.avatar import bone_sums, flesh, posing, rigid_fit
 from piavatar_envs.avatar.injection import inject_velocity
 from piavatar_envs.avatar.root import lay_command_on_body, root_wrench
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
@@ -92,11 +92,11 @@ def record_fit(drive: AvatarDrive, program: Program, state: State) -> None:
     s, n, bones = drive.scratch, drive.model.num_envs, drive.groups.bones
     reference = drive.tracked.position
     program.launch(
-        rigid_fit.sum_moments,
+        bone_sums.sum_moments,
         (n, drive.num_chunks, drive.threads),
         [drive.body, drive.model.particles, state.x, state.u, reference, state.failure, drive.threads],
         [s.moments],
-        block_dim=rigid_fit.BLOCK,
+        block_dim=bone_sums.BLOCK,
     )
     program.launch(
         rigid_fit.fit_bones,
@@ -173,11 +173,11 @@ def _record_free_motion(drive: AvatarDrive, program: Program, state: State) -> N
     s, g, n, let_go = drive.scratch, drive.groups, drive.model.num_envs, drive.state.let_go
     body, particles = drive.body, drive.model.particles
     program.launch(
-        rigid_fit.sum_motion,
-        (n, int(rigid_fit.GROUPS), drive.threads),
+        bone_sums.sum_motion,
+        (n, int(bone_sums.GROUPS), drive.threads),
         [body, drive.drive, particles, state.x, state.vk, s.bone_center, let_go, state.failure, drive.threads],
         [s.corrections],
-        block_dim=rigid_fit.BLOCK,
+        block_dim=bone_sums.BLOCK,
     )
     program.launch(
         flesh.free_motion,
@@ -192,18 +192,18 @@ def _record_sums(drive: AvatarDrive, program: Program, state: State) -> None:
     """Momenta of the pulls, bone by bone."""
     s, n = drive.scratch, drive.model.num_envs
     program.launch(
-        rigid_fit.sum_corrections,
+        bone_sums.sum_corrections,
         (n, drive.num_chunks, drive.threads),
         [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.threads],
         [s.corrections],
-        block_dim=rigid_fit.BLOCK,
+        block_dim=bone_sums.BLOCK,
     )
     program.launch(
-        rigid_fit.add_chunks,
+        bone_sums.add_chunks,
         (n, NUM_JOINTS, drive.bone_threads),
         [drive.body, s.corrections, state.failure, drive.bone_threads],
         [s.bone_corrections],
-        block_dim=rigid_fit.BLOCK,
+        block_dim=bone_sums.BLOCK,
     )
 
 

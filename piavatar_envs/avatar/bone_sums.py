@@ -1,0 +1,212 @@
+"""Sums over the particles of bones: moments that rigid motions are fitted to, momenta of what the drive changes.
+
+They run over fixed lists of particles in chunks (no atomics): the result does not depend on the schedule. ``threads``
+threads share a chunk, or the chunks of a bone.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.lanes import store_sum12, store_sum16, sum_threads12
+from piavatar_envs.avatar.loads import components_at, float_at, int_at, number_at, vector_at
+from piavatar_envs.avatar.types import Body, Drive, vec12, vec16
+from piavatar_envs.mpm.types import Particles, row
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+#: Threads of a block in all launches of this module.
+BLOCK = 128
+#: Groups of threads that share the chunks of a body, where it seldom has any.
+GROUPS = wp.constant(8)
+
+
+@wp.func
+def entry_of(body: Body, n: int, last: int):
+    """Particle of entry ``n`` and the bone's weight in it, or those of the ``last`` entry of the chunk.
+
+    Loops over a chunk ask for the next entry before they need it: else all that they read of a particle would wait for
+    its number.
+    """
+    at = wp.min(n, last)
+    return int_at(body.entry, at), float_at(body.entry_weight, at)
+
+
+@wp.func
+def moments_of(w: float, d: wp.vec3, v: wp.vec3):
+    """What a share of mass ``w`` at ``d`` with velocity ``v`` has of the sums in :data:`vec16`."""
+    p = w * v
+    wd = w * d
+    l = wp.cross(wd, v)
+    # fmt: off
+    return vec16(
+        w, wd[0], wd[1], wd[2], p[0], p[1], p[2],
+        wd[0] * d[0], wd[1] * d[1], wd[2] * d[2], wd[1] * d[2], wd[2] * d[0], wd[0] * d[1],
+        l[0], l[1], l[2],
+    )
+    # fmt: on
+
+
+@wp.kernel(launch_bounds=(BLOCK, 10))
+def sum_moments(
+    body: Body,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    reference: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    threads: int,
+    # out
+    moments: wp.array2d(dtype=vec16),
+):
+    """Moments of one chunk of a bone's particles about the bone's reference point (small numbers, small round-off)."""
+    e, c, thread = wp.tid()
+    if failure[e] != 0:
+        return
+    origin = reference[e, body.chunk_bone[c]]
+    r = row(e, particles.mass.shape[0])
+    total = vec16()
+    last = body.entry_start[c + 1] - 1
+    n = body.entry_start[c] + thread
+    following, weight = entry_of(body, n, last)
+    while n <= last:
+        p = body.first + following
+        w = weight * number_at(particles.mass, r, p)
+        n += threads
+        following, weight = entry_of(body, n, last)
+        total += moments_of(w, vector_at(x, e, p) - origin, vector_at(u, e, p))
+    store_sum16(moments, e, c, total, threads)
+
+
+@wp.kernel(launch_bounds=(BLOCK, 8))
+def sum_moments_of_both(
+    body: Body,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    other: wp.array2d(dtype=wp.vec3),
+    reference: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    threads: int,
+    # out
+    moments: wp.array2d(dtype=vec16),
+    other_moments: wp.array2d(dtype=vec12),
+):
+    """:func:`sum_moments` of ``u``; of an ``other`` velocity momentum and angular momentum, six of twelve numbers."""
+    e, c, thread = wp.tid()
+    if failure[e] != 0:
+        return
+    origin = reference[e, body.chunk_bone[c]]
+    r = row(e, particles.mass.shape[0])
+    total = vec16()
+    P = wp.vec3()
+    L = wp.vec3()
+    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
+        p = body.first + int_at(body.entry, n)
+        w = float_at(body.entry_weight, n) * number_at(particles.mass, r, p)
+        d = vector_at(x, e, p) - origin
+        total += moments_of(w, d, vector_at(u, e, p))
+        momentum = w * vector_at(other, e, p)
+        P += momentum
+        L += wp.cross(d, momentum)
+    store_sum16(moments, e, c, total, threads)
+    others = vec12(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    store_sum12(other_moments, e, c, others, threads)
+
+
+@wp.kernel(launch_bounds=(BLOCK, 9))
+def sum_corrections(
+    body: Body,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    center: wp.array2d(dtype=wp.vec3),
+    pull: wp.array3d(dtype=float),
+    lean: wp.array3d(dtype=float),
+    failure: wp.array(dtype=int),
+    threads: int,
+    # out
+    corrections: wp.array2d(dtype=vec12),
+):
+    """Momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk."""
+    e, c, thread = wp.tid()
+    if failure[e] != 0:
+        return
+    origin = center[e, body.chunk_bone[c]]
+    r = row(e, particles.mass.shape[0])
+    p1 = wp.vec3()
+    l1 = wp.vec3()
+    p2 = wp.vec3()
+    l2 = wp.vec3()
+    last = body.entry_start[c + 1] - 1
+    n = body.entry_start[c] + thread
+    following, weight = entry_of(body, n, last)
+    while n <= last:
+        p = following
+        w = weight * number_at(particles.mass, r, body.first + p)
+        n += threads
+        following, weight = entry_of(body, n, last)
+        d = vector_at(x, e, body.first + p) - origin
+        a = w * components_at(pull, e, p)
+        p1 += a
+        l1 += wp.cross(d, a)
+        a = w * components_at(lean, e, p)
+        p2 += a
+        l2 += wp.cross(d, a)
+    total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])
+    store_sum12(corrections, e, c, total, threads)
+
+
+@wp.kernel
+def add_chunks(
+    body: Body,
+    corrections: wp.array2d(dtype=vec12),
+    failure: wp.array(dtype=int),
+    threads: int,
+    # out
+    bone_corrections: wp.array2d(dtype=vec12),
+):
+    """Sum of the chunks of every bone."""
+    e, b, thread = wp.tid()
+    if failure[e] != 0:
+        return
+    s = vec12()
+    for c in range(body.chunk_start[b] + thread, body.chunk_start[b + 1], threads):
+        s += corrections[e, c]
+    s = sum_threads12(s, threads)
+    if thread == 0:
+        bone_corrections[e, b] = s
+
+
+@wp.kernel(launch_bounds=(BLOCK, 10))
+def sum_motion(
+    body: Body,
+    drive: Drive,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    center: wp.array2d(dtype=wp.vec3),
+    let_go: wp.array(dtype=int),
+    failure: wp.array(dtype=int),
+    threads: int,
+    # out
+    corrections: wp.array2d(dtype=vec12),
+):
+    """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in every chunk.
+
+    Launched over ``(num_envs, GROUPS, threads)``: most bodies have nothing to do here, and end few threads.
+    """
+    e, group, thread = wp.tid()
+    if failure[e] != 0 or (drive.free_motion == 0 and let_go[e] == 0):
+        return
+    r = row(e, particles.mass.shape[0])
+    for c in range(group, body.chunk_bone.shape[0], GROUPS):
+        origin = center[e, body.chunk_bone[c]]
+        P = wp.vec3()
+        K = wp.mat33()
+        for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
+            p = body.first + int_at(body.entry, n)
+            a = (float_at(body.entry_weight, n) * number_at(particles.mass, r, p)) * vector_at(vk, e, p)
+            P += a
+            K += wp.outer(vector_at(x, e, p) - origin, a)
+        total = vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2])
+        store_sum12(corrections, e, c, total, threads)
