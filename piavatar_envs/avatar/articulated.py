@@ -143,14 +143,16 @@ class ArticulatedBody:
         self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
         self.target.rotation.fill_(wp.quat_identity())
         self.mass = JointMass(points, body, model)
-        self._factor, self._driven, self._cut = (self.mass.make_factor() for _ in range(3))
-        self._diagonal = zeros((n, NUM_DOF), float)
-        self._change, self._momentum = zeros((n, NUM_DOF), float), zeros((2, n, NUM_DOF), float)
-        self._momenta = [self._momentum[0], self._momentum[1]]
+        # where there are two of a kind, they are worked on together: those of all environments, then the others
+        self._factors, self._cut = self.mass.make_factors(2 * n), self.mass.make_factors(n)
+        self._factor, self._driven = self._factors[:n], self._factors[n:]
+        self._diagonals = zeros((2 * n, NUM_DOF), float)
+        self._locks, self._diagonal = self._diagonals[:n], self._diagonals[n:]
+        self._momentum, self._shares = zeros((2, n, NUM_DOF), float), zeros((2 * n, NUM_DOF), float)
+        self._change, self._taken = self._shares[:n], self._shares[n:]
         self._left, self._limited = zeros((n, NUM_DOF), float), zeros(n, int)
         self._muscle, self.impulse = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF), float)
         self._stop, self._nothing = zeros(bones, float), zeros((n, NUM_DOF), float)
-        self._taken = zeros((n, NUM_DOF), float)
         self._place = zeros(bones, wp.mat44)
         self._leaving, self._moving = zeros(bones, vec8), zeros(bones, vec8)
         self._linear, self._angular = zeros((2, *bones), wp.vec3), zeros((2, *bones), wp.vec3)
@@ -175,7 +177,7 @@ class ArticulatedBody:
         """Let joints resist; see :func:`make_tissue`. To be called before anything is recorded."""
         self.tissue = make_tissue(damping, stop, lower, upper, locked, self.model.device)
         locks = np.r_[np.zeros(3), np.repeat(self.tissue.lock.numpy(), 3)]
-        self._locks = self._upload(locks[None])
+        self._locks.assign(np.broadcast_to(locks.astype(np.float32), self._locks.shape))
 
     def record_mass(self, program: Program, state: State) -> None:
         """Append: build the mass matrix where particles and joints are, and what follows from it."""
@@ -183,8 +185,7 @@ class ArticulatedBody:
         inputs = [self.body, self.model.step.dt, self.pose, self.springs, self.tissue]
         outputs = [self._stop, self._diagonal]
         program.launch(implicit_diagonals, (self.model.num_envs, 1 + NUM_JOINTS), inputs, outputs)
-        self.mass.record_factor(program, self._locks, self._factor)
-        self.mass.record_factor(program, self._diagonal, self._driven)
+        self.mass.record_factors(program, self._diagonals, self._factors)
 
     def _record_fit(self, program: Program, state: State) -> None:
         """Append: fit the pose to the particles, by a share. No velocity changes."""
@@ -193,7 +194,7 @@ class ArticulatedBody:
         self._record_place(program)
         inputs = [self.body, state.x, self._place]
         program.launch(find_displacement, (n, self.body.count), inputs, [self._displacement])
-        self._record_shares(program, state, [self._displacement], [self._change])
+        self._record_shares(program, state, [self._displacement], self._change)
         self._record_spread(program, self._change, self._moving)
         inputs = [self.body, FIT_SHARE, self._moving, state.failure, self.threads]
         program.launch(move_joints, (n, self.threads), inputs, pose)
@@ -208,7 +209,7 @@ class ArticulatedBody:
         inputs = [self.body, self.state.rotation, self.state.position]
         program.launch(rest_matrices, self._place.shape, inputs, [self._place])
 
-    def _record_shares(self, program: Program, state: State, vectors: Sequence[wp.array], shares: list) -> None:
+    def _record_shares(self, program: Program, state: State, vectors: Sequence[wp.array], shares: wp.array) -> None:
         """Append: the shares ``dq = M^-1 J^T m v`` that the joints can take of one or two vectors at the particles."""
         n, position = self.model.num_envs, self.state.position
         sums = [self._chunks, self._other_chunks][: len(vectors)]
@@ -222,8 +223,8 @@ class ArticulatedBody:
         outputs = [self._linear, self._angular, self._bones, self._momentum]
         inputs = [self.body, position, self._chunks, self._other_chunks, self.threads]
         program.launch(gather_momentum, (len(vectors), n, self.threads), inputs, outputs)
-        for momentum, share in zip(self._momenta, shares, strict=False):
-            self.mass.record_solve(program, self._factor, momentum, share)
+        momenta = self._momentum.reshape((-1, NUM_DOF))[: shares.shape[0]]
+        self.mass.record_solve(program, self._factor, momenta, shares)
 
     def _record_attachment(self, program: Program, state: State) -> None:
         """Append: hand back, then flesh is pulled to the bones, and the bones to the flesh.
@@ -235,7 +236,7 @@ class ArticulatedBody:
         where = [state.x, s.position, self._place, self._moving]
         inputs = [self.body, self.model.step.dt, *where, self.attachment, state.vk, state.failure]
         program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
-        self._record_shares(program, state, [self._displacement, state.u], [self._change, self._taken])
+        self._record_shares(program, state, [self._displacement, state.u], self._shares)
         self._record_spread(program, self._change, self._moving)
         inputs = [s.position, self._bones, 1.0, self._nothing, self._moving, self.threads]
         program.launch(balance, (n, self.threads), inputs, [self._change])
@@ -250,7 +251,7 @@ class ArticulatedBody:
         self.mass.record_solve(program, self._driven, self.impulse, self._change)
         inputs = [self.body, dt, self.pose, self.springs, self.strength, self._muscle, self._diagonal, self._change]
         program.launch(limit_torques, each, inputs, [self.impulse, self._left, self._limited])
-        self.mass.record_factor(program, self._left, self._cut, self._limited)
+        self.mass.record_factors(program, self._left, self._cut, self._limited)
         self.mass.record_solve(program, self._cut, self.impulse, self._change, self._limited)
         program.launch(find_given, (n, NUM_DOF), [self._left, self._change], [self.impulse])
         self._record_spread(program, self._change, self._moving)
@@ -277,7 +278,7 @@ class ArticulatedBody:
         else:
             inputs = [self.body, state.x, s.position, self._moving, state.vk, state.failure]
             program.launch(hand_back, points, inputs, [state.u])
-            self._record_shares(program, state, [state.u], [self._taken])
+            self._record_shares(program, state, [state.u], self._taken)
         program.launch(add_change, (n, NUM_DOF), [self._taken, state.failure], [s.velocity, s.outside])
         self._record_torques(program, state)
         inputs = [self._change, s.outside, state.failure]

@@ -66,12 +66,12 @@ def start_of_row(k: int):
 # Rows as plain pointers: on a CPU, finding an entry's address costs more than what is done with it.
 _ROW = """
 const int* const at = column.data;
-const float* const row = &wp::index(factor, e, k * (k + 1) / 2);
+const float* const row = &wp::index(factor, f, k * (k + 1) / 2);
 """
 
 
 @wp.func_native(
-    _ROW + "float* const to = &wp::index(factor, e, i * (i + 1) / 2);\n"
+    _ROW + "float* const to = &wp::index(factor, f, i * (i + 1) / 2);\n"
     "for (int n = first; n < last; ++n) to[at[n]] -= share * row[at[n]];"
 )
 def subtract_row(
@@ -79,7 +79,7 @@ def subtract_row(
     first: int,
     last: int,
     factor: wp.array2d(dtype=float),
-    e: int,
+    f: int,
     k: int,
     i: int,
     share: float,
@@ -96,9 +96,10 @@ def subtract_column(
     first: int,
     last: int,
     factor: wp.array2d(dtype=float),
-    e: int,
+    f: int,
     k: int,
     y: float,
+    e: int,
     x: wp.array2d(dtype=float),
 ):
     """Take ``y`` times row ``k`` of a factor from a vector."""
@@ -114,8 +115,9 @@ def dot_row(
     first: int,
     last: int,
     factor: wp.array2d(dtype=float),
-    e: int,
+    f: int,
     k: int,
+    e: int,
     x: wp.array2d(dtype=float),
 ) -> float:
     """Product of row ``k`` of a factor and a vector."""
@@ -127,17 +129,18 @@ def factorize_alone(
     pattern: Pattern,
     matrix: wp.array3d(dtype=float),
     diagonal: wp.array2d(dtype=float),
-    e: int,
+    source: int,
     r: int,
+    e: int,
     factor: wp.array2d(dtype=float),
 ):
-    """:func:`factorize` for one thread; row ``r`` of the ``diagonal`` is the environment's."""
+    """:func:`factorize` for one thread: matrix ``source`` and row ``r`` of the ``diagonal`` make factor ``e``."""
     size = matrix.shape[1]
     for k in range(size):
         at = start_of_row(k)
         for n in range(pattern.start[k], pattern.start[k + 1]):
-            factor[e, at + pattern.column[n]] = matrix[e, k, pattern.column[n]]
-        factor[e, at + k] = matrix[e, k, k] + diagonal[r, k]
+            factor[e, at + pattern.column[n]] = matrix[source, k, pattern.column[n]]
+        factor[e, at + k] = matrix[source, k, k] + diagonal[r, k]
     for row in range(size):
         k = size - 1 - row
         at = start_of_row(k)
@@ -155,17 +158,17 @@ def factorize_alone(
 
 
 @wp.func
-def solve_alone(pattern: Pattern, factor: wp.array2d(dtype=float), e: int, x: wp.array2d(dtype=float)):
-    """:func:`solve` for one thread; ``x`` has the right-hand side at first."""
+def solve_alone(pattern: Pattern, factor: wp.array2d(dtype=float), f: int, e: int, x: wp.array2d(dtype=float)):
+    """:func:`solve` for one thread, ``x[e]`` with factor ``f``; ``x`` has the right-hand side at first."""
     size = x.shape[1]
     for row in range(size):
         k = size - 1 - row
-        y = x[e, k] / factor[e, start_of_row(k) + k]
+        y = x[e, k] / factor[f, start_of_row(k) + k]
         x[e, k] = y
-        subtract_column(pattern.column, pattern.start[k], pattern.start[k + 1], factor, e, k, y, x)
+        subtract_column(pattern.column, pattern.start[k], pattern.start[k + 1], factor, f, k, y, e, x)
     for k in range(size):
-        part = dot_row(pattern.column, pattern.start[k], pattern.start[k + 1], factor, e, k, x)
-        x[e, k] = (x[e, k] - part) / factor[e, start_of_row(k) + k]
+        part = dot_row(pattern.column, pattern.start[k], pattern.start[k + 1], factor, f, k, e, x)
+        x[e, k] = (x[e, k] - part) / factor[f, start_of_row(k) + k]
 
 
 @wp.kernel
@@ -178,19 +181,22 @@ def factorize(
     # out
     factor: wp.array2d(dtype=float),
 ):
-    """``L`` of ``L^T L = matrix + diag(diagonal)``; launched over ``(num_envs, threads)`` in blocks of ``threads``.
+    """``L`` of ``L^T L = matrix + diag(diagonal)``; launched over ``(systems, threads)`` in blocks of ``threads``.
 
-    Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, zero where the pattern has nothing, and
-    ``factor`` ``(num_envs, factor_size(N))`` is written where the pattern says. ``diagonal`` is ``(1 or num_envs, N)``.
+    A system is one of an environment's: ``systems`` are once or several times ``num_envs``, the first of all
+    environments first. Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, zero where the pattern has
+    nothing, and ``factor`` ``(systems, factor_size(N))`` is written where the pattern says. ``diagonal`` is
+    ``(1 or systems, N)``.
     """
     e, _ = wp.tid()
-    if wanted[e] == 0:
+    source = e % matrix.shape[0]
+    if wanted[e % wanted.shape[0]] == 0:
         return
     r = wp.min(e, diagonal.shape[0] - 1)
     if threads == 1:
-        factorize_alone(pattern, matrix, diagonal, e, r, factor)
+        factorize_alone(pattern, matrix, diagonal, source, r, e, factor)
     else:
-        factorize_together(pattern.start, pattern.column, matrix, diagonal, e, r, factor)
+        factorize_together(pattern.start, pattern.column, matrix, diagonal, source, r, e, factor)
 
 
 @wp.kernel
@@ -203,13 +209,14 @@ def solve(
     # out
     x: wp.array2d(dtype=float),
 ):
-    """``x`` with ``L^T L x = right``, ``L`` the ``factor``; launched as :func:`factorize`."""
+    """``x`` with ``L^T L x = right``, ``L`` the ``factor``; launched as :func:`factorize`, over factors or more."""
     e, thread = wp.tid()
-    if wanted[e] == 0:
+    f = e % factor.shape[0]
+    if wanted[e % wanted.shape[0]] == 0:
         return
     for i in range(thread, x.shape[1], threads):
         x[e, i] = right[e, i]
     if threads == 1:
-        solve_alone(pattern, factor, e, x)
+        solve_alone(pattern, factor, f, e, x)
     else:
-        solve_together(factor, e, x)
+        solve_together(factor, f, e, x)

@@ -44,22 +44,25 @@ class JointMass:
         inputs = [self.body, self.pairs, self._sums, position, self.threads, self._scratch]
         program.launch(compose_mass, (self.model.num_envs, self.threads), inputs, [self.matrix], block_dim=self.threads)
 
-    def make_factor(self) -> wp.array:
-        """Room for a Cholesky factor in every environment."""
-        return wp.zeros((self.model.num_envs, factor_size(NUM_DOF)), dtype=float, device=self.model.device)
+    def make_factors(self, systems: int) -> wp.array:
+        """Room for so many Cholesky factors."""
+        return wp.zeros((systems, factor_size(NUM_DOF)), dtype=float, device=self.model.device)
 
-    def record_factor(
+    def record_factors(
         self, program: Program, diagonal: wp.array, factor: wp.array, wanted: wp.array | None = None
     ) -> None:
-        """Append: the Cholesky factor of the matrix and a diagonal, of all environments or of those ``wanted``."""
+        """Append: Cholesky factors of the matrix and a diagonal, of all environments or of those ``wanted``.
+
+        Those of several diagonals, all environments of the first one first, are found together.
+        """
         wanted = self._every if wanted is None else wanted
         inputs = [self.pattern, self.matrix, diagonal, wanted, self.threads]
-        program.launch(factorize, (self.model.num_envs, self.threads), inputs, [factor], block_dim=self.threads)
+        program.launch(factorize, (factor.shape[0], self.threads), inputs, [factor], block_dim=self.threads)
 
     def record_solve(
         self, program: Program, factor: wp.array, right: wp.array, x: wp.array, wanted: wp.array | None = None
     ) -> None:
-        """Append: solve with a factor, in all environments or in those ``wanted``."""
+        """Append: solve with a factor, in all environments or in those ``wanted``; once or several times in each."""
         wanted = self._every if wanted is None else wanted
         inputs = [self.pattern, factor, right, wanted, self.threads]
-        program.launch(solve, (self.model.num_envs, self.threads), inputs, [x], block_dim=self.threads)
+        program.launch(solve, (x.shape[0], self.threads), inputs, [x], block_dim=self.threads)

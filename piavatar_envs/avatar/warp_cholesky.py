@@ -22,7 +22,7 @@ _ROOM = MOST_ROWS * (MOST_ROWS + 1) // 2
 __shared__ float __align__(16) room[{_ROOM}];
 __shared__ float4 joint[{MOST_ROWS}];
 const int lane = threadIdx.x & 31, size = matrix.shape[1];
-const float* const from = &wp::index(matrix, e, 0, 0);
+const float* const from = &wp::index(matrix, source, 0, 0);
 const float* const more = &wp::index(diagonal, r, 0);
 for (int part = 0; part < size; part += 32) {{
     const int j = part + lane;
@@ -85,11 +85,12 @@ def factorize_together(
     columns: wp.array(dtype=int),
     matrix: wp.array3d(dtype=float),
     diagonal: wp.array2d(dtype=float),
-    e: int,
+    source: int,
     r: int,
+    e: int,
     factor: wp.array2d(dtype=float),
 ):
-    """Factors of :mod:`piavatar_envs.avatar.cholesky`, by a warp; ``r`` is the row of the ``diagonal``."""
+    """Factor ``e`` of :mod:`piavatar_envs.avatar.cholesky`, by a warp, of matrix ``source`` and diagonal ``r``."""
     ...
 
 
@@ -99,7 +100,7 @@ def factorize_together(
 #if defined(__CUDA_ARCH__)
 __shared__ float __align__(16) room[{_ROOM}];
 const int lane = threadIdx.x & 31, size = x.shape[1];
-const float4* const from = reinterpret_cast<const float4*>(&wp::index(factor, e, 0));
+const float4* const from = reinterpret_cast<const float4*>(&wp::index(factor, f, 0));
 #pragma unroll 4
 for (int n = lane; n < factor.shape[1] / 4; n += 32) reinterpret_cast<float4*>(room)[n] = from[n];
 float* const result = &wp::index(x, e, 0);
@@ -137,6 +138,6 @@ for (int q = 0; q < PARTS; ++q)
     if (32 * q + lane < size) result[32 * q + lane] = value[q];
 #endif
 """)
-def solve_together(factor: wp.array2d(dtype=float), e: int, x: wp.array2d(dtype=float)):
-    """What is solved with them; ``x`` has the right-hand side at first."""
+def solve_together(factor: wp.array2d(dtype=float), f: int, e: int, x: wp.array2d(dtype=float)):
+    """What is solved with factor ``f``; ``x[e]`` has the right-hand side at first."""
     ...

@@ -110,7 +110,7 @@ def joints(make_rig, wild_pose):
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_factors_solve(device, sparse):
-    """Of some environments; the dense one has more rows than two warps have lanes."""
+    """Of some environments, two of each; the dense one has more rows than two warps have lanes."""
     rng, size, n, threads = np.random.default_rng(0), 39 if sparse else NUM_DOF, 3, warp_threads(device)
     root = rng.normal(size=(n, size, size))
     filled = np.ones((size, size), bool)
@@ -119,17 +119,18 @@ def test_factors_solve(device, sparse):
         filled[3:6, 12:15] = filled[12:15, 3:6] = False
     matrix = np.where(filled, root @ root.transpose(0, 2, 1), 0.0)
     matrix = (matrix + (2.0 + np.abs(matrix).sum(2).max()) * np.eye(size)).astype(np.float32)
-    diagonal, right = rng.uniform(0.0, 3.0, (1, size)), rng.normal(size=(n, size))
+    diagonal, right = rng.uniform(0.0, 3.0, (2 * n, size)), rng.normal(size=(2 * n, size))
     arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in (matrix, diagonal, right)]
-    factor, x = (wp.zeros((n, rows), dtype=float, device=device) for rows in (factor_size(size), size))
+    factor, x = (wp.zeros((2 * n, rows), dtype=float, device=device) for rows in (factor_size(size), size))
     chosen = np.array([True, False, True])
     wanted = wp.array(chosen.astype(np.int32), dtype=int, device=device)
     pattern = find_pattern(filled, device)
-    how = {"dim": (n, threads), "block_dim": threads, "device": device}
+    how = {"dim": (2 * n, threads), "block_dim": threads, "device": device}
     wp.launch(factorize, inputs=[pattern, *arrays[:2], wanted, threads], outputs=[factor], **how)
     wp.launch(solve, inputs=[pattern, factor, arrays[2], wanted, threads], outputs=[x], **how)
-    whole = matrix + np.diag(diagonal[0])
-    L = np.zeros((n, size, size))
+    chosen = np.tile(chosen, 2)
+    whole = np.tile(matrix, (2, 1, 1)) + diagonal[:, :, None] * np.eye(size)
+    L = np.zeros((2 * n, size, size))
     rows, columns = np.tril_indices(size)
     L[:, rows, columns] = factor.numpy()[:, : len(rows)]
     found = (L.transpose(0, 2, 1) @ L)[chosen]
