@@ -45,6 +45,9 @@ _TERMS: Mapping[str, tuple[tuple[float, ...], Sequence[str]]] = {
     "foot_impulses": (_SCALAR, _SIDES),
     "ball_position": (_VECTOR, ("ball",)),
     "ball_velocity": (_VECTOR, ("ball",)),
+    "reference_positions": (_VECTOR, _BODY),
+    "reference_root": (_ROTATION, ("root",)),
+    "reference_turns": (_SPIN, _JOINTS),
     "way_direction": (_VECTOR, ("way",)),
     "way_offset": (_ASIDE, ("way",)),
 }

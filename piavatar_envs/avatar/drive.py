@@ -19,7 +19,7 @@ from piavatar_envs.avatar.kabsch import local_rotations, track_bones
 from piavatar_envs.avatar.lanes import chunk_threads, warp_threads
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
-from piavatar_envs.avatar.spawn import place_particles, reset_drive
+from piavatar_envs.avatar.spawn import place_particles, reset_drive, set_in_motion
 from piavatar_envs.avatar.substeps import Groups, record_drive, record_injection, record_pose
 from piavatar_envs.avatar.types import DriveScratch, DriveState, Tracked, vec8, vec12, vec16, vec44
 from piavatar_envs.mpm.program import Program
@@ -132,6 +132,19 @@ class AvatarDrive:
         )
         if self.joints:
             self.joints.record_reset(program, mask)
+            if self.joints.first:
+                self._record_motion(program, state, mask)
+
+    def _record_motion(self, program: Program, state: State, mask: wp.array) -> None:
+        """Append: the masked environments' bodies, placed already, are on their way to a pose."""
+        n, s = self.model.num_envs, self.scratch
+        after = self.groups.next_pose
+        record_pose(self, program, 0.0, *self.joints.first, s.command_increment, after)
+        program.launch(
+            posing.rest_matrices, (n, NUM_JOINTS), [self.body, after.rotation, after.position], [s.bone_step]
+        )
+        inputs = [mask, self.body, self.model.control_dt, s.bone_step, state.x]
+        program.launch(set_in_motion, (n, self.num_points), inputs, [state.u])
 
     def record_begin(self, program: Program) -> None:
         """Append what begins a control step: from the tracked pose towards ``state.goal_*``."""

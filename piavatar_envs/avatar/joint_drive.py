@@ -140,6 +140,8 @@ class JointDrive:
         body: the joints.
         assist: of the pelvis, ``(num_envs,)``, 0 to 1; what is written here holds until it is written again.
         gains: springs and dampers of the reference adult's joints, ``(1, 23)``.
+        first: the pose that bodies are on their way to when an episode begins, and reach after a control step: local
+            rotations and root, as commands; None where they begin at rest.
     """
 
     def __init__(self, points: BodyPoints, drive: AvatarDrive, settings: JointSettings) -> None:
@@ -170,6 +172,7 @@ class JointDrive:
         joints, rest = points.joints[0], points.rest[0]
         span = float(joints[joint_index("head"), 2] - joints[joint_index("left_foot"), 2])
         self._per_size = float(np.ptp(rest[:, 2])) / span / (REFERENCE_MASS * REFERENCE_HEIGHT)
+        self.first: tuple[wp.array, wp.array] | None = None
         self.refresh = max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6))
 
     @property

@@ -1,10 +1,10 @@
-"""Placing bodies: at reset every particle goes to its skinned place, at rest and unstrained."""
+"""Placing bodies: at reset every particle goes to its skinned place, unstrained, at rest or on its way."""
 
 from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.rotation import apply_point
+from piavatar_envs.avatar.blending import blend_places
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.types import Kinematic, row
 
@@ -53,14 +53,8 @@ def place_particles(
     e, p = wp.tid()
     if not mask[e]:
         return
-    A = wp.mat44()
-    joint = body.joint[p]
-    weight = body.weight[p]
-    for n in range(4):
-        if weight[n] > 0.0:
-            A += weight[n] * bone_from[e, joint[n]]
     q = body.first + p
-    x[e, q] = apply_point(A, body.rest[row(e, body.rest.shape[0]), p])
+    x[e, q] = blend_places(bone_from, e, body.joint, body.weight, p, body.rest[row(e, body.rest.shape[0]), p])
     u[e, q] = wp.vec3(0.0)
     driven.vk[e, q] = wp.vec3(0.0)
     driven.spin[e, q] = wp.vec3(0.0)
@@ -68,3 +62,22 @@ def place_particles(
     C[e, q] = wp.mat33()
     F[e, q] = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     failure[e] = 0
+
+
+@wp.kernel
+def set_in_motion(
+    mask: wp.array(dtype=wp.bool),
+    body: Body,
+    time: float,
+    bone_after: wp.array2d(dtype=wp.mat44),
+    x: wp.array2d(dtype=wp.vec3),
+    # out
+    u: wp.array2d(dtype=wp.vec3),
+):
+    """Physical velocity of placed particles that are in the pose ``bone_after`` a ``time`` [s] later."""
+    e, p = wp.tid()
+    if not mask[e]:
+        return
+    q = body.first + p
+    after = blend_places(bone_after, e, body.joint, body.weight, p, body.rest[row(e, body.rest.shape[0]), p])
+    u[e, q] = (after - x[e, q]) / time

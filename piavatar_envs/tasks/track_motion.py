@@ -125,7 +125,8 @@ class TrackMotionTask(Task):
     summary = """The avatar moves as a clip does, and every `impulse_interval` an impulse of 0.3 to 1 times `impulse`
 and of random direction strikes its trunk, head, shoulders, hips or left knee. Actions are added to the clip's own
 increments: with zero actions the commanded pose is the clip's, and what an impulse disturbs comes back only as firmly
-as `tone` and the root wrench pull. A good agent steers against the disturbance and stays on the clip."""
+as `tone` and the root wrench pull. A good agent steers against the disturbance and stays on the clip. With
+`control="torque"` or `"pd"` nothing but the joints moves the body, which begins with the clip's own velocity."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "position": "0.6 while `mpjpe` is at most 0.01 m; beyond it a Gaussian that has fallen to 0.06 at 0.31 m",
         "rotation": "0.4 while the mean rotation error of the joints is at most 0.01 rad; beyond it a Gaussian that "
@@ -221,6 +222,10 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
             [self.start, self.origin, drive.command_rotation, drive.command_root],
         )
         program.launch(draw_offset, env.num_envs, [env.mask, env.seed, env.episode, self.interval], [self.offset])
+        joints = env.simulation.avatar.joints
+        if joints:  # torques could not bring the body up to the clip's speed at once
+            joints.first = self.clip_rotation, self.clip_root
+            self._record_next_pose(env, program)
 
     def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
         drive, config = env.simulation.avatar.state, self.config
@@ -248,15 +253,19 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         )
         return [(self.reference_rotation, self.reference_root)]
 
-    def _record_clip(self, env, program) -> None:
-        """Append: the clip's pose one step ahead of the counter, in the world."""
-        n = env.num_envs
+    def _record_next_pose(self, env, program) -> None:
+        """Append: the clip's pose one step ahead of the counter."""
         program.launch(
             read_clip,
-            (n, NUM_JOINTS),
+            (env.num_envs, NUM_JOINTS),
             [self.clip, env.simulation.avatar.body, self.start, self.origin, env.step_count],
             [self.clip_rotation, self.clip_root],
         )
+
+    def _record_clip(self, env, program) -> None:
+        """Append: that pose, and where it has the bones in the world."""
+        n = env.num_envs
+        self._record_next_pose(env, program)
         avatar = env.simulation.avatar
         program.launch(
             pose_body,

@@ -17,6 +17,7 @@ from agents.batches import load_batched, new_task  # noqa: E402
 from agents.checkpoint import Checkpoint  # noqa: E402
 from agents.rsl_policy import RslTraining  # noqa: E402
 from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
+from piavatar_envs.avatar.motion import deepmimic  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 from tests.agents.killing import flat, run_killed  # noqa: E402
 
@@ -33,6 +34,8 @@ def test_there_are_published_configurations():
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_published_configurations_train_and_leave_their_results(path, device, tmp_path, capsys):
+    if "deepmimic:" in path.read_text() and deepmimic.clip_folder() is None:
+        pytest.skip("no pybullet here (its wheels are for Python 3.10 and 3.11): its clip cannot be learned from")
     rsl_ppo.main([str(path), *TINY, "--out", str(tmp_path), "--device", device])
     assert "trained" in capsys.readouterr().out
     left = {entry.name for entry in tmp_path.iterdir()}

@@ -216,3 +216,24 @@ def test_zero_actions_hold_the_clip_and_actions_leave_it(make_env):
         env.step(-action)
     offset = Rotation.from_matrix(clip_frame(env, 0)[0][elbow].T @ tracked(env)[0][elbow]).magnitude()
     assert offset == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("control", ["pose", "torque"])
+def test_under_torques_bodies_begin_as_fast_as_the_clip(make_batch, control):
+    """Particles move from where a frame puts them to where the next one does: other episodes begin there."""
+    n, dt = 48, 1.0 / 30.0
+    batch = make_batch(TRACK, n, motion="arm_wave", impulse=0.0, control=control)
+    batch.reset(seeds=np.arange(n))
+    state = batch.simulation.state
+    start, x, u = (a.numpy().astype(float) for a in (batch.task.start, state.x, state.u))
+    avatar = batch.simulation.avatar
+    own = slice(avatar.body.first, avatar.body.first + avatar.num_points)
+    pairs = [(i, j) for i in range(n) for j in range(n) if start[j] == start[i] + 1]
+    assert len(pairs) > 5
+    fastest = 0.0
+    for i, j in pairs:
+        way = (x[j, own] - x[i, own]) / dt
+        fastest = max(fastest, np.abs(way).max())
+        np.testing.assert_allclose(u[i, own], way if control == "torque" else 0.0, atol=2e-4)
+    assert fastest > 0.5
+    assert not state.vk.numpy().any()
