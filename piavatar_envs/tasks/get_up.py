@@ -5,46 +5,34 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-import numpy as np
 import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
+from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.config import DriveConfig, EnvConfig
-from piavatar_envs.envs.draws import STREAM_POSE, STREAM_TASK, generator
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.ground import Grounding
+from piavatar_envs.tasks.lying import first_poses, lying_rule, spawn_lying
+from piavatar_envs.tasks.rising import RISING_DOCS, RISING_TERMS, record_rising_outcome
 from piavatar_envs.tasks.upright import (
     METRIC_DOCS,
     METRICS,
-    REWARD_TERMS,
     STANDING_DOC,
     UPRIGHT_TERMS,
     StillConfig,
     UprightConfig,
     record_observe_upright,
-    record_standing_outcome,
-    reward_docs_of,
     still_rule,
     upright_rule,
 )
 
 wp.set_module_options({"enable_backward": False})
 
-#: How bodies lie, turns about x from the rest pose [rad]: the arms beside the chest; face down the toes are pointed and
-#: the head is raised off the nose, face up the heels come down to the ground.
-_ARMS = {"left_shoulder": 0.4, "right_shoulder": 0.4}
-_FACE_DOWN = {**_ARMS, "left_ankle": 0.8, "right_ankle": 0.8, "neck": -0.2, "head": -0.2}
-_FACE_UP = {**_ARMS, "left_hip": 0.09, "right_hip": 0.09}
-_QUARTER, _HALF = wp.constant(0.5 * np.pi), wp.constant(np.pi)
-#: What height, tilt, speed and pose are worth a step. Who sits has a chest as straight as can be, and bends it again to
-#: get on its feet: that must not cost more than the height that it gains is worth.
-WEIGHTS = (0.6, 0.05, 0.15, 0.2)
 #: How far the assisted pelvis is led: upwards [m] and towards upright [rad].
 LEAD, LEAD_TURN = wp.constant(0.15), wp.constant(0.3)
 
@@ -55,54 +43,21 @@ class GetUpConfig(EnvConfig):
     drive: DriveConfig = Field(
         default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
     )
-    upright: UprightConfig = Field(
-        default_factory=lambda: UprightConfig(height_margin=0.85, tilt_margin=1.5),
-        description="what counts as standing",
-    )
+    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
     still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     hold_seconds: float = Field(1.0, gt=0.0, description="how long it must stand [s]")
     face_up: float = Field(0.5, ge=0.0, le=1.0, description="share of episodes that begin face up [-]")
+    halfway: float = Field(
+        0.0, ge=0.0, le=1.0, description="share of episodes that begin on the way up, as a curriculum [-]"
+    )
+    feet_margin: float = Field(
+        0.6,
+        gt=0.0,
+        description="distance of the feet from below the pelvis at which a reward is 0.1, in its heights [-]",
+    )
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle off the lying pose [rad]")
-
-
-@wp.kernel
-def spawn_lying(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    face_up: float,
-    noise: float,
-    lower: wp.array(dtype=wp.vec3),
-    upper: wp.array(dtype=wp.vec3),
-    lying: wp.array2d(dtype=wp.vec3),
-    place: wp.vec3,
-    # out
-    command_rotation: wp.array2d(dtype=wp.quat),
-    command_root: wp.array(dtype=wp.vec3),
-    lies_up: wp.array(dtype=float),
-):
-    """Lying with the pelvis over ``place`` (x, y [m]), turned at random about the vertical; over ``(E, bones)``.
-
-    ``lying`` are the rotation vectors of the poses face down and face up [rad], ``(2, bones)``.
-    """
-    e, b = wp.tid()
-    if not mask[e]:
-        return
-    random = generator(seed[e], episode[e], STREAM_TASK, 0)
-    up = wp.randf(random) < face_up
-    turn = wp.randf(random, -_HALF, _HALF)
-    if b == 0:
-        over = wp.where(up, -_QUARTER, _QUARTER)
-        command_rotation[e, b] = quat_exp(wp.vec3(0.0, 0.0, turn)) * quat_exp(wp.vec3(over, 0.0, 0.0))
-        command_root[e] = wp.vec3(place[0], place[1], 0.0)
-        lies_up[e] = wp.where(up, 1.0, 0.0)
-        return
-    random = generator(seed[e], episode[e], STREAM_POSE, b)
-    v = noise * wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0))
-    v += lying[wp.where(up, 1, 0), b]
-    command_rotation[e, b] = quat_exp(wp.max(lower[b], wp.min(v, upper[b])))
 
 
 @wp.kernel
@@ -171,19 +126,20 @@ class GetUpTask(Task):
     Config = GetUpConfig
     description = "from lying on the ground, face down or up, to standing"
     observation_terms = UPRIGHT_TERMS
-    reward_terms = REWARD_TERMS
+    reward_terms = RISING_TERMS
     metrics = (*METRICS, "held_seconds")
 
     camera_position = (2.2, -3.2, 1.6)
     camera_target = (0.0, 0.0, 0.5)
 
     summary = """The avatar lies on the ground, face down or face up (`face_up`), turned about the vertical at random,
-its arms beside it, its joints up to `pose_noise` off that pose. It shall stand up by the strength
+its arms beside it, its joints up to `pose_noise` off that pose; or (`halfway`, a curriculum) it is on the way up from
+there: on all fours or on a knee, sitting or squatting, or half up. It shall stand up by the strength
 of its joints, to the rest pose, and stay there for `hold_seconds`. Nothing but the clock ends an episode; a fall costs
 time. Where it stands in the end does not matter. `root_assist` helps here in its own way: it leads the pelvis, from
 wherever it is, upwards and towards upright. With `control="pose"` the root wrench keeps the pelvis where it lies, and
 there is nothing to be learnt."""
-    reward_docs: ClassVar[Mapping[str, str]] = reward_docs_of(WEIGHTS)
+    reward_docs: ClassVar[Mapping[str, str]] = RISING_DOCS
     metric_docs: ClassVar[Mapping[str, str]] = {
         **METRIC_DOCS,
         "held_seconds": "how long it has been standing without a break [s]",
@@ -195,25 +151,25 @@ there is nothing to be learnt."""
     config: GetUpConfig
 
     def drawn(self) -> tuple[Parameter, ...]:
-        return (Parameter("face_up", "-", 0.0, 1.0, "1 if the episode began face up, 0 if face down"),)
+        return (
+            Parameter(
+                "face_up", "-", 0.0, 1.0, "1 if the episode began face up, or on the way up from there; 0 if face down"
+            ),
+        )
 
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         return (Drawn(self.lies_up),)
 
     def allocate(self, env) -> None:
         n, device, config = env.num_envs, env.device, self.config
-        self.rule, self.still = upright_rule(config.upright, config.control_cost), still_rule(config.still, WEIGHTS)
+        self.rule, self.still = upright_rule(config.upright, config.control_cost), still_rule(config.still)
         self.grounding = Grounding(env)
         self.steps = max(1, round(config.hold_seconds / config.physics.control_dt))
         self.held = wp.zeros(n, dtype=int, device=device)
         self.lies_up = wp.zeros(n, dtype=float, device=device)
         self.reference_rotation = wp.zeros((n, NUM_JOINTS), dtype=wp.quat, device=device)
         self.reference_root = wp.zeros(n, dtype=wp.vec3, device=device)
-        lying = np.zeros((2, NUM_JOINTS, 3), np.float32)
-        for index, pose in enumerate((_FACE_DOWN, _FACE_UP)):
-            for name, angle in pose.items():
-                lying[index, joint_index(name), 0] = angle
-        self.lying = wp.array(lying, dtype=wp.vec3, device=device)
+        self.poses = first_poses(device)
 
     def arrays(self) -> dict[str, wp.array]:
         return {"held": self.held}
@@ -221,12 +177,13 @@ there is nothing to be learnt."""
     def record_reset(self, env, program) -> None:
         state, avatar = env.simulation.avatar.state, self.scene.avatars[0]
         limits, config = env.action_map, self.config
+        rule = lying_rule(config.face_up, config.halfway, config.pose_noise)
         program.launch(
             spawn_lying,
             (env.num_envs, NUM_JOINTS),
             [
-                env.mask, env.seed, env.episode, config.face_up, config.pose_noise, limits.lower, limits.upper,
-                self.lying, wp.vec3(*avatar.position, 0.0),
+                env.mask, env.seed, env.episode, rule, limits.lower, limits.upper, self.poses,
+                wp.vec3(*avatar.position, 0.0),
             ],
             [state.command_rotation, state.command_root, self.lies_up],
         )  # fmt: skip
@@ -246,7 +203,7 @@ there is nothing to be learnt."""
         return [(self.reference_rotation, self.reference_root)]
 
     def record_outcome(self, env, program) -> None:
-        record_standing_outcome(env, program, self.rule, self.still)
+        record_rising_outcome(env, program, self.rule, self.still, self.config.feet_margin)
         dt = self.config.physics.control_dt
         program.launch(
             judge_hold,

@@ -22,16 +22,15 @@ from piavatar_envs.tasks.upright import (
     FALL_DOC,
     METRIC_DOCS,
     METRICS,
+    REWARD_DOCS,
     REWARD_TERMS,
     STANDING_DOC,
     UPRIGHT_TERMS,
-    WEIGHTS,
     StillConfig,
     UprightConfig,
     record_fall,
     record_observe_upright,
     record_standing_outcome,
-    reward_docs_of,
     still_rule,
     upright_rule,
 )
@@ -88,7 +87,7 @@ drawn uniformly in its logarithm; the heaviest at the greatest speed carries 40 
 motion by half a metre a second. The ball is seen while it flies, its mass is not. It pushes by contact like anything
 else, and may come to lie before the feet; one that has flown past is caught and waits. `info["strongest_push"]` is the
 greatest impulse of the episode so far: of all episodes, the share that lasts may be told by it."""
-    reward_docs: ClassVar[Mapping[str, str]] = reward_docs_of(WEIGHTS)
+    reward_docs: ClassVar[Mapping[str, str]] = REWARD_DOCS
     metric_docs: ClassVar[Mapping[str, str]] = {
         **METRIC_DOCS,
         "impulse": "size of the ball's impulse on the body in this step [N s]",

@@ -15,16 +15,15 @@ from piavatar_envs.tasks.upright import (
     FALL_DOC,
     METRIC_DOCS,
     METRICS,
+    REWARD_DOCS,
     REWARD_TERMS,
     STANDING_DOC,
     UPRIGHT_TERMS,
-    WEIGHTS,
     StillConfig,
     UprightConfig,
     record_fall,
     record_observe_upright,
     record_standing_outcome,
-    reward_docs_of,
     still_rule,
     upright_rule,
 )
@@ -57,7 +56,7 @@ class StandTask(Task):
 holds it but what its joints can do: actions are joint targets (`control="pd"`) or torques, and `root_assist` is 0. A
 rest pose that is merely asked for tips over within two seconds: ankles must press with the balls of the feet or with
 the heels, and hips must give way, before the body's weight has left the soles. Where it stands does not matter."""
-    reward_docs: ClassVar[Mapping[str, str]] = reward_docs_of(WEIGHTS)
+    reward_docs: ClassVar[Mapping[str, str]] = REWARD_DOCS
     metric_docs: ClassVar[Mapping[str, str]] = METRIC_DOCS
     success_doc = STANDING_DOC
     termination_doc = FALL_DOC

@@ -37,8 +37,17 @@ UPRIGHT_TERMS = (
     ),
 )
 REWARD_TERMS = ("height", "upright", "still", "pose", "control")
-#: What height, tilt, speed and pose are worth a step.
-WEIGHTS = (0.3, 0.3, 0.2, 0.2)
+REWARD_DOCS: Mapping[str, str] = {
+    "height": "0.3 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that has "
+    "fallen to 0.03 after another `upright.height_margin` of that height",
+    "upright": "0.3 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.03 after "
+    "another `upright.tilt_margin`",
+    "still": "0.2 while the pelvis is no faster than 0.05 m/s; beyond it a Gaussian that has fallen to 0.02 after "
+    "another `still.speed_margin`; all times `height` / 0.3",
+    "pose": "0.2 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian that "
+    "has fallen to 0.02 after another `still.pose_margin`; all times `height` / 0.3",
+    "control": "`-control_cost` times the mean of the squared action components",
+}
 METRICS = ("head_height", "pelvis_height", "tilt_deg", "speed")
 METRIC_DOCS: Mapping[str, str] = {
     "head_height": "height of the head joint over that in the rest pose [-]",
@@ -48,23 +57,6 @@ METRIC_DOCS: Mapping[str, str] = {
 }
 STANDING_DOC = "the head is no lower than `upright.stand_head` of its height in the rest pose"
 FALL_DOC = f"the avatar falls: {FALLEN_DOC}"
-
-
-def reward_docs_of(weights: tuple[float, float, float, float]) -> dict[str, str]:
-    """What is said of :data:`REWARD_TERMS` where they have such weights."""
-    height, tilt, speed, pose = (f"{weight:g}" for weight in weights)
-    low = [f"{0.1 * weight:g}" for weight in weights]
-    return {
-        "height": f"{height} while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian "
-        f"that has fallen to {low[0]} after another `upright.height_margin` of that height",
-        "upright": f"{tilt} while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to {low[1]} "
-        "after another `upright.tilt_margin`",
-        "still": f"{speed} while the pelvis is no faster than 0.05 m/s; beyond it a Gaussian that has fallen to "
-        f"{low[2]} after another `still.speed_margin`; all times `height` / {height}",
-        "pose": f"{pose} while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a "
-        f"Gaussian that has fallen to {low[3]} after another `still.pose_margin`; all times `height` / {height}",
-        "control": "`-control_cost` times the mean of the squared action components",
-    }
 
 
 class UprightConfig(BaseModel):
@@ -100,7 +92,6 @@ class Upright:
 class Still:
     """Constants of standing still."""
 
-    weights: wp.vec4  # of height, tilt, speed and pose
     speed_margin: float  # [m/s]
     pose_margin: float  # [rad]
 
@@ -124,10 +115,9 @@ def upright_rule(config: UprightConfig, control_cost: float) -> Upright:
     return rule
 
 
-def still_rule(config: StillConfig, weights: tuple[float, float, float, float] = WEIGHTS) -> Still:
+def still_rule(config: StillConfig) -> Still:
     """Kernel argument."""
     rule = Still()
-    rule.weights = wp.vec4(*weights)
     rule.speed_margin, rule.pose_margin = config.speed_margin, config.pose_margin
     return rule
 
@@ -146,6 +136,15 @@ def posture_of(
     now.high = tolerance(1.0 - now.head, 0.05, rule.height_margin)
     now.straight = tolerance(now.tilt, 0.1, rule.tilt_margin)
     return now
+
+
+@wp.func
+def mean_angle(local: wp.array2d(dtype=wp.quat), e: int):
+    """Of all joints but the pelvis, from the rest pose [rad]."""
+    total = float(0.0)
+    for b in range(1, local.shape[1]):
+        total += wp.length(quat_log(local[e, b]))
+    return total / float(local.shape[1] - 1)
 
 
 @wp.func
@@ -175,13 +174,11 @@ def judge_standing(
     e = wp.tid()
     now = posture_of(rule, body, e, rotation, position)
     speed = wp.length(velocity[e, 0])
-    angle = float(0.0)
-    for b in range(1, local.shape[1]):
-        angle += wp.length(quat_log(local[e, b])) / float(local.shape[1] - 1)
-    terms[e, 0, 0] = still.weights[0] * now.high
-    terms[e, 0, 1] = still.weights[1] * now.straight
-    terms[e, 0, 2] = still.weights[2] * now.high * tolerance(speed, 0.05, still.speed_margin)
-    terms[e, 0, 3] = still.weights[3] * now.high * tolerance(angle, 0.05, still.pose_margin)
+    angle = mean_angle(local, e)
+    terms[e, 0, 0] = 0.3 * now.high
+    terms[e, 0, 1] = 0.3 * now.straight
+    terms[e, 0, 2] = 0.2 * now.high * tolerance(speed, 0.05, still.speed_margin)
+    terms[e, 0, 3] = 0.2 * now.high * tolerance(angle, 0.05, still.pose_margin)
     terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
     write_posture(now, e, metrics)
     metrics[e, 0, 3] = speed

@@ -6,11 +6,32 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.skeleton import joint_index
+
 GET_UP = "PIAvatar/GetUp-v0"
+HEAD, CHEST, ANKLES = (
+    joint_index("head"),
+    joint_index("spine3"),
+    [joint_index("left_ankle"), joint_index("right_ankle")],
+)
 
 
 def still(env) -> np.ndarray:
     return np.zeros(env.action_space.shape, np.float32)
+
+
+def tolerance(value: float, bound: float, margin: float) -> float:
+    return 10.0 ** -((max(value - bound, 0.0) / margin) ** 2)
+
+
+def worth_of(env, turns: np.ndarray) -> float:
+    """Reward of a step that begins in a pose, by the joints' rotation vectors ``(22, 3)`` [rad], with limp joints."""
+    poses = env.batch.task.poses
+    before = poses.numpy().copy()
+    poses.assign(np.broadcast_to(turns, before.shape).astype(np.float32))
+    env.reset(seed=0)
+    poses.assign(before)
+    return env.step(still(env))[1]
 
 
 def faces(env) -> np.ndarray:
@@ -35,6 +56,58 @@ def test_bodies_lie_on_the_ground_on_either_side(make_env):
         headings.append(np.arctan2(*head[:2]))
         assert np.linalg.norm(head[:2]) == pytest.approx(0.55, abs=0.1)
     assert 0 < sum(ups) < 8 and np.ptp(headings) > 1.0
+
+
+def test_some_begin_on_the_way_up(make_env):
+    """On the ground, higher than who lies there, and told apart by the side from which they come."""
+    env, seen = make_env(GET_UP, halfway=1.0, pose_noise=0.0, observe_parameters=True), {}
+    rest = env.batch.simulation.flesh[0].points
+    for seed in range(24):
+        observation, _ = env.reset(seed=seed)
+        assert env.batch.simulation.state.x.numpy()[0, :, 2].min() == pytest.approx(rest.rest[0, :, 2].min(), abs=1e-5)
+        at = env.batch.simulation.avatar.tracked.position.numpy()[0]
+        side = env.observation_layout.split(observation)["parameters"][-2]
+        assert side in (-1.0, 1.0) and at[HEAD, 2] / rest.joints[0, HEAD, 2] > 0.3
+        seen.setdefault(side, set()).add(round(float(at[0, 2]), 2))
+    assert len(seen[-1.0]) == len(seen[1.0]) == 3 and len(seen[-1.0] & seen[1.0]) == 1
+
+
+def test_the_reward_is_what_the_joints_say(make_env):
+    """From lying, over being lifted, to standing."""
+    env = make_env(GET_UP, root_assist=1.0, control_cost=0.1)
+    rule, rest, joints = env.config.upright, env.config.still, env.batch.simulation.flesh[0].points.joints[0]
+    action, worth = 0.1 * env.action_space.high, []
+    env.reset(seed=1)
+    for _ in range(75):
+        _, reward, _, _, info = env.step(action)
+        tracked = env.batch.simulation.avatar.tracked
+        at, terms = tracked.position.numpy()[0], info["reward_terms"]
+        head, pelvis = np.clip([at[HEAD, 2] / joints[HEAD, 2], at[0, 2] / joints[0, 2]], 0.0, 1.0)
+        feet = np.linalg.norm(at[ANKLES, :2] - at[0, :2], axis=1).mean() / joints[0, 2]
+        turn = Rotation.from_quat(tracked.rotation.numpy()[0, CHEST].astype(float))
+        tilt = np.arccos(np.clip(turn.apply([0.0, 0.0, 1.0])[2], -1.0, 1.0))
+        stands = tolerance(1.0 - head, 0.05, rule.height_margin) * tolerance(tilt, 0.1, rule.tilt_margin)
+        speed = float(np.linalg.norm(tracked.velocity.numpy()[0, 0]))
+        angle = Rotation.from_quat(tracked.local.numpy()[0, 1:].astype(float)).magnitude().mean()
+        assert terms["height"] == pytest.approx(0.5 * np.sqrt(head * pelvis), abs=1e-4)
+        assert terms["feet"] == pytest.approx(0.2 * tolerance(feet, 0.25, env.config.feet_margin), abs=1e-4)
+        assert terms["still"] == pytest.approx(0.15 * stands * tolerance(speed, 0.05, rest.speed_margin), abs=1e-3)
+        assert terms["pose"] == pytest.approx(0.15 * stands * tolerance(angle, 0.05, rest.pose_margin), abs=1e-3)
+        assert terms["control"] == pytest.approx(-0.1 * 0.01, abs=1e-6)
+        worth.append(reward)
+    assert worth[0] < 0.1 and worth[-1] > 0.7
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_every_pose_on_the_way_is_worth_more_than_the_one_before(make_env, side):
+    """And the splits, from where no way leads up, less than a squat, or a knee on the ground."""
+    env = make_env(GET_UP, control="torque", pose_noise=0.0)
+    way = list(env.batch.task.poses.numpy()[side].copy())
+    worth = [worth_of(env, pose) for pose in [*way, np.zeros_like(way[0])]]
+    assert np.diff(worth).min() > 0.02 and worth[0] < 0.1 and worth[-1] > 0.95
+    splits = np.zeros_like(way[0])
+    splits[[joint_index("left_hip"), joint_index("right_hip")]] = [[-1.0, 0.8, 0.0], [-1.0, -0.8, 0.0]]
+    assert worth[0] < worth_of(env, splits) < worth[2] - 0.05
 
 
 @pytest.mark.parametrize(("share", "up"), [(0.0, False), (1.0, True)])

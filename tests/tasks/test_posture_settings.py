@@ -42,12 +42,12 @@ def test_settings_that_would_do_nothing_are_refused(config, name, line):
     [
         ("Stand-v0", {}),
         ("PushRecovery-v0", {"throw_interval": 0.2, "hit_impulse": 0.0}),
-        ("GetUp-v0", {"hold_seconds": 0.01}),
+        ("GetUp-v0", {"hold_seconds": 0.01, "root_assist": 1.0}),
         ("Walk-v0", {"target_speed": 0.01}),
     ],
 )
 def test_every_setting_of_the_posture_acts(make_env, task, settings):
-    """Each changes a reward, a success or a fall of a body that tips over, or that lies."""
+    """Each changes a reward, a success or a fall of a body that tips over, or that is lifted."""
 
     def play(**posture: float) -> list[tuple]:
         env = make_env(f"PIAvatar/{task}", pose_noise=0.3, **settings, **posture)
