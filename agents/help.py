@@ -2,51 +2,80 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-from pydantic import BaseModel, Field
+import torch
+from pydantic import BaseModel, Field, model_validator
+from tensordict import TensorDict
 
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
 from piavatar_envs.envs.config import FROZEN
 
-if TYPE_CHECKING:
-    import torch
-    from tensordict import TensorDict
-
 
 class HelpSettings(BaseModel):
-    """A curriculum of ``root_assist``."""
+    """A curriculum of ``root_assist``: by the clock (``rollouts``), or by what is achieved (``step``)."""
 
     model_config = FROZEN
 
     first: float = Field(gt=0.0, le=1.0, description="greatest help in the first rollout, as root_assist [-]")
-    rollouts: int = Field(ge=1, description="rollouts over which it falls to nothing, in equal steps")
+    rollouts: int | None = Field(
+        None, ge=1, description="rollouts over which it falls to nothing, in equal steps; null to give step"
+    )
+    step: float | None = Field(
+        None,
+        gt=0.0,
+        le=1.0,
+        description="by which the help of an environment falls after an episode that ends in success, and rises, up to "
+        "the first, after any other [-]; null to give rollouts",
+    )
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> HelpSettings:
+        if (self.rollouts is None) == (self.step is None):
+            raise ValueError(f"rollouts={self.rollouts} and step={self.step}: give one of them")
+        return self
 
 
 class HelpedEnv(AvatarRslEnv):
     """Environments whose help for the pelvis wanes while an agent learns.
 
-    At any time environment ``i`` of ``n`` has ``i / (n - 1)`` of the greatest help, so that some have next to none from
-    the start, and what is learned with help is tried without; a single one has all of it. Evaluations have none.
+    At first environment ``i`` of ``n`` has ``i / (n - 1)`` of the greatest help, so that some have next to none from
+    the start, and what is learned with help is tried without; a single one has all of it. By the clock it keeps that
+    share of a greatest help that falls. By what is achieved, every environment comes to where half of its episodes end
+    in success, and to none where more do; the idea of the pulling force of Huang et al., "Learning Humanoid Standing-up
+    Control across Diverse Postures" (2025), which never rises again. Evaluations have none.
 
     Attributes:
         steps: control steps of every environment so far; to be set where a training goes on.
+        help: of every environment, ``(num_envs,)`` float32 on the device; likewise.
     """
 
     def __init__(self, settings: HelpSettings, rollout_steps: int, *args: Any, **kwargs: Any) -> None:
         """Build the environments; all but the first two arguments are those of the base."""
         super().__init__(*args, **kwargs)
         self.settings, self.rollout_steps, self.steps = settings, rollout_steps, 0
-        self._spread = np.linspace(0.0, 1.0, self.num_envs, dtype=np.float32) if self.num_envs > 1 else np.ones(1)
+        n = self.num_envs
+        self._spread = torch.linspace(0.0, 1.0, n, device=self.device) if n > 1 else torch.ones(1, device=self.device)
+        self.help = settings.first * self._spread
 
     def share(self) -> float:
-        """The greatest help in the current rollout."""
+        """The greatest help in the current rollout, by the clock."""
         return self.settings.first * max(0.0, 1.0 - self.steps // self.rollout_steps / self.settings.rollouts)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance by one control step; help changes before the first of a rollout."""
-        if self.steps % self.rollout_steps == 0:
-            self.assist_root(self.share() * self._spread)
+        """Advance by one control step; help changes before the first of a rollout, or of an episode.
+
+        ``extras["log"]`` also holds the mean help.
+        """
+        if self.settings.rollouts is not None and self.steps % self.rollout_steps == 0:
+            self.help = self.share() * self._spread
+        self.episodes.api.write(self.help, [group.simulation.avatar.joints.assist for group in self.episodes.groups])
         self.steps += 1
-        return super().step(actions)
+        stepped = super().step(actions)
+        _, _, ended, extras = stepped
+        extras["log"]["Task/help"] = self.help.mean()
+        if self.settings.step is not None:
+            change = torch.where(extras["info"]["success"], -self.settings.step, self.settings.step)
+            changed = (self.help + change).clamp(0.0, self.settings.first)
+            self.help = torch.where(ended.bool(), changed, self.help)
+        return stepped

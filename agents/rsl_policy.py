@@ -5,11 +5,11 @@ from __future__ import annotations
 import pickle
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field
 from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
@@ -18,7 +18,7 @@ from agents.checkpoint import first_line
 from agents.evaluate import Agent
 from agents.help import HelpSettings
 from agents.workers import components
-from piavatar_envs.envs.config import FROZEN, ConfigError
+from piavatar_envs.envs.config import FROZEN, ConfigError, FrozenDict
 from piavatar_envs.envs.observations import ObservationLayout
 
 
@@ -61,6 +61,9 @@ class RslTraining(BatchTraining):
     env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
     ppo: RslPPOSettings = Field(default_factory=RslPPOSettings, description="the algorithm")
     help: HelpSettings | None = Field(None, description="help for the pelvis that wanes; null for what env says")
+    lessons: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
+        default_factory=dict, description="settings of the environment that differ from env while it learns"
+    )
 
 
 def network_settings(ppo: RslPPOSettings) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from agents.mirror import Mirror
 from agents.rsl_policy import RslTraining, actor_settings, mean_agent, network_settings
 from agents.workers import components
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.envs.config import ConfigError, load_config
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
@@ -145,7 +145,8 @@ class Runner(OnPolicyRunner):
 
     def _state(self) -> dict[str, Any]:
         log = self.logger
-        return {
+        helped = {"help": self.env.help} if isinstance(self.env, HelpedEnv) else {}
+        return helped | {
             "iterations": self.iterations,
             "algorithm": self.alg.save(),
             "envs": self.env.episodes.get_state(),
@@ -169,6 +170,7 @@ class Runner(OnPolicyRunner):
         self.alg.updates = self.iterations
         if isinstance(self.env, HelpedEnv):
             self.env.steps = self.iterations * self.env.rollout_steps
+            self.env.help = saved["help"]
 
 
 def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
@@ -238,16 +240,17 @@ def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
     """The environments to learn in.
 
     Raises:
-        ConfigError: there is no such term to observe, or nothing to be helped.
+        ConfigError: there is no such term to observe, or nothing to be helped, or a lesson is no setting.
     """
-    if config.help is not None and task.config.drive.control == "pose":
+    settings = load_config(type(task.config), task.config, dict(config.lessons))
+    if config.help is not None and settings.drive.control == "pose":
         raise ConfigError('help is for bodies under torques, and env.drive.control="pose"; use "pd" or "torque"')
-    if config.help is not None and task.config.drive.root_assist > 0.0:
+    if config.help is not None and settings.drive.root_assist > 0.0:
         raise ConfigError(
-            f"help wanes to nothing, and env.drive.root_assist={task.config.drive.root_assist} stays; give one of them"
+            f"help wanes to nothing, and env.drive.root_assist={settings.drive.root_assist} stays; give one of them"
         )
     groups = None if config.observe is None else {"policy": config.observe}
-    about = (config.env_id, config.num_envs, device, task.config, groups, config.first_seed)
+    about = (config.env_id, config.num_envs, device, settings, groups, config.first_seed)
     if config.help is None:
         return AvatarRslEnv(*about)
     return HelpedEnv(config.help, config.ppo.rollout_steps, *about)

@@ -10,7 +10,11 @@ for needed in ("rsl_rl", "tensordict", "git"):
     pytest.importorskip(needed, reason="needs the extra rsl")
 
 from agents import rsl_ppo  # noqa: E402
+from agents.batches import load_batched  # noqa: E402
 from agents.help import HelpedEnv, HelpSettings  # noqa: E402
+from agents.rsl_policy import RslTraining  # noqa: E402
+from piavatar_envs.envs.config import load_config, parse_assignments  # noqa: E402
+from piavatar_envs.tasks import load_task  # noqa: E402
 
 FEW = (
     "configs/rsl_rl/stand_rsl.yaml", "env.fidelity=tiny", "num_envs=3", "ppo.rollout_steps=4", "ppo.minibatches=1",
@@ -35,8 +39,30 @@ def test_it_falls_in_equal_steps_and_some_have_none(device):
     alone.close()
 
 
-def test_a_resumed_training_has_the_help_that_it_would_have_had(device, tmp_path, capsys):
-    command = [*FEW, "help={first: 0.5, rollouts: 3}", "--device", device, "--out"]
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [
+        ("Stand-v0", [[0.0, 0.4, 0.8], [0.0, 0.1, 0.5], [0.0, 0.0, 0.2]]),
+        ("GetUp-v0", [[0.0, 0.4, 0.8], [0.3, 0.7, 0.8], [0.6, 0.8, 0.8]]),
+    ],
+)
+def test_it_falls_after_success_and_rises_after_failure(device, task, expected):
+    """In a tenth of a second nobody falls, and nobody gets up."""
+    settings = HelpSettings(first=0.8, step=0.3)
+    env = HelpedEnv(settings, 4, task, 3, device, {"fidelity": "tiny", "episode_seconds": 0.1})
+    still = torch.zeros(3, env.num_actions, device=env.device)
+    for shares in np.repeat(expected, 3, axis=0):
+        _, _, _, extras = env.step(still)
+        groups = env.episodes.groups
+        had = np.concatenate([group.simulation.avatars[0].joints.assist.numpy() for group in groups])
+        np.testing.assert_allclose(had, shares, atol=1e-6)
+        assert float(extras["log"]["Task/help"]) == pytest.approx(shares.mean(), abs=1e-6)
+    env.close()
+
+
+@pytest.mark.parametrize("how", ["rollouts: 3", "step: 0.2"])
+def test_a_resumed_training_has_the_help_that_it_would_have_had(device, tmp_path, capsys, how):
+    command = [*FEW, f"help={{first: 0.5, {how}}}", "--device", device, "--out"]
     rsl_ppo.main([*command[:-3], "iterations=4", *command[-3:], str(tmp_path / "whole")])
     parts = str(tmp_path / "parts")
     rsl_ppo.main([*command[:-3], "iterations=2", *command[-3:], parts])
@@ -56,5 +82,20 @@ def test_what_cannot_be_helped_is_refused(device, tmp_path, capsys):
     both = ("env.drive.root_assist=0.1", "help={first: 0.5, rollouts: 3}", "iterations=1")
     with pytest.raises(SystemExit, match=r"root_assist=0.1 stays; give one of them"):
         rsl_ppo.main([*FEW, *both, "--device", device, "--out", str(tmp_path)])
+    neither = ("help={first: 0.5}", "iterations=1")
+    with pytest.raises(SystemExit, match=r"rollouts=None and step=None: give one of them"):
+        rsl_ppo.main([*FEW, *neither, "--device", device, "--out", str(tmp_path)])
     with pytest.raises(SystemExit, match=r"error: .*'tail' is not a joint"):
         rsl_ppo.main([*FEW, "env.joints=[tail]", "--device", device, "--out", str(tmp_path)])
+
+
+def test_lessons_are_for_learning_only(device, tmp_path, capsys):
+    lessons = "lessons={pose_noise: 0.3, drive.root_assist: 0.1}"
+    config = load_batched(RslTraining, load_task, FEW[0], parse_assignments([*FEW[1:], lessons]))
+    task = load_task(config.env_id)
+    env = rsl_ppo.make_env(config, task(load_config(task.Config, config.env)), device)
+    assert env.config.pose_noise == 0.3 and env.config.drive.root_assist == 0.1
+    assert config.env["pose_noise"] == 0.05 and config.env["drive"]["root_assist"] == 0.0
+    env.close()
+    with pytest.raises(SystemExit, match=r"tail is no setting of StandConfig"):
+        rsl_ppo.main([*FEW, "lessons={tail: 1}", "iterations=1", "--device", device, "--out", str(tmp_path)])

@@ -24,7 +24,7 @@ from tests.agents.killing import flat, run_killed  # noqa: E402
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "rsl_rl").glob("*.yaml"))
 TINY = (
     "env.fidelity=tiny", "env.episode_seconds=0.3", "num_envs=2", "iterations=3", "ppo.rollout_steps=8",
-    "ppo.minibatches=2", "ppo.epochs=2", "evaluation.episodes=2",
+    "ppo.minibatches=2", "ppo.epochs=2", "evaluation.episodes=2", 'lessons={"episode_seconds": 0.3}',
 )  # fmt: skip
 
 
