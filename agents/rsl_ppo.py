@@ -170,7 +170,7 @@ class Runner(OnPolicyRunner):
         self.alg.updates = self.iterations
         if isinstance(self.env, HelpedEnv):
             self.env.steps = self.iterations * self.env.rollout_steps
-            self.env.help = saved["help"]
+            self.env.help = saved["help"].to(self.env.device)
 
 
 def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
