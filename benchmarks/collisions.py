@@ -17,6 +17,7 @@ from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.fields import Fields
+from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
@@ -72,11 +73,11 @@ def body(resolution: str, shift: Sequence[float] = (0.0, 0.0, 0.0), yaw: float =
 
 
 @wp.kernel
-def damp(keep: float, u: wp.array2d(dtype=wp.vec3), C: wp.array2d(dtype=wp.mat33)):
+def damp(keep: float, u: wp.array2d(dtype=wp.vec3), C: wp.array3d(dtype=float)):
     """Take a share of all physical motion away."""
     e, p = wp.tid()
     u[e, p] = keep * u[e, p]
-    C[e, p] = keep * C[e, p]
+    store_matrix(C, e, p, keep * matrix_at(C, e, p))
 
 
 @dataclass

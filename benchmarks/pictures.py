@@ -14,6 +14,7 @@ from benchmarks.poses import random_poses, random_shapes
 from benchmarks.rig import Rig, World
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.settings import DriveSettings
+from piavatar_envs.mpm.matrices import matrices_of
 
 COLORS = {"split": "#1b7f79", "paper": "#d1495b", "none": "#8d6a9f"}
 TITLES = {"split": "split (ours)", "paper": "F (F^k)^-1 (paper)", "none": "no decoupling"}
@@ -112,7 +113,7 @@ def draw_strain(path: Path, world: World) -> None:
             tracked = rig.avatar.tracked
             turned = Rotation.from_quat(tracked.rotation.numpy()[0]).as_matrix()
             vertices = skin.deform(turned, tracked.position.numpy()[0], rig.state.x.numpy()[0])
-            strain = skin.interpolate(strain_magnitude(rig.state.F.numpy()[0]))
+            strain = skin.interpolate(strain_magnitude(matrices_of(rig.state.F)[0]))
             frame = renderer.render([Body(vertices, rig.asset.faces, scalars=strain)])
             mean = 1e3 * float(rig.distances().mean())
             panels.append(label(frame, f"{title}: {mean:.3g} mm off"))

@@ -19,6 +19,7 @@ from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematic
 from piavatar_envs.envs.simulation import GRID_PER_HEIGHT
 from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
+from piavatar_envs.mpm.matrices import matrices_of
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.tasks.disturb import apply_impulse
@@ -212,7 +213,7 @@ class Rig:
 
         ``|F - R|`` rather than ``|F - I|``: a free body that is struck turns, and a turn is no strain.
         """
-        F = self.state.F.numpy().astype(float)
+        F = matrices_of(self.state.F).astype(float)
         squared = np.linalg.eigvalsh(np.swapaxes(F, 2, 3) @ F)
         return np.linalg.norm(np.sqrt(np.maximum(squared, 0.0)) - 1.0, axis=2).mean(1)
 

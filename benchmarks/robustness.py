@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 
 from benchmarks import runner
+from piavatar_envs.mpm.matrices import matrices_of
 from piavatar_envs.tasks import task_modules
 
 
@@ -57,7 +58,7 @@ def run_seed(env: gymnasium.Env, seed: int, steps: int) -> dict:
         nonfinite += int(not np.isfinite(list(numbers({"reward": reward, "info": info}))).all())
         if info["failure"]:
             failures[info["failure"]] += 1
-        stretch = np.linalg.norm(state.F.numpy()[0] - np.eye(3, dtype=np.float32), axis=(1, 2))
+        stretch = np.linalg.norm(matrices_of(state.F)[0] - np.eye(3, dtype=np.float32), axis=(1, 2))
         strain = max(strain, float(stretch.max()))
         speed = max(speed, float(np.linalg.norm(state.u.numpy()[0], axis=1).max()))
         if terminated or truncated:

@@ -9,6 +9,7 @@ import numpy as np
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import RenderConfig
 from piavatar_envs.envs.flesh import Flesh
+from piavatar_envs.mpm.matrices import matrices_of
 
 
 class Picture:
@@ -48,7 +49,8 @@ class Picture:
         """The scene of environment ``env``, ``(height, width, 3)`` uint8."""
         from piavatar_envs.render import Sphere
 
-        x, F = (array.numpy()[env] for array in (self.batch.simulation.state.x, self.batch.simulation.state.F))
+        state = self.batch.simulation.state
+        x, F = state.x.numpy()[env], matrices_of(state.F)[env]
         bodies = self._avatars(env, x, F) + self._props(env, x)
         markers = self.batch.task.markers(self.batch, env)
         markers = [Sphere(*marker) if isinstance(marker, tuple) else marker for marker in markers]

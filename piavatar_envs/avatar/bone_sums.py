@@ -9,7 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.lanes import store_sum12, store_sum16, sum_threads12
-from piavatar_envs.avatar.loads import components_at, float_at, int_at, number_at, vector_at
+from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
 from piavatar_envs.avatar.types import Body, Drive, vec12, vec16
 from piavatar_envs.mpm.types import Particles, row
 
@@ -120,8 +120,8 @@ def sum_corrections(
     particles: Particles,
     x: wp.array2d(dtype=wp.vec3),
     center: wp.array2d(dtype=wp.vec3),
-    pull: wp.array3d(dtype=float),
-    lean: wp.array3d(dtype=float),
+    pull: wp.array2d(dtype=wp.vec3),
+    lean: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     threads: int,
     # out
@@ -146,10 +146,10 @@ def sum_corrections(
         n += threads
         following, weight = entry_of(body, n, last)
         d = vector_at(x, e, body.first + p) - origin
-        a = w * components_at(pull, e, p)
+        a = w * vector_at(pull, e, p)
         p1 += a
         l1 += wp.cross(d, a)
-        a = w * components_at(lean, e, p)
+        a = w * vector_at(lean, e, p)
         p2 += a
         l2 += wp.cross(d, a)
     total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])

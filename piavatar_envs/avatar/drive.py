@@ -85,8 +85,8 @@ class AvatarDrive:
             "bone_corrections": (bones, vec12),
             "bone_change": (bones, vec8),
             "removed_turn": (n, wp.mat33),
-            "pull": ((n, 3, self.num_points), float),
-            "lean": ((n, 3, self.num_points), float),
+            "pull": ((n, self.num_points), wp.vec3),
+            "lean": ((n, self.num_points), wp.vec3),
         }
         per_env = ("body_", "wrench_", "removed_")
         arrays = {}

@@ -24,7 +24,7 @@ from piavatar_envs.avatar.blending import (
     motion_at,
 )
 from piavatar_envs.avatar.lanes import sum_threads12, sum_threads16
-from piavatar_envs.avatar.loads import components_at, number_at, store_components, vector_at
+from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
 from piavatar_envs.avatar.rotation import finite_turn
@@ -58,8 +58,8 @@ def drive_particles(
     motion: wp.array2d(dtype=wp.vec3),
     # out
     driven: Kinematic,
-    pull: wp.array3d(dtype=float),
-    lean: wp.array3d(dtype=float),
+    pull: wp.array2d(dtype=wp.vec3),
+    lean: wp.array2d(dtype=wp.vec3),
 ):
     """Kinematic velocity of a particle, its pulls [m/s] and its way to the commanded pose [m].
 
@@ -89,9 +89,8 @@ def drive_particles(
         motion[e, p] = k
     store_vector(driven.vk, e, body.first + p, k, True)
     store_vector(driven.spin, e, body.first + p, -0.5 * axial(turn), True)
-    store_components(pull, e, p, pulled + pull_gain(drive.tone_rate, drive.dt) * way)
-    if drive.tone_rate > 0.0:
-        store_components(lean, e, p, way)
+    store_vector(pull, e, p, pulled + pull_gain(drive.tone_rate, drive.dt) * way, True)
+    store_vector(lean, e, p, way, drive.tone_rate > 0.0)
 
 
 @wp.func
@@ -226,7 +225,7 @@ def apply_corrections(
     body: Body,
     drive: Drive,
     x: wp.array2d(dtype=wp.vec3),
-    pull: wp.array3d(dtype=float),
+    pull: wp.array2d(dtype=wp.vec3),
     bones: RigidFits,
     change: wp.array2d(dtype=vec8),
     removed: RemovedMotion,
@@ -242,7 +241,7 @@ def apply_corrections(
         return
     at = vector_at(x, e, body.first + p)
     field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - bones.center[e, 0])
-    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + components_at(pull, e, p) + field, True)
+    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, e, p) + field, True)
     if drive.free_motion != 0 or let_go[e] != 0:
         free = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]
         free += removed.turn[e] * (at - removed.center[e] + drive.dt * free)

@@ -1,4 +1,4 @@
-"""Reads and writes of arrays whose rows are dense, as all of this package's are: an address is one multiplication.
+"""Reads of arrays whose rows are dense, as all of this package's are: their address is one multiplication.
 
 An array of Warp may have any strides and be indexed from its end, which costs ten instructions an address on a GPU:
 half of what a sum over scattered particles would do.
@@ -34,23 +34,4 @@ def number_at(rows: wp.array2d(dtype=float), e: int, p: int) -> float:
 @wp.func_native(f"return {_ROW % 'wp::vec3'};")
 def vector_at(rows: wp.array2d(dtype=wp.vec3), e: int, p: int) -> wp.vec3:
     """``rows[e, p]``."""
-    ...
-
-
-_COMPONENT = """
-char* const row = reinterpret_cast<char*>(rows.data) + wp::int64(rows.strides[0]) * e;
-auto* const at = reinterpret_cast<wp::float32*>(row) + p;
-const int n = rows.shape[2];
-"""
-
-
-@wp.func_native(_COMPONENT + "return wp::vec3(at[0], at[n], at[2 * n]);")
-def components_at(rows: wp.array3d(dtype=float), e: int, p: int) -> wp.vec3:
-    """The vector ``rows[e, :, p]``: neighbouring threads read neighbouring words."""
-    ...
-
-
-@wp.func_native(_COMPONENT + "at[0] = value[0], at[n] = value[1], at[2 * n] = value[2];")
-def store_components(rows: wp.array3d(dtype=float), e: int, p: int, value: wp.vec3):
-    """``rows[e, :, p] = value``."""
     ...

@@ -6,6 +6,7 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import blend_places
 from piavatar_envs.avatar.types import Body
+from piavatar_envs.mpm.matrices import store_matrix
 from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False})
@@ -43,8 +44,8 @@ def place_particles(
     # out
     x: wp.array2d(dtype=wp.vec3),
     u: wp.array2d(dtype=wp.vec3),
-    C: wp.array2d(dtype=wp.mat33),
-    F: wp.array2d(dtype=wp.mat33),
+    C: wp.array3d(dtype=float),
+    F: wp.array3d(dtype=float),
     driven: Kinematic,
     motion: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
@@ -59,8 +60,8 @@ def place_particles(
     driven.vk[e, q] = wp.vec3(0.0)
     driven.spin[e, q] = wp.vec3(0.0)
     motion[e, p] = wp.vec3(0.0)
-    C[e, q] = wp.mat33()
-    F[e, q] = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    store_matrix(C, e, q, wp.mat33())
+    store_matrix(F, e, q, wp.identity(n=3, dtype=float))
     failure[e] = 0
 
 

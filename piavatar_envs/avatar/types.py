@@ -207,9 +207,8 @@ class DriveScratch:
     bone_from: wp.array  # (num_envs, bones) mat44: G T_s, rest world to world
     bone_step: wp.array  # (num_envs, bones) mat44: (G T_{s+1} - G T_s) / dt
     bone_record: wp.array  # (num_envs, bones) vec44: all that particles blend of a bone
-    # of every particle, an array a component: threads that work together then read what lies together
-    pull: wp.array  # (num_envs, 3, count) velocity change by shape preservation and tone [m/s]
-    lean: wp.array  # (num_envs, 3, count) displacement from the carried to the commanded pose [m]
+    pull: wp.array  # (num_envs, count) velocity change by shape preservation and tone [m/s]
+    lean: wp.array  # (num_envs, count) displacement from the carried to the commanded pose [m]
     corrections: wp.array  # (num_envs, chunks) vec12
     bone_corrections: wp.array  # (num_envs, bones) vec12: their sums
     bone_change: wp.array  # (num_envs, bones) vec8: correction field

@@ -12,6 +12,7 @@ import warp as wp
 from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_ACTUATED, NUM_JOINTS
 from piavatar_envs.avatar.types import Body, Tracked
 from piavatar_envs.mpm.materials import kirchhoff_stress, von_mises_stress
+from piavatar_envs.mpm.matrices import matrix_at
 from piavatar_envs.mpm.types import Particles, Sensors, row
 
 wp.set_module_options({"enable_backward": False})
@@ -171,7 +172,7 @@ def clear_stress(agent: int, start: int, observation: wp.array3d(dtype=float)):
 def observe_stress(
     body: Body,
     particles: Particles,
-    F: wp.array2d(dtype=wp.mat33),
+    F: wp.array3d(dtype=float),
     part: wp.array(dtype=int),
     agent: int,
     start: int,
@@ -182,7 +183,7 @@ def observe_stress(
     """Peak von Mises stress of each body part, in units of Young's modulus. A maximum does not depend on its order."""
     e, p = wp.tid()
     q = body.first + p
-    G = F[e, q]
+    G = matrix_at(F, e, q)
     tau = kirchhoff_stress(
         particles.material[row(e, particles.material.shape[0]), q],
         G,

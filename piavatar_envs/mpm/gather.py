@@ -7,6 +7,7 @@ import warp as wp
 from piavatar_envs.mpm.blocks import line_of_records, mark_blocks, slab_records
 from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.decouple import advance_deformation
+from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline, stencil_inside
 from piavatar_envs.mpm.sums import first_of_records, read_half_from
 from piavatar_envs.mpm.types import (
@@ -126,7 +127,7 @@ def finish_gather(
             own = seen + remove_approach(boundaries, e, x, own - seen, CONTACT_GATE * grid.dx)
         advection += own
     decoupling = wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
-    s.F = advance_deformation(moved.F[e, p], s.C, grad_vk, moved.spin[e, p], step.dt, decoupling)
+    s.F = advance_deformation(matrix_at(moved.F, e, p), s.C, grad_vk, moved.spin[e, p], step.dt, decoupling)
     s.x = x + step.dt * advection
     s.fault = fault_of(grid, step, s.F, advection, s.x)
     if s.fault != 0:
@@ -258,5 +259,5 @@ def grid_to_particles(
     if s.fault == 0:
         moved.x[e, p] = s.x
         moved.u[e, p] = s.u
-        moved.C[e, p] = s.C
-        moved.F[e, p] = s.F
+        store_matrix(moved.C, e, p, s.C)
+        store_matrix(moved.F, e, p, s.F)

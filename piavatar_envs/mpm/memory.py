@@ -7,6 +7,7 @@ import math
 import numpy as np
 import warp as wp
 
+from piavatar_envs.mpm.matrices import components_of
 from piavatar_envs.mpm.shared_room import plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.sums import units
@@ -114,12 +115,12 @@ def check_memory(
 def allocate(model: Model) -> tuple[State, Scratch]:
     """Zeroed state (identity deformation) and scratch."""
     particles = (model.num_envs, model.num_particles)
-    identity = np.broadcast_to(np.eye(3, dtype=np.float32), (*particles, 3, 3))
+    unstrained = components_of(np.broadcast_to(np.eye(3, dtype=np.float32), (*particles, 3, 3)))
     state = State(
         x=_zeros(model, particles, wp.vec3),
         u=_zeros(model, particles, wp.vec3),
-        C=_zeros(model, particles, wp.mat33),
-        F=wp.array(np.ascontiguousarray(identity), dtype=wp.mat33, device=model.device),
+        C=_zeros(model, unstrained.shape, float),
+        F=wp.array(unstrained, dtype=float, device=model.device),
         vk=_zeros(model, particles, wp.vec3),
         spin=_zeros(model, particles, wp.vec3),
         failure=_zeros(model, model.num_envs, int),

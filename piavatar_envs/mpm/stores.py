@@ -1,7 +1,7 @@
-"""Stores of a warp: vectors and matrices that lie one after the other in memory, written in whole lines.
+"""Stores of a warp: vectors that lie one after the other in memory, written in whole lines.
 
-A thread that stores a matrix of 36 bytes writes nine words, and with each of them a warp touches 32 lines of memory: of
-what then goes out, an eighth is news. Here a warp's values meet in shared memory and go out as they lie in memory.
+A thread that stores a vector writes three words, and each of them goes out with all lines that the warp's vectors are
+in. Here a warp's values meet in shared memory and go out as they lie in memory.
 Where the threads' places do not follow each other, or not all threads have come, each stores its own.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.gather import Gathered
+from piavatar_envs.mpm.matrices import store_matrix
 from piavatar_envs.mpm.types import Moving
 
 wp.set_module_options({"enable_backward": False})
@@ -17,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 _STORE = """
 #if defined(__CUDA_ARCH__)
 constexpr unsigned ALL = 0xffffffffu;
-constexpr int STAGE = 144;  // words of a warp: 16 matrices
+constexpr int STAGE = 96;  // words of a warp: 32 vectors
 __shared__ float stages[WP_TILE_BLOCK_DIM / 32 * STAGE];  // as many threads as the module is compiled for
 const int lane = threadIdx.x & 31;
 float* const stage = stages + (threadIdx.x >> 5) * STAGE;
@@ -34,22 +35,16 @@ auto put = [&](auto& into, const auto& value) {
         if (store) wp::index(into, e, p) = value;
         return;
     }
-    constexpr int WORDS = sizeof(value) / 4, AT_ONCE = WORDS > 4 ? 16 : 32, TURNS = (WORDS * AT_ONCE + 31) / 32;
     float* const first = reinterpret_cast<float*>(&wp::index(into, e, p - lane));
 #pragma unroll
-    for (int begin = 0; begin < 32; begin += AT_ONCE) {
-        if (lane >= begin && lane < begin + AT_ONCE)
-            for (int c = 0; c < WORDS; ++c)
-                stage[WORDS * (lane - begin) + c] = reinterpret_cast<const float*>(&value)[c];
-        __syncwarp();
+    for (int c = 0; c < 3; ++c) stage[3 * lane + c] = value[c];
+    __syncwarp();
 #pragma unroll
-        for (int c = 0; c < TURNS; ++c) {
-            const int word = 32 * c + lane;
-            if (word < WORDS * AT_ONCE && (storing == ALL || (storing >> (begin + word / WORDS) & 1u)))
-                first[WORDS * begin + word] = stage[word];
-        }
-        __syncwarp();
+    for (int c = 0; c < 3; ++c) {
+        const int word = 32 * c + lane;
+        if (storing == ALL || (storing >> word / 3 & 1u)) first[word] = stage[word];
     }
+    __syncwarp();
 };
 %s
 #else
@@ -67,7 +62,16 @@ def store_vector(into: wp.array2d(dtype=wp.vec3), e: int, p: int, value: wp.vec3
     ...
 
 
-@wp.func_native(_STORE % (("put(moved.x, s.x); put(moved.u, s.u); put(moved.C, s.C); put(moved.F, s.F);",) * 2))
-def store_particle(moved: Moving, e: int, p: int, s: Gathered, store: bool):
-    """:func:`store_vector` of all that a particle ``p`` has become."""
+@wp.func_native(_STORE % (("put(moved.x, s.x); put(moved.u, s.u);",) * 2))
+def store_vectors(moved: Moving, e: int, p: int, s: Gathered, store: bool):
+    """:func:`store_vector` of where particle ``p`` has come to, and of its velocity."""
     ...
+
+
+@wp.func
+def store_particle(moved: Moving, e: int, p: int, s: Gathered, store: bool):
+    """All that a particle ``p`` has become, if ``store``; at best all threads of a warp come here."""
+    store_vectors(moved, e, p, s, store)
+    if store:
+        store_matrix(moved.C, e, p, s.C)
+        store_matrix(moved.F, e, p, s.F)

@@ -11,6 +11,7 @@ import warp as wp
 from piavatar_envs.mpm.blocks import fields_around, line_of_records, record_of, slab_records
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.materials import kirchhoff_stress
+from piavatar_envs.mpm.matrices import matrix_at
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
@@ -59,11 +60,11 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
     s.base = base_node(xg)
     s.f = xg - wp.vec3(float(s.base[0]), float(s.base[1]), float(s.base[2]))
     m = particles.mass[row(e, particles.mass.shape[0]), p]
-    affine = m * moving.C[e, p]
+    affine = m * matrix_at(moving.C, e, p)
     if step.decoupling != NO_STRESS:
         tau = kirchhoff_stress(
             particles.material[row(e, particles.material.shape[0]), p],
-            moving.F[e, p],
+            matrix_at(moving.F, e, p),
             particles.mu[row(e, particles.mu.shape[0]), p],
             particles.lam[row(e, particles.lam.shape[0]), p],
         )

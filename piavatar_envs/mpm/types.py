@@ -16,6 +16,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 import warp as wp
 
+from piavatar_envs.mpm.matrices import matrices_of
+
 wp.set_module_options({"enable_backward": False})
 
 #: A grid node's record: mass [kg], physical momentum (3), kinematic momentum (3), padding. Eight floats are one
@@ -184,12 +186,12 @@ class Room:
 
 @wp.struct
 class Moving:
-    """Particle state as the transfers take it, each of shape ``(num_envs, num_particles)``; see :class:`State`."""
+    """Particle state as the transfers take it, vectors ``(num_envs, num_particles)``; see :class:`State`."""
 
     x: wp.array2d(dtype=wp.vec3)
     u: wp.array2d(dtype=wp.vec3)
-    C: wp.array2d(dtype=wp.mat33)
-    F: wp.array2d(dtype=wp.mat33)
+    C: wp.array3d(dtype=float)
+    F: wp.array3d(dtype=float)
     vk: wp.array2d(dtype=wp.vec3)
     spin: wp.array2d(dtype=wp.vec3)
 
@@ -249,12 +251,15 @@ class Model:
 
 @dataclass
 class State:
-    """What evolves: a checkpoint holds exactly this. Shapes ``(num_envs, num_particles)`` and ``(num_envs,)``."""
+    """What evolves: a checkpoint holds exactly this. Shapes ``(num_envs, num_particles)`` and ``(num_envs,)``.
 
-    x: wp.array
-    u: wp.array
-    C: wp.array
-    F: wp.array
+    Matrices are arrays of their components, ``(num_envs, 9, num_particles)``; see :mod:`piavatar_envs.mpm.matrices`.
+    """
+
+    x: wp.array  # position [m]
+    u: wp.array  # physical velocity [m/s]
+    C: wp.array  # its affine part, APIC's [1/s]
+    F: wp.array  # deformation gradient
     vk: wp.array  # kinematic velocity of the last substep: part of the total velocity u + vk
     spin: wp.array  # kinematic spin in the last substep, by which the deformation turns [rad/s]
     failure: wp.array  # bits FAILURE_*; a failed environment is frozen until it is reset
@@ -265,8 +270,9 @@ class State:
         return group(Kinematic, vk=self.vk, spin=self.spin)
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """A copy of every array on the host."""
-        return {field.name: getattr(self, field.name).numpy().copy() for field in fields(self)}
+        """A copy of every array on the host, matrices as such: ``(num_envs, num_particles, 3, 3)``."""
+        arrays = {field.name: getattr(self, field.name).numpy().copy() for field in fields(self)}
+        return arrays | {name: matrices_of(arrays[name]) for name in ("C", "F")}
 
 
 @dataclass

@@ -9,6 +9,7 @@ import warp as wp
 
 from piavatar_envs.avatar.kabsch import kabsch_rotation
 from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of
+from piavatar_envs.mpm.matrices import store_matrix
 from piavatar_envs.mpm.types import Particles, row
 
 wp.set_module_options({"enable_backward": False})
@@ -72,8 +73,8 @@ def place_prop(
     # out
     x: wp.array2d(dtype=wp.vec3),
     u: wp.array2d(dtype=wp.vec3),
-    C: wp.array2d(dtype=wp.mat33),
-    F: wp.array2d(dtype=wp.mat33),
+    C: wp.array3d(dtype=float),
+    F: wp.array3d(dtype=float),
     vk: wp.array2d(dtype=wp.vec3),
 ):
     """Particles of prop ``index`` in the masked environments into rigid motion, unstrained; over ``(E, count)``.
@@ -87,8 +88,8 @@ def place_prop(
     q = prop.first + p
     x[e, q] = position[e, index] + arm
     u[e, q] = velocity[e, index] + wp.cross(spin[e, index], arm)
-    C[e, q] = wp.skew(spin[e, index])
-    F[e, q] = wp.identity(n=3, dtype=float)
+    store_matrix(C, e, q, wp.skew(spin[e, index]))
+    store_matrix(F, e, q, wp.identity(n=3, dtype=float))
     vk[e, q] = wp.vec3(0.0)
 
 

@@ -125,7 +125,7 @@ class Rig:
 
     def read(self, name: str, env: int = 0) -> np.ndarray:
         """One array of the state, double precision."""
-        return getattr(self.state, name).numpy()[env].astype(float)
+        return self.state.numpy()[name][env].astype(float)
 
     def skinned(self, rotations, root, env: int = 0) -> np.ndarray:
         """Particles of a pose by NumPy's forward kinematics and skinning."""
@@ -200,7 +200,8 @@ class Rig:
         x = self.read("x")
         center = self.mass @ x / self.mass.sum()
         self.state.u.assign((np.asarray(velocity) + np.cross(spin, x - center)).astype(np.float32)[None])
-        self.state.C.assign(np.broadcast_to(np.cross(np.eye(3), -spin).T, (1, len(x), 3, 3)).astype(np.float32).copy())
+        C = np.cross(np.eye(3), -spin).T.reshape(9, 1)
+        self.state.C.assign(np.broadcast_to(C, self.state.C.shape).astype(np.float32).copy())
 
     def strike(self, momentum, at=CHEST, radius: float = 0.16, internal: bool = False) -> None:
         """Hit the skin near ``at`` with a momentum [N s], spread over the particles of the torso that a ball covers.

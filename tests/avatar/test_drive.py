@@ -120,7 +120,7 @@ def test_strain_turns_with_the_bones(make_rig, wild_pose, settings):
     """``Q F Q^T`` of flesh that one bone moves; unstrained flesh would not tell by what it is turned."""
     rig = make_rig(root="free", tone=0.0, alpha=0.0, decoupling="no_stress", num_substeps=60, **settings)
     stretch = np.diag([1.2, 0.9, 1.0])
-    rig.state.F.assign(np.broadcast_to(stretch, (1, rig.points.num_points, 3, 3)).astype(np.float32).copy())
+    rig.state.F.assign(np.broadcast_to(stretch.reshape(9, 1), rig.state.F.shape).astype(np.float32).copy())
     rig.command(wild_pose(np.random.default_rng(6), 0.4))
     rig.step()
     single = rig.weights.max(1) > 1.0 - 1e-6

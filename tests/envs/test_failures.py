@@ -46,7 +46,8 @@ def test_faults_end_the_episode_and_are_named(make_env, env_id, equal, fault):
     env.reset(seed=2)
     steps(env, 3)
     state = env.get_state()
-    state[name][0, PARTICLE] = value
+    where = (0, slice(None), PARTICLE) if name in ("particles.C", "particles.F") else (0, PARTICLE)
+    state[name][where] = value
     env.set_state(state)
     observation, reward, terminated, truncated, info = steps(env, 1)[0]
     assert terminated is True and truncated is False and info["failure"] == failure

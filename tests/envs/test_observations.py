@@ -16,6 +16,7 @@ from piavatar_envs.envs.observations import (
     ObservationTerm,
 )
 from piavatar_envs.envs.others import prop_terms
+from piavatar_envs.mpm.matrices import matrices_of
 
 
 def kabsch(x: np.ndarray, x0: np.ndarray) -> np.ndarray:
@@ -63,7 +64,7 @@ def observed(batch, env: int = 0) -> dict[str, np.ndarray]:
     bones, physics = bones_of(batch, env), batch.config.physics
     to_root = bones.rotation[0].T
     local = [bones.rotation[PARENTS[b]].T @ bones.rotation[b] for b in range(1, NUM_JOINTS)]
-    F = batch.simulation.state.F.numpy()[env, : batch.simulation.avatar.num_points].astype(float)
+    F = matrices_of(batch.simulation.state.F)[env, : batch.simulation.avatar.num_points].astype(float)
     stress = von_mises(F, physics.young_modulus, physics.poisson_ratio)
     owner = [JOINT_NAMES[j] for j in batch.simulation.flesh[0].points.skin_joints[:, 0]]
     return {
@@ -87,7 +88,7 @@ def test_values_are_those_of_the_particles(make_batch, env_id, settings):
     batch.reset(seeds=[5, 9])
     rng = np.random.default_rng(0)
     # commanded motion hardly strains the flesh: this does
-    strain = batch.simulation.state.F.numpy() + rng.normal(0.0, 0.05, (*batch.simulation.state.F.shape, 3, 3))
+    strain = batch.simulation.state.F.numpy() + rng.normal(0.0, 0.05, batch.simulation.state.F.shape)
     batch.simulation.state.F.assign(strain.astype(np.float32))
     batch.observe_program.run()
     for step in range(9):
@@ -110,7 +111,7 @@ def test_stress_is_that_of_the_configured_material(make_batch):
     batch.reset(seeds=[0])
     stretch = np.diag([1.1, 1.0, 0.95])
     F = batch.simulation.state.F
-    F.assign(np.broadcast_to(stretch, (*F.shape, 3, 3)).astype(np.float32))
+    F.assign(np.broadcast_to(stretch.reshape(9, 1), F.shape).astype(np.float32))
     batch.observe_program.run()
     mu, J = 2.0e4 / 2.8, np.linalg.det(stretch)
     sigma = 2.0 * mu * (stretch - np.eye(3)) @ stretch / J  # the volumetric part has no deviator

@@ -192,7 +192,7 @@ def test_ranges_that_are_none_are_refused(bounds, told):
 def compressed(batch) -> np.ndarray:
     """Physical velocity of every particle after one short step from the same compressed, resting body."""
     state = batch.get_state()
-    state["particles.F"][:] = np.diag([0.95, 1.0, 1.02]).astype(np.float32)
+    state["particles.F"][:] = np.diag([0.95, 1.0, 1.02]).reshape(9, 1)
     batch.set_state(state)
     batch.step()
     return batch.get_state()["particles.u"].astype(float)
@@ -220,7 +220,7 @@ def test_stress_goes_with_the_modulus(make_batch):
     for b in (plain, batch):
         b.reset(seeds=[1, 2, 3])
         state = b.get_state()
-        state["particles.F"][:] = np.diag([0.95, 1.0, 1.02]).astype(np.float32)
+        state["particles.F"][:] = np.diag([0.95, 1.0, 1.02]).reshape(9, 1)
         b.set_state(state)
         seen.append(b.observation.numpy()[:, 0, b.layout["stress"].slice].copy())
     assert (seen[0] > 0.01).all()

@@ -13,6 +13,7 @@ from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.fields import CONTACT_GATE, Fields
+from piavatar_envs.mpm.matrices import components_of, matrix_at, store_matrix
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
@@ -27,11 +28,11 @@ def push_particles(
     kick: wp.array(dtype=wp.vec3),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
-    C: wp.array2d(dtype=wp.mat33),
+    C: wp.array3d(dtype=float),
 ):
     e, p = wp.tid()
     u[e, p] = keep[0] * u[e, p] + kick[p]
-    C[e, p] = keep[0] * C[e, p]
+    store_matrix(C, e, p, keep[0] * matrix_at(C, e, p))
 
 
 @dataclass
@@ -54,9 +55,9 @@ class Simulation:
     def set(self, **arrays: np.ndarray) -> Simulation:
         """Write state arrays, in double precision or not, for all environments or one for each."""
         for name, value in arrays.items():
-            target = getattr(self.state, name)
-            shape = target.numpy().shape
-            target.assign(np.ascontiguousarray(np.broadcast_to(np.asarray(value, np.float32), shape)))
+            target, shape = getattr(self.state, name), self.state.numpy()[name].shape
+            whole = np.broadcast_to(np.asarray(value, np.float32), shape)
+            target.assign(components_of(whole) if name in ("C", "F") else np.ascontiguousarray(whole))
         return self
 
     def push(self, damping: float = 0.0, acceleration: np.ndarray | None = None) -> Simulation:
@@ -68,7 +69,7 @@ class Simulation:
         return self
 
     def get(self, name: str, env: int = 0) -> np.ndarray:
-        return getattr(self.state, name).numpy()[env].astype(float)
+        return self.state.numpy()[name][env].astype(float)
 
     def totals(self, env: int = 0, **kwargs) -> Totals:
         return totals(self.model, self.state, env, **kwargs)

@@ -95,7 +95,7 @@ def test_model_is_what_was_asked_for(model_of):
     assert model.particles.mass.numpy() == pytest.approx(np.ones((1, 8)))
     state, scratch = allocate(model)
     assert state.x.shape == (2, 8) and scratch.velocity.shape == (2, 64 * model.max_slots)
-    assert np.array_equal(state.F.numpy(), np.broadcast_to(np.eye(3), (2, 8, 3, 3)))
+    assert np.array_equal(state.numpy()["F"], np.broadcast_to(np.eye(3), (2, 8, 3, 3)))
 
 
 def test_default_step_is_refused_when_too_long(model_of):

@@ -48,7 +48,7 @@ def three(simulate):
 def break_particle(sim, name, value):
     array = getattr(sim.state, name)
     host = array.numpy()
-    host[VICTIM, PARTICLE] = value
+    host[(VICTIM, slice(None), PARTICLE) if name in ("C", "F") else (VICTIM, PARTICLE)] = value
     array.assign(host)
 
 

@@ -40,7 +40,7 @@ def put_ball(world, at: tuple[float, float, float], velocity: tuple[float, float
     state, first = world.get_state(), world.batch.simulation.subjects.first[-2]
     state["particles.x"][0, first:] += (np.array(at) - ball_of(world.batch)[0]).astype(np.float32)
     state["particles.u"][0, first:] = velocity
-    state["particles.C"][0, first:] = 0.0
+    state["particles.C"][0, :, first:] = 0.0
     world.set_state(state)
 
 

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.mpm.matrices import matrices_of
 from piavatar_envs.mpm.types import Particles, group
 from piavatar_envs.props import geometry
 from piavatar_envs.props.body import Prop, PropMatter, PropState, place_prop, scale_density, track_prop
@@ -38,7 +39,7 @@ class Scene:
         self.particles = group(Particles, mass=wp.array(mass, dtype=float, device=device))
         shape = (NUM_ENVS, self.total)
         self.x, self.u, self.vk = (self.poisoned(shape, wp.vec3) for _ in range(3))
-        self.C, self.F = (self.poisoned(shape, wp.mat33) for _ in range(2))
+        self.C, self.F = (self.poisoned((NUM_ENVS, 9, self.total), float) for _ in range(2))
         self.failure = wp.zeros(NUM_ENVS, dtype=int, device=device)
         self.spawn, self.state = (PropState.allocate(NUM_ENVS, NUM_PROPS, device) for _ in range(2))
         for array in vars(self.state).values():
@@ -48,6 +49,11 @@ class Scene:
         array = wp.zeros(shape, dtype=dtype, device=self.device)
         array.assign(np.full_like(array.numpy(), POISON))
         return array
+
+    def read(self, name):
+        """Vectors ``(E, P, 3)``, matrices ``(E, P, 3, 3)``."""
+        array = getattr(self, name)
+        return matrices_of(array) if name in ("C", "F") else array.numpy()
 
     def array(self, values, dtype):
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
@@ -97,7 +103,7 @@ def test_placed_particles_move_rigidly(device):
     scene = Scene(device)
     R, position, velocity, spin = scene.place(np.random.default_rng(0))
     arm = np.einsum("eij,pj->epi", R, scene.rest)
-    x, u, C, F, vk = (getattr(scene, name).numpy()[:, scene.own].astype(float) for name in ("x", "u", "C", "F", "vk"))
+    x, u, C, F, vk = (scene.read(name)[:, scene.own].astype(float) for name in ("x", "u", "C", "F", "vk"))
     assert np.abs(x - (position[:, None] + arm)).max() < 2e-6
     assert np.abs(u - (velocity[:, None] + np.cross(spin[:, None], arm))).max() < 1e-5
     # the affine matrix carries the same motion on to the next point
@@ -111,7 +117,7 @@ def test_placing_touches_only_the_prop_and_the_masked_environments(device):
     scene = Scene(device)
     scene.place(np.random.default_rng(1), mask=(True, False, True, False))
     for name in ("x", "u", "C", "F", "vk"):
-        values = getattr(scene, name).numpy()
+        values = scene.read(name)
         foreign = np.concatenate([values[:, :BEFORE], values[:, scene.own.stop :]], axis=1)
         assert np.all(foreign == np.float32(POISON)), name
         assert np.all(values[[1, 3]] == np.float32(POISON)), name

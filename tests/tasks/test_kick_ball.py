@@ -32,7 +32,7 @@ def put_ball(env, position, velocity) -> None:
     x = state["particles.x"][0, own]
     state["particles.x"][0, own] = x - ball(env.batch)[0] + position
     state["particles.u"][0, own], state["particles.vk"][0, own] = velocity, 0.0
-    state["particles.C"][0, own] = 0.0
+    state["particles.C"][0, :, own] = 0.0
     state["task.last"][0] = position
     env.set_state(state)
 
