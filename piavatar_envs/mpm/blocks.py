@@ -73,10 +73,9 @@ def lowest_other(mask: int, f: int, num_fields: int):
 def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
     """Fields that have matter in any block of a stencil."""
     mask = int(0)
-    touched = blocks_touched(base)
-    for i in range(touched[0]):
-        for j in range(touched[1]):
-            for k in range(touched[2]):
+    for i in range(2):  # a block may come twice: so all are asked for before the first has answered
+        for j in range(2):
+            for k in range(2):
                 mask = mask | blocks.fields[e, block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)]
     return mask
 
@@ -157,14 +156,24 @@ def held_by(grid: Grid, blocks: Blocks, e: int, slot: int):
 
 
 @wp.func
-def shared_by(grid: Grid, blocks: Blocks, e: int, slot: int, num_fields: int):
-    """:func:`held_by` where the block has several fields and the slot is of the first of them; else -1 and 0."""
-    held = held_by(grid, blocks, e, slot)
-    if held[0] >= 0:
-        mask = blocks.fields[e, held[1]]
-        if mask == (1 << held[0]) or held[0] != lowest_field(mask, num_fields):
-            held = wp.vec2i(-1, 0)
-    return held
+def list_shared(blocks: Blocks, e: int, block: int, before: int):
+    """Note that a block which had the fields ``before`` gets another one, if that is its second."""
+    if before != 0 and (before & (before - 1)) == 0:
+        n = wp.atomic_add(blocks.num_shared, e, 1)
+        if n < blocks.shared.shape[1]:
+            blocks.shared[e, n] = block
+
+
+@wp.func
+def nodes_shared(blocks: Blocks, e: int):
+    """Nodes of the blocks of environment ``e`` that have several fields."""
+    return BLOCK_NODES * wp.min(blocks.num_shared[e], blocks.shared.shape[1])
+
+
+@wp.func
+def shared_block(blocks: Blocks, e: int, n: int):
+    """Block with the ``n``-th of :func:`nodes_shared`, nonsense beyond: who asks need not know their number yet."""
+    return blocks.shared[e, wp.min(n // BLOCK_NODES, blocks.shared.shape[1] - 1)]
 
 
 @wp.func
@@ -179,6 +188,7 @@ def mark_blocks(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: int, 
                 if (blocks.fields[e, block] & bit) == 0:
                     before = wp.atomic_or(blocks.fields, e, block, bit)
                     if (before & bit) == 0:
+                        list_shared(blocks, e, block, before)
                         slot = wp.atomic_add(blocks.count, e, 1)
                         if slot < blocks.held.shape[1]:
                             blocks.held[e, slot] = field * grid.num_blocks + block
@@ -201,6 +211,7 @@ def free_slots(failure: wp.array(dtype=int), blocks: Blocks):
     """No slot is in use."""
     e = wp.tid()
     blocks.count[e] = 0
+    blocks.num_shared[e] = 0
     blocks.frozen[e] = failure[e]
 
 

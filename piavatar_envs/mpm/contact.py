@@ -69,7 +69,7 @@ def touch(
     local: int,
     a: int,
     b: int,
-    node_facing: wp.array2d(dtype=wp.vec3),
+    node_facing: wp.array2d(dtype=wp.vec4),
     node_velocity: wp.array2d(dtype=vec8),
     sensors: Sensors,
 ):
@@ -157,7 +157,7 @@ def touch_all(
     e: int,
     block: int,
     local: int,
-    node_facing: wp.array2d(dtype=wp.vec3),
+    node_facing: wp.array2d(dtype=wp.vec4),
     node_velocity: wp.array2d(dtype=vec8),
     sensors: Sensors,
 ):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import first_record, has_field, held_by, shared_by, slots_used
+from piavatar_envs.mpm.blocks import first_record, has_field, held_by, nodes_shared, shared_block, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_BLOCK, NEAR_SLAB, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.contact import touch_all
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry, read_change, write_change
@@ -224,7 +224,7 @@ def settle_node(
             clear_offset(sums, e, r)
 
 
-@wp.kernel(launch_bounds=(THREADS, 4))
+@wp.kernel(launch_bounds=(THREADS, 3))
 def solve_contact(
     grid: Grid,
     step: Step,
@@ -232,7 +232,7 @@ def solve_contact(
     contact: Contact,
     sweep: Sweep,
     blocks: Blocks,
-    node_facing: wp.array2d(dtype=wp.vec3),
+    node_facing: wp.array2d(dtype=wp.vec4),
     # in and out: offsets are read, then cleared; sums become velocities
     sums: Sums,
     node_velocity: wp.array2d(dtype=vec8),
@@ -240,27 +240,19 @@ def solve_contact(
 ):
     """The same in blocks with several fields, whose sums have been taken: bodies touch, boundaries are met."""
     e, thread = wp.tid()
-    lane = lane_of_thread()
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    end = BLOCK_NODES * slots_used(blocks, e)
-    begin = first_node(sweep, thread)
-    if begin >= end:
-        return
-    held = shared_by(grid, blocks, e, (begin + lane * sweep.stride) // BLOCK_NODES, contact.num_fields)
-    known = with_near(grid, sweep, boundaries, e, held, begin)
+    end = nodes_shared(blocks, e)
     for turn in range(sweep.turns):
-        first = begin + turn * sweep.stride
+        first = thread * sweep.share + turn * sweep.stride
+        block = shared_block(blocks, e, first)
         if first >= end:
             break
-        about = from_lane(known[0], turn)
-        if about < 0:
-            continue
-        block = from_lane(known[1], turn)
         mask = blocks.fields[e, block]
         corner = block_corner(grid, block)
-        for n in range(first + lane, first + lane + sweep.share):
+        for n in range(first, first + sweep.share):
             local = n % BLOCK_NODES
-            for f in range(about // ALL_SLABS, contact.num_fields):
+            near = slab_is_near(grid, boundaries, e, corner, local)
+            for f in range(contact.num_fields):
                 if has_field(mask, f):
                     r = first_record(grid, blocks, e, f, block) + local
                     v = total_velocity(step, split, read_record(node_velocity, e, r))
@@ -268,6 +260,6 @@ def solve_contact(
                     write_change(sensors.node, e, r, wp.vec4(0.0))
             touch_all(grid, contact, blocks, sums, mask, e, block, local, node_facing, node_velocity, sensors)
             settle_node(
-                grid, step, boundaries, contact, blocks, sums, mask, near_node(about, local), corner, e, block, local,
-                node_velocity, sensors,
+                grid, step, boundaries, contact, blocks, sums, mask, near, corner, e, block, local, node_velocity,
+                sensors,
             )  # fmt: skip

@@ -82,7 +82,7 @@ return wp::index(node, e, r);
 #endif
 """)
 def read_change(node: wp.array2d(dtype=wp.vec4), e: int, r: int) -> wp.vec4:
-    """``node[e, r]`` of the sensors, on a GPU in one load of 16 bytes."""
+    """``node[e, r]``, of the sensors or of what faces what, on a GPU in one load of 16 bytes."""
     ...
 
 

@@ -11,6 +11,7 @@ from piavatar_envs.mpm.matrices import components_of
 from piavatar_envs.mpm.shared_room import plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.sums import units
+from piavatar_envs.mpm.sweep import most_shared
 from piavatar_envs.mpm.types import (
     SCATTERS,
     Blocks,
@@ -77,12 +78,12 @@ def estimate_bytes(
 ) -> int:
     """Device memory of state and scratch [bytes].
 
-    120 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 28 more
+    120 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 32 more
     where there are several fields; the map of blocks.
     """
     sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter])
-    node = sums + 32 + (16 + 12 if num_fields > 1 else 0)
-    slots = max_slots * (BLOCK**3 * node + (8 if num_fields > 1 else 4))
+    node = sums + 32 + (16 + 16 if num_fields > 1 else 0)
+    slots = max_slots * (BLOCK**3 * node + (10 if num_fields > 1 else 4))
     return num_envs * (num_particles * 120 + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
 
 
@@ -133,7 +134,7 @@ def allocate(model: Model) -> tuple[State, Scratch]:
         blocks=allocate_blocks(model),
         sums=allocate_sums(model, velocity),
         velocity=velocity,
-        facing=_zeros(model, shared, wp.vec3),
+        facing=_zeros(model, shared, wp.vec4),
         sensors=allocate_sensors(model, shared),
         room=room,
         large_room=large_room,
@@ -154,6 +155,8 @@ def allocate_blocks(model: Model) -> Blocks:
         slot=_zeros(model, (n, model.contact.num_fields * count), int),
         held=_zeros(model, (n, model.max_slots), int),
         count=_zeros(model, n, int),
+        shared=_zeros(model, (n, most_shared(model)), int),
+        num_shared=_zeros(model, n, int),
         swept=_zeros(model, n, int),
         frozen=_zeros(model, n, int),
     )

@@ -15,11 +15,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import first_record, has_field, shared_by, slots_used
-from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES, block_index, node_in_block
+from piavatar_envs.mpm.blocks import first_record, has_field, nodes_shared, shared_block
+from piavatar_envs.mpm.impulses import read_change, write_change
+from piavatar_envs.mpm.stencil import BLOCK_NODES, block_index, node_in_block
 from piavatar_envs.mpm.sums import move_offset, offset_at, read_record, take_sum, write_record
-from piavatar_envs.mpm.sweep import THREADS, Sweep, first_node, from_lane, lane_of_thread
-from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, row, vec8
+from piavatar_envs.mpm.sweep import THREADS, Sweep
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, row, vec8, vec8i
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -93,7 +94,7 @@ def face_node(
     local: int,
     node_velocity: wp.array2d(dtype=vec8),
     # out
-    node_facing: wp.array2d(dtype=wp.vec3),
+    node_facing: wp.array2d(dtype=wp.vec4),
 ):
     """Summands of a node, a vector a field."""
     volume = float(0.0)
@@ -116,7 +117,7 @@ def face_node(
                 reduced = V * (volume - V) / volume
                 own = weighted_gradient(grid, V, m, offset_at(grid, sums, e, f, r))
                 facing = (reduced * reduced) * (2.0 * own - outward)
-            node_facing[e, r] = facing
+            write_change(node_facing, e, r, wp.vec4(facing[0], facing[1], facing[2], 0.0))
 
 
 @wp.kernel(launch_bounds=(THREADS, 6))
@@ -129,7 +130,7 @@ def find_facing(
     sums: Sums,
     # out
     node_velocity: wp.array2d(dtype=vec8),
-    node_facing: wp.array2d(dtype=wp.vec3),
+    node_facing: wp.array2d(dtype=wp.vec4),
 ):
     """What every node of a block with several fields says about the normals around it.
 
@@ -137,56 +138,92 @@ def find_facing(
     Limbs grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
     """
     e, thread = wp.tid()
-    lane = lane_of_thread()
-    end = BLOCK_NODES * slots_used(blocks, e)
-    begin = first_node(sweep, thread)
-    if begin >= end:
-        return
-    held = shared_by(grid, blocks, e, (begin + lane * sweep.stride) // BLOCK_NODES, contact.num_fields)
+    end = nodes_shared(blocks, e)
     for turn in range(sweep.turns):
-        first = begin + turn * sweep.stride
+        first = thread * sweep.share + turn * sweep.stride
+        block = shared_block(blocks, e, first)
         if first >= end:
             break
-        if from_lane(held[0], turn) < 0:
-            continue
-        block = from_lane(held[1], turn)
         mask = blocks.fields[e, block]
-        for n in range(first + lane, first + lane + sweep.share):
+        for n in range(first, first + sweep.share):
             take_sums(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity)
             face_node(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity, node_facing)
 
 
 @wp.func
+def records_around(grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int):
+    """First records of the fields ``a`` and ``b`` in the blocks of a node and its neighbours, two along each axis.
+
+    That of the lower neighbour comes first, and both are the same where all are in one. -1 where a block has not both
+    fields: it holds nothing that was written in this substep.
+    """
+    both = (1 << a) | (1 << b)
+    of_a = vec8i()
+    of_b = vec8i()
+    for n in range(8):
+        i = wp.clamp(node[0] - 1 + 2 * (n >> 2), 0, grid.nodes[0] - 1)
+        j = wp.clamp(node[1] - 1 + 2 * ((n >> 1) & 1), 0, grid.nodes[1] - 1)
+        k = wp.clamp(node[2] - 1 + 2 * (n & 1), 0, grid.nodes[2] - 1)
+        block = block_index(grid, i, j, k)
+        has_both = (blocks.fields[e, block] & both) == both
+        of_a[n] = wp.where(has_both, first_record(grid, blocks, e, a, block), -1)
+        of_b[n] = wp.where(has_both, first_record(grid, blocks, e, b, block), -1)
+    return of_a, of_b
+
+
+@wp.func
+def component(of: vec8i, x: int, y: int, z: int):
+    """``of[4 x + 2 y + z]``; a GPU would put ``of`` into memory for an index."""
+    lower = wp.where(y == 0, wp.where(z == 0, of[0], of[1]), wp.where(z == 0, of[2], of[3]))
+    upper = wp.where(y == 0, wp.where(z == 0, of[4], of[5]), wp.where(z == 0, of[6], of[7]))
+    return wp.where(x == 0, lower, upper)
+
+
+@wp.func
+def in_grid(grid: Grid, node: wp.vec3i):
+    """Whether there is such a node."""
+    low = wp.min(node[0], wp.min(node[1], node[2]))
+    return low >= 0 and node[0] < grid.nodes[0] and node[1] < grid.nodes[1] and node[2] < grid.nodes[2]
+
+
+@wp.func
 def shared_normal(
-    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, node_facing: wp.array2d(dtype=wp.vec3)
+    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, node_facing: wp.array2d(dtype=wp.vec4)
 ):
     """Unit normal from field ``a`` to field ``b`` at a node; zero if there is no telling."""
-    both = (1 << a) | (1 << b)
-    facing = wp.vec3()
-    start = wp.max(node[2] - 1, 0)
-    has_both = bool(False)
-    ra = int(0)
-    rb = int(0)
-    for i in range(wp.max(node[0] - 1, 0), wp.min(node[0] + 2, grid.nodes[0])):
-        for j in range(wp.max(node[1] - 1, 0), wp.min(node[1] + 2, grid.nodes[1])):
-            for k in range(start, wp.min(node[2] + 2, grid.nodes[2])):
-                if k == start or k % BLOCK == 0:  # another block
-                    block = block_index(grid, i, j, k)
-                    # one without one of the two holds nothing that was written in this substep
-                    has_both = (blocks.fields[e, block] & both) == both
-                    if has_both:
-                        ra = first_record(grid, blocks, e, a, block)
-                        rb = first_record(grid, blocks, e, b, block)
-                if has_both:
-                    n = node_in_block(i, j, k)
-                    d = wp.vec3i(i - node[0], j - node[1], k - node[2])
-                    c = 1.0 / float(1 + wp.dot(d, d))
-                    facing += c * (node_facing[e, ra + n] - node_facing[e, rb + n])
+    first_a, first_b = records_around(grid, blocks, e, node, a, b)
+    # along an axis, the node's own block is the lower of the two unless the node is the first of it
+    x = wp.where((node[0] & 3) == 0, 1, 0)
+    y = wp.where((node[1] & 3) == 0, 1, 0)
+    z = wp.where((node[2] & 3) == 0, 1, 0)
+    own = node_in_block(node[0], node[1], node[2])
+    ra = component(first_a, x, y, z) + own
+    rb = component(first_b, x, y, z) + own
+    facing = wp.vec4()
+    planes = int(3)  # not a constant: a GPU has too few registers for the loads of all three at once
+    for i in range(planes):
+        for j in range(3):
+            for k in range(3):
+                at = node + wp.vec3i(i - 1, j - 1, k - 1)
+                bx = wp.where(i == 1, x, i // 2)
+                by = wp.where(j == 1, y, j // 2)
+                bz = wp.where(k == 1, z, k // 2)
+                n = node_in_block(at[0], at[1], at[2])
+                to_a = component(first_a, bx, by, bz)
+                to_b = component(first_b, bx, by, bz)
+                counts = to_a >= 0 and in_grid(grid, at)
+                across = float((j - 1) * (j - 1) + (k - 1) * (k - 1))
+                c = wp.where(i == 1, 1.0 / (1.0 + across), 1.0 / (2.0 + across))
+                # what does not count is the node itself, times 0: all are read before the first has come
+                of_a = read_change(node_facing, e, wp.where(counts, to_a + n, ra))
+                of_b = read_change(node_facing, e, wp.where(counts, to_b + n, rb))
+                facing += wp.where(counts, c, 0.0) * (of_a - of_b)
     # summands of nearly empty nodes are so small that their squares are not
-    largest = wp.max(wp.abs(facing))
+    n_ab = wp.vec3(facing[0], facing[1], facing[2])
+    largest = wp.max(wp.abs(n_ab))
     if largest <= 0.0:
         return wp.vec3()
-    return wp.normalize(facing / largest)
+    return wp.normalize(n_ab / largest)
 
 
 @wp.func

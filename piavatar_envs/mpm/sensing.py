@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import fields_around, first_record, has_field, record_of
+from piavatar_envs.mpm.blocks import fields_around, first_record, has_field, line_of_records, record_of, slab_records
 from piavatar_envs.mpm.impulses import add_impulse, part_entry, read_change
 from piavatar_envs.mpm.stencil import (
     BLOCK_NODES,
     base_node,
     block_index,
-    blocks_touched,
     grid_position,
     spline,
     stencil_inside,
@@ -37,17 +36,46 @@ def pick(w: wp.vec3, n: int):
 @wp.func
 def touched_around(grid: Grid, blocks: Blocks, sensors: Sensors, e: int, f: int, base: wp.vec3i):
     """Whether contact has changed velocities of field ``f`` in any block of a stencil."""
-    touched = blocks_touched(base)
     any = int(0)
-    for i in range(touched[0]):
-        for j in range(touched[1]):
-            for k in range(touched[2]):
+    for i in range(2):  # see fields_around
+        for j in range(2):
+            for k in range(2):
                 block = block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)
                 any = any | sensors.touched[e, first_record(grid, blocks, e, f, block) // BLOCK_NODES]
     return any != 0
 
 
-@wp.kernel(launch_bounds=(THREADS, 8))
+@wp.func
+def change_at(sensors: Sensors, e: int, r: int):
+    """What contact has done to a record: change of velocity, and the subject that did most of it."""
+    change = read_change(sensors.node, e, r)
+    # else it is of the past
+    return wp.where(sensors.touched[e, r // BLOCK_NODES] != 0, change, wp.vec4())
+
+
+@wp.func
+def give(sensors: Sensors, e: int, sensor: int, taken: wp.vec4):
+    """Add an impulse to a sensor, by the subject in its last component."""
+    impulse = wp.vec3(taken[0], taken[1], taken[2])
+    if wp.length_sq(impulse) > 0.0:
+        add_impulse(sensors, e, part_entry(sensors, sensor, int(taken[3])), impulse)
+
+
+@wp.func
+def take_share(sensors: Sensors, e: int, sensor: int, taken: wp.vec4, change: wp.vec4, share: float):
+    """Impulse that a particle has taken so far, and from whom, with its ``share`` [kg] of a node's change.
+
+    As long as it comes from one subject it is added up before it is rounded.
+    """
+    if wp.length_sq(wp.vec3(change[0], change[1], change[2])) == 0.0:
+        return taken
+    if change[3] != taken[3]:
+        give(sensors, e, sensor, taken)
+        taken = wp.vec4(0.0, 0.0, 0.0, change[3])
+    return taken + share * wp.vec4(change[0], change[1], change[2], 0.0)
+
+
+@wp.kernel(launch_bounds=(THREADS, 7))
 def sense_contact(
     grid: Grid,
     particles: Particles,
@@ -64,11 +92,11 @@ def sense_contact(
     """
     e, p = wp.tid()
     sensor = particles.sensor[p]
+    own = particles.field[p]
+    xg = grid_position(grid, x[e, p])
     if failure[e] != 0 or sensor < 0:
         return
-    xg = grid_position(grid, x[e, p])
     base = base_node(xg)
-    own = particles.field[p]
     # nearly all particles leave here
     if fields_around(grid, blocks, base, e) == (1 << own) or not touched_around(grid, blocks, sensors, e, own, base):
         return
@@ -77,25 +105,22 @@ def sense_contact(
     wy = spline(f[1])
     wz = spline(f[2])
     m = particles.mass[row(e, particles.mass.shape[0]), p]
-    # added up before it is rounded
-    impulse = wp.vec3()
-    giver = int(0)
+    taken = wp.vec4()
+    slab = wp.vec4i()
     for i in range(3):
+        if i == 0 or ((base[0] + i) & 3) == 0:
+            slab = slab_records(grid, blocks, e, own, base, i)
         for j in range(3):
-            for k in range(3):
-                r = record_of(grid, blocks, e, own, base[0] + i, base[1] + j, base[2] + k)
-                if sensors.touched[e, r // BLOCK_NODES] != 0:  # else its records are of the past
-                    change = read_change(sensors.node, e, r)
-                    dv = wp.vec3(change[0], change[1], change[2])
-                    if wp.length_sq(dv) > 0.0:
-                        if int(change[3]) != giver:
-                            if wp.length_sq(impulse) > 0.0:
-                                add_impulse(sensors, e, part_entry(sensors, sensor, giver), impulse)
-                            impulse = wp.vec3()
-                            giver = int(change[3])
-                        impulse += (m * pick(wx, i) * pick(wy, j) * pick(wz, k)) * dv
-    if wp.length_sq(impulse) > 0.0:
-        add_impulse(sensors, e, part_entry(sensors, sensor, giver), impulse)
+            at = line_of_records(slab, base, i, j)
+            w = m * pick(wx, i) * pick(wy, j)
+            # all of a line are asked for before the first has answered
+            first = change_at(sensors, e, at[0])
+            second = change_at(sensors, e, at[1])
+            third = change_at(sensors, e, at[2])
+            taken = take_share(sensors, e, sensor, taken, first, w * wz[0])
+            taken = take_share(sensors, e, sensor, taken, second, w * wz[1])
+            taken = take_share(sensors, e, sensor, taken, third, w * wz[2])
+    give(sensors, e, sensor, taken)
 
 
 @wp.kernel

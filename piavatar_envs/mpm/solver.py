@@ -13,7 +13,7 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import record_runs
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
 from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
-from piavatar_envs.mpm.sweep import THREADS, plan_sweep
+from piavatar_envs.mpm.sweep import THREADS, plan_shared_sweep, plan_sweep
 from piavatar_envs.mpm.transfer import particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
@@ -56,7 +56,7 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
 def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append the grid pass over the blocks with several fields, and what the contact sensors feel."""
     m, blocks, sums = model, scratch.blocks, scratch.sums
-    threads, sweep = plan_sweep(m)
+    threads, sweep = plan_shared_sweep(m)
     program.launch(
         find_facing,
         threads,

@@ -35,6 +35,9 @@ LANES = 32
 #: Slots for which a large GPU has threads at once, and the fewest for which an environment gets them.
 SLOTS_AT_ONCE = 132 * 32
 FEWEST_SLOTS = 8
+#: The same for blocks that have several fields.
+SHARED_AT_ONCE = 132 * 6
+FEWEST_SHARED = 2
 
 
 @wp.struct
@@ -74,6 +77,23 @@ def from_lane(value: int, lane: int) -> int:
 def first_node(sweep: Sweep, thread: int):
     """First node that the warp of a thread takes."""
     return thread * sweep.share - lane_of_thread()
+
+
+def most_shared(model: Model) -> int:
+    """Most blocks of an environment that can have several fields, and so several slots; 1 where there is but one."""
+    return max(1, model.max_slots // 2) if model.contact.num_fields > 1 else 1
+
+
+def plan_shared_sweep(model: Model) -> tuple[tuple[int, int], Sweep]:
+    """:func:`plan_sweep` over the blocks that have several fields, which are listed and few."""
+    nodes, blocks = int(BLOCK_NODES), 1
+    sweep = Sweep()
+    sweep.share = nodes
+    if wp.get_device(model.device).is_cuda:
+        blocks = min(most_shared(model), max(FEWEST_SHARED, -(-SHARED_AT_ONCE // model.num_envs)))
+        sweep.share = 1
+    sweep.turns, sweep.stride = -(-most_shared(model) // blocks), nodes * blocks
+    return (model.num_envs, sweep.stride // sweep.share), sweep
 
 
 def plan_sweep(model: Model) -> tuple[tuple[int, int], Sweep]:

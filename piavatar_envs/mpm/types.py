@@ -150,6 +150,8 @@ class Blocks:
     slot: wp.array2d(dtype=int)  # (num_envs, F * B) slot of a field's block; means something where its bit is set
     held: wp.array2d(dtype=int)  # (num_envs, S) field * B + block of a slot
     count: wp.array(dtype=int)  # (num_envs,) slots in use
+    shared: wp.array2d(dtype=int)  # (num_envs, S // 2) blocks that have got a second field, as they got it
+    num_shared: wp.array(dtype=int)  # (num_envs,) how many, also such as found no slot for it
     swept: wp.array(dtype=int)  # (num_envs,) slots whose records the last grid pass has written
     frozen: wp.array(dtype=int)  # (num_envs,) not 0: had failed when this was last looked at, see :func:`freeze`
 
@@ -286,8 +288,8 @@ class Scratch:
         sums: what particles have added up.
         velocity: vec8: mass, physical velocity, kinematic velocity, nothing. In blocks with several fields the sums
             stand here until they have become velocities.
-        facing: vec3: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`; of blocks with
-            several fields only.
+        facing: vec4: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`, and nothing;
+            of blocks with several fields only.
         sensors: what contact did in this control step.
         room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
     """

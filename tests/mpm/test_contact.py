@@ -70,6 +70,19 @@ def test_prescribed_motion_meets_bodies_like_momentum(meet, share):
     assert np.abs(all_physical.get("x") - sim.get("x")).max() < 1e-4
 
 
+def test_blocks_with_several_fields_are_listed_once(meet):
+    """As bodies come to them; what has been is forgotten with the marks."""
+    third = {"box": ((-0.1, -0.1, 0.1), (0.1, 0.1, 0.2)), "velocity": (0.6, 0.0, -3.0)}
+    sim = meet([LEFT, RIGHT, third], friction=0.4)
+    blocks = sim.scratch.blocks
+    for _ in range(3):
+        sim.run()
+        fields = blocks.fields.numpy()[0]
+        several = np.flatnonzero(fields & (fields - 1))
+        assert len(several) > 3 and (np.bitwise_count(fields) == 3).any()
+        assert sorted(blocks.shared.numpy()[0, : blocks.num_shared.numpy()[0]]) == several.tolist()
+
+
 def test_three_bodies_at_a_node(meet):
     """Two blocks side by side and a third that falls on the joint of both."""
     third = {"box": ((-0.1, -0.1, 0.1), (0.1, 0.1, 0.2)), "velocity": (0.6, 0.0, -3.0), "density": 2000.0}

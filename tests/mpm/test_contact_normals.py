@@ -13,7 +13,7 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_marks, record_scatter
 from piavatar_envs.mpm.stencil import block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import offset_at
-from piavatar_envs.mpm.sweep import THREADS, plan_sweep
+from piavatar_envs.mpm.sweep import THREADS, plan_shared_sweep
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, vec8
 
 DX = 0.05
@@ -29,7 +29,7 @@ def look_at_nodes(
     blocks: Blocks,
     sums: Sums,
     node_velocity: wp.array2d(dtype=vec8),
-    node_facing: wp.array2d(dtype=wp.vec3),
+    node_facing: wp.array2d(dtype=wp.vec4),
     # out
     volume: wp.array2d(dtype=float),
     normal: wp.array(dtype=wp.vec3),
@@ -70,7 +70,7 @@ class Look:
         program = Program(model.device)
         record_marks(program, model, state, scratch)
         record_scatter(program, model, state, scratch)
-        threads, sweep = plan_sweep(model)
+        threads, sweep = plan_shared_sweep(model)
         found = [scratch.sums, scratch.velocity, scratch.facing]
         program.launch(
             find_facing, threads, [model.grid, model.contact, sweep, scratch.blocks], found, block_dim=THREADS

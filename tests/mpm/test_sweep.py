@@ -33,6 +33,20 @@ def test_every_node_has_one_thread(monkeypatch, cuda, num_envs, slots):
     assert np.array_equal(np.sort(nodes[nodes < 64 * slots]), np.arange(64 * slots))
 
 
+@pytest.mark.parametrize("cuda", [False, True])
+@pytest.mark.parametrize("num_envs", [1, 64, 4096])
+@pytest.mark.parametrize("slots", [1, 7, 208, 17784])
+def test_every_node_of_shared_blocks_has_one_thread(monkeypatch, cuda, num_envs, slots):
+    monkeypatch.setattr(sweep.wp, "get_device", lambda name: SimpleNamespace(is_cuda=cuda))
+    model = SimpleNamespace(device="any", num_envs=num_envs, max_slots=slots, contact=SimpleNamespace(num_fields=2))
+    (envs, threads), plan = sweep.plan_shared_sweep(model)
+    assert envs == num_envs and threads % (64 if cuda else 1) == 0
+    nodes = plan.share * np.arange(threads)[:, None] + plan.stride * np.arange(plan.turns)
+    nodes = (nodes[..., None] + np.arange(plan.share)).ravel()
+    most = 64 * sweep.most_shared(model)
+    assert most >= 64 * (slots // 2) and np.array_equal(np.sort(nodes[nodes < most]), np.arange(most))
+
+
 @wp.kernel
 def take_all(grid: Grid, sums: Sums, taken: wp.array(dtype=vec8), offset: wp.array(dtype=wp.vec4)):
     """Records of field 1."""
