@@ -14,7 +14,8 @@ from piavatar_envs.mpm.sums import clear_offset, offset_at, read_record, take_su
 from piavatar_envs.mpm.sweep import THREADS, Sweep, first_node, from_lane, lane_of_thread
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, vec8
 
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+# on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 #: Nodes of a slab of a block, the unit in which boundaries are looked for.
 SLAB_NODES = wp.constant(16)

@@ -61,6 +61,8 @@ if (takes) {
 const bool on = lane < 27;
 const int li = on ? lane / 9 : 0, lj = on ? lane / 3 % 3 : 0, lc = on ? lane % 3 : 0;
 const float ri = li, rj = lj;
+// of a power of two: exact, however the module divides
+auto one_over = [](float unit) { return __int_as_float(0x7f000000 - __float_as_int(unit)); };
 // the two integers of so many units
 auto high = [](float units) { return rintf(units * 0x1p-20f); };
 auto low = [](float units, float high) { return __float2int_rn(fmaf(high, -0x1p20f, units)); };
@@ -84,8 +86,9 @@ for (;;) {
     if (fitting == 0) {
         if (f >= 0 && (waiting || ends)) {
             // which nodes have got something: who adds no mass adds nothing
-            const float per_mass = 1.0f / wp::index(sums.mass_unit, min(e, sums.mass_unit.shape[0] - 1), f);
-            const float per_momentum = 1.0f / wp::index(sums.momentum_unit, min(e, sums.momentum_unit.shape[0] - 1), f);
+            const float per_mass = one_over(wp::index(sums.mass_unit, min(e, sums.mass_unit.shape[0] - 1), f));
+            const float per_momentum =
+                one_over(wp::index(sums.momentum_unit, min(e, sums.momentum_unit.shape[0] - 1), f));
             int count = 0;
 #pragma unroll 1
             for (int t = lane; t < 7 * 32; t += 32) {
@@ -204,7 +207,7 @@ for (;;) {
                     grown[c] += w * a[c] * a[26];
                 }
             }
-            const float per_mass = 1.0f / wp::index(sums.mass_unit, min(e, sums.mass_unit.shape[0] - 1), f);
+            const float per_mass = one_over(wp::index(sums.mass_unit, min(e, sums.mass_unit.shape[0] - 1), f));
             const int at = now >> 12, i = at / ALONG_X + li, j = at % ALONG_X / ALONG_Y + lj;
             for (int c = 0; c < 3; ++c) {
                 const int record = record_at(i, j, at % ALONG_X % ALONG_Y / ALONG_Z + c);
