@@ -49,7 +49,7 @@ THREADS = 128
 #: Up to how many particles of an environment a warp takes so many in a round, and in how many rounds. Small worlds come
 #: in batches, which fill a GPU anyway; of a single larger one, many warps with few particles each do. The numbers must
 #: not depend on the batch: in which order particles are added up does on them.
-SHARES = ((8192, 32, 2), (16384, 8, 1), (65536, 16, 1), (262144, 32, 1), (2**31, 32, 2))
+SHARES = ((8192, 32, 2), (16384, 4, 1), (65536, 16, 1), (262144, 32, 1), (2**31, 32, 2))
 
 
 @wp.func
