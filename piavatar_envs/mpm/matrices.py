@@ -1,8 +1,8 @@
 """Matrices of particles, an array a component: ``(num_envs, 9, num_particles)``, row by row.
 
 Of matrices that lie one after the other, 36 bytes each, the threads of a warp read nine words, and touch nine lines of
-the cache with each of them: transfers waited for that more than for memory. Component by component, neighbouring
-threads read and write neighbouring words.
+the cache with each of them. Component by component, neighbouring threads read and write neighbouring words. Each
+component begins where a line does, or what a warp writes would begin and end amid the sectors that memory takes.
 """
 
 from __future__ import annotations
@@ -12,10 +12,13 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+#: Components begin at multiples of so many numbers: a line of a GPU's cache.
+LINE = 32
+
 _COMPONENTS = """
 char* const first = reinterpret_cast<char*>(rows.data) + wp::int64(rows.strides[0]) * e;
 wp::float32* const at = reinterpret_cast<wp::float32*>(first) + p;
-const int n = rows.shape[2];
+const int n = rows.strides[1] / 4;
 """
 
 
@@ -38,6 +41,16 @@ for (int c = 0; c < 9; ++c) at[c * n] = value.data[c / 3][c % 3];
 def store_matrix(rows: wp.array3d(dtype=float), e: int, p: int, value: wp.mat33):
     """Write the matrix of particle ``p`` in environment ``e``."""
     ...
+
+
+def whole_lines(num_particles: int) -> int:
+    """Numbers that a component of so many particles takes."""
+    return -(-num_particles // LINE) * LINE
+
+
+def allocate_matrices(num_envs: int, num_particles: int, device: str) -> wp.array:
+    """Zeros."""
+    return wp.zeros((num_envs, 9, whole_lines(num_particles)), dtype=float, device=device)[:, :, :num_particles]
 
 
 def matrices_of(components: wp.array | np.ndarray) -> np.ndarray:

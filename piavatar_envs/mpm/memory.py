@@ -7,7 +7,7 @@ import math
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.matrices import components_of
+from piavatar_envs.mpm.matrices import allocate_matrices, components_of, whole_lines
 from piavatar_envs.mpm.shared_room import plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.sums import units
@@ -84,7 +84,8 @@ def estimate_bytes(
     sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter])
     node = sums + 32 + (16 + 16 if num_fields > 1 else 0)
     slots = max_slots * (BLOCK**3 * node + (10 if num_fields > 1 else 4))
-    return num_envs * (num_particles * 120 + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
+    particles = 48 * num_particles + 72 * whole_lines(num_particles)  # four vectors and two matrices
+    return num_envs * (particles + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
 
 
 def check_memory(
@@ -116,12 +117,13 @@ def check_memory(
 def allocate(model: Model) -> tuple[State, Scratch]:
     """Zeroed state (identity deformation) and scratch."""
     particles = (model.num_envs, model.num_particles)
-    unstrained = components_of(np.broadcast_to(np.eye(3, dtype=np.float32), (*particles, 3, 3)))
+    C, F = (allocate_matrices(*particles, model.device) for _ in range(2))
+    F.assign(components_of(np.broadcast_to(np.eye(3), (*particles, 3, 3))))
     state = State(
         x=_zeros(model, particles, wp.vec3),
         u=_zeros(model, particles, wp.vec3),
-        C=_zeros(model, unstrained.shape, float),
-        F=wp.array(unstrained, dtype=float, device=model.device),
+        C=C,
+        F=F,
         vk=_zeros(model, particles, wp.vec3),
         spin=_zeros(model, particles, wp.vec3),
         failure=_zeros(model, model.num_envs, int),
