@@ -21,6 +21,9 @@ from agents.checkpoint import flattened
 from agents.evaluate import over_seeds
 from benchmarks.runner import plain, write_json
 
+#: Settings that may differ: nothing that is learned depends on how often a training is saved.
+FREE = ("seed", "checkpoint_every")
+
 
 def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """One report for several runs.
@@ -32,7 +35,7 @@ def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         What is common to the runs, their ``seeds``, and a row for every agent in ``results``.
 
     Raises:
-        ValueError: fewer than two runs, two of the same seed, other settings than the seed, or competing agents.
+        ValueError: fewer than two runs, two of the same seed, other settings than :data:`FREE`, or competing agents.
     """
     if len(runs) < 2:
         raise ValueError(f"there are {len(runs)} runs; give at least two, of different seeds")
@@ -50,18 +53,16 @@ def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     if len(set(seeds)) < len(seeds):
         raise ValueError(f"the runs have the seeds {seeds}; each must have one of its own")
     rows = [_row([run["results"][place] for run in runs.values()]) for place in range(len(first["results"]))]
-    config = {key: value for key, value in first["config"].items() if key != "seed"}
+    config = {key: value for key, value in first["config"].items() if key not in FREE}
     commits = sorted({str(run["commit"]) for run in runs.values()})
     about = {"benchmark": "compare", "of": first["benchmark"], "commits": commits, "device": first["device"]}
     return about | {"versions": first["versions"], "seeds": seeds, "config": config, "results": rows}
 
 
 def _settings(run: Mapping[str, Any]) -> dict[str, Any]:
-    """All that must be alike."""
-    return {
-        "script": run["benchmark"],
-        **flattened({key: run["config"][key] for key in run["config"] if key != "seed"}),
-    }
+    """All that must be alike; an older run does not know of what it had none of."""
+    config = flattened({key: run["config"][key] for key in run["config"] if key not in FREE})
+    return {"script": run["benchmark"], **{key: value for key, value in config.items() if value != {}}}
 
 
 def _row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -55,6 +56,8 @@ def flat(value: Any, name: str = "") -> dict[str, str]:
     if isinstance(value, (dict, list, tuple)):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         return {key: bits for part, item in items for key, bits in flat(item, f"{name}.{part}").items()}
+    if isinstance(value, torch.Tensor):
+        value = value.cpu()
     return {name: repr(value) if np.isscalar(value) or value is None else np.asarray(value).tobytes().hex()}
 
 

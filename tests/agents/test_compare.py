@@ -40,6 +40,13 @@ def test_runs_of_several_seeds_become_one_table(runs, tmp_path, capsys):
     assert "trained with 3 seeds" in shown and "zero" in shown and "random" in shown
 
 
+def test_how_often_a_training_is_saved_does_not_matter(runs):
+    first, second = (json.loads((run / "results.json").read_text()) for run in runs[:2])
+    second["config"]["checkpoint_every"] = 12345
+    report = compare.summarize({"a": first, "b": second})
+    assert report["seeds"] == [0, 1] and "checkpoint_every" not in report["config"]
+
+
 def test_what_cannot_be_compared_is_refused(runs):
     first, second = (json.loads((run / "results.json").read_text()) for run in runs[:2])
     other = copy.deepcopy(second)
