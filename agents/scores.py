@@ -47,7 +47,7 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
         raise ValueError("there are no runs; give folders with a results.json")
     groups: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for name, run in runs.items():
-        groups.setdefault((run["config"]["env_id"], run["benchmark"]), {})[name] = run
+        groups.setdefault((run["config"]["env_id"], _learner(run)), {})[name] = run
     rows: list[dict[str, Any]] = []
     for (env_id, script), group in sorted(groups.items()):
         for row in _rows(group):
@@ -62,6 +62,13 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
                 row = {"runs": list(group), **_cost(group), **row}
             rows.append({"env_id": env_id, "agent": agent} | {key: row[key] for key in row if key != "case"})
     return sorted(rows, key=lambda row: (row["env_id"], "runs" in row, row["agent"]))
+
+
+def _learner(run: Mapping[str, Any]) -> str:
+    """The script of a run; for that of stable-baselines3, which has several, the algorithm."""
+    if run["benchmark"] != "train":
+        return run["benchmark"]
+    return "sb3_sac" if run["config"].get("sac") else "sb3_ppo"
 
 
 def _rows(group: Mapping[str, Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:

@@ -48,7 +48,7 @@ def runs() -> dict[str, dict]:
 def test_seeds_become_one_row_and_the_untrained_stand_once(runs):
     rows = scores.scores(runs)
     assert [(r["env_id"], r["agent"], r["seeds"]) for r in rows] == [
-        ("Push-v0", "random", None), ("Push-v0", "zero", None), ("Push-v0", "train", 1),
+        ("Push-v0", "random", None), ("Push-v0", "zero", None), ("Push-v0", "sb3_ppo", 1),
         ("Stand-v0", "random", None), ("Stand-v0", "zero", None), ("Stand-v0", "PID", None), ("Stand-v0", "rsl_ppo", 2),
     ]  # fmt: skip
     trained = rows[-1]
