@@ -21,6 +21,7 @@ from piavatar_envs.avatar.surface import ClosedSurface
 SPACING_PER_DX = 0.57  # lattice spacing over grid spacing: about 5 particles a cell
 SUBDIVISIONS = 3  # points per axis and cell that decide how much of it is inside
 MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
+SMALL_BODY = 8192  # particles up to which they are in the order of their bones
 LINK_LENGTH = 1.8  # of a link between neighbouring particles, over the spacing
 SHELL = 0.75  # depth of the particles that simply follow the skin, over the spacing
 INSET = 0.05  # depth of a particle that a change of shape would leave outside, over the spacing
@@ -234,7 +235,10 @@ def order_by_bones(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndar
     """Order ``(P,)`` in which particles of one bone come first, then those of two, and so on; else it stays.
 
     Threads that work together then blend as many bones, and mostly the same: one that blends four makes 31 others wait.
+    Large bodies stay as they are: their neighbours are alike anyway, and their P2G adds up by cells what lies together.
     """
+    if len(skin_joints) > SMALL_BODY:
+        return np.arange(len(skin_joints))
     return np.lexsort((skin_joints[:, 0], (skin_weights > 0.0).sum(axis=1)))
 
 
