@@ -110,7 +110,10 @@ class AvatarDrive:
         program.launch(local_rotations, bones, [self.body, t.rotation], [t.local])
 
     def record_reset(self, program: Program, state: State, mask: wp.array) -> None:
-        """Append: put the masked environments into the pose of ``state.command_*``, at rest and unstrained."""
+        """Append: put the masked environments into the pose of ``state.command_*``, unstrained.
+
+        They are at rest, or on their way to where :attr:`JointDrive.first` says.
+        """
         n, s, d = self.model.num_envs, self.scratch, self.state
         program.launch(
             reset_drive,
@@ -145,6 +148,7 @@ class AvatarDrive:
         )
         inputs = [mask, self.body, self.model.control_dt, s.bone_step, state.x]
         program.launch(set_in_motion, (n, self.num_points), inputs, [state.u])
+        self.joints.record_motion(program, mask, after)
 
     def record_begin(self, program: Program) -> None:
         """Append what begins a control step: from the tracked pose towards ``state.goal_*``."""

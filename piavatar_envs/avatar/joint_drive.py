@@ -15,11 +15,13 @@ import warp as wp
 
 from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.joint_motion import set_part
 from piavatar_envs.avatar.joint_torques import Springs, Target
 from piavatar_envs.avatar.muscles import FASTEST, LOCKED_JOINTS, REFERENCE_HEIGHT, REFERENCE_MASS, Muscles, spring_rows
+from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.settings import ROOT_RATE
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
-from piavatar_envs.avatar.types import Body
+from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import State, group, row
 
@@ -116,6 +118,38 @@ def reset_joints(
         torque[e, n - 1] = wp.vec3(0.0)
 
 
+@wp.func
+def spin_between(before: wp.quat, after: wp.quat, time: float):
+    """Constant angular velocity by which a rotation becomes another one in a ``time`` [rad/s]."""
+    return quat_log(after * wp.quat_inverse(before)) / time
+
+
+@wp.kernel
+def set_joints_in_motion(
+    mask: wp.array(dtype=wp.bool),
+    body: Body,
+    time: float,
+    pose: Pose,
+    after: Pose,
+    # out
+    velocity: wp.array2d(dtype=float),
+):
+    """Joints of the masked environments on their way to the pose ``after`` a ``time`` [s] later; over ``(E, bones)``.
+
+    Joints that only found it in their particles would take it for what the world does to them in every substep.
+    """
+    e, b = wp.tid()
+    if not mask[e]:
+        return
+    spin = spin_between(pose.rotation[e, b], after.rotation[e, b], time)
+    if b == 0:
+        set_part(velocity, e, 0, (after.position[e, 0] - pose.position[e, 0]) / time)
+    else:
+        a = body.parent[b]
+        spin -= spin_between(pose.rotation[e, a], after.rotation[e, a], time)
+    set_part(velocity, e, 3 + 3 * b, spin)
+
+
 @wp.kernel
 def note_support(
     share: float,
@@ -141,7 +175,7 @@ class JointDrive:
         assist: of the pelvis, ``(num_envs,)``, 0 to 1; what is written here holds until it is written again.
         gains: springs and dampers of the reference adult's joints, ``(1, 23)``.
         first: the pose that bodies are on their way to when an episode begins, and reach after a control step: local
-            rotations and root, as commands; None where they begin at rest.
+            rotations and root, as commands; None where they begin at rest. To be set before a reset is recorded.
     """
 
     def __init__(self, points: BodyPoints, drive: AvatarDrive, settings: JointSettings) -> None:
@@ -196,6 +230,12 @@ class JointDrive:
             [mask, posed.pose_rotation, posed.pose_position],
             [s.rotation, s.position, s.torque, s.velocity, s.outside],
         )
+
+    def record_motion(self, program: Program, mask: wp.array, after: Pose) -> None:
+        """Append: joints of the masked environments, reset already, reach a pose after a control step."""
+        model, body = self.drive.model, self.drive.body
+        inputs = [mask, body, model.control_dt, self.body.pose, after]
+        program.launch(set_joints_in_motion, (model.num_envs, NUM_JOINTS), inputs, [self.state.velocity])
 
     def record_begin(self, program: Program) -> None:
         """Append what begins a control step: strength and springs of the bodies as they are."""

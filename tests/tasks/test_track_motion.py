@@ -237,3 +237,19 @@ def test_under_torques_bodies_begin_as_fast_as_the_clip(make_batch, control):
         np.testing.assert_allclose(u[i, own], way if control == "torque" else 0.0, atol=2e-4)
     assert fastest > 0.5
     assert not state.vk.numpy().any()
+
+
+def test_joints_know_how_fast_they_begin(make_batch):
+    """What is observed of them takes their rotations, in a control step, to those of episodes that begin a frame on."""
+    n, dt = 48, 1.0 / 30.0
+    batch = make_batch(TRACK, n, motion="arm_wave", impulse=0.0, control="torque")
+    batch.reset(seeds=np.arange(n))
+    start, local = batch.task.start.numpy(), batch.simulation.avatar.tracked.local.numpy().astype(float)
+    seen = batch.observation.numpy()[:, 0, batch.layout["joint_velocities"].slice].reshape(n, NUM_JOINTS - 1, 3)
+    pairs = [(i, j) for i in range(n) for j in range(n) if start[j] == start[i] + 1]
+    fastest = 0.0
+    for i, j in pairs:
+        turn = (Rotation.from_quat(local[j, 1:]) * Rotation.from_quat(local[i, 1:]).inv()).as_rotvec() / dt
+        fastest = max(fastest, np.abs(turn).max())
+        np.testing.assert_allclose(seen[i], turn, atol=0.1)
+    assert fastest > 2.0
