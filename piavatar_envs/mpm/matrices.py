@@ -56,7 +56,8 @@ def allocate_matrices(num_envs: int, num_particles: int, device: str) -> wp.arra
 def matrices_of(components: wp.array | np.ndarray) -> np.ndarray:
     """A copy as matrices, ``(..., 9, num_particles)`` to ``(..., num_particles, 3, 3)``."""
     values = components if isinstance(components, np.ndarray) else components.numpy()
-    return np.moveaxis(values, -2, -1).reshape(*values.shape[:-2], values.shape[-1], 3, 3)
+    matrices = np.ascontiguousarray(np.moveaxis(values, -2, -1))  # on a CPU the values are the array's own memory
+    return matrices.reshape(*values.shape[:-2], values.shape[-1], 3, 3)
 
 
 def components_of(matrices: np.ndarray) -> np.ndarray:

@@ -202,7 +202,7 @@ def test_memory_estimate(model_of, fields):
         scratch.sensors.node,
         scratch.sensors.touched,
     ]
-    grid += [blocks.fields, blocks.slot, blocks.held]
+    grid += [blocks.fields, blocks.slot, blocks.held, blocks.shared]
     arrays = {array.ptr: array.capacity for array in [*vars(state).values(), *grid]}  # two may be one
     taken = sum(arrays.values())
     layout = model.max_slots, fields, model.num_blocks, model.scatter
