@@ -24,11 +24,12 @@ from agents.batches import Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, set_random_states
 from agents.curve import Curve
 from agents.help import HelpedEnv
+from agents.lessons import with_lessons
 from agents.mirror import Mirror
 from agents.rsl_policy import RslTraining, actor_settings, mean_agent, network_settings
 from agents.workers import components
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
-from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
@@ -240,9 +241,9 @@ def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
     """The environments to learn in.
 
     Raises:
-        ConfigError: there is no such term to observe, or nothing to be helped, or a lesson is no setting.
+        ConfigError: there is no such term to observe, or nothing to be helped, or a lesson is none.
     """
-    settings = load_config(type(task.config), task.config, dict(config.lessons))
+    settings = with_lessons(task, config.lessons)
     if config.help is not None and settings.drive.control == "pose":
         raise ConfigError('help is for bodies under torques, and env.drive.control="pose"; use "pd" or "torque"')
     if config.help is not None and settings.drive.root_assist > 0.0:

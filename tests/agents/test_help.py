@@ -99,3 +99,17 @@ def test_lessons_are_for_learning_only(device, tmp_path, capsys):
     env.close()
     with pytest.raises(SystemExit, match=r"tail is no setting of StandConfig"):
         rsl_ppo.main([*FEW, "lessons={tail: 1}", "iterations=1", "--device", device, "--out", str(tmp_path)])
+
+
+@pytest.mark.parametrize(
+    ("lesson", "told"),
+    [
+        ("drive.control: pd", "drive.control"),
+        ("joints: [left_hip]", "its actions"),
+        ("observe_parameters: true", "observe_parameters"),
+    ],
+)
+def test_lessons_for_another_body_are_refused(device, tmp_path, lesson, told):
+    """A policy that sees or does something else would fail, or be evaluated at what it has not learned."""
+    with pytest.raises(SystemExit, match=rf"lessons=.* change .*{told}.*give such settings as env"):
+        rsl_ppo.main([*FEW, f"lessons={{{lesson}}}", "iterations=1", "--device", device, "--out", str(tmp_path)])
