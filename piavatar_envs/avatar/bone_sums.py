@@ -25,8 +25,8 @@ GROUPS = wp.constant(8)
 def entry_of(body: Body, n: int, last: int):
     """Particle of entry ``n`` and the bone's weight in it, or those of the ``last`` entry of the chunk.
 
-    Loops over a chunk ask for the next entry before they need it: else all that they read of a particle would wait for
-    its number.
+    A loop over a chunk that asks for the next entry ahead has its particle's number when it needs it: else all that it
+    reads of the particle would wait for that.
     """
     at = wp.min(n, last)
     return int_at(body.entry, at), float_at(body.entry_weight, at)
