@@ -54,7 +54,7 @@ class GetUpConfig(EnvConfig):
     feet_margin: float = Field(
         0.6,
         gt=0.0,
-        description="distance of the feet from below the pelvis at which a reward is 0.1, in its heights [-]",
+        description="how much further off the pelvis than in standing feet have a reward of 0.1, in its heights [-]",
     )
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle off the lying pose [rad]")

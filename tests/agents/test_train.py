@@ -93,7 +93,8 @@ def test_a_vector_trains_what_workers_train(tiny, workers, facts, tmp_path, devi
     returns = [evaluate("x", agent, own, 3, 7, progress=False).returns for own in (workers, venv)]
     venv.close()
     np.testing.assert_allclose(*returns, rtol=0.0, atol=0.0 if device == "cpu" else 1e-4)
-    np.testing.assert_allclose(*weights, rtol=0.0, atol=0.0 if device == "cpu" else 1e-4)
+    # Adam makes steps of one size of gradients that differ in their last place, however small they are
+    np.testing.assert_allclose(*weights, rtol=0.0, atol=0.0 if device == "cpu" else 1e-3)
 
 
 @pytest.mark.parametrize("what", [{"vector": True}, {"sac": {}}], ids=["vector", "sac"])
