@@ -21,7 +21,7 @@ ALMOST_CONSTANT = {
     "root_height": (0,),
     "root_orientation": (0, 2, 4, 5),
     "bone_positions": range(9),
-    "command_lead": (0, 1),
+    "command_lead": (0, 1, 2),
     "joint_velocities": range(27, 33),
 }
 
