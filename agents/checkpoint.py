@@ -151,10 +151,10 @@ def first_line(error: Exception) -> str:
 
 
 def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Leaves of nested dictionaries by dotted name."""
+    """Leaves of nested dictionaries by dotted name; one without any is as if it were not there."""
     found: dict[str, Any] = {}
     for name, value in tree.items():
-        if isinstance(value, Mapping) and value:
+        if isinstance(value, Mapping):
             found |= flattened(value, f"{prefix}{name}.")
         else:
             found[f"{prefix}{name}"] = value

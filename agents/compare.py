@@ -60,9 +60,9 @@ def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _settings(run: Mapping[str, Any]) -> dict[str, Any]:
-    """All that must be alike; an older run does not know of what it had none of."""
-    config = flattened({key: run["config"][key] for key in run["config"] if key not in FREE})
-    return {"script": run["benchmark"], **{key: value for key, value in config.items() if value != {}}}
+    """All that must be alike."""
+    config = {key: run["config"][key] for key in run["config"] if key not in FREE}
+    return {"script": run["benchmark"], **flattened(config)}
 
 
 def _row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -41,7 +41,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.bone_sums import BLOCK, sum_moments, sum_moments_of_both
+from piavatar_envs.avatar.bone_sums import sum_moments, sum_moments_of_both
 from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_momentum import balance, gather_momentum
 from piavatar_envs.avatar.joint_motion import (
@@ -65,7 +65,7 @@ from piavatar_envs.avatar.joint_torques import (
     make_strength,
     make_tissue,
 )
-from piavatar_envs.avatar.lanes import warp_threads
+from piavatar_envs.avatar.lanes import BLOCK, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.posing import rest_matrices
 from piavatar_envs.avatar.skeleton import NUM_JOINTS

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.types import vec8, vec24, vec44
+from piavatar_envs.avatar.loads import vector_at
+from piavatar_envs.avatar.types import Body, vec8, vec24, vec44
+from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,7 +22,7 @@ PLACE, LEAN, TURN = wp.constant(0), wp.constant(12), wp.constant(24)
 STEP, VELOCITY, SPIN = wp.constant(33), wp.constant(36), wp.constant(39)
 #: Where in what a particle has blended the parts begin.
 AT_PLACE, AT_LEAN, AT_STEP = wp.constant(0), wp.constant(3), wp.constant(6)
-AT_TURN, AT_VELOCITY, AT_SPIN = wp.constant(9), wp.constant(18), wp.constant(21)
+AT_VELOCITY, AT_SPIN = wp.constant(18), wp.constant(21)
 
 # What a particle is skinned to, in loads of 16 bytes.
 _INFLUENCES = """
@@ -188,6 +190,13 @@ def blend_places(
 ) -> wp.vec3:
     """``sum_n weight_n place[e, joint_n] (rest, 1)`` of particle ``p``: linear blend skinning."""
     ...
+
+
+@wp.func
+def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int):
+    """Where linear blend skinning has a particle [m]; ``place`` takes bones from rest to where they are."""
+    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+    return blend_places(place, e, body.joint, body.weight, p, rest)
 
 
 @wp.func

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.lanes import store_sum12, store_sum16, sum_threads12
+from piavatar_envs.avatar.lanes import BLOCK, store_sum12, store_sum16, sum_threads12
 from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
 from piavatar_envs.avatar.types import Body, Drive, vec12, vec16
 from piavatar_envs.mpm.types import Particles, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
-#: Threads of a block in all launches of this module.
-BLOCK = 128
 #: Groups of threads that share the chunks of a body, where it seldom has any.
 GROUPS = wp.constant(8)
 

@@ -130,17 +130,16 @@ def factorize_alone(
     matrix: wp.array3d(dtype=float),
     diagonal: wp.array2d(dtype=float),
     source: int,
-    r: int,
     e: int,
     factor: wp.array2d(dtype=float),
 ):
-    """:func:`factorize` for one thread: matrix ``source`` and row ``r`` of the ``diagonal`` make factor ``e``."""
+    """:func:`factorize` for one thread: matrix ``source`` and row ``e`` of the ``diagonal`` make factor ``e``."""
     size = matrix.shape[1]
     for k in range(size):
         at = start_of_row(k)
         for n in range(pattern.start[k], pattern.start[k + 1]):
             factor[e, at + pattern.column[n]] = matrix[source, k, pattern.column[n]]
-        factor[e, at + k] = matrix[source, k, k] + diagonal[r, k]
+        factor[e, at + k] = matrix[source, k, k] + diagonal[e, k]
     for row in range(size):
         k = size - 1 - row
         at = start_of_row(k)
@@ -186,17 +185,16 @@ def factorize(
     A system is one of an environment's: ``systems`` are once or several times ``num_envs``, the first of all
     environments first. Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, zero where the pattern has
     nothing, and ``factor`` ``(systems, factor_size(N))`` is written where the pattern says. ``diagonal`` is
-    ``(1 or systems, N)``.
+    ``(systems, N)``.
     """
     e, _ = wp.tid()
     source = e % matrix.shape[0]
-    if wanted[e % wanted.shape[0]] == 0:
+    if wanted[source] == 0:
         return
-    r = wp.min(e, diagonal.shape[0] - 1)
     if threads == 1:
-        factorize_alone(pattern, matrix, diagonal, source, r, e, factor)
+        factorize_alone(pattern, matrix, diagonal, source, e, factor)
     else:
-        factorize_together(pattern.start, pattern.column, matrix, diagonal, source, r, e, factor)
+        factorize_together(pattern.start, pattern.column, matrix, diagonal, source, e, factor)
 
 
 @wp.kernel

@@ -23,7 +23,7 @@ from piavatar_envs.avatar.blending import (
     blended_velocity,
     motion_at,
 )
-from piavatar_envs.avatar.lanes import sum_threads12, sum_threads16
+from piavatar_envs.avatar.lanes import BLOCK, sum_threads12, sum_threads16
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
@@ -33,9 +33,6 @@ from piavatar_envs.mpm.stores import store_vector
 from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
-
-#: Threads of a block in all launches of this module.
-BLOCK = 128
 
 
 @wp.func

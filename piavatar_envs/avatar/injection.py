@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.rotation import apply_point
+from piavatar_envs.avatar.blending import skinned_place
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.types import row
 
@@ -31,16 +31,8 @@ def inject_velocity(
     e, p = wp.tid()
     if failure[e] != 0:
         return
-    A = wp.mat44()
-    step = wp.mat44()
-    joint = body.joint[p]
-    weight = body.weight[p]
-    for n in range(4):
-        if weight[n] > 0.0:
-            A += weight[n] * bone_from[e, joint[n]]
-            step += weight[n] * bone_step[e, joint[n]]
-    rest = body.rest[row(e, body.rest.shape[0]), p]
-    k = apply_point(step, rest) - kinematic_shape_rate * (x[e, body.first + p] - apply_point(A, rest))
+    displacement = x[e, body.first + p] - skinned_place(body, bone_from, e, p)
+    k = skinned_place(body, bone_step, e, p) - kinematic_shape_rate * displacement
     share = 1.0 - body.inert[row(e, body.inert.shape[0]), p]
     u[e, body.first + p] = u[e, body.first + p] + share * (k - vk[e, body.first + p])
     vk[e, body.first + p] = k

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_changes, blend_places, motion_at
+from piavatar_envs.avatar.blending import blend_changes, motion_at, skinned_place
 from piavatar_envs.avatar.lanes import meet_threads
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
@@ -125,13 +125,6 @@ def hand_back(
         return
     v = skinned_motion(body, moving, e, p, x[e, body.first + p] - position[e, 0])
     u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
-
-
-@wp.func
-def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int):
-    """Where linear blend skinning has a particle [m]; ``place`` takes bones from rest to where they are."""
-    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-    return blend_places(place, e, body.joint, body.weight, p, rest)
 
 
 @wp.kernel

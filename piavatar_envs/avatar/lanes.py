@@ -13,6 +13,10 @@ from piavatar_envs.avatar.types import vec12, vec16
 wp.set_module_options({"enable_backward": False})
 
 
+#: Threads of a CUDA block in the drive's launches over particles and over sums.
+BLOCK = 128
+
+
 def warp_threads(device: str) -> int:
     """Threads that share a chunk of a bone's particles, or the bones of an environment: a warp on a GPU."""
     return 32 if wp.get_device(device).is_cuda else 1

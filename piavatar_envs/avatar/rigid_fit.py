@@ -18,9 +18,6 @@ from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
-#: Threads of a block in all launches of this module.
-BLOCK = 128
-
 
 @wp.func
 def spin_of(inertia: wp.mat33, angular_momentum: wp.vec3):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_places
+from piavatar_envs.avatar.blending import skinned_place
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.matrices import store_matrix
-from piavatar_envs.mpm.types import Kinematic, row
+from piavatar_envs.mpm.types import Kinematic
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,7 +55,7 @@ def place_particles(
     if not mask[e]:
         return
     q = body.first + p
-    x[e, q] = blend_places(bone_from, e, body.joint, body.weight, p, body.rest[row(e, body.rest.shape[0]), p])
+    x[e, q] = skinned_place(body, bone_from, e, p)
     u[e, q] = wp.vec3(0.0)
     driven.vk[e, q] = wp.vec3(0.0)
     driven.spin[e, q] = wp.vec3(0.0)
@@ -80,5 +80,4 @@ def set_in_motion(
     if not mask[e]:
         return
     q = body.first + p
-    after = blend_places(bone_after, e, body.joint, body.weight, p, body.rest[row(e, body.rest.shape[0]), p])
-    u[e, q] = (after - x[e, q]) / time
+    u[e, q] = (skinned_place(body, bone_after, e, p) - x[e, q]) / time

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from piavatar_envs.avatar import bone_sums, flesh, posing, rigid_fit
 from piavatar_envs.avatar.injection import inject_velocity
+from piavatar_envs.avatar.lanes import BLOCK
 from piavatar_envs.avatar.root import lay_command_on_body, root_wrench
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import (
@@ -96,21 +97,21 @@ def record_fit(drive: AvatarDrive, program: Program, state: State) -> None:
         (n, drive.num_chunks, drive.threads),
         [drive.body, drive.model.particles, state.x, state.u, reference, state.failure, drive.threads],
         [s.moments],
-        block_dim=bone_sums.BLOCK,
+        block_dim=BLOCK,
     )
     program.launch(
         rigid_fit.fit_bones,
         (n, NUM_JOINTS, drive.bone_threads),
         [drive.body, reference, s.moments, state.failure, drive.bone_threads],
         [s.bone_center, s.bone_velocity, s.bone_spin, s.bone_inertia],
-        block_dim=rigid_fit.BLOCK,
+        block_dim=BLOCK,
     )
     program.launch(
         rigid_fit.fit_body,
         (n, drive.threads),
         [drive.body, bones, state.failure, drive.threads],
         [s.body_center, s.body_velocity, s.body_spin, s.body_inertia],
-        block_dim=rigid_fit.BLOCK,
+        block_dim=BLOCK,
     )
 
 
@@ -145,7 +146,7 @@ def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
         (n, drive.num_points),
         [drive.body, drive.drive, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure],
         [state.u, drive.state.motion, state.kinematic, s.pull, s.lean],
-        block_dim=flesh.BLOCK,
+        block_dim=BLOCK,
     )
     if drive.drive.free_motion or drive.drive.root_rate > 0.0:  # a root that lets go leaves a free body
         _record_free_motion(drive, program, state)
@@ -156,7 +157,7 @@ def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
         [drive.body, drive.drive, s.bone_corrections, g.bones, g.whole, s.wrench_linear, s.wrench_angular]
         + [drive.threads],
         [s.bone_change],
-        block_dim=flesh.BLOCK,
+        block_dim=BLOCK,
     )
     program.launch(
         flesh.apply_corrections,
@@ -164,7 +165,7 @@ def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
         [drive.body, drive.drive, state.x, s.pull, g.bones, s.bone_change, g.removed, drive.state.let_go]
         + [state.failure],
         [state.u, state.kinematic],
-        block_dim=flesh.BLOCK,
+        block_dim=BLOCK,
     )
 
 
@@ -177,14 +178,14 @@ def _record_free_motion(drive: AvatarDrive, program: Program, state: State) -> N
         (n, int(bone_sums.GROUPS), drive.threads),
         [body, drive.drive, particles, state.x, state.vk, s.bone_center, let_go, state.failure, drive.threads],
         [s.corrections],
-        block_dim=bone_sums.BLOCK,
+        block_dim=BLOCK,
     )
     program.launch(
         flesh.free_motion,
         (n, drive.threads),
         [drive.body, drive.drive, s.corrections, g.bones, g.whole, let_go, drive.threads],
         [s.removed_velocity, s.removed_turn, s.removed_center, s.wrench_angular],
-        block_dim=flesh.BLOCK,
+        block_dim=BLOCK,
     )
 
 
@@ -196,14 +197,14 @@ def _record_sums(drive: AvatarDrive, program: Program, state: State) -> None:
         (n, drive.num_chunks, drive.threads),
         [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.threads],
         [s.corrections],
-        block_dim=bone_sums.BLOCK,
+        block_dim=BLOCK,
     )
     program.launch(
         bone_sums.add_chunks,
         (n, NUM_JOINTS, drive.bone_threads),
         [drive.body, s.corrections, state.failure, drive.bone_threads],
         [s.bone_corrections],
-        block_dim=bone_sums.BLOCK,
+        block_dim=BLOCK,
     )
 
 

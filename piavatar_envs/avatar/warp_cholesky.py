@@ -23,7 +23,7 @@ __shared__ float __align__(16) room[{_ROOM}];
 __shared__ float4 joint[{MOST_ROWS}];
 const int lane = threadIdx.x & 31, size = matrix.shape[1];
 const float* const from = &wp::index(matrix, source, 0, 0);
-const float* const more = &wp::index(diagonal, r, 0);
+const float* const more = &wp::index(diagonal, e, 0);
 for (int part = 0; part < size; part += 32) {{
     const int j = part + lane;
 #pragma unroll 8
@@ -86,11 +86,10 @@ def factorize_together(
     matrix: wp.array3d(dtype=float),
     diagonal: wp.array2d(dtype=float),
     source: int,
-    r: int,
     e: int,
     factor: wp.array2d(dtype=float),
 ):
-    """Factor ``e`` of :mod:`piavatar_envs.avatar.cholesky`, by a warp, of matrix ``source`` and diagonal ``r``."""
+    """Factor ``e`` of :mod:`piavatar_envs.avatar.cholesky`, by a warp, of matrix ``source`` and diagonal ``e``."""
     ...
 
 

@@ -15,8 +15,16 @@ import warp as wp
 from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.types import row
-from piavatar_envs.tasks.rewards import mean_square_action, tolerance
-from piavatar_envs.tasks.upright import Still, Upright, mean_angle, posture_of, write_posture
+from piavatar_envs.tasks.rewards import tolerance
+from piavatar_envs.tasks.upright import (
+    Still,
+    Upright,
+    mean_angle,
+    posture_of,
+    restfulness,
+    stillness,
+    write_standing,
+)
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
@@ -79,12 +87,9 @@ def judge_rising(
     high = wp.sqrt(wp.clamp(now.head, 0.0, 1.0) * wp.clamp(now.pelvis, 0.0, 1.0))
     terms[e, 0, 0] = 0.5 * high
     terms[e, 0, 1] = 0.2 * tolerance(feet_off(body, e, position), _FEET_BOUND, feet_margin)
-    terms[e, 0, 2] = 0.15 * stands * tolerance(speed, 0.05, still.speed_margin)
-    terms[e, 0, 3] = 0.15 * stands * tolerance(angle, 0.05, still.pose_margin)
-    terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
-    write_posture(now, e, metrics)
-    metrics[e, 0, 3] = speed
-    success[e, 0] = now.head >= rule.stand_head
+    terms[e, 0, 2] = 0.15 * stands * stillness(still, speed)
+    terms[e, 0, 3] = 0.15 * stands * restfulness(still, angle)
+    write_standing(rule, now, speed, e, action, terms, metrics, success)
 
 
 def record_rising_outcome(env: BatchEnv, program: Program, rule: Upright, still: Still, feet_margin: float) -> None:

@@ -207,6 +207,8 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         self.clip_rotation, self.clip_root = zeros((n, NUM_JOINTS), wp.quat), zeros(n, wp.vec3)
         self.clip_world, self.clip_position = zeros((n, NUM_JOINTS), wp.quat), zeros((n, NUM_JOINTS), wp.vec3)
         self.still = zeros((n, NUM_JOINTS), wp.vec3)
+        if env.simulation.avatar.joints:  # torques could not bring the body up to the clip's speed at once
+            env.simulation.avatar.joints.first = self.clip_rotation, self.clip_root
         self.impulse, self.struck, self.offset = zeros(n, wp.vec3), zeros(n, int), zeros(n, int)
         self.bones = wp.array([joint_index(name) for name in STRUCK], dtype=int, device=device)
 
@@ -222,9 +224,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
             [self.start, self.origin, drive.command_rotation, drive.command_root],
         )
         program.launch(draw_offset, env.num_envs, [env.mask, env.seed, env.episode, self.interval], [self.offset])
-        joints = env.simulation.avatar.joints
-        if joints:  # torques could not bring the body up to the clip's speed at once
-            joints.first = self.clip_rotation, self.clip_root
+        if env.simulation.avatar.joints:
             self._record_next_pose(env, program)
 
     def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:

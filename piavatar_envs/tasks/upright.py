@@ -155,6 +155,37 @@ def write_posture(now: Posture, e: int, metrics: wp.array3d(dtype=float)):
     metrics[e, 0, 2] = wp.degrees(now.tilt)
 
 
+@wp.func
+def stillness(still: Still, speed: float):
+    """1 while the pelvis hardly moves [m/s], and less the faster it is."""
+    return tolerance(speed, 0.05, still.speed_margin)
+
+
+@wp.func
+def restfulness(still: Still, angle: float):
+    """1 while the joints are hardly off the rest pose on average [rad], and less the more they are."""
+    return tolerance(angle, 0.05, still.pose_margin)
+
+
+@wp.func
+def write_standing(
+    rule: Upright,
+    now: Posture,
+    speed: float,
+    e: int,
+    action: wp.array3d(dtype=float),
+    # out
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
+):
+    """All of :data:`METRICS`, whether it stands, and the last reward term, what acting costs."""
+    terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
+    write_posture(now, e, metrics)
+    metrics[e, 0, 3] = speed
+    success[e, 0] = now.head >= rule.stand_head
+
+
 @wp.kernel
 def judge_standing(
     rule: Upright,
@@ -177,12 +208,9 @@ def judge_standing(
     angle = mean_angle(local, e)
     terms[e, 0, 0] = 0.3 * now.high
     terms[e, 0, 1] = 0.3 * now.straight
-    terms[e, 0, 2] = 0.2 * now.high * tolerance(speed, 0.05, still.speed_margin)
-    terms[e, 0, 3] = 0.2 * now.high * tolerance(angle, 0.05, still.pose_margin)
-    terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
-    write_posture(now, e, metrics)
-    metrics[e, 0, 3] = speed
-    success[e, 0] = now.head >= rule.stand_head
+    terms[e, 0, 2] = 0.2 * now.high * stillness(still, speed)
+    terms[e, 0, 3] = 0.2 * now.high * restfulness(still, angle)
+    write_standing(rule, now, speed, e, action, terms, metrics, success)
 
 
 @wp.kernel
