@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.lanes import BLOCK, store_sum12, store_sum16, sum_threads12
+from piavatar_envs.avatar.lanes import BLOCK, place_in_chunks, store_sum12, store_sum16, sum_threads12
 from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
 from piavatar_envs.avatar.types import Body, Drive, vec12, vec16
 from piavatar_envs.mpm.types import Particles, row
@@ -45,22 +45,21 @@ def moments_of(w: float, d: wp.vec3, v: wp.vec3):
     # fmt: on
 
 
-@wp.kernel(launch_bounds=(BLOCK, 10))
-def sum_moments(
+@wp.func
+def chunk_moments(
     body: Body,
     particles: Particles,
     x: wp.array2d(dtype=wp.vec3),
     u: wp.array2d(dtype=wp.vec3),
     reference: wp.array2d(dtype=wp.vec3),
-    failure: wp.array(dtype=int),
+    e: int,
+    c: int,
+    thread: int,
     threads: int,
     # out
     moments: wp.array2d(dtype=vec16),
 ):
     """Moments of one chunk of a bone's particles about the bone's reference point (small numbers, small round-off)."""
-    e, c, thread = wp.tid()
-    if failure[e] != 0:
-        return
     origin = reference[e, body.chunk_bone[c]]
     r = row(e, particles.mass.shape[0])
     total = vec16()
@@ -74,6 +73,28 @@ def sum_moments(
         following, weight = entry_of(body, n, last)
         total += moments_of(w, vector_at(x, e, p) - origin, vector_at(u, e, p))
     store_sum16(moments, e, c, total, threads)
+
+
+@wp.kernel(launch_bounds=(BLOCK, 10))
+def sum_moments(
+    body: Body,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    reference: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    threads: int,
+    # out
+    moments: wp.array2d(dtype=vec16),
+):
+    """:func:`chunk_moments` of every chunk, over ``(num_envs, chunks, threads)``."""
+    i, j, k = wp.tid()
+    at = place_in_chunks(i, j, k, body.chunk_bone.shape[0])
+    e = at[0]
+    c = at[1]
+    thread = at[2]
+    if failure[e] == 0:
+        chunk_moments(body, particles, x, u, reference, e, c, thread, threads, moments)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 8))
@@ -91,7 +112,11 @@ def sum_moments_of_both(
     other_moments: wp.array2d(dtype=vec12),
 ):
     """:func:`sum_moments` of ``u``; of an ``other`` velocity momentum and angular momentum, six of twelve numbers."""
-    e, c, thread = wp.tid()
+    i, j, k = wp.tid()
+    at = place_in_chunks(i, j, k, body.chunk_bone.shape[0])
+    e = at[0]
+    c = at[1]
+    thread = at[2]
     if failure[e] != 0:
         return
     origin = reference[e, body.chunk_bone[c]]
@@ -112,23 +137,26 @@ def sum_moments_of_both(
     store_sum12(other_moments, e, c, others, threads)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 9))
-def sum_corrections(
+@wp.func
+def chunk_corrections(
     body: Body,
     particles: Particles,
     x: wp.array2d(dtype=wp.vec3),
     center: wp.array2d(dtype=wp.vec3),
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
-    failure: wp.array(dtype=int),
+    e: int,
+    c: int,
+    slot: int,
+    thread: int,
     threads: int,
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """Momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk."""
-    e, c, thread = wp.tid()
-    if failure[e] != 0:
-        return
+    """Momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk.
+
+    Those of environment ``e`` are in row ``slot``.
+    """
     origin = center[e, body.chunk_bone[c]]
     r = row(e, particles.mass.shape[0])
     p1 = wp.vec3()
@@ -144,35 +172,85 @@ def sum_corrections(
         n += threads
         following, weight = entry_of(body, n, last)
         d = vector_at(x, e, body.first + p) - origin
-        a = w * vector_at(pull, e, p)
+        a = w * vector_at(pull, slot, p)
         p1 += a
         l1 += wp.cross(d, a)
-        a = w * vector_at(lean, e, p)
+        a = w * vector_at(lean, slot, p)
         p2 += a
         l2 += wp.cross(d, a)
     total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])
     store_sum12(corrections, e, c, total, threads)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 9))
+def sum_corrections(
+    body: Body,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    center: wp.array2d(dtype=wp.vec3),
+    pull: wp.array2d(dtype=wp.vec3),
+    lean: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    threads: int,
+    # out
+    corrections: wp.array2d(dtype=vec12),
+):
+    """:func:`chunk_corrections` of every chunk, over ``(num_envs, chunks, threads)``."""
+    i, j, k = wp.tid()
+    at = place_in_chunks(i, j, k, body.chunk_bone.shape[0])
+    e = at[0]
+    c = at[1]
+    thread = at[2]
+    if failure[e] == 0:
+        chunk_corrections(body, particles, x, center, pull, lean, e, c, e, thread, threads, corrections)
+
+
+@wp.func
 def add_chunks(
     body: Body,
     corrections: wp.array2d(dtype=vec12),
-    failure: wp.array(dtype=int),
+    e: int,
+    b: int,
+    thread: int,
     threads: int,
     # out
     bone_corrections: wp.array2d(dtype=vec12),
 ):
-    """Sum of the chunks of every bone."""
-    e, b, thread = wp.tid()
-    if failure[e] != 0:
-        return
+    """Sum of the chunks of bone ``b``."""
     s = vec12()
     for c in range(body.chunk_start[b] + thread, body.chunk_start[b + 1], threads):
         s += corrections[e, c]
     s = sum_threads12(s, threads)
     if thread == 0:
         bone_corrections[e, b] = s
+
+
+@wp.func
+def chunk_motion(
+    body: Body,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    center: wp.array2d(dtype=wp.vec3),
+    e: int,
+    c: int,
+    thread: int,
+    threads: int,
+    # out
+    corrections: wp.array2d(dtype=vec12),
+):
+    """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in one chunk."""
+    origin = center[e, body.chunk_bone[c]]
+    r = row(e, particles.mass.shape[0])
+    P = wp.vec3()
+    K = wp.mat33()
+    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
+        p = body.first + int_at(body.entry, n)
+        a = (float_at(body.entry_weight, n) * number_at(particles.mass, r, p)) * vector_at(vk, e, p)
+        P += a
+        K += wp.outer(vector_at(x, e, p) - origin, a)
+    total = vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2])
+    store_sum12(corrections, e, c, total, threads)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 10))
@@ -189,22 +267,12 @@ def sum_motion(
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in every chunk.
+    """:func:`chunk_motion` of bodies that nothing supports.
 
     Launched over ``(num_envs, GROUPS, threads)``: most bodies have nothing to do here, and end few threads.
     """
     e, group, thread = wp.tid()
     if failure[e] != 0 or (drive.free_motion == 0 and let_go[e] == 0):
         return
-    r = row(e, particles.mass.shape[0])
     for c in range(group, body.chunk_bone.shape[0], GROUPS):
-        origin = center[e, body.chunk_bone[c]]
-        P = wp.vec3()
-        K = wp.mat33()
-        for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
-            p = body.first + int_at(body.entry, n)
-            a = (float_at(body.entry_weight, n) * number_at(particles.mass, r, p)) * vector_at(vk, e, p)
-            P += a
-            K += wp.outer(vector_at(x, e, p) - origin, a)
-        total = vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2])
-        store_sum12(corrections, e, c, total, threads)
+        chunk_motion(body, particles, x, vk, center, e, c, thread, threads, corrections)

@@ -23,22 +23,88 @@ from piavatar_envs.avatar.blending import (
     blended_velocity,
     motion_at,
 )
-from piavatar_envs.avatar.lanes import BLOCK, sum_threads12, sum_threads16
+from piavatar_envs.avatar.lanes import BLOCK, place_in_rows, sum_threads12, sum_threads16
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
 from piavatar_envs.avatar.rotation import finite_turn
-from piavatar_envs.avatar.types import Body, Drive, RemovedMotion, RigidFit, RigidFits, vec8, vec12, vec16, vec44
-from piavatar_envs.mpm.stores import store_vector
+from piavatar_envs.avatar.types import (
+    Body,
+    Drive,
+    RemovedMotion,
+    RigidFit,
+    RigidFits,
+    Wrench,
+    vec8,
+    vec12,
+    vec16,
+    vec44,
+)
+from piavatar_envs.mpm.stores import store_pair, store_vector, store_velocities
 from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
+def is_free(drive: Drive, let_go: int):
+    """Whether nothing supports a body: commanded motion must then carry no momentum."""
+    return drive.free_motion != 0 or let_go != 0
+
+
+@wp.func
 def axial(K: wp.mat33):
     """``sum a x b`` from ``K = sum a b^T``."""
     return wp.vec3(K[1, 2] - K[2, 1], K[2, 0] - K[0, 2], K[0, 1] - K[1, 0])
+
+
+@wp.func
+def drive_particle(
+    body: Body,
+    drive: Drive,
+    x: wp.array2d(dtype=wp.vec3),
+    record: wp.array2d(dtype=vec44),
+    center: wp.vec3,
+    let_go: bool,
+    e: int,
+    p: int,
+    slot: int,
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    motion: wp.array2d(dtype=wp.vec3),
+    # out
+    driven: Kinematic,
+    pull: wp.array2d(dtype=wp.vec3),
+    lean: wp.array2d(dtype=wp.vec3),
+):
+    """Kinematic velocity of a particle; its pull [m/s], which it gets, and its way to the commanded pose [m].
+
+    ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
+    that contact has caused along with the bone. Inert flesh misses its share of every change of that velocity.
+    ``center`` is the pelvis', where the bones' blended velocity is; pulls and ways are in row ``slot``.
+    """
+    at = vector_at(x, e, body.first + p)
+    before = vector_at(u, e, body.first + p)
+    after = before
+    inert = number_at(body.inert, row(e, body.inert.shape[0]), p)
+    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+    s = blend_records(record, e, body.joint, body.weight, p, rest)
+    displacement = at - blended_vector(s, AT_PLACE)
+    turn = blended_turn(s)
+    k = blended_vector(s, AT_STEP) + turn * displacement
+    # the paper's shape preservation is part of the prescribed velocity
+    k -= drive.kinematic_shape_rate * displacement
+    relative = before - blended_velocity(s, at - center)
+    pulled = implicit_velocity(drive.shape_rate, drive.dt, -displacement, relative) - relative
+    way = blended_vector(s, AT_LEAN)
+    if inert > 0.0:
+        # a body that nothing supports could not take the reaction
+        if drive.free_motion == 0 and not let_go:
+            after = before - inert * (k - motion[e, p])
+        motion[e, p] = k
+    pulled += pull_gain(drive.tone_rate, drive.dt) * way
+    store_velocities(u, driven, e, body.first + p, after + pulled, k, -0.5 * axial(turn), True)
+    store_pair(pull, lean, slot, p, pulled, way, drive.tone_rate > 0.0, True)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 7))
@@ -58,36 +124,15 @@ def drive_particles(
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
 ):
-    """Kinematic velocity of a particle, its pulls [m/s] and its way to the commanded pose [m].
-
-    ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
-    that contact has caused along with the bone. Inert flesh misses its share of every change of that velocity.
-    """
-    e, p = wp.tid()
-    if failure[e] != 0:
-        return
-    at = vector_at(x, e, body.first + p)
-    before = vector_at(u, e, body.first + p)
-    inert = number_at(body.inert, row(e, body.inert.shape[0]), p)
-    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-    s = blend_records(record, e, body.joint, body.weight, p, rest)
-    displacement = at - blended_vector(s, AT_PLACE)
-    turn = blended_turn(s)
-    k = blended_vector(s, AT_STEP) + turn * displacement
-    # the paper's shape preservation is part of the prescribed velocity
-    k -= drive.kinematic_shape_rate * displacement
-    relative = before - blended_velocity(s, at - bones.center[e, 0])
-    pulled = implicit_velocity(drive.shape_rate, drive.dt, -displacement, relative) - relative
-    way = blended_vector(s, AT_LEAN)
-    if inert > 0.0:
-        # a body that nothing supports could not take the reaction
-        if drive.free_motion == 0 and let_go[e] == 0:
-            u[e, body.first + p] = before - inert * (k - motion[e, p])
-        motion[e, p] = k
-    store_vector(driven.vk, e, body.first + p, k, True)
-    store_vector(driven.spin, e, body.first + p, -0.5 * axial(turn), True)
-    store_vector(pull, e, p, pulled + pull_gain(drive.tone_rate, drive.dt) * way, True)
-    store_vector(lean, e, p, way, drive.tone_rate > 0.0)
+    """:func:`drive_particle` of every particle, over :func:`piavatar_envs.avatar.lanes.rows_of`."""
+    i, j = wp.tid()
+    at = place_in_rows(i, j, body.count)
+    e = at[0]
+    p = at[1]
+    if p < body.count and failure[e] == 0:
+        drive_particle(
+            body, drive, x, record, bones.center[e, 0], let_go[e] != 0, e, p, e, u, motion, driven, pull, lean
+        )  # fmt: skip
 
 
 @wp.func
@@ -97,15 +142,16 @@ def bone_change(velocity: wp.vec3, spin: wp.vec3, arm: wp.vec3):
     return vec8(v[0], v[1], v[2], spin[0], spin[1], spin[2], 0.0, 0.0)
 
 
-@wp.kernel
+@wp.func
 def blend_corrections(
     body: Body,
     drive: Drive,
     corrections: wp.array2d(dtype=vec12),
     bones: RigidFits,
     whole: RigidFit,
-    wrench_linear: wp.array(dtype=wp.vec3),
-    wrench_angular: wp.array(dtype=wp.vec3),
+    wrench: Wrench,
+    e: int,
+    thread: int,
     threads: int,
     # out
     change: wp.array2d(dtype=vec8),
@@ -114,7 +160,6 @@ def blend_corrections(
 
     The shape pull given back, the tone, the damping of motion between bones, and the root wrench.
     """
-    e, thread = wp.tid()
     r = row(e, body.bone_mass.shape[0])
     dt = drive.dt
     gain = pull_gain(drive.tone_rate, dt)
@@ -141,28 +186,27 @@ def blend_corrections(
     total = sum_threads12(vec12(m, P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0), threads)
     # All of this is internal: its rigid part comes off, and with it what round-off left (a drag of 1e-6 a second else).
     # To command a turn of the whole body is the root's business.
-    V = dt * wrench_linear[e] - wp.vec3(total[1], total[2], total[3]) / total[0]
-    W = dt * wrench_angular[e] - spin_of(whole.inertia[e], wp.vec3(total[4], total[5], total[6]))
+    V = dt * wrench.linear[e] - wp.vec3(total[1], total[2], total[3]) / total[0]
+    W = dt * wrench.angular[e] - spin_of(whole.inertia[e], wp.vec3(total[4], total[5], total[6]))
     rigid = bone_change(V, W, bones.center[e, 0] - whole.center[e])
     for b in range(thread, body.parent.shape[0], threads):
         change[e, b] = change[e, b] + rigid
 
 
-@wp.kernel
+@wp.func
 def free_motion(
     body: Body,
     drive: Drive,
     corrections: wp.array2d(dtype=vec12),
     bones: RigidFits,
     whole: RigidFit,
-    let_go: wp.array(dtype=int),
+    e: int,
+    thread: int,
     threads: int,
     # out
-    removed_velocity: wp.array(dtype=wp.vec3),
-    removed_turn: wp.array(dtype=wp.mat33),
-    removed_center: wp.array(dtype=wp.vec3),
+    removed: RemovedMotion,
     # in and out
-    wrench_angular: wp.array(dtype=wp.vec3),
+    wrench: Wrench,
 ):
     """What a body without support takes out of commanded motion: a body cannot push itself off nothing.
 
@@ -170,13 +214,6 @@ def free_motion(
     momentum: ``vk' = y + A (r + dt y)`` with ``y = vk - V`` and ``sum m r x vk' = 0``. And as the inertia changes, a
     spinning body keeps its angular momentum, not its spin (a skater who draws in the arms).
     """
-    e, thread = wp.tid()
-    if drive.free_motion == 0 and let_go[e] == 0:
-        if thread == 0:  # one left over from before would enter the carry by its round-off
-            removed_velocity[e] = wp.vec3(0.0)
-            removed_turn[e] = wp.mat33()
-            removed_center[e] = wp.vec3(0.0)
-        return
     r = row(e, body.bone_mass.shape[0])
     m = float(0.0)
     for b in range(thread, body.parent.shape[0], threads):
@@ -210,11 +247,40 @@ def free_motion(
         w -= spin_of(I, axial(moment))
         A = finite_turn(w, drive.dt)
         moment = K + (drive.dt * K + second) * wp.transpose(A)
-    removed_velocity[e] = wp.vec3(t[1], t[2], t[3]) / t[0]
-    removed_turn[e] = A
-    removed_center[e] = whole.center[e]
+    removed.velocity[e] = wp.vec3(t[1], t[2], t[3]) / t[0]
+    removed.turn[e] = A
+    removed.center[e] = whole.center[e]
     W = whole.spin[e]
-    wrench_angular[e] = wrench_angular[e] - spin_of(I, wp.trace(moment) * W - moment * W)
+    wrench.angular[e] = wrench.angular[e] - spin_of(I, wp.trace(moment) * W - moment * W)
+
+
+@wp.func
+def apply_correction(
+    body: Body,
+    drive: Drive,
+    x: wp.array2d(dtype=wp.vec3),
+    center: wp.vec3,
+    change: wp.array2d(dtype=vec8),
+    removed: RemovedMotion,
+    free: bool,
+    e: int,
+    p: int,
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
+):
+    """Change the physical velocity by the bones' blended field; ``free`` commanded motion of its rigid part."""
+    at = vector_at(x, e, body.first + p)
+    field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - center)
+    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + field, True)
+    if free:
+        v = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]
+        v += removed.turn[e] * (at - removed.center[e] + drive.dt * v)
+        store_vector(driven.vk, e, body.first + p, v, True)
+        # half the curl of that: one turn after the other, which is not their sum
+        w = driven.spin[e, body.first + p]
+        back = -0.5 * axial(removed.turn[e])
+        driven.spin[e, body.first + p] = w + back + (0.5 * drive.dt) * wp.cross(back, w)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 12))
@@ -222,7 +288,6 @@ def apply_corrections(
     body: Body,
     drive: Drive,
     x: wp.array2d(dtype=wp.vec3),
-    pull: wp.array2d(dtype=wp.vec3),
     bones: RigidFits,
     change: wp.array2d(dtype=vec8),
     removed: RemovedMotion,
@@ -232,18 +297,11 @@ def apply_corrections(
     u: wp.array2d(dtype=wp.vec3),
     driven: Kinematic,
 ):
-    """Change the physical velocity by the pulls and the bones' blended field; free the motion of its rigid part."""
-    e, p = wp.tid()
-    if failure[e] != 0:
-        return
-    at = vector_at(x, e, body.first + p)
-    field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - bones.center[e, 0])
-    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, e, p) + field, True)
-    if drive.free_motion != 0 or let_go[e] != 0:
-        free = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]
-        free += removed.turn[e] * (at - removed.center[e] + drive.dt * free)
-        store_vector(driven.vk, e, body.first + p, free, True)
-        # half the curl of that: one turn after the other, which is not their sum
-        w = driven.spin[e, body.first + p]
-        back = -0.5 * axial(removed.turn[e])
-        driven.spin[e, body.first + p] = w + back + (0.5 * drive.dt) * wp.cross(back, w)
+    """:func:`apply_correction` to every particle, over :func:`piavatar_envs.avatar.lanes.rows_of`."""
+    i, j = wp.tid()
+    at = place_in_rows(i, j, body.count)
+    e = at[0]
+    p = at[1]
+    if p < body.count and failure[e] == 0:
+        free = is_free(drive, let_go[e])
+        apply_correction(body, drive, x, bones.center[e, 0], change, removed, free, e, p, u, driven)

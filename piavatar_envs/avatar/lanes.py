@@ -27,6 +27,38 @@ def chunk_threads(device: str, chunks: int) -> int:
     return min(warp_threads(device), 1 << max(0, (chunks - 1) // 2).bit_length())
 
 
+def rows_of(device: str, num_envs: int, count: int) -> tuple[int, int]:
+    """Threads over ``count`` particles of each environment: on a GPU whole CUDA blocks of :data:`BLOCK`."""
+    return num_envs, -(-count // BLOCK) * BLOCK if wp.get_device(device).is_cuda else count
+
+
+# Warp finds a thread's place by divisions of 64 bits, which take a tenth of a short kernel's instructions.
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+const unsigned blocks = ((unsigned)count + {BLOCK - 1}u) / {BLOCK}u, row = blockIdx.x / blocks;
+return wp::vec_t<2, wp::int32>((int)row, (int)((blockIdx.x - row * blocks) * {BLOCK}u + threadIdx.x));
+#else
+return wp::vec_t<2, wp::int32>(e, p);
+#endif
+""")
+def place_in_rows(e: int, p: int, count: int) -> wp.vec2i:
+    """Environment and particle of a thread of a launch over :func:`rows_of`; ``e`` and ``p`` are what Warp says."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+const unsigned warp = blockIdx.x * (blockDim.x >> 5) + (threadIdx.x >> 5), row = warp / (unsigned)chunks;
+return wp::vec_t<3, wp::int32>((int)row, (int)(warp - row * (unsigned)chunks), (int)(threadIdx.x & 31));
+#else
+return wp::vec_t<3, wp::int32>(e, c, thread);
+#endif
+""")
+def place_in_chunks(e: int, c: int, thread: int, chunks: int) -> wp.vec3i:
+    """Environment, chunk and lane in a launch over ``(num_envs, chunks, warp_threads)``, as Warp says, too."""
+    ...
+
+
 _SUM = """
 #if defined(__CUDA_ARCH__)
 const unsigned group = threads >= 32 ? 0xffffffffu : ((1u << threads) - 1u) << (threadIdx.x & 31 & -threads);

@@ -16,6 +16,7 @@ from piavatar_envs.avatar.rotation import finite_turn, quat_exp, quat_log, rigid
 from piavatar_envs.avatar.types import (
     DRIVE_REFERENCE,
     DRIVE_TARGET,
+    Anchor,
     Body,
     Carry,
     Drive,
@@ -88,6 +89,36 @@ def pose_bone(
         position[e, b] = position[e, parent] + wp.quat_rotate(rotation[e, parent], offset)
 
 
+@wp.func
+def pose_bones(
+    body: Body,
+    fraction: float,
+    base_rotation: wp.array2d(dtype=wp.quat),
+    base_root: wp.array(dtype=wp.vec3),
+    increment: wp.array2d(dtype=wp.vec3),
+    root_increment: wp.array(dtype=wp.vec3),
+    e: int,
+    thread: int,
+    threads: int,
+    # out
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+):
+    """Pose at ``fraction`` of the control step: base local rotations turned along arcs, then forward kinematics.
+
+    A thread that is alone poses the bones in their order, parents first; the threads of a warp do so level by level.
+    """
+    root = base_root[e] + fraction * root_increment[e]
+    for b in range(thread, body.parent.shape[0], threads):
+        rotation[e, b] = base_rotation[e, b] * quat_exp(fraction * increment[e, b])
+    levels = wp.where(threads > 1, body.levels, 1)
+    for level in range(levels):
+        for b in range(thread, body.parent.shape[0], threads):
+            if threads == 1 or body.depth[b] == level:
+                pose_bone(body, e, b, root, rotation, position)
+        meet_threads(threads)
+
+
 @wp.kernel
 def pose_body(
     body: Body,
@@ -101,20 +132,11 @@ def pose_body(
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """Pose at ``fraction`` of the control step: base local rotations turned along arcs, then forward kinematics.
-
-    A thread that is alone poses the bones in their order, parents first; the threads of a warp do so level by level.
-    """
+    """:func:`pose_bones` of every environment, over ``(num_envs, threads)``."""
     e, thread = wp.tid()
-    root = base_root[e] + fraction * root_increment[e]
-    for b in range(thread, body.parent.shape[0], threads):
-        rotation[e, b] = base_rotation[e, b] * quat_exp(fraction * increment[e, b])
-    levels = wp.where(threads > 1, body.levels, 1)
-    for level in range(levels):
-        for b in range(thread, body.parent.shape[0], threads):
-            if threads == 1 or body.depth[b] == level:
-                pose_bone(body, e, b, root, rotation, position)
-        meet_threads(threads)
+    pose_bones(
+        body, fraction, base_rotation, base_root, increment, root_increment, e, thread, threads, rotation, position
+    )  # fmt: skip
 
 
 @wp.func
@@ -134,35 +156,40 @@ def carried(
     return wp.normalize(turn * q_back), wp.quat_rotate(turn, t_back - before) + c
 
 
-@wp.kernel
-def carry_bones(
+@wp.func
+def carry_bone(
     dt: float,
     bones: RigidFits,
-    whole: RigidFit,
     removed: RemovedMotion,
-    failure: wp.array(dtype=int),
+    e: int,
+    b: int,
     # in and out
-    carry_rotation: wp.array2d(dtype=wp.quat),
-    carry_translation: wp.array2d(dtype=wp.vec3),
-    anchor_rotation: wp.array(dtype=wp.quat),
-    anchor_translation: wp.array(dtype=wp.vec3),
+    carry: Carry,
 ):
-    """Advance ``G`` by the motion that the physical velocity gave each bone, the laid command by the body's own."""
-    e, b = wp.tid()
-    if failure[e] != 0:
-        return
+    """Advance ``G`` of a bone by the motion that the physical velocity gave it."""
     q, t = carried(
         e, dt, removed, bones.center[e, b], bones.velocity[e, b], bones.spin[e, b],
-        carry_rotation[e, b], carry_translation[e, b],
+        carry.rotation[e, b], carry.translation[e, b],
     )  # fmt: skip
-    carry_rotation[e, b] = q
-    carry_translation[e, b] = t
-    if b == 0:
-        q_anchor, t_anchor = carried(
-            e, dt, removed, whole.center[e], whole.velocity[e], whole.spin[e], anchor_rotation[e], anchor_translation[e]
-        )
-        anchor_rotation[e] = q_anchor
-        anchor_translation[e] = t_anchor
+    carry.rotation[e, b] = q
+    carry.translation[e, b] = t
+
+
+@wp.func
+def carry_anchor(
+    dt: float,
+    whole: RigidFit,
+    removed: RemovedMotion,
+    e: int,
+    # in and out
+    anchor: Anchor,
+):
+    """Advance the laid command by the body's own motion."""
+    q, t = carried(
+        e, dt, removed, whole.center[e], whole.velocity[e], whole.spin[e], anchor.rotation[e], anchor.translation[e]
+    )
+    anchor.rotation[e] = q
+    anchor.translation[e] = t
 
 
 @wp.kernel
@@ -225,8 +252,8 @@ def bone_matrices(
     bone_step[e, b] = (rigid_matrix(q_next, rest, at_next) - A) / dt
 
 
-@wp.kernel
-def write_records(
+@wp.func
+def write_record(
     body: Body,
     drive: Drive,
     pose: Pose,
@@ -234,9 +261,10 @@ def write_records(
     carry: Carry,
     bones: RigidFits,
     command: Pose,
-    anchor_rotation: wp.array(dtype=wp.quat),
-    anchor_translation: wp.array(dtype=wp.vec3),
+    anchor: Anchor,
     gap: wp.array2d(dtype=wp.vec3),
+    e: int,
+    b: int,
     # out
     record: wp.array2d(dtype=vec44),
 ):
@@ -245,7 +273,6 @@ def write_records(
     Then from the carried to the commanded bone: the commanded pose is laid on the body by the anchor. A bone that
     contact has torn off its parent is carried where the parent would have it; its way back is added.
     """
-    e, b = wp.tid()
     q, at = carried_bone(pose, carry, e, b)
     q_next, at_next = carried_bone(next_pose, carry, e, b)
     rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
@@ -254,9 +281,9 @@ def write_records(
     step = (at_next - at) / drive.dt - turn * at
     lean = wp.mat44()
     if drive.tone_rate > 0.0:
-        goal = wp.quat_rotate(anchor_rotation[e], command.position[e, b]) + anchor_translation[e]
+        goal = wp.quat_rotate(anchor.rotation[e], command.position[e, b]) + anchor.translation[e]
         back = wp.quat_rotate(carry.rotation[e, b], gap[e, b])
-        lean = rigid_matrix(anchor_rotation[e] * command.rotation[e, b], rest, goal - back) - A
+        lean = rigid_matrix(anchor.rotation[e] * command.rotation[e, b], rest, goal - back) - A
     spin = bones.spin[e, b]
     velocity = bones.velocity[e, b] - wp.cross(spin, bones.center[e, b] - bones.center[e, 0])
     s = vec44()
@@ -270,15 +297,3 @@ def write_records(
         s[VELOCITY + i] = velocity[i]
         s[SPIN + i] = spin[i]
     store_record(record, e, b, s)
-
-
-@wp.kernel
-def find_gaps(
-    tracked_position: wp.array2d(dtype=wp.vec3),
-    pose: Pose,
-    # out
-    gap: wp.array2d(dtype=wp.vec3),
-):
-    """How far bones are from where fixed offsets would put them, at the start of a control step."""
-    e, b = wp.tid()
-    gap[e, b] = tracked_position[e, b] - pose.position[e, b]

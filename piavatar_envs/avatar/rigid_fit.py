@@ -13,7 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.lanes import sum_threads12, sum_threads16
-from piavatar_envs.avatar.types import Body, RigidFits, vec12, vec16
+from piavatar_envs.avatar.types import Body, RigidFit, RigidFits, vec12, vec16
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -47,23 +47,19 @@ def point_inertia(mass: float, d: wp.vec3):
     return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
 
 
-@wp.kernel
-def fit_bones(
+@wp.func
+def fit_bone(
     body: Body,
     reference: wp.array2d(dtype=wp.vec3),
     moments: wp.array2d(dtype=vec16),
-    failure: wp.array(dtype=int),
+    e: int,
+    b: int,
+    thread: int,
     threads: int,
     # out
-    center: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    spin: wp.array2d(dtype=wp.vec3),
-    inertia: wp.array2d(dtype=wp.mat33),
+    bones: RigidFits,
 ):
-    """Rigid motion of every bone: centre [m], its velocity [m/s], angular velocity [rad/s], inertia [kg m^2]."""
-    e, b, thread = wp.tid()
-    if failure[e] != 0:
-        return
+    """Rigid motion of one bone: centre [m], its velocity [m/s], angular velocity [rad/s], inertia [kg m^2]."""
     s = vec16()
     for c in range(body.chunk_start[b] + thread, body.chunk_start[b + 1], threads):
         s += moments[e, c]
@@ -76,28 +72,23 @@ def fit_bones(
     second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12])) - m * wp.outer(d, d)
     I = wp.diag(wp.vec3(wp.trace(second))) - second
     L = wp.vec3(s[13], s[14], s[15]) - m * wp.cross(d, V)
-    center[e, b] = reference[e, b] + d
-    velocity[e, b] = V
-    spin[e, b] = spin_of(I, L)
-    inertia[e, b] = I
+    bones.center[e, b] = reference[e, b] + d
+    bones.velocity[e, b] = V
+    bones.spin[e, b] = spin_of(I, L)
+    bones.inertia[e, b] = I
 
 
-@wp.kernel
-def fit_body(
+@wp.func
+def fit_whole(
     body: Body,
     bones: RigidFits,
-    failure: wp.array(dtype=int),
+    e: int,
+    thread: int,
     threads: int,
     # out
-    body_center: wp.array(dtype=wp.vec3),
-    body_velocity: wp.array(dtype=wp.vec3),
-    body_spin: wp.array(dtype=wp.vec3),
-    body_inertia: wp.array(dtype=wp.mat33),
+    whole: RigidFit,
 ):
     """Rigid motion of the whole body from those of its bones: their momenta add up to the body's."""
-    e, thread = wp.tid()
-    if failure[e] != 0:
-        return
     r = row(e, body.bone_mass.shape[0])
     pelvis = bones.center[e, 0]
     m = float(0.0)
@@ -123,7 +114,7 @@ def fit_body(
     # fmt: on
     if thread == 0:
         I = wp.mat33(t[3], t[4], t[5], t[6], t[7], t[8], t[9], t[10], t[11])
-        body_center[e] = c
-        body_velocity[e] = wp.vec3(s[4], s[5], s[6]) / s[0]
-        body_spin[e] = spin_of(I, wp.vec3(t[0], t[1], t[2]))
-        body_inertia[e] = I
+        whole.center[e] = c
+        whole.velocity[e] = wp.vec3(s[4], s[5], s[6]) / s[0]
+        whole.spin[e] = spin_of(I, wp.vec3(t[0], t[1], t[2]))
+        whole.inertia[e] = I

@@ -14,7 +14,7 @@ from piavatar_envs.avatar.kabsch import kabsch_rotation
 from piavatar_envs.avatar.lanes import sum_threads12
 from piavatar_envs.avatar.pulls import critical_pull
 from piavatar_envs.avatar.rotation import quat_exp, quat_log
-from piavatar_envs.avatar.types import Body, Carry, Command, Drive, Pose, RigidFit, vec12
+from piavatar_envs.avatar.types import Anchor, Body, Carry, Command, Drive, Held, Pose, RigidFit, Wrench, vec12
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -26,27 +26,24 @@ def clamp_length(v: wp.vec3, limit: float):
     return v * wp.min(1.0, limit / wp.max(wp.length(v), 1.0e-12))
 
 
-@wp.kernel
-def root_wrench(
+@wp.func
+def hold_root(
     drive: Drive,
     fraction: float,
     command: Command,
     pose: Pose,
     carry: Carry,
     whole: RigidFit,
-    body_mass: wp.array(dtype=float),
+    mass: float,
+    e: int,
     # in and out
-    let_go: wp.array(dtype=int),
-    wrench_force: wp.array(dtype=wp.vec3),
-    wrench_torque: wp.array(dtype=wp.vec3),
+    held: Held,
     # out
-    wrench_linear: wp.array(dtype=wp.vec3),
-    wrench_angular: wp.array(dtype=wp.vec3),
+    wrench: Wrench,
 ):
     """Acceleration of the body by the root wrench in this substep; its mean over the control step is accumulated."""
-    e = wp.tid()
-    wrench_linear[e] = wp.vec3(0.0)
-    wrench_angular[e] = wp.vec3(0.0)
+    wrench.linear[e] = wp.vec3(0.0)
+    wrench.angular[e] = wp.vec3(0.0)
     if drive.root_rate <= 0.0:
         return
     G = carry.rotation[e, 0]
@@ -62,22 +59,21 @@ def root_wrench(
         or horizontal > drive.max_horizontal_error
         or wp.abs(error[2]) > drive.max_height_error
     ):
-        let_go[e] = 1
-    if let_go[e] != 0:
+        held.let_go[e] = 1
+    if held.let_go[e] != 0:
         return
-    m = body_mass[wp.min(e, body_mass.shape[0] - 1)]
     I = whole.inertia[e]
     a = critical_pull(drive.root_rate, drive.dt, error, whole.velocity[e]) - drive.gravity
     a = clamp_length(a, drive.max_force)
     torque = I * critical_pull(drive.root_rate, drive.dt, quat_log(q_command * wp.quat_inverse(q)), whole.spin[e])
-    torque = clamp_length(torque, drive.max_torque * m)
+    torque = clamp_length(torque, drive.max_torque * mass)
     if not (wp.isfinite(a) and wp.isfinite(torque)):
         return  # the body has blown up; the substep will say so
-    wrench_linear[e] = a
-    wrench_angular[e] = wp.inverse(I) * torque
+    wrench.linear[e] = a
+    wrench.angular[e] = wp.inverse(I) * torque
     share = 1.0 / float(drive.num_substeps)
-    wrench_force[e] = wrench_force[e] + share * m * a
-    wrench_torque[e] = wrench_torque[e] + share * torque
+    held.wrench_force[e] = held.wrench_force[e] + share * mass * a
+    held.wrench_torque[e] = held.wrench_torque[e] + share * torque
 
 
 @wp.func
@@ -87,18 +83,18 @@ def bone_place(body: Body, pose: Pose, e: int, b: int):
     return pose.position[e, b] + wp.quat_rotate(pose.rotation[e, b], arm)
 
 
-@wp.kernel
-def lay_command_on_body(
+@wp.func
+def lay_command(
     body: Body,
     command: Pose,
     pose: Pose,
+    e: int,
+    thread: int,
     threads: int,
     # out
-    anchor_rotation: wp.array(dtype=wp.quat),
-    anchor_translation: wp.array(dtype=wp.vec3),
+    anchor: Anchor,
 ):
     """Best rigid motion from the commanded to the tracked pose: Kabsch over the bones' centres of mass."""
-    e, thread = wp.tid()
     r = row(e, body.bone_mass.shape[0])
     m = float(0.0)
     x = wp.vec3()
@@ -123,5 +119,5 @@ def lay_command_on_body(
     if thread == 0:
         H = wp.mat33(t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7], t[8])
         q = wp.normalize(wp.quat_from_matrix(kabsch_rotation(H)))
-        anchor_rotation[e] = q
-        anchor_translation[e] = mean - wp.quat_rotate(q, mean_command)
+        anchor.rotation[e] = q
+        anchor.translation[e] = mean - wp.quat_rotate(q, mean_command)

@@ -8,20 +8,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from piavatar_envs.avatar import bone_sums, flesh, posing, rigid_fit
+import warp as wp
+
+from piavatar_envs.avatar import bone_sums, drive_stages, flesh, posing
 from piavatar_envs.avatar.injection import inject_velocity
-from piavatar_envs.avatar.lanes import BLOCK
-from piavatar_envs.avatar.root import lay_command_on_body, root_wrench
+from piavatar_envs.avatar.lanes import BLOCK, rows_of
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import (
+    Anchor,
+    Bench,
     Carry,
     Command,
     DriveScratch,
     DriveState,
+    Held,
     Pose,
     RemovedMotion,
     RigidFit,
     RigidFits,
+    Wrench,
 )
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import State, group
@@ -46,6 +51,7 @@ class Groups:
         self.next_pose = group(Pose, rotation=s.next_rotation, position=s.next_position)
         self.command_pose = group(Pose, rotation=s.command_pose_rotation, position=s.command_pose_position)
         self.carry = group(Carry, rotation=s.carry_rotation, translation=s.carry_translation)
+        self.held = group(Held, let_go=d.let_go, wrench_force=d.wrench_force, wrench_torque=d.wrench_torque)
         self.command = group(
             Command,
             rotation=d.command_rotation,
@@ -53,6 +59,40 @@ class Groups:
             root=d.command_root,
             goal_root=d.goal_root,
         )
+
+    def lay_out(self, s: DriveScratch, start: tuple[wp.array, wp.array], tracked: wp.array) -> None:
+        """Make :attr:`bench`, of even and of odd substeps, for control steps that ``start`` from a pose."""
+        rotation, root = start
+        poses = (self.pose, self.next_pose), (self.next_pose, self.pose)
+        self.bench = [
+            group(
+                Bench,
+                start_rotation=rotation,
+                start_root=root,
+                increment=s.increment,
+                root_increment=s.root_increment,
+                command=self.command,
+                tracked=tracked,
+                now=now,
+                after=after,
+                command_pose=self.command_pose,
+                carry=self.carry,
+                anchor=group(Anchor, rotation=s.anchor_rotation, translation=s.anchor_translation),
+                gap=s.gap,
+                bones=self.bones,
+                whole=self.whole,
+                removed=self.removed,
+                wrench=group(Wrench, linear=s.wrench_linear, angular=s.wrench_angular),
+                moments=s.moments,
+                record=s.bone_record,
+                pull=s.pull,
+                lean=s.lean,
+                corrections=s.corrections,
+                bone_corrections=s.bone_corrections,
+                change=s.bone_change,
+            )
+            for now, after in poses
+        ]
 
 
 def record_pose(drive: AvatarDrive, program: Program, fraction: float, rotation, root, increment, out: Pose) -> None:
@@ -63,149 +103,50 @@ def record_pose(drive: AvatarDrive, program: Program, fraction: float, rotation,
 
 def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) -> None:
     """Append what an avatar does before substep ``step`` of a control step of the ``"split"`` scheme."""
-    s, d, g = drive.scratch, drive.state, drive.groups
-    n, steps = drive.model.num_envs, drive.model.num_substeps
-    now, after = (g.pose, g.next_pose) if step % 2 == 0 else (g.next_pose, g.pose)
-    record_fit(drive, program, state)
-    if step > 0:
-        _record_carry(drive, program, state)
-    record_pose(drive, program, (step + 1) / steps, *drive.start_pose(), s.increment, after)
-    if drive.settings.tone > 0.0:
-        command = (d.command_rotation, d.command_root, s.command_increment)
-        record_pose(drive, program, step / steps, *command, g.command_pose)
-        if step == 0:
-            anchor = [s.anchor_rotation, s.anchor_translation]
-            inputs = [drive.body, g.command_pose, now, drive.threads]
-            program.launch(lay_command_on_body, (n, drive.threads), inputs, anchor)
-            program.launch(posing.find_gaps, (n, NUM_JOINTS), [drive.tracked.position, now], [s.gap])
-    program.launch(
-        root_wrench,
-        n,
-        [drive.drive, step / steps, g.command, now, g.carry, g.whole, drive.body_mass],
-        [d.let_go, d.wrench_force, d.wrench_torque, s.wrench_linear, s.wrench_angular],
-    )
-    _record_bones(drive, program, now, after)
-    _record_flesh(drive, program, state)
-
-
-def record_fit(drive: AvatarDrive, program: Program, state: State) -> None:
-    """Rigid motions of bones and body, fitted to the physical velocity."""
-    s, n, bones = drive.scratch, drive.model.num_envs, drive.groups.bones
-    reference = drive.tracked.position
-    program.launch(
-        bone_sums.sum_moments,
-        (n, drive.num_chunks, drive.threads),
-        [drive.body, drive.model.particles, state.x, state.u, reference, state.failure, drive.threads],
-        [s.moments],
-        block_dim=BLOCK,
-    )
-    program.launch(
-        rigid_fit.fit_bones,
-        (n, NUM_JOINTS, drive.bone_threads),
-        [drive.body, reference, s.moments, state.failure, drive.bone_threads],
-        [s.bone_center, s.bone_velocity, s.bone_spin, s.bone_inertia],
-        block_dim=BLOCK,
-    )
-    program.launch(
-        rigid_fit.fit_body,
-        (n, drive.threads),
-        [drive.body, bones, state.failure, drive.threads],
-        [s.body_center, s.body_velocity, s.body_spin, s.body_inertia],
-        block_dim=BLOCK,
-    )
-
-
-def _record_carry(drive: AvatarDrive, program: Program, state: State) -> None:
-    """Advance the carried bones and the laid command by the motion of the substep that has just been."""
-    s, g, n, dt = drive.scratch, drive.groups, drive.model.num_envs, drive.model.step.dt
-    program.launch(
-        posing.carry_bones,
-        (n, NUM_JOINTS),
-        [dt, g.bones, g.whole, g.removed, state.failure],
-        [s.carry_rotation, s.carry_translation, s.anchor_rotation, s.anchor_translation],
-    )
-
-
-def _record_bones(drive: AvatarDrive, program: Program, now: Pose, after: Pose) -> None:
-    """What particles blend of their bones in the substep from ``now`` to ``after``."""
-    s, g = drive.scratch, drive.groups
-    anchor = [s.anchor_rotation, s.anchor_translation]
-    program.launch(
-        posing.write_records,
-        (drive.model.num_envs, NUM_JOINTS),
-        [drive.body, drive.drive, now, after, g.carry, g.bones, g.command_pose, *anchor, s.gap],
-        [s.bone_record],
-    )
-
-
-def _record_flesh(drive: AvatarDrive, program: Program, state: State) -> None:
-    """Kinematic velocity and pulls of every particle."""
-    s, g, n = drive.scratch, drive.groups, drive.model.num_envs
+    n, s, g = drive.model.num_envs, drive.scratch, drive.groups
+    bench, who = g.bench[step % 2], [drive.body, drive.drive]
+    if drive.in_one:
+        inputs = [*who, drive.model.particles, drive.body_mass, step, state.x, state.failure]
+        outputs = [bench, g.held, drive.state.motion, state.u, state.kinematic]
+        program.launch(drive_stages.drive_body, n, inputs, outputs)
+        return
+    chunks, own = (n, drive.num_chunks, drive.threads), [drive.chunk_threads, state.failure, drive.bone_threads]
+    inputs = [drive.body, drive.model.particles, state.x, state.u, bench.tracked, state.failure, drive.threads]
+    program.launch(bone_sums.sum_moments, chunks, inputs, [s.moments], block_dim=BLOCK)
+    bones, block = (n, drive.bone_threads), drive.bone_threads
+    inputs = [*who, drive.body_mass, step, *own]
+    program.launch(drive_stages.prepare_body, bones, inputs, [bench, g.held], block_dim=block)
     program.launch(
         flesh.drive_particles,
-        (n, drive.num_points),
-        [drive.body, drive.drive, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure],
+        rows_of(drive.model.device, n, drive.num_points),
+        [*who, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure],
         [state.u, drive.state.motion, state.kinematic, s.pull, s.lean],
         block_dim=BLOCK,
     )
     if drive.drive.free_motion or drive.drive.root_rate > 0.0:  # a root that lets go leaves a free body
-        _record_free_motion(drive, program, state)
-    _record_sums(drive, program, state)
-    program.launch(
-        flesh.blend_corrections,
-        (n, drive.threads),
-        [drive.body, drive.drive, s.bone_corrections, g.bones, g.whole, s.wrench_linear, s.wrench_angular]
-        + [drive.threads],
-        [s.bone_change],
-        block_dim=BLOCK,
-    )
+        _record_free_motion(drive, program, state, bench)
+    inputs = [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.threads]
+    program.launch(bone_sums.sum_corrections, chunks, inputs, [s.corrections], block_dim=BLOCK)
+    program.launch(drive_stages.settle_body, bones, [*who, *own], [bench], block_dim=block)
     program.launch(
         flesh.apply_corrections,
-        (n, drive.num_points),
-        [drive.body, drive.drive, state.x, s.pull, g.bones, s.bone_change, g.removed, drive.state.let_go]
-        + [state.failure],
+        rows_of(drive.model.device, n, drive.num_points),
+        [*who, state.x, g.bones, s.bone_change, g.removed, drive.state.let_go, state.failure],
         [state.u, state.kinematic],
         block_dim=BLOCK,
     )
 
 
-def _record_free_motion(drive: AvatarDrive, program: Program, state: State) -> None:
+def _record_free_motion(drive: AvatarDrive, program: Program, state: State, bench: Bench) -> None:
     """Take the rigid part out of the commanded motion of bodies that nothing supports."""
-    s, g, n, let_go = drive.scratch, drive.groups, drive.model.num_envs, drive.state.let_go
-    body, particles = drive.body, drive.model.particles
+    s, n, threads = drive.scratch, drive.model.num_envs, drive.threads
+    inputs = [drive.body, drive.drive, drive.model.particles, state.x, state.vk, s.bone_center, drive.state.let_go]
+    shape = (n, int(bone_sums.GROUPS), threads)
     program.launch(
-        bone_sums.sum_motion,
-        (n, int(bone_sums.GROUPS), drive.threads),
-        [body, drive.drive, particles, state.x, state.vk, s.bone_center, let_go, state.failure, drive.threads],
-        [s.corrections],
-        block_dim=BLOCK,
-    )
-    program.launch(
-        flesh.free_motion,
-        (n, drive.threads),
-        [drive.body, drive.drive, s.corrections, g.bones, g.whole, let_go, drive.threads],
-        [s.removed_velocity, s.removed_turn, s.removed_center, s.wrench_angular],
-        block_dim=BLOCK,
-    )
-
-
-def _record_sums(drive: AvatarDrive, program: Program, state: State) -> None:
-    """Momenta of the pulls, bone by bone."""
-    s, n = drive.scratch, drive.model.num_envs
-    program.launch(
-        bone_sums.sum_corrections,
-        (n, drive.num_chunks, drive.threads),
-        [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.threads],
-        [s.corrections],
-        block_dim=BLOCK,
-    )
-    program.launch(
-        bone_sums.add_chunks,
-        (n, NUM_JOINTS, drive.bone_threads),
-        [drive.body, s.corrections, state.failure, drive.bone_threads],
-        [s.bone_corrections],
-        block_dim=BLOCK,
-    )
+        bone_sums.sum_motion, shape, [*inputs, state.failure, threads], [s.corrections], block_dim=BLOCK
+    )  # fmt: skip
+    inputs = [drive.body, drive.drive, state.failure, threads]
+    program.launch(drive_stages.settle_motion, (n, threads), inputs, [bench, drive.groups.held], block_dim=BLOCK)
 
 
 def record_injection(drive: AvatarDrive, program: Program, state: State) -> None:

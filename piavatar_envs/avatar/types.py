@@ -124,6 +124,14 @@ class Carry:
 
 
 @wp.struct
+class Anchor:
+    """Rigid motion that lays the commanded pose on the body; ``(num_envs,)``."""
+
+    rotation: wp.array(dtype=wp.quat)
+    translation: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
 class Command:
     """The commanded pose at the start of the control step and what it gains until the end."""
 
@@ -131,6 +139,52 @@ class Command:
     increment: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) [rad]
     root: wp.array(dtype=wp.vec3)  # (num_envs,) [m]
     goal_root: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Wrench:
+    """What the root wrench does to the body as a whole in a substep; ``(num_envs,)``."""
+
+    linear: wp.array(dtype=wp.vec3)  # acceleration of its centre [m/s^2]
+    angular: wp.array(dtype=wp.vec3)  # angular acceleration [rad/s^2]
+
+
+@wp.struct
+class Held:
+    """What the root wrench leaves behind, see :class:`DriveState`; ``(num_envs,)``."""
+
+    let_go: wp.array(dtype=int)
+    wrench_force: wp.array(dtype=wp.vec3)
+    wrench_torque: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Bench:
+    """What a drive works on in a substep, see :class:`DriveScratch`; ``now`` and ``after`` take turns."""
+
+    start_rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) the pose that the control step starts from, local
+    start_root: wp.array(dtype=wp.vec3)
+    increment: wp.array2d(dtype=wp.vec3)
+    root_increment: wp.array(dtype=wp.vec3)
+    command: Command
+    tracked: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) joint positions at the start of the control step [m]
+    now: Pose
+    after: Pose
+    command_pose: Pose
+    carry: Carry
+    anchor: Anchor
+    gap: wp.array2d(dtype=wp.vec3)
+    bones: RigidFits
+    whole: RigidFit
+    removed: RemovedMotion
+    wrench: Wrench
+    moments: wp.array2d(dtype=vec16)
+    record: wp.array2d(dtype=vec44)
+    pull: wp.array2d(dtype=wp.vec3)
+    lean: wp.array2d(dtype=wp.vec3)
+    corrections: wp.array2d(dtype=vec12)
+    bone_corrections: wp.array2d(dtype=vec12)
+    change: wp.array2d(dtype=vec8)
 
 
 @dataclass

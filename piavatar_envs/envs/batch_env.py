@@ -106,7 +106,7 @@ class BatchEnv:
         self.task.record_reset(self, program)
         sim.record_reset(program, self.mask)
         self.observer.record_reset(program, self.mask)
-        self._record_observation(program)
+        self._record_observation(program, self.mask)
         self._record_observation(self.observe_program)
 
         program = self.step_program
@@ -146,11 +146,11 @@ class BatchEnv:
             joints = avatar.joints
             program.launch(apply_torques, bones, [*acting, joints.body.strength], [joints.state.torque])
 
-    def _record_observation(self, program: Program) -> None:
-        """Append what writes the observation; it changes nothing else."""
+    def _record_observation(self, program: Program, mask: wp.array | None = None) -> None:
+        """Append what writes the observation; it changes nothing else. A reset has changed that of the ``mask``."""
         self.observer.record_settings(program)
         for agent in range(self.num_agents):
-            self.observer.record(program, agent, self.observation)
+            self.observer.record(program, agent, self.observation, mask)
             if self.task.terms():
                 self.task.record_observe(self, program, agent, self.observer.task_start)
             self.observer.record_parameters(program, self, agent)

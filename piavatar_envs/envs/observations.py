@@ -162,14 +162,16 @@ def observe_body(
 
 
 @wp.kernel
-def clear_stress(agent: int, start: int, observation: wp.array3d(dtype=float)):
+def clear_stress(mask: wp.array(dtype=wp.bool), agent: int, start: int, observation: wp.array3d(dtype=float)):
     """Peaks are taken anew every control step."""
     e, part = wp.tid()
-    observation[e, agent, start + part] = 0.0
+    if mask[e]:
+        observation[e, agent, start + part] = 0.0
 
 
 @wp.kernel
 def observe_stress(
+    mask: wp.array(dtype=wp.bool),
     body: Body,
     particles: Particles,
     F: wp.array3d(dtype=float),
@@ -182,6 +184,8 @@ def observe_stress(
 ):
     """Peak von Mises stress of each body part, in units of Young's modulus. A maximum does not depend on its order."""
     e, p = wp.tid()
+    if not mask[e]:
+        return
     q = body.first + p
     G = matrix_at(F, e, q)
     tau = kirchhoff_stress(

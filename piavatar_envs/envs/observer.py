@@ -63,20 +63,25 @@ class Observer:
         last = [self.parameters.term] if self.parameters else []
         self.layout = ObservationLayout((*terms, *task.terms(), *last))
         device = simulation.device
+        self._everybody = wp.full(simulation.num_envs, True, dtype=wp.bool, device=device)
         self._part = [wp.array(flesh.part, dtype=int, device=device) for flesh in simulation.flesh]
 
-    def record(self, program: Program, agent: int, observation: wp.array) -> None:
-        """Append: write all but the task's terms of ``agent``. Changes nothing else."""
+    def record(self, program: Program, agent: int, observation: wp.array, mask: wp.array | None = None) -> None:
+        """Append: write all but the task's terms of ``agent``. Changes nothing else.
+
+        What takes a pass over the particles is written where there is no ``mask``, or where it is set.
+        """
+        mask = self._everybody if mask is None else mask
         sim = self.simulation
         n, avatar = sim.num_envs, sim.avatars[agent]
         start = self.layout["stress"].slice.start
         program.launch(observe_body, (n, NUM_JOINTS), [agent, *tracked_arrays(avatar.tracked)], [observation])
-        program.launch(clear_stress, (n, len(BODY_PARTS)), [agent, start], [observation])
+        program.launch(clear_stress, (n, len(BODY_PARTS)), [mask, agent, start], [observation])
         modulus = 1.0 / sim.flesh[agent].physics.young_modulus
         program.launch(
             observe_stress,
             (n, avatar.num_points),
-            [avatar.body, sim.model.particles, sim.state.F, self._part[agent], agent, start, modulus],
+            [mask, avatar.body, sim.model.particles, sim.state.F, self._part[agent], agent, start, modulus],
             [observation],
         )
         if self.task.observes_contact:

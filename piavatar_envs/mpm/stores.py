@@ -11,7 +11,7 @@ import warp as wp
 
 from piavatar_envs.mpm.gather import Gathered
 from piavatar_envs.mpm.matrices import store_matrix
-from piavatar_envs.mpm.types import Moving
+from piavatar_envs.mpm.types import Kinematic, Moving
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,6 +65,36 @@ def store_vector(into: wp.array2d(dtype=wp.vec3), e: int, p: int, value: wp.vec3
 @wp.func_native(_STORE % (("put(moved.x, s.x); put(moved.u, s.u);",) * 2))
 def store_vectors(moved: Moving, e: int, p: int, s: Gathered, store: bool):
     """:func:`store_vector` of where particle ``p`` has come to, and of its velocity."""
+    ...
+
+
+@wp.func_native(_STORE % (("put(u, velocity); put(driven.vk, vk); put(driven.spin, spin);",) * 2))
+def store_velocities(
+    u: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
+    e: int,
+    p: int,
+    velocity: wp.vec3,
+    vk: wp.vec3,
+    spin: wp.vec3,
+    store: bool,
+):
+    """:func:`store_vector` of a particle's physical velocity, and of its prescribed motion."""
+    ...
+
+
+@wp.func_native(_STORE % (("put(first, one); if (second_too) put(second, other);",) * 2))
+def store_pair(
+    first: wp.array2d(dtype=wp.vec3),
+    second: wp.array2d(dtype=wp.vec3),
+    e: int,
+    p: int,
+    one: wp.vec3,
+    other: wp.vec3,
+    second_too: bool,
+    store: bool,
+):
+    """:func:`store_vector` of one, and of another if that is wanted, as all threads know."""
     ...
 
 

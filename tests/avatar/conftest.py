@@ -85,6 +85,10 @@ class Rig:
                 return
         raise ValueError(f"a control step has {count} launches of {kernel} fewer than asked for")
 
+    def run_drive(self) -> None:
+        """Run a control step up to the first substep's scatter."""
+        self.run_part_of_step("drive_body" if self.drive.in_one else "apply_corrections", 1)
+
     def track(self) -> None:
         """Track the particles where they are now."""
         program = Program(self.model.device)

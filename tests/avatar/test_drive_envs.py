@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar import drive, substeps
 from piavatar_envs.mpm.types import FAILURE_NONFINITE
 
 
@@ -105,3 +107,46 @@ def test_running_twice_gives_the_same_bits_and_eager_equals_recorded(make_rig, w
     first = runs[0].everything()
     assert_same(runs[0], first, runs[1].everything())
     assert_same(runs[0], first, runs[2].everything())
+
+
+@pytest.mark.parametrize("root", ["wrench", "free"])
+def test_one_launch_drives_a_body_as_many_do(make_rig, wild_pose, monkeypatch, root):
+    """On a CPU all of the drive is one launch, on a GPU every pass over particles is one."""
+    options = {"root": root, "free_motion": root == "free"}
+    one = disturbed(make_rig, wild_pose, **options)
+    if wp.get_device(one.model.device).is_cuda:
+        assert not one.drive.in_one
+        return
+    record_drive = substeps.record_drive
+
+    def by_passes(avatar, program, state, step):
+        avatar.in_one = False
+        record_drive(avatar, program, state, step)
+
+    monkeypatch.setattr(drive, "record_drive", by_passes)
+    rows = drive.AvatarDrive._allocate
+
+    def allocate(avatar, cls):
+        avatar.in_one = False  # which needs a row of pulls for every environment
+        return rows(avatar, cls)
+
+    monkeypatch.setattr(drive.AvatarDrive, "_allocate", allocate)
+    many = disturbed(make_rig, wild_pose, **options)
+    assert "drive_body" in one.step_program._names and "drive_particles" in many.step_program._names
+    for name, value in one.everything().items():
+        np.testing.assert_array_equal(value, many.everything()[name], err_msg=name)
+
+
+def test_the_size_of_a_block_does_not_change_the_drive(make_rig, wild_pose, monkeypatch):
+    """Sums run over fixed lists by warps, however many of them a block has."""
+    results = []
+    for threads in (32, 64, 96):
+        monkeypatch.setattr(drive, "BONE_THREADS", threads)
+        rng = np.random.default_rng(2)
+        rig = make_rig().reset(wild_pose(rng))
+        rig.state.u.assign(rng.normal(size=(1, rig.points.num_points, 3)).astype(np.float32))
+        rig.run_drive()
+        results.append((rig.state.u.numpy(), rig.state.vk.numpy(), rig.drive.scratch.bone_change.numpy()))
+    for other in results[1:]:
+        for mine, theirs in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(mine, theirs)
