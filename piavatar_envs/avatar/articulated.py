@@ -43,31 +43,11 @@ import warp as wp
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.bone_sums import sum_moments, sum_moments_of_both
 from piavatar_envs.avatar.joint_mass import JointMass
-from piavatar_envs.avatar.joint_momentum import balance, gather_momentum
-from piavatar_envs.avatar.joint_motion import (
-    add_change,
-    attach_flesh,
-    find_displacement,
-    go_on,
-    hand_back,
-    move_joints,
-    spread_motion,
-    take_over,
-)
-from piavatar_envs.avatar.joint_torques import (
-    UNBOUNDED,
-    Springs,
-    Target,
-    find_given,
-    implicit_diagonals,
-    joint_impulse,
-    limit_torques,
-    make_strength,
-    make_tissue,
-)
+from piavatar_envs.avatar.joint_motion import attach_flesh, find_displacement, hand_back, take_over
+from piavatar_envs.avatar.joint_stages import JointBench, Support, act, begin_substep, build_mass, fit_pose
+from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.lanes import BLOCK, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
-from piavatar_envs.avatar.posing import rest_matrices
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
 from piavatar_envs.mpm.program import Program
@@ -90,6 +70,7 @@ class ArticulatedBody:
         attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s], or None.
         mass: the mass matrix.
         impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` is what held the pelvis.
+        support: force and torque of what holds the pelvis: every substep adds its share of a control step's mean.
     """
 
     def __init__(
@@ -143,26 +124,50 @@ class ArticulatedBody:
         self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
         self.target.rotation.fill_(wp.quat_identity())
         self.mass = JointMass(points, body, model)
-        # where there are two of a kind, they are worked on together: those of all environments, then the others
-        self._factors, self._cut = self.mass.make_factors(2 * n), self.mass.make_factors(n)
-        self._factor, self._driven = self._factors[:n], self._factors[n:]
-        self._diagonals = zeros((2 * n, NUM_DOF), float)
-        self._locks, self._diagonal = self._diagonals[:n], self._diagonals[n:]
-        self._momentum, self._shares = zeros((2, n, NUM_DOF), float), zeros((2 * n, NUM_DOF), float)
-        self._change, self._taken = self._shares[:n], self._shares[n:]
-        self._left, self._limited = zeros((n, NUM_DOF), float), zeros(n, int)
-        self._muscle, self.impulse = zeros((n, NUM_DOF), float), zeros((n, NUM_DOF), float)
-        self._stop, self._nothing = zeros(bones, float), zeros((n, NUM_DOF), float)
-        self._place = zeros(bones, wp.mat44)
-        self._leaving, self._moving = zeros(bones, vec8), zeros(bones, vec8)
-        self._linear, self._angular = zeros((2, *bones), wp.vec3), zeros((2, *bones), wp.vec3)
         self._displacement = zeros((n, model.num_particles), wp.vec3)
-        chunks = (n, body.chunk_bone.shape[0])
-        self._chunks, self._other_chunks = zeros(chunks, vec16), zeros(chunks, vec12)
-        self._bones = zeros(bones, vec16)
+        self.impulse = zeros((n, NUM_DOF), float)
+        self.support = group(Support, force=zeros(n, wp.vec3), torque=zeros(n, wp.vec3))
+        self._bench = self._allocate()
         without, everywhere = np.zeros((NUM_JOINTS, 3)), np.full((NUM_JOINTS, 3), UNBOUNDED)
         self.set_strength(-everywhere, everywhere, 1)
         self.set_tissue(without[:, 0], without[:, 0], -everywhere, everywhere, [])
+
+    def _allocate(self) -> JointBench:
+        """What a substep works on."""
+        n, s, mass = self.model.num_envs, self.state, self.mass
+
+        def zeros(dtype, *shape):
+            return wp.zeros(shape, dtype=dtype, device=self.model.device)
+
+        chunks = self.body.chunk_bone.shape[0]
+        return group(
+            JointBench,
+            pose=self.pose,
+            velocity=s.velocity,
+            outside=s.outside,
+            pair_sums=mass.sums,
+            records=mass.records,
+            pattern=mass.pattern,
+            matrix=mass.matrix,
+            diagonals=zeros(float, 2 * n, NUM_DOF),
+            factors=mass.make_factors(2 * n),
+            cut=mass.make_factors(1),
+            stop=zeros(float, n, NUM_JOINTS),
+            moments=zeros(vec16, n, chunks),
+            other_moments=zeros(vec12, n, chunks),
+            bones=zeros(vec16, n, NUM_JOINTS),
+            linear=zeros(wp.vec3, 2 * n, NUM_JOINTS),
+            angular=zeros(wp.vec3, 2 * n, NUM_JOINTS),
+            momentum=zeros(float, 2 * n, NUM_DOF),
+            shares=zeros(float, 2 * n, NUM_DOF),
+            muscle=zeros(float, n, NUM_DOF),
+            impulse=self.impulse,
+            left=zeros(float, n, NUM_DOF),
+            place=zeros(wp.mat44, n, NUM_JOINTS),
+            leaving=zeros(vec8, n, NUM_JOINTS),
+            moving=zeros(vec8, n, NUM_JOINTS),
+            pelvis=zeros(wp.vec3, n),
+        )
 
     def _upload(self, value: np.ndarray, dtype: type = float) -> wp.array:
         return wp.array(np.ascontiguousarray(value, np.float32), dtype=dtype, device=self.model.device)
@@ -177,86 +182,39 @@ class ArticulatedBody:
         """Let joints resist; see :func:`make_tissue`. To be called before anything is recorded."""
         self.tissue = make_tissue(damping, stop, lower, upper, locked, self.model.device)
         locks = np.r_[np.zeros(3), np.repeat(self.tissue.lock.numpy(), 3)]
-        self._locks.assign(np.broadcast_to(locks.astype(np.float32), self._locks.shape))
+        own = self._bench.diagonals[: self.model.num_envs]
+        own.assign(np.broadcast_to(locks.astype(np.float32), own.shape))
 
     def record_mass(self, program: Program, state: State) -> None:
         """Append: build the mass matrix where particles and joints are, and what follows from it."""
-        self.mass.record(program, state, self.state.position)
-        inputs = [self.body, self.model.step.dt, self.pose, self.springs, self.tissue]
-        outputs = [self._stop, self._diagonal]
-        program.launch(implicit_diagonals, (self.model.num_envs, 1 + NUM_JOINTS), inputs, outputs)
-        self.mass.record_factors(program, self._diagonals, self._factors)
+        self.mass.record_sums(program, state, self.state.position)
+        threads = min(2 * self.threads, 64) if self.threads > 1 else 1
+        inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure, threads]
+        program.launch(build_mass, (self.model.num_envs, threads), inputs, [self._bench], block_dim=threads)
 
     def _record_fit(self, program: Program, state: State) -> None:
         """Append: fit the pose to the particles, by a share. No velocity changes."""
-        n, s = self.model.num_envs, self.state
-        pose = [s.rotation, s.position]
-        self._record_place(program)
-        inputs = [self.body, state.x, self._place]
-        program.launch(find_displacement, (n, self.body.count), inputs, [self._displacement])
-        self._record_shares(program, state, [self._displacement], self._change)
-        self._record_spread(program, self._change, self._moving)
-        inputs = [self.body, FIT_SHARE, self._moving, state.failure, self.threads]
-        program.launch(move_joints, (n, self.threads), inputs, pose)
+        points = (self.model.num_envs, self.body.count)
+        inputs = [self.body, state.x, self._bench.place, state.failure]
+        program.launch(find_displacement, points, inputs, [self._displacement])
+        self._record_moments(program, state, [self._displacement])
+        self._record_stage(program, fit_pose, [self.body, FIT_SHARE], state)
 
-    def _record_spread(self, program: Program, q: wp.array, field: wp.array) -> None:
-        """Append: motion of the bones under a generalised velocity."""
-        inputs = [self.body, self.state.position, q, self.threads]
-        program.launch(spread_motion, (self.model.num_envs, self.threads), inputs, [field])
+    def _record_stage(self, program: Program, stage: wp.Kernel, inputs: list, state: State, *more: Support) -> None:
+        """Append what a warp does for an environment."""
+        inputs, outputs = [*inputs, state.failure, self.threads], [*more, self._bench]
+        program.launch(stage, (self.model.num_envs, self.threads), inputs, outputs, block_dim=self.threads)
 
-    def _record_place(self, program: Program) -> None:
-        """Append: matrices that take the bones from rest to where they are."""
-        inputs = [self.body, self.state.rotation, self.state.position]
-        program.launch(rest_matrices, self._place.shape, inputs, [self._place])
-
-    def _record_shares(self, program: Program, state: State, vectors: Sequence[wp.array], shares: wp.array) -> None:
-        """Append: the shares ``dq = M^-1 J^T m v`` that the joints can take of one or two vectors at the particles."""
-        n, position = self.model.num_envs, self.state.position
-        sums = [self._chunks, self._other_chunks][: len(vectors)]
+    def _record_moments(self, program: Program, state: State, vectors: Sequence[wp.array]) -> None:
+        """Append: moments of the chunks of one or two vectors at the particles."""
+        w, one = self._bench, len(vectors) == 1
         program.launch(
-            sum_moments if len(vectors) == 1 else sum_moments_of_both,
-            (*self._chunks.shape, self.threads),
-            [self.body, self.model.particles, state.x, *vectors, position, state.failure, self.threads],
-            sums,
+            sum_moments if one else sum_moments_of_both,
+            (*w.moments.shape, self.threads),
+            [self.body, self.model.particles, state.x, *vectors, self.state.position, state.failure, self.threads],
+            [w.moments] if one else [w.moments, w.other_moments],
             block_dim=BLOCK,
         )
-        outputs = [self._linear, self._angular, self._bones, self._momentum]
-        inputs = [self.body, position, self._chunks, self._other_chunks, self.threads]
-        program.launch(gather_momentum, (len(vectors), n, self.threads), inputs, outputs)
-        momenta = self._momentum.reshape((-1, NUM_DOF))[: shares.shape[0]]
-        self.mass.record_solve(program, self._factor, momenta, shares)
-
-    def _record_attachment(self, program: Program, state: State) -> None:
-        """Append: hand back, then flesh is pulled to the bones, and the bones to the flesh.
-
-        And what the joints can take of the velocity that this leaves: one pass over the particles sums both.
-        """
-        n, s, points = self.model.num_envs, self.state, (self.model.num_envs, self.body.count)
-        self._record_place(program)
-        where = [state.x, s.position, self._place, self._moving]
-        inputs = [self.body, self.model.step.dt, *where, self.attachment, state.vk, state.failure]
-        program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
-        self._record_shares(program, state, [self._displacement, state.u], self._shares)
-        self._record_spread(program, self._change, self._moving)
-        inputs = [s.position, self._bones, 1.0, self._nothing, self._moving, self.threads]
-        program.launch(balance, (n, self.threads), inputs, [self._change])
-        program.launch(add_change, (n, NUM_DOF), [self._change, state.failure], [s.velocity, s.outside])
-
-    def _record_torques(self, program: Program, state: State) -> None:
-        """Append: springs, torques and tissue change the velocity of the joints."""
-        n, s, dt, each = self.model.num_envs, self.state, self.model.step.dt, (self.model.num_envs, 1 + NUM_JOINTS)
-        inputs = [self.body, dt, self.pose, self.target, self.springs, self.tissue, self._stop]
-        outputs = [self._muscle, self.impulse, self._limited]
-        program.launch(joint_impulse, each, [*inputs, s.velocity, s.outside], outputs)
-        self.mass.record_solve(program, self._driven, self.impulse, self._change)
-        inputs = [self.body, dt, self.pose, self.springs, self.strength, self._muscle, self._diagonal, self._change]
-        program.launch(limit_torques, each, inputs, [self.impulse, self._left, self._limited])
-        self.mass.record_factors(program, self._left, self._cut, self._limited)
-        self.mass.record_solve(program, self._cut, self.impulse, self._change, self._limited)
-        program.launch(find_given, (n, NUM_DOF), [self._left, self._change], [self.impulse])
-        self._record_spread(program, self._change, self._moving)
-        inputs = [s.position, self._bones, 0.0, self.impulse, self._moving, self.threads]
-        program.launch(balance, (n, self.threads), inputs, [self._change])
 
     def record_substep(self, program: Program, state: State, refresh: bool) -> None:
         """Append what the joints do before an MPM substep: take over, act, and move the pose on.
@@ -267,25 +225,24 @@ class ArticulatedBody:
             refresh: build the mass matrix anew, and fit the pose to the particles; to be done in the first substep of a
                 program and every few milliseconds.
         """
-        n, s, pose = self.model.num_envs, self.state, [self.state.rotation, self.state.position]
-        points = (n, self.body.count)
+        model, w, points = self.model, self._bench, (self.model.num_envs, self.body.count)
+        position, dt = self.state.position, model.step.dt
         if refresh:
             self.record_mass(program, state)
             self._record_fit(program, state)
-        self._record_spread(program, s.velocity, self._moving)
-        if self.attachment is not None:
-            self._record_attachment(program, state)
         else:
-            inputs = [self.body, state.x, s.position, self._moving, state.vk, state.failure]
+            self._record_stage(program, begin_substep, [self.body], state)
+        # hand back; flesh may be pulled to the bones, too: one pass over the particles sums what both leave
+        if self.attachment is not None:
+            inputs = [self.body, dt, state.x, position, w.place, w.moving, self.attachment, state.vk, state.failure]
+            program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
+            vectors = [self._displacement, state.u]
+        else:
+            inputs = [self.body, state.x, position, w.moving, state.vk, state.failure]
             program.launch(hand_back, points, inputs, [state.u])
-            self._record_shares(program, state, [state.u], self._taken)
-        program.launch(add_change, (n, NUM_DOF), [self._taken, state.failure], [s.velocity, s.outside])
-        self._record_torques(program, state)
-        inputs = [self._change, s.outside, state.failure]
-        program.launch(go_on, (n, NUM_DOF), inputs, [s.velocity, self._taken])
-        self._record_spread(program, self._taken, self._leaving)
-        self._record_spread(program, s.velocity, self._moving)
-        inputs = [self.body, state.x, s.position, self._leaving, self._moving, state.failure]
+            vectors = [state.u]
+        self._record_moments(program, state, vectors)
+        inputs = [self.body, dt, 1.0 / model.control_dt, len(vectors), self.target, self.springs, self.tissue]
+        self._record_stage(program, act, [*inputs, self.strength], state, self.support)
+        inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, state.failure]
         program.launch(take_over, points, inputs, [state.u, state.kinematic])
-        inputs = [self.body, self.model.step.dt, self._moving, state.failure, self.threads]
-        program.launch(move_joints, (n, self.threads), inputs, pose)

@@ -3,12 +3,11 @@
 The matrix is ``L^T L`` with a lower triangle ``L``: rows are eliminated from the last one up. Where rows are joints
 in an order that has children after their parents, limbs go before what they hang on, and of two limbs neither fills
 the rows of the other (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6.5). Which entries are not zero is
-found once, on the host; rows come in threes, the axes of a joint. What is not ``wanted`` ``(num_envs,)`` stays as it
-is.
+found once, on the host; rows come in threes, the axes of a joint.
 
 A factor's rows lie one after the other, row ``k`` from entry ``k (k + 1) / 2`` on. On a CPU one thread has a matrix to
-itself (``threads = 1``). On a GPU a warp has it, in shared memory (:mod:`piavatar_envs.avatar.warp_cholesky`): each row
-needs the one before, and would wait for global memory every time.
+itself (``threads = 1``). On a GPU a warp has it, in a ``room`` in shared memory
+(:mod:`piavatar_envs.avatar.warp_cholesky`): each row needs the one before, and would wait for global memory every time.
 """
 
 from __future__ import annotations
@@ -16,7 +15,14 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.warp_cholesky import MOST_ROWS, factorize_together, solve_together
+from piavatar_envs.avatar.lanes import meet_threads
+from piavatar_envs.avatar.warp_cholesky import (
+    MOST_ROWS,
+    factorize_together,
+    load_factor,
+    solve_together,
+    store_factor,
+)
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -131,29 +137,30 @@ def factorize_alone(
     diagonal: wp.array2d(dtype=float),
     source: int,
     e: int,
+    f: int,
     factor: wp.array2d(dtype=float),
 ):
-    """:func:`factorize` for one thread: matrix ``source`` and row ``e`` of the ``diagonal`` make factor ``e``."""
+    """:func:`factorize` for one thread."""
     size = matrix.shape[1]
     for k in range(size):
         at = start_of_row(k)
         for n in range(pattern.start[k], pattern.start[k + 1]):
-            factor[e, at + pattern.column[n]] = matrix[source, k, pattern.column[n]]
-        factor[e, at + k] = matrix[source, k, k] + diagonal[e, k]
+            factor[f, at + pattern.column[n]] = matrix[source, k, pattern.column[n]]
+        factor[f, at + k] = matrix[source, k, k] + diagonal[e, k]
     for row in range(size):
         k = size - 1 - row
         at = start_of_row(k)
         first = pattern.start[k]
         last = pattern.start[k + 1]
-        pivot = wp.sqrt(factor[e, at + k])
-        factor[e, at + k] = pivot
+        pivot = wp.sqrt(factor[f, at + k])
+        factor[f, at + k] = pivot
         for n in range(first, last):
             i = pattern.column[n]
-            share = factor[e, at + i] / pivot
-            factor[e, at + i] = share
-            subtract_row(pattern.column, first, n, factor, e, k, i, share)
+            share = factor[f, at + i] / pivot
+            factor[f, at + i] = share
+            subtract_row(pattern.column, first, n, factor, f, k, i, share)
             own = start_of_row(i) + i
-            factor[e, own] = factor[e, own] - share * share
+            factor[f, own] = factor[f, own] - share * share
 
 
 @wp.func
@@ -170,51 +177,66 @@ def solve_alone(pattern: Pattern, factor: wp.array2d(dtype=float), f: int, e: in
         x[e, k] = (x[e, k] - part) / factor[f, start_of_row(k) + k]
 
 
-@wp.kernel
+@wp.func
 def factorize(
     pattern: Pattern,
     matrix: wp.array3d(dtype=float),
     diagonal: wp.array2d(dtype=float),
-    wanted: wp.array(dtype=int),
+    source: int,
+    e: int,
     threads: int,
+    room: wp.uint64,
+    f: int,
     # out
     factor: wp.array2d(dtype=float),
 ):
-    """``L`` of ``L^T L = matrix + diag(diagonal)``; launched over ``(systems, threads)`` in blocks of ``threads``.
+    """``L`` of ``L^T L = matrix + diag(diagonal)``, of matrix ``source`` and row ``e`` of the ``diagonal``.
 
-    A system is one of an environment's: ``systems`` are once or several times ``num_envs``, the first of all
-    environments first. Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, zero where the pattern has
-    nothing, and ``factor`` ``(systems, factor_size(N))`` is written where the pattern says. ``diagonal`` is
-    ``(systems, N)``.
+    Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, zero where the pattern has nothing. A thread
+    that is alone writes factor ``f``, ``(systems, factor_size(N))``, where the pattern says; a warp has it in its room,
+    from where :func:`keep_factor` writes it.
     """
-    e, _ = wp.tid()
-    source = e % matrix.shape[0]
-    if wanted[source] == 0:
-        return
     if threads == 1:
-        factorize_alone(pattern, matrix, diagonal, source, e, factor)
+        factorize_alone(pattern, matrix, diagonal, source, e, f, factor)
     else:
-        factorize_together(pattern.start, pattern.column, matrix, diagonal, source, e, factor)
+        factorize_together(pattern.start, pattern.column, matrix, diagonal, source, e, room)
 
 
-@wp.kernel
+@wp.func
+def keep_factor(threads: int, room: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
+    """Write factor ``f``, which :func:`factorize` has just found, where it has not done so itself."""
+    if threads > 1:
+        store_factor(room, f, factor)
+
+
+@wp.func
+def fetch_factor(factor: wp.array2d(dtype=float), f: int, threads: int, room: wp.uint64):
+    """Let a warp solve with factor ``f`` from here on."""
+    if threads > 1:
+        load_factor(factor, f, room)
+
+
+@wp.func
 def solve(
     pattern: Pattern,
     factor: wp.array2d(dtype=float),
+    f: int,
     right: wp.array2d(dtype=float),
-    wanted: wp.array(dtype=int),
+    e: int,
+    row: int,
+    thread: int,
     threads: int,
+    room: wp.uint64,
     # out
     x: wp.array2d(dtype=float),
 ):
-    """``x`` with ``L^T L x = right``, ``L`` the ``factor``; launched as :func:`factorize`, over factors or more."""
-    e, thread = wp.tid()
-    f = e % factor.shape[0]
-    if wanted[e % wanted.shape[0]] == 0:
-        return
+    """``x[row]`` with ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its room."""
+    meet_threads(threads)
     for i in range(thread, x.shape[1], threads):
-        x[e, i] = right[e, i]
+        x[row, i] = right[e, i]
+    meet_threads(threads)
     if threads == 1:
-        solve_alone(pattern, factor, f, e, x)
+        solve_alone(pattern, factor, f, row, x)
     else:
-        solve_together(factor, f, e, x)
+        solve_together(room, row, x)
+        meet_threads(threads)

@@ -16,6 +16,7 @@ import warp as wp
 from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.joint_motion import set_part
+from piavatar_envs.avatar.joint_stages import Support
 from piavatar_envs.avatar.joint_torques import Springs, Target
 from piavatar_envs.avatar.muscles import FASTEST, LOCKED_JOINTS, REFERENCE_HEIGHT, REFERENCE_MASS, Muscles, spring_rows
 from piavatar_envs.avatar.rotation import quat_log
@@ -150,23 +151,6 @@ def set_joints_in_motion(
     set_part(velocity, e, 3 + 3 * b, spin)
 
 
-@wp.kernel
-def note_support(
-    share: float,
-    impulse: wp.array2d(dtype=float),
-    failure: wp.array(dtype=int),
-    # in and out
-    force: wp.array(dtype=wp.vec3),
-    torque: wp.array(dtype=wp.vec3),
-):
-    """Add the assisting force and torque of a substep to their mean; ``share`` is that of an impulse [1/s]."""
-    e = wp.tid()
-    if failure[e] != 0:
-        return
-    force[e] = force[e] + share * wp.vec3(impulse[e, 0], impulse[e, 1], impulse[e, 2])
-    torque[e] = torque[e] + share * wp.vec3(impulse[e, 3], impulse[e, 4], impulse[e, 5])
-
-
 class JointDrive:
     """What turns the joints of one avatar in every environment.
 
@@ -196,6 +180,7 @@ class JointDrive:
         locked = [joint_index(name) for name in LOCKED_JOINTS]
         self.body.set_tissue(muscles.tissue_damping, muscles.stop, *ranges, locked)
         goal = {"rotation": drive.state.goal_rotation, "root": drive.state.goal_root}
+        self.body.support = group(Support, force=drive.state.wrench_force, torque=drive.state.wrench_torque)
         torques = {"torque": self.state.torque, "factor": self.body.strength.factor}
         self.body.target = group(Target, **goal, **torques)
         gains = [spring_rows(values).astype(np.float32) for values in (muscles.stiffness, muscles.damping)]
@@ -258,9 +243,6 @@ class JointDrive:
     def record_substep(self, program: Program, state: State, step: int) -> None:
         """Append what the joints do before substep ``step`` of a control step."""
         self.body.record_substep(program, state, refresh=step % self.refresh == 0)
-        n, share = self.drive.model.num_envs, 1.0 / self.drive.model.control_dt
-        d = self.drive.state
-        program.launch(note_support, n, [share, self.body.impulse, state.failure], [d.wrench_force, d.wrench_torque])
 
 
 def checked_assist(share: float | np.ndarray, num_envs: int) -> np.ndarray:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import motion_at
-from piavatar_envs.avatar.joint_motion import part_of, set_part
-from piavatar_envs.avatar.lanes import meet_threads, sum_threads16
+from piavatar_envs.avatar.joint_motion import set_part
+from piavatar_envs.avatar.lanes import sum_threads16
 from piavatar_envs.avatar.mass_matrix import BONES, I3
 from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
@@ -14,72 +14,96 @@ from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
-@wp.kernel
-def gather_momentum(
+@wp.func
+def gather_bones(
     body: Body,
-    position: wp.array2d(dtype=wp.vec3),
     moments: wp.array2d(dtype=vec16),
-    other_moments: wp.array2d(dtype=vec12),
+    e: int,
+    thread: int,
     threads: int,
-    # scratch
-    linear: wp.array3d(dtype=wp.vec3),
-    angular: wp.array3d(dtype=wp.vec3),
     # out
     bones: wp.array2d(dtype=vec16),
-    momentum: wp.array3d(dtype=float),
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
 ):
-    """``J^T m u`` from the moments of the bones about their joints: each joint has what all beyond it have.
-
-    Of one velocity or of two, from :func:`piavatar_envs.avatar.bone_sums.sum_moments_of_both`. Launched over
-    ``(velocities, num_envs, threads)``: threads share the bones' chunks, one of them goes down the tree.
-    """
-    n, e, thread = wp.tid()
+    """Moments of the bones about their joints from those of their chunks, and from them two momenta each."""
     for b in range(thread, BONES, threads):
         s = vec16()
         for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
-            if n == 0:
-                s += moments[e, c]
-            else:
-                t = other_moments[e, c]
-                for i in range(3):
-                    s[4 + i] += t[i]
-                    s[13 + i] += t[3 + i]
-        if n == 0:
-            bones[e, b] = s
-        linear[n, e, b] = wp.vec3(s[4], s[5], s[6])
-        angular[n, e, b] = wp.vec3(s[13], s[14], s[15])
-    meet_threads(threads)
-    if thread > 0:
-        return
+            s += moments[e, c]
+        bones[e, b] = s
+        linear[e, b] = wp.vec3(s[4], s[5], s[6])
+        angular[e, b] = wp.vec3(s[13], s[14], s[15])
+
+
+@wp.func
+def gather_other(
+    body: Body,
+    moments: wp.array2d(dtype=vec12),
+    e: int,
+    row: int,
+    thread: int,
+    threads: int,
+    # out
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+):
+    """The two momenta of a second velocity, from :func:`piavatar_envs.avatar.bone_sums.sum_moments_of_both`."""
+    for b in range(thread, BONES, threads):
+        P = wp.vec3()
+        L = wp.vec3()
+        for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
+            t = moments[e, c]
+            P += wp.vec3(t[0], t[1], t[2])
+            L += wp.vec3(t[3], t[4], t[5])
+        linear[row, b] = P
+        angular[row, b] = L
+
+
+@wp.func
+def pass_down(
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    e: int,
+    row: int,
+    # in and out
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+    # out
+    momentum: wp.array2d(dtype=float),
+):
+    """``J^T m u`` from the momenta of the bones about their joints: each joint has what all beyond it have."""
     for back in range(BONES - 1):
         b = BONES - 1 - back  # children come after their parents
         a = body.parent[b]
         arm = position[e, b] - position[e, a]
-        angular[n, e, a] = angular[n, e, a] + angular[n, e, b] + wp.cross(arm, linear[n, e, b])
-        linear[n, e, a] = linear[n, e, a] + linear[n, e, b]
-        set_part(momentum[n], e, 3 + 3 * b, angular[n, e, b])
-    set_part(momentum[n], e, 0, linear[n, e, 0])
-    set_part(momentum[n], e, 3, angular[n, e, 0])
+        angular[row, a] = angular[row, a] + angular[row, b] + wp.cross(arm, linear[row, b])
+        linear[row, a] = linear[row, a] + linear[row, b]
+        set_part(momentum, row, 3 + 3 * b, angular[row, b])
+    set_part(momentum, row, 0, linear[row, 0])
+    set_part(momentum, row, 3, angular[row, 0])
 
 
-@wp.kernel
+@wp.func
 def balance(
     position: wp.array2d(dtype=wp.vec3),
     bones: wp.array2d(dtype=vec16),
     reaction: float,
-    support: wp.array2d(dtype=float),
+    support: wp.vec3,
+    moment: wp.vec3,
     field: wp.array2d(dtype=vec8),
+    e: int,
+    thread: int,
     threads: int,
     # in and out
     change: wp.array2d(dtype=float),
 ):
     """Give a change of the joints' velocities, whose motion of the bones is ``field``, the momentum that it must have.
 
-    That is ``support``, an impulse and its moment about the pelvis joint, and with ``reaction`` 1 what the bones' sums
-    say. A rigid motion of the body makes up the difference. The blend of the bones' motions has the momenta of the
-    bones' own sums, because weights add up to one. Launched over ``(num_envs, threads)``.
+    That is ``support``, an impulse, and its ``moment`` about the pelvis joint, and with ``reaction`` 1 what the bones'
+    sums say. A rigid motion of the body makes up the difference. The blend of the bones' motions has the momenta of the
+    bones' own sums, because weights add up to one.
     """
-    e, thread = wp.tid()
     m = float(0.0)
     first = wp.vec3()
     I = wp.mat33()
@@ -112,8 +136,8 @@ def balance(
     if thread > 0:
         return
     center = wp.vec3(t[1], t[2], t[3]) / t[0]
-    P = wp.vec3(t[4], t[5], t[6]) - part_of(support, e, 0)
-    L = wp.vec3(t[7], t[8], t[9]) - part_of(support, e, 3)
+    P = wp.vec3(t[4], t[5], t[6]) - support
+    L = wp.vec3(t[7], t[8], t[9]) - moment
     I = symmetric(wp.vec3(t[10], t[11], t[12]), wp.vec3(t[13], t[14], t[15]))
     W = spin_of(I - point_inertia(t[0], center), L - wp.cross(center, P))
     V = P / t[0] - wp.cross(W, center)

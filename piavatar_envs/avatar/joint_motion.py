@@ -40,13 +40,14 @@ def spread_to_bone(
     body: Body,
     position: wp.array2d(dtype=wp.vec3),
     q: wp.array2d(dtype=float),
+    row: int,
     e: int,
     b: int,
     field: wp.array2d(dtype=vec8),
 ):
     """Rigid motion of one bone, whose parent's is known."""
-    w = part_of(q, e, 3 + 3 * b)
-    v = part_of(q, e, 0)
+    w = part_of(q, row, 3 + 3 * b)
+    v = part_of(q, row, 0)
     if b > 0:
         above = field[e, body.parent[b]]
         v = wp.vec3(above[0], above[1], above[2]) + wp.cross(w, position[e, 0] - position[e, b])
@@ -54,26 +55,29 @@ def spread_to_bone(
     field[e, b] = vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
 
 
-@wp.kernel
+@wp.func
 def spread_motion(
     body: Body,
     position: wp.array2d(dtype=wp.vec3),
     q: wp.array2d(dtype=float),
+    row: int,
+    e: int,
+    thread: int,
     threads: int,
     # out
     field: wp.array2d(dtype=vec8),
 ):
-    """Rigid motion of every bone under a generalised velocity: velocity where the pelvis joint is, and spin.
+    """Rigid motion of every bone under generalised velocity ``q[row]``: velocity where the pelvis joint is, and spin.
 
-    Launched over ``(num_envs, threads)``: a thread that is alone goes through the bones in their order, parents first;
-    the threads of a warp do so level by level.
+    A thread that is alone goes through the bones in their order, parents first; the threads of a warp do so level by
+    level.
     """
-    e, thread = wp.tid()
+    meet_threads(threads)
     levels = wp.where(threads > 1, body.levels, 1)
     for level in range(levels):
         for b in range(thread, BONES, threads):
             if threads == 1 or body.depth[b] == level:
-                spread_to_bone(body, position, q, e, b, field)
+                spread_to_bone(body, position, q, row, e, b, field)
         meet_threads(threads)
 
 
@@ -87,7 +91,7 @@ def skinned_motion(body: Body, field: wp.array2d(dtype=vec8), e: int, p: int, ar
 def take_over(
     body: Body,
     x: wp.array2d(dtype=wp.vec3),
-    position: wp.array2d(dtype=wp.vec3),
+    pelvis: wp.array(dtype=wp.vec3),
     leaving: wp.array2d(dtype=vec8),
     moving: wp.array2d(dtype=vec8),
     failure: wp.array(dtype=int),
@@ -96,12 +100,15 @@ def take_over(
     # out
     driven: Kinematic,
 ):
-    """Take from the physical velocity what leaves it for the joints, and write ``J qdot``."""
+    """Take from the physical velocity what leaves it for the joints, and write ``J qdot``.
+
+    Both are motions about where the ``pelvis`` joint is before it moves on [m].
+    """
     e, p = wp.tid()
     if failure[e] != 0:
         return
     q = body.first + p
-    arm = vector_at(x, e, q) - position[e, 0]
+    arm = vector_at(x, e, q) - pelvis[e]
     store_vector(u, e, q, vector_at(u, e, q) - skinned_motion(body, leaving, e, p, arm), True)
     now = blend_changes(moving, e, body.joint, body.weight, p)
     store_vector(driven.vk, e, q, motion_at(now, arm), True)
@@ -132,11 +139,14 @@ def find_displacement(
     body: Body,
     x: wp.array2d(dtype=wp.vec3),
     place: wp.array2d(dtype=wp.mat44),
+    failure: wp.array(dtype=int),
     # out
     displacement: wp.array2d(dtype=wp.vec3),
 ):
     """Of the particles from where the pose has them by linear blend skinning [m], at their places in the world."""
     e, p = wp.tid()
+    if failure[e] != 0:
+        return
     q = body.first + p
     store_vector(displacement, e, q, vector_at(x, e, q) - skinned_place(body, place, e, p), True)
 
@@ -162,10 +172,9 @@ def attach_flesh(
     ``lost`` is what the pull has taken of the velocity [m/s].
     """
     e, p = wp.tid()
-    q = body.first + p
     if failure[e] != 0:
-        lost[e, q] = wp.vec3(0.0)
         return
+    q = body.first + p
     at = vector_at(x, e, q)
     before = vector_at(u, e, q) + vector_at(vk, e, q) - skinned_motion(body, moving, e, p, at - position[e, 0])
     way = skinned_place(body, place, e, p) - at
@@ -195,24 +204,20 @@ def move_bone(
     rotation[e, b] = wp.normalize(quat_exp(dt * wp.vec3(s[3], s[4], s[5])) * rotation[e, b])
 
 
-@wp.kernel
+@wp.func
 def move_joints(
     body: Body,
     dt: float,
     field: wp.array2d(dtype=vec8),
-    failure: wp.array(dtype=int),
+    e: int,
+    thread: int,
     threads: int,
     # in and out
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together.
-
-    Launched as :func:`spread_motion`.
-    """
-    e, thread = wp.tid()
-    if failure[e] != 0:
-        return
+    """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together. Threads as above."""
+    meet_threads(threads)
     levels = wp.where(threads > 1, body.levels, 1)
     for level in range(levels):
         for b in range(thread, BONES, threads):
@@ -221,32 +226,41 @@ def move_joints(
         meet_threads(threads)
 
 
-@wp.kernel
+@wp.func
 def add_change(
     change: wp.array2d(dtype=float),
-    failure: wp.array(dtype=int),
+    row: int,
+    e: int,
+    thread: int,
+    threads: int,
     # in and out
     q: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
 ):
     """What the particles did to the joints: it was not the joints' own doing."""
-    e, i = wp.tid()
-    if failure[e] == 0:
-        q[e, i] = q[e, i] + change[e, i]
-        outside[e, i] = outside[e, i] + change[e, i]
+    meet_threads(threads)
+    for i in range(thread, q.shape[1], threads):
+        q[e, i] = q[e, i] + change[row, i]
+        outside[e, i] = outside[e, i] + change[row, i]
 
 
-@wp.kernel
+@wp.func
 def go_on(
     change: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
-    failure: wp.array(dtype=int),
+    row: int,
+    e: int,
+    thread: int,
+    threads: int,
     # in and out
     q: wp.array2d(dtype=float),
     taken: wp.array2d(dtype=float),
 ):
-    """The velocity that joints will have if all else does again what it did; what this takes from the particles."""
-    e, i = wp.tid()
-    if failure[e] == 0:
+    """The velocity that joints will have if all else does again what it did; what this takes from the particles.
+
+    The joints' own ``change`` is in row ``e``, what was ``taken`` already in ``row``.
+    """
+    meet_threads(threads)
+    for i in range(thread, q.shape[1], threads):
         q[e, i] = q[e, i] + change[e, i] + outside[e, i]
-        taken[e, i] = taken[e, i] + outside[e, i]
+        taken[row, i] = taken[row, i] + outside[e, i]

@@ -142,19 +142,21 @@ def beyond(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
     return short_of_pi(wp.max(lower, wp.min(v, upper))) - v
 
 
-@wp.kernel
-def implicit_diagonals(
+@wp.func
+def implicit_diagonal(
     body: Body,
     dt: float,
     pose: Pose,
     springs: Springs,
     tissue: Tissue,
+    e: int,
+    n: int,
+    into: int,
     # out
     stop: wp.array2d(dtype=float),
     diagonal: wp.array2d(dtype=float),
 ):
-    """Which joints are beyond their range, and ``A`` of muscles and tissue; over ``(num_envs, 1 + bones)``."""
-    e, n = wp.tid()
+    """Whether a joint is beyond its range, and ``A`` of muscles and tissue; ``n`` is 0 for the pelvis' place."""
     r = row(e, springs.stiffness.shape[0])
     value = implicit_inertia(dt, springs.stiffness[r, n], springs.damping[r, n])
     if n > 1:
@@ -165,10 +167,10 @@ def implicit_diagonals(
             stiff = tissue.stop[b]
         stop[e, b] = stiff
         value += implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) + tissue.lock[b]
-    set_part(diagonal, e, 3 * n, wp.vec3(value))
+    set_part(diagonal, into, 3 * n, wp.vec3(value))
 
 
-@wp.kernel
+@wp.func
 def joint_impulse(
     body: Body,
     dt: float,
@@ -179,18 +181,16 @@ def joint_impulse(
     stop: wp.array2d(dtype=float),
     q: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
+    e: int,
+    n: int,
     # out
     muscle: wp.array2d(dtype=float),
     impulse: wp.array2d(dtype=float),
-    limited: wp.array(dtype=int),
 ):
-    """Impulses if the joints themselves changed nothing, of muscles and of all; over ``(num_envs, 1 + bones)``.
+    """Impulse of a joint if the joints themselves changed nothing, of muscles and of all.
 
     A torque of the pelvis, which would come from outside, is not asked for.
     """
-    e, n = wp.tid()
-    if n == 0:
-        limited[e] = 0
     r = row(e, springs.stiffness.shape[0])
     K = springs.stiffness[r, n]
     v = part_of(q, e, 3 * n) + part_of(outside, e, 3 * n)
@@ -214,30 +214,30 @@ def joint_impulse(
     set_part(impulse, e, 3 * n, active + passive)
 
 
-@wp.kernel
-def limit_torques(
+@wp.func
+def limit_torque(
     body: Body,
     dt: float,
     pose: Pose,
     springs: Springs,
     strength: Strength,
     muscle: wp.array2d(dtype=float),
-    diagonal: wp.array2d(dtype=float),
+    rest: float,
     change: wp.array2d(dtype=float),
+    e: int,
+    n: int,
     # in and out
     impulse: wp.array2d(dtype=float),
     # out
     left: wp.array2d(dtype=float),
-    limited: wp.array(dtype=int),
-):
-    """Where muscles would give more than they have, let them give that, whatever moves; over ``(num_envs, 1 + bones)``.
+) -> float:
+    """Where a muscle would give more than it has, let it give that, whatever moves: then the answer is 1, else 0.
 
-    ``left`` is ``A`` without the springs that were cut, and ``limited`` says whether any was.
+    ``left`` is ``A``, of which all is ``rest``, without the spring that was cut.
     """
-    e, n = wp.tid()
+    limited = float(0.0)
     r = row(e, springs.stiffness.shape[0])
     A = implicit_inertia(dt, springs.stiffness[r, n], springs.damping[r, n])
-    rest = diagonal[e, 3 * n]
     if n > 1:
         before = part_of(muscle, e, 3 * n)
         frame = above(body, pose.rotation, e, n - 1)
@@ -246,18 +246,22 @@ def limit_torques(
         cut = wp.max(limit * strength.lower[n - 1], wp.min(own, limit * strength.upper[n - 1]))
         if wp.length_sq(cut - own) > 0.0:
             rest -= A
-            limited[e] = 1
+            limited = 1.0
             set_part(impulse, e, 3 * n, part_of(impulse, e, 3 * n) - before + wp.quat_rotate(frame, cut))
     set_part(left, e, 3 * n, wp.vec3(rest))
+    return limited
 
 
-@wp.kernel
+@wp.func
 def find_given(
     left: wp.array2d(dtype=float),
     change: wp.array2d(dtype=float),
+    e: int,
+    thread: int,
+    threads: int,
     # in and out
     impulse: wp.array2d(dtype=float),
 ):
-    """The impulses that joints and pelvis really get, implicit as they are; launched over ``(num_envs, 69)``."""
-    e, i = wp.tid()
-    impulse[e, i] = impulse[e, i] - left[e, i] * change[e, i]
+    """The impulses that joints and pelvis really get, implicit as they are."""
+    for i in range(thread, impulse.shape[1], threads):
+        impulse[e, i] = impulse[e, i] - left[e, i] * change[e, i]

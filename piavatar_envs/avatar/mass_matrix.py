@@ -22,11 +22,11 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.lanes import meet_threads
 from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.rigid_fit import symmetric
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
+from piavatar_envs.mpm.shared_memory import meet
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -86,14 +86,14 @@ _WORD = _ROW * NUM_JOINTS
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-__shared__ float words[{_WORDS * _WORD}];
-return reinterpret_cast<wp::uint64>(words);
+__shared__ float __align__(16) words[{_WORDS * _WORD}];
+return reinterpret_cast<wp::uint64>(words + at);
 #else
-return reinterpret_cast<wp::uint64>(&wp::index(scratch, e, 0));
+return reinterpret_cast<wp::uint64>(scratch.data);
 #endif
 """)
-def records_of(scratch: wp.array2d(dtype=vec16), e: int) -> wp.uint64:
-    """Where the records of an environment are: a CUDA block's own, or on a CPU ``scratch``."""
+def room_of_records(scratch: wp.array(dtype=vec16), at: int) -> wp.uint64:
+    """Where an environment's records are: from word ``at`` of a CUDA block's shared memory; on a CPU in ``scratch``."""
     ...
 
 
@@ -200,34 +200,34 @@ def fill_blocks(s: vec16, e: int, c: int, d: int, mass: wp.array3d(dtype=float))
             set_block(mass, e, 0, 0, s[0] * I3)
 
 
-@wp.kernel
+@wp.func
 def compose_mass(
     body: Body,
     pairs: Pairs,
     sums: wp.array2d(dtype=vec12),
     position: wp.array2d(dtype=wp.vec3),
+    records: wp.uint64,
+    e: int,
+    thread: int,
     threads: int,
-    scratch: wp.array2d(dtype=vec16),
     # out
     mass: wp.array3d(dtype=float),
 ):
     """The mass matrix from the moments of pairs; of ``mass`` only the lower triangle is written.
 
     Moments of every two bones become those of all that two joints carry: first for one side of the pairs, then for the
-    other. Launched over ``(num_envs, threads)``, a CUDA block an environment; threads share the bones.
+    other. The threads of a CUDA block share the bones.
     """
-    e, thread = wp.tid()
-    records = records_of(scratch, e)
     for n in range(thread, BONES * BONES, threads):
         c = n // BONES
         write_pair(records, c, n % BONES, place_pair(pairs, sums, position, e, c, n % BONES))
-    meet_threads(threads)
+    meet()
     for other in range(thread, BONES, threads):
         compose_rows(body, position, records, e, other)
-    meet_threads(threads)
+    meet()
     for other in range(thread, BONES, threads):
         compose_columns(body, position, records, e, other)
-    meet_threads(threads)
+    meet()
     for n in range(thread, BONES * BONES, threads):
         c = n // BONES
         d = n % BONES

@@ -1,6 +1,7 @@
 """Cholesky factors in the shared memory of a warp, which has a CUDA block of its own. Nothing here runs on a CPU.
 
-See :mod:`piavatar_envs.avatar.cholesky`, which has the same in plain Warp.
+See :mod:`piavatar_envs.avatar.cholesky`, which has the same in plain Warp. A warp has :data:`ROOM` words, where a
+factor stays until the next one comes: what is solved with it need not fetch it again.
 """
 
 from __future__ import annotations
@@ -11,7 +12,23 @@ wp.set_module_options({"enable_backward": False})
 
 #: Rows of the largest matrix that there is room for.
 MOST_ROWS = 72
-_ROOM = MOST_ROWS * (MOST_ROWS + 1) // 2
+_FACTOR = MOST_ROWS * (MOST_ROWS + 1) // 2
+#: Words of shared memory of a warp: a factor, and three rows of it by columns.
+ROOM = _FACTOR + 4 * MOST_ROWS
+_AT = "float* const room = reinterpret_cast<float*>(at);"
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+__shared__ float __align__(16) room[{ROOM}];
+return reinterpret_cast<wp::uint64>(room);
+#else
+return 0;
+#endif
+""")
+def room_of_warp() -> wp.uint64:
+    """Room of a warp that has a CUDA block of its own."""
+    ...
 
 
 # The rows of a joint are eliminated together, so that an entry is read and written once for three of them. Lanes have
@@ -19,8 +36,8 @@ _ROOM = MOST_ROWS * (MOST_ROWS + 1) // 2
 # written, or each would wait for the one before.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-__shared__ float __align__(16) room[{_ROOM}];
-__shared__ float4 joint[{MOST_ROWS}];
+{_AT}
+float4* const joint = reinterpret_cast<float4*>(room + {_FACTOR});
 const int lane = threadIdx.x & 31, size = matrix.shape[1];
 const float* const from = &wp::index(matrix, source, 0, 0);
 const float* const more = &wp::index(diagonal, e, 0);
@@ -76,8 +93,6 @@ for (int k = size - 3; k >= 0; k -= 3) {{
     }}
     __syncwarp();
 }}
-float4* const to = reinterpret_cast<float4*>(&wp::index(factor, e, 0));
-for (int n = lane; n < factor.shape[1] / 4; n += 32) to[n] = reinterpret_cast<const float4*>(room)[n];
 #endif
 """)
 def factorize_together(
@@ -87,9 +102,36 @@ def factorize_together(
     diagonal: wp.array2d(dtype=float),
     source: int,
     e: int,
-    factor: wp.array2d(dtype=float),
+    at: wp.uint64,
 ):
-    """Factor ``e`` of :mod:`piavatar_envs.avatar.cholesky`, by a warp, of matrix ``source`` and diagonal ``e``."""
+    """The factor of matrix ``source`` and diagonal ``e``, as :mod:`piavatar_envs.avatar.cholesky` has it."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_AT}
+float4* const to = reinterpret_cast<float4*>(&wp::index(factor, f, 0));
+for (int n = threadIdx.x & 31; n < factor.shape[1] / 4; n += 32) to[n] = reinterpret_cast<const float4*>(room)[n];
+#endif
+""")
+def store_factor(at: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
+    """Write factor ``f`` from a warp's room."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_AT}
+const float4* const from = reinterpret_cast<const float4*>(&wp::index(factor, f, 0));
+__syncwarp();
+#pragma unroll 4
+for (int n = threadIdx.x & 31; n < factor.shape[1] / 4; n += 32) reinterpret_cast<float4*>(room)[n] = from[n];
+__syncwarp();
+#endif
+""")
+def load_factor(factor: wp.array2d(dtype=float), f: int, at: wp.uint64):
+    """Read factor ``f`` into a warp's room."""
     ...
 
 
@@ -97,11 +139,8 @@ def factorize_together(
 # columns of what is left: triangular numbers of 32 rows differ modulo 32, so lanes read from different banks.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-__shared__ float __align__(16) room[{_ROOM}];
+{_AT}
 const int lane = threadIdx.x & 31, size = x.shape[1];
-const float4* const from = reinterpret_cast<const float4*>(&wp::index(factor, f, 0));
-#pragma unroll 4
-for (int n = lane; n < factor.shape[1] / 4; n += 32) reinterpret_cast<float4*>(room)[n] = from[n];
 float* const result = &wp::index(x, e, 0);
 constexpr int PARTS = {-(-MOST_ROWS // 32)};
 float value[PARTS], over[PARTS];
@@ -137,6 +176,6 @@ for (int q = 0; q < PARTS; ++q)
     if (32 * q + lane < size) result[32 * q + lane] = value[q];
 #endif
 """)
-def solve_together(factor: wp.array2d(dtype=float), f: int, e: int, x: wp.array2d(dtype=float)):
-    """What is solved with factor ``f``; ``x[e]`` has the right-hand side at first."""
+def solve_together(at: wp.uint64, e: int, x: wp.array2d(dtype=float)):
+    """What is solved with the factor in a warp's room; ``x[e]`` has the right-hand side at first."""
     ...

@@ -9,15 +9,47 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.articulated import ArticulatedBody
-from piavatar_envs.avatar.cholesky import factor_size, factorize, find_pattern, solve
+from piavatar_envs.avatar.cholesky import (
+    Pattern,
+    factor_size,
+    factorize,
+    fetch_factor,
+    find_pattern,
+    keep_factor,
+    solve,
+)
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.warp_cholesky import room_of_warp
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 
 #: Springs of the joints, none of the pelvis.
 GAINS = np.r_[0.0, 0.0, np.ones(NUM_JOINTS - 1)][None]
+
+
+@wp.kernel(enable_backward=False)
+def factorize_and_solve(
+    pattern: Pattern,
+    matrix: wp.array3d(dtype=float),
+    diagonal: wp.array2d(dtype=float),
+    right: wp.array2d(dtype=float),
+    threads: int,
+    factor: wp.array2d(dtype=float),
+    x: wp.array2d(dtype=float),
+):
+    """Two diagonals of every matrix, over ``(num_envs, threads)``; all is solved after both factors have been found."""
+    e, thread = wp.tid()
+    n, room = matrix.shape[0], room_of_warp()
+    for which in range(2):
+        system = which * n + e
+        factorize(pattern, matrix, diagonal, e, system, threads, room, system, factor)
+        keep_factor(threads, room, system, factor)
+    for which in range(2):
+        system = which * n + e
+        fetch_factor(factor, system, threads, room)
+        solve(pattern, factor, system, right, system, system, thread, threads, room, x)
 
 
 def carried_by() -> np.ndarray:
@@ -110,7 +142,7 @@ def joints(make_rig, wild_pose):
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_factors_solve(device, sparse):
-    """Of some environments, two of each; the dense one has more rows than two warps have lanes."""
+    """Two of each environment; the dense one has more rows than two warps have lanes."""
     rng, size, n, threads = np.random.default_rng(0), 39 if sparse else NUM_DOF, 3, warp_threads(device)
     root = rng.normal(size=(n, size, size))
     filled = np.ones((size, size), bool)
@@ -122,22 +154,15 @@ def test_factors_solve(device, sparse):
     diagonal, right = rng.uniform(0.0, 3.0, (2 * n, size)), rng.normal(size=(2 * n, size))
     arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in (matrix, diagonal, right)]
     factor, x = (wp.zeros((2 * n, rows), dtype=float, device=device) for rows in (factor_size(size), size))
-    chosen = np.array([True, False, True])
-    wanted = wp.array(chosen.astype(np.int32), dtype=int, device=device)
-    pattern = find_pattern(filled, device)
-    how = {"dim": (2 * n, threads), "block_dim": threads, "device": device}
-    wp.launch(factorize, inputs=[pattern, *arrays[:2], wanted, threads], outputs=[factor], **how)
-    wp.launch(solve, inputs=[pattern, factor, arrays[2], wanted, threads], outputs=[x], **how)
-    chosen = np.tile(chosen, 2)
+    inputs = [find_pattern(filled, device), *arrays, threads]
+    wp.launch(factorize_and_solve, (n, threads), inputs, [factor, x], block_dim=threads, device=device)
     whole = np.tile(matrix, (2, 1, 1)) + diagonal[:, :, None] * np.eye(size)
     L = np.zeros((2 * n, size, size))
     rows, columns = np.tril_indices(size)
     L[:, rows, columns] = factor.numpy()[:, : len(rows)]
-    found = (L.transpose(0, 2, 1) @ L)[chosen]
-    np.testing.assert_allclose(found, whole[chosen], atol=1e-5 * np.abs(whole).max())
-    solved = np.linalg.solve(whole, right[..., None])[chosen, :, 0]
-    np.testing.assert_allclose(x.numpy()[chosen], solved, atol=1e-5 * np.abs(solved).max())
-    assert not factor.numpy()[~chosen].any() and not x.numpy()[~chosen].any()
+    np.testing.assert_allclose(L.transpose(0, 2, 1) @ L, whole, atol=1e-5 * np.abs(whole).max())
+    solved = np.linalg.solve(whole, right[..., None])[..., 0]
+    np.testing.assert_allclose(x.numpy(), solved, atol=1e-5 * np.abs(solved).max())
 
 
 def test_factors_of_odd_patterns_are_refused():
