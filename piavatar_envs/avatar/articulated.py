@@ -46,7 +46,7 @@ from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_motion import attach_flesh, find_displacement, hand_back, take_over
 from piavatar_envs.avatar.joint_stages import JointBench, Support, act, begin_substep, build_mass, fit_pose
 from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
-from piavatar_envs.avatar.lanes import BLOCK, warp_threads
+from piavatar_envs.avatar.lanes import BLOCK, particle_threads, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
@@ -105,6 +105,7 @@ class ArticulatedBody:
             if not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
         self.body, self.model, self.threads = body, model, warp_threads(device)
+        self._points = (n, particle_threads(device, body.count))
         self.springs = group(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
         self.attachment = None if attachment is None else self._upload(attachment)
 
@@ -194,9 +195,8 @@ class ArticulatedBody:
 
     def _record_fit(self, program: Program, state: State) -> None:
         """Append: fit the pose to the particles, by a share. No velocity changes."""
-        points = (self.model.num_envs, self.body.count)
         inputs = [self.body, state.x, self._bench.place, state.failure]
-        program.launch(find_displacement, points, inputs, [self._displacement])
+        program.launch(find_displacement, self._points, inputs, [self._displacement], block_dim=BLOCK)
         self._record_moments(program, state, [self._displacement])
         self._record_stage(program, fit_pose, [self.body, FIT_SHARE], state)
 
@@ -225,7 +225,7 @@ class ArticulatedBody:
             refresh: build the mass matrix anew, and fit the pose to the particles; to be done in the first substep of a
                 program and every few milliseconds.
         """
-        model, w, points = self.model, self._bench, (self.model.num_envs, self.body.count)
+        model, w, points = self.model, self._bench, self._points
         position, dt = self.state.position, model.step.dt
         if refresh:
             self.record_mass(program, state)
@@ -235,14 +235,14 @@ class ArticulatedBody:
         # hand back; flesh may be pulled to the bones, too: one pass over the particles sums what both leave
         if self.attachment is not None:
             inputs = [self.body, dt, state.x, position, w.place, w.moving, self.attachment, state.vk, state.failure]
-            program.launch(attach_flesh, points, inputs, [state.u, self._displacement])
+            program.launch(attach_flesh, points, inputs, [state.u, self._displacement], block_dim=BLOCK)
             vectors = [self._displacement, state.u]
         else:
             inputs = [self.body, state.x, position, w.moving, state.vk, state.failure]
-            program.launch(hand_back, points, inputs, [state.u])
+            program.launch(hand_back, points, inputs, [state.u], block_dim=BLOCK)
             vectors = [state.u]
         self._record_moments(program, state, vectors)
         inputs = [self.body, dt, 1.0 / model.control_dt, len(vectors), self.target, self.springs, self.tissue]
         self._record_stage(program, act, [*inputs, self.strength], state, self.support)
         inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, state.failure]
-        program.launch(take_over, points, inputs, [state.u, state.kinematic])
+        program.launch(take_over, points, inputs, [state.u, state.kinematic], block_dim=BLOCK)

@@ -23,7 +23,7 @@ from piavatar_envs.avatar.blending import (
     blended_velocity,
     motion_at,
 )
-from piavatar_envs.avatar.lanes import BLOCK, place_in_rows, sum_threads12, sum_threads16
+from piavatar_envs.avatar.lanes import BLOCK, own_particles, sum_threads12, sum_threads16
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
@@ -124,12 +124,13 @@ def drive_particles(
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
 ):
-    """:func:`drive_particle` of every particle, over :func:`piavatar_envs.avatar.lanes.rows_of`."""
-    i, j = wp.tid()
-    at = place_in_rows(i, j, body.count)
-    e = at[0]
-    p = at[1]
-    if p < body.count and failure[e] == 0:
+    """:func:`drive_particle` of every particle, over ``(num_envs, particle_threads)``."""
+    i, _ = wp.tid()
+    own = own_particles(i, body.count)
+    e = own[0]
+    if failure[e] != 0:
+        return
+    for p in range(own[1], own[2]):
         drive_particle(
             body, drive, x, record, bones.center[e, 0], let_go[e] != 0, e, p, e, u, motion, driven, pull, lean
         )  # fmt: skip
@@ -297,11 +298,12 @@ def apply_corrections(
     u: wp.array2d(dtype=wp.vec3),
     driven: Kinematic,
 ):
-    """:func:`apply_correction` to every particle, over :func:`piavatar_envs.avatar.lanes.rows_of`."""
-    i, j = wp.tid()
-    at = place_in_rows(i, j, body.count)
-    e = at[0]
-    p = at[1]
-    if p < body.count and failure[e] == 0:
-        free = is_free(drive, let_go[e])
+    """:func:`apply_correction` to every particle, over ``(num_envs, particle_threads)``."""
+    i, _ = wp.tid()
+    own = own_particles(i, body.count)
+    e = own[0]
+    if failure[e] != 0:
+        return
+    free = is_free(drive, let_go[e])
+    for p in range(own[1], own[2]):
         apply_correction(body, drive, x, bones.center[e, 0], change, removed, free, e, p, u, driven)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import blend_changes, motion_at, skinned_place
-from piavatar_envs.avatar.lanes import meet_threads
+from piavatar_envs.avatar.lanes import BLOCK, meet_threads, own_particles
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.pulls import implicit_velocity
@@ -87,7 +87,7 @@ def skinned_motion(body: Body, field: wp.array2d(dtype=vec8), e: int, p: int, ar
     return motion_at(blend_changes(field, e, body.joint, body.weight, p), arm)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 12))
 def take_over(
     body: Body,
     x: wp.array2d(dtype=wp.vec3),
@@ -104,15 +104,18 @@ def take_over(
 
     Both are motions about where the ``pelvis`` joint is before it moves on [m].
     """
-    e, p = wp.tid()
+    i, _ = wp.tid()
+    own = own_particles(i, body.count)
+    e = own[0]
     if failure[e] != 0:
         return
-    q = body.first + p
-    arm = vector_at(x, e, q) - pelvis[e]
-    store_vector(u, e, q, vector_at(u, e, q) - skinned_motion(body, leaving, e, p, arm), True)
-    now = blend_changes(moving, e, body.joint, body.weight, p)
-    store_vector(driven.vk, e, q, motion_at(now, arm), True)
-    store_vector(driven.spin, e, q, wp.vec3(now[3], now[4], now[5]), True)
+    for p in range(own[1], own[2]):
+        q = body.first + p
+        arm = vector_at(x, e, q) - pelvis[e]
+        store_vector(u, e, q, vector_at(u, e, q) - skinned_motion(body, leaving, e, p, arm), True)
+        now = blend_changes(moving, e, body.joint, body.weight, p)
+        store_vector(driven.vk, e, q, motion_at(now, arm), True)
+        store_vector(driven.spin, e, q, wp.vec3(now[3], now[4], now[5]), True)
 
 
 @wp.kernel
@@ -127,11 +130,14 @@ def hand_back(
     u: wp.array2d(dtype=wp.vec3),
 ):
     """What a new pose has changed of ``J qdot`` goes to the physical velocity; :func:`take_over` writes the new one."""
-    e, p = wp.tid()
+    i, _ = wp.tid()
+    own = own_particles(i, body.count)
+    e = own[0]
     if failure[e] != 0:
         return
-    v = skinned_motion(body, moving, e, p, x[e, body.first + p] - position[e, 0])
-    u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
+    for p in range(own[1], own[2]):
+        v = skinned_motion(body, moving, e, p, x[e, body.first + p] - position[e, 0])
+        u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
 
 
 @wp.kernel
@@ -144,11 +150,14 @@ def find_displacement(
     displacement: wp.array2d(dtype=wp.vec3),
 ):
     """Of the particles from where the pose has them by linear blend skinning [m], at their places in the world."""
-    e, p = wp.tid()
+    i, _ = wp.tid()
+    own = own_particles(i, body.count)
+    e = own[0]
     if failure[e] != 0:
         return
-    q = body.first + p
-    store_vector(displacement, e, q, vector_at(x, e, q) - skinned_place(body, place, e, p), True)
+    for p in range(own[1], own[2]):
+        q = body.first + p
+        store_vector(displacement, e, q, vector_at(x, e, q) - skinned_place(body, place, e, p), True)
 
 
 @wp.kernel
@@ -171,16 +180,19 @@ def attach_flesh(
 
     ``lost`` is what the pull has taken of the velocity [m/s].
     """
-    e, p = wp.tid()
+    i, _ = wp.tid()
+    own = own_particles(i, body.count)
+    e = own[0]
     if failure[e] != 0:
         return
-    q = body.first + p
-    at = vector_at(x, e, q)
-    before = vector_at(u, e, q) + vector_at(vk, e, q) - skinned_motion(body, moving, e, p, at - position[e, 0])
-    way = skinned_place(body, place, e, p) - at
-    after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
-    store_vector(u, e, q, after, True)
-    store_vector(lost, e, q, before - after, True)
+    for p in range(own[1], own[2]):
+        q = body.first + p
+        at = vector_at(x, e, q)
+        before = vector_at(u, e, q) + vector_at(vk, e, q) - skinned_motion(body, moving, e, p, at - position[e, 0])
+        way = skinned_place(body, place, e, p) - at
+        after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
+        store_vector(u, e, q, after, True)
+        store_vector(lost, e, q, before - after, True)
 
 
 @wp.func

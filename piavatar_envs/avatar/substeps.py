@@ -12,7 +12,7 @@ import warp as wp
 
 from piavatar_envs.avatar import bone_sums, drive_stages, flesh, posing
 from piavatar_envs.avatar.injection import inject_velocity
-from piavatar_envs.avatar.lanes import BLOCK, rows_of
+from piavatar_envs.avatar.lanes import BLOCK, particle_threads
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import (
     Anchor,
@@ -118,7 +118,7 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
     program.launch(drive_stages.prepare_body, bones, inputs, [bench, g.held], block_dim=block)
     program.launch(
         flesh.drive_particles,
-        rows_of(drive.model.device, n, drive.num_points),
+        (n, particle_threads(drive.model.device, drive.num_points)),
         [*who, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure],
         [state.u, drive.state.motion, state.kinematic, s.pull, s.lean],
         block_dim=BLOCK,
@@ -130,7 +130,7 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
     program.launch(drive_stages.settle_body, bones, [*who, *own], [bench], block_dim=block)
     program.launch(
         flesh.apply_corrections,
-        rows_of(drive.model.device, n, drive.num_points),
+        (n, particle_threads(drive.model.device, drive.num_points)),
         [*who, state.x, g.bones, s.bone_change, g.removed, drive.state.let_go, state.failure],
         [state.u, state.kinematic],
         block_dim=BLOCK,
