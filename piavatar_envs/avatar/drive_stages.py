@@ -10,7 +10,8 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.bone_sums import add_chunks, chunk_corrections, chunk_moments, chunk_motion
-from piavatar_envs.avatar.flesh import apply_correction, blend_corrections, drive_particle, free_motion, is_free
+from piavatar_envs.avatar.flesh import apply_correction, blend_corrections, drive_particle
+from piavatar_envs.avatar.free_motion import free_motion, is_free
 from piavatar_envs.avatar.lanes import meet_threads
 from piavatar_envs.avatar.posing import carry_anchor, carry_bone, pose_bones, write_record
 from piavatar_envs.avatar.rigid_fit import fit_bone, fit_whole

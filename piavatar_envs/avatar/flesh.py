@@ -23,11 +23,11 @@ from piavatar_envs.avatar.blending import (
     blended_velocity,
     motion_at,
 )
-from piavatar_envs.avatar.lanes import BLOCK, own_particles, sum_threads12, sum_threads16
+from piavatar_envs.avatar.free_motion import axial, is_free
+from piavatar_envs.avatar.lanes import BLOCK, first_particle, next_particle, sum_threads12
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
-from piavatar_envs.avatar.rotation import finite_turn
 from piavatar_envs.avatar.types import (
     Body,
     Drive,
@@ -37,25 +37,12 @@ from piavatar_envs.avatar.types import (
     Wrench,
     vec8,
     vec12,
-    vec16,
     vec44,
 )
 from piavatar_envs.mpm.stores import store_pair, store_vector, store_velocities
 from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
-
-
-@wp.func
-def is_free(drive: Drive, let_go: int):
-    """Whether nothing supports a body: commanded motion must then carry no momentum."""
-    return drive.free_motion != 0 or let_go != 0
-
-
-@wp.func
-def axial(K: wp.mat33):
-    """``sum a x b`` from ``K = sum a b^T``."""
-    return wp.vec3(K[1, 2] - K[2, 1], K[2, 0] - K[0, 2], K[0, 1] - K[1, 0])
 
 
 @wp.func
@@ -126,14 +113,16 @@ def drive_particles(
 ):
     """:func:`drive_particle` of every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
-    own = own_particles(i, body.count)
+    own = first_particle(i, body.count)
     e = own[0]
     if failure[e] != 0:
         return
-    for p in range(own[1], own[2]):
+    p = own[1]
+    while p < body.count:
         drive_particle(
             body, drive, x, record, bones.center[e, 0], let_go[e] != 0, e, p, e, u, motion, driven, pull, lean
         )  # fmt: skip
+        p = next_particle(p)
 
 
 @wp.func
@@ -195,67 +184,6 @@ def blend_corrections(
 
 
 @wp.func
-def free_motion(
-    body: Body,
-    drive: Drive,
-    corrections: wp.array2d(dtype=vec12),
-    bones: RigidFits,
-    whole: RigidFit,
-    e: int,
-    thread: int,
-    threads: int,
-    # out
-    removed: RemovedMotion,
-    # in and out
-    wrench: Wrench,
-):
-    """What a body without support takes out of commanded motion: a body cannot push itself off nothing.
-
-    The kinematic step, as a whole, is moved back by the rigid motion that leaves it without momentum and angular
-    momentum: ``vk' = y + A (r + dt y)`` with ``y = vk - V`` and ``sum m r x vk' = 0``. And as the inertia changes, a
-    spinning body keeps its angular momentum, not its spin (a skater who draws in the arms).
-    """
-    r = row(e, body.bone_mass.shape[0])
-    m = float(0.0)
-    for b in range(thread, body.parent.shape[0], threads):
-        m += body.bone_mass[r, b]
-    P = wp.vec3()
-    K = wp.mat33()
-    for c in range(thread, body.chunk_bone.shape[0], threads):
-        s = corrections[e, c]
-        p = wp.vec3(s[0], s[1], s[2])
-        P += p
-        K += wp.mat33(s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])
-        K += wp.outer(bones.center[e, body.chunk_bone[c]] - whole.center[e], p)
-    # fmt: off
-    t = sum_threads16(
-        vec16(
-            m, P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2],
-            0.0, 0.0, 0.0,
-        ),
-        threads,
-    )
-    # fmt: on
-    if thread > 0:
-        return
-    K = wp.mat33(t[4], t[5], t[6], t[7], t[8], t[9], t[10], t[11], t[12])
-    I = whole.inertia[e]
-    second = wp.diag(wp.vec3(0.5 * wp.trace(I))) - I
-    A = wp.mat33()
-    w = wp.vec3()
-    moment = K
-    for _ in range(5):  # each turn of the loop gains a factor of dt |w|
-        w -= spin_of(I, axial(moment))
-        A = finite_turn(w, drive.dt)
-        moment = K + (drive.dt * K + second) * wp.transpose(A)
-    removed.velocity[e] = wp.vec3(t[1], t[2], t[3]) / t[0]
-    removed.turn[e] = A
-    removed.center[e] = whole.center[e]
-    W = whole.spin[e]
-    wrench.angular[e] = wrench.angular[e] - spin_of(I, wp.trace(moment) * W - moment * W)
-
-
-@wp.func
 def apply_correction(
     body: Body,
     drive: Drive,
@@ -300,10 +228,12 @@ def apply_corrections(
 ):
     """:func:`apply_correction` to every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
-    own = own_particles(i, body.count)
+    own = first_particle(i, body.count)
     e = own[0]
     if failure[e] != 0:
         return
     free = is_free(drive, let_go[e])
-    for p in range(own[1], own[2]):
+    p = own[1]
+    while p < body.count:
         apply_correction(body, drive, x, bones.center[e, 0], change, removed, free, e, p, u, driven)
+        p = next_particle(p)

@@ -10,13 +10,13 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import blend_changes, motion_at, skinned_place
-from piavatar_envs.avatar.lanes import BLOCK, meet_threads, own_particles
+from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, next_particle
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body, vec8
-from piavatar_envs.mpm.stores import store_vector
+from piavatar_envs.mpm.stores import store_pair, store_vector, store_velocities
 from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -105,17 +105,18 @@ def take_over(
     Both are motions about where the ``pelvis`` joint is before it moves on [m].
     """
     i, _ = wp.tid()
-    own = own_particles(i, body.count)
+    own = first_particle(i, body.count)
     e = own[0]
     if failure[e] != 0:
         return
-    for p in range(own[1], own[2]):
+    p = own[1]
+    while p < body.count:
         q = body.first + p
         arm = vector_at(x, e, q) - pelvis[e]
-        store_vector(u, e, q, vector_at(u, e, q) - skinned_motion(body, leaving, e, p, arm), True)
+        after = vector_at(u, e, q) - skinned_motion(body, leaving, e, p, arm)
         now = blend_changes(moving, e, body.joint, body.weight, p)
-        store_vector(driven.vk, e, q, motion_at(now, arm), True)
-        store_vector(driven.spin, e, q, wp.vec3(now[3], now[4], now[5]), True)
+        store_velocities(u, driven, e, q, after, motion_at(now, arm), wp.vec3(now[3], now[4], now[5]), True)
+        p = next_particle(p)
 
 
 @wp.kernel
@@ -131,13 +132,15 @@ def hand_back(
 ):
     """What a new pose has changed of ``J qdot`` goes to the physical velocity; :func:`take_over` writes the new one."""
     i, _ = wp.tid()
-    own = own_particles(i, body.count)
+    own = first_particle(i, body.count)
     e = own[0]
     if failure[e] != 0:
         return
-    for p in range(own[1], own[2]):
+    p = own[1]
+    while p < body.count:
         v = skinned_motion(body, moving, e, p, x[e, body.first + p] - position[e, 0])
         u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
+        p = next_particle(p)
 
 
 @wp.kernel
@@ -151,13 +154,15 @@ def find_displacement(
 ):
     """Of the particles from where the pose has them by linear blend skinning [m], at their places in the world."""
     i, _ = wp.tid()
-    own = own_particles(i, body.count)
+    own = first_particle(i, body.count)
     e = own[0]
     if failure[e] != 0:
         return
-    for p in range(own[1], own[2]):
+    p = own[1]
+    while p < body.count:
         q = body.first + p
         store_vector(displacement, e, q, vector_at(x, e, q) - skinned_place(body, place, e, p), True)
+        p = next_particle(p)
 
 
 @wp.kernel
@@ -181,18 +186,19 @@ def attach_flesh(
     ``lost`` is what the pull has taken of the velocity [m/s].
     """
     i, _ = wp.tid()
-    own = own_particles(i, body.count)
+    own = first_particle(i, body.count)
     e = own[0]
     if failure[e] != 0:
         return
-    for p in range(own[1], own[2]):
+    p = own[1]
+    while p < body.count:
         q = body.first + p
         at = vector_at(x, e, q)
         before = vector_at(u, e, q) + vector_at(vk, e, q) - skinned_motion(body, moving, e, p, at - position[e, 0])
         way = skinned_place(body, place, e, p) - at
         after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
-        store_vector(u, e, q, after, True)
-        store_vector(lost, e, q, before - after, True)
+        store_pair(u, lost, e, q, after, before - after, True, True)
+        p = next_particle(p)
 
 
 @wp.func

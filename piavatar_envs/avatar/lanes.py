@@ -39,14 +39,25 @@ def particle_threads(device: str, count: int) -> int:
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
 const unsigned blocks = ((unsigned)count + {BLOCK - 1}u) / {BLOCK}u, row = blockIdx.x / blocks;
-const int p = (int)((blockIdx.x - row * blocks) * {BLOCK}u + threadIdx.x);
-return wp::vec_t<3, wp::int32>((int)row, p, p < count ? p + 1 : p);
+return wp::vec_t<2, wp::int32>((int)row, (int)((blockIdx.x - row * blocks) * {BLOCK}u + threadIdx.x));
 #else
-return wp::vec_t<3, wp::int32>(e, 0, count);
+return wp::vec_t<2, wp::int32>(e, 0);
 #endif
 """)
-def own_particles(e: int, count: int) -> wp.vec3i:
-    """A thread of :func:`particle_threads`: its environment, which on a CPU is ``e``, its first particle, and the end."""
+def first_particle(e: int, count: int) -> wp.vec2i:
+    """Environment, on a CPU ``e``, and first particle of one of :func:`particle_threads`; there may be none."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 0x7fffffff;
+#else
+return p + 1;
+#endif
+""")
+def next_particle(p: int) -> int:
+    """The one after ``p`` that its thread has, beyond all if it has none: a GPU's compiler then sees no loop."""
     ...
 
 
