@@ -17,7 +17,7 @@ from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.ground import Grounding
-from piavatar_envs.tasks.lying import first_poses, lying_rule, spawn_lying
+from piavatar_envs.tasks.lying import NUM_KINDS, first_poses, lying_rule, spawn_lying
 from piavatar_envs.tasks.rising import RISING_DOCS, RISING_TERMS, record_rising_outcome
 from piavatar_envs.tasks.upright import (
     METRIC_DOCS,
@@ -128,17 +128,18 @@ class GetUpTask(Task):
     observation_terms = UPRIGHT_TERMS
     reward_terms = RISING_TERMS
     metrics = (*METRICS, "held_seconds")
+    num_kinds = NUM_KINDS
 
     camera_position = (2.2, -3.2, 1.6)
     camera_target = (0.0, 0.0, 0.5)
 
     summary = """The avatar lies on the ground, face down or face up (`face_up`), turned about the vertical at random,
 its arms beside it, its joints up to `pose_noise` off that pose; or (`halfway`, a curriculum) it is on the way up from
-there: on all fours or on a knee, sitting or squatting, or half up. It shall stand up by the strength
-of its joints, to the rest pose, and stay there for `hold_seconds`. Nothing but the clock ends an episode; a fall costs
-time. Where it stands in the end does not matter. `root_assist` helps here in its own way: it leads the pelvis, from
-wherever it is, upwards and towards upright. With `control="pose"` the root wrench keeps the pelvis where it lies, and
-there is nothing to be learnt."""
+there: on its side, on all fours or on a knee, sitting or squatting, half up, or standing already. It shall stand up by
+the strength of its joints, to the rest pose, and stay there for `hold_seconds`. Nothing but the clock ends an episode;
+a fall costs time. Where it stands in the end does not matter. `root_assist` helps here in its own way: it leads the
+pelvis, from wherever it is, upwards and towards upright. With `control="pose"` the root wrench keeps the pelvis where
+it lies, and there is nothing to be learnt."""
     reward_docs: ClassVar[Mapping[str, str]] = RISING_DOCS
     metric_docs: ClassVar[Mapping[str, str]] = {
         **METRIC_DOCS,
@@ -167,12 +168,16 @@ there is nothing to be learnt."""
         self.steps = max(1, round(config.hold_seconds / config.physics.control_dt))
         self.held = wp.zeros(n, dtype=int, device=device)
         self.lies_up = wp.zeros(n, dtype=float, device=device)
+        self.kind = wp.zeros(n, dtype=int, device=device)
         self.reference_rotation = wp.zeros((n, NUM_JOINTS), dtype=wp.quat, device=device)
         self.reference_root = wp.zeros(n, dtype=wp.vec3, device=device)
         self.poses = first_poses(device)
 
     def arrays(self) -> dict[str, wp.array]:
-        return {"held": self.held}
+        return {"held": self.held, "kind": self.kind}
+
+    def kinds(self) -> wp.array:
+        return self.kind
 
     def record_reset(self, env, program) -> None:
         state, avatar = env.simulation.avatar.state, self.scene.avatars[0]
@@ -185,7 +190,7 @@ there is nothing to be learnt."""
                 env.mask, env.seed, env.episode, rule, limits.lower, limits.upper, self.poses,
                 wp.vec3(*avatar.position, 0.0),
             ],
-            [state.command_rotation, state.command_root, self.lies_up],
+            [state.command_rotation, state.command_root, self.lies_up, self.kind],
         )  # fmt: skip
         self.grounding.record_reset(env, program)
         program.launch(forget_hold, env.num_envs, [env.mask], [self.held])
