@@ -12,6 +12,7 @@ from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.config import DriveConfig, EnvConfig
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.mpm.types import row
@@ -35,6 +36,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: How far the assisted pelvis is led: upwards [m] and towards upright [rad].
 LEAD, LEAD_TURN = wp.constant(0.15), wp.constant(0.3)
+#: How far it may go aside while it tries, beside the room for a fall [m]: each fall takes it about a body's height.
+ROAM = 3.0
 
 
 class GetUpConfig(EnvConfig):
@@ -160,6 +163,10 @@ it lies, and there is nothing to be learnt."""
 
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         return (Drawn(self.lies_up),)
+
+    def domain(self) -> Domain:
+        x, y = self.scene.avatars[0].position[:2]
+        return Domain().around([(x - ROAM, y - ROAM), (x + ROAM, y + ROAM)])
 
     def allocate(self, env) -> None:
         n, device, config = env.num_envs, env.device, self.config

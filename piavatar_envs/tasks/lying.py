@@ -37,10 +37,10 @@ _SQUATTING: _Pose = {
 _HALF_UP: _Pose = {"pelvis": 0.35, "hip": -1.31, "knee": 1.4, "ankle": -0.35, "spine1": 0.09, "shoulder": -0.7}
 _STANDING: _Pose = {}
 #: Face down and face up: lying, and poses through which people get up from there, each worth more than the one before
-#: (:mod:`piavatar_envs.tasks.rising`). Who lies on a side has all fours before it, so this is on the way of face down.
+#: (:mod:`piavatar_envs.tasks.rising`).
 _WAYS = (
-    (_FACE_DOWN, _ON_THE_SIDE, _ON_ALL_FOURS, _ON_A_KNEE, _HALF_UP),
-    (_FACE_UP, _SITTING, _SQUATTING, _HALF_UP, _STANDING),
+    (_FACE_DOWN, _ON_THE_SIDE, _ON_ALL_FOURS, _ON_A_KNEE, _HALF_UP, _STANDING),
+    (_FACE_UP, _ON_THE_SIDE, _SITTING, _SQUATTING, _HALF_UP, _STANDING),
 )
 #: Kinds of episodes: from lying face down, from lying face up, and from on the way up.
 NUM_KINDS, _HALFWAY = 3, wp.constant(2)

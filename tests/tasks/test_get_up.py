@@ -70,13 +70,20 @@ def test_some_begin_on_the_way_up(make_env):
         side = env.observation_layout.split(observation)["parameters"][-2]
         lies = abs(faces(env)[2]) < 0.01 and at[HEAD, 2] < 0.3 * rest.joints[0, HEAD, 2]
         assert side in (-1.0, 1.0) and (lies or at[HEAD, 2] / rest.joints[0, HEAD, 2] > 0.3)
-        assert not lies or side == -1.0
         assert env.batch.task.kinds().numpy().tolist() == [2]
         seen.setdefault(side, set()).add(round(float(at[0, 2]), 2))
         if lies:
             below.add("left" if at[SHOULDERS[0], 2] < at[SHOULDERS[1], 2] else "right")
-    assert len(seen[-1.0]) == len(seen[1.0]) == 4 and len(seen[-1.0] & seen[1.0]) == 1
+    assert len(seen[-1.0]) == len(seen[1.0]) == 5 and len(seen[-1.0] & seen[1.0]) == 3
     assert below == {"left", "right"}
+
+
+def test_there_is_room_for_several_falls(make_env):
+    """An agent that tries again and again goes a body's height aside with each fall; that is no failure."""
+    domain = make_env(GET_UP).batch.task.domain()
+    height = 1.75
+    assert min(np.subtract(domain.upper, domain.lower)[:2]) > 2 * 2.5 * height
+    assert np.add(domain.upper, domain.lower)[:2] == pytest.approx(0.0)
 
 
 def test_the_reward_is_what_the_joints_say(make_env):
@@ -110,13 +117,11 @@ def test_every_pose_on_the_way_is_worth_more_than_the_one_before(make_env, side)
     """And the splits, from where no way leads up, less than a squat, or a knee on the ground."""
     env = make_env(GET_UP, control="torque", pose_noise=0.0)
     way = list(env.batch.task.poses.numpy()[side].copy())
-    way += [np.zeros_like(way[0])] if way[-1].any() else []
     worth = [worth_of(env, pose) for pose in way]
     assert np.diff(worth).min() > 0.02 and worth[0] < 0.1 and worth[-1] > 0.95
     splits = np.zeros_like(way[0])
     splits[[joint_index("left_hip"), joint_index("right_hip")]] = [[-1.0, 0.8, 0.0], [-1.0, -0.8, 0.0]]
-    squat_or_knee = worth[3 if side == 0 else 2]
-    assert worth[0] < worth_of(env, splits) < squat_or_knee - 0.05
+    assert worth[0] < worth_of(env, splits) < worth[3] - 0.05
 
 
 @pytest.mark.parametrize(("share", "up"), [(0.0, False), (1.0, True)])
