@@ -161,9 +161,10 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
         **dict.fromkeys(SUBSTEPS, particles * (STATE_BYTES + constants + 72 + WRITTEN_BYTES)),
         # velocities or sums out
         **dict.fromkeys(NODE_PASSES, particles * (STATE_BYTES + constants) + nodes * NODE_BYTES),
-        # x, u in; u, vk, spin, pull, lean out; of flesh that is not inert and bodies that are held, as is the next
-        "drive_particles": particles * 7 * 12,
-        "apply_corrections": particles * 3 * 12,  # x, u in; u out
+        # x, u in; vk, spin, pull, lean out; of flesh that is not inert and bodies that are held
+        "drive_particles": particles * 6 * 12,
+        # x, u, pull in; u out
+        "apply_corrections": particles * 4 * 12,
         "sum_moments": particles * 2 * 12,  # x, u
         "sum_moments_of_both": particles * 3 * 12,
         "sum_corrections": particles * 3 * 12,  # x, pull, lean

@@ -24,8 +24,9 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: Threads of a warp.
 WARP = wp.constant(32)
-#: Threads of a CUDA block that does the bones of a body: each of three warps has something to do at first.
-BONE_THREADS = 96
+#: Threads of a CUDA block that does the bones of a body, and blocks of a multiprocessor: they wait for memory and for
+#: one step after the other, so the more of them, the better.
+BONE_THREADS, BODIES_AT_ONCE = 32, 32
 
 
 @wp.func
@@ -159,10 +160,10 @@ def drive_body(
         chunk_corrections(body, particles, x, w.bones.center, w.pull, w.lean, e, c, 0, 0, 1, w.corrections)
     settle_bones(body, drive, 1, w, e, 0, 1)
     for p in range(body.count):
-        apply_correction(body, drive, x, center, w.change, w.removed, free, e, p, u, driven)
+        apply_correction(body, drive, x, w.pull, center, w.change, w.removed, free, e, p, 0, u, driven)
 
 
-@wp.kernel(launch_bounds=(BONE_THREADS, 10))
+@wp.kernel(launch_bounds=(BONE_THREADS, BODIES_AT_ONCE))
 def prepare_body(
     body: Body,
     drive: Drive,
@@ -197,7 +198,7 @@ def settle_motion(
         settle_removed(body, drive, w, held, e, thread, threads)
 
 
-@wp.kernel(launch_bounds=(BONE_THREADS, 10))
+@wp.kernel(launch_bounds=(BONE_THREADS, BODIES_AT_ONCE))
 def settle_body(
     body: Body,
     drive: Drive,

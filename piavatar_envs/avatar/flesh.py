@@ -39,7 +39,7 @@ from piavatar_envs.avatar.types import (
     vec12,
     vec44,
 )
-from piavatar_envs.mpm.stores import store_pair, store_vector, store_velocities
+from piavatar_envs.mpm.stores import store_pair, store_vector
 from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -64,7 +64,7 @@ def drive_particle(
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
 ):
-    """Kinematic velocity of a particle; its pull [m/s], which it gets, and its way to the commanded pose [m].
+    """Kinematic velocity of a particle, its pull [m/s] and its way to the commanded pose [m].
 
     ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
     that contact has caused along with the bone. Inert flesh misses its share of every change of that velocity.
@@ -72,7 +72,6 @@ def drive_particle(
     """
     at = vector_at(x, e, body.first + p)
     before = vector_at(u, e, body.first + p)
-    after = before
     inert = number_at(body.inert, row(e, body.inert.shape[0]), p)
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     s = blend_records(record, e, body.joint, body.weight, p, rest)
@@ -87,10 +86,10 @@ def drive_particle(
     if inert > 0.0:
         # a body that nothing supports could not take the reaction
         if drive.free_motion == 0 and not let_go:
-            after = before - inert * (k - motion[e, p])
+            u[e, body.first + p] = before - inert * (k - motion[e, p])
         motion[e, p] = k
     pulled += pull_gain(drive.tone_rate, drive.dt) * way
-    store_velocities(u, driven, e, body.first + p, after + pulled, k, -0.5 * axial(turn), True)
+    store_pair(driven.vk, driven.spin, e, body.first + p, k, -0.5 * axial(turn), True, True)
     store_pair(pull, lean, slot, p, pulled, way, drive.tone_rate > 0.0, True)
 
 
@@ -188,20 +187,25 @@ def apply_correction(
     body: Body,
     drive: Drive,
     x: wp.array2d(dtype=wp.vec3),
+    pull: wp.array2d(dtype=wp.vec3),
     center: wp.vec3,
     change: wp.array2d(dtype=vec8),
     removed: RemovedMotion,
     free: bool,
     e: int,
     p: int,
+    slot: int,
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     driven: Kinematic,
 ):
-    """Change the physical velocity by the bones' blended field; ``free`` commanded motion of its rigid part."""
+    """Change the physical velocity by the pull, in row ``slot``, and the bones' blended field.
+
+    Where the body is ``free``, the rigid part of its commanded motion comes off.
+    """
     at = vector_at(x, e, body.first + p)
     field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - center)
-    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + field, True)
+    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, slot, p) + field, True)
     if free:
         v = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]
         v += removed.turn[e] * (at - removed.center[e] + drive.dt * v)
@@ -217,6 +221,7 @@ def apply_corrections(
     body: Body,
     drive: Drive,
     x: wp.array2d(dtype=wp.vec3),
+    pull: wp.array2d(dtype=wp.vec3),
     bones: RigidFits,
     change: wp.array2d(dtype=vec8),
     removed: RemovedMotion,
@@ -235,5 +240,5 @@ def apply_corrections(
     free = is_free(drive, let_go[e])
     p = own[1]
     while p < body.count:
-        apply_correction(body, drive, x, bones.center[e, 0], change, removed, free, e, p, u, driven)
+        apply_correction(body, drive, x, pull, bones.center[e, 0], change, removed, free, e, p, e, u, driven)
         p = next_particle(p)

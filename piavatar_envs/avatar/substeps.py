@@ -131,7 +131,7 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
     program.launch(
         flesh.apply_corrections,
         (n, particle_threads(drive.model.device, drive.num_points)),
-        [*who, state.x, g.bones, s.bone_change, g.removed, drive.state.let_go, state.failure],
+        [*who, state.x, s.pull, g.bones, s.bone_change, g.removed, drive.state.let_go, state.failure],
         [state.u, state.kinematic],
         block_dim=BLOCK,
     )

@@ -140,7 +140,7 @@ def test_one_launch_drives_a_body_as_many_do(make_rig, wild_pose, monkeypatch, r
 def test_the_size_of_a_block_does_not_change_the_drive(make_rig, wild_pose, monkeypatch):
     """Sums run over fixed lists by warps, however many of them a block has."""
     results = []
-    for threads in (32, 64, 96):
+    for threads in (96, 64, 32):
         monkeypatch.setattr(drive, "BONE_THREADS", threads)
         rng = np.random.default_rng(2)
         rig = make_rig().reset(wild_pose(rng))
