@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import first_record, has_field, held_by, nodes_shared, shared_block, slots_used
+from piavatar_envs.mpm.blocks import (
+    beside_others,
+    first_record,
+    has_field,
+    held_by,
+    nodes_shared,
+    shared_block,
+    slots_used,
+)
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_BLOCK, NEAR_SLAB, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.contact import touch_all
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry, read_change, write_change
-from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN
+from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN, face_shared
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import clear_offset, offset_at, read_record, take_sum, write_record
-from piavatar_envs.mpm.sweep import THREADS, Sweep, first_node, from_lane, lane_of_thread
+from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, vec8
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
@@ -129,6 +137,17 @@ def alone_in(grid: Grid, contact: Contact, blocks: Blocks, sensors: Sensors, e: 
     return held
 
 
+@wp.func
+def told_by_neighbours(grid: Grid, contact: Contact, blocks: Blocks, e: int, f: int, corner: wp.vec3i):
+    """Whether particles next to another field may have left their offsets in the block of field ``f`` at ``corner``."""
+    told = bool(False)
+    if contact.num_fields > 1 and blocks.num_shared[e] > 0:
+        for n in range(lane_of_thread(), 27, lanes_of_warp()):
+            told = told or beside_others(grid, blocks, e, f, corner, n)
+        told = any_lane(told)
+    return told
+
+
 @wp.kernel(launch_bounds=(THREADS, 7))
 def update_grid(
     grid: Grid,
@@ -136,19 +155,27 @@ def update_grid(
     boundaries: Boundaries,
     contact: Contact,
     sweep: Sweep,
+    of_shared: Sweep,
     failure: wp.array(dtype=int),
     # in and out: sums are read, then cleared
     blocks: Blocks,
     sums: Sums,
     # out
     node_velocity: wp.array2d(dtype=vec8),
+    node_facing: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """Velocity of every node with mass in blocks of one field.
 
-    Contact acts on the total velocity ``v = u + vk``; the rest is physical.
+    Contact acts on the total velocity ``v = u + vk``; the rest is physical. Where there are several fields, the first
+    threads prepare contact, see :func:`piavatar_envs.mpm.normals.face_shared`: they are few, and have the longest to
+    wait.
     """
-    e, thread = wp.tid()
+    e, place = wp.tid()
+    if place < of_shared.threads:
+        face_shared(grid, contact, of_shared, blocks, sums, e, place, node_velocity, node_facing)
+        return
+    thread = place - of_shared.threads
     lane = lane_of_thread()
     used = slots_used(blocks, e)
     if thread == 0:
@@ -171,8 +198,9 @@ def update_grid(
         f = about // ALL_SLABS
         block = from_lane(known[1], turn)
         corner = wp.vec3i()
-        if about % ALL_SLABS != 0:
+        if contact.num_fields > 1 or about % ALL_SLABS != 0:
             corner = block_corner(grid, block)
+        told = told_by_neighbours(grid, contact, blocks, e, f, corner)
         for r in range(first + lane, first + lane + sweep.share):
             is_near = near_node(about, r % BLOCK_NODES)
             total = total_velocity(step, split, take_sum(sums, e, f, r))
@@ -180,8 +208,7 @@ def update_grid(
                 at = place_of(grid, corner, r % BLOCK_NODES)
                 total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
             write_record(node_velocity, e, r, physical_velocity(split, total))
-            # particles next to another field's block have left their offsets here, too
-            if is_near or contact.num_fields > 1:
+            if is_near or told:
                 clear_offset(sums, e, r)
 
 

@@ -121,6 +121,36 @@ def face_node(
             write_change(node_facing, e, r, wp.vec4(facing[0], facing[1], facing[2], 0.0))
 
 
+@wp.func
+def face_shared(
+    grid: Grid,
+    contact: Contact,
+    sweep: Sweep,
+    blocks: Blocks,
+    sums: Sums,
+    e: int,
+    thread: int,
+    # out
+    node_velocity: wp.array2d(dtype=vec8),
+    node_facing: wp.array2d(dtype=wp.vec4),
+):
+    """What every node of a block with several fields says about the normals around it, for the nodes of a thread.
+
+    It is the summand of the module's formula, with all other fields of the node as ``b``; zero where there is none.
+    Limbs grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
+    """
+    end = nodes_shared(blocks, e)
+    for turn in range(sweep.turns):
+        first = thread * sweep.share + turn * sweep.stride
+        block = shared_block(blocks, e, first)
+        if first >= end:
+            break
+        mask = blocks.fields[e, block]
+        for n in range(first, first + sweep.share):
+            take_sums(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity)
+            face_node(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity, node_facing)
+
+
 @wp.kernel(launch_bounds=(THREADS, 6))
 def find_facing(
     grid: Grid,
@@ -133,22 +163,9 @@ def find_facing(
     node_velocity: wp.array2d(dtype=vec8),
     node_facing: wp.array2d(dtype=wp.vec4),
 ):
-    """What every node of a block with several fields says about the normals around it.
-
-    It is the summand of the module's formula, with all other fields of the node as ``b``; zero where there is none.
-    Limbs grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
-    """
+    """:func:`face_shared` alone, where no grid pass is launched that could do it as well."""
     e, thread = wp.tid()
-    end = nodes_shared(blocks, e)
-    for turn in range(sweep.turns):
-        first = thread * sweep.share + turn * sweep.stride
-        block = shared_block(blocks, e, first)
-        if first >= end:
-            break
-        mask = blocks.fields[e, block]
-        for n in range(first, first + sweep.share):
-            take_sums(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity)
-            face_node(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity, node_facing)
+    face_shared(grid, contact, sweep, blocks, sums, e, thread, node_velocity, node_facing)
 
 
 @wp.func

@@ -13,7 +13,7 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import record_runs
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
 from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
-from piavatar_envs.mpm.sweep import THREADS, plan_shared_sweep, plan_sweep
+from piavatar_envs.mpm.sweep import THREADS, Sweep, plan_shared_sweep, plan_sweep
 from piavatar_envs.mpm.transfer import particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
@@ -35,12 +35,13 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
         record_marks(program, model, state, scratch)
     record_scatter(program, model, state, scratch)
     if m.scatter != "shared":
-        threads, sweep = plan_sweep(m)
+        (num_envs, threads), sweep = plan_sweep(m)
+        of_shared = plan_shared_sweep(m)[1] if m.contact.num_fields > 1 else Sweep()
         program.launch(
             update_grid,
-            threads,
-            [m.grid, m.step, m.boundaries, m.contact, sweep, s.failure],
-            [blocks, sums, scratch.velocity, scratch.sensors],
+            (num_envs, of_shared.threads + threads),
+            [m.grid, m.step, m.boundaries, m.contact, sweep, of_shared, s.failure],
+            [blocks, sums, scratch.velocity, scratch.facing, scratch.sensors],
             block_dim=THREADS,
         )
     if m.contact.num_fields > 1:
@@ -57,13 +58,14 @@ def _record_contact(program: Program, model: Model, state: State, scratch: Scrat
     """Append the grid pass over the blocks with several fields, and what the contact sensors feel."""
     m, blocks, sums = model, scratch.blocks, scratch.sums
     threads, sweep = plan_shared_sweep(m)
-    program.launch(
-        find_facing,
-        threads,
-        [m.grid, m.contact, sweep, blocks],
-        [sums, scratch.velocity, scratch.facing],
-        block_dim=THREADS,
-    )
+    if m.scatter == "shared":  # else the grid pass has done it
+        program.launch(
+            find_facing,
+            threads,
+            [m.grid, m.contact, sweep, blocks],
+            [sums, scratch.velocity, scratch.facing],
+            block_dim=THREADS,
+        )
     program.launch(
         solve_contact,
         threads,

@@ -44,6 +44,7 @@ FEWEST_SHARED = 2
 class Sweep:
     """Who takes which nodes."""
 
+    threads: int  # of an environment
     turns: int  # that a thread may have, no more than there are threads to look ahead for each other
     share: int  # nodes of a thread in a turn
     stride: int  # nodes from one turn to the next
@@ -73,6 +74,30 @@ def from_lane(value: int, lane: int) -> int:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return __any_sync(0xffffffffu, here);
+#else
+return here;
+#endif
+""")
+def any_lane(here: bool) -> bool:
+    """Whether it is so ``here`` in any thread of the warp; all of its threads must come here."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 32;
+#else
+return 1;
+#endif
+""")
+def lanes_of_warp() -> int:
+    """Threads of a warp; 1 on a CPU."""
+    ...
+
+
 @wp.func
 def first_node(sweep: Sweep, thread: int):
     """First node that the warp of a thread takes."""
@@ -93,7 +118,8 @@ def plan_shared_sweep(model: Model) -> tuple[tuple[int, int], Sweep]:
         blocks = min(most_shared(model), max(FEWEST_SHARED, -(-SHARED_AT_ONCE // model.num_envs)))
         sweep.share = 1
     sweep.turns, sweep.stride = -(-most_shared(model) // blocks), nodes * blocks
-    return (model.num_envs, sweep.stride // sweep.share), sweep
+    sweep.threads = sweep.stride // sweep.share
+    return (model.num_envs, sweep.threads), sweep
 
 
 def plan_sweep(model: Model) -> tuple[tuple[int, int], Sweep]:
@@ -105,4 +131,5 @@ def plan_sweep(model: Model) -> tuple[tuple[int, int], Sweep]:
         slots = max(FEWEST_SLOTS, -(-SLOTS_AT_ONCE // model.num_envs), -(-model.max_slots // LANES))
         slots, sweep.share = min(slots, model.max_slots), 1
     sweep.turns, sweep.stride = -(-model.max_slots // slots), nodes * slots
-    return (model.num_envs, sweep.stride // sweep.share), sweep
+    sweep.threads = sweep.stride // sweep.share
+    return (model.num_envs, sweep.threads), sweep
