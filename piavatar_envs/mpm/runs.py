@@ -17,7 +17,8 @@ import warp as wp
 
 from piavatar_envs.mpm.gather import Gathered, gather
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.stencil import spline
+from piavatar_envs.mpm.sensing import sense_gathered
+from piavatar_envs.mpm.stencil import grid_position, spline
 from piavatar_envs.mpm.stores import store_particle
 from piavatar_envs.mpm.transfer import Scattered, near_boundary, prepare, scatters
 from piavatar_envs.mpm.types import (
@@ -29,6 +30,7 @@ from piavatar_envs.mpm.types import (
     Grid,
     Moving,
     Particles,
+    Sensors,
     Step,
     Sums,
     row,
@@ -119,19 +121,24 @@ def grid_to_particles(
     particles: Particles,
     boundaries: Boundaries,
     node_velocity: wp.array2d(dtype=vec8),
+    senses: int,
     # in and out; vk is read
     blocks: Blocks,
     moved: Moving,
     failure: wp.array(dtype=int),
+    sensors: Sensors,
 ):
     """Move every particle with the grid, see :func:`piavatar_envs.mpm.gather.gather`.
 
-    Unlike the gather of a CPU it has its loops unrolled, and its threads store together.
+    Unlike the gather of a CPU it has its loops unrolled, and its threads store together. If it ``senses``, it does the
+    work of :func:`piavatar_envs.mpm.sensing.sense_contact` first, for the same particles.
     """
     e, p = wp.tid()
     stays = blocks.frozen[e] != 0
     s = Gathered()
     if not stays:
+        if senses != 0:
+            sense_gathered(grid, particles, blocks, sensors, e, p, grid_position(grid, moved.x[e, p]))
         s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
         stays = s.fault != 0
     store_particle(moved, e, p, s, not stays)

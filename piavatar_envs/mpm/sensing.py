@@ -16,6 +16,7 @@ from piavatar_envs.mpm.stencil import (
 )
 from piavatar_envs.mpm.sweep import THREADS
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Particles, Sensors, row, vec8
+from piavatar_envs.mpm.warp_blocks import fields_may_meet
 
 # unrolled, the stencil takes so many registers that a GPU has few threads at once
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -75,6 +76,50 @@ def take_share(sensors: Sensors, e: int, sensor: int, taken: wp.vec4, change: wp
     return taken + share * wp.vec4(change[0], change[1], change[2], 0.0)
 
 
+@wp.func
+def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
+    """Impulse that contact gives particle ``p`` at grid position ``xg``, on its sensor, by the subject that gave it."""
+    sensor = particles.sensor[p]
+    own = particles.field[p]
+    base = base_node(xg)
+    # nearly all particles leave here
+    if sensor < 0 or fields_around(grid, blocks, base, e) == (1 << own):
+        return
+    if not touched_around(grid, blocks, sensors, e, own, base):
+        return
+    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
+    wx = spline(f[0])
+    wy = spline(f[1])
+    wz = spline(f[2])
+    m = particles.mass[row(e, particles.mass.shape[0]), p]
+    taken = wp.vec4()
+    slab = wp.vec4i()
+    three = int(3)  # not a constant, where loops are unrolled: what few particles come to is as short as can be
+    for i in range(three):
+        if i == 0 or ((base[0] + i) & 3) == 0:
+            slab = slab_records(grid, blocks, e, own, base, i)
+        for j in range(three):
+            at = line_of_records(slab, base, i, j)
+            w = m * pick(wx, i) * pick(wy, j)
+            # all of a line are asked for before the first has answered
+            first = change_at(sensors, e, at[0])
+            second = change_at(sensors, e, at[1])
+            third = change_at(sensors, e, at[2])
+            taken = take_share(sensors, e, sensor, taken, first, w * wz[0])
+            taken = take_share(sensors, e, sensor, taken, second, w * wz[1])
+            taken = take_share(sensors, e, sensor, taken, third, w * wz[2])
+    give(sensors, e, sensor, taken)
+
+
+@wp.func
+def sense_gathered(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
+    """:func:`sense_particle` of a warp's particles, before they move; few warps have any that contact may reach."""
+    if blocks.num_shared[e] == 0:
+        return
+    if fields_may_meet(grid, blocks, e, base_node(xg)):
+        sense_particle(grid, particles, blocks, sensors, e, p, xg)
+
+
 @wp.kernel(launch_bounds=(THREADS, 7))
 def sense_contact(
     grid: Grid,
@@ -91,36 +136,9 @@ def sense_contact(
     the impulse at the nodes. Where three subjects meet at a node, all of it is booked on the one that did most.
     """
     e, p = wp.tid()
-    sensor = particles.sensor[p]
-    own = particles.field[p]
     xg = grid_position(grid, x[e, p])
-    if failure[e] != 0 or sensor < 0:
-        return
-    base = base_node(xg)
-    # nearly all particles leave here
-    if fields_around(grid, blocks, base, e) == (1 << own) or not touched_around(grid, blocks, sensors, e, own, base):
-        return
-    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
-    wx = spline(f[0])
-    wy = spline(f[1])
-    wz = spline(f[2])
-    m = particles.mass[row(e, particles.mass.shape[0]), p]
-    taken = wp.vec4()
-    slab = wp.vec4i()
-    for i in range(3):
-        if i == 0 or ((base[0] + i) & 3) == 0:
-            slab = slab_records(grid, blocks, e, own, base, i)
-        for j in range(3):
-            at = line_of_records(slab, base, i, j)
-            w = m * pick(wx, i) * pick(wy, j)
-            # all of a line are asked for before the first has answered
-            first = change_at(sensors, e, at[0])
-            second = change_at(sensors, e, at[1])
-            third = change_at(sensors, e, at[2])
-            taken = take_share(sensors, e, sensor, taken, first, w * wz[0])
-            taken = take_share(sensors, e, sensor, taken, second, w * wz[1])
-            taken = take_share(sensors, e, sensor, taken, third, w * wz[2])
-    give(sensors, e, sensor, taken)
+    if failure[e] == 0:
+        sense_particle(grid, particles, blocks, sensors, e, p, xg)
 
 
 @wp.kernel

@@ -47,11 +47,30 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     if m.contact.num_fields > 1:
         _record_contact(program, model, state, scratch)
     if m.contact.num_fields > 1 or m.scatter != "shared":
-        gather = grid_to_particles if m.scatter == "plain" else runs.grid_to_particles
-        inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
-        program.launch(gather, s.x.shape, inputs, [blocks, _moving(s), s.failure], block_dim=runs.THREADS)
+        _record_gather(program, model, state, scratch)
     if m.moving_boundaries:
         program.launch(move_colliders, m.boundaries.position.shape, [m.step.dt], [m.boundaries])
+
+
+def _record_gather(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """Append the transfer of nodes to particles, and what their contact sensors feel."""
+    m, s = model, state
+    inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
+    outputs = [scratch.blocks, _moving(s), s.failure]
+    if m.scatter == "plain":
+        program.launch(grid_to_particles, s.x.shape, inputs, outputs, block_dim=runs.THREADS)
+        return
+    inputs.append(int(_senses(m) and not _senses_apart(m)))
+    program.launch(runs.grid_to_particles, s.x.shape, inputs, [*outputs, scratch.sensors], block_dim=runs.THREADS)
+
+
+def _senses(model: Model) -> bool:
+    return model.contact.num_fields > 1 and model.num_sensors > 0
+
+
+def _senses_apart(model: Model) -> bool:
+    """Whether particles sense contact in a launch of its own: the gather of large bodies on a GPU does it, too."""
+    return model.scatter not in ("runs", "runs_float")
 
 
 def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -73,7 +92,7 @@ def _record_contact(program: Program, model: Model, state: State, scratch: Scrat
         [sums, scratch.velocity, scratch.sensors],
         block_dim=THREADS,
     )
-    if m.num_sensors > 0:
+    if _senses(m) and _senses_apart(m):
         program.launch(
             sense_contact,
             state.x.shape,
