@@ -59,6 +59,40 @@ def book_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, 
 
 
 @wp.func
+def impulse_between(
+    grid: Grid,
+    contact: Contact,
+    e: int,
+    a: int,
+    b: int,
+    va: vec8,
+    vb: vec8,
+    offset_a: wp.vec4,
+    offset_b: wp.vec4,
+    n_ab: wp.vec3,
+):
+    """Impulse [N s] that field ``a`` gives ``b`` at a node, from records and offsets of both; zero without contact."""
+    apart = offset_a / va[0] - offset_b / vb[0]
+    distance = wp.dot(n_ab, wp.vec3(apart[0], apart[1], apart[2]))
+    V_a = volume_at(grid, contact, e, a, va[0])
+    V_b = volume_at(grid, contact, e, b, vb[0])
+    if surface_gap(grid, V_a, V_b, distance) >= contact.gate:
+        return wp.vec3()
+    approach = wp.vec3(va[1] - vb[1], va[2] - vb[2], va[3] - vb[3])
+    pairs = row(e, contact.friction.shape[0])
+    return coulomb(va[0], vb[0], approach, n_ab, contact.friction[pairs, a * contact.num_fields + b])
+
+
+@wp.func
+def book_pair(contact: Contact, e: int, a: int, b: int, J: wp.vec3, sensors: Sensors):
+    """Add the impulse that field ``a`` gives ``b`` to what is known of their subjects, if they have two."""
+    first = contact.subject[a]
+    second = contact.subject[b]
+    if first != second:
+        add_impulse(sensors, e, pair_entry(sensors, first * contact.num_subjects + second), -J)
+
+
+@wp.func
 def touch(
     grid: Grid,
     contact: Contact,
@@ -81,25 +115,16 @@ def touch(
     if va[0] <= MASS_MIN or vb[0] <= MASS_MIN:
         return
     n_ab = shared_normal(grid, blocks, e, node_of_block(block_corner(grid, block), local), a, b, node_facing)
-    apart = offset_at(grid, sums, e, a, ra) / va[0] - offset_at(grid, sums, e, b, rb) / vb[0]
-    distance = wp.dot(n_ab, wp.vec3(apart[0], apart[1], apart[2]))
-    V_a = volume_at(grid, contact, e, a, va[0])
-    V_b = volume_at(grid, contact, e, b, vb[0])
-    if surface_gap(grid, V_a, V_b, distance) >= contact.gate:
-        return
-    approach = wp.vec3(va[1] - vb[1], va[2] - vb[2], va[3] - vb[3])
-    pairs = row(e, contact.friction.shape[0])
-    J = coulomb(va[0], vb[0], approach, n_ab, contact.friction[pairs, a * contact.num_fields + b])
+    offset_a = offset_at(grid, sums, e, a, ra)
+    offset_b = offset_at(grid, sums, e, b, rb)
+    J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
     if wp.length_sq(J) <= 0.0:
         return
     write_record(node_velocity, e, ra, va - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / va[0])
     write_record(node_velocity, e, rb, vb + vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / vb[0])
     book_contact(contact, e, ra, b, -J / va[0], sensors)
     book_contact(contact, e, rb, a, J / vb[0], sensors)
-    first = contact.subject[a]
-    second = contact.subject[b]
-    if first != second:
-        add_impulse(sensors, e, pair_entry(sensors, first * contact.num_subjects + second), -J)
+    book_pair(contact, e, a, b, J, sensors)
 
 
 @wp.func

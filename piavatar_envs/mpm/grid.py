@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import (
-    beside_others,
-    first_record,
-    has_field,
-    held_by,
-    nodes_shared,
-    shared_block,
-    slots_used,
-)
+from piavatar_envs.mpm.blocks import beside_others, held_by, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_BLOCK, NEAR_SLAB, boundary_contact, nearest_boundary
-from piavatar_envs.mpm.contact import touch_all
-from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry, read_change, write_change
-from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN, face_shared
+from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
+from piavatar_envs.mpm.normals import MASS_MIN, face_shared
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
-from piavatar_envs.mpm.sums import clear_offset, offset_at, read_record, take_sum, write_record
+from piavatar_envs.mpm.sums import clear_offset, offset_at, take_sum, write_record
 from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, vec8
 
@@ -210,84 +201,3 @@ def update_grid(
             write_record(node_velocity, e, r, physical_velocity(split, total))
             if is_near or told:
                 clear_offset(sums, e, r)
-
-
-@wp.func
-def settle_node(
-    grid: Grid,
-    step: Step,
-    boundaries: Boundaries,
-    contact: Contact,
-    blocks: Blocks,
-    sums: Sums,
-    mask: int,
-    near: bool,
-    corner: wp.vec3i,
-    e: int,
-    block: int,
-    local: int,
-    node_velocity: wp.array2d(dtype=vec8),
-    sensors: Sensors,
-):
-    """What comes after the contact of the fields of a node: boundaries are met, and velocities become physical."""
-    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    for f in range(contact.num_fields):
-        if has_field(mask, f):
-            r = first_record(grid, blocks, e, f, block) + local
-            total = read_record(node_velocity, e, r)
-            if total[0] == GROWN_TOGETHER:
-                # the trunk comes first: its velocity is final
-                t = first_record(grid, blocks, e, contact.trunk[f], block) + local
-                v = read_record(node_velocity, e, t)
-                write_record(node_velocity, e, r, vec8(0.0, v[1], v[2], v[3], v[4], v[5], v[6], 0.0))
-                change = read_change(sensors.node, e, t)
-                write_change(sensors.node, e, r, change)
-                if wp.length_sq(wp.vec3(change[0], change[1], change[2])) > 0.0:
-                    sensors.touched[e, r // BLOCK_NODES] = 1
-            else:
-                if near:
-                    at = place_of(grid, corner, local)
-                    total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
-                write_record(node_velocity, e, r, physical_velocity(split, total))
-            clear_offset(sums, e, r)
-
-
-@wp.kernel(launch_bounds=(THREADS, 3))
-def solve_contact(
-    grid: Grid,
-    step: Step,
-    boundaries: Boundaries,
-    contact: Contact,
-    sweep: Sweep,
-    blocks: Blocks,
-    node_facing: wp.array2d(dtype=wp.vec4),
-    # in and out: offsets are read, then cleared; sums become velocities
-    sums: Sums,
-    node_velocity: wp.array2d(dtype=vec8),
-    sensors: Sensors,
-):
-    """The same in blocks with several fields, whose sums have been taken: bodies touch, boundaries are met."""
-    e, thread = wp.tid()
-    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    end = nodes_shared(blocks, e)
-    for turn in range(sweep.turns):
-        first = thread * sweep.share + turn * sweep.stride
-        block = shared_block(blocks, e, first)
-        if first >= end:
-            break
-        mask = blocks.fields[e, block]
-        corner = block_corner(grid, block)
-        for n in range(first, first + sweep.share):
-            local = n % BLOCK_NODES
-            near = slab_is_near(grid, boundaries, e, corner, local)
-            for f in range(contact.num_fields):
-                if has_field(mask, f):
-                    r = first_record(grid, blocks, e, f, block) + local
-                    v = total_velocity(step, split, read_record(node_velocity, e, r))
-                    write_record(node_velocity, e, r, v)
-                    write_change(sensors.node, e, r, wp.vec4(0.0))
-            touch_all(grid, contact, blocks, sums, mask, e, block, local, node_facing, node_velocity, sensors)
-            settle_node(
-                grid, step, boundaries, contact, blocks, sums, mask, near, corner, e, block, local, node_velocity,
-                sensors,
-            )  # fmt: skip

@@ -205,11 +205,10 @@ def in_grid(grid: Grid, node: wp.vec3i):
 
 
 @wp.func
-def shared_normal(
-    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, node_facing: wp.array2d(dtype=wp.vec4)
+def normal_from(
+    grid: Grid, e: int, node: wp.vec3i, first_a: vec8i, first_b: vec8i, node_facing: wp.array2d(dtype=wp.vec4)
 ):
-    """Unit normal from field ``a`` to field ``b`` at a node; zero if there is no telling."""
-    first_a, first_b = records_around(grid, blocks, e, node, a, b)
+    """:func:`shared_normal`, from the :func:`records_around` a node."""
     # along an axis, the node's own block is the lower of the two unless the node is the first of it
     x = wp.where((node[0] & 3) == 0, 1, 0)
     y = wp.where((node[1] & 3) == 0, 1, 0)
@@ -242,6 +241,15 @@ def shared_normal(
     if largest <= 0.0:
         return wp.vec3()
     return wp.normalize(n_ab / largest)
+
+
+@wp.func
+def shared_normal(
+    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, node_facing: wp.array2d(dtype=wp.vec4)
+):
+    """Unit normal from field ``a`` to field ``b`` at a node; zero if there is no telling."""
+    first_a, first_b = records_around(grid, blocks, e, node, a, b)
+    return normal_from(grid, e, node, first_a, first_b, node_facing)
 
 
 @wp.func

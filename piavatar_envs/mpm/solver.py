@@ -5,8 +5,9 @@ from __future__ import annotations
 from piavatar_envs.mpm import runs
 from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
+from piavatar_envs.mpm.contact_pass import solve_contact
 from piavatar_envs.mpm.gather import grid_to_particles
-from piavatar_envs.mpm.grid import solve_contact, update_grid
+from piavatar_envs.mpm.grid import update_grid
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
