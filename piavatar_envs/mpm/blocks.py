@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.mpm.warp_blocks import share_of_blocks
 from piavatar_envs.mpm.stencil import (
     BLOCK_NODES,
     base_node,
@@ -193,25 +194,33 @@ def shared_block(blocks: Blocks, e: int, n: int):
 
 
 @wp.func
-def mark_blocks(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: int, failure: wp.array(dtype=int)):
-    """See that a field has slots in all blocks that a stencil touches; too few slots flag the environment."""
+def mark_block(grid: Grid, blocks: Blocks, block: int, field: int, e: int, failure: wp.array(dtype=int)):
+    """See that a field has a slot in a block; too few slots flag the environment."""
     bit = 1 << field
+    if (blocks.fields[e, block] & bit) != 0:
+        return
+    before = wp.atomic_or(blocks.fields, e, block, bit)
+    if (before & bit) != 0:
+        return
+    list_shared(blocks, e, block, before)
+    slot = wp.atomic_add(blocks.count, e, 1)
+    if slot < blocks.held.shape[1]:
+        blocks.held[e, slot] = field * grid.num_blocks + block
+        blocks.slot[e, field * grid.num_blocks + block] = slot
+    else:
+        wp.atomic_and(blocks.fields, e, block, ~bit)
+        wp.atomic_or(failure, e, _BLOCKS)
+
+
+@wp.func
+def mark_blocks(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: int, failure: wp.array(dtype=int)):
+    """:func:`mark_block` of all blocks that a stencil touches."""
     touched = blocks_touched(base)
     for i in range(touched[0]):
         for j in range(touched[1]):
             for k in range(touched[2]):
                 block = block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)
-                if (blocks.fields[e, block] & bit) == 0:
-                    before = wp.atomic_or(blocks.fields, e, block, bit)
-                    if (before & bit) == 0:
-                        list_shared(blocks, e, block, before)
-                        slot = wp.atomic_add(blocks.count, e, 1)
-                        if slot < blocks.held.shape[1]:
-                            blocks.held[e, slot] = field * grid.num_blocks + block
-                            blocks.slot[e, field * grid.num_blocks + block] = slot
-                        else:
-                            wp.atomic_and(blocks.fields, e, block, ~bit)
-                            wp.atomic_or(failure, e, _BLOCKS)
+                mark_block(grid, blocks, block, field, e, failure)
 
 
 @wp.kernel
@@ -251,15 +260,27 @@ def mark_particles(
     blocks: Blocks,
     failure: wp.array(dtype=int),
 ):
-    """Mark the blocks of all particles, wherever they have been put; one outside the grid flags its environment."""
+    """Mark the blocks of all particles, wherever they have been put; one outside the grid flags its environment.
+
+    A warp marks each block once, where it can: the first to come all find it without a mark.
+    """
     e, p = wp.tid()
-    if blocks.frozen[e] != 0:
+    field = particles.field[p]
+    base = wp.vec3i()
+    takes = bool(False)
+    if blocks.frozen[e] == 0:
+        if wp.isfinite(wp.length_sq(x[e, p])):
+            base = base_node(grid_position(grid, x[e, p]))
+            takes = stencil_inside(grid, base)
+            if not takes:
+                wp.atomic_or(failure, e, _OUT_OF_GRID)
+        else:
+            wp.atomic_or(failure, e, _NONFINITE)
+    mine = share_of_blocks(grid, e, field, base, takes)
+    if mine[0] == -2:
+        if takes:
+            mark_blocks(grid, blocks, base, field, e, failure)
         return
-    if not wp.isfinite(wp.length_sq(x[e, p])):
-        wp.atomic_or(failure, e, _NONFINITE)
-        return
-    base = base_node(grid_position(grid, x[e, p]))
-    if not stencil_inside(grid, base):
-        wp.atomic_or(failure, e, _OUT_OF_GRID)
-        return
-    mark_blocks(grid, blocks, base, particles.field[p], e, failure)
+    for n in range(2):
+        if mine[n] >= 0:
+            mark_block(grid, blocks, mine[n], field, e, failure)

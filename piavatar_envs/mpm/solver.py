@@ -33,7 +33,7 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     if index == 0 and m.scatter == "shared":
         program.launch(forget_speeds, scratch.room.speed.shape, [scratch.room])
     if index > 0 and index % MARKS_EVERY == 0:
-        record_marks(program, model, state, scratch)
+        _record_new_marks(program, model, state, scratch)
     record_scatter(program, model, state, scratch)
     if m.scatter != "shared":
         (num_envs, threads), sweep = plan_sweep(m)
@@ -132,11 +132,16 @@ def record_marks(program: Program, model: Model, state: State, scratch: Scratch)
     What has been is forgotten first: a reset may have put the particles elsewhere, and a block that is marked for
     nothing costs time and, in its rounding, the equality of runs.
     """
+    _record_new_marks(program, model, state, scratch)
+    program.launch(freeze, model.num_envs, [state.failure], [scratch.blocks])
+
+
+def _record_new_marks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """:func:`record_marks` where no environment can fail by them: only gathers have moved particles since the last."""
     m, blocks = model, scratch.blocks
     program.launch(forget_blocks, (m.num_envs, m.max_slots), [m.grid], [blocks])
     program.launch(free_slots, m.num_envs, [state.failure], [blocks])
     program.launch(mark_particles, state.x.shape, [m.grid, m.particles, state.x], [blocks, state.failure])
-    program.launch(freeze, m.num_envs, [state.failure], [blocks])
 
 
 def record_end(program: Program, model: Model, state: State, scratch: Scratch) -> None:

@@ -112,7 +112,7 @@ def test_timed_reports_every_kernel(simulate):
         each = {"substep_in_large_room"}
     assert set(seconds) == once | each
     assert all(value > 0.0 for value in seconds.values())
-    marks = {"forget_blocks", "free_slots", "mark_particles", "freeze"}  # at the start, and after 8, 16 and 24 substeps
+    marks = {"forget_blocks", "free_slots", "mark_particles"}  # at the start, and after 8, 16 and 24 substeps
     assert len(sim.program) == len(once - marks) + 4 * len(marks) + len(each) * 25
 
 
