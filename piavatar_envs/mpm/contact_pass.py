@@ -23,6 +23,7 @@ from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN, normal_from, rec
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
 from piavatar_envs.mpm.sums import clear_offset, offset_at, read_record, write_record
 from piavatar_envs.mpm.sweep import THREADS, Sweep
+from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, vec8
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
@@ -180,7 +181,9 @@ def solve_contact(
 
     Bodies touch, boundaries are met; the rest is physical.
     """
-    e, thread = wp.tid()
+    at = environment_of(wp.tid(), sweep.threads)
+    e = at[0]
+    thread = at[1]
     end = nodes_shared(blocks, e)
     for turn in range(sweep.turns):
         first = thread * sweep.share + turn * sweep.stride

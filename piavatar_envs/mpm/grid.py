@@ -11,6 +11,7 @@ from piavatar_envs.mpm.normals import MASS_MIN, face_shared
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import clear_offset, offset_at, take_sum, write_record
 from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
+from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, vec8
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
@@ -162,7 +163,9 @@ def update_grid(
     threads prepare contact, see :func:`piavatar_envs.mpm.normals.face_shared`: they are few, and have the longest to
     wait.
     """
-    e, place = wp.tid()
+    at = environment_of(wp.tid(), of_shared.threads + sweep.threads)
+    e = at[0]
+    place = at[1]
     if place < of_shared.threads:
         face_shared(grid, contact, of_shared, blocks, sums, e, place, node_velocity, node_facing)
         return
@@ -196,8 +199,8 @@ def update_grid(
             is_near = near_node(about, r % BLOCK_NODES)
             total = total_velocity(step, split, take_sum(sums, e, f, r))
             if is_near:  # most skip all of that work
-                at = place_of(grid, corner, r % BLOCK_NODES)
-                total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
+                x = place_of(grid, corner, r % BLOCK_NODES)
+                total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, total, sensors)
             write_record(node_velocity, e, r, physical_velocity(split, total))
             if is_near or told:
                 clear_offset(sums, e, r)

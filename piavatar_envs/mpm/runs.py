@@ -20,6 +20,7 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.sensing import sense_gathered
 from piavatar_envs.mpm.stencil import grid_position, spline
 from piavatar_envs.mpm.stores import store_particle
+from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.transfer import Scattered, near_boundary, prepare, scatters
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
@@ -78,6 +79,7 @@ def runs_to_grid(
     contact: Contact,
     moving: Moving,
     blocks: Blocks,
+    threads: int,
     share: int,
     rounds: int,
     # in and out
@@ -86,9 +88,12 @@ def runs_to_grid(
 ):
     """The same sums as :func:`piavatar_envs.mpm.transfer.particles_to_grid`.
 
-    A warp takes ``share`` particles in each of its rounds; all of its threads come to what they do together.
+    An environment has so many ``threads``. A warp takes ``share`` particles in each of its rounds; all of its threads
+    come to what they do together.
     """
-    e, t = wp.tid()
+    at = environment_of(wp.tid(), threads)
+    e = at[0]
+    t = at[1]
     for n in range(rounds):
         p = (t // 32 * rounds + n) * share + t % 32
         takes = bool(False)
@@ -133,7 +138,9 @@ def grid_to_particles(
     Unlike the gather of a CPU it has its loops unrolled, and its threads store together. If it ``senses``, it does the
     work of :func:`piavatar_envs.mpm.sensing.sense_contact` first, for the same particles.
     """
-    e, p = wp.tid()
+    at = environment_of(wp.tid(), moved.x.shape[1])
+    e = at[0]
+    p = at[1]
     stays = blocks.frozen[e] != 0
     s = Gathered()
     if not stays:
@@ -149,5 +156,5 @@ def record_runs(program: Program, inputs: list[Any], shape: tuple[int, int], fai
     num_envs, per_env = shape
     share, rounds = next(rest for most, *rest in SHARES if per_env <= most)
     threads = -(-per_env * 32 // (THREADS * share * rounds)) * THREADS
-    inputs = [*inputs, share, rounds]
-    program.launch(runs_to_grid, (num_envs, threads), inputs, [failure, sums], block_dim=THREADS)
+    inputs = [*inputs, threads, share, rounds]
+    program.launch(runs_to_grid, num_envs * threads, inputs, [failure, sums], block_dim=THREADS)

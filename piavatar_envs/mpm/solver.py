@@ -40,7 +40,7 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
         of_shared = plan_shared_sweep(m)[1] if m.contact.num_fields > 1 else Sweep()
         program.launch(
             update_grid,
-            (num_envs, of_shared.threads + threads),
+            num_envs * (of_shared.threads + threads),
             [m.grid, m.step, m.boundaries, m.contact, sweep, of_shared, s.failure],
             [blocks, sums, scratch.velocity, scratch.facing, scratch.sensors],
             block_dim=THREADS,
@@ -62,7 +62,8 @@ def _record_gather(program: Program, model: Model, state: State, scratch: Scratc
         program.launch(grid_to_particles, s.x.shape, inputs, outputs, block_dim=runs.THREADS)
         return
     inputs.append(int(_senses(m) and not _senses_apart(m)))
-    program.launch(runs.grid_to_particles, s.x.shape, inputs, [*outputs, scratch.sensors], block_dim=runs.THREADS)
+    outputs.append(scratch.sensors)
+    program.launch(runs.grid_to_particles, s.x.size, inputs, outputs, block_dim=runs.THREADS)
 
 
 def _senses(model: Model) -> bool:
@@ -88,7 +89,7 @@ def _record_contact(program: Program, model: Model, state: State, scratch: Scrat
         )
     program.launch(
         solve_contact,
-        threads,
+        m.num_envs * sweep.threads,
         [m.grid, m.step, m.boundaries, m.contact, sweep, blocks, scratch.facing],
         [sums, scratch.velocity, scratch.sensors],
         block_dim=THREADS,
