@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.warp_blocks import share_of_blocks
 from piavatar_envs.mpm.stencil import (
     BLOCK_NODES,
     base_node,
@@ -27,6 +26,7 @@ from piavatar_envs.mpm.types import (
     Grid,
     Particles,
 )
+from piavatar_envs.mpm.warp_blocks import share_of_blocks
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -121,39 +121,6 @@ def first_record(grid: Grid, blocks: Blocks, e: int, f: int, block: int):
 def record_of(grid: Grid, blocks: Blocks, e: int, f: int, i: int, j: int, k: int):
     """Record of node ``(i, j, k)``, whose block must hold matter of field ``f``."""
     return first_record(grid, blocks, e, f, block_index(grid, i, j, k)) + node_in_block(i, j, k)
-
-
-@wp.func
-def slab_records(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i, i: int):
-    """Where the blocks of the nodes ``base + (i, ...)`` of a stencil have their records, for :func:`line_of_records`.
-
-    The slab lies in two blocks along y and two along z; where it does not, the second repeats the first. What is found
-    holds for all slabs of a stencil in the same blocks.
-    """
-    block = block_index(grid, base[0] + i, base[1], base[2])
-    lower = first_record(grid, blocks, e, f, block)
-    lower_last = lower
-    upper = lower
-    upper_last = lower
-    if (base[2] & 3) > 1:
-        lower_last = first_record(grid, blocks, e, f, block + 1) - 4
-        upper_last = lower_last
-    if (base[1] & 3) > 1:
-        upper = first_record(grid, blocks, e, f, block + grid.blocks[2])
-        upper_last = upper
-        if (base[2] & 3) > 1:
-            upper_last = first_record(grid, blocks, e, f, block + grid.blocks[2] + 1) - 4
-    return wp.vec4i(lower, lower_last, upper, upper_last)
-
-
-@wp.func
-def line_of_records(slab: wp.vec4i, base: wp.vec3i, i: int, j: int):
-    """Records of the nodes ``base + (i, j, 0..2)`` of a stencil, ``slab`` those of the blocks of ``i``."""
-    y = (base[1] & 3) + j
-    in_block = 16 * ((base[0] + i) & 3) + 4 * (y & 3) + (base[2] & 3)
-    first = wp.where(y > 3, slab[2], slab[0]) + in_block
-    last = wp.where(y > 3, slab[3], slab[1]) + in_block
-    return wp.vec3i(first, wp.where((base[2] & 3) == 3, last, first) + 1, last + 2)
 
 
 @wp.func

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import line_of_records, mark_blocks, slab_records
+from piavatar_envs.mpm.blocks import mark_blocks
 from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline, stencil_inside
+from piavatar_envs.mpm.stencil_records import ends_of_line, line_of_records, slab_records
 from piavatar_envs.mpm.sums import first_of_records, read_half_from
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
@@ -161,11 +162,12 @@ def gather_physical(
         if i == 0 or ((base[0] + i) & 3) == 0:
             slab = slab_records(grid, blocks, e, field, base, i)
         for j in range(3):
-            at_line = line_of_records(slab, base, i, j)
+            ends = ends_of_line(slab, base, i, j)
+            middle = wp.where((base[2] & 3) == 3, ends[1], ends[0])
             w = wi * wy[j]
-            second = (w * wz[1]) * read_half_from(nodes, at_line[1], 0)
-            third = (w * wz[2]) * read_half_from(nodes, at_line[2], 0)
-            line = (w * wz[0]) * read_half_from(nodes, at_line[0], 0) + second + third
+            second = (w * wz[1]) * read_half_from(nodes, middle, 1, 0)
+            third = (w * wz[2]) * read_half_from(nodes, ends[1], 2, 0)
+            line = (w * wz[0]) * read_half_from(nodes, ends[0], 0, 0) + second + third
             plane += line
             g.along_y += float(j) * line
             g.along_z += second + 2.0 * third
@@ -195,7 +197,7 @@ def gather_kinematic(
         at = line_of_records(slab_records(grid, blocks, e, field, base, i), base, i, j)
         w = wx[i] * wy[j]
         for l in range(3):
-            s = (w * wz[l]) * read_half_from(nodes, at[l], 1)
+            s = (w * wz[l]) * read_half_from(nodes, at[l], 0, 1)
             g.mean += s
             g.along_x += float(i) * s
             g.along_y += float(j) * s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import fields_around, first_record, has_field, line_of_records, record_of, slab_records
+from piavatar_envs.mpm.blocks import fields_around, first_record, has_field, record_of
 from piavatar_envs.mpm.impulses import add_impulse, part_entry, read_change
 from piavatar_envs.mpm.stencil import (
     BLOCK_NODES,
@@ -14,6 +14,7 @@ from piavatar_envs.mpm.stencil import (
     spline,
     stencil_inside,
 )
+from piavatar_envs.mpm.stencil_records import line_of_records, slab_records
 from piavatar_envs.mpm.sweep import THREADS
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Particles, Sensors, row, vec8
 from piavatar_envs.mpm.warp_blocks import fields_may_meet

@@ -59,17 +59,20 @@ def read_record_from(first: wp.uint64, r: int) -> vec8:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-const float4 a = reinterpret_cast<const float4*>(first)[2 * r + half];
+const float4 a = (reinterpret_cast<const float4*>(first) + 2 * (wp::int64)r)[2 * next + half];
 if (half == 0) return wp::vec_t<4, wp::float32>(a.x, a.y, a.z, a.w);
 return wp::vec_t<4, wp::float32>(a.w, a.x, a.y, a.z);
 #else
-const wp::vec_t<4, wp::float32>& a = reinterpret_cast<const wp::vec_t<4, wp::float32>*>(first)[2 * r + half];
+const wp::vec_t<4, wp::float32>& a = reinterpret_cast<const wp::vec_t<4, wp::float32>*>(first)[2 * (r + next) + half];
 if (half == 0) return a;
 return wp::vec_t<4, wp::float32>(a[3], a[0], a[1], a[2]);
 #endif
 """)
-def read_half_from(first: wp.uint64, r: int, half: int) -> wp.vec4:
-    """The physical (``half`` 0) or the kinematic (1) part of :func:`read_record_from`, in components 1 to 3."""
+def read_half_from(first: wp.uint64, r: int, next: int, half: int) -> wp.vec4:
+    """The physical (``half`` 0) or the kinematic (1) part of a record, in components 1 to 3.
+
+    That is the ``next``-th after :func:`read_record_from`'s: a constant, it takes a GPU no arithmetic.
+    """
     ...
 
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import fields_around, line_of_records, record_of, slab_records
+from piavatar_envs.mpm.blocks import fields_around, record_of
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.matrices import matrix_at
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
+from piavatar_envs.mpm.stencil_records import line_of_records, slab_records
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
     FAILURE_NONFINITE,
