@@ -2,7 +2,7 @@
 
 A thread that stores a vector writes three words, and each of them goes out with all lines that the warp's vectors are
 in. Here a warp's values meet in shared memory and go out as they lie in memory.
-Where the threads' places do not follow each other, or not all threads have come, each stores its own.
+Where the threads' places do not follow each other, or not all threads store, each that does stores its own.
 """
 
 from __future__ import annotations
@@ -24,11 +24,9 @@ const int lane = threadIdx.x & 31;
 float* const stage = stages + (threadIdx.x >> 5) * STAGE;
 const bool here = __activemask() == ALL && blockDim.x <= WP_TILE_BLOCK_DIM;
 bool together = false;
-unsigned storing = 0;
 if (here) {  // all threads of the warp go on to every exchange, or they would wait for each other for ever
     const int first = __shfl_sync(ALL, p, 0), row = __shfl_sync(ALL, e, 0);
-    together = __all_sync(ALL, p == first + lane && e == row);
-    storing = __ballot_sync(ALL, store);
+    together = __all_sync(ALL, store && p == first + lane && e == row);
 }
 auto put = [&](auto& into, const auto& value) {
     if (!together) {
@@ -40,10 +38,7 @@ auto put = [&](auto& into, const auto& value) {
     for (int c = 0; c < 3; ++c) stage[3 * lane + c] = value[c];
     __syncwarp();
 #pragma unroll
-    for (int c = 0; c < 3; ++c) {
-        const int word = 32 * c + lane;
-        if (storing == ALL || (storing >> word / 3 & 1u)) first[word] = stage[word];
-    }
+    for (int c = 0; c < 3; ++c) first[32 * c + lane] = stage[32 * c + lane];
     __syncwarp();
 };
 %s
