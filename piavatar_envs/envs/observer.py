@@ -41,6 +41,7 @@ class Observer:
         layout: of the flat observation.
         task_start: first component of the task's terms.
         parameters: what the episode has drawn, or None.
+        everybody: a mask of all environments, ``(num_envs,)`` bool.
     """
 
     def __init__(self, simulation: Simulation, task: Task) -> None:
@@ -63,7 +64,7 @@ class Observer:
         last = [self.parameters.term] if self.parameters else []
         self.layout = ObservationLayout((*terms, *task.terms(), *last))
         device = simulation.device
-        self._everybody = wp.full(simulation.num_envs, True, dtype=wp.bool, device=device)
+        self.everybody = wp.full(simulation.num_envs, True, dtype=wp.bool, device=device)
         self._part = [wp.array(flesh.part, dtype=int, device=device) for flesh in simulation.flesh]
 
     def record(self, program: Program, agent: int, observation: wp.array, mask: wp.array | None = None) -> None:
@@ -71,7 +72,7 @@ class Observer:
 
         What takes a pass over the particles is written where there is no ``mask``, or where it is set.
         """
-        mask = self._everybody if mask is None else mask
+        mask = self.everybody if mask is None else mask
         sim = self.simulation
         n, avatar = sim.num_envs, sim.avatars[agent]
         start = self.layout["stress"].slice.start

@@ -62,12 +62,12 @@ class Hits:
     def record_outcome(self, env: BatchEnv, program: Program) -> None:
         """Append: costs, the metrics from the third on, and success."""
         sim = env.simulation
-        program.launch(clear_stress, (env.num_envs, len(BODY_PARTS)), [0, 0], [self._stress])
+        program.launch(clear_stress, (env.num_envs, len(BODY_PARTS)), [env.observer.everybody, 0, 0], [self._stress])
         program.launch(
             observe_stress,
             (env.num_envs, sim.avatar.num_points),
             [
-                sim.avatar.body, sim.model.particles, sim.state.F, self._part, 0, 0,
+                env.observer.everybody, sim.avatar.body, sim.model.particles, sim.state.F, self._part, 0, 0,
                 1.0 / sim.flesh[0].physics.young_modulus,
             ],
             [self._stress],
