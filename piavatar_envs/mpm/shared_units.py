@@ -24,9 +24,7 @@ from piavatar_envs.mpm.shared_memory import (
     threads_of_block,
     word,
 )
-from piavatar_envs.mpm.transfer import (
-    Scattered,
-)
+from piavatar_envs.mpm.transfer import Scattered, momentum_bounds
 from piavatar_envs.mpm.types import (
     Room,
 )
@@ -54,11 +52,9 @@ def unit_of_place(field: int):
 @wp.func
 def speed_of(s: Scattered):
     """A bound of the momenta that a particle adds, by its mass [m/s]."""
-    most = float(0.0)
+    most = wp.max(momentum_bounds(s))
     for c in range(3):
-        reach = wp.abs(s.A[c, 0]) + wp.abs(s.A[c, 1]) + wp.abs(s.A[c, 2])
-        center = s.at_base[1 + c] + s.A[c, 0] + s.A[c, 1] + s.A[c, 2]
-        most = wp.max(most, wp.max(wp.abs(center) + reach, wp.abs(s.at_base[4 + c])))
+        most = wp.max(most, wp.abs(s.at_base[4 + c]))
     return most / s.at_base[0]
 
 

@@ -8,10 +8,10 @@ from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.contact_pass import solve_contact
 from piavatar_envs.mpm.gather import grid_to_particles
 from piavatar_envs.mpm.grid import update_grid
+from piavatar_envs.mpm.groups import record_runs
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import record_runs
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
 from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
 from piavatar_envs.mpm.sweep import THREADS, Sweep, plan_shared_sweep, plan_sweep

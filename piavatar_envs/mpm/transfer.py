@@ -49,6 +49,16 @@ class Scattered:
 
 
 @wp.func
+def placed(grid: Grid, x: wp.vec3):
+    """A particle at ``x`` that scatters nothing."""
+    s = Scattered()
+    xg = grid_position(grid, x)
+    s.base = base_node(xg)
+    s.f = xg - wp.vec3(float(s.base[0]), float(s.base[1]), float(s.base[2]))
+    return s
+
+
+@wp.func
 def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, tells: bool):
     """What particle ``p`` of environment ``e`` scatters.
 
@@ -56,10 +66,7 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
     again. So only particles add it that ``tell`` the nodes how they are driven. (The paper's variant needs its gradient
     everywhere.)
     """
-    s = Scattered()
-    xg = grid_position(grid, moving.x[e, p])
-    s.base = base_node(xg)
-    s.f = xg - wp.vec3(float(s.base[0]), float(s.base[1]), float(s.base[2]))
+    s = placed(grid, moving.x[e, p])
     m = particles.mass[row(e, particles.mass.shape[0]), p]
     affine = m * matrix_at(moving.C, e, p)
     if step.decoupling != NO_STRESS:
@@ -78,6 +85,17 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
         k = m * moving.vk[e, p]
     s.at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
     return s
+
+
+@wp.func
+def momentum_bounds(s: Scattered):
+    """Bounds of the components of physical momentum that a particle has anywhere in its stencil [kg m/s]."""
+    bounds = wp.vec3()
+    for c in range(3):
+        reach = wp.abs(s.A[c, 0]) + wp.abs(s.A[c, 1]) + wp.abs(s.A[c, 2])
+        center = s.at_base[1 + c] + s.A[c, 0] + s.A[c, 1] + s.A[c, 2]
+        bounds[c] = wp.abs(center) + reach
+    return bounds
 
 
 @wp.func

@@ -43,7 +43,7 @@ FAILURE_NAMES: dict[int, str] = {
 
 #: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.decouple`).
 DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
-#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, :mod:`piavatar_envs.mpm.runs` and
+#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, :mod:`piavatar_envs.mpm.groups` and
 #: :mod:`piavatar_envs.mpm.shared_substep`), and whether the nodes have sums in fixed point.
 SCATTERS: dict[str, bool] = {"plain": False, "runs": True, "runs_float": False, "shared": False}
 SPLIT = wp.constant(0)

@@ -1,0 +1,240 @@
+"""The scatter of a GPU for large bodies: particles are added up by the group before the nodes are touched.
+
+A group is of neighbours in memory, which should be neighbours in the body: the fewer bricks of nodes they touch, the
+less there is to put down. It has a CUDA block of its own, see :mod:`piavatar_envs.mpm.group_bricks` and
+:mod:`piavatar_envs.mpm.group_sums`. What it adds up
+depends on its own particles only, and integers are added: runs repeat bit for bit, and an environment does the same in
+any batch.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from piavatar_envs.mpm.group_bricks import (
+    BRICKS_TOUCHED,
+    CAPACITY,
+    CROWDED,
+    DRIVEN,
+    FASTEST,
+    HEAVIEST,
+    KEYS,
+    KINEMATIC,
+    MOMENTUM,
+    MORE,
+    PLACE,
+    RECORDS,
+    THREADS,
+    UNITS,
+    WORDS,
+    find_bricks,
+    is_shared,
+    note_record,
+    per_unit_of,
+    raise_most,
+)
+from piavatar_envs.mpm.group_sums import add_to_nodes, put_down
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.runs import MOST_UNITS, fault_of_sums
+from piavatar_envs.mpm.shared_memory import clear_words, meet, or_word, set_number, set_word, thread_of_block, word
+from piavatar_envs.mpm.transfer import (
+    Scattered,
+    momentum_bounds,
+    near_boundary,
+    placed,
+    prepare,
+    scatters,
+)
+from piavatar_envs.mpm.types import (
+    PAPER,
+    Blocks,
+    Boundaries,
+    Contact,
+    Grid,
+    Moving,
+    Particles,
+    Step,
+    Sums,
+    row,
+    vec8,
+)
+
+# divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls: a
+# warp with a few particles waits for its instructions as much as for its numbers
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+
+#: Up to how many particles of an environment a group has so many. Small worlds come in batches, which fill a GPU in any
+#: case; single larger ones do with small groups only. The numbers must not depend on the batch: units do on the group.
+SHARES = ((8192, int(THREADS)), (65536, 64), (2**31, int(THREADS)))
+#: Particles that one round surely has bricks for.
+SURE = wp.constant(int(CAPACITY) // int(BRICKS_TOUCHED))
+
+
+@wp.func
+def begin_group(sums: Sums, num_fields: int, e: int, driven: bool):
+    """Nothing has been added yet; units are not smaller than those of the sums. All threads come here."""
+    f = thread_of_block()
+    clear_words(KEYS, RECORDS - KEYS)
+    if f < num_fields:
+        momentum = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
+        set_number(HEAVIEST + f, UNITS * sums.mass_unit[row(e, sums.mass_unit.shape[0]), f])
+        set_number(FASTEST + f, UNITS * momentum)
+        set_number(DRIVEN + f, UNITS * momentum)
+    if f == 0:
+        set_word(CROWDED, 0)
+        set_word(MORE, wp.where(driven, 1 << KINEMATIC, 0))
+    meet()
+
+
+@wp.func
+def begin_round():
+    """Forget the bricks of the round before, whose nodes have been put down. All threads come here."""
+    meet()  # all have seen what it was like
+    clear_words(KEYS, CAPACITY)
+    if thread_of_block() == 0:
+        set_word(CROWDED, 0)
+    meet()
+
+
+@wp.func
+def telling(grid: Grid, particles: Particles, moving: Moving, e: int, p: int, kind: int):
+    """What a particle tells: how it is driven, or its place, ``w m (x_i - x_p) / dx``, and ``w m`` of a seam."""
+    s = placed(grid, moving.x[e, p])
+    m = particles.mass[row(e, particles.mass.shape[0]), p]
+    if kind == KINEMATIC:
+        k = m * moving.vk[e, p]
+        s.at_base = vec8(0.0, k[0], k[1], k[2], 0.0, 0.0, 0.0, 0.0)
+    else:
+        s.at_base = vec8(particles.seam[p] * m, -m * s.f[0], -m * s.f[1], -m * s.f[2], 0.0, 0.0, 0.0, 0.0)
+        s.A = wp.diag(wp.vec3(m))
+    return s
+
+
+@wp.func
+def scatter_kind(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    moving: Moving,
+    blocks: Blocks,
+    failure: wp.array(dtype=int),
+    sums: Sums,
+    contact: Contact,
+    e: int,
+    p: int,
+    share: int,
+    adds: bool,
+    near: bool,
+    kind: int,
+):
+    """Add what a particle has of a ``kind`` up with the group's, and put the sums down. All threads come here.
+
+    Returns whether it tells its place; if not all particles find room, nothing else is done.
+    """
+    tells = near
+    field = int(0)
+    momentum = float(0.0)
+    s = Scattered()
+    if adds:
+        field = particles.field[p]
+        if kind == MOMENTUM:
+            s = prepare(grid, step, particles, moving, e, p, False)
+        else:
+            s = telling(grid, particles, moving, e, p, kind)
+        unit = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
+        bounds = momentum_bounds(s)
+        momentum = wp.max(bounds)
+        if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:  # of what is no number, either
+            fault = fault_of_sums(s, unit)
+            if fault != 0:
+                wp.atomic_or(failure, e, fault)
+                adds = False
+    if kind != PLACE:
+        raise_most(adds, field, kind, s, momentum)
+    bricks = find_bricks(grid, adds, field, s.base)
+    if adds and bricks[0] < 0:
+        set_word(CROWDED, 1)
+    meet()
+    if word(CROWDED) == 0:
+        if kind == MOMENTUM:
+            note_record(grid, blocks, contact.num_fields, e)
+            if contact.num_fields > 1:
+                meet()
+                tells = tells or (adds and is_shared(bricks))
+            if adds and tells:
+                or_word(MORE, (1 << KINEMATIC) + (1 << PLACE))
+        per_scalar = per_unit_of(HEAVIEST + field)
+        per_vector = 0.5 * per_scalar  # of places, up to 1.5 masses
+        if kind != PLACE:
+            per_vector = per_unit_of(wp.where(kind == MOMENTUM, FASTEST, DRIVEN) + field)
+        at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
+        add_to_nodes(share, adds, bricks, s.base, s.f, at_base, s.A, per_scalar, per_vector)
+        meet()
+        put_down(grid, sums, contact.num_fields, failure, e, kind)
+        meet()
+    return tells
+
+
+@wp.kernel(launch_bounds=(int(THREADS), 3))
+def runs_to_grid(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    moving: Moving,
+    blocks: Blocks,
+    share: int,
+    groups: int,
+    # in and out
+    failure: wp.array(dtype=int),
+    sums: Sums,
+):
+    """The same sums as :func:`piavatar_envs.mpm.transfer.particles_to_grid`.
+
+    A CUDA block takes a ``share`` of particles, a thread each, one of the ``groups`` of an environment; all of its
+    threads come to what they do together.
+    """
+    group = wp.tid() // THREADS
+    e = group // groups
+    reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
+    t = thread_of_block()
+    p = (group - e * groups) * share + t
+    takes = bool(False)
+    tells = bool(False)
+    if t < share and p < moving.x.shape[1]:
+        takes = scatters(blocks, moving, e, p, failure)
+    if takes:
+        tells = near_boundary(grid, boundaries, e, moving.x[e, p])
+    # kinematic momentum is for contact; the paper's variant needs its gradient everywhere
+    driven = step.decoupling == PAPER
+    begin_group(sums, contact.num_fields, e, driven)
+    turn = int(-1)  # all at once; or, if some find no room, so many as surely do, whatever the order of the threads
+    turns = int(0)
+    while turn < turns:
+        if turn >= 0:
+            begin_round()
+        ours = takes and (turn < 0 or t // SURE == turn)
+        kind = int(0)
+        while kind <= PLACE:
+            adds = ours and (kind == MOMENTUM or tells or (driven and kind == KINEMATIC))
+            tells = scatter_kind(
+                grid, step, particles, moving, blocks, failure, sums, contact, e, p, share, adds, tells, kind
+            )
+            kind += 1
+            if word(MORE) == 0 or word(CROWDED) != 0:
+                kind = PLACE + 1
+        if word(CROWDED) != 0:
+            turns = (share + SURE - 1) // SURE
+        turn += 1
+
+
+def record_runs(program: Program, inputs: list[Any], shape: tuple[int, int], failure: wp.array, sums: Sums) -> None:
+    """Append :func:`runs_to_grid` for particles of ``shape``: no CUDA block has two environments."""
+    num_envs, per_env = shape
+    share = next(rest for most, rest in SHARES if per_env <= most)
+    groups = -(-per_env // share)
+    inputs = [*inputs, share, groups]
+    program.launch(runs_to_grid, num_envs * groups * int(THREADS), inputs, [failure, sums], block_dim=int(THREADS))
