@@ -27,10 +27,11 @@ BRICKS_TOUCHED = wp.constant(8)
 #: Particles of a group, at most; so many threads it has, whatever their number.
 THREADS = wp.constant(256)
 #: Words of the header: not 0 if a particle has found no room; bits of what else is added up; and of each of up to 32
-#: fields, the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s].
+#: fields, the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units.
 CROWDED, MORE = (wp.constant(n) for n in range(2))
 HEAVIEST, FASTEST, DRIVEN = (wp.constant(n) for n in (4, 36, 68))
-KEYS = wp.constant(100)
+MASS_UNIT, MOMENTUM_UNIT = (wp.constant(n) for n in (100, 132))
+KEYS = wp.constant(164)
 NODES = wp.constant(int(KEYS) + int(CAPACITY))
 RECORDS = wp.constant(int(NODES) + 4 * 8 * int(CAPACITY))
 MASSIVE = wp.constant(int(RECORDS) + int(CAPACITY))
@@ -51,7 +52,8 @@ POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fff
 
 def in_group(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
-    names = "CAPACITY EDGE KEYS NODES RECORDS MASSIVE HANDED SHARED HEAVIEST FASTEST DRIVEN KINEMATIC PLACE"
+    names = "CAPACITY EDGE HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT KEYS NODES RECORDS MASSIVE HANDED SHARED"
+    names += " KINEMATIC PLACE"
     known = ", ".join(f"{name} = {int(globals()[name])}" for name in names.split())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
 

@@ -135,9 +135,8 @@ float unit = 0.0f;
 int shift = 0, right = 0, left = 0, half = 0, most_high = 0;
 auto count_in = [&](int field) {{  // the group's units are not smaller than those of the sums: shifted, they are exact
     unit = power_of_two(room[most + field]) * (is_place && c > 0 ? 0x1p-22f : 0x1p-23f);
-    const float counted = of_mass ? wp::index(sums.mass_unit, min(e, sums.mass_unit.shape[0] - 1), field)
-                                  : wp::index(sums.momentum_unit, min(e, sums.momentum_unit.shape[0] - 1), field);
-    shift = (__float_as_int(unit) - __float_as_int(counted)) >> 23;
+    const int counted = room[(of_mass ? MASS_UNIT : MOMENTUM_UNIT) + field];
+    shift = (__float_as_int(unit) - counted) >> 23;
     right = max(20 - shift, 0), left = max(shift - 20, 0), half = (1 << right) >> 1;
     most_high = shift > 31 ? 0 : 1 << (28 - left);
 }};

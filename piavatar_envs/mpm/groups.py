@@ -22,7 +22,9 @@ from piavatar_envs.mpm.group_bricks import (
     HEAVIEST,
     KEYS,
     KINEMATIC,
+    MASS_UNIT,
     MOMENTUM,
+    MOMENTUM_UNIT,
     MORE,
     PLACE,
     RECORDS,
@@ -38,7 +40,16 @@ from piavatar_envs.mpm.group_bricks import (
 from piavatar_envs.mpm.group_sums import add_to_nodes, put_down
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import MOST_UNITS, fault_of_sums
-from piavatar_envs.mpm.shared_memory import clear_words, meet, or_word, set_number, set_word, thread_of_block, word
+from piavatar_envs.mpm.shared_memory import (
+    clear_words,
+    meet,
+    number,
+    or_word,
+    set_number,
+    set_word,
+    thread_of_block,
+    word,
+)
 from piavatar_envs.mpm.transfer import (
     Scattered,
     momentum_bounds,
@@ -74,28 +85,29 @@ SURE = wp.constant(int(CAPACITY) // int(BRICKS_TOUCHED))
 
 @wp.func
 def begin_group(sums: Sums, num_fields: int, e: int, driven: bool):
-    """Nothing has been added yet; units are not smaller than those of the sums. All threads come here."""
+    """Nothing has been added yet; units are not smaller than those of the sums. All threads meet later."""
     f = thread_of_block()
-    clear_words(KEYS, RECORDS - KEYS)
     if f < num_fields:
+        mass = sums.mass_unit[row(e, sums.mass_unit.shape[0]), f]
         momentum = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
-        set_number(HEAVIEST + f, UNITS * sums.mass_unit[row(e, sums.mass_unit.shape[0]), f])
+        set_number(MASS_UNIT + f, mass)
+        set_number(MOMENTUM_UNIT + f, momentum)
+        set_number(HEAVIEST + f, UNITS * mass)
         set_number(FASTEST + f, UNITS * momentum)
         set_number(DRIVEN + f, UNITS * momentum)
     if f == 0:
         set_word(CROWDED, 0)
         set_word(MORE, wp.where(driven, 1 << KINEMATIC, 0))
-    meet()
+    clear_words(KEYS, RECORDS - KEYS)
 
 
 @wp.func
 def begin_round():
-    """Forget the bricks of the round before, whose nodes have been put down. All threads come here."""
+    """Forget the bricks of the round before, whose nodes have been put down. All threads come here, and meet later."""
     meet()  # all have seen what it was like
     clear_words(KEYS, CAPACITY)
     if thread_of_block() == 0:
         set_word(CROWDED, 0)
-    meet()
 
 
 @wp.func
@@ -143,7 +155,9 @@ def scatter_kind(
             s = prepare(grid, step, particles, moving, e, p, False)
         else:
             s = telling(grid, particles, moving, e, p, kind)
-        unit = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
+    meet()  # what has begun
+    if adds:
+        unit = number(MOMENTUM_UNIT + field)
         bounds = momentum_bounds(s)
         momentum = wp.max(bounds)
         if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:  # of what is no number, either
@@ -202,15 +216,14 @@ def runs_to_grid(
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
     t = thread_of_block()
     p = (group - e * groups) * share + t
+    driven = step.decoupling == PAPER  # that variant needs the gradient of kinematic momentum everywhere
+    begin_group(sums, contact.num_fields, e, driven)
     takes = bool(False)
     tells = bool(False)
     if t < share and p < moving.x.shape[1]:
         takes = scatters(blocks, moving, e, p, failure)
     if takes:
         tells = near_boundary(grid, boundaries, e, moving.x[e, p])
-    # kinematic momentum is for contact; the paper's variant needs its gradient everywhere
-    driven = step.decoupling == PAPER
-    begin_group(sums, contact.num_fields, e, driven)
     turn = int(-1)  # all at once; or, if some find no room, so many as surely do, whatever the order of the threads
     turns = int(0)
     while turn < turns:
