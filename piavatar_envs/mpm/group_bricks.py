@@ -1,11 +1,13 @@
 """The nodes of a group of particles in the shared memory of its CUDA block, in CUDA: where they lie.
 
-They lie in bricks of 2 x 2 x 2 nodes. A brick's key says where it is on the grid and of which velocity field; its place
-follows from that, or is the next that is free. So it does not matter how a group lies: three quarters of the places are
-enough for 256 particles inside a body or 64 on its skin.
+They lie in bricks of 2 x 2 x 2 nodes, numbered as they come. A brick's key says where it is on the grid and of which
+velocity field; a sparse table, where hardly any two keys meet, leads from keys to numbers. So it does not matter how a
+group lies. Particles of a warp that lie in the same brick look its neighbors up once, a thread each. Numbers depend on
+who comes first, sums do not: integers are added, and whether there is room depends on how many bricks there are.
 
-Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; the keys; four sums of every node, one after
-the other; of every brick its record, and which nodes have got mass; what is handed to other threads.
+Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; the table of keys, and of numbers in half
+words; of every brick its key, its record, and which nodes have got mass; four sums of every node, one after the other;
+where in the table the bricks are that a warp looked up, in half words; what is handed to other threads.
 """
 
 from __future__ import annotations
@@ -18,26 +20,35 @@ from piavatar_envs.mpm.types import Blocks, Grid
 
 wp.set_module_options({"enable_backward": False})
 
-#: Bricks that there is room for.
-CAPACITY = wp.constant(216)
-#: Bricks that have places of their own whatever the others are: a cube of them, wherever it lies.
-EDGE = wp.constant(6)
+#: Bricks that there is room for: a multiprocessor of 228 KB holds six groups.
+CAPACITY = wp.constant(184)
+#: Places of the table, a power of two: with so many more than bricks, a key is mostly found at the first.
+TABLE_BITS = wp.constant(9)
+TABLE = wp.constant(1 << int(TABLE_BITS))
 #: Bricks that a particle touches.
 BRICKS_TOUCHED = wp.constant(8)
 #: Particles of a group, at most; so many threads it has, whatever their number.
-THREADS = wp.constant(256)
-#: Words of the header: not 0 if a particle has found no room; bits of what else is added up; and of each of up to 32
-#: fields, the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units.
-CROWDED, MORE = (wp.constant(n) for n in range(2))
+THREADS = wp.constant(128)
+#: Particles of a group of which a thread takes a plane of nodes instead, at most.
+MOST_SPLIT = wp.constant(int(THREADS) // 2)
+#: Words of the header: how many bricks there are, or more than there is room for; bits of what else is added up; and of
+#: each of up to 32 fields, the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the
+#: sums' own units.
+COUNT, MORE = (wp.constant(n) for n in range(2))
 HEAVIEST, FASTEST, DRIVEN = (wp.constant(n) for n in (4, 36, 68))
 MASS_UNIT, MOMENTUM_UNIT = (wp.constant(n) for n in (100, 132))
 KEYS = wp.constant(164)
-NODES = wp.constant(int(KEYS) + int(CAPACITY))
-RECORDS = wp.constant(int(NODES) + 4 * 8 * int(CAPACITY))
+NUMBERS = wp.constant(int(KEYS) + int(TABLE))
+BRICKS = wp.constant(int(NUMBERS) + int(TABLE) // 2)
+RECORDS = wp.constant(int(BRICKS) + int(CAPACITY))
 MASSIVE = wp.constant(int(RECORDS) + int(CAPACITY))
-HANDED = wp.constant(int(MASSIVE) + int(CAPACITY))
-#: Words of a room; a third of the threads' particles may be handed on.
-WORDS = wp.constant(int(HANDED) + 21 * (int(THREADS) // 3))
+NODES = wp.constant(int(MASSIVE) + int(CAPACITY))
+#: From a sum of a node to its next; the four of eight nodes lie in 32 banks.
+ALONG = wp.constant(8 * int(CAPACITY) + 8)
+FOUND = wp.constant(int(NODES) + 4 * int(ALONG))
+HANDED = wp.constant(int(FOUND) + 4 * int(THREADS))
+#: Words of a room.
+WORDS = wp.constant(int(HANDED) + 21 * int(MOST_SPLIT))
 #: Units of the most that a particle has.
 UNITS = wp.constant(float(2**23))
 #: What a brick's record has besides it, if there is matter of another field in its block.
@@ -52,8 +63,8 @@ POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fff
 
 def in_group(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
-    names = "CAPACITY EDGE HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT KEYS NODES RECORDS MASSIVE HANDED SHARED"
-    names += " KINEMATIC PLACE"
+    names = "CAPACITY TABLE_BITS TABLE COUNT HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT KEYS NUMBERS BRICKS"
+    names += " RECORDS MASSIVE NODES ALONG FOUND HANDED MOST_SPLIT SHARED KINEMATIC PLACE"
     known = ", ".join(f"{name} = {int(globals()[name])}" for name in names.split())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
 
@@ -85,70 +96,95 @@ def raise_most(takes: bool, field: int, kind: int, s: Scattered, momentum: float
 @wp.func_native(
     in_group(
         """
-if (!takes) return wp::vec_t<4, wp::int32>(-1, 0, 0, 0);
-unsigned* const keys = reinterpret_cast<unsigned*>(room + KEYS);
-const int ny = grid.blocks[1], nz = grid.blocks[2];
-unsigned x[2], y[2], z[2], key[8], got[8];
-int at[8];
-for (int n = 0; n < 2; ++n) {
-    const int i = base[0] + 2 * n, j = base[1] + 2 * n, k = base[2] + 2 * n;
-    x[n] = 8u * (field * grid.num_blocks + (i >> 2) * ny * nz) + ((i & 2) << 1) + 1;  // 0 is for nobody's
-    y[n] = 8u * ((j >> 2) * nz) + (j & 2);
-    z[n] = 8u * (k >> 2) + ((k & 2) >> 1);
-}
-// bricks next to each other have places of their own; other fields' begin elsewhere
-const int bx = (unsigned)((base[0] >> 1) + 3 * (field & 1)) % EDGE, by = (unsigned)(base[1] >> 1) % EDGE;
-const int bz = (unsigned)((base[2] >> 1) + 3 * (field >> 1 & 1)) % EDGE;
-const int of_x[2] = {bx * EDGE * EDGE, bx == EDGE - 1 ? 0 : (bx + 1) * EDGE * EDGE};
-const int of_y[2] = {by * EDGE, by == EDGE - 1 ? 0 : (by + 1) * EDGE}, of_z[2] = {bz, bz == EDGE - 1 ? 0 : bz + 1};
-#pragma unroll
-for (int b = 0; b < 8; ++b) {
-    key[b] = x[b >> 2] + y[b >> 1 & 1] + z[b & 1];
-    at[b] = of_x[b >> 2] + of_y[b >> 1 & 1] + of_z[b & 1];
-}
-#pragma unroll
-for (int b = 0; b < 8; ++b) got[b] = atomicCAS(keys + at[b], 0u, key[b]);  // one does not wait for the other
-bool fits = true;
-#pragma unroll
-for (int b = 0; b < 8; ++b)
-    for (int n = 1; got[b] != 0u && got[b] != key[b]; ++n) {
-        if (n == CAPACITY) {
-            fits = false;
-            break;
+const int lane = threadIdx.x & 31, b = lane & 7;
+const int ny = grid.blocks[1], nz = grid.blocks[2], i = base[0], j = base[1], k = base[2];
+const unsigned block = field * grid.num_blocks + ((i >> 2) * ny + (j >> 2)) * nz + (k >> 2);
+const unsigned own = takes ? 8u * block + ((i & 2) << 1) + (j & 2) + ((k & 2) >> 1) + 1 : 0u;  // 0 is for nobody's
+if (!__any_sync(ALL, takes)) return 0;
+// the first of those in the same brick has the eight of them looked up, four such at a time
+const int first = __ffs(__match_any_sync(ALL, own)) - 1;
+const unsigned firsts = __ballot_sync(ALL, takes && first == lane);
+const int among = __popc(firsts & ((1u << first) - 1u)), num = __popc(firsts);
+volatile unsigned* const keys = reinterpret_cast<unsigned*>(room + KEYS);
+unsigned short* const numbers = reinterpret_cast<unsigned short*>(room + NUMBERS);
+volatile int* const found = room + FOUND + 4 * ((int)threadIdx.x - lane);
+unsigned short* const found_at = reinterpret_cast<unsigned short*>(room + FOUND + 4 * ((int)threadIdx.x - lane));
+if (takes && first == lane) found[4 * among] = (int)own;
+__syncwarp();
+for (int begin = 0; begin < num; begin += 4) {
+    const int n = begin + (lane >> 3);
+    unsigned key = n < num ? (unsigned)found[4 * n] : 0u;
+    __syncwarp();  // all have read it
+    // when there are too many, it does not matter who they are; and the table is never full
+    if (n < num && *(volatile int*)(room + COUNT) <= CAPACITY) {
+        const unsigned lowest = key - 1u;
+        if (b & 4) key += lowest & 4u ? 8 * ny * nz - 4 : 4;
+        if (b & 2) key += lowest & 2u ? 8 * nz - 2 : 2;
+        if (b & 1) key += lowest & 1u ? 7 : 1;
+        unsigned at = key * 0x9e3779b1u >> (32 - TABLE_BITS), got;
+        while ((got = keys[at]) != key) {
+            if (got == 0u) {
+                got = atomicCAS((unsigned*)keys + at, 0u, key);
+                if (got == key) break;
+                if (got == 0u) {
+                    const int number = atomicAdd(room + COUNT, 1);
+                    if (number < CAPACITY) room[BRICKS + number] = (int)key;
+                    numbers[at] = (unsigned short)number;
+                    break;
+                }
+            }
+            at = at + 1 & TABLE - 1;
         }
-        at[b] = at[b] + 1 == CAPACITY ? 0 : at[b] + 1;
-        got[b] = atomicCAS(keys + at[b], 0u, key[b]);
+        found_at[8 * n + b] = (unsigned short)at;
     }
-if (!fits) return wp::vec_t<4, wp::int32>(-1, 0, 0, 0);
-return wp::vec_t<4, wp::int32>(
-    8 * (at[0] | at[1] << 16), 8 * (at[2] | at[3] << 16), 8 * (at[4] | at[5] << 16), 8 * (at[6] | at[7] << 16));
+}
+return among;
+""",
+        "return 0;",
+    )
+)
+def seek_bricks(grid: Grid, takes: bool, field: int, base: wp.vec3i) -> int:
+    """See that the bricks of a stencil have numbers, if there is room; all threads of a warp come here.
+
+    Returns where :func:`bricks_found` finds them when all threads have met.
+    """
+    ...
+
+
+@wp.func_native(
+    in_group(
+        """
+const int4 at = *reinterpret_cast<const int4*>(room + FOUND + 4 * ((int)(threadIdx.x & ~31u) + found));
+const unsigned short* const numbers = reinterpret_cast<const unsigned short*>(room + NUMBERS);
+auto both = [=](int two) { return 8 * (numbers[two & 0xffff] | numbers[(unsigned)two >> 16] << 16); };
+return wp::vec_t<4, wp::int32>(both(at.x), both(at.y), both(at.z), both(at.w));
 """,
         "return wp::vec_t<4, wp::int32>();",
     )
 )
-def find_bricks(grid: Grid, takes: bool, field: int, base: wp.vec3i) -> wp.vec4i:
+def bricks_found(found: int) -> wp.vec4i:
     """First nodes of the bricks of a stencil: for the lower and the upper along x and y, of the two along z in 16 bits.
 
-    -1 is the first word of a particle that does not ``take`` part, or for whose bricks there is no room.
+    There has been room for them, see :func:`seek_bricks`.
     """
     ...
 
 
 @wp.func_native(
     in_group("""
-const int key = threadIdx.x < CAPACITY ? room[KEYS + threadIdx.x] : 0;
-if (key == 0) return;
-const int brick = key - 1, held = (int)((unsigned)brick >> 3);  // field and block
-int record = 64 * wp::index(blocks.slot, e, held) + ((brick & 4) << 3) + ((brick & 2) << 2) + ((brick & 1) << 1);
-if (num_fields > 1) {
-    const int field = held / grid.num_blocks;
-    if (wp::index(blocks.fields, e, held - field * grid.num_blocks) != 1 << field) record |= SHARED;
+for (int n = threadIdx.x; n < room[COUNT]; n += blockDim.x) {
+    const int brick = room[BRICKS + n] - 1, held = (int)((unsigned)brick >> 3);  // field and block
+    int record = 64 * wp::index(blocks.slot, e, held) + ((brick & 4) << 3) + ((brick & 2) << 2) + ((brick & 1) << 1);
+    if (num_fields > 1) {
+        const int field = held / grid.num_blocks;
+        if (wp::index(blocks.fields, e, held - field * grid.num_blocks) != 1 << field) record |= SHARED;
+    }
+    room[RECORDS + n] = record;
 }
-room[RECORDS + threadIdx.x] = record;
 """)
 )
-def note_record(grid: Grid, blocks: Blocks, num_fields: int, e: int):
-    """Find the record of the first node of the thread's brick, and whether its block is shared with another field."""
+def note_records(grid: Grid, blocks: Blocks, num_fields: int, e: int):
+    """Find the record of every brick's first node, and whether its block is shared with another field."""
     ...
 
 

@@ -3,7 +3,7 @@
 What particles add has a scalar and a vector that is linear over the stencil. It is counted in units of the group: 2^-23
 of the most that any of its particles of a field has, a power of two, and not less than what the sums outside count. So
 integers are added in any order, and put down exactly. A weight is 27/64 at most: a summand stays below 2^22, for which
-a fused addition turns it into an integer, and 256 of them below 2^30.
+a fused addition turns it into an integer, and 128 of them below 2^29.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func_native(
     in_group("""
-constexpr int ALONG = 8 * CAPACITY;  // from a sum of a node to its next
-constexpr float MAGIC = 0x1.8p23f;   // whatever is added to it has its last bit where an integer does
+constexpr float MAGIC = 0x1.8p23f;  // whatever is added to it has its last bit where an integer does
 float value[4], along[3][3], f[3];
 int brick[4], parity = 4 * (base[0] & 1) + 2 * (base[1] & 1) + (base[2] & 1);
 value[0] = s[0] * per_scalar;
@@ -29,13 +28,12 @@ for (int c = 0; c < 3; ++c) {
     f[c] = at[c];
 }
 for (int n = 0; n < 4; ++n) brick[n] = bricks[n];
-const bool splits = 3 * share <= (int)blockDim.x;
-// neighbours, which are often in the same cell, take its nodes in another order: who adds to the same word waits
-int i = threadIdx.x / 9 % 3;
-const int first_j = threadIdx.x / 3 % 3, first_l = threadIdx.x % 3;
+// in small groups, a thread takes a plane of a particle instead, and half of the threads perhaps another
+const bool splits = share <= MOST_SPLIT;
+const int t = threadIdx.x;
 if (splits) {
-    int* handed = room + HANDED + threadIdx.x;
-    if ((int)threadIdx.x < share) {
+    int* handed = room + HANDED + t;
+    if (t < share) {
         for (int n = 0; n < 4; ++n, handed += share) *handed = __float_as_int(value[n]);
         for (int n = 0; n < 9; ++n, handed += share) *handed = __float_as_int(along[n / 3][n % 3]);
         for (int n = 0; n < 3; ++n, handed += share) *handed = __float_as_int(f[n]);
@@ -43,24 +41,28 @@ if (splits) {
         *handed = takes ? parity : -1;
     }
     __syncthreads();
-    takes = (int)threadIdx.x < 3 * share;
-    if (takes) {
-        i = threadIdx.x / share;
-        handed = room + HANDED + threadIdx.x - i * share;
-        for (int n = 0; n < 4; ++n, handed += share) value[n] = __int_as_float(*handed);
-        for (int n = 0; n < 9; ++n, handed += share) along[n / 3][n % 3] = __int_as_float(*handed);
-        for (int n = 0; n < 3; ++n, handed += share) f[n] = __int_as_float(*handed);
-        for (int n = 0; n < 4; ++n, handed += share) brick[n] = *handed;
-        parity = *handed;
-        takes = parity >= 0;
-    }
 }
-if (!takes) return;
-const int px = parity >> 2, py = parity >> 1 & 1, pz = parity & 1;
+// neighbours, which are often in the same cell, take its nodes in another order: who adds to the same word waits
+int i = t / 9 % 3;
+const int first_j = t / 3 % 3, first_l = t % 3, items = splits ? 3 * share : (int)blockDim.x;
 auto spline = [](float f, int n) {
     const float edge = n == 0 ? 1.5f - f : f - 0.5f;
     return n == 1 ? 0.75f - (f - 1.0f) * (f - 1.0f) : 0.5f * edge * edge;
 };
+#pragma unroll 1
+for (int item = t; item < items; item += blockDim.x) {
+if (splits) {
+    i = item / share;
+    const int* handed = room + HANDED + item - i * share;
+    for (int n = 0; n < 4; ++n, handed += share) value[n] = __int_as_float(*handed);
+    for (int n = 0; n < 9; ++n, handed += share) along[n / 3][n % 3] = __int_as_float(*handed);
+    for (int n = 0; n < 3; ++n, handed += share) f[n] = __int_as_float(*handed);
+    for (int n = 0; n < 4; ++n, handed += share) brick[n] = *handed;
+    parity = *handed;
+    takes = parity >= 0;
+}
+if (!takes) continue;
+const int px = parity >> 2, py = parity >> 1 & 1, pz = parity & 1;
 float weight_y[3], weight_z[3], at_y[3], at_z[3];
 int word_y[3], word_z[3];
 bool upper_y[3], upper_z[3];
@@ -96,6 +98,7 @@ for (int n = splits ? 2 : 0; n < 3; ++n, i = i == 2 ? 0 : i + 1) {
         }
     }
 }
+}
 """)
 )
 def add_to_nodes(
@@ -111,8 +114,8 @@ def add_to_nodes(
 ):
     """Add to the 27 nodes of a stencil a scalar and a vector, ``s`` at the lowest node, the latter changing by ``A``.
 
-    ``at`` is the position from there. In groups of a ``share`` of a third of the threads or less, three of these take a
-    plane of a particle each; so all of them come here.
+    ``at`` is the position from there. In groups of a ``share`` of up to half of the threads, these take a plane of a
+    particle each; so all of them come here.
     """
     ...
 
@@ -142,17 +145,18 @@ auto count_in = [&](int field) {{  // the group's units are not smaller than tho
 }};
 count_in(0);
 bool too_much = false;
-const int seen = lane * warps + warp;
-unsigned used = __ballot_sync(ALL, seen < CAPACITY && room[KEYS + min(seen, CAPACITY - 1)] != 0);
-for (; used; used &= used - 1) {{
-    const int place = (__ffs(used) - 1) * warps + warp;
-    int* const at = room + NODES + c * 8 * CAPACITY + 8 * place + corner;
-    const int sum = *at;
-    *at = 0;
+const int bricks = room[COUNT];
+int* at = room + NODES + c * ALONG + 8 * warp + corner;
+int next = warp < bricks ? *at : 0;  // one ahead: a warp does not wait for every brick
+for (int place = warp; place < bricks; place += warps) {{
+    const int sum = next;
+    if (sum != 0) *at = 0;
+    at += 8 * warps;
+    if (place + warps < bricks) next = *at;
     unsigned massive = __ballot_sync(ALL, sum != 0);  // who adds no mass adds nothing
     if (kind != 0) massive = room[MASSIVE + place];
     if (kind == 0 && lane == 0) room[MASSIVE + place] = massive;
-    if (num_fields > 1) count_in((int)((unsigned)(room[KEYS + place] - 1) >> 3) / grid.num_blocks);
+    if (num_fields > 1) count_in((int)((unsigned)(room[BRICKS + place] - 1) >> 3) / grid.num_blocks);
     if (sum == 0 || !(massive >> (lane & 28) & 1u)) continue;
     const unsigned record = room[RECORDS + place] & ~SHARED;
     if (is_fixed) {{

@@ -14,11 +14,11 @@ from typing import Any
 import warp as wp
 
 from piavatar_envs.mpm.group_bricks import (
-    BRICKS_TOUCHED,
     CAPACITY,
-    CROWDED,
+    COUNT,
     DRIVEN,
     FASTEST,
+    FOUND,
     HEAVIEST,
     KEYS,
     KINEMATIC,
@@ -26,16 +26,18 @@ from piavatar_envs.mpm.group_bricks import (
     MOMENTUM,
     MOMENTUM_UNIT,
     MORE,
+    NODES,
+    NUMBERS,
     PLACE,
-    RECORDS,
     THREADS,
     UNITS,
     WORDS,
-    find_bricks,
+    bricks_found,
     is_shared,
-    note_record,
+    note_records,
     per_unit_of,
     raise_most,
+    seek_bricks,
 )
 from piavatar_envs.mpm.group_sums import add_to_nodes, put_down
 from piavatar_envs.mpm.program import Program
@@ -76,11 +78,9 @@ from piavatar_envs.mpm.types import (
 # warp with a few particles waits for its instructions as much as for its numbers
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: Up to how many particles of an environment a group has so many. Small worlds come in batches, which fill a GPU in any
-#: case; single larger ones do with small groups only. The numbers must not depend on the batch: units do on the group.
-SHARES = ((8192, int(THREADS)), (65536, 64), (2**31, int(THREADS)))
-#: Particles that one round surely has bricks for.
-SURE = wp.constant(int(CAPACITY) // int(BRICKS_TOUCHED))
+#: Up to how many particles of an environment a group has so many: smaller worlds fill a GPU with small groups only. The
+#: numbers must not depend on the batch: units do on the group.
+SHARES = ((65536, 64), (2**31, int(THREADS)))
 
 
 @wp.func
@@ -96,18 +96,18 @@ def begin_group(sums: Sums, num_fields: int, e: int, driven: bool):
         set_number(FASTEST + f, UNITS * momentum)
         set_number(DRIVEN + f, UNITS * momentum)
     if f == 0:
-        set_word(CROWDED, 0)
         set_word(MORE, wp.where(driven, 1 << KINEMATIC, 0))
-    clear_words(KEYS, RECORDS - KEYS)
+    clear_words(NODES, FOUND - NODES)
 
 
 @wp.func
 def begin_round():
-    """Forget the bricks of the round before, whose nodes have been put down. All threads come here, and meet later."""
-    meet()  # all have seen what it was like
-    clear_words(KEYS, CAPACITY)
+    """Forget the bricks of the round before, whose nodes have been put down. All threads come here."""
+    meet()  # all have seen how many there were
+    clear_words(KEYS, NUMBERS - KEYS)
     if thread_of_block() == 0:
-        set_word(CROWDED, 0)
+        set_word(COUNT, 0)
+    meet()
 
 
 @wp.func
@@ -125,7 +125,45 @@ def telling(grid: Grid, particles: Particles, moving: Moving, e: int, p: int, ki
 
 
 @wp.func
-def scatter_kind(
+def bounded(s: Scattered, unit: float, failure: wp.array(dtype=int), e: int):
+    """The most momentum that a particle has anywhere in its stencil [kg m/s]; -1 if it must not be added up."""
+    bounds = momentum_bounds(s)
+    if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:  # of what is no number, either
+        fault = fault_of_sums(s, unit)
+        if fault != 0:
+            wp.atomic_or(failure, e, fault)
+            return -1.0
+    return wp.max(bounds)
+
+
+@wp.func
+def sum_up(
+    grid: Grid,
+    sums: Sums,
+    num_fields: int,
+    failure: wp.array(dtype=int),
+    e: int,
+    share: int,
+    adds: bool,
+    field: int,
+    kind: int,
+    bricks: wp.vec4i,
+    s: Scattered,
+):
+    """Add what a particle has of a ``kind`` up with the group's, and put the sums down. All threads come here."""
+    per_scalar = per_unit_of(HEAVIEST + field)
+    per_vector = 0.5 * per_scalar  # of places, up to 1.5 masses
+    if kind != PLACE:
+        per_vector = per_unit_of(wp.where(kind == MOMENTUM, FASTEST, DRIVEN) + field)
+    at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
+    add_to_nodes(share, adds, bricks, s.base, s.f, at_base, s.A, per_scalar, per_vector)
+    meet()
+    put_down(grid, sums, num_fields, failure, e, kind)
+    meet()
+
+
+@wp.func
+def scatter_round(
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -133,65 +171,57 @@ def scatter_kind(
     blocks: Blocks,
     failure: wp.array(dtype=int),
     sums: Sums,
-    contact: Contact,
+    num_fields: int,
     e: int,
     p: int,
     share: int,
-    adds: bool,
+    ours: bool,
     near: bool,
-    kind: int,
 ):
-    """Add what a particle has of a ``kind`` up with the group's, and put the sums down. All threads come here.
-
-    Returns whether it tells its place; if not all particles find room, nothing else is done.
-    """
-    tells = near
+    """Scatter the particles that are ``ours``, unless there is no room for all their bricks. All threads come here."""
+    driven = step.decoupling == PAPER  # that variant needs the gradient of kinematic momentum everywhere
+    active = bool(ours)
+    tells = bool(near)
     field = int(0)
-    momentum = float(0.0)
-    s = Scattered()
-    if adds:
-        field = particles.field[p]
+    found = int(0)
+    bricks = wp.vec4i()
+    kind = int(0)
+    while kind <= PLACE:
+        adds = active and (kind == MOMENTUM or tells or (driven and kind == KINEMATIC))
+        momentum = float(0.0)
+        s = Scattered()
+        if adds:
+            field = particles.field[p]
+            if kind == MOMENTUM:
+                s = prepare(grid, step, particles, moving, e, p, False)
+            else:
+                s = telling(grid, particles, moving, e, p, kind)
+            momentum = bounded(s, number(MOMENTUM_UNIT + field), failure, e)
+            adds = momentum >= 0.0
+        if kind != PLACE:
+            raise_most(adds, field, kind, s, momentum)
         if kind == MOMENTUM:
-            s = prepare(grid, step, particles, moving, e, p, False)
-        else:
-            s = telling(grid, particles, moving, e, p, kind)
-    meet()  # what has begun
-    if adds:
-        unit = number(MOMENTUM_UNIT + field)
-        bounds = momentum_bounds(s)
-        momentum = wp.max(bounds)
-        if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:  # of what is no number, either
-            fault = fault_of_sums(s, unit)
-            if fault != 0:
-                wp.atomic_or(failure, e, fault)
-                adds = False
-    if kind != PLACE:
-        raise_most(adds, field, kind, s, momentum)
-    bricks = find_bricks(grid, adds, field, s.base)
-    if adds and bricks[0] < 0:
-        set_word(CROWDED, 1)
-    meet()
-    if word(CROWDED) == 0:
-        if kind == MOMENTUM:
-            note_record(grid, blocks, contact.num_fields, e)
-            if contact.num_fields > 1:
+            active = adds  # who has no bricks has nothing to tell
+            found = seek_bricks(grid, adds, field, s.base)
+        meet()
+        if kind == MOMENTUM and word(COUNT) <= CAPACITY:
+            if adds:
+                bricks = bricks_found(found)
+            note_records(grid, blocks, num_fields, e)
+            if num_fields > 1:
                 meet()
-                tells = tells or (adds and is_shared(bricks))
+                if adds:
+                    tells = tells or is_shared(bricks)
             if adds and tells:
                 or_word(MORE, (1 << KINEMATIC) + (1 << PLACE))
-        per_scalar = per_unit_of(HEAVIEST + field)
-        per_vector = 0.5 * per_scalar  # of places, up to 1.5 masses
-        if kind != PLACE:
-            per_vector = per_unit_of(wp.where(kind == MOMENTUM, FASTEST, DRIVEN) + field)
-        at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
-        add_to_nodes(share, adds, bricks, s.base, s.f, at_base, s.A, per_scalar, per_vector)
-        meet()
-        put_down(grid, sums, contact.num_fields, failure, e, kind)
-        meet()
-    return tells
+        if word(COUNT) <= CAPACITY:
+            sum_up(grid, sums, num_fields, failure, e, share, adds, field, kind, bricks, s)
+        kind += 1
+        if word(COUNT) > CAPACITY or word(MORE) == 0:
+            kind = PLACE + 1
 
 
-@wp.kernel(launch_bounds=(int(THREADS), 3))
+@wp.kernel(launch_bounds=(int(THREADS), 6))
 def runs_to_grid(
     grid: Grid,
     step: Step,
@@ -216,32 +246,23 @@ def runs_to_grid(
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
     t = thread_of_block()
     p = (group - e * groups) * share + t
-    driven = step.decoupling == PAPER  # that variant needs the gradient of kinematic momentum everywhere
-    begin_group(sums, contact.num_fields, e, driven)
+    begin_group(sums, contact.num_fields, e, step.decoupling == PAPER)
     takes = bool(False)
-    tells = bool(False)
+    near = bool(False)
     if t < share and p < moving.x.shape[1]:
         takes = scatters(blocks, moving, e, p, failure)
     if takes:
-        tells = near_boundary(grid, boundaries, e, moving.x[e, p])
-    turn = int(-1)  # all at once; or, if some find no room, so many as surely do, whatever the order of the threads
-    turns = int(0)
-    while turn < turns:
-        if turn >= 0:
-            begin_round()
-        ours = takes and (turn < 0 or t // SURE == turn)
-        kind = int(0)
-        while kind <= PLACE:
-            adds = ours and (kind == MOMENTUM or tells or (driven and kind == KINEMATIC))
-            tells = scatter_kind(
-                grid, step, particles, moving, blocks, failure, sums, contact, e, p, share, adds, tells, kind
-            )
-            kind += 1
-            if word(MORE) == 0 or word(CROWDED) != 0:
-                kind = PLACE + 1
-        if word(CROWDED) != 0:
-            turns = (share + SURE - 1) // SURE
-        turn += 1
+        near = near_boundary(grid, boundaries, e, moving.x[e, p])
+    first = int(0)
+    size = int(share)  # of a round: all at once, or half as many where there was no room for their bricks
+    while first < share:
+        begin_round()
+        ours = takes and t >= first and t < first + size
+        scatter_round(grid, step, particles, moving, blocks, failure, sums, contact.num_fields, e, p, share, ours, near)
+        if word(COUNT) > CAPACITY:
+            size = (size + 1) // 2
+        else:
+            first += size
 
 
 def record_runs(program: Program, inputs: list[Any], shape: tuple[int, int], failure: wp.array, sums: Sums) -> None:
