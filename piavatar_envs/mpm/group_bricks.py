@@ -96,7 +96,7 @@ def raise_most(takes: bool, field: int, kind: int, s: Scattered, momentum: float
 @wp.func_native(
     in_group(
         """
-const int lane = threadIdx.x & 31, b = lane & 7;
+const int t = threadIdx.x, lane = t & 31, b = lane & 7;
 const int ny = grid.blocks[1], nz = grid.blocks[2], i = base[0], j = base[1], k = base[2];
 const unsigned block = field * grid.num_blocks + ((i >> 2) * ny + (j >> 2)) * nz + (k >> 2);
 const unsigned own = takes ? 8u * block + ((i & 2) << 1) + (j & 2) + ((k & 2) >> 1) + 1 : 0u;  // 0 is for nobody's
@@ -107,8 +107,8 @@ const unsigned firsts = __ballot_sync(ALL, takes && first == lane);
 const int among = __popc(firsts & ((1u << first) - 1u)), num = __popc(firsts);
 volatile unsigned* const keys = reinterpret_cast<unsigned*>(room + KEYS);
 unsigned short* const numbers = reinterpret_cast<unsigned short*>(room + NUMBERS);
-volatile int* const found = room + FOUND + 4 * ((int)threadIdx.x - lane);
-unsigned short* const found_at = reinterpret_cast<unsigned short*>(room + FOUND + 4 * ((int)threadIdx.x - lane));
+volatile int* const found = room + FOUND + 4 * (t - lane);
+unsigned short* const found_at = reinterpret_cast<unsigned short*>(room + FOUND + 4 * (t - lane));
 if (takes && first == lane) found[4 * among] = (int)own;
 __syncwarp();
 for (int begin = 0; begin < num; begin += 4) {

@@ -30,7 +30,8 @@ for (int c = 0; c < 3; ++c) {
 for (int n = 0; n < 4; ++n) brick[n] = bricks[n];
 // in small groups, a thread takes a plane of a particle instead, and half of the threads perhaps another
 const bool splits = share <= MOST_SPLIT;
-const int t = threadIdx.x;
+int t = threadIdx.x;
+asm volatile("" : "+r"(t));  // what follows from it is not kept from kind to kind, in registers that there are not
 if (splits) {
     int* handed = room + HANDED + t;
     if (t < share) {

@@ -41,7 +41,7 @@ from piavatar_envs.mpm.group_bricks import (
 )
 from piavatar_envs.mpm.group_sums import add_to_nodes, put_down
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import MOST_UNITS, fault_of_sums
+from piavatar_envs.mpm.runs import bounded
 from piavatar_envs.mpm.shared_memory import (
     clear_words,
     meet,
@@ -54,7 +54,6 @@ from piavatar_envs.mpm.shared_memory import (
 )
 from piavatar_envs.mpm.transfer import (
     Scattered,
-    momentum_bounds,
     near_boundary,
     placed,
     prepare,
@@ -125,18 +124,6 @@ def telling(grid: Grid, particles: Particles, moving: Moving, e: int, p: int, ki
 
 
 @wp.func
-def bounded(s: Scattered, unit: float, failure: wp.array(dtype=int), e: int):
-    """The most momentum that a particle has anywhere in its stencil [kg m/s]; -1 if it must not be added up."""
-    bounds = momentum_bounds(s)
-    if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:  # of what is no number, either
-        fault = fault_of_sums(s, unit)
-        if fault != 0:
-            wp.atomic_or(failure, e, fault)
-            return -1.0
-    return wp.max(bounds)
-
-
-@wp.func
 def sum_up(
     grid: Grid,
     sums: Sums,
@@ -163,6 +150,62 @@ def sum_up(
 
 
 @wp.func
+def scatter_kind(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    moving: Moving,
+    blocks: Blocks,
+    failure: wp.array(dtype=int),
+    sums: Sums,
+    num_fields: int,
+    e: int,
+    p: int,
+    share: int,
+    adds: bool,
+    near: bool,
+    kind: int,
+    known: wp.vec4i,
+):
+    """Scatter what a particle has of a ``kind``, unless there is no room for the group's bricks. All threads come here.
+
+    Returns whether it takes part and tells its place, and its bricks, which are ``known`` but for the first kind.
+    """
+    active = adds
+    tells = near
+    field = int(0)
+    momentum = float(0.0)
+    bricks = known
+    s = Scattered()
+    if adds:
+        field = particles.field[p]
+        if kind == MOMENTUM:
+            s = prepare(grid, step, particles, moving, e, p, False)
+        else:
+            s = telling(grid, particles, moving, e, p, kind)
+        momentum = bounded(s, number(MOMENTUM_UNIT + field), failure, e)
+        active = momentum >= 0.0
+    if kind != PLACE:
+        raise_most(active, field, kind, s, momentum)
+    found = int(0)
+    if kind == MOMENTUM:
+        found = seek_bricks(grid, active, field, s.base)
+    meet()
+    if word(COUNT) <= CAPACITY:
+        if kind == MOMENTUM:
+            if active:
+                bricks = bricks_found(found)
+            note_records(grid, blocks, num_fields, e)
+            if num_fields > 1:
+                meet()
+                tells = tells or (active and is_shared(bricks))
+            if active and tells:
+                or_word(MORE, (1 << KINEMATIC) + (1 << PLACE))
+        sum_up(grid, sums, num_fields, failure, e, share, active, field, kind, bricks, s)
+    return active, tells, bricks
+
+
+@wp.func
 def scatter_round(
     grid: Grid,
     step: Step,
@@ -180,42 +223,19 @@ def scatter_round(
 ):
     """Scatter the particles that are ``ours``, unless there is no room for all their bricks. All threads come here."""
     driven = step.decoupling == PAPER  # that variant needs the gradient of kinematic momentum everywhere
-    active = bool(ours)
+    has_bricks = bool(ours)
     tells = bool(near)
-    field = int(0)
-    found = int(0)
     bricks = wp.vec4i()
     kind = int(0)
     while kind <= PLACE:
-        adds = active and (kind == MOMENTUM or tells or (driven and kind == KINEMATIC))
-        momentum = float(0.0)
-        s = Scattered()
-        if adds:
-            field = particles.field[p]
-            if kind == MOMENTUM:
-                s = prepare(grid, step, particles, moving, e, p, False)
-            else:
-                s = telling(grid, particles, moving, e, p, kind)
-            momentum = bounded(s, number(MOMENTUM_UNIT + field), failure, e)
-            adds = momentum >= 0.0
-        if kind != PLACE:
-            raise_most(adds, field, kind, s, momentum)
+        adds = has_bricks and (kind == MOMENTUM or tells or (driven and kind == KINEMATIC))
+        active, tells_now, found = scatter_kind(
+            grid, step, particles, moving, blocks, failure, sums, num_fields, e, p, share, adds, tells, kind, bricks
+        )
         if kind == MOMENTUM:
-            active = adds  # who has no bricks has nothing to tell
-            found = seek_bricks(grid, adds, field, s.base)
-        meet()
-        if kind == MOMENTUM and word(COUNT) <= CAPACITY:
-            if adds:
-                bricks = bricks_found(found)
-            note_records(grid, blocks, num_fields, e)
-            if num_fields > 1:
-                meet()
-                if adds:
-                    tells = tells or is_shared(bricks)
-            if adds and tells:
-                or_word(MORE, (1 << KINEMATIC) + (1 << PLACE))
-        if word(COUNT) <= CAPACITY:
-            sum_up(grid, sums, num_fields, failure, e, share, adds, field, kind, bricks, s)
+            has_bricks = active
+            tells = tells_now
+            bricks = found
         kind += 1
         if word(COUNT) > CAPACITY or word(MORE) == 0:
             kind = PLACE + 1

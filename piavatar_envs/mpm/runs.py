@@ -9,7 +9,7 @@ from piavatar_envs.mpm.sensing import sense_gathered
 from piavatar_envs.mpm.stencil import grid_position
 from piavatar_envs.mpm.stores import store_particle
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.transfer import Scattered
+from piavatar_envs.mpm.transfer import Scattered, momentum_bounds
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -48,6 +48,18 @@ def fault_of_sums(s: Scattered, unit: float):
         for j in range(3):
             most = wp.max(most, wp.abs(s.A[i, j]))
     return wp.where(most > MOST_UNITS * unit, _CFL, 0)
+
+
+@wp.func
+def bounded(s: Scattered, unit: float, failure: wp.array(dtype=int), e: int):
+    """The most momentum that a particle has anywhere in its stencil [kg m/s]; -1 if it must not be added up."""
+    bounds = momentum_bounds(s)
+    if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:  # of what is no number, either
+        fault = fault_of_sums(s, unit)
+        if fault != 0:
+            wp.atomic_or(failure, e, fault)
+            return -1.0
+    return wp.max(bounds)
 
 
 @wp.kernel(launch_bounds=(128, 5))
