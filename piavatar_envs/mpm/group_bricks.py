@@ -6,8 +6,9 @@ group lies. Particles of a warp that lie in the same brick look its neighbors up
 who comes first, sums do not: integers are added, and whether there is room depends on how many bricks there are.
 
 Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; the table of keys, and of numbers in half
-words; of every brick its key, its record, and which nodes have got mass; four sums of every node, one after the other;
-where in the table the bricks are that a warp looked up, in half words; what is handed to other threads.
+words; of every brick its key, later its field, its record, and which nodes have got mass; four sums of every node, one
+after the other; where in the table the bricks are that a warp looked up, in half words; what is handed to other
+threads.
 """
 
 from __future__ import annotations
@@ -178,13 +179,14 @@ for (int n = threadIdx.x; n < room[COUNT]; n += blockDim.x) {
     if (num_fields > 1) {
         const int field = held / grid.num_blocks;
         if (wp::index(blocks.fields, e, held - field * grid.num_blocks) != 1 << field) record |= SHARED;
+        room[BRICKS + n] = field;
     }
     room[RECORDS + n] = record;
 }
 """)
 )
 def note_records(grid: Grid, blocks: Blocks, num_fields: int, e: int):
-    """Find the record of every brick's first node, and whether its block is shared with another field."""
+    """Find the record of every brick's first node, and whether its block is shared; its field takes its key's place."""
     ...
 
 

@@ -144,22 +144,23 @@ auto count_in = [&](int field) {{  // the group's units are not smaller than tho
     right = max(20 - shift, 0), left = max(shift - 20, 0), half = (1 << right) >> 1;
     most_high = shift > 31 ? 0 : 1 << (28 - left);
 }};
-count_in(0);
+int counted_in = num_fields > 1 ? room[BRICKS] : 0;
+count_in(counted_in);
 bool too_much = false;
 const int bricks = room[COUNT];
 int* at = room + NODES + c * ALONG + 8 * warp + corner;
-int next = warp < bricks ? *at : 0;  // one ahead: a warp does not wait for every brick
+int next = warp < bricks ? *at : 0, next_record = warp < bricks ? room[RECORDS + warp] : 0;  // one ahead: less to wait
 for (int place = warp; place < bricks; place += warps) {{
     const int sum = next;
     if (sum != 0) *at = 0;
     at += 8 * warps;
-    if (place + warps < bricks) next = *at;
+    const unsigned record = next_record & ~SHARED;
+    if (place + warps < bricks) next = *at, next_record = room[RECORDS + place + warps];
     unsigned massive = __ballot_sync(ALL, sum != 0);  // who adds no mass adds nothing
     if (kind != 0) massive = room[MASSIVE + place];
     if (kind == 0 && lane == 0) room[MASSIVE + place] = massive;
-    if (num_fields > 1) count_in((int)((unsigned)(room[BRICKS + place] - 1) >> 3) / grid.num_blocks);
+    if (num_fields > 1 && room[BRICKS + place] != counted_in) count_in(counted_in = room[BRICKS + place]);
     if (sum == 0 || !(massive >> (lane & 28) & 1u)) continue;
-    const unsigned record = room[RECORDS + place] & ~SHARED;
     if (is_fixed) {{
         int high = (sum + half) >> right;
         if (abs(high) > most_high) {{
