@@ -110,8 +110,10 @@ def begin_round():
 
 
 @wp.func
-def telling(grid: Grid, particles: Particles, moving: Moving, e: int, p: int, kind: int):
-    """What a particle tells: how it is driven, or its place, ``w m (x_i - x_p) / dx``, and ``w m`` of a seam."""
+def scattered(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, kind: int):
+    """Mass and momentum of a particle, how it is driven, or its place ``w m (x_i - x_p) / dx`` and a seam's ``w m``."""
+    if kind == MOMENTUM:
+        return prepare(grid, step, particles, moving, e, p, False)
     s = placed(grid, moving.x[e, p])
     m = particles.mass[row(e, particles.mass.shape[0]), p]
     if kind == KINEMATIC:
@@ -179,10 +181,7 @@ def scatter_kind(
     s = Scattered()
     if adds:
         field = particles.field[p]
-        if kind == MOMENTUM:
-            s = prepare(grid, step, particles, moving, e, p, False)
-        else:
-            s = telling(grid, particles, moving, e, p, kind)
+        s = scattered(grid, step, particles, moving, e, p, kind)
         momentum = bounded(s, number(MOMENTUM_UNIT + field), failure, e)
         active = momentum >= 0.0
     if kind != PLACE:
