@@ -106,8 +106,9 @@ def test_seeding_again_starts_over(make_env, env_id, equal):
 
 
 def test_never_seeded_environments_differ(device, env_id):
-    starts = [gymnasium.make(env_id, fidelity="tiny", device=device).reset()[0] for _ in range(2)]
-    assert np.abs(starts[0] - starts[1]).max() > 1e-4
+    # four of them, for two may well begin with the same frame of a clip
+    starts = [gymnasium.make(env_id, fidelity="tiny", device=device).reset()[0] for _ in range(4)]
+    assert max(np.abs(starts[0] - start).max() for start in starts) > 1e-4
 
 
 def test_observations_are_finite_and_none_is_constant(make_env, env_id):

@@ -51,7 +51,7 @@ HANDED = wp.constant(int(FOUND) + 4 * int(THREADS))
 #: Words of a room.
 WORDS = wp.constant(int(HANDED) + 21 * int(MOST_SPLIT))
 #: Units of the most that a particle has.
-UNITS = wp.constant(float(2**23))
+UNITS = wp.constant(float(2**25))
 #: What a brick's record has besides it, if there is matter of another field in its block.
 SHARED = wp.constant(1 << 30)
 #: What is added up: mass and momentum; kinematic momentum; places and seams.
@@ -207,7 +207,7 @@ def is_shared(bricks: wp.vec4i) -> bool:
 
 @wp.func_native(
     in_group(
-        POWER + "return __int_as_float(0x7f000000 - __float_as_int(power_of_two(room[at]))) * 0x1p23f;",
+        POWER + "return __int_as_float(0x7f000000 - __float_as_int(power_of_two(room[at]))) * 0x1p25f;",
         "return 0.0f;",
     )
 )

@@ -135,18 +135,3 @@ def test_one_launch_drives_a_body_as_many_do(make_rig, wild_pose, monkeypatch, r
     assert "drive_body" in one.step_program._names and "drive_particles" in many.step_program._names
     for name, value in one.everything().items():
         np.testing.assert_array_equal(value, many.everything()[name], err_msg=name)
-
-
-def test_the_size_of_a_block_does_not_change_the_drive(make_rig, wild_pose, monkeypatch):
-    """Sums run over fixed lists by warps, however many of them a block has."""
-    results = []
-    for threads in (96, 64, 32):
-        monkeypatch.setattr(drive, "BONE_THREADS", threads)
-        rng = np.random.default_rng(2)
-        rig = make_rig().reset(wild_pose(rng))
-        rig.state.u.assign(rng.normal(size=(1, rig.points.num_points, 3)).astype(np.float32))
-        rig.run_drive()
-        results.append((rig.state.u.numpy(), rig.state.vk.numpy(), rig.drive.scratch.bone_change.numpy()))
-    for other in results[1:]:
-        for mine, theirs in zip(results[0], other, strict=True):
-            np.testing.assert_array_equal(mine, theirs)
