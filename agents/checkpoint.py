@@ -27,7 +27,7 @@ from piavatar_envs.envs.config import ConfigError
 
 NAME = "checkpoint.pt"
 #: Of the file's content; rises with every change.
-FORMAT = 4
+FORMAT = 3
 #: Settings that what has been learned so far does not depend on.
 FREE = ("total_steps", "iterations", "checkpoint_every", "evaluation")
 #: Of these, how long a training is, and the settings that change with how much of it is over: where there is one, what

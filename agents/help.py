@@ -43,65 +43,39 @@ class HelpedEnv(AvatarRslEnv):
     the start, and what is learned with help is tried without; a single one has all of it. By the clock it keeps that
     share of a greatest help that falls. By what is achieved, every environment comes to where half of its episodes end
     in success, and to none where more do; the idea of the pulling force of Huang et al., "Learning Humanoid Standing-up
-    Control across Diverse Postures" (2025), which never rises again. Where a task has several kinds of episodes, there
-    is help for each: what is easy soon goes without, what is hard keeps it. Evaluations have none.
-
-    The observation group ``help`` holds how much there is, for a critic: what a state is worth depends on it, and an
-    actor must do without.
+    Control across Diverse Postures" (2025), which never rises again. Evaluations have none.
 
     Attributes:
         steps: control steps of every environment so far; to be set where a training goes on.
-        help: of every environment and kind of episodes, ``(num_envs, num_kinds)`` float32 on the device; likewise.
-            None until there are environments.
+        help: of every environment, ``(num_envs,)`` float32 on the device; likewise.
     """
-
-    help: torch.Tensor | None = None
 
     def __init__(self, settings: HelpSettings, rollout_steps: int, *args: Any, **kwargs: Any) -> None:
         """Build the environments; all but the first two arguments are those of the base."""
         super().__init__(*args, **kwargs)
         self.settings, self.rollout_steps, self.steps = settings, rollout_steps, 0
         n = self.num_envs
-        spread = torch.linspace(0.0, 1.0, n, device=self.device) if n > 1 else torch.ones(1, device=self.device)
-        self._spread = spread[:, None].repeat(1, self.episodes.task.num_kinds)
+        self._spread = torch.linspace(0.0, 1.0, n, device=self.device) if n > 1 else torch.ones(1, device=self.device)
         self.help = settings.first * self._spread
 
     def share(self) -> float:
         """The greatest help in the current rollout, by the clock."""
         return self.settings.first * max(0.0, 1.0 - self.steps // self.rollout_steps / self.settings.rollouts)
 
-    def kinds(self) -> torch.Tensor:
-        """Of every environment's episode, ``(num_envs, 1)`` int64."""
-        if self.episodes.task.num_kinds == 1:
-            return torch.zeros(self.num_envs, 1, dtype=torch.int64, device=self.device)
-        return self.episodes.read(lambda group: group.task.kinds()).long()[:, None]
-
-    def get_observations(self) -> TensorDict:
-        """What the avatars see, and the help, by group."""
-        return self._told(super().get_observations())
-
-    def _told(self, observations: TensorDict) -> TensorDict:
-        if self.help is not None:
-            observations["help"] = self.help.gather(1, self.kinds())
-        return observations
-
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance by one control step; help changes after the last of a rollout, or of an episode.
+        """Advance by one control step; help changes before the first of a rollout, or of an episode.
 
-        ``extras["log"]`` also holds the mean help of every kind of episodes.
+        ``extras["log"]`` also holds the mean help.
         """
-        kinds = self.kinds()
-        now = self.help.gather(1, kinds)
-        self.episodes.api.write(now[:, 0], [group.simulation.avatar.joints.assist for group in self.episodes.groups])
+        if self.settings.rollouts is not None and self.steps % self.rollout_steps == 0:
+            self.help = self.share() * self._spread
+        self.episodes.api.write(self.help, [group.simulation.avatar.joints.assist for group in self.episodes.groups])
         self.steps += 1
-        observations, rewards, ended, extras = super().step(actions)
-        for kind, mean in enumerate(self.help.mean(0)):
-            extras["log"][f"Task/help_{kind}" if self.help.shape[1] > 1 else "Task/help"] = mean
-        if self.settings.step is None:
-            if self.steps % self.rollout_steps == 0:
-                self.help = self.share() * self._spread
-        else:
+        stepped = super().step(actions)
+        _, _, ended, extras = stepped
+        extras["log"]["Task/help"] = self.help.mean()
+        if self.settings.step is not None:
             change = torch.where(extras["info"]["success"], -self.settings.step, self.settings.step)
-            changed = (now + change[:, None]).clamp(0.0, self.settings.first)
-            self.help = self.help.scatter(1, kinds, torch.where(ended.bool()[:, None], changed, now))
-        return self._told(observations), rewards, ended, extras
+            changed = (self.help + change).clamp(0.0, self.settings.first)
+            self.help = torch.where(ended.bool(), changed, self.help)
+        return stepped

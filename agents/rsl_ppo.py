@@ -184,7 +184,7 @@ def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
     return {
         "num_steps_per_env": ppo.rollout_steps,
         "save_interval": config.checkpoint_every,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy", *(["help"] if isinstance(env, HelpedEnv) else [])]},
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
         "actor": actor_settings(ppo),
         "critic": network_settings(ppo),
         "algorithm": {
@@ -231,8 +231,7 @@ def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
         env: AvatarRslEnv, obs: TensorDict | None = None, actions: torch.Tensor | None = None
     ) -> tuple[TensorDict | None, torch.Tensor | None]:
         if obs is not None:
-            mirrored = obs.named_apply(lambda name, part: mirror.observations(part) if name == "policy" else part)
-            obs = torch.cat([obs, mirrored])
+            obs = torch.cat([obs, obs.apply(mirror.observations)])
         return obs, None if actions is None else torch.cat([actions, mirror.actions(actions)])
 
     return {"data_augmentation_func": append, "use_data_augmentation": True}

@@ -41,7 +41,6 @@ class Task:
         camera_position, camera_target: the eye and what it looks at [m], from the ground below the agents' middle, or
             from the origin if the camera does not follow them (``camera_follows``).
         cost_terms: names of what is summed in ``info["cost"]``, for constrained learning; not part of the reward.
-        num_kinds: number of kinds of episodes, which are not equally hard; how a curriculum goes on may differ.
 
     Class attributes for the task's page in ``docs/envs`` (Markdown; ``python -m scripts.env_pages`` writes it):
         summary: a paragraph: what happens, and what a good agent does.
@@ -64,7 +63,6 @@ class Task:
     reward_terms: ClassVar[tuple[str, ...]] = ()
     metrics: ClassVar[tuple[str, ...]] = ()
     cost_terms: ClassVar[tuple[str, ...]] = ()
-    num_kinds: ClassVar[int] = 1
 
     observes_contact: ClassVar[bool] = False
     observes_others: ClassVar[bool] = False
@@ -140,10 +138,6 @@ class Task:
 
     def allocate(self, env: BatchEnv) -> None:
         """Create the task's arrays."""
-
-    def kinds(self) -> wp.array | None:
-        """Which of ``num_kinds`` every environment's episode is, ``(E,)`` int32; None where all are alike."""
-        return None
 
     def arrays(self) -> dict[str, wp.array]:
         """Arrays of the task that a checkpoint must hold."""

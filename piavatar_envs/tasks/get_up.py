@@ -12,13 +12,12 @@ from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.config import DriveConfig, EnvConfig
-from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.ground import Grounding
-from piavatar_envs.tasks.lying import NUM_KINDS, first_poses, lying_rule, spawn_lying
+from piavatar_envs.tasks.lying import first_poses, lying_rule, spawn_lying
 from piavatar_envs.tasks.rising import RISING_DOCS, RISING_TERMS, record_rising_outcome
 from piavatar_envs.tasks.upright import (
     METRIC_DOCS,
@@ -36,8 +35,6 @@ wp.set_module_options({"enable_backward": False})
 
 #: How far the assisted pelvis is led: upwards [m] and towards upright [rad].
 LEAD, LEAD_TURN = wp.constant(0.15), wp.constant(0.3)
-#: How far it may go aside while it tries, beside the room for a fall [m]: each fall takes it about a body's height.
-ROAM = 3.0
 
 
 class GetUpConfig(EnvConfig):
@@ -131,18 +128,17 @@ class GetUpTask(Task):
     observation_terms = UPRIGHT_TERMS
     reward_terms = RISING_TERMS
     metrics = (*METRICS, "held_seconds")
-    num_kinds = NUM_KINDS
 
     camera_position = (2.2, -3.2, 1.6)
     camera_target = (0.0, 0.0, 0.5)
 
     summary = """The avatar lies on the ground, face down or face up (`face_up`), turned about the vertical at random,
 its arms beside it, its joints up to `pose_noise` off that pose; or (`halfway`, a curriculum) it is on the way up from
-there: on its side, on all fours or on a knee, sitting or squatting, half up, or standing already. It shall stand up by
-the strength of its joints, to the rest pose, and stay there for `hold_seconds`. Nothing but the clock ends an episode;
-a fall costs time. Where it stands in the end does not matter. `root_assist` helps here in its own way: it leads the
-pelvis, from wherever it is, upwards and towards upright. With `control="pose"` the root wrench keeps the pelvis where
-it lies, and there is nothing to be learnt."""
+there: on all fours or on a knee, sitting or squatting, or half up. It shall stand up by the strength
+of its joints, to the rest pose, and stay there for `hold_seconds`. Nothing but the clock ends an episode; a fall costs
+time. Where it stands in the end does not matter. `root_assist` helps here in its own way: it leads the pelvis, from
+wherever it is, upwards and towards upright. With `control="pose"` the root wrench keeps the pelvis where it lies, and
+there is nothing to be learnt."""
     reward_docs: ClassVar[Mapping[str, str]] = RISING_DOCS
     metric_docs: ClassVar[Mapping[str, str]] = {
         **METRIC_DOCS,
@@ -164,10 +160,6 @@ it lies, and there is nothing to be learnt."""
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         return (Drawn(self.lies_up),)
 
-    def domain(self) -> Domain:
-        x, y = self.scene.avatars[0].position[:2]
-        return Domain().around([(x - ROAM, y - ROAM), (x + ROAM, y + ROAM)])
-
     def allocate(self, env) -> None:
         n, device, config = env.num_envs, env.device, self.config
         self.rule, self.still = upright_rule(config.upright, config.control_cost), still_rule(config.still)
@@ -175,16 +167,12 @@ it lies, and there is nothing to be learnt."""
         self.steps = max(1, round(config.hold_seconds / config.physics.control_dt))
         self.held = wp.zeros(n, dtype=int, device=device)
         self.lies_up = wp.zeros(n, dtype=float, device=device)
-        self.kind = wp.zeros(n, dtype=int, device=device)
         self.reference_rotation = wp.zeros((n, NUM_JOINTS), dtype=wp.quat, device=device)
         self.reference_root = wp.zeros(n, dtype=wp.vec3, device=device)
         self.poses = first_poses(device)
 
     def arrays(self) -> dict[str, wp.array]:
-        return {"held": self.held, "kind": self.kind}
-
-    def kinds(self) -> wp.array:
-        return self.kind
+        return {"held": self.held}
 
     def record_reset(self, env, program) -> None:
         state, avatar = env.simulation.avatar.state, self.scene.avatars[0]
@@ -197,7 +185,7 @@ it lies, and there is nothing to be learnt."""
                 env.mask, env.seed, env.episode, rule, limits.lower, limits.upper, self.poses,
                 wp.vec3(*avatar.position, 0.0),
             ],
-            [state.command_rotation, state.command_root, self.lies_up, self.kind],
+            [state.command_rotation, state.command_root, self.lies_up],
         )  # fmt: skip
         self.grounding.record_reset(env, program)
         program.launch(forget_hold, env.num_envs, [env.mask], [self.held])

@@ -1,4 +1,4 @@
-"""First poses: lying on the ground face down or face up, on the way up from there, or standing already."""
+"""First poses on the ground: lying face down or face up, or already on the way up from there."""
 
 from __future__ import annotations
 
@@ -14,18 +14,12 @@ from piavatar_envs.envs.draws import STREAM_POSE, STREAM_TASK, generator
 wp.set_module_options({"enable_backward": False})
 
 _HALF = wp.constant(np.pi)
-#: Turns from the rest pose [rad], of the left and the right joint of a name alike, of the pelvis from upright: about x,
-#: or as a rotation vector.
-_Pose = Mapping[str, float | tuple[float, float, float]]
+#: Turns about x from the rest pose [rad], of the left and the right joint of a name alike, of the pelvis from upright.
+_Pose = Mapping[str, float]
 #: The arms beside the chest; face down the toes are pointed and the head is raised off the nose, face up the heels come
 #: down to the ground.
 _FACE_DOWN: _Pose = {"pelvis": 0.5 * np.pi, "shoulder": 0.4, "ankle": 0.8, "neck": -0.2, "head": -0.2}
 _FACE_UP: _Pose = {"pelvis": -0.5 * np.pi, "shoulder": 0.4, "hip": 0.09}
-#: Between face up and all fours: who rolls over need not sit up. The arms are stretched forwards.
-_ON_THE_SIDE: _Pose = {
-    "pelvis": (-1.2092, 1.2092, 1.2092), "hip": -0.9, "knee": 1.1,
-    "left_shoulder": (0.0, 0.0, -1.2), "right_shoulder": (0.0, 0.0, 1.2),
-}  # fmt: skip
 _ON_ALL_FOURS: _Pose = {"pelvis": 1.4, "hip": -1.48, "knee": 1.66, "ankle": 0.79, "shoulder": -1.4}
 _ON_A_KNEE: _Pose = {
     "left_hip": -1.57, "left_knee": 1.57, "right_knee": 1.57, "right_ankle": -0.35,
@@ -35,15 +29,8 @@ _SQUATTING: _Pose = {
     "pelvis": 0.35, "hip": -2.0, "knee": 2.18, "ankle": -0.35, "spine1": 0.17, "spine2": 0.17, "shoulder": -1.0,
 }  # fmt: skip
 _HALF_UP: _Pose = {"pelvis": 0.35, "hip": -1.31, "knee": 1.4, "ankle": -0.35, "spine1": 0.09, "shoulder": -0.7}
-_STANDING: _Pose = {}
-#: Face down and face up: lying, and poses through which people get up from there, each worth more than the one before
-#: (:mod:`piavatar_envs.tasks.rising`).
-_WAYS = (
-    (_FACE_DOWN, _ON_THE_SIDE, _ON_ALL_FOURS, _ON_A_KNEE, _HALF_UP, _STANDING),
-    (_FACE_UP, _ON_THE_SIDE, _SITTING, _SQUATTING, _HALF_UP, _STANDING),
-)
-#: Kinds of episodes: from lying face down, from lying face up, and from on the way up.
-NUM_KINDS, _HALFWAY = 3, wp.constant(2)
+#: Face down and face up: lying, and the poses through which people get up from there.
+_WAYS = ((_FACE_DOWN, _ON_ALL_FOURS, _ON_A_KNEE, _HALF_UP), (_FACE_UP, _SITTING, _SQUATTING, _HALF_UP))
 
 
 @wp.struct
@@ -68,8 +55,7 @@ def first_poses(device: str) -> wp.array:
     for side, way in enumerate(_WAYS):
         for index, pose in enumerate(way):
             for joint, name in enumerate(JOINT_NAMES):
-                turn = pose.get(name, pose.get(name.partition("_")[2], 0.0))
-                turns[side, index, joint] = turn if isinstance(turn, tuple) else (turn, 0.0, 0.0)
+                turns[side, index, joint, 0] = pose.get(name, pose.get(name.partition("_")[2], 0.0))
     return wp.array(turns, dtype=wp.vec3, device=device)
 
 
@@ -87,11 +73,10 @@ def spawn_lying(
     command_rotation: wp.array2d(dtype=wp.quat),
     command_root: wp.array(dtype=wp.vec3),
     lies_up: wp.array(dtype=float),
-    kind: wp.array(dtype=int),
 ):
     """With the pelvis over ``place`` (x, y [m]), turned at random about the vertical; over ``(E, bones)``.
 
-    ``poses`` are those of :func:`first_poses`; who begins on its side may lie on either.
+    ``poses`` are those of :func:`first_poses`.
     """
     e, b = wp.tid()
     if not mask[e]:
@@ -104,9 +89,6 @@ def spawn_lying(
         pose = wp.randi(random, 1, poses.shape[1])
     v = poses[side, pose, b]
     if b == 0:
-        kind[e] = wp.where(pose == 0, side, _HALFWAY)
-        if pose > 0 and wp.randf(random) < 0.5:
-            v = wp.vec3(v[0], -v[1], -v[2])
         command_rotation[e, b] = quat_exp(wp.vec3(0.0, 0.0, turn)) * quat_exp(v)
         command_root[e] = wp.vec3(place[0], place[1], 0.0)
         lies_up[e] = float(side)

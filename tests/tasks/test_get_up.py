@@ -14,7 +14,6 @@ HEAD, CHEST, ANKLES = (
     joint_index("spine3"),
     [joint_index("left_ankle"), joint_index("right_ankle")],
 )
-SHOULDERS = [joint_index("left_shoulder"), joint_index("right_shoulder")]
 
 
 def still(env) -> np.ndarray:
@@ -61,29 +60,16 @@ def test_bodies_lie_on_the_ground_on_either_side(make_env):
 
 def test_some_begin_on_the_way_up(make_env):
     """On the ground, higher than who lies there, and told apart by the side from which they come."""
-    env, seen, below = make_env(GET_UP, halfway=1.0, pose_noise=0.0, observe_parameters=True), {}, set()
+    env, seen = make_env(GET_UP, halfway=1.0, pose_noise=0.0, observe_parameters=True), {}
     rest = env.batch.simulation.flesh[0].points
-    for seed in range(48):
+    for seed in range(24):
         observation, _ = env.reset(seed=seed)
         assert env.batch.simulation.state.x.numpy()[0, :, 2].min() == pytest.approx(rest.rest[0, :, 2].min(), abs=1e-5)
         at = env.batch.simulation.avatar.tracked.position.numpy()[0]
         side = env.observation_layout.split(observation)["parameters"][-2]
-        lies = abs(faces(env)[2]) < 0.01 and at[HEAD, 2] < 0.3 * rest.joints[0, HEAD, 2]
-        assert side in (-1.0, 1.0) and (lies or at[HEAD, 2] / rest.joints[0, HEAD, 2] > 0.3)
-        assert env.batch.task.kinds().numpy().tolist() == [2]
+        assert side in (-1.0, 1.0) and at[HEAD, 2] / rest.joints[0, HEAD, 2] > 0.3
         seen.setdefault(side, set()).add(round(float(at[0, 2]), 2))
-        if lies:
-            below.add("left" if at[SHOULDERS[0], 2] < at[SHOULDERS[1], 2] else "right")
-    assert len(seen[-1.0]) == len(seen[1.0]) == 5 and len(seen[-1.0] & seen[1.0]) == 3
-    assert below == {"left", "right"}
-
-
-def test_there_is_room_for_several_falls(make_env):
-    """An agent that tries again and again goes a body's height aside with each fall; that is no failure."""
-    domain = make_env(GET_UP).batch.task.domain()
-    height = 1.75
-    assert min(np.subtract(domain.upper, domain.lower)[:2]) > 2 * 2.5 * height
-    assert np.add(domain.upper, domain.lower)[:2] == pytest.approx(0.0)
+    assert len(seen[-1.0]) == len(seen[1.0]) == 3 and len(seen[-1.0] & seen[1.0]) == 1
 
 
 def test_the_reward_is_what_the_joints_say(make_env):
@@ -117,11 +103,11 @@ def test_every_pose_on_the_way_is_worth_more_than_the_one_before(make_env, side)
     """And the splits, from where no way leads up, less than a squat, or a knee on the ground."""
     env = make_env(GET_UP, control="torque", pose_noise=0.0)
     way = list(env.batch.task.poses.numpy()[side].copy())
-    worth = [worth_of(env, pose) for pose in way]
+    worth = [worth_of(env, pose) for pose in [*way, np.zeros_like(way[0])]]
     assert np.diff(worth).min() > 0.02 and worth[0] < 0.1 and worth[-1] > 0.95
     splits = np.zeros_like(way[0])
     splits[[joint_index("left_hip"), joint_index("right_hip")]] = [[-1.0, 0.8, 0.0], [-1.0, -0.8, 0.0]]
-    assert worth[0] < worth_of(env, splits) < worth[3] - 0.05
+    assert worth[0] < worth_of(env, splits) < worth[2] - 0.05
 
 
 @pytest.mark.parametrize(("share", "up"), [(0.0, False), (1.0, True)])
