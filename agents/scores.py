@@ -3,7 +3,8 @@
 Every run is a folder with the ``results.json`` of ``agents.train``, ``agents.rsl_ppo`` or ``agents.score_pid``. Runs of
 one configuration that differ in their seed become one row (:mod:`agents.compare`), runs of one environment one table;
 what no training changes (zero and random actions) stands in it once, unless an environment's settings change what an
-action means. Beside the JSON file comes the same as Markdown.
+action means. Beside the JSON file comes the same as Markdown. Environments
+that none of the runs is about can keep the rows that an earlier table has of them (``--keep FILE.json``).
 """
 
 from __future__ import annotations
@@ -149,6 +150,18 @@ def _read(path: Path) -> dict[str, Any]:
     return run
 
 
+def _kept(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What an earlier table says of environments that ``rows`` are not about, with its devices and commits."""
+    if path is None:
+        return {"results": [], "devices": [], "commits": []}
+    table = json.loads(path.read_text(encoding="utf-8"))
+    missing = [name for name in ("results", "devices", "commits") if name not in table]
+    if missing:
+        raise ValueError(f"{path} has no {missing[0]!r}; give a table that agents.scores has written")
+    known = {row["env_id"] for row in rows}
+    return table | {"results": [row for row in table["results"] if row["env_id"] not in known]}
+
+
 @dataclass(frozen=True)
 class Options:
     """Sum up runs of several agents, environments and seeds in a table."""
@@ -157,6 +170,8 @@ class Options:
     runs: tyro.conf.Positional[tuple[Path, ...]]
     #: JSON file to write; the table comes beside it, as .md
     out: Path | None = None
+    #: earlier JSON file, whose rows of other environments stay
+    keep: Path | None = None
 
 
 def main(args: list[str] | None = None) -> None:
@@ -165,10 +180,12 @@ def main(args: list[str] | None = None) -> None:
     try:
         runs = {str(path): _read(path / "results.json") for path in options.runs}
         rows = scores(runs)
+        kept = _kept(options.keep, rows)
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
-    devices = sorted({run["device"]["name"] for run in runs.values()})
-    commits = sorted({str(run["commit"])[:12] for run in runs.values()})
+    rows = sorted([*kept["results"], *rows], key=lambda row: row["env_id"])
+    devices = sorted({run["device"]["name"] for run in runs.values()} | set(kept["devices"]))
+    commits = sorted({str(run["commit"])[:12] for run in runs.values()} | set(kept["commits"]))
     about = (
         f"{', '.join(devices)}; commits {', '.join(commits)}. Brackets are 95 % intervals: over seeds where there are "
         "several, else over episodes."

@@ -75,6 +75,22 @@ def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
         scores.main([str(tmp_path / "nowhere")])
 
 
+def test_other_environments_keep_their_rows(runs, tmp_path, capsys):
+    for name, content in runs.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.json").write_text(json.dumps(content | {"commit": name}))
+    first, second = tmp_path / "first.json", tmp_path / "second.json"
+    scores.main([*(str(tmp_path / name) for name in runs), "--out", str(first)])
+    scores.main([str(tmp_path / "stand_1"), "--keep", str(first), "--out", str(second)])
+    before, after = (json.loads(path.read_text()) for path in (first, second))
+    pushed = [row for row in before["results"] if row["env_id"] == "Push-v0"]
+    assert after["results"][:3] == pushed and {row["env_id"] for row in after["results"][3:]} == {"Stand-v0"}
+    assert after["results"][-1]["return_mean"] == 90.0
+    assert after["commits"] == sorted(name[:12] for name in runs)
+    with pytest.raises(SystemExit, match=r"results.json has no 'devices'"):
+        scores.main([str(tmp_path / "stand_1"), "--keep", str(tmp_path / "push" / "results.json")])
+
+
 def test_runs_of_one_name_in_other_folders_all_count(runs, tmp_path, capsys):
     folders = [tmp_path / f"seed{seed}" / "stand" for seed in range(2)]
     for folder, name in zip(folders, ("stand_0", "stand_1"), strict=True):
