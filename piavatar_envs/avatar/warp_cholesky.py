@@ -113,6 +113,7 @@ def factorize_together(
 {_AT}
 float4* const to = reinterpret_cast<float4*>(&wp::index(factor, f, 0));
 for (int n = threadIdx.x & 31; n < factor.shape[1] / 4; n += 32) to[n] = reinterpret_cast<const float4*>(room)[n];
+__syncwarp();  // the room is free
 #endif
 """)
 def store_factor(at: wp.uint64, f: int, factor: wp.array2d(dtype=float)):

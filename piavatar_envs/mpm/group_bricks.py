@@ -26,8 +26,6 @@ CAPACITY = wp.constant(184)
 #: Places of the table, a power of two: with so many more than bricks, a key is mostly found at the first.
 TABLE_BITS = wp.constant(9)
 TABLE = wp.constant(1 << int(TABLE_BITS))
-#: Bricks that a particle touches.
-BRICKS_TOUCHED = wp.constant(8)
 #: Particles of a group, at most; so many threads it has, whatever their number.
 THREADS = wp.constant(128)
 #: Particles of a group of which a thread takes a plane of nodes instead, at most.

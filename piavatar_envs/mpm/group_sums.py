@@ -144,10 +144,10 @@ auto count_in = [&](int field) {{  // the group's units are not smaller than tho
     right = max(20 - shift, 0), left = max(shift - 20, 0), half = (1 << right) >> 1;
     most_high = shift > 31 ? 0 : 1 << (28 - left);
 }};
-int counted_in = num_fields > 1 ? room[BRICKS] : 0;
+const int bricks = room[COUNT];
+int counted_in = num_fields > 1 && bricks > 0 ? room[BRICKS] : 0;  // where nobody takes part, nothing is there
 count_in(counted_in);
 bool too_much = false;
-const int bricks = room[COUNT];
 int* at = room + NODES + c * ALONG + 8 * warp + corner;
 int next = warp < bricks ? *at : 0, next_record = warp < bricks ? room[RECORDS + warp] : 0;  // one ahead: less to wait
 for (int place = warp; place < bricks; place += warps) {{

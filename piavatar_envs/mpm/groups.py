@@ -2,9 +2,8 @@
 
 A group is of neighbours in memory, which should be neighbours in the body: the fewer bricks of nodes they touch, the
 less there is to put down. It has a CUDA block of its own, see :mod:`piavatar_envs.mpm.group_bricks` and
-:mod:`piavatar_envs.mpm.group_sums`. What it adds up
-depends on its own particles only, and integers are added: runs repeat bit for bit, and an environment does the same in
-any batch.
+:mod:`piavatar_envs.mpm.group_sums`. What it adds up depends on its own particles only, and integers are added: runs
+repeat bit for bit, and an environment does the same in any batch.
 """
 
 from __future__ import annotations
@@ -182,8 +181,9 @@ def scatter_kind(
     if adds:
         field = particles.field[p]
         s = scattered(grid, step, particles, moving, e, p, kind)
-        momentum = bounded(s, number(MOMENTUM_UNIT + field), failure, e)
-        active = momentum >= 0.0
+        if kind != PLACE:  # whose numbers are no momenta, and as sound as the masses were
+            momentum = bounded(s, number(MOMENTUM_UNIT + field), failure, e)
+            active = momentum >= 0.0
     if kind != PLACE:
         raise_most(active, field, kind, s, momentum)
     found = int(0)

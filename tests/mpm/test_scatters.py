@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from piavatar_envs.mpm import groups
 from piavatar_envs.mpm.memory import estimate_slots
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.shared_room import parts_of
@@ -134,6 +135,18 @@ def test_scatters_agree(collide, scatter):
     for e in range(3):
         for array, atol in zip(ARRAYS, (1e-5, 2e-3, 2e-1, 1e-3), strict=True):
             np.testing.assert_allclose(other.get(array, e), plain.get(array, e), atol=atol, err_msg=array)
+
+
+@pytest.mark.parametrize("share", [42, 64, 128])
+def test_groups_of_any_size_agree(collide, device, monkeypatch, share):
+    """Of particles that one thread adds, or three; their units are their own."""
+    if device == "cpu":
+        pytest.skip("groups are a GPU's")
+    monkeypatch.setattr(groups, "SHARES", ((2**31, share),))
+    grouped, plain = collide(scatter="runs", max_slots=SLOTS).run(2), collide(scatter="plain").run(2)
+    for e in range(3):
+        for array, atol in zip(ARRAYS, (1e-5, 2e-3, 2e-1, 1e-3), strict=True):
+            np.testing.assert_allclose(grouped.get(array, e), plain.get(array, e), atol=atol, err_msg=array)
 
 
 def test_bricks_that_do_not_fit_go_in_rounds(collide, device):
