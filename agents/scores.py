@@ -3,8 +3,8 @@
 Every run is a folder with the ``results.json`` of ``agents.train``, ``agents.rsl_ppo`` or ``agents.score_pid``. Runs of
 one configuration that differ in their seed become one row (:mod:`agents.compare`), runs of one environment one table;
 what no training changes (zero and random actions) stands in it once, unless an environment's settings change what an
-action means. Beside the JSON file comes the same as Markdown. Environments
-that none of the runs is about can keep the rows that an earlier table has of them (``--keep FILE.json``).
+action means. Beside the JSON file comes the same as Markdown. Environments that none of the runs is about can keep the
+rows that an earlier table has of them (``--keep FILE.json``).
 """
 
 from __future__ import annotations

@@ -189,7 +189,7 @@ class ArticulatedBody:
     def record_mass(self, program: Program, state: State) -> None:
         """Append: build the mass matrix where particles and joints are, and what follows from it."""
         self.mass.record_sums(program, state, self.state.position)
-        threads = min(2 * self.threads, 64) if self.threads > 1 else 1
+        threads = 2 * self.threads if self.threads > 1 else 1  # a warp for each of the two factors
         inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure, threads]
         program.launch(build_mass, (self.model.num_envs, threads), inputs, [self._bench], block_dim=threads)
 

@@ -147,16 +147,12 @@ def chunk_corrections(
     lean: wp.array2d(dtype=wp.vec3),
     e: int,
     c: int,
-    slot: int,
     thread: int,
     threads: int,
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """Momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk.
-
-    Those of environment ``e`` are in row ``slot``.
-    """
+    """Momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk."""
     origin = center[e, body.chunk_bone[c]]
     r = row(e, particles.mass.shape[0])
     p1 = wp.vec3()
@@ -172,10 +168,10 @@ def chunk_corrections(
         n += threads
         following, weight = entry_of(body, n, last)
         d = vector_at(x, e, body.first + p) - origin
-        a = w * vector_at(pull, slot, p)
+        a = w * vector_at(pull, e, p)
         p1 += a
         l1 += wp.cross(d, a)
-        a = w * vector_at(lean, slot, p)
+        a = w * vector_at(lean, e, p)
         p2 += a
         l2 += wp.cross(d, a)
     total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])
@@ -202,7 +198,7 @@ def sum_corrections(
     c = at[1]
     thread = at[2]
     if failure[e] == 0:
-        chunk_corrections(body, particles, x, center, pull, lean, e, c, e, thread, threads, corrections)
+        chunk_corrections(body, particles, x, center, pull, lean, e, c, thread, threads, corrections)
 
 
 @wp.func

@@ -14,7 +14,6 @@ import warp as wp
 
 from piavatar_envs.avatar import posing
 from piavatar_envs.avatar.body import BodyPoints, build_body
-from piavatar_envs.avatar.drive_stages import BONE_THREADS
 from piavatar_envs.avatar.joint_drive import JointDrive, JointSettings
 from piavatar_envs.avatar.kabsch import local_rotations, track_bones
 from piavatar_envs.avatar.lanes import chunk_threads, warp_threads
@@ -56,8 +55,7 @@ class AvatarDrive:
         self.threads = warp_threads(model.device)
         most_chunks = int(np.diff(self.body.chunk_start.numpy()).max())
         self.chunk_threads = chunk_threads(model.device, most_chunks)
-        on_gpu = wp.get_device(model.device).is_cuda
-        self.in_one, self.bone_threads = not on_gpu, BONE_THREADS if on_gpu else 1
+        self.in_one = wp.get_device(model.device).is_cpu
         self.state = self._allocate(DriveState)
         self.tracked = self._allocate(Tracked)
         self.scratch = self._allocate(DriveScratch)
@@ -70,7 +68,6 @@ class AvatarDrive:
     def _allocate(self, cls):
         """Zeroed arrays for a dataclass of arrays, by the name's ending."""
         n, bones = self.model.num_envs, (self.model.num_envs, NUM_JOINTS)
-        pulls = (1 if self.in_one else n, self.num_points)
         special = {
             "let_go": (n, int),
             "local": (bones, wp.quat),
@@ -90,8 +87,8 @@ class AvatarDrive:
             "bone_corrections": (bones, vec12),
             "bone_change": (bones, vec8),
             "removed_turn": (n, wp.mat33),
-            "pull": (pulls, wp.vec3),
-            "lean": (pulls, wp.vec3),
+            "pull": ((n, self.num_points), wp.vec3),
+            "lean": ((n, self.num_points), wp.vec3),
         }
         per_env = ("body_", "wrench_", "removed_")
         arrays = {}

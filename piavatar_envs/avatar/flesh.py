@@ -55,7 +55,6 @@ def drive_particle(
     let_go: bool,
     e: int,
     p: int,
-    slot: int,
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     motion: wp.array2d(dtype=wp.vec3),
@@ -68,7 +67,7 @@ def drive_particle(
 
     ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
     that contact has caused along with the bone. Inert flesh misses its share of every change of that velocity.
-    ``center`` is the pelvis', where the bones' blended velocity is; pulls and ways are in row ``slot``.
+    ``center`` is the pelvis', where the bones' blended velocity is.
     """
     at = vector_at(x, e, body.first + p)
     before = vector_at(u, e, body.first + p)
@@ -90,7 +89,7 @@ def drive_particle(
         motion[e, p] = k
     pulled += pull_gain(drive.tone_rate, drive.dt) * way
     store_pair(driven.vk, driven.spin, e, body.first + p, k, -0.5 * axial(turn), True, True)
-    store_pair(pull, lean, slot, p, pulled, way, drive.tone_rate > 0.0, True)
+    store_pair(pull, lean, e, p, pulled, way, drive.tone_rate > 0.0, True)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 7))
@@ -119,7 +118,7 @@ def drive_particles(
     p = own[1]
     while p < body.count:
         drive_particle(
-            body, drive, x, record, bones.center[e, 0], let_go[e] != 0, e, p, e, u, motion, driven, pull, lean
+            body, drive, x, record, bones.center[e, 0], let_go[e] != 0, e, p, u, motion, driven, pull, lean
         )  # fmt: skip
         p = next_particle(p)
 
@@ -194,18 +193,17 @@ def apply_correction(
     free: bool,
     e: int,
     p: int,
-    slot: int,
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     driven: Kinematic,
 ):
-    """Change the physical velocity by the pull, in row ``slot``, and the bones' blended field.
+    """Change the physical velocity by the pull and the bones' blended field.
 
     Where the body is ``free``, the rigid part of its commanded motion comes off.
     """
     at = vector_at(x, e, body.first + p)
     field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - center)
-    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, slot, p) + field, True)
+    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, e, p) + field, True)
     if free:
         v = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]
         v += removed.turn[e] * (at - removed.center[e] + drive.dt * v)
@@ -240,5 +238,5 @@ def apply_corrections(
     free = is_free(drive, let_go[e])
     p = own[1]
     while p < body.count:
-        apply_correction(body, drive, x, pull, bones.center[e, 0], change, removed, free, e, p, e, u, driven)
+        apply_correction(body, drive, x, pull, bones.center[e, 0], change, removed, free, e, p, u, driven)
         p = next_particle(p)

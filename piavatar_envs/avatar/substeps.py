@@ -110,12 +110,12 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         outputs = [bench, g.held, drive.state.motion, state.u, state.kinematic]
         program.launch(drive_stages.drive_body, n, inputs, outputs)
         return
-    chunks, own = (n, drive.num_chunks, drive.threads), [drive.chunk_threads, state.failure, drive.bone_threads]
+    chunks, own = (n, drive.num_chunks, drive.threads), [drive.chunk_threads, state.failure, drive.threads]
     inputs = [drive.body, drive.model.particles, state.x, state.u, bench.tracked, state.failure, drive.threads]
     program.launch(bone_sums.sum_moments, chunks, inputs, [s.moments], block_dim=BLOCK)
-    bones, block = (n, drive.bone_threads), drive.bone_threads
+    bones = (n, drive.threads)
     inputs = [*who, drive.body_mass, step, *own]
-    program.launch(drive_stages.prepare_body, bones, inputs, [bench, g.held], block_dim=block)
+    program.launch(drive_stages.prepare_body, bones, inputs, [bench, g.held], block_dim=drive.threads)
     program.launch(
         flesh.drive_particles,
         (n, particle_threads(drive.model.device, drive.num_points)),
@@ -127,7 +127,7 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         _record_free_motion(drive, program, state, bench)
     inputs = [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.threads]
     program.launch(bone_sums.sum_corrections, chunks, inputs, [s.corrections], block_dim=BLOCK)
-    program.launch(drive_stages.settle_body, bones, [*who, *own], [bench], block_dim=block)
+    program.launch(drive_stages.settle_body, bones, [*who, *own], [bench], block_dim=drive.threads)
     program.launch(
         flesh.apply_corrections,
         (n, particle_threads(drive.model.device, drive.num_points)),

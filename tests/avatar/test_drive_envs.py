@@ -123,13 +123,6 @@ def test_one_launch_drives_a_body_as_many_do(make_rig, wild_pose, monkeypatch, r
         record_drive(avatar, program, state, step)
 
     monkeypatch.setattr(drive, "record_drive", by_passes)
-    rows = drive.AvatarDrive._allocate
-
-    def allocate(avatar, cls):
-        avatar.in_one = False  # which needs a row of pulls for every environment
-        return rows(avatar, cls)
-
-    monkeypatch.setattr(drive.AvatarDrive, "_allocate", allocate)
     many = disturbed(make_rig, wild_pose, **options)
     assert "drive_body" in one.step_program._names and "drive_particles" in many.step_program._names
     for name, value in one.everything().items():
