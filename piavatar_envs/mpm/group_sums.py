@@ -127,14 +127,17 @@ def add_to_nodes(
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, warps = blockDim.x >> 5, c = lane & 3, corner = lane >> 2;
 const bool is_place = kind == PLACE, of_mass = c == 0 || is_place;
 const int most = of_mass ? HEAVIEST : kind == KINEMATIC ? DRIVEN : FASTEST;
-const int word = (kind == KINEMATIC ? 3 : is_place ? -1 : 0) + (c > 0 || kind == 0 ? c : 4);
-const int words = is_place ? 8 : 16;  // of a record in fixed point
+const int word = c > 0 ? c - (kind != 0) : kind == 0 ? 0 : 3;  // of four that lie together
+const int in_record = word + (kind == KINEMATIC ? 4 : 0);  // in floating point
 const int within = ((corner & 4) << 2) + ((corner & 2) << 1) + (corner & 1);
 const bool is_fixed = sums.is_fixed != 0;
-char* const fixed = is_place ? (char*)&wp::index(sums.offset_fixed, is_fixed ? e : 0, 0)
-                             : (char*)&wp::index(sums.fixed, is_fixed ? e : 0, 0);
-char* const high_at = fixed + 4 * (words * within + word);
-char* const low_at = high_at + 2 * words;
+// in fixed point: memory takes 32 bytes at a time, a node's high and low parts. Four threads have a node of their own,
+// next to another four: they exchange one part for the other, and all eight add to the one node, then to the other
+const int odd = corner & 1, words = is_place ? 8 : 16;
+char* const one_at = (is_place ? (char*)&wp::index(sums.offset_fixed, is_fixed ? e : 0, 0)
+                               : (char*)&wp::index(sums.fixed, is_fixed ? e : 0, 0))
+    + 4 * (words * (within - odd) + (kind == KINEMATIC ? 8 : 0) + 4 * odd + word);
+char* const other_at = one_at + 4 * words;
 float unit = 0.0f;
 int shift = 0, right = 0, left = 0, half = 0, most_high = 0;
 auto count_in = [&](int field) {{  // the group's units are not smaller than those of the sums: shifted, they are exact
@@ -151,7 +154,7 @@ bool too_much = false;
 int* at = room + NODES + c * ALONG + 8 * warp + corner;
 int next = warp < bricks ? *at : 0, next_record = warp < bricks ? room[RECORDS + warp] : 0;  // one ahead: less to wait
 for (int place = warp; place < bricks; place += warps) {{
-    const int sum = next;
+    int sum = next;
     if (sum != 0) *at = 0;
     at += 8 * warps;
     const unsigned record = next_record & ~SHARED;
@@ -160,22 +163,25 @@ for (int place = warp; place < bricks; place += warps) {{
     if (kind != 0) massive = room[MASSIVE + place];
     if (kind == 0 && lane == 0) room[MASSIVE + place] = massive;
     if (num_fields > 1 && room[BRICKS + place] != counted_in) count_in(counted_in = room[BRICKS + place]);
-    if (sum == 0 || !(massive >> (lane & 28) & 1u)) continue;
+    if (!(massive >> (lane & 28) & 1u)) sum = 0;
     if (is_fixed) {{
         int high = (sum + half) >> right;
         if (abs(high) > most_high) {{
             too_much = true;
-            continue;
+            high = sum = 0;
         }}
         high <<= left;
         const int low = (int)(((unsigned)sum << shift) - ((unsigned)high << 20));
+        const int got = __shfl_xor_sync(ALL, odd ? high : low, 4), one = odd ? got : high, other = odd ? low : got;
         const size_t from = (size_t)record * (size_t)(4 * words);
-        atomicAdd((int*)(high_at + from), high);
-        atomicAdd((int*)(low_at + from), low);
-    }} else if (is_place)
+        if (one != 0) atomicAdd((int*)(one_at + from), one);
+        if (other != 0) atomicAdd((int*)(other_at + from), other);
+    }} else if (sum == 0)
+        continue;
+    else if (is_place)
         atomicAdd((float*)&wp::index(sums.offset, e, record + within) + word, sum * (c > 0 ? unit * grid.dx : unit));
     else
-        atomicAdd((float*)&wp::index(sums.value, e, record + within) + word, sum * unit);
+        atomicAdd((float*)&wp::index(sums.value, e, record + within) + in_record, sum * unit);
 }}
 if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 """)

@@ -7,6 +7,10 @@ do not, and a run can be repeated bit for bit. 32 bits are too few: they leave a
 thousand summands. Together they count units of 2^-36 of what a full cell of matter has, at rest or at a grid spacing a
 time step, and reach 10^4 such cells. Summands are rounded to the nearest unit, which is unbiased: rounding masses up
 would slow all motion down.
+
+Four numbers lie together, their high parts before their low ones: 32 bytes, which a GPU's memory takes at a time. They
+are mass and physical momentum; kinematic momentum and nothing; offsets and the mass of seams. So what is added up
+together, and the first without the second, is of whole such sectors.
 """
 
 from __future__ import annotations
@@ -194,9 +198,9 @@ def take_sum(sums: Sums, e: int, f: int, r: int):
         s = read_record(sums.value, e, r)
         write_record(sums.value, e, r, vec8())
     else:
-        a = join_parts(part_of_sum(sums.fixed, e, r, 0), part_of_sum(sums.fixed, e, r, 2))
+        a = join_parts(part_of_sum(sums.fixed, e, r, 0), part_of_sum(sums.fixed, e, r, 1))
         if a[0] > 0.0:  # who adds no mass adds nothing
-            b = join_parts(part_of_sum(sums.fixed, e, r, 1), part_of_sum(sums.fixed, e, r, 3))
+            b = join_parts(part_of_sum(sums.fixed, e, r, 2), part_of_sum(sums.fixed, e, r, 3))
             m = sums.mass_unit[row(e, sums.mass_unit.shape[0]), f]
             p = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
             s = vec8(m * a[0], p * a[1], p * a[2], p * a[3], p * b[0], p * b[1], p * b[2], 0.0)

@@ -23,7 +23,8 @@ wp.set_module_options({"enable_backward": False})
 #: A grid node's record: mass [kg], physical momentum (3), kinematic momentum (3), padding. Eight floats are one
 #: vector register on a CPU and one 32-byte sector on a GPU.
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
-#: Records in fixed point, see :mod:`piavatar_envs.mpm.sums`.
+#: Records in fixed point, see :mod:`piavatar_envs.mpm.sums`: a sector of mass and physical momentum, and one of
+#: kinematic momentum; one of offsets.
 vec16i = wp.types.vector(length=16, dtype=wp.int32)
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
