@@ -12,7 +12,19 @@ from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, 
 from piavatar_envs.mpm.sums import clear_offset, offset_at, take_sum, write_record
 from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, vec8
+from piavatar_envs.mpm.types import (
+    NO_STRESS,
+    PAPER,
+    SPLIT,
+    Blocks,
+    Boundaries,
+    Contact,
+    Grid,
+    Sensors,
+    Step,
+    Sums,
+    vec8,
+)
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
@@ -162,6 +174,11 @@ def update_grid(
     Contact acts on the total velocity ``v = u + vk``; the rest is physical. Where there are several fields, the first
     threads prepare contact, see :func:`piavatar_envs.mpm.normals.face_shared`: they are few, and have the longest to
     wait.
+
+    Nodes have offsets and, but for the paper's variant, kinematic momentum only from particles that tell their place,
+    see :func:`piavatar_envs.mpm.transfer.tells_place`. Such a particle is at most ``NEAR_PARTICLE`` from a boundary,
+    and then every node of its stencil is in a slab within ``NEAR_SLAB``; or a block of its stencil has another field
+    besides its own, and then every block of its stencil is that one or one of its neighbours, and told.
     """
     at = environment_of(wp.tid(), of_shared.threads + sweep.threads)
     e = at[0]
@@ -197,10 +214,11 @@ def update_grid(
         told = told_by_neighbours(grid, contact, blocks, e, f, corner)
         for r in range(first + lane, first + lane + sweep.share):
             is_near = near_node(about, r % BLOCK_NODES)
-            total = total_velocity(step, split, take_sum(sums, e, f, r))
+            is_told = is_near or told
+            total = total_velocity(step, split, take_sum(sums, e, f, r, is_told or step.decoupling == PAPER))
             if is_near:  # most skip all of that work
                 x = place_of(grid, corner, r % BLOCK_NODES)
                 total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, total, sensors)
             write_record(node_velocity, e, r, physical_velocity(split, total))
-            if is_near or told:
+            if is_told:
                 clear_offset(sums, e, r)

@@ -138,21 +138,28 @@ if (__activemask() == ALL) {
     const int lane = threadIdx.x & 31;
     int4* const first = (int4*)__shfl_sync(ALL, (unsigned long long)mine, 0);
     if (__all_sync(ALL, mine == first + PARTS * lane)) {  // a warp's records lie together: cleared as they lie
-        const unsigned cleared = __ballot_sync(ALL, clears);
-        __syncwarp();  // all have read theirs
 #pragma unroll
-        for (int part = lane; part < 32 * PARTS; part += 32)
-            if (cleared >> (part / PARTS) & 1u) first[part] = zero;
+        for (int sector = 0; sector < PARTS; sector += 2) {
+            const unsigned cleared = __ballot_sync(ALL, clears && sector < 2 * sectors);
+            __syncwarp();  // all have read theirs
+            if (cleared == 0u) break;
+#pragma unroll
+            for (int part = lane; part < 64; part += 32)
+                if (cleared >> (part >> 1) & 1u) first[PARTS * (part >> 1) + sector + (part & 1)] = zero;
+        }
         __syncwarp();
         return;
     }
 }
 if (clears) {
 #pragma unroll
-    for (int part = 0; part < PARTS; ++part) mine[part] = zero;
+    for (int part = 0; part < PARTS; ++part)
+        if (part < 2 * sectors) mine[part] = zero;
 }
 #else
-if (clears) wp::index(records, e, r) = {};
+auto& record = wp::index(records, e, r);
+if (clears)
+    for (int n = 0; n < 8 * sectors; ++n) record[n] = 0;
 #endif
 """
 
@@ -170,13 +177,13 @@ def part_of_offset(records: wp.array2d(dtype=vec8i), e: int, r: int, part: int) 
 
 
 @wp.func_native(_CLEAR)
-def clear_fixed_sum(records: wp.array2d(dtype=vec16i), e: int, r: int, clears: bool):
-    """``records[e, r] = 0`` if ``clears``; at best all threads of a warp come here."""
+def clear_fixed_sum(records: wp.array2d(dtype=vec16i), e: int, r: int, sectors: int, clears: bool):
+    """Zero the first ``sectors`` of ``records[e, r]`` if ``clears``; at best all threads of a warp come here."""
     ...
 
 
 @wp.func_native(_CLEAR)
-def clear_fixed_offset(records: wp.array2d(dtype=vec8i), e: int, r: int, clears: bool):
+def clear_fixed_offset(records: wp.array2d(dtype=vec8i), e: int, r: int, sectors: int, clears: bool):
     """:func:`clear_fixed_sum` of offsets."""
     ...
 
@@ -191,8 +198,12 @@ def join_parts(high: wp.vec4i, low: wp.vec4i):
 
 
 @wp.func
-def take_sum(sums: Sums, e: int, f: int, r: int):
-    """Mass, physical and kinematic momentum of record ``r`` of field ``f``, which is cleared."""
+def take_sum(sums: Sums, e: int, f: int, r: int, driven: bool):
+    """Mass, physical and kinematic momentum of record ``r`` of field ``f``, which is cleared.
+
+    Where it is known that nobody has added kinematic momentum, the record is not ``driven``: that is not read in fixed
+    point, nor cleared.
+    """
     s = vec8()
     if sums.is_fixed == 0:
         s = read_record(sums.value, e, r)
@@ -200,11 +211,13 @@ def take_sum(sums: Sums, e: int, f: int, r: int):
     else:
         a = join_parts(part_of_sum(sums.fixed, e, r, 0), part_of_sum(sums.fixed, e, r, 1))
         if a[0] > 0.0:  # who adds no mass adds nothing
-            b = join_parts(part_of_sum(sums.fixed, e, r, 2), part_of_sum(sums.fixed, e, r, 3))
             m = sums.mass_unit[row(e, sums.mass_unit.shape[0]), f]
             p = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
-            s = vec8(m * a[0], p * a[1], p * a[2], p * a[3], p * b[0], p * b[1], p * b[2], 0.0)
-        clear_fixed_sum(sums.fixed, e, r, a[0] > 0.0)
+            s = vec8(m * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
+            if driven:
+                b = join_parts(part_of_sum(sums.fixed, e, r, 2), part_of_sum(sums.fixed, e, r, 3))
+                s = s + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
+        clear_fixed_sum(sums.fixed, e, r, wp.where(driven, 2, 1), a[0] > 0.0)
     return s
 
 
@@ -239,4 +252,4 @@ def clear_offset(sums: Sums, e: int, r: int):
     if sums.is_fixed == 0:
         sums.offset[e, r] = wp.vec4(0.0)
     else:
-        clear_fixed_offset(sums.offset_fixed, e, r, True)
+        clear_fixed_offset(sums.offset_fixed, e, r, 1, True)

@@ -48,17 +48,21 @@ def test_every_node_of_shared_blocks_has_one_thread(monkeypatch, cuda, num_envs,
 
 
 @wp.kernel
-def take_all(grid: Grid, sums: Sums, taken: wp.array(dtype=vec8), offset: wp.array(dtype=wp.vec4)):
+def take_all(grid: Grid, sums: Sums, driven: bool, taken: wp.array(dtype=vec8), offset: wp.array(dtype=wp.vec4)):
     """Records of field 1."""
     r = wp.tid()
-    taken[r] = take_sum(sums, 0, 1, r)
+    taken[r] = take_sum(sums, 0, 1, r, driven)
     offset[r] = offset_at(grid, sums, 0, 1, r)
     if r % 2 == 0:
         clear_offset(sums, 0, r)
 
 
-def test_fixed_sums(device):
-    """High and low parts make a number; a record with mass is cleared when it is taken, one without is not touched."""
+@pytest.mark.parametrize("driven", [True, False])
+def test_fixed_sums(device, driven):
+    """High and low parts make a number; a record with mass is cleared when it is taken, one without is not touched.
+
+    Where nobody is driven, kinematic momentum is left alone.
+    """
     rng = np.random.default_rng(1)
     parts = rng.integers(-900, 900, (1, RECORDS, 16)).astype(np.int32)
     parts[..., 0] = np.abs(parts[..., 0]) + 1
@@ -80,12 +84,18 @@ def test_fixed_sums(device):
     grid.dx = 0.25
     taken = wp.zeros(RECORDS, dtype=vec8, device=device)
     found = wp.zeros(RECORDS, dtype=wp.vec4, device=device)
-    wp.launch(take_all, RECORDS, inputs=[grid, sums], outputs=[taken, found], device=device)
+    wp.launch(take_all, RECORDS, inputs=[grid, sums, driven], outputs=[taken, found], device=device)
     scale = np.array([2.0**-30] + 7 * [2.0**-28])
-    by_sector = parts[0].astype(float).reshape(RECORDS, 2, 2, 4)
-    numbers = (LOW * by_sector[:, :, 0] + by_sector[:, :, 1]).reshape(RECORDS, 8)
-    np.testing.assert_allclose(taken.numpy(), scale * numbers, rtol=1e-6)
-    assert not sums.fixed.numpy().any()
+    sectors = parts[0].astype(float).reshape(RECORDS, 2, 2, 4)
+    numbers = LOW * sectors[:, :, 0] + sectors[:, :, 1]
+    left = sums.fixed.numpy().reshape(RECORDS, 2, 8)
+    assert not left[:, 0].any()
+    if driven:
+        assert not left[:, 1].any()
+    else:
+        assert np.array_equal(left[:, 1], parts.reshape(RECORDS, 2, 8)[:, 1])
+        numbers[:, 1] = 0.0
+    np.testing.assert_allclose(taken.numpy(), scale * numbers.reshape(RECORDS, 8), rtol=1e-6)
     scale = np.array(3 * [0.25 * 2.0**-30] + [2.0**-30])
     np.testing.assert_allclose(
         found.numpy(), scale * (LOW * offsets[0, :, :4].astype(float) + offsets[0, :, 4:]), rtol=1e-6
