@@ -2,13 +2,14 @@
 
 They lie in bricks of 2 x 2 x 2 nodes, numbered as they come. A brick's key says where it is on the grid and of which
 velocity field; a sparse table, where hardly any two keys meet, leads from keys to numbers. So it does not matter how a
-group lies. Particles of a warp that lie in the same brick look its neighbors up once, a thread each. Numbers depend on
-who comes first, sums do not: integers are added, and whether there is room depends on how many bricks there are.
+group lies. Particles of a warp that lie in the same brick list it once, and all threads look the neighbors of what is
+listed up. Numbers depend on who comes first, sums do not: integers are added, and whether there is room depends on how
+many bricks there are.
 
 Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; the table of keys, and of numbers in half
 words; of every brick its key, later its field, its record, and which nodes have got mass; four sums of every node, one
-after the other; where in the table the bricks are that a warp looked up, in half words; what is handed to other
-threads.
+after the other; where in the table the bricks are that were looked up, in half words; what is handed to other threads,
+first the list of bricks.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ TABLE = wp.constant(1 << int(TABLE_BITS))
 THREADS = wp.constant(128)
 #: Particles of a group of which a thread takes a plane of nodes instead, at most.
 MOST_SPLIT = wp.constant(int(THREADS) // 2)
-#: Words of the header: how many bricks there are, or more than there is room for; bits of what else is added up; and of
-#: each of up to 32 fields, the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the
-#: sums' own units.
-COUNT, MORE = (wp.constant(n) for n in range(2))
+#: Words of the header: how many bricks there are, or more than there is room for; bits of what else is added up; how
+#: many bricks are listed whose neighbors are sought; and of each of up to 32 fields, the most that a particle has of
+#: mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units.
+COUNT, MORE, LISTED = (wp.constant(n) for n in range(3))
 HEAVIEST, FASTEST, DRIVEN = (wp.constant(n) for n in (4, 36, 68))
 MASS_UNIT, MOMENTUM_UNIT = (wp.constant(n) for n in (100, 132))
 KEYS = wp.constant(164)
@@ -62,7 +63,7 @@ POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fff
 
 def in_group(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
-    names = "CAPACITY TABLE_BITS TABLE COUNT HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT KEYS NUMBERS BRICKS"
+    names = "CAPACITY TABLE_BITS TABLE COUNT LISTED HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT KEYS NUMBERS BRICKS"
     names += " RECORDS MASSIVE NODES ALONG FOUND HANDED MOST_SPLIT SHARED KINEMATIC PLACE"
     known = ", ".join(f"{name} = {int(globals()[name])}" for name in names.split())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
@@ -95,57 +96,67 @@ def raise_most(takes: bool, field: int, kind: int, s: Scattered, momentum: float
 @wp.func_native(
     in_group(
         """
-const int t = threadIdx.x, lane = t & 31, b = lane & 7;
-const int ny = grid.blocks[1], nz = grid.blocks[2], i = base[0], j = base[1], k = base[2];
-const unsigned block = field * grid.num_blocks + ((i >> 2) * ny + (j >> 2)) * nz + (k >> 2);
+const int lane = threadIdx.x & 31, i = base[0], j = base[1], k = base[2];
+const unsigned block = field * grid.num_blocks + ((i >> 2) * grid.blocks[1] + (j >> 2)) * grid.blocks[2] + (k >> 2);
 const unsigned own = takes ? 8u * block + ((i & 2) << 1) + (j & 2) + ((k & 2) >> 1) + 1 : 0u;  // 0 is for nobody's
 if (!__any_sync(ALL, takes)) return 0;
-// the first of those in the same brick has the eight of them looked up, four such at a time
 const int first = __ffs(__match_any_sync(ALL, own)) - 1;
-const unsigned firsts = __ballot_sync(ALL, takes && first == lane);
-const int among = __popc(firsts & ((1u << first) - 1u)), num = __popc(firsts);
-volatile unsigned* const keys = reinterpret_cast<unsigned*>(room + KEYS);
-unsigned short* const numbers = reinterpret_cast<unsigned short*>(room + NUMBERS);
-volatile int* const found = room + FOUND + 4 * (t - lane);
-unsigned short* const found_at = reinterpret_cast<unsigned short*>(room + FOUND + 4 * (t - lane));
-if (takes && first == lane) found[4 * among] = (int)own;
-__syncwarp();
-for (int begin = 0; begin < num; begin += 4) {
-    const int n = begin + (lane >> 3);
-    unsigned key = n < num ? (unsigned)found[4 * n] : 0u;
-    __syncwarp();  // all have read it
-    // when there are too many, it does not matter who they are; and the table is never full
-    if (n < num && *(volatile int*)(room + COUNT) <= CAPACITY) {
-        const unsigned lowest = key - 1u;
-        if (b & 4) key += lowest & 4u ? 8 * ny * nz - 4 : 4;
-        if (b & 2) key += lowest & 2u ? 8 * nz - 2 : 2;
-        if (b & 1) key += lowest & 1u ? 7 : 1;
-        unsigned at = key * 0x9e3779b1u >> (32 - TABLE_BITS), got;
-        while ((got = keys[at]) != key) {
-            if (got == 0u) {
-                got = atomicCAS((unsigned*)keys + at, 0u, key);
-                if (got == key) break;
-                if (got == 0u) {
-                    const int number = atomicAdd(room + COUNT, 1);
-                    if (number < CAPACITY) room[BRICKS + number] = (int)key;
-                    numbers[at] = (unsigned short)number;
-                    break;
-                }
-            }
-            at = at + 1 & TABLE - 1;
-        }
-        found_at[8 * n + b] = (unsigned short)at;
-    }
-}
-return among;
+const bool is_first = takes && first == lane;
+const unsigned firsts = __ballot_sync(ALL, is_first);
+int begin = 0;
+if (lane == 0) begin = atomicAdd(room + LISTED, __popc(firsts));
+const int place = __shfl_sync(ALL, begin, 0) + __popc(firsts & ((1u << first) - 1u));
+if (is_first) room[HANDED + place] = (int)own;
+return place;
 """,
         "return 0;",
     )
 )
-def seek_bricks(grid: Grid, takes: bool, field: int, base: wp.vec3i) -> int:
-    """See that the bricks of a stencil have numbers, if there is room; all threads of a warp come here.
+def list_brick(grid: Grid, takes: bool, field: int, base: wp.vec3i) -> int:
+    """List the brick that a stencil begins in, once a warp, for :func:`seek_bricks`; all threads of a warp come here.
 
-    Returns where :func:`bricks_found` finds them when all threads have met.
+    Returns its place in the list, for :func:`bricks_found`.
+    """
+    ...
+
+
+@wp.func_native(
+    in_group("""
+const int ny = grid.blocks[1], nz = grid.blocks[2], items = 8 * room[LISTED];
+volatile unsigned* const keys = reinterpret_cast<unsigned*>(room + KEYS);
+unsigned short* const numbers = reinterpret_cast<unsigned short*>(room + NUMBERS);
+unsigned short* const found_at = reinterpret_cast<unsigned short*>(room + FOUND);
+for (int item = threadIdx.x; item < items; item += blockDim.x) {
+    // when there are too many, it does not matter who they are; and the table is never full
+    if (*(volatile int*)(room + COUNT) > CAPACITY) break;
+    const int b = item & 7;
+    unsigned key = (unsigned)room[HANDED + (item >> 3)];
+    const unsigned lowest = key - 1u;
+    if (b & 4) key += lowest & 4u ? 8 * ny * nz - 4 : 4;
+    if (b & 2) key += lowest & 2u ? 8 * nz - 2 : 2;
+    if (b & 1) key += lowest & 1u ? 7 : 1;
+    unsigned at = key * 0x9e3779b1u >> (32 - TABLE_BITS), got;
+    while ((got = keys[at]) != key) {
+        if (got == 0u) {
+            got = atomicCAS((unsigned*)keys + at, 0u, key);
+            if (got == key) break;
+            if (got == 0u) {
+                const int number = atomicAdd(room + COUNT, 1);
+                if (number < CAPACITY) room[BRICKS + number] = (int)key;
+                numbers[at] = (unsigned short)number;
+                break;
+            }
+        }
+        at = at + 1 & TABLE - 1;
+    }
+    found_at[item] = (unsigned short)at;
+}
+""")
+)
+def seek_bricks(grid: Grid):
+    """See that the listed bricks and their upper neighbors have numbers, if there is room, a thread each of them.
+
+    All threads of the group come here, and have met before; when they meet again, :func:`bricks_found` finds them.
     """
     ...
 
@@ -153,7 +164,7 @@ def seek_bricks(grid: Grid, takes: bool, field: int, base: wp.vec3i) -> int:
 @wp.func_native(
     in_group(
         """
-const int4 at = *reinterpret_cast<const int4*>(room + FOUND + 4 * ((int)(threadIdx.x & ~31u) + found));
+const int4 at = *reinterpret_cast<const int4*>(room + FOUND + 4 * place);
 const unsigned short* const numbers = reinterpret_cast<const unsigned short*>(room + NUMBERS);
 auto both = [=](int two) { return 8 * (numbers[two & 0xffff] | numbers[(unsigned)two >> 16] << 16); };
 return wp::vec_t<4, wp::int32>(both(at.x), both(at.y), both(at.z), both(at.w));
@@ -161,10 +172,10 @@ return wp::vec_t<4, wp::int32>(both(at.x), both(at.y), both(at.z), both(at.w));
         "return wp::vec_t<4, wp::int32>();",
     )
 )
-def bricks_found(found: int) -> wp.vec4i:
+def bricks_found(place: int) -> wp.vec4i:
     """First nodes of the bricks of a stencil: for the lower and the upper along x and y, of the two along z in 16 bits.
 
-    There has been room for them, see :func:`seek_bricks`.
+    Its own is at a ``place`` of the list; and there has been room for them, see :func:`seek_bricks`.
     """
     ...
 

@@ -21,6 +21,7 @@ from piavatar_envs.mpm.group_bricks import (
     HEAVIEST,
     KEYS,
     KINEMATIC,
+    LISTED,
     MASS_UNIT,
     MOMENTUM,
     MOMENTUM_UNIT,
@@ -33,6 +34,7 @@ from piavatar_envs.mpm.group_bricks import (
     WORDS,
     bricks_found,
     is_shared,
+    list_brick,
     note_records,
     per_unit_of,
     raise_most,
@@ -105,6 +107,7 @@ def begin_round():
     clear_words(KEYS, NUMBERS - KEYS)
     if thread_of_block() == 0:
         set_word(COUNT, 0)
+        set_word(LISTED, 0)
     meet()
 
 
@@ -186,14 +189,16 @@ def scatter_kind(
             active = momentum >= 0.0
     if kind != PLACE:
         raise_most(active, field, kind, s, momentum)
-    found = int(0)
+    place = int(0)
     if kind == MOMENTUM:
-        found = seek_bricks(grid, active, field, s.base)
+        place = list_brick(grid, active, field, s.base)
+        meet()
+        seek_bricks(grid)
     meet()
     if word(COUNT) <= CAPACITY:
         if kind == MOMENTUM:
             if active:
-                bricks = bricks_found(found)
+                bricks = bricks_found(place)
             note_records(grid, blocks, num_fields, e)
             if num_fields > 1:
                 meet()
