@@ -183,19 +183,44 @@ def bricks_found(place: int) -> wp.vec4i:
 @wp.func_native(
     in_group("""
 for (int n = threadIdx.x; n < room[COUNT]; n += blockDim.x) {
-    const int brick = room[BRICKS + n] - 1, held = (int)((unsigned)brick >> 3);  // field and block
-    int record = 64 * wp::index(blocks.slot, e, held) + ((brick & 4) << 3) + ((brick & 2) << 2) + ((brick & 1) << 1);
+    const int held = (int)((unsigned)(room[BRICKS + n] - 1) >> 3);  // field and block
+    const int* const slot = &wp::index(blocks.slot, e, held);
+#if __CUDA_ARCH__ >= 800
+    const unsigned to = (unsigned)__cvta_generic_to_shared(room + RECORDS + n);
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" :: "r"(to), "l"(slot) : "memory");
+#else
+    room[RECORDS + n] = *slot;
+#endif
+}
+""")
+)
+def fetch_slots(blocks: Blocks, e: int):
+    """Ask for the slots of the bricks' blocks, which nobody waits for before :func:`note_records`."""
+    ...
+
+
+@wp.func_native(
+    in_group("""
+for (int n = threadIdx.x; n < room[COUNT]; n += blockDim.x) {
+    const int brick = room[BRICKS + n] - 1;
+    int record = ((brick & 4) << 3) + ((brick & 2) << 2) + ((brick & 1) << 1);
     if (num_fields > 1) {
-        const int field = held / grid.num_blocks;
+        const int held = (int)((unsigned)brick >> 3), field = held / grid.num_blocks;
         if (wp::index(blocks.fields, e, held - field * grid.num_blocks) != 1 << field) record |= SHARED;
         room[BRICKS + n] = field;
     }
-    room[RECORDS + n] = record;
+#if __CUDA_ARCH__ >= 800
+    asm volatile("cp.async.wait_all;" ::: "memory");
+#endif
+    room[RECORDS + n] = record + 64 * room[RECORDS + n];
 }
 """)
 )
 def note_records(grid: Grid, blocks: Blocks, num_fields: int, e: int):
-    """Find the record of every brick's first node, and whether its block is shared; its field takes its key's place."""
+    """Find the record of every brick's first node, and whether its block is shared; its field takes its key's place.
+
+    The slots are those that the same threads have fetched.
+    """
     ...
 
 

@@ -33,6 +33,7 @@ from piavatar_envs.mpm.group_bricks import (
     UNITS,
     WORDS,
     bricks_found,
+    fetch_slots,
     is_shared,
     list_brick,
     note_records,
@@ -130,6 +131,7 @@ def scattered(grid: Grid, step: Step, particles: Particles, moving: Moving, e: i
 @wp.func
 def sum_up(
     grid: Grid,
+    blocks: Blocks,
     sums: Sums,
     num_fields: int,
     failure: wp.array(dtype=int),
@@ -148,6 +150,8 @@ def sum_up(
         per_vector = per_unit_of(wp.where(kind == MOMENTUM, FASTEST, DRIVEN) + field)
     at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
     add_to_nodes(share, adds, bricks, s.base, s.f, at_base, s.A, per_scalar, per_vector)
+    if kind == MOMENTUM and num_fields == 1:  # nobody needs them before
+        note_records(grid, blocks, num_fields, e)
     meet()
     put_down(grid, sums, num_fields, failure, e, kind)
     meet()
@@ -199,13 +203,14 @@ def scatter_kind(
         if kind == MOMENTUM:
             if active:
                 bricks = bricks_found(place)
-            note_records(grid, blocks, num_fields, e)
+            fetch_slots(blocks, e)
             if num_fields > 1:
+                note_records(grid, blocks, num_fields, e)
                 meet()
                 tells = tells or (active and is_shared(bricks))
             if active and tells:
                 or_word(MORE, (1 << KINEMATIC) + (1 << PLACE))
-        sum_up(grid, sums, num_fields, failure, e, share, active, field, kind, bricks, s)
+        sum_up(grid, blocks, sums, num_fields, failure, e, share, active, field, kind, bricks, s)
     return active, tells, bricks
 
 
