@@ -54,13 +54,8 @@ from piavatar_envs.mpm.shared_memory import (
     thread_of_block,
     word,
 )
-from piavatar_envs.mpm.transfer import (
-    Scattered,
-    near_boundary,
-    placed,
-    prepare,
-    scatters,
-)
+from piavatar_envs.mpm.threads import environment_of
+from piavatar_envs.mpm.transfer import Scattered, near_boundary, placed, prepare, scatters
 from piavatar_envs.mpm.types import (
     PAPER,
     Blocks,
@@ -87,8 +82,8 @@ SHARES = ((16384, 42), (65536, 64), (2**31, int(THREADS)))
 @wp.func
 def begin_group(sums: Sums, num_fields: int, e: int, driven: bool):
     """Nothing has been added yet; units are not smaller than those of the sums. All threads meet later."""
-    f = thread_of_block()
-    if f < num_fields:
+    f = thread_of_block() - (THREADS - 32)  # the last warp's threads: it has few particles to wait for, or none
+    if f >= 0 and f < num_fields:
         mass = sums.mass_unit[row(e, sums.mass_unit.shape[0]), f]
         momentum = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
         set_number(MASS_UNIT + f, mass)
@@ -96,7 +91,7 @@ def begin_group(sums: Sums, num_fields: int, e: int, driven: bool):
         set_number(HEAVIEST + f, UNITS * mass)
         set_number(FASTEST + f, UNITS * momentum)
         set_number(DRIVEN + f, UNITS * momentum)
-    if f == 0:
+    if thread_of_block() == 0:
         set_word(MORE, wp.where(driven, 1 << KINEMATIC, 0))
     clear_words(NODES, FOUND - NODES)
 
@@ -169,6 +164,7 @@ def scatter_kind(
     num_fields: int,
     e: int,
     p: int,
+    field: int,
     share: int,
     adds: bool,
     near: bool,
@@ -181,12 +177,10 @@ def scatter_kind(
     """
     active = adds
     tells = near
-    field = int(0)
     momentum = float(0.0)
     bricks = known
     s = Scattered()
     if adds:
-        field = particles.field[p]
         s = scattered(grid, step, particles, moving, e, p, kind)
         if kind != PLACE:  # whose numbers are no momenta, and as sound as the masses were
             momentum = bounded(s, number(MOMENTUM_UNIT + field), failure, e)
@@ -226,6 +220,7 @@ def scatter_round(
     num_fields: int,
     e: int,
     p: int,
+    field: int,
     share: int,
     ours: bool,
     near: bool,
@@ -239,8 +234,9 @@ def scatter_round(
     while kind <= PLACE:
         adds = has_bricks and (kind == MOMENTUM or tells or (driven and kind == KINEMATIC))
         active, tells_now, found = scatter_kind(
-            grid, step, particles, moving, blocks, failure, sums, num_fields, e, p, share, adds, tells, kind, bricks
-        )
+            grid, step, particles, moving, blocks, failure, sums, num_fields, e, p, field, share, adds, tells, kind,
+            bricks,
+        )  # fmt: skip
         if kind == MOMENTUM:
             has_bricks = active
             tells = tells_now
@@ -270,24 +266,28 @@ def runs_to_grid(
     A CUDA block takes a ``share`` of particles, a thread each, one of the ``groups`` of an environment; all of its
     threads come to what they do together.
     """
-    group = wp.tid() // THREADS
-    e = group // groups
+    group = environment_of(wp.tid() // THREADS, groups)
+    e = group[0]
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
     t = thread_of_block()
-    p = (group - e * groups) * share + t
+    p = group[1] * share + t
     begin_group(sums, contact.num_fields, e, step.decoupling == PAPER)
     takes = bool(False)
     near = bool(False)
+    field = int(0)
     if t < share and p < moving.x.shape[1]:
+        x = moving.x[e, p]  # with the field asked for before it is known who takes part
+        field = particles.field[p]
         takes = scatters(blocks, moving, e, p, failure)
-    if takes:
-        near = near_boundary(grid, boundaries, e, moving.x[e, p])
+        near = near_boundary(grid, boundaries, e, x)
     first = int(0)
     size = int(share)  # of a round: all at once, or half as many where there was no room for their bricks
     while first < share:
         begin_round()
         ours = takes and t >= first and t < first + size
-        scatter_round(grid, step, particles, moving, blocks, failure, sums, contact.num_fields, e, p, share, ours, near)
+        scatter_round(
+            grid, step, particles, moving, blocks, failure, sums, contact.num_fields, e, p, field, share, ours, near
+        )
         if word(COUNT) > CAPACITY:
             size = (size + 1) // 2
         else:

@@ -70,13 +70,13 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
     m = particles.mass[row(e, particles.mass.shape[0]), p]
     affine = m * matrix_at(moving.C, e, p)
     if step.decoupling != NO_STRESS:
+        volume = particles.volume[row(e, particles.volume.shape[0]), p]
         tau = kirchhoff_stress(
             particles.material[row(e, particles.material.shape[0]), p],
             matrix_at(moving.F, e, p),
             particles.mu[row(e, particles.mu.shape[0]), p],
             particles.lam[row(e, particles.lam.shape[0]), p],
         )
-        volume = particles.volume[row(e, particles.volume.shape[0]), p]
         affine -= (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
     s.A = grid.dx * affine
     q = m * moving.u[e, p] - s.A * s.f
@@ -101,13 +101,14 @@ def momentum_bounds(s: Scattered):
 @wp.func
 def scatters(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
     """Whether a particle takes part; one that is not finite flags its environment and does not."""
+    # all of it is asked for before the first has come
+    moves = wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p]))
+    fault = wp.where(moves, 0, _NONFINITE)
     # where slots have run out since, some particles have none; no scatter sets that flag
-    if blocks.frozen[e] != 0 or (failure[e] & _BLOCKS) != 0:
-        return False
-    if not wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p])):
-        wp.atomic_or(failure, e, _NONFINITE)
-        return False
-    return True
+    stops = blocks.frozen[e] | (failure[e] & _BLOCKS)
+    if fault != 0 and stops == 0:
+        wp.atomic_or(failure, e, fault)
+    return (stops | fault) == 0
 
 
 @wp.func
