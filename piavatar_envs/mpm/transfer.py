@@ -68,7 +68,8 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
     """
     s = placed(grid, moving.x[e, p])
     m = particles.mass[row(e, particles.mass.shape[0]), p]
-    affine = m * matrix_at(moving.C, e, p)
+    C = matrix_at(moving.C, e, p)  # first used after the stress: its parameters are asked for before this has come
+    stress = wp.mat33()
     if step.decoupling != NO_STRESS:
         volume = particles.volume[row(e, particles.volume.shape[0]), p]
         tau = kirchhoff_stress(
@@ -77,7 +78,8 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
             particles.mu[row(e, particles.mu.shape[0]), p],
             particles.lam[row(e, particles.lam.shape[0]), p],
         )
-        affine -= (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
+        stress = (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
+    affine = m * C - stress
     s.A = grid.dx * affine
     q = m * moving.u[e, p] - s.A * s.f
     k = wp.vec3()
