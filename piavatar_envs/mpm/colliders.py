@@ -38,6 +38,9 @@ NEAR_PARTICLE = wp.constant(3.5)
 NEAR_BLOCK = wp.constant(7.0)
 #: Slabs of nodes closer than this may hold such a position: NEAR_PARTICLE, a stencil and a slab's half diagonal.
 NEAR_SLAB = wp.constant(8.5)
+#: Slabs of nodes closer than this may hold matter within the gate: CONTACT_GATE, half a stencil's and half a slab's
+#: diagonal.
+GATED_SLAB = wp.constant(5.3)
 
 #: A direction shorter than this [m] is round-off, and another is taken for it.
 _NO_LENGTH = wp.constant(1.0e-9)

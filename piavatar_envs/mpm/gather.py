@@ -8,7 +8,7 @@ from piavatar_envs.mpm.blocks import mark_blocks
 from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.matrices import matrix_at, store_matrix
-from piavatar_envs.mpm.stencil import base_node, grid_position, spline, stencil_inside
+from piavatar_envs.mpm.stencil import base_node, grid_position, in_same_brick, spline, stencil_inside
 from piavatar_envs.mpm.stencil_records import ends_of_line, line_of_records, slab_records
 from piavatar_envs.mpm.sums import first_of_records, read_half_from
 from piavatar_envs.mpm.types import (
@@ -135,7 +135,7 @@ def finish_gather(
         wp.atomic_or(failure, e, s.fault)
     else:
         to = base_node(grid_position(grid, s.x))
-        if to[0] != base[0] or to[1] != base[1] or to[2] != base[2]:
+        if not in_same_brick(to, base):
             mark_blocks(grid, blocks, to, particles.field[p], e, failure)
     return s
 

@@ -86,11 +86,11 @@ def physical_velocity(split: bool, total: vec8):
 
 
 @wp.func
-def slab_is_near(grid: Grid, boundaries: Boundaries, e: int, corner: wp.vec3i, local: int):
-    """Whether a boundary is near the slab of 4 x 4 nodes of node ``local`` of the block at ``corner``."""
+def slab_is_near(grid: Grid, boundaries: Boundaries, e: int, corner: wp.vec3i, local: int, reach: float):
+    """Whether a boundary is within ``reach`` [grid spacings] of the slab of 4 x 4 nodes of a block's node ``local``."""
     slab = local // SLAB_NODES
     center = node_position(grid, corner[0] + slab, corner[1], corner[2]) + grid.dx * wp.vec3(0.0, 1.5, 1.5)
-    return nearest_boundary(boundaries, e, center) < NEAR_SLAB * grid.dx
+    return nearest_boundary(boundaries, e, center) < reach * grid.dx
 
 
 @wp.func
@@ -112,7 +112,7 @@ def with_near(grid: Grid, sweep: Sweep, boundaries: Boundaries, e: int, held: wp
     first = (begin % BLOCK_NODES) // SLAB_NODES
     about = held[0] * ALL_SLABS
     for slab in range(first, first + wp.max(sweep.share // SLAB_NODES, 2)):  # a warp's turn is two slabs
-        if slab_is_near(grid, boundaries, e, corner, slab * SLAB_NODES):
+        if slab_is_near(grid, boundaries, e, corner, slab * SLAB_NODES, NEAR_SLAB):
             about = about | (1 << slab)
     return wp.vec2i(about, held[1])
 

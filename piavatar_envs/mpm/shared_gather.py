@@ -5,7 +5,15 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.gather import Gathered, Gradients, asks_kinematic, finish_gather, gather
-from piavatar_envs.mpm.shared_grid import bricks_around, line_in_bricks, node_half
+from piavatar_envs.mpm.shared_grid import (
+    KINEMATIC,
+    KINEMATIC_WORDS,
+    PHYSICAL_WORDS,
+    bricks_around,
+    kinematic_at,
+    line_in_bricks,
+    physical_at,
+)
 from piavatar_envs.mpm.shared_memory import has_bit, meet_warp, thread_of_block, threads_of_block
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
 from piavatar_envs.mpm.stores import store_particle
@@ -30,9 +38,9 @@ def kinematic_from_bricks(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec
     mean = wp.vec4()
     lines = int(9)  # not a constant: it is as short as can be
     for n in range(lines):
-        at = line_in_bricks(bricks, base, n // 3, n % 3)
+        at = line_in_bricks(bricks, base, n // 3, n % 3, KINEMATIC, KINEMATIC_WORDS)
         w = wx[n // 3] * wy[n % 3]
-        mean += w * (wz[0] * node_half(at[0], 1) + wz[1] * node_half(at[1], 1) + wz[2] * node_half(at[2], 1))
+        mean += w * (wz[0] * kinematic_at(at[0]) + wz[1] * kinematic_at(at[1]) + wz[2] * kinematic_at(at[2]))
     return mean
 
 
@@ -47,10 +55,10 @@ def physical_from_bricks(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3
         along_y = wp.vec4()
         along_z = wp.vec4()
         for j in range(3):
-            at = line_in_bricks(bricks, base, i, j)
-            second = node_half(at[1], 0)
-            third = node_half(at[2], 0)
-            line = wz[0] * node_half(at[0], 0) + wz[1] * second + wz[2] * third
+            at = line_in_bricks(bricks, base, i, j, 0, PHYSICAL_WORDS)
+            second = physical_at(at[1])
+            third = physical_at(at[2])
+            line = wz[0] * physical_at(at[0]) + wz[1] * second + wz[2] * third
             plane += wy[j] * line
             along_y += (float(j) * wy[j]) * line
             along_z += (wy[j] * wz[1]) * second + (2.0 * wy[j] * wz[2]) * third
@@ -83,13 +91,13 @@ def gather_from_bricks(
     wy = spline(f[1])
     wz = spline(f[2])
     bricks = bricks_around(grid, blocks, room, e, particles.field[p], base, 0)
-    physical = physical_from_bricks(bricks, base, wx, wy, wz)
     kinematic = Gradients()
     asked = bool(False)
     if has_bit(room.told, p):  # who is that near a boundary tells its place
         asked = asks_kinematic(grid, step, boundaries, e, x)
     if asked:
         kinematic.mean = kinematic_from_bricks(bricks, base, wx, wy, wz)
+    physical = physical_from_bricks(bricks, base, wx, wy, wz)
     return finish_gather(
         grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, base, f
     )  # fmt: skip

@@ -23,23 +23,26 @@ from piavatar_envs.mpm.types import Blocks, Grid, Room, vec8, vec8i
 
 wp.set_module_options({"enable_backward": False})
 
-#: Words of a node: mass, physical and kinematic momentum; odd, for the banks. Later: nothing, and the velocities.
+#: Words of a node: mass, physical and kinematic momentum; odd, for the banks.
 NODE_WORDS = wp.constant(7)
 #: Words of a brick of 2 x 2 x 2 nodes.
 BRICK_WORDS = wp.constant(8 * NODE_WORDS)
+#: Later a brick has the physical velocities of its eight nodes, in so many words each, for loads of 16 bytes; and from
+#: a word on, the kinematic ones.
+PHYSICAL_WORDS, KINEMATIC, KINEMATIC_WORDS = wp.constant(4), wp.constant(32), wp.constant(3)
 #: Bricks of a block of 4 x 4 x 4 nodes.
 BLOCK_BRICKS = wp.constant(8)
-#: Words of the header: bricks in use; bits FAILURE_*; not 0 if a particle tells its place; not 0 if a node holds too
-#: much; units in a field's heaviest particle; and of every field, of which
-#: there are 32 at most, for they are bits of a block's mask: the mass of its heaviest particle [kg], the speed of its
-#: fastest, and the speed that its momenta are counted at [m/s].
+#: Words of the header: bricks in use; bits FAILURE_*; particles that tell their places; not 0 if a node holds too much;
+#: units in a field's heaviest particle; how many particles are listed; and of every field, of which there are 32 at
+#: most, for they are bits of a block's mask: the mass of its heaviest particle [kg], the speed of its fastest, and the
+#: speed that its momenta are counted at [m/s].
 HEADER = wp.constant(104)
-COUNT, FAULTS, TOLD, CROWDED, UNITS = (wp.constant(n) for n in range(5))
+COUNT, FAULTS, TOLD, CROWDED, UNITS, LISTED = (wp.constant(n) for n in range(6))
 HEAVIEST, FASTEST, SPEED = (wp.constant(n) for n in (8, 40, 72))
 #: Units of mass in a field's heaviest particle, if no node holds too much.
 MOST_UNITS = wp.constant(float(2**27))
-#: No brick has this number.
-NO_BRICK = wp.constant(0xFFFF)
+#: No brick has this number; nor this one, which those have that are to be numbered.
+NO_BRICK, TOUCHED = wp.constant(0xFFFF), wp.constant(0xFFFE)
 #: What a brick's place has besides its slot and its number there: a bit for each of its planes of nodes across x.
 PLACES = wp.constant(0x4000)
 
@@ -48,29 +51,34 @@ def _native(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows the header's words and the strides of the nodes of a brick."""
     z = int(NODE_WORDS)
     strides = f"constexpr int ALONG_Z = {z}, ALONG_Y = {2 * z}, ALONG_X = {4 * z}, BRICK = {8 * z};\n"
-    return native(f"constexpr int COUNT = {int(COUNT)}, CROWDED = {int(CROWDED)};\n{strides}{cuda}", otherwise)
+    words = f"COUNT = {int(COUNT)}, CROWDED = {int(CROWDED)}, TOUCHED = {int(TOUCHED)}, PLACES = {int(PLACES)}"
+    return native(f"constexpr int {words};\n{strides}{cuda}", otherwise)
 
 
 @wp.func_native(
     _native("""
 unsigned short* const number = reinterpret_cast<unsigned short*>(room + numbers);
 unsigned short* const place = reinterpret_cast<unsigned short*>(room + places);
-if (threadIdx.x < 32) {
-    int count = 0;
-    for (int n = threadIdx.x; n - (int)threadIdx.x < most; n += 32) {
-        const bool touched = n < most && number[n] != 0;
-        const unsigned all = __ballot_sync(0xffffffffu, touched);
-        const int own = count + __popc(all & ((1u << threadIdx.x) - 1u));
-        if (n < most) number[n] = touched ? own : 0xFFFF;
-        if (touched) place[own] = n;
-        count += __popc(all);
-    }
-    if (threadIdx.x == 0) room[COUNT] = count;
+const unsigned char* const slabs = reinterpret_cast<const unsigned char*>(room + near);
+const int lane = threadIdx.x & 31;
+for (int n = threadIdx.x; n - lane < most; n += blockDim.x) {
+    const bool touched = n < most && number[n] == TOUCHED;
+    // of the four slabs of a block a brick has the first or the last two
+    const int planes = touched ? slabs[n >> 3] >> ((n & 4) >> 1) & 3 : 0;
+    const bool own = touched && (planes != 0) == by_boundaries;
+    const unsigned all = __ballot_sync(0xffffffffu, own);
+    int begin = 0;
+    if (lane == 0 && all != 0u) begin = atomicAdd(room + COUNT, __popc(all));
+    begin = __shfl_sync(0xffffffffu, begin, 0) + __popc(all & ((1u << lane) - 1u));
+    if (own) number[n] = begin, place[begin] = n + planes * PLACES;
 }
 """)
 )
-def number_bricks(numbers: int, places: int, most: int):
-    """Number the bricks whose half word is not 0, of ``most``, and note their places."""
+def number_bricks(numbers: int, places: int, near: int, most: int, by_boundaries: bool):
+    """Number the touched bricks of ``most`` that boundaries are near, or those that none is, and note their places.
+
+    All threads come here; which number a brick gets depends on who comes first, and nothing depends on that.
+    """
     ...
 
 
@@ -84,6 +92,12 @@ def bricks_of_round(room: Room, first: int):
 def node_word(room: Room, n: int):
     """Word at which node ``n`` of a round begins, eight a brick."""
     return room.bricks + BRICK_WORDS * (n // 8) + NODE_WORDS * (n % 8)
+
+
+@wp.func
+def in_marked_plane(marked: int, n: int):
+    """Whether the plane of node ``n`` of a round has its bit in the ``marked`` place of the brick."""
+    return (marked & (PLACES << ((n >> 2) & 1))) != 0
 
 
 _AROUND = """
@@ -200,23 +214,22 @@ def add_to_bricks(
     _native("""
 const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
 const float g[3] = {wx[1] + 2.0f * wx[2], wy[1] + 2.0f * wy[2], wz[1] + 2.0f * wz[2]};  // where it is, from the lowest
-#pragma unroll 1
-for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j)
-        for (int l = 0; l < 3; ++l) {
-            const int b = (px + i > 1 ? 4 : 0) + (py + j > 1 ? 2 : 0) + (pz + l > 1 ? 1 : 0);
-            const int in_plane = ((py + j) & 1) * ALONG_Y + ((pz + l) & 1) * ALONG_Z;
-            int* const node = room + bricks[b] + ((px + i) & 1) * ALONG_X + in_plane;
-            const float m = wx[i] * wy[j] * wz[l] * mass;
-            atomicAdd(node, __float2int_rn(m * ((float)i - g[0])));
-            atomicAdd(node + 1, __float2int_rn(m * ((float)j - g[1])));
-            atomicAdd(node + 2, __float2int_rn(m * ((float)l - g[2])));
-            atomicAdd(node + 3, __float2int_rn(m * seam));
-        }
+const float wi = i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2];
+for (int j = 0; j < 3; ++j)
+    for (int l = 0; l < 3; ++l) {
+        const int b = (px + i > 1 ? 4 : 0) + (py + j > 1 ? 2 : 0) + (pz + l > 1 ? 1 : 0);
+        const int in_plane = ((py + j) & 1) * ALONG_Y + ((pz + l) & 1) * ALONG_Z;
+        int* const node = room + bricks[b] + ((px + i) & 1) * ALONG_X + in_plane;
+        const float m = wi * wy[j] * wz[l] * mass;
+        atomicAdd(node, __float2int_rn(m * ((float)i - g[0])));
+        atomicAdd(node + 1, __float2int_rn(m * ((float)j - g[1])));
+        atomicAdd(node + 2, __float2int_rn(m * ((float)l - g[2])));
+        atomicAdd(node + 3, __float2int_rn(m * seam));
+    }
 """)
 )
-def add_place(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, mass: float, seam: float):
-    """Tell the nodes of a stencil where a particle is: ``w m (x_i - x_p) / dx``, and ``w m`` of a seam; in units."""
+def add_place(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, i: int, mass: float, seam: float):
+    """Tell plane ``i`` of a stencil where a particle is: ``w m (x_i - x_p) / dx``, and ``w m`` of a seam; in units."""
     ...
 
 
@@ -225,40 +238,56 @@ def add_place(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.ve
         """
 const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
 const bool far = px + i > 1, upper = py + j > 1;
-const int first = far ? (upper ? bricks[6] : bricks[4]) : (upper ? bricks[2] : bricks[0]);
-const int last = far ? (upper ? bricks[7] : bricks[5]) : (upper ? bricks[3] : bricks[1]);
-const int line = ((px + i) & 1) * ALONG_X + ((py + j) & 1) * ALONG_Y;
-const int second = pz ? last : first + ALONG_Z;
-return wp::vec3i(line + first + pz * ALONG_Z, line + second, line + last + pz * ALONG_Z);
+const int lower_z = far ? (upper ? bricks[6] : bricks[4]) : (upper ? bricks[2] : bricks[0]);
+const int upper_z = far ? (upper ? bricks[7] : bricks[5]) : (upper ? bricks[3] : bricks[1]);
+const int line = first + along * (4 * ((px + i) & 1) + 2 * ((py + j) & 1));
+const int second = pz ? upper_z : lower_z + along;
+return wp::vec3i(line + lower_z + pz * along, line + second, line + upper_z + pz * along);
 """,
         "return wp::vec3i();",
     )
 )
-def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
-    """Words of the nodes ``base + (i, j, 0..2)``."""
+def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int, first: int, along: int) -> wp.vec3i:
+    """Words of the nodes ``base + (i, j, 0..2)``, which a brick has from its word ``first``, ``along`` words each."""
     ...
 
 
 @wp.func_native(
     _native(
         """
-const float* const node = reinterpret_cast<const float*>(room + at + 3 * half);
-return wp::vec_t<4, wp::float32>(0.0f, node[1], node[2], node[3]);
+const float4 v = *reinterpret_cast<const float4*>(room + at);
+return wp::vec_t<4, wp::float32>(0.0f, v.x, v.y, v.z);
 """,
         "return wp::vec_t<4, wp::float32>();",
     )
 )
-def node_half(at: int, half: int) -> wp.vec4:
-    """Nothing, and the physical (``half`` 0) or the kinematic (1) velocity of the node at a word."""
+def physical_at(at: int) -> wp.vec4:
+    """Nothing, and the physical velocity of the node that has it at a word."""
     ...
 
 
 @wp.func_native(
-    _native("""
-float* const node = reinterpret_cast<float*>(room + at);
-for (int c = 1; c < 7; ++c) node[c] = value[c];
+    _native(
+        """
+const float* const v = reinterpret_cast<const float*>(room + at);
+return wp::vec_t<4, wp::float32>(0.0f, v[0], v[1], v[2]);
+""",
+        "return wp::vec_t<4, wp::float32>();",
+    )
+)
+def kinematic_at(at: int) -> wp.vec4:
+    """Nothing, and the kinematic velocity of the node that has it at a word."""
+    ...
+
+
+@wp.func_native(
+    _native(f"""
+float4* const v = reinterpret_cast<float4*>(room + brick + {int(PHYSICAL_WORDS)} * node);
+*v = make_float4(value[1], value[2], value[3], 0.0f);
+float* const k = reinterpret_cast<float*>(room + brick + {int(KINEMATIC)} + {int(KINEMATIC_WORDS)} * node);
+for (int c = 0; c < 3; ++c) k[c] = value[4 + c];
 """)
 )
-def set_node_record(at: int, value: vec8):
-    """Write what :func:`node_half` reads."""
+def set_velocities(brick: int, node: int, value: vec8):
+    """Write what :func:`physical_at` and :func:`kinematic_at` read, of one of the eight nodes of a brick."""
     ...

@@ -58,6 +58,12 @@ def or_word(at: int, bits: int):
     ...
 
 
+@wp.func_native(native("atomicAdd(room + at, value);"))
+def add_word(at: int, value: int):
+    """Add to word ``at``."""
+    ...
+
+
 @wp.func_native(native("return (room[bits + (n >> 5)] >> (n & 31)) & 1;", "return false;"))
 def has_bit(bits: int, n: int) -> bool:
     """Bit ``n`` of those that begin at a word."""
@@ -73,6 +79,18 @@ def half_word(at: int, n: int) -> int:
 @wp.func_native(native("reinterpret_cast<unsigned short*>(room + at)[n] = (unsigned short)value;"))
 def set_half_word(at: int, n: int, value: int):
     """Write half word ``n`` after word ``at``."""
+    ...
+
+
+@wp.func_native(native("return reinterpret_cast<const unsigned char*>(room + at)[n];", "return 0;"))
+def byte(at: int, n: int) -> int:
+    """Byte ``n`` after word ``at``."""
+    ...
+
+
+@wp.func_native(native("reinterpret_cast<unsigned char*>(room + at)[n] = (unsigned char)value;"))
+def set_byte(at: int, n: int, value: int):
+    """Write byte ``n`` after word ``at``."""
     ...
 
 
@@ -103,10 +121,37 @@ def power_of_two(x: float) -> float:
 @wp.func_native(
     native("""
 int4* const first = reinterpret_cast<int4*>(room + start);
-const int4 zero = make_int4(0, 0, 0, 0);
-for (int n = threadIdx.x; n < words / 4; n += blockDim.x) first[n] = zero;
+const int4 four = make_int4(value, value, value, value);
+for (int n = threadIdx.x; n < words / 4; n += blockDim.x) first[n] = four;
 """)
 )
+def fill_words(start: int, words: int, value: int):
+    """Write ``value`` to ``words`` words, a multiple of four; ``start`` is one, too."""
+    ...
+
+
+@wp.func
 def clear_words(start: int, words: int):
     """Zero ``words`` words, a multiple of four; ``start`` is one, too."""
+    fill_words(start, words, 0)
+
+
+@wp.func_native(
+    native("""
+unsigned short* const list = reinterpret_cast<unsigned short*>(room + at);
+const int lane = threadIdx.x & 31, warps = blockDim.x >> 5;
+for (int n = threadIdx.x >> 5; n < words; n += warps) {
+    const unsigned some = (unsigned)room[bits + n];
+    int begin = 0;
+    if (lane == 0 && some != 0u) begin = atomicAdd(room + count, __popc(some));
+    begin = __shfl_sync(0xffffffffu, begin, 0);
+    if (some >> lane & 1u) list[begin + __popc(some & ((1u << lane) - 1u))] = (unsigned short)(32 * n + lane);
+}
+""")
+)
+def list_bits(bits: int, words: int, at: int, count: int):
+    """Write which bits of ``words`` words are set to half words from word ``at`` on, in any order.
+
+    How many is added to word ``count``. All threads come here.
+    """
     ...

@@ -51,7 +51,7 @@ def suits_shared(device: str, field: np.ndarray, max_slots: int) -> bool:
     target = wp.get_device(device)
     if not (target.is_cuda and target.arch >= 80 and most_particles(field) <= MOST_PARTICLES):
         return False
-    tables = int(BLOCK_BRICKS) * max_slots + (len(field) + max_slots) // 32
+    tables = int(BLOCK_BRICKS) * max_slots + len(field) // 32 + max_slots // 4
     fits = 4 * tables < LARGE_ROOM and int(BLOCK_BRICKS) * max_slots < int(PLACES)
     return target.max_shared_memory_per_block >= 227 * 1024 and fits
 
@@ -77,7 +77,7 @@ def plan_room(model: Model) -> tuple[Room, bool]:
     room.numbers = int(HEADER)
     room.told = room.numbers + int(BLOCK_BRICKS) * model.max_slots // 2
     room.near = room.told + -(-model.num_particles // 32)
-    room.places = _multiple_of_4(room.near + -(-model.max_slots // 32))
+    room.places = _multiple_of_4(room.near + -(-model.max_slots // 4))
     room.bricks = _multiple_of_4(room.places + int(BLOCK_BRICKS) * model.max_slots // 2)
     room.capacity = ((LARGE_ROOM if large else SMALL_ROOM) - room.bricks) // int(BRICK_WORDS) - 1
     room.part = wp.array(np.array(parts, np.int32), dtype=wp.vec3i, device=model.device)

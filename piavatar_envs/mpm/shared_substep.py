@@ -14,48 +14,23 @@ from functools import cache
 import warp as wp
 
 from piavatar_envs.mpm.blocks import freeze, has_field, slots_used
-from piavatar_envs.mpm.grid import meet_boundaries, physical_velocity, place_of, total_velocity
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.shared_gather import gather_all
-from piavatar_envs.mpm.shared_grid import (
-    BLOCK_BRICKS,
-    COUNT,
-    FASTEST,
-    FAULTS,
-    MOST_UNITS,
-    NO_BRICK,
-    PLACES,
-    SPEED,
-    TOLD,
-    UNITS,
-    bricks_of_round,
-    node_word,
-    set_node_record,
-)
+from piavatar_envs.mpm.shared_grid import COUNT, FASTEST, FAULTS, MOST_UNITS, SPEED, TOLD, UNITS
+from piavatar_envs.mpm.shared_layout import lay_out
 from piavatar_envs.mpm.shared_memory import (
-    half_word,
     meet,
     number,
     or_word,
     set_number,
     thread_of_block,
-    threads_of_block,
     word,
 )
 from piavatar_envs.mpm.shared_room import LARGE_ROOM, LARGE_THREADS, SMALL_ROOM, SMALL_THREADS
-from piavatar_envs.mpm.shared_scatter import (
-    block_of,
-    lay_out,
-    record_of_place,
-    scatter_places,
-    scatter_round,
-)
-from piavatar_envs.mpm.shared_units import speed_for, unit_of_mass
-from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner
-from piavatar_envs.mpm.sums import write_record
+from piavatar_envs.mpm.shared_scatter import scatter_places, scatter_round
+from piavatar_envs.mpm.shared_units import speed_for
+from piavatar_envs.mpm.shared_update import clear_untouched, update_bricks
 from piavatar_envs.mpm.types import (
-    NO_STRESS,
-    SPLIT,
     Blocks,
     Boundaries,
     Contact,
@@ -73,78 +48,6 @@ from piavatar_envs.mpm.types import (
 )
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
-
-
-@wp.func
-def update_bricks(
-    grid: Grid,
-    step: Step,
-    boundaries: Boundaries,
-    contact: Contact,
-    blocks: Blocks,
-    room: Room,
-    sums: Sums,
-    node_velocity: wp.array2d(dtype=vec8),
-    sensors: Sensors,
-    e: int,
-    first: int,
-    writes: bool,
-):
-    """Sums of a round's nodes to velocities, see :func:`piavatar_envs.mpm.grid.update_grid`; where ``writes``, outside.
-
-    In blocks with several fields they stay sums.
-    """
-    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    for n in range(thread_of_block(), 8 * bricks_of_round(room, first), threads_of_block()):
-        at = node_word(room, n)
-        marked = half_word(room.places, first + n // 8)
-        place = marked % PLACES
-        r = record_of_place(place, n % 8)
-        held = blocks.held[e, place // BLOCK_BRICKS]
-        block = block_of(grid, contact, held)
-        f = int(0)
-        if contact.num_fields > 1:
-            f = held // grid.num_blocks
-        unit = unit_of_mass(f)
-        q = unit * number(SPEED + f)
-        s = vec8(
-            unit * float(word(at)), q * float(word(at + 1)), q * float(word(at + 2)), q * float(word(at + 3)),
-            q * float(word(at + 4)), q * float(word(at + 5)), q * float(word(at + 6)), 0.0,
-        )  # fmt: skip
-        if contact.num_fields == 1 or blocks.fields[e, block] == (1 << f):
-            near = (marked & (PLACES << ((n >> 2) & 1))) != 0
-            s = total_velocity(step, split, s)
-            if near:
-                x = place_of(grid, block_corner(grid, block), r % BLOCK_NODES)
-                s = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, s, sensors)
-            s = physical_velocity(split, s)
-            if near or contact.num_fields > 1:
-                sums.offset[e, r] = wp.vec4()
-        if writes:
-            write_record(node_velocity, e, r, s)
-        else:
-            set_node_record(at, s)
-
-
-@wp.func
-def clear_untouched(
-    grid: Grid,
-    blocks: Blocks,
-    room: Room,
-    node_velocity: wp.array2d(dtype=vec8),
-    sensors: Sensors,
-    e: int,
-    part: wp.vec3i,
-):
-    """Records of nodes that no particle touches, in slots that the fields use; nothing has touched anything yet."""
-    for r in range(thread_of_block(), BLOCK_NODES * slots_used(blocks, e), threads_of_block()):
-        slot = r // BLOCK_NODES
-        if has_field(part[2], blocks.held[e, slot] // grid.num_blocks):
-            brick = ((r >> 5) & 1) * 4 + ((r >> 3) & 1) * 2 + ((r >> 1) & 1)
-            if half_word(room.numbers, BLOCK_BRICKS * slot + brick) == NO_BRICK:
-                write_record(node_velocity, e, r, vec8())
-            if r % BLOCK_NODES == 0:
-                sensors.touched[e, slot] = 0
 
 
 @wp.func
@@ -186,9 +89,10 @@ def run_substep(
     for n in range(passes):
         first = (n % rounds) * room.capacity
         settles = n >= passes - rounds
-        if settles and word(TOLD) != 0:
+        tells = settles and word(TOLD) != 0
+        if tells:
             scatter_places(grid, particles, blocks, room, e, part, first, moved.x, sums)
-        scatter_round(grid, step, particles, moved, blocks, room, sums, failure, e, part, first)
+        scatter_round(grid, step, particles, moved, blocks, room, sums, failure, e, part, first, tells)
         if settles:
             update_bricks(grid, step, boundaries, contact, blocks, room, sums, node_velocity, sensors, e, first, writes)
         meet()

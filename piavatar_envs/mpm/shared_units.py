@@ -24,7 +24,7 @@ from piavatar_envs.mpm.shared_memory import (
     threads_of_block,
     word,
 )
-from piavatar_envs.mpm.transfer import Scattered, momentum_bounds
+from piavatar_envs.mpm.transfer import Scattered
 from piavatar_envs.mpm.types import (
     Room,
 )
@@ -50,9 +50,9 @@ def unit_of_place(field: int):
 
 
 @wp.func
-def speed_of(s: Scattered):
-    """A bound of the momenta that a particle adds, by its mass [m/s]."""
-    most = wp.max(momentum_bounds(s))
+def speed_of(s: Scattered, physical: float):
+    """A bound of the momenta that a particle adds, by its mass [m/s]; of the ``physical`` ones it is known [kg m/s]."""
+    most = physical
     for c in range(3):
         most = wp.max(most, wp.abs(s.at_base[4 + c]))
     return most / s.at_base[0]

@@ -88,6 +88,12 @@ def blocks_touched(base: wp.vec3i):
 
 
 @wp.func
+def in_same_brick(a: wp.vec3i, b: wp.vec3i):
+    """Whether two nodes lie in the same brick of 2 x 2 x 2 nodes; then the stencils at them lie in the same blocks."""
+    return (((a[0] ^ b[0]) | (a[1] ^ b[1]) | (a[2] ^ b[2])) >> 1) == 0
+
+
+@wp.func
 def node_of_block(corner: wp.vec3i, local: int):
     """Node ``local`` of the block whose lowest node is ``corner``."""
     return wp.vec3i(corner[0] + (local >> 4), corner[1] + ((local >> 2) & 3), corner[2] + (local & 3))

@@ -101,16 +101,25 @@ def momentum_bounds(s: Scattered):
 
 
 @wp.func
+def takes_part(blocks: Blocks, e: int, failure: wp.array(dtype=int)):
+    """Whether an environment goes on. Where slots have run out, some particles have none; no scatter sets that flag."""
+    return (blocks.frozen[e] | (failure[e] & _BLOCKS)) == 0
+
+
+@wp.func
+def moves_finitely(moving: Moving, e: int, p: int):
+    """Whether a particle's velocities are finite."""
+    return wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p]))
+
+
+@wp.func
 def scatters(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
     """Whether a particle takes part; one that is not finite flags its environment and does not."""
-    # all of it is asked for before the first has come
-    moves = wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p]))
-    fault = wp.where(moves, 0, _NONFINITE)
-    # where slots have run out since, some particles have none; no scatter sets that flag
-    stops = blocks.frozen[e] | (failure[e] & _BLOCKS)
-    if fault != 0 and stops == 0:
-        wp.atomic_or(failure, e, fault)
-    return (stops | fault) == 0
+    moves = moves_finitely(moving, e, p)  # asked for before it is known who takes part
+    takes = takes_part(blocks, e, failure)
+    if takes and not moves:
+        wp.atomic_or(failure, e, _NONFINITE)
+    return takes and moves
 
 
 @wp.func

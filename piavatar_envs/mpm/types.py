@@ -179,7 +179,7 @@ class Room:
 
     numbers: int  # of the bricks, two a word
     told: int  # bits of particles that tell their place
-    near: int  # bits of slots that another field or a boundary is near
+    near: int  # bytes of slots: what is near, see :mod:`piavatar_envs.mpm.shared_layout`
     places: int  # of the bricks: 8 slot + brick in block, two a word
     bricks: int
     capacity: int  # bricks that the room has; one more takes what is not of this round
