@@ -76,7 +76,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 
 #: Up to how many particles of an environment a group has so many: smaller worlds fill a GPU with small groups only. The
 #: numbers must not depend on the batch: units do on the group.
-SHARES = ((16384, 42), (65536, 64), (2**31, int(THREADS)))
+SHARES = ((16384, 21), (65536, 64), (2**31, int(THREADS)))
 
 
 @wp.func

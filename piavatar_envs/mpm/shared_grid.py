@@ -100,18 +100,27 @@ def in_marked_plane(marked: int, n: int):
     return (marked & (PLACES << ((n >> 2) & 1))) != 0
 
 
+# of two bricks along an axis the upper one lies in the next block if the lower one is a block's second; a thread asks
+# for no slot twice: reads of a warp in many places are what keeps a multiprocessor busy
 _AROUND = """
-const int* const slots = &wp::index(blocks.slot, e, field * grid.num_blocks);
 const int ny = grid.blocks[1], nz = grid.blocks[2];
-const int of_x[2] = {(base[0] >> 2) * ny, ((base[0] + 2) >> 2) * ny};
-const int of_y[2] = {base[1] >> 2, (base[1] + 2) >> 2}, of_z[2] = {base[2] >> 2, (base[2] + 2) >> 2};
-const int in_x[2] = {(base[0] & 2) << 1, 4 - ((base[0] & 2) << 1)}, in_y[2] = {base[1] & 2, 2 - (base[1] & 2)};
-const int in_z[2] = {(base[2] & 2) >> 1, 1 - ((base[2] & 2) >> 1)};
+const int* const slots =
+    &wp::index(blocks.slot, e, field * grid.num_blocks + ((base[0] >> 2) * ny + (base[1] >> 2)) * nz + (base[2] >> 2));
+const bool next_x = base[0] & 2, next_y = base[1] & 2, next_z = base[2] & 2;
+int asked[8] = {};
+#pragma unroll
+for (int b = 0; b < 8; ++b)
+    if ((!(b & 4) || next_x) && (!(b & 2) || next_y) && (!(b & 1) || next_z))
+        asked[b] = slots[(b & 4 ? ny * nz : 0) + (b & 2 ? nz : 0) + (b & 1)];
+const int in_x = (base[0] & 2) << 1, in_y = base[1] & 2, in_z = (base[2] & 2) >> 1;
 wp::vec_t<8, wp::int32> n;
-for (int i = 0; i < 2; ++i)
-    for (int j = 0; j < 2; ++j)
-        for (int k = 0; k < 2; ++k)
-            n[4 * i + 2 * j + k] = 8 * slots[(of_x[i] + of_y[j]) * nz + of_z[k]] + in_x[i] + in_y[j] + in_z[k];
+#pragma unroll
+for (int b = 0; b < 8; ++b) {
+    if ((b & 4) && !next_x) asked[b] = asked[b ^ 4];
+    else if ((b & 2) && !next_y) asked[b] = asked[b ^ 2];
+    else if ((b & 1) && !next_z) asked[b] = asked[b ^ 1];
+    n[b] = 8 * asked[b] + (b & 4 ? 4 - in_x : in_x) + (b & 2 ? 2 - in_y : in_y) + (b & 1 ? 1 - in_z : in_z);
+}
 """
 
 
