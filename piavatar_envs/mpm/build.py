@@ -13,7 +13,7 @@ from piavatar_envs.mpm.boundaries import Collider, make_boundaries
 from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.materials import lame_parameters, material_index
 from piavatar_envs.mpm.memory import bound_slots, check_memory
-from piavatar_envs.mpm.shared_room import MOST_PARTICLES, most_particles, suits_shared
+from piavatar_envs.mpm.shared_room import MOST_LISTED, MOST_PARTICLES, most_particles, suits_shared
 from piavatar_envs.mpm.stencil import BLOCK
 from piavatar_envs.mpm.types import (
     DECOUPLING,
@@ -228,8 +228,8 @@ def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slot
     if scatter == "shared" and not shared:
         raise ValueError(
             f"scatter='shared' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
-            f"particles a body (here {most_particles(field)}), few slots ({max_slots}) and another decoupling than "
-            f"'paper' ({decoupling!r}); {target} takes 'runs'"
+            f"particles a body (here {most_particles(field)}), {MOST_LISTED} in all ({len(field)}), few slots "
+            f"({max_slots}) and another decoupling than 'paper' ({decoupling!r}); {target} takes 'runs'"
         )
     return scatter
 

@@ -10,7 +10,7 @@ none of the field's particles exceeds, a power of two, in every substep another:
 and what a particle adds is rounded as a floating-point number would be.
 
 Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; for every brick of every slot a half word, its
-number; a bit for every particle; the bricks' own places; bricks of seven words a node.
+number; a bit for every particle; a byte for every slot; the bricks' own places; bricks of seven words a node.
 """
 
 from __future__ import annotations

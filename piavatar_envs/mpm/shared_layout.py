@@ -34,7 +34,7 @@ from piavatar_envs.mpm.types import Blocks, Boundaries, Contact, Grid, Particles
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
-#: Bit of a slot of which particles may tell their places; those of its four slabs come before.
+#: Bit of a slot whose particles may tell their places; the bits of its four slabs come before.
 MAY_TELL = wp.constant(16)
 
 

@@ -18,7 +18,7 @@ def native(cuda: str, otherwise: str = "") -> str:
 
 @wp.func_native(native("__syncwarp();"))
 def meet_warp():
-    """Wait for the other threads of the warp: where not all of them have come, they do one after the other."""
+    """Wait for the other threads of the warp; all that have not ended come here."""
     ...
 
 

@@ -20,6 +20,8 @@ SMALL_THREADS, LARGE_THREADS = 320, 640
 MOST_SLOTS_SMALL = 210
 #: Particles of a part up to which its CUDA block has no more to do than others have time for.
 MOST_PARTICLES = 8192
+#: Particles of an environment, which are listed in half words.
+MOST_LISTED = 2**16
 
 
 def parts_of(field: np.ndarray) -> list[tuple[int, int, int]]:
@@ -49,7 +51,8 @@ def most_particles(field: np.ndarray) -> int:
 def suits_shared(device: str, field: np.ndarray, max_slots: int) -> bool:
     """Whether environments with such particles may have CUDA blocks of their own, and enough shared memory."""
     target = wp.get_device(device)
-    if not (target.is_cuda and target.arch >= 80 and most_particles(field) <= MOST_PARTICLES):
+    few = most_particles(field) <= MOST_PARTICLES and len(field) <= MOST_LISTED
+    if not (target.is_cuda and target.arch >= 80 and few):
         return False
     tables = int(BLOCK_BRICKS) * max_slots + len(field) // 32 + max_slots // 4
     fits = 4 * tables < LARGE_ROOM and int(BLOCK_BRICKS) * max_slots < int(PLACES)

@@ -99,15 +99,16 @@ def scatter_places(
     # out
     sums: Sums,
 ):
-    """Where particles are, to the nodes' offsets, from those that tell it; the bricks are as clear as before.
+    """Where particles are, to the nodes' offsets, from those that tell it; the bricks are left clear.
 
-    Of one field only the nodes are told that a boundary is near; the grid pass forgets what they have been told.
+    Where there is one field, only nodes near a boundary are told; the grid pass forgets what they have been told.
     """
     t = thread_of_block()
     several = room.speed.shape[1] > 1
     clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
     meet()
-    # they are few, and would leave most threads of many warps idle: where there is room for it, they are listed
+    # they are few, and would leave most threads of many warps idle: where there is room behind the bricks, they are
+    # listed, which is in one round only, for all but the last are full
     listed = room.bricks + BRICK_WORDS * bricks_of_round(room, first)
     if word(TOLD) <= 2 * (room.bricks + BRICK_WORDS * room.capacity - listed):
         list_bits(room.told, room.near - room.told, listed, LISTED)

@@ -180,7 +180,7 @@ class Room:
     numbers: int  # of the bricks, two a word
     told: int  # bits of particles that tell their place
     near: int  # bytes of slots: what is near, see :mod:`piavatar_envs.mpm.shared_layout`
-    places: int  # of the bricks: 8 slot + brick in block, two a word
+    places: int  # of the bricks: 8 slot + brick in block, and bits of planes near boundaries, two a word
     bricks: int
     capacity: int  # bricks that the room has; one more takes what is not of this round
     part: wp.array(dtype=wp.vec3i)  # (parts,) first particle, one after the last, bits of the fields that are theirs

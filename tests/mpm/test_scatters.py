@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import warp as wp
 
 from piavatar_envs.mpm import groups
 from piavatar_envs.mpm.memory import estimate_slots
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.shared_room import parts_of
+from piavatar_envs.mpm.shared_room import parts_of, suits_shared
 from piavatar_envs.mpm.solver import record_marks, record_scatter
 from piavatar_envs.mpm.sums import units
 from piavatar_envs.mpm.types import SCATTERS
@@ -188,6 +191,23 @@ def test_a_large_room_gives_the_same(simulate, equal, device, monkeypatch):
 )
 def test_parts_share_no_field(field, parts):
     assert parts_of(np.array(field)) == parts
+
+
+@pytest.mark.parametrize(
+    ("bodies", "particles", "slots", "suits"),
+    [
+        (1, 8192, 300, True),
+        (1, 8193, 300, False),
+        (8, 8000, 1000, True),
+        (9, 8000, 1000, False),
+        (1, 2000, 3000, False),
+    ],
+)
+def test_what_shared_memory_holds(monkeypatch, bodies, particles, slots, suits):
+    """Bodies that a CUDA block has time for, particles that half words count, slots that there is room for."""
+    h200 = SimpleNamespace(is_cuda=True, arch=90, max_shared_memory_per_block=227 * 1024)
+    monkeypatch.setattr(wp, "get_device", lambda name: h200)
+    assert suits_shared("cuda:0", np.repeat(np.arange(bodies), particles), slots) is suits
 
 
 @pytest.mark.parametrize("copies", [60, 80, 100, 140, 300])
