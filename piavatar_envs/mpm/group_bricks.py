@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.shared_memory import native
+from piavatar_envs.mpm.shared_memory import APPEND, native
 from piavatar_envs.mpm.transfer import Scattered
 from piavatar_envs.mpm.types import Blocks, Grid
 
@@ -95,17 +95,15 @@ def raise_most(takes: bool, field: int, kind: int, s: Scattered, momentum: float
 
 @wp.func_native(
     in_group(
-        """
+        APPEND
+        + """
 const int lane = threadIdx.x & 31, i = base[0], j = base[1], k = base[2];
 const unsigned block = field * grid.num_blocks + ((i >> 2) * grid.blocks[1] + (j >> 2)) * grid.blocks[2] + (k >> 2);
 const unsigned own = takes ? 8u * block + ((i & 2) << 1) + (j & 2) + ((k & 2) >> 1) + 1 : 0u;  // 0 is for nobody's
 if (!__any_sync(ALL, takes)) return 0;
 const int first = __ffs(__match_any_sync(ALL, own)) - 1;
 const bool is_first = takes && first == lane;
-const unsigned firsts = __ballot_sync(ALL, is_first);
-int begin = 0;
-if (lane == 0) begin = atomicAdd(room + LISTED, __popc(firsts));
-const int place = __shfl_sync(ALL, begin, 0) + __popc(firsts & ((1u << first) - 1u));
+const int place = append(room + LISTED, __ballot_sync(ALL, is_first), first);
 if (is_first) room[HANDED + place] = (int)own;
 return place;
 """,

@@ -51,14 +51,22 @@ def fault_of_sums(s: Scattered, unit: float):
 
 
 @wp.func
+def fault_within(s: Scattered, bounds: wp.vec3, unit: float):
+    """:func:`fault_of_sums`, asked for only where the ``bounds`` of what a particle has leave that open."""
+    fault = int(0)
+    if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:  # of what is no number, either
+        fault = fault_of_sums(s, unit)
+    return fault
+
+
+@wp.func
 def bounded(s: Scattered, unit: float, failure: wp.array(dtype=int), e: int):
     """The most momentum that a particle has anywhere in its stencil [kg m/s]; -1 if it must not be added up."""
     bounds = momentum_bounds(s)
-    if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:  # of what is no number, either
-        fault = fault_of_sums(s, unit)
-        if fault != 0:
-            wp.atomic_or(failure, e, fault)
-            return -1.0
+    fault = fault_within(s, bounds, unit)
+    if fault != 0:
+        wp.atomic_or(failure, e, fault)
+        return -1.0
     return wp.max(bounds)
 
 

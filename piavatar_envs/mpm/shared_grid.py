@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.shared_memory import native, word
+from piavatar_envs.mpm.shared_memory import APPEND, native, word
 from piavatar_envs.mpm.transfer import Scattered
 from piavatar_envs.mpm.types import Blocks, Grid, Room, vec8, vec8i
 
@@ -56,7 +56,9 @@ def _native(cuda: str, otherwise: str = "") -> str:
 
 
 @wp.func_native(
-    _native("""
+    _native(
+        APPEND
+        + """
 unsigned short* const number = reinterpret_cast<unsigned short*>(room + numbers);
 unsigned short* const place = reinterpret_cast<unsigned short*>(room + places);
 const unsigned char* const slabs = reinterpret_cast<const unsigned char*>(room + near);
@@ -66,13 +68,11 @@ for (int n = threadIdx.x; n - lane < most; n += blockDim.x) {
     // of the four slabs of a block a brick has the first or the last two
     const int planes = touched ? slabs[n >> 3] >> ((n & 4) >> 1) & 3 : 0;
     const bool own = touched && (planes != 0) == by_boundaries;
-    const unsigned all = __ballot_sync(0xffffffffu, own);
-    int begin = 0;
-    if (lane == 0 && all != 0u) begin = atomicAdd(room + COUNT, __popc(all));
-    begin = __shfl_sync(0xffffffffu, begin, 0) + __popc(all & ((1u << lane) - 1u));
-    if (own) number[n] = begin, place[begin] = n + planes * PLACES;
+    const int next = append(room + COUNT, __ballot_sync(0xffffffffu, own), lane);
+    if (own) number[n] = next, place[next] = n + planes * PLACES;
 }
-""")
+"""
+    )
 )
 def number_bricks(numbers: int, places: int, near: int, most: int, by_boundaries: bool):
     """Number the touched bricks of ``most`` that boundaries are near, or those that none is, and note their places.

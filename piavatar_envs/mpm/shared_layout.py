@@ -58,6 +58,21 @@ def record_of_place(place: int, node: int):
 
 
 @wp.func
+def place_of_record(r: int):
+    """Place of the brick that a record's node is in, see :func:`record_of_place`."""
+    return BLOCK_BRICKS * (r // BLOCK_NODES) + ((r >> 5) & 1) * 4 + ((r >> 3) & 1) * 2 + ((r >> 1) & 1)
+
+
+@wp.func
+def end_of_part(blocks: Blocks, failure: wp.array(dtype=int), e: int, part: wp.vec3i):
+    """One after the last particle of a part that takes part: where the environment does not, they may be anywhere."""
+    end = part[1]
+    if not takes_part(blocks, e, failure):
+        end = part[0]
+    return end
+
+
+@wp.func
 def note_boundaries(grid: Grid, boundaries: Boundaries, contact: Contact, blocks: Blocks, room: Room, e: int):
     """Find the slabs of every slot that a boundary is near, and whether its particles may tell their places."""
     for slot in range(thread_of_block(), slots_used(blocks, e), threads_of_block()):
@@ -74,7 +89,7 @@ def note_boundaries(grid: Grid, boundaries: Boundaries, contact: Contact, blocks
 
 
 @wp.func
-def touch(
+def touch_bricks(
     grid: Grid,
     particles: Particles,
     boundaries: Boundaries,
@@ -99,7 +114,7 @@ def touch(
 
 
 @wp.func
-def touch_all(
+def touch_with_all(
     grid: Grid,
     particles: Particles,
     boundaries: Boundaries,
@@ -111,7 +126,7 @@ def touch_all(
     end: int,
     x: wp.array2d(dtype=wp.vec3),
 ):
-    """:func:`touch` with the particles from ``begin`` to ``end``, three of a thread at a time: less to wait for."""
+    """:func:`touch_bricks` with the particles from ``begin`` to ``end``, three of a thread at a time."""
     r = row(e, particles.mass.shape[0])
     step = threads_of_block()
     for p in range(begin + thread_of_block(), end, 3 * step):
@@ -125,11 +140,11 @@ def touch_all(
         n = places_around(grid, blocks, e, f[0], base_node(grid_position(grid, at)))
         n_second = places_around(grid, blocks, e, f[1], base_node(grid_position(grid, at_second)))
         n_third = places_around(grid, blocks, e, f[2], base_node(grid_position(grid, at_third)))
-        touch(grid, particles, boundaries, contact, blocks, room, e, p, at, m[0], f[0], n)
+        touch_bricks(grid, particles, boundaries, contact, blocks, room, e, p, at, m[0], f[0], n)
         if p + step < end:
-            touch(grid, particles, boundaries, contact, blocks, room, e, second, at_second, m[1], f[1], n_second)
+            touch_bricks(grid, particles, boundaries, contact, blocks, room, e, second, at_second, m[1], f[1], n_second)
         if p + 2 * step < end:
-            touch(grid, particles, boundaries, contact, blocks, room, e, third, at_third, m[2], f[2], n_third)
+            touch_bricks(grid, particles, boundaries, contact, blocks, room, e, third, at_third, m[2], f[2], n_third)
 
 
 @wp.func
@@ -155,10 +170,8 @@ def lay_out(
     meet()
     note_boundaries(grid, boundaries, contact, blocks, room, e)
     meet()
-    end = part[1]
-    if not takes_part(blocks, e, failure):
-        end = part[0]  # they may be anywhere
-    touch_all(grid, particles, boundaries, contact, blocks, room, e, part[0], end, x)
+    end = end_of_part(blocks, failure, e, part)
+    touch_with_all(grid, particles, boundaries, contact, blocks, room, e, part[0], end, x)
     meet()
     most = BLOCK_BRICKS * slots_used(blocks, e)
     number_bricks(room.numbers, room.places, room.near, most, False)

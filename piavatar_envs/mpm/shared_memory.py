@@ -16,6 +16,16 @@ def native(cuda: str, otherwise: str = "") -> str:
     return f"#if defined(__CUDA_ARCH__)\n{start}{cuda}\n#else\n{otherwise}\n#endif\n"
 
 
+#: In CUDA: the place of thread ``of`` among those of a warp in ``all``, which count on in a word, one after the other.
+APPEND = """
+auto append = [](int* count, unsigned all, int of) {
+    int begin = 0;
+    if ((threadIdx.x & 31) == 0 && all != 0u) begin = atomicAdd(count, __popc(all));
+    return __shfl_sync(0xffffffffu, begin, 0) + __popc(all & ((1u << of) - 1u));
+};
+"""
+
+
 @wp.func_native(native("__syncwarp();"))
 def meet_warp():
     """Wait for the other threads of the warp; all that have not ended come here."""
@@ -137,17 +147,18 @@ def clear_words(start: int, words: int):
 
 
 @wp.func_native(
-    native("""
+    native(
+        APPEND
+        + """
 unsigned short* const list = reinterpret_cast<unsigned short*>(room + at);
 const int lane = threadIdx.x & 31, warps = blockDim.x >> 5;
 for (int n = threadIdx.x >> 5; n < words; n += warps) {
     const unsigned some = (unsigned)room[bits + n];
-    int begin = 0;
-    if (lane == 0 && some != 0u) begin = atomicAdd(room + count, __popc(some));
-    begin = __shfl_sync(0xffffffffu, begin, 0);
-    if (some >> lane & 1u) list[begin + __popc(some & ((1u << lane) - 1u))] = (unsigned short)(32 * n + lane);
+    const int place = append(room + count, some, lane);
+    if (some >> lane & 1u) list[place] = (unsigned short)(32 * n + lane);
 }
-""")
+"""
+    )
 )
 def list_bits(bits: int, words: int, at: int, count: int):
     """Write which bits of ``words`` words are set to half words from word ``at`` on, in any order.

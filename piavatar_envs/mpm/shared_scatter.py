@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.runs import MOST_UNITS, fault_of_sums
+from piavatar_envs.mpm.runs import fault_within
 from piavatar_envs.mpm.shared_grid import (
     BLOCK_BRICKS,
     BRICK_WORDS,
@@ -25,7 +25,7 @@ from piavatar_envs.mpm.shared_grid import (
     in_marked_plane,
     node_word,
 )
-from piavatar_envs.mpm.shared_layout import record_of_place
+from piavatar_envs.mpm.shared_layout import end_of_part, record_of_place
 from piavatar_envs.mpm.shared_memory import (
     clear_words,
     half_word,
@@ -41,8 +41,8 @@ from piavatar_envs.mpm.shared_memory import (
     word,
 )
 from piavatar_envs.mpm.shared_units import correct_units, speed_of, speeds_known, sums_hold, unit_of_mass, unit_of_place
-from piavatar_envs.mpm.stencil import base_node, grid_position, spline
-from piavatar_envs.mpm.transfer import momentum_bounds, moves_finitely, prepare, takes_part
+from piavatar_envs.mpm.stencil import spline
+from piavatar_envs.mpm.transfer import momentum_bounds, moves_finitely, placed, prepare
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -78,12 +78,10 @@ def scatter_place(
 ):
     """Where a particle is, to the bricks that a plane of its stencil is in."""
     field = particles.field[p]
-    xg = grid_position(grid, x[e, p])
-    base = base_node(xg)
-    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
+    s = placed(grid, x[e, p])
     m = particles.mass[row(e, particles.mass.shape[0]), p] / unit_of_place(field)
-    n = bricks_around(grid, blocks, room, e, field, base, first)
-    add_place(n, base, spline(f[0]), spline(f[1]), spline(f[2]), plane, m, particles.seam[p])
+    n = bricks_around(grid, blocks, room, e, field, s.base, first)
+    add_place(n, s.base, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), plane, m, particles.seam[p])
 
 
 @wp.func
@@ -160,18 +158,13 @@ def scatter_momenta(
     if clears:
         clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
     meet()
-    end = part[1]
-    if not takes_part(blocks, e, failure):
-        end = part[0]
-    for p in range(part[0] + t, end, threads_of_block()):
+    for p in range(part[0] + t, end_of_part(blocks, failure, e, part), threads_of_block()):
         field = particles.field[p]
         s = prepare(grid, step, particles, moving, e, p, has_bit(room.told, p))  # asks for all that it needs at once
         if moves_finitely(moving, e, p):
             bounds = momentum_bounds(s)
             unit = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
-            fault = int(0)
-            if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:
-                fault = fault_of_sums(s, unit)
+            fault = fault_within(s, bounds, unit)
             speed = speed_of(s, wp.max(bounds))
             if fault != 0:
                 wp.atomic_or(failure, e, fault)

@@ -17,7 +17,7 @@ from piavatar_envs.mpm.shared_grid import (
     node_word,
     set_velocities,
 )
-from piavatar_envs.mpm.shared_layout import block_of, record_of_place
+from piavatar_envs.mpm.shared_layout import block_of, place_of_record, record_of_place
 from piavatar_envs.mpm.shared_memory import half_word, meet_warp, number, thread_of_block, threads_of_block, word
 from piavatar_envs.mpm.shared_units import unit_of_mass
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner
@@ -139,8 +139,7 @@ def clear_untouched(
     for r in range(thread_of_block(), BLOCK_NODES * slots_used(blocks, e), threads_of_block()):
         slot = r // BLOCK_NODES
         if has_field(part[2], blocks.held[e, slot] // grid.num_blocks):
-            brick = ((r >> 5) & 1) * 4 + ((r >> 3) & 1) * 2 + ((r >> 1) & 1)
-            if half_word(room.numbers, BLOCK_BRICKS * slot + brick) == NO_BRICK:
+            if half_word(room.numbers, place_of_record(r)) == NO_BRICK:
                 write_record(node_velocity, e, r, vec8())
             if r % BLOCK_NODES == 0:
                 sensors.touched[e, slot] = 0
