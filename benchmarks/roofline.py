@@ -153,6 +153,7 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
     formulas = {
         "particles_to_grid": scatter,
         "runs_to_grid": scatter,
+        "singles_to_grid": scatter,
         # sums in, sums cleared, velocities out
         "update_grid": 2 * sums + nodes * NODE_BYTES,
         # x, F, vk, spin and physical velocities in; x, u, C, F out
@@ -174,5 +175,5 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
 
 def kernel_additions(kernel: str, counts: Counts) -> int | None:
     """Records that one launch of a kernel adds to nodes if it adds each particle's by itself; None for others."""
-    scatters = ("particles_to_grid", "runs_to_grid", *SUBSTEPS, *NODE_PASSES)
+    scatters = ("particles_to_grid", "runs_to_grid", "singles_to_grid", *SUBSTEPS, *NODE_PASSES)
     return counts.particles * STENCIL if kernel in scatters else None

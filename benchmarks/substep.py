@@ -29,7 +29,7 @@ REBUILT_MS = {"10475x1": 0.286, "10475x4": 0.888, "300000x1": 1.315, "300000x4":
 #: At most, on an H200: a fifteenth of that.
 EXPECTED_MS = {"10475x1": 0.018, "10475x4": 0.045, "300000x1": 0.08, "300000x4": 0.28}
 #: Scatters that add up in fixed point, and the same in floating point, which no run repeats bit for bit.
-FLOATING = {"runs": "runs_float"}
+FLOATING = {name: f"{name}_float" for name in ("runs", "singles")}
 STAGE_RUNS = 3  # control steps launched kernel by kernel
 LEAST_MOTION = 1e-4  # mean way of the particles in the first control step that counts as moving [m]
 

@@ -26,6 +26,9 @@ from piavatar_envs.mpm.types import (
 
 #: Largest stable ``c dt / dx`` that was measured (0.84 to 1.04, less near incompressibility).
 CFL_STABLE = 0.84
+#: Particles for every slot up to which a large body's are added to the nodes one by one: a skin has some three
+#: particles a slot, of which a body at rest fills three of five, and an interior more than thirty.
+SPARSE = 8
 
 
 @dataclass(frozen=True)
@@ -167,8 +170,8 @@ def build_model(
     ``num_substeps`` is chosen from the CFL limit unless given; the limit comes from the points, or from
     ``sound_speed`` [m/s] where parameters will be randomised. ``max_slots`` bounds the blocks with matter of an
     environment, each field's counted; if not given, no state can exceed it. ``scatter`` is a key of ``SCATTERS``;
-    if not given, ``"shared"`` on a GPU whose shared memory holds an environment's grid, ``"runs"`` on one that can
-    match within a warp, else ``"plain"``.
+    if not given, ``"shared"`` on a GPU whose shared memory holds an environment's grid; on another one that can match
+    within a warp, ``"singles"`` where few particles share a block of nodes, else ``"runs"``; else ``"plain"``.
 
     Raises:
         ValueError: bad material, unstable time step, a scatter that the device does not know, or more memory than it
@@ -220,7 +223,8 @@ def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slot
     # in shared memory nobody asks for the gradient of the kinematic velocity
     shared = decoupling != "paper" and suits_shared(device, field, max_slots)
     if scatter is None:
-        return "shared" if shared else "runs" if matches else "plain"
+        large = "singles" if len(field) <= SPARSE * max_slots else "runs"
+        return "shared" if shared else large if matches else "plain"
     if scatter not in SCATTERS:
         raise ValueError(f"unknown scatter {scatter!r}; use one of {', '.join(SCATTERS)}")
     if scatter != "plain" and not matches:

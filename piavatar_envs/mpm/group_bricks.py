@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.mpm.runs import KINEMATIC, PLACE
 from piavatar_envs.mpm.shared_memory import APPEND, native
 from piavatar_envs.mpm.transfer import Scattered
 from piavatar_envs.mpm.types import Blocks, Grid
@@ -53,9 +54,6 @@ WORDS = wp.constant(int(HANDED) + 21 * int(MOST_SPLIT))
 UNITS = wp.constant(float(2**25))
 #: What a brick's record has besides it, if there is matter of another field in its block.
 SHARED = wp.constant(1 << 30)
-#: What is added up: mass and momentum; kinematic momentum; places and seams.
-MOMENTUM, KINEMATIC, PLACE = (wp.constant(n) for n in range(3))
-
 
 #: The least power of two that is not below the positive number in a word.
 POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fffff) & 0x7f800000); };"
@@ -64,8 +62,9 @@ POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fff
 def in_group(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
     names = "CAPACITY TABLE_BITS TABLE COUNT LISTED HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT KEYS NUMBERS BRICKS"
-    names += " RECORDS MASSIVE NODES ALONG FOUND HANDED MOST_SPLIT SHARED KINEMATIC PLACE"
-    known = ", ".join(f"{name} = {int(globals()[name])}" for name in names.split())
+    names += " RECORDS MASSIVE NODES ALONG FOUND HANDED MOST_SPLIT SHARED"
+    values = {name: globals()[name] for name in names.split()} | {"KINEMATIC": KINEMATIC, "PLACE": PLACE}
+    known = ", ".join(f"{name} = {int(value)}" for name, value in values.items())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
 
 

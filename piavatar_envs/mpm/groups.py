@@ -20,15 +20,12 @@ from piavatar_envs.mpm.group_bricks import (
     FOUND,
     HEAVIEST,
     KEYS,
-    KINEMATIC,
     LISTED,
     MASS_UNIT,
-    MOMENTUM,
     MOMENTUM_UNIT,
     MORE,
     NODES,
     NUMBERS,
-    PLACE,
     THREADS,
     UNITS,
     WORDS,
@@ -43,7 +40,7 @@ from piavatar_envs.mpm.group_bricks import (
 )
 from piavatar_envs.mpm.group_sums import add_to_nodes, put_down
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import bounded
+from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattered
 from piavatar_envs.mpm.shared_memory import (
     clear_words,
     meet,
@@ -55,7 +52,7 @@ from piavatar_envs.mpm.shared_memory import (
     word,
 )
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.transfer import Scattered, near_boundary, placed, prepare, scatters
+from piavatar_envs.mpm.transfer import Scattered, near_boundary, scatters
 from piavatar_envs.mpm.types import (
     PAPER,
     Blocks,
@@ -67,7 +64,6 @@ from piavatar_envs.mpm.types import (
     Step,
     Sums,
     row,
-    vec8,
 )
 
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls: a
@@ -105,22 +101,6 @@ def begin_round():
         set_word(COUNT, 0)
         set_word(LISTED, 0)
     meet()
-
-
-@wp.func
-def scattered(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, kind: int):
-    """Mass and momentum of a particle, how it is driven, or its place ``w m (x_i - x_p) / dx`` and a seam's ``w m``."""
-    if kind == MOMENTUM:
-        return prepare(grid, step, particles, moving, e, p, False)
-    s = placed(grid, moving.x[e, p])
-    m = particles.mass[row(e, particles.mass.shape[0]), p]
-    if kind == KINEMATIC:
-        k = m * moving.vk[e, p]
-        s.at_base = vec8(0.0, k[0], k[1], k[2], 0.0, 0.0, 0.0, 0.0)
-    else:
-        s.at_base = vec8(particles.seam[p] * m, -m * s.f[0], -m * s.f[1], -m * s.f[2], 0.0, 0.0, 0.0, 0.0)
-        s.A = wp.diag(wp.vec3(m))
-    return s
 
 
 @wp.func

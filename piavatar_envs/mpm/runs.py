@@ -1,4 +1,7 @@
-"""The gather of a GPU for large bodies, and what its scatters must not add up; see :mod:`piavatar_envs.mpm.groups`."""
+"""The gather of a GPU for large bodies, and what its two scatters add up and what not.
+
+These are :mod:`piavatar_envs.mpm.groups` and, where particles are far apart, :mod:`piavatar_envs.mpm.singles`.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from piavatar_envs.mpm.sensing import sense_gathered
 from piavatar_envs.mpm.stencil import grid_position
 from piavatar_envs.mpm.stores import store_particle
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.transfer import Scattered, momentum_bounds
+from piavatar_envs.mpm.transfer import Scattered, momentum_bounds, placed, prepare
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -20,6 +23,7 @@ from piavatar_envs.mpm.types import (
     Particles,
     Sensors,
     Step,
+    row,
     vec8,
 )
 
@@ -31,8 +35,26 @@ _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _CFL = wp.constant(FAILURE_CFL)
 #: Units of momentum that a particle may have: those of 4,000 full cells that move a grid spacing in a time step.
 MOST_UNITS = wp.constant(float(2**48))
+#: What is added up: mass and momentum; kinematic momentum; places and seams.
+MOMENTUM, KINEMATIC, PLACE = (wp.constant(n) for n in range(3))
 #: Threads of a CUDA block of the gather.
 THREADS = 128
+
+
+@wp.func
+def scattered(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, kind: int):
+    """Mass and momentum of a particle, how it is driven, or its place ``w m (x_i - x_p) / dx`` and a seam's ``w m``."""
+    if kind == MOMENTUM:
+        return prepare(grid, step, particles, moving, e, p, False)
+    s = placed(grid, moving.x[e, p])
+    m = particles.mass[row(e, particles.mass.shape[0]), p]
+    if kind == KINEMATIC:
+        k = m * moving.vk[e, p]
+        s.at_base = vec8(0.0, k[0], k[1], k[2], 0.0, 0.0, 0.0, 0.0)
+    else:
+        s.at_base = vec8(particles.seam[p] * m, -m * s.f[0], -m * s.f[1], -m * s.f[2], 0.0, 0.0, 0.0, 0.0)
+        s.A = wp.diag(wp.vec3(m))
+    return s
 
 
 @wp.func

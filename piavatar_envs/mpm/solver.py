@@ -14,6 +14,7 @@ from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
 from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
+from piavatar_envs.mpm.singles import record_singles
 from piavatar_envs.mpm.sweep import THREADS, Sweep, plan_shared_sweep, plan_sweep
 from piavatar_envs.mpm.transfer import particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
@@ -72,7 +73,7 @@ def _senses(model: Model) -> bool:
 
 def _senses_apart(model: Model) -> bool:
     """Whether particles sense contact in a launch of its own: the gather of large bodies on a GPU does it, too."""
-    return model.scatter not in ("runs", "runs_float")
+    return model.scatter in ("plain", "shared")
 
 
 def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -113,6 +114,8 @@ def record_scatter(program: Program, model: Model, state: State, scratch: Scratc
     inputs = [m.grid, m.step, m.particles, m.boundaries, m.contact, _moving(s), scratch.blocks]
     if m.scatter == "plain":
         program.launch(particles_to_grid, s.x.shape, inputs, [s.failure, scratch.sums])
+    elif m.scatter in ("singles", "singles_float"):
+        record_singles(program, inputs, s.x.shape, s.failure, scratch.sums)
     else:
         record_runs(program, inputs, s.x.shape, s.failure, scratch.sums)
 

@@ -113,13 +113,18 @@ def moves_finitely(moving: Moving, e: int, p: int):
 
 
 @wp.func
-def scatters(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
-    """Whether a particle takes part; one that is not finite flags its environment and does not."""
-    moves = moves_finitely(moving, e, p)  # asked for before it is known who takes part
-    takes = takes_part(blocks, e, failure)
+def admitted(takes: bool, moves: bool, e: int, failure: wp.array(dtype=int)):
+    """Whether a particle that ``takes`` part is added up; one that does not move finitely flags its environment."""
     if takes and not moves:
         wp.atomic_or(failure, e, _NONFINITE)
     return takes and moves
+
+
+@wp.func
+def scatters(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
+    """Whether a particle takes part; one that is not finite flags its environment and does not."""
+    moves = moves_finitely(moving, e, p)  # asked for before it is known who takes part
+    return admitted(takes_part(blocks, e, failure), moves, e, failure)
 
 
 @wp.func

@@ -44,9 +44,17 @@ FAILURE_NAMES: dict[int, str] = {
 
 #: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.decouple`).
 DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
-#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, :mod:`piavatar_envs.mpm.groups` and
-#: :mod:`piavatar_envs.mpm.shared_substep`), and whether the nodes have sums in fixed point.
-SCATTERS: dict[str, bool] = {"plain": False, "runs": True, "runs_float": False, "shared": False}
+#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, :mod:`piavatar_envs.mpm.groups`,
+#: :mod:`piavatar_envs.mpm.singles` and :mod:`piavatar_envs.mpm.shared_substep`), and whether the nodes have sums in
+#: fixed point.
+SCATTERS: dict[str, bool] = {
+    "plain": False,
+    "runs": True,
+    "runs_float": False,
+    "singles": True,
+    "singles_float": False,
+    "shared": False,
+}
 SPLIT = wp.constant(0)
 PAPER = wp.constant(1)
 NO_STRESS = wp.constant(3)

@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 
 from piavatar_envs.mpm import groups
+from piavatar_envs.mpm.build import choose_scatter
 from piavatar_envs.mpm.memory import estimate_slots
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.shared_room import parts_of, suits_shared
@@ -118,7 +119,7 @@ def test_sums_are_those_of_the_equations(collide, scatter):
     assert compared > 1000
 
 
-@pytest.mark.parametrize("scatter", ["plain", "runs", "runs_float"], indirect=True)
+@pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "shared"], indirect=True)
 def test_particles_far_apart(simulate, scatter):
     """They touch more bricks of nodes than a group has room for, and go in turns."""
     rng = np.random.default_rng(6)
@@ -208,6 +209,22 @@ def test_what_shared_memory_holds(monkeypatch, bodies, particles, slots, suits):
     h200 = SimpleNamespace(is_cuda=True, arch=90, max_shared_memory_per_block=227 * 1024)
     monkeypatch.setattr(wp, "get_device", lambda name: h200)
     assert suits_shared("cuda:0", np.repeat(np.arange(bodies), particles), slots) is suits
+
+
+@pytest.mark.parametrize(
+    ("particles", "slots", "arch", "chosen"),
+    [
+        (2_900, 200, 90, "shared"),
+        (10_475, 3_600, 90, "singles"),
+        (300_000, 4_000, 90, "runs"),
+        (10_475, 3_600, 60, "plain"),
+    ],
+)
+def test_the_density_of_particles_chooses_the_scatter(monkeypatch, particles, slots, arch, chosen):
+    """A skin's particles share hardly a node; in an interior they are worth adding up first."""
+    gpu = SimpleNamespace(is_cuda=True, arch=arch, max_shared_memory_per_block=227 * 1024)
+    monkeypatch.setattr(wp, "get_device", lambda name: gpu)
+    assert choose_scatter(None, "cuda:0", np.zeros(particles, int), slots, "split") == chosen
 
 
 @pytest.mark.parametrize("copies", [60, 80, 100, 140, 300])
