@@ -132,9 +132,9 @@ def slots_used(blocks: Blocks, e: int):
 @wp.func
 def held_by(grid: Grid, blocks: Blocks, e: int, slot: int):
     """Field and block that a slot belongs to; -1 and 0 if it is free."""
+    n = blocks.held[e, wp.min(slot, blocks.held.shape[1] - 1)]  # asked for before it is known whether it counts
     held = wp.vec2i(-1, 0)
     if slot < slots_used(blocks, e):
-        n = blocks.held[e, slot]
         held = wp.vec2i(n // grid.num_blocks, n % grid.num_blocks)
     return held
 

@@ -9,7 +9,7 @@ from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_BLOCK, NEAR_SLAB, bou
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.normals import MASS_MIN, face_shared
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
-from piavatar_envs.mpm.sums import clear_offset, offset_at, take_sum, write_record
+from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, write_record
 from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import (
@@ -195,14 +195,19 @@ def update_grid(
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     end = BLOCK_NODES * used
     begin = first_node(sweep, thread)
+    # asked for early: who waits for one answer after the other waits for most of the pass
+    next_sum = begin_sum(sums, e, begin + lane)
+    held = alone_in(grid, contact, blocks, sensors, e, begin + lane * sweep.stride)
     if begin >= end:
         return
-    held = alone_in(grid, contact, blocks, sensors, e, begin + lane * sweep.stride)
     known = with_near(grid, sweep, boundaries, e, held, begin)
     for turn in range(sweep.turns):
         first = begin + turn * sweep.stride
         if first >= end:
             break
+        sum = next_sum
+        if first + sweep.stride < end and turn + 1 < sweep.turns:
+            next_sum = begin_sum(sums, e, first + sweep.stride + lane)
         about = from_lane(known[0], turn)
         if about < 0:
             continue
@@ -215,7 +220,10 @@ def update_grid(
         for r in range(first + lane, first + lane + sweep.share):
             is_near = near_node(about, r % BLOCK_NODES)
             is_told = is_near or told
-            total = total_velocity(step, split, take_sum(sums, e, f, r, is_told or step.decoupling == PAPER))
+            if r > first + lane:  # on a CPU, where a thread takes a block
+                sum = begin_sum(sums, e, r)
+            s = end_sum(sums, e, f, r, sum, is_told or step.decoupling == PAPER)
+            total = total_velocity(step, split, s)
             if is_near:  # most skip all of that work
                 x = place_of(grid, corner, r % BLOCK_NODES)
                 total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, total, sensors)

@@ -59,7 +59,7 @@ def take_sums(
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
-            s = take_sum(sums, e, f, r, True)
+            s = take_sum(sums, e, f, r)
             write_record(node_velocity, e, r, s)
             t = contact.trunk[f]
             if t != f and has_field(mask, t):

@@ -197,9 +197,33 @@ def join_parts(high: wp.vec4i, low: wp.vec4i):
     return n
 
 
+@wp.struct
+class Begun:
+    """The first half of a sum in fixed point, in its two parts: mass and physical momentum."""
+
+    high: wp.vec4i
+    low: wp.vec4i
+
+
 @wp.func
-def take_sum(sums: Sums, e: int, f: int, r: int, driven: bool):
-    """Mass, physical and kinematic momentum of record ``r`` of field ``f``, which is cleared.
+def begin_sum(sums: Sums, e: int, r: int):
+    """What :func:`end_sum` begins with, to be asked for early; nothing where sums are in floating point."""
+    s = Begun()
+    if sums.is_fixed != 0:
+        s.high = part_of_sum(sums.fixed, e, r, 0)
+        s.low = part_of_sum(sums.fixed, e, r, 1)
+    return s
+
+
+@wp.func
+def take_sum(sums: Sums, e: int, f: int, r: int):
+    """Mass, physical and kinematic momentum of record ``r`` of field ``f``, which is cleared."""
+    return end_sum(sums, e, f, r, begin_sum(sums, e, r), True)
+
+
+@wp.func
+def end_sum(sums: Sums, e: int, f: int, r: int, begun: Begun, driven: bool):
+    """:func:`take_sum` of what has ``begun``.
 
     Where it is known that nobody has added kinematic momentum, the record is not ``driven``: that is not read in fixed
     point, nor cleared.
@@ -209,7 +233,7 @@ def take_sum(sums: Sums, e: int, f: int, r: int, driven: bool):
         s = read_record(sums.value, e, r)
         write_record(sums.value, e, r, vec8())
     else:
-        a = join_parts(part_of_sum(sums.fixed, e, r, 0), part_of_sum(sums.fixed, e, r, 1))
+        a = join_parts(begun.high, begun.low)
         if a[0] > 0.0:  # who adds no mass adds nothing
             m = sums.mass_unit[row(e, sums.mass_unit.shape[0]), f]
             p = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]

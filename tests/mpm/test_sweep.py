@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from piavatar_envs.mpm import sweep
-from piavatar_envs.mpm.sums import clear_offset, offset_at, read_record, take_sum, write_record
+from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, read_record, write_record
 from piavatar_envs.mpm.types import Grid, Sums, group, vec8, vec8i, vec16i
 
 RECORDS = 64
@@ -51,7 +51,7 @@ def test_every_node_of_shared_blocks_has_one_thread(monkeypatch, cuda, num_envs,
 def take_all(grid: Grid, sums: Sums, driven: bool, taken: wp.array(dtype=vec8), offset: wp.array(dtype=wp.vec4)):
     """Records of field 1."""
     r = wp.tid()
-    taken[r] = take_sum(sums, 0, 1, r, driven)
+    taken[r] = end_sum(sums, 0, 1, r, begin_sum(sums, 0, r), driven)
     offset[r] = offset_at(grid, sums, 0, 1, r)
     if r % 2 == 0:
         clear_offset(sums, 0, r)
