@@ -1,10 +1,10 @@
 """The scatter of a GPU for large bodies of few particles a cell, skins for example: each goes to the nodes by itself.
 
 Groups of particles, see :mod:`piavatar_envs.mpm.groups`, take time to find out which nodes they have in common. Where
-these are few, memory is faster asked for all additions. A particle has eight threads, all of which know what it
-scatters. Each looks one of the eight blocks up that its stencil may lie in, and to every node all add together, a high
-or a low part of four numbers each: 32 bytes, which memory takes at a time. What is added are integers: runs repeat bit
-for bit.
+these are few, memory is faster asked for all additions. Four threads prepare a particle together: each looks two of the
+eight blocks up that its stencil may lie in, and knows one of the four numbers that are added to a node. Eight add it,
+the particles of both of their fours in turn: a high or a low part of a number each, 32 bytes together, which memory
+takes at a time. What is added are integers: runs repeat bit for bit.
 """
 
 from __future__ import annotations
@@ -36,28 +36,34 @@ from piavatar_envs.mpm.types import (
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: Threads of a particle.
-TEAM = wp.constant(8)
+#: Threads that prepare a particle.
+TEAM = wp.constant(4)
+#: Particles of a warp.
+SHARE = wp.constant(32 // int(TEAM))
 #: Threads of a CUDA block.
 THREADS = 128
 
 
 @wp.func
-def block_of_thread(grid: Grid, base: wp.vec3i):
-    """The one that a thread looks up, of the eight blocks that the stencil at ``base`` may lie in.
+def record_of_thread(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i, upper: int):
+    """First record of a block that a thread looks up, of the lower or the ``upper`` ones along x.
 
-    Bits of the thread's place in its team say whether it is the upper along x, y and z; where the stencil lies in one
-    block along an axis, that is the lower. It exists also where a particle is outside the grid, and takes no part.
+    Bits of the thread's place in its team say whether it is the upper along y and z; where the stencil at ``base`` lies
+    in one block along an axis, that is the lower. It exists also where a particle is outside the grid, and takes no
+    part. Returned with whether there is matter of another field.
     """
-    upper = lane_of_thread()
-    i = base[0] + 2 * ((upper >> 2) & 1)
-    j = base[1] + 2 * ((upper >> 1) & 1)
-    return wp.clamp(block_index(grid, i, j, base[2] + 2 * (upper & 1)), 0, grid.num_blocks - 1)
+    j = base[1] + (lane_of_thread() & 2)
+    block = block_index(grid, base[0] + 2 * upper, j, base[2] + 2 * (lane_of_thread() & 1))
+    block = wp.clamp(block, 0, grid.num_blocks - 1)
+    others = int(0)
+    if blocks.slot.shape[1] > grid.num_blocks:
+        others = blocks.fields[e, block] & ~(1 << field)
+    return wp.vec2i(BLOCK_NODES * blocks.slot[e, field * grid.num_blocks + block], others)
 
 
 @wp.func_native(
     native(
-        "return (__ballot_sync(0xffffffffu, here) >> (threadIdx.x & 24) & 255u) != 0u;",
+        "return (__ballot_sync(0xffffffffu, here) >> (threadIdx.x & 28) & 15u) != 0u;",
         "return here;",
     )
 )
@@ -74,43 +80,77 @@ const int lane = threadIdx.x & 31, c = lane & 3, part = lane >> 2 & 1;  // of th
 const bool is_place = kind == {int(PLACE)}, is_fixed = sums.is_fixed != 0;
 // units are powers of two: one over them is exact, however the module divides
 auto per = [](float unit) {{ return __int_as_float(0x7f000000 - __float_as_int(unit)); }};
-float scale = is_place && c > 0 ? grid.dx : 1.0f, massive = 0.0f;
+float scale = is_place && c > 0 ? grid.dx : 1.0f, massive = 1.0f;
 if (is_fixed) scale = per(c == 0 || is_place ? units[0] : units[1]), massive = per(units[0]) * mass;
 float value = s[0], along_x = 0.0f, along_y = 0.0f, along_z = 0.0f;
 #pragma unroll
 for (int n = 1; n < 4; ++n)
     if (c == n) value = s[n], along_x = A.data[n - 1][0], along_y = A.data[n - 1][1], along_z = A.data[n - 1][2];
+if (!takes) value = along_x = along_y = along_z = massive = 0.0f;
 value *= scale, along_x *= scale, along_y *= scale, along_z *= scale;
+auto least = [](const wp::vec_t<3, wp::float32>& w) {{ return fminf(fminf(w[0], w[1]), w[2]); }};
+// who adds no mass adds nothing; hardly a particle is so near a node's plane that this has to be asked node by node
+const bool sure = __all_sync(ALL, !takes || least(wx) * least(wy) * least(wz) * massive > 0.5f);
 const int word = kind == {int(MOMENTUM)} ? c : c + 3 & 3;  // a vector begins where the mass was, if there is none
-char* to;
-if (is_fixed) to = is_place ? (char*)&wp::index(sums.offset_fixed, e, 0) : (char*)&wp::index(sums.fixed, e, 0);
-else to = is_place ? (char*)&wp::index(sums.offset, e, 0) : (char*)&wp::index(sums.value, e, 0);
-to += 4 * word + (is_fixed ? 16 * part : 0) + (kind == {int(KINEMATIC)} ? (is_fixed ? 32 : 16) : 0);
-takes = takes && (is_fixed || part == 0);
-struct Fixed {{ enum {{ value = 1 }}; }};
-struct Floating {{ enum {{ value = 0 }}; }};
-auto add = [&](auto sum) {{
-    constexpr bool FIXED = decltype(sum)::value;
-    const size_t size = FIXED ? (is_place ? 32 : 64) : (is_place ? 16 : 32);  // of a node's record [bytes]
+const void* records_at = &wp::index(sums.value, is_fixed ? 0 : e, 0);
+if (is_fixed) records_at = &wp::index(sums.fixed, e, 0);
+if (is_place) records_at = &wp::index(sums.offset, is_fixed ? 0 : e, 0);
+if (is_place && is_fixed) records_at = &wp::index(sums.offset_fixed, e, 0);
+const size_t to = __cvta_generic_to_global(records_at) + 4 * word + (is_fixed ? 16 * part : 0)
+    + (kind == {int(KINEMATIC)} ? (is_fixed ? 32 : 16) : 0);
+const int size = (is_fixed ? 2 : 1) * (is_place ? 16 : 32);  // of a node's record [bytes]
+const float per_high = part == 0 ? 1.0f : -0x1p20f, per_all = part == 0 ? 0.0f : 1.0f;
+struct Fixed {{ enum {{ FIXED = 1, SURE = 0 }}; }};
+struct Sure {{ enum {{ FIXED = 1, SURE = 1 }}; }};
+struct Floating {{ enum {{ FIXED = 0, SURE = 1 }}; }};
+#pragma unroll 1
+for (int turn = 0; turn < 8; turn += 4) {{
+    const int first = lane & 24 | turn, from = first | c;  // the four threads whose particle it is
+    auto of = [=](auto number) {{ return __shfl_sync(ALL, number, from); }};
+    const float v = of(value), by_x = of(along_x), by_y = of(along_y), by_z = of(along_z), count = of(massive);
+    const float x[3] = {{of(wx[0]), of(wx[1]), of(wx[2])}}, y[3] = {{of(wy[0]), of(wy[1]), of(wy[2])}};
+    const float z[3] = {{of(wz[0]), of(wz[1]), of(wz[2])}};
+    const int bx = of(base[0] & 3), by = of(base[1] & 3), bz = of(base[2] & 3);
+    int lower[4], upper[4];
 #pragma unroll
-    for (int n = 0; n < 27; ++n) {{
-        const int i = n / 9, j = n / 3 % 3, l = n % 3;
-        const int x = (base[0] & 3) + i, y = (base[1] & 3) + j, z = (base[2] & 3) + l;
-        // from the thread that has looked the node's block up
-        const int first = __shfl_sync(ALL, record, (lane & 24) | (x & 4) | (y & 4) >> 1 | z >> 2);
-        char* const node = to + (size_t)(first + 16 * (x & 3) + 4 * (y & 3) + (z & 3)) * size;
-        const float w = wx[i] * wy[j] * wz[l], number = w * (value + i * along_x + j * along_y + l * along_z);
-        if (FIXED) {{
-            const int high = __float2int_rn(0x1p-20f * number);
-            const int added = part == 0 ? high : __float2int_rn(number - 0x1p20f * (float)high);
-            // who adds no mass adds nothing: a zero, since branches would keep the next one waiting
-            atomicAdd((int*)node, takes && w * massive > 0.5f ? added : 0);
-        }} else if (takes)
-            atomicAdd((float*)node, number);
-    }}
-}};
-if (is_fixed) add(Fixed());
-else add(Floating());
+    for (int n = 0; n < 4; ++n)
+        lower[n] = __shfl_sync(ALL, records[0], first | n), upper[n] = __shfl_sync(ALL, records[1], first | n);
+    auto add = [&](auto sum) {{
+        constexpr bool FIXED = decltype(sum)::FIXED, SURE = decltype(sum)::SURE;
+#pragma unroll
+        for (int i = 0; i < 3; ++i) {{
+            const float plane = i == 0 ? v : v + i * by_x;
+            int slab[4];
+#pragma unroll
+            for (int n = 0; n < 4; ++n) slab[n] = bx + i > 3 ? upper[n] : lower[n];
+#pragma unroll
+            for (int j = 0; j < 3; ++j) {{
+                const int in_block = 16 * (bx + i & 3) + 4 * (by + j & 3);
+                const int near = (by + j > 3 ? slab[2] : slab[0]) + in_block;
+                const int next = (by + j > 3 ? slab[3] : slab[1]) + in_block;
+                const float w_line = x[i] * y[j], line = j == 0 ? plane : plane + j * by_y;
+#pragma unroll
+                for (int l = 0; l < 3; ++l) {{
+                    const float w = w_line * z[l], number = w * (l == 0 ? line : line + l * by_z);
+                    size_t node;
+                    asm("mad.wide.s32 %0, %1, %2, %3;"
+                        : "=l"(node) : "r"((bz + l > 3 ? next : near) + (bz + l & 3)), "r"(size), "l"(to));
+                    if (FIXED) {{
+                        // the nearest integer, as far as a number has bits; and what is left for the lower part
+                        const float high = __fadd_rn(__fmaf_rn(number, 0x1p-20f, 0x1.8p23f), -0x1.8p23f);
+                        const int added = __float2int_rn(per_high * high + per_all * number);
+                        asm volatile("red.global.add.s32 [%0], %1;"
+                                     :: "l"(node), "r"(SURE || w * count > 0.5f ? added : 0) : "memory");
+                    }} else if (count > 0.0f && part == 0)
+                        asm volatile("red.global.add.f32 [%0], %1;" :: "l"(node), "f"(number) : "memory");
+                }}
+            }}
+        }}
+    }};
+    if (!is_fixed) add(Floating());
+    else if (sure) add(Sure());
+    else add(Fixed());
+}}
 """)
 )
 def add_to_nodes(
@@ -126,27 +166,15 @@ def add_to_nodes(
     s: wp.vec4,
     A: wp.mat33,
     mass: float,
-    record: int,
+    records: wp.vec2i,
     units: wp.vec2,
 ):
     """Add a scalar and a vector to the 27 nodes of a stencil, ``s`` at the lowest node, the latter changing by ``A``.
 
-    ``record`` is of the first node of :func:`block_of_thread`; ``units`` are of mass and of momentum. All threads of a
-    warp come here.
+    ``records`` are those of :func:`record_of_thread`; ``units`` are of mass and of momentum. All threads of a warp come
+    here, with particles of one environment.
     """
     ...
-
-
-@wp.func
-def add_kind(
-    grid: Grid, sums: Sums, e: int, takes: bool, kind: int, s: Scattered, mass: float, record: int, units: wp.vec2
-):
-    """Add what a particle has of a ``kind`` to the nodes. All threads of a warp come here."""
-    wx = spline(s.f[0])
-    wy = spline(s.f[1])
-    wz = spline(s.f[2])
-    at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
-    add_to_nodes(grid, sums, e, takes, kind, s.base, wx, wy, wz, at_base, s.A, mass, record, units)
 
 
 @wp.kernel(launch_bounds=(THREADS, 5))
@@ -158,53 +186,58 @@ def singles_to_grid(
     contact: Contact,
     moving: Moving,
     blocks: Blocks,
+    per_env: int,
     # in and out
     failure: wp.array(dtype=int),
     sums: Sums,
 ):
-    """The same sums as :func:`piavatar_envs.mpm.transfer.particles_to_grid`, eight threads a particle."""
-    at = environment_of(wp.tid() // TEAM, moving.x.shape[1])
+    """The same sums as :func:`piavatar_envs.mpm.transfer.particles_to_grid`; ``per_env`` particles fill whole warps."""
+    at = environment_of(wp.tid() // TEAM, per_env)
     e = at[0]
     p = at[1]
     takes = bool(False)
     tells = bool(False)
-    record = int(0)
+    records = wp.vec2i()
     units = wp.vec2()
     s = Scattered()
-    if e < moving.x.shape[0]:  # the last warp may have more threads than there are
-        # all is asked for at once, before it is known who takes part: a warp with four particles has little else to do
+    if p < moving.x.shape[1]:
+        # all is asked for at once, before it is known who takes part: a warp with few particles has little else to do
         x = moving.x[e, p]
         field = particles.field[p]
         moves = moves_finitely(moving, e, p)
         here = takes_part(blocks, e, failure)
-        block = block_of_thread(grid, base_node(grid_position(grid, x)))
-        record = BLOCK_NODES * blocks.slot[e, field * grid.num_blocks + block]
+        base = base_node(grid_position(grid, x))
+        lower = record_of_thread(grid, blocks, e, field, base, 0)
+        upper = record_of_thread(grid, blocks, e, field, base, 1)
+        records = wp.vec2i(lower[0], upper[0])
         units[0] = sums.mass_unit[row(e, sums.mass_unit.shape[0]), field]
         units[1] = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
-        if contact.num_fields > 1:
-            tells = blocks.fields[e, block] != (1 << field)
         s = scattered(grid, step, particles, moving, e, p, MOMENTUM)
-        tells = tells or near_boundary(grid, boundaries, e, x)
+        tells = (lower[1] | upper[1]) != 0 or near_boundary(grid, boundaries, e, x)
         takes = admitted(here, moves, e, failure)
         if takes:
             takes = bounded(s, units[1], failure, e) >= 0.0
+    tells = any_of_team(tells)
     mass = s.at_base[0]
-    if contact.num_fields > 1:
-        tells = any_of_team(tells)
-    add_kind(grid, sums, e, takes, MOMENTUM, s, mass, record, units)
     driven = step.decoupling == PAPER  # that variant needs the gradient of kinematic momentum everywhere
-    kind = int(KINEMATIC)
-    while kind <= PLACE and any_lane(takes and (tells or driven)):
-        adds = takes and (tells or (driven and kind == KINEMATIC))
+    kind = int(MOMENTUM)
+    adds = takes
+    while any_lane(adds):
+        wx = spline(s.f[0])
+        wy = spline(s.f[1])
+        wz = spline(s.f[2])
+        at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
+        add_to_nodes(grid, sums, e, adds, kind, s.base, wx, wy, wz, at_base, s.A, mass, records, units)
+        kind += 1
+        adds = takes and kind <= PLACE and (tells or (driven and kind == KINEMATIC))
         if adds:
             s = scattered(grid, step, particles, moving, e, p, kind)
             if kind == KINEMATIC:
                 adds = bounded(s, units[1], failure, e) >= 0.0
-        add_kind(grid, sums, e, adds, kind, s, mass, record, units)
-        kind += 1
 
 
 def record_singles(program: Program, inputs: list[Any], shape: tuple[int, int], failure: Any, sums: Sums) -> None:
-    """Append :func:`singles_to_grid` for particles of ``shape``; its threads exchange numbers, by whole warps."""
-    threads = -(-shape[0] * shape[1] * int(TEAM) // 32) * 32
-    program.launch(singles_to_grid, threads, inputs, [failure, sums], block_dim=THREADS)
+    """Append :func:`singles_to_grid` for particles of ``shape``; no warp has two environments."""
+    per_env = -(-shape[1] // int(SHARE)) * int(SHARE)
+    threads = shape[0] * per_env * int(TEAM)
+    program.launch(singles_to_grid, threads, [*inputs, per_env], [failure, sums], block_dim=THREADS)
