@@ -6,11 +6,9 @@ import warp as wp
 
 from piavatar_envs.mpm.gather import Gathered, Gradients, asks_kinematic, finish_gather, gather
 from piavatar_envs.mpm.shared_grid import (
-    KINEMATIC,
-    KINEMATIC_WORDS,
-    PHYSICAL_WORDS,
     bricks_around,
     kinematic_at,
+    kinematic_of,
     line_in_bricks,
     physical_at,
 )
@@ -33,14 +31,16 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
-def kinematic_from_bricks(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3):
+def kinematic_from_bricks(room: Room, bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3):
     """Kinematic velocity of a stencil's nodes, in components 1 to 3; few particles ask for it."""
     mean = wp.vec4()
     lines = int(9)  # not a constant: it is as short as can be
     for n in range(lines):
-        at = line_in_bricks(bricks, base, n // 3, n % 3, KINEMATIC, KINEMATIC_WORDS)
+        at = line_in_bricks(bricks, base, n // 3, n % 3)
         w = wx[n // 3] * wy[n % 3]
-        mean += w * (wz[0] * kinematic_at(at[0]) + wz[1] * kinematic_at(at[1]) + wz[2] * kinematic_at(at[2]))
+        first = wz[0] * kinematic_at(kinematic_of(room, at[0]))
+        second = wz[1] * kinematic_at(kinematic_of(room, at[1]))
+        mean += w * (first + second + wz[2] * kinematic_at(kinematic_of(room, at[2])))
     return mean
 
 
@@ -55,7 +55,7 @@ def physical_from_bricks(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3
         along_y = wp.vec4()
         along_z = wp.vec4()
         for j in range(3):
-            at = line_in_bricks(bricks, base, i, j, 0, PHYSICAL_WORDS)
+            at = line_in_bricks(bricks, base, i, j)
             second = physical_at(at[1])
             third = physical_at(at[2])
             line = wz[0] * physical_at(at[0]) + wz[1] * second + wz[2] * third
@@ -96,7 +96,7 @@ def gather_from_bricks(
     if has_bit(room.told, p):  # who is that near a boundary tells its place
         asked = asks_kinematic(grid, step, boundaries, e, x)
     if asked:
-        kinematic.mean = kinematic_from_bricks(bricks, base, wx, wy, wz)
+        kinematic.mean = kinematic_from_bricks(room, bricks, base, wx, wy, wz)
     physical = physical_from_bricks(bricks, base, wx, wy, wz)
     return finish_gather(
         grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, base, f

@@ -10,34 +10,34 @@ none of the field's particles exceeds, a power of two, in every substep another:
 and what a particle adds is rounded as a floating-point number would be.
 
 Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; for every brick of every slot a half word, its
-number; a bit for every particle; a byte for every slot; the bricks' own places; bricks of seven words a node.
+number; a bit for every particle; a byte for every slot; the bricks' own places; bricks of four words a node; three more
+of every node, in the same order. A brick has a word in each of the 32 banks, and its place in the brick says in which:
+threads that add to different nodes of the eight, or to different words of the four, do not wait for each other.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.shared_memory import APPEND, native, word
-from piavatar_envs.mpm.transfer import Scattered
+from piavatar_envs.mpm.shared_memory import APPEND, clear_words, native, word
 from piavatar_envs.mpm.types import Blocks, Grid, Room, vec8, vec8i
 
 wp.set_module_options({"enable_backward": False})
 
-#: Words of a node: mass, physical and kinematic momentum; odd, for the banks.
-NODE_WORDS = wp.constant(7)
-#: Words of a brick of 2 x 2 x 2 nodes.
-BRICK_WORDS = wp.constant(8 * NODE_WORDS)
-#: Later a brick has the physical velocities of its eight nodes, in so many words each, for loads of 16 bytes; and from
-#: a word on, the kinematic ones.
-PHYSICAL_WORDS, KINEMATIC, KINEMATIC_WORDS = wp.constant(4), wp.constant(32), wp.constant(3)
+#: Words of a node: mass and physical momentum, later physical velocity and nothing, for loads of 16 bytes.
+NODE_WORDS = wp.constant(4)
+#: Words that it has elsewhere: kinematic momentum, later kinematic velocity.
+KINEMATIC_WORDS = wp.constant(3)
+#: Words of a brick of 2 x 2 x 2 nodes, as many as there are banks, and those that it has elsewhere.
+BRICK_WORDS, KINEMATIC_BRICK_WORDS = wp.constant(8 * NODE_WORDS), wp.constant(8 * KINEMATIC_WORDS)
 #: Bricks of a block of 4 x 4 x 4 nodes.
 BLOCK_BRICKS = wp.constant(8)
-#: Words of the header: bricks in use; bits FAILURE_*; particles that tell their places; not 0 if a node holds too much;
-#: units in a field's heaviest particle; how many particles are listed; and of every field, of which there are 32 at
-#: most, for they are bits of a block's mask: the mass of its heaviest particle [kg], the speed of its fastest, and the
-#: speed that its momenta are counted at [m/s].
+#: Words of the header: bricks in use; bits FAILURE_*; particles that tell their places; mass that has been lost
+#: [LOST_UNITS]; units in a field's heaviest particle; how many particles are listed; and of every field, of which there
+#: are 32 at most, for they are bits of a block's mask: the mass of its heaviest particle [kg], the speed of its
+#: fastest, and the speed that its momenta are counted at [m/s].
 HEADER = wp.constant(104)
-COUNT, FAULTS, TOLD, CROWDED, UNITS, LISTED = (wp.constant(n) for n in range(6))
+COUNT, FAULTS, TOLD, LOST, UNITS, LISTED = (wp.constant(n) for n in range(6))
 HEAVIEST, FASTEST, SPEED = (wp.constant(n) for n in (8, 40, 72))
 #: Units of mass in a field's heaviest particle, if no node holds too much.
 MOST_UNITS = wp.constant(float(2**27))
@@ -47,16 +47,17 @@ NO_BRICK, TOUCHED = wp.constant(0xFFFF), wp.constant(0xFFFE)
 PLACES = wp.constant(0x4000)
 
 
-def _native(cuda: str, otherwise: str = "") -> str:
-    """A snippet that knows the header's words and the strides of the nodes of a brick."""
-    z = int(NODE_WORDS)
+def brick_native(cuda: str, otherwise: str = "") -> str:
+    """A snippet that knows the header's words, the strides of the nodes of a brick, and :func:`kinematic_of`."""
+    z, rest = int(NODE_WORDS), int(KINEMATIC_WORDS)
     strides = f"constexpr int ALONG_Z = {z}, ALONG_Y = {2 * z}, ALONG_X = {4 * z}, BRICK = {8 * z};\n"
-    words = f"COUNT = {int(COUNT)}, CROWDED = {int(CROWDED)}, TOUCHED = {int(TOUCHED)}, PLACES = {int(PLACES)}"
-    return native(f"constexpr int {words};\n{strides}{cuda}", otherwise)
+    words = f"COUNT = {int(COUNT)}, TOUCHED = {int(TOUCHED)}, PLACES = {int(PLACES)}"
+    of = f"[](const auto& in, int at) {{ return in.kinematic + (at - in.bricks) / {z} * {rest}; }}"
+    return native(f"constexpr int {words};\n{strides}auto kinematic_of = {of};\n{cuda}", otherwise)
 
 
 @wp.func_native(
-    _native(
+    brick_native(
         APPEND
         + """
 unsigned short* const number = reinterpret_cast<unsigned short*>(room + numbers);
@@ -91,7 +92,26 @@ def bricks_of_round(room: Room, first: int):
 @wp.func
 def node_word(room: Room, n: int):
     """Word at which node ``n`` of a round begins, eight a brick."""
-    return room.bricks + BRICK_WORDS * (n // 8) + NODE_WORDS * (n % 8)
+    return room.bricks + NODE_WORDS * n
+
+
+@wp.func
+def kinematic_word(room: Room, n: int):
+    """Word at which the kinematic momentum of node ``n`` of a round begins."""
+    return room.kinematic + KINEMATIC_WORDS * n
+
+
+@wp.func
+def kinematic_of(room: Room, at: int):
+    """The same of the node that begins at word ``at``."""
+    return kinematic_word(room, (at - room.bricks) >> 2)
+
+
+@wp.func
+def clear_bricks(room: Room, first: int):
+    """Zero the nodes of a round."""
+    clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
+    clear_words(room.kinematic, KINEMATIC_BRICK_WORDS * bricks_of_round(room, first))
 
 
 @wp.func
@@ -124,14 +144,14 @@ for (int b = 0; b < 8; ++b) {
 """
 
 
-@wp.func_native(_native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
+@wp.func_native(brick_native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
 def places_around(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i) -> vec8i:
     """Where the bricks of a stencil have their half words: 8 slot + brick in block, for x, y and z lower and upper."""
     ...
 
 
 @wp.func_native(
-    _native(
+    brick_native(
         _AROUND
         + """
 const unsigned short* const number = reinterpret_cast<const unsigned short*>(room + layout.numbers);
@@ -148,121 +168,26 @@ def bricks_around(grid: Grid, blocks: Blocks, layout: Room, e: int, field: int, 
 
 
 @wp.func_native(
-    _native("""
-const int px = s.base[0] & 1, py = s.base[1] & 1, pz = s.base[2] & 1;
-const float m = s.at_base[0] * per_mass;
-float q[3], k[3], along[3][3];
-for (int c = 0; c < 3; ++c) {
-    q[c] = s.at_base[1 + c] * per_momentum;
-    k[c] = s.at_base[4 + c] * per_momentum;
-    for (int d = 0; d < 3; ++d) along[c][d] = s.A.data[c][d] * per_momentum;
-}
-const bool driven = k[0] != 0.0f || k[1] != 0.0f || k[2] != 0.0f;
-// threads that add to the same word wait for each other: neighbours, which are often in the same cell, take the nodes
-// of a plane in another order
-float weight_y[3], weight_z[3], at_y[3], at_z[3];
-int word_y[3], word_z[3];
-bool upper_y[3], upper_z[3];
-int j = threadIdx.x / 3 % 3, l = threadIdx.x % 3;
-for (int n = 0; n < 3; ++n) {
-    weight_y[n] = j == 0 ? wy[0] : j == 1 ? wy[1] : wy[2];
-    weight_z[n] = l == 0 ? wz[0] : l == 1 ? wz[1] : wz[2];
-    at_y[n] = (float)j, at_z[n] = (float)l;
-    word_y[n] = ((py + j) & 1) * ALONG_Y, word_z[n] = ((pz + l) & 1) * ALONG_Z;
-    upper_y[n] = py + j > 1, upper_z[n] = pz + l > 1;
-    j = j == 2 ? 0 : j + 1, l = l == 2 ? 0 : l + 1;
-}
-#pragma unroll 1
-for (int i = 0; i < 3; ++i) {
-    const float wi = i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2];
-    const bool far = px + i > 1;
-    const int b00 = far ? bricks[4] : bricks[0], b01 = far ? bricks[5] : bricks[1];
-    const int b10 = far ? bricks[6] : bricks[2], b11 = far ? bricks[7] : bricks[3];
-    int* const plane = room + ((px + i) & 1) * ALONG_X;
-    int over = 0;
-#pragma unroll
-    for (int j = 0; j < 3; ++j) {
-        int* const line = plane + word_y[j];
-        const int first = upper_y[j] ? b10 : b00, last = upper_y[j] ? b11 : b01;
-        const int of_first = first == trash ? 0 : -1, of_last = last == trash ? 0 : -1;
-        const float w = wi * weight_y[j];
-        float at[3];
-        for (int c = 0; c < 3; ++c) at[c] = q[c] + at_y[j] * along[c][1];
-#pragma unroll
-        for (int l = 0; l < 3; ++l) {
-            int* const node = line + (upper_z[l] ? last : first) + word_z[l];
-            const float wl = w * weight_z[l];
-            // a sum of masses that runs over is negative for 2^31, which nobody adds at once: somebody sees it
-            over |= atomicAdd(node, __float2int_rn(wl * m)) & (upper_z[l] ? of_last : of_first);
-            for (int c = 0; c < 3; ++c)
-                atomicAdd(node + 1 + c, __float2int_rn(wl * (at[c] + at_z[l] * along[c][2])));
-            if (driven)
-                for (int c = 0; c < 3; ++c) atomicAdd(node + 4 + c, __float2int_rn(wl * k[c]));
-        }
-    }
-    if (over < 0) room[CROWDED] = 1;
-    for (int c = 0; c < 3; ++c) q[c] += along[c][0];
-}
-""")
-)
-def add_to_bricks(
-    bricks: vec8i,
-    trash: int,
-    s: Scattered,
-    wx: wp.vec3,
-    wy: wp.vec3,
-    wz: wp.vec3,
-    per_mass: float,
-    per_momentum: float,
-):
-    """Add a particle to the 27 nodes of its stencil, in bricks that begin at those words; one may be ``trash``."""
-    ...
-
-
-@wp.func_native(
-    _native("""
-const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
-const float g[3] = {wx[1] + 2.0f * wx[2], wy[1] + 2.0f * wy[2], wz[1] + 2.0f * wz[2]};  // where it is, from the lowest
-const float wi = i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2];
-for (int j = 0; j < 3; ++j)
-    for (int l = 0; l < 3; ++l) {
-        const int b = (px + i > 1 ? 4 : 0) + (py + j > 1 ? 2 : 0) + (pz + l > 1 ? 1 : 0);
-        const int in_plane = ((py + j) & 1) * ALONG_Y + ((pz + l) & 1) * ALONG_Z;
-        int* const node = room + bricks[b] + ((px + i) & 1) * ALONG_X + in_plane;
-        const float m = wi * wy[j] * wz[l] * mass;
-        atomicAdd(node, __float2int_rn(m * ((float)i - g[0])));
-        atomicAdd(node + 1, __float2int_rn(m * ((float)j - g[1])));
-        atomicAdd(node + 2, __float2int_rn(m * ((float)l - g[2])));
-        atomicAdd(node + 3, __float2int_rn(m * seam));
-    }
-""")
-)
-def add_place(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, i: int, mass: float, seam: float):
-    """Tell plane ``i`` of a stencil where a particle is: ``w m (x_i - x_p) / dx``, and ``w m`` of a seam; in units."""
-    ...
-
-
-@wp.func_native(
-    _native(
+    brick_native(
         """
 const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
 const bool far = px + i > 1, upper = py + j > 1;
 const int lower_z = far ? (upper ? bricks[6] : bricks[4]) : (upper ? bricks[2] : bricks[0]);
 const int upper_z = far ? (upper ? bricks[7] : bricks[5]) : (upper ? bricks[3] : bricks[1]);
-const int line = first + along * (4 * ((px + i) & 1) + 2 * ((py + j) & 1));
-const int second = pz ? upper_z : lower_z + along;
-return wp::vec3i(line + lower_z + pz * along, line + second, line + upper_z + pz * along);
+const int line = ((px + i) & 1) * ALONG_X + ((py + j) & 1) * ALONG_Y;
+const int second = pz ? upper_z : lower_z + ALONG_Z;
+return wp::vec3i(line + lower_z + pz * ALONG_Z, line + second, line + upper_z + pz * ALONG_Z);
 """,
         "return wp::vec3i();",
     )
 )
-def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int, first: int, along: int) -> wp.vec3i:
-    """Words of the nodes ``base + (i, j, 0..2)``, which a brick has from its word ``first``, ``along`` words each."""
+def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
+    """Words at which the nodes ``base + (i, j, 0..2)`` begin."""
     ...
 
 
 @wp.func_native(
-    _native(
+    brick_native(
         """
 const float4 v = *reinterpret_cast<const float4*>(room + at);
 return wp::vec_t<4, wp::float32>(0.0f, v.x, v.y, v.z);
@@ -271,12 +196,12 @@ return wp::vec_t<4, wp::float32>(0.0f, v.x, v.y, v.z);
     )
 )
 def physical_at(at: int) -> wp.vec4:
-    """Nothing, and the physical velocity of the node that has it at a word."""
+    """Nothing, and the physical velocity of the node that begins at a word."""
     ...
 
 
 @wp.func_native(
-    _native(
+    brick_native(
         """
 const float* const v = reinterpret_cast<const float*>(room + at);
 return wp::vec_t<4, wp::float32>(0.0f, v[0], v[1], v[2]);
@@ -290,13 +215,26 @@ def kinematic_at(at: int) -> wp.vec4:
 
 
 @wp.func_native(
-    _native(f"""
-float4* const v = reinterpret_cast<float4*>(room + brick + {int(PHYSICAL_WORDS)} * node);
-*v = make_float4(value[1], value[2], value[3], 0.0f);
-float* const k = reinterpret_cast<float*>(room + brick + {int(KINEMATIC)} + {int(KINEMATIC_WORDS)} * node);
+    brick_native(
+        """
+const int4 v = *reinterpret_cast<const int4*>(room + at);
+return wp::vec_t<4, wp::int32>(v.x, v.y, v.z, v.w);
+""",
+        "return wp::vec_t<4, wp::int32>();",
+    )
+)
+def sums_at(at: int) -> wp.vec4i:
+    """Mass and physical momentum of the node that begins at a word."""
+    ...
+
+
+@wp.func_native(
+    brick_native("""
+*reinterpret_cast<float4*>(room + at) = make_float4(value[1], value[2], value[3], 0.0f);
+float* const k = reinterpret_cast<float*>(room + kinematic);
 for (int c = 0; c < 3; ++c) k[c] = value[4 + c];
 """)
 )
-def set_velocities(brick: int, node: int, value: vec8):
-    """Write what :func:`physical_at` and :func:`kinematic_at` read, of one of the eight nodes of a brick."""
+def set_velocities(at: int, kinematic: int, value: vec8):
+    """Write what :func:`physical_at` and :func:`kinematic_at` read, of one node, where its sums were."""
     ...

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.shared_grid import BLOCK_BRICKS, BRICK_WORDS, HEADER, PLACES
+from piavatar_envs.mpm.shared_grid import BLOCK_BRICKS, BRICK_WORDS, HEADER, KINEMATIC_BRICK_WORDS, PLACES
 from piavatar_envs.mpm.types import Model, Room
 
 #: Words of a room of which two fit into a multiprocessor, and of one that takes it all; with what stores take of it.
@@ -82,7 +82,9 @@ def plan_room(model: Model) -> tuple[Room, bool]:
     room.near = room.told + -(-model.num_particles // 32)
     room.places = _multiple_of_4(room.near + -(-model.max_slots // 4))
     room.bricks = _multiple_of_4(room.places + int(BLOCK_BRICKS) * model.max_slots // 2)
-    room.capacity = ((LARGE_ROOM if large else SMALL_ROOM) - room.bricks) // int(BRICK_WORDS) - 1
+    words = int(BRICK_WORDS) + int(KINEMATIC_BRICK_WORDS)
+    room.capacity = ((LARGE_ROOM if large else SMALL_ROOM) - room.bricks) // words - 1
+    room.kinematic = room.bricks + int(BRICK_WORDS) * (room.capacity + 1)
     room.part = wp.array(np.array(parts, np.int32), dtype=wp.vec3i, device=model.device)
     room.speed = wp.zeros((model.num_envs, model.contact.num_fields), dtype=float, device=model.device)
     return room, large

@@ -9,25 +9,27 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.runs import fault_within
+from piavatar_envs.mpm.shared_add import add_kinematic, add_place, add_to_bricks, share_of_round
 from piavatar_envs.mpm.shared_grid import (
     BLOCK_BRICKS,
     BRICK_WORDS,
+    COUNT,
     FASTEST,
     FAULTS,
     LISTED,
+    LOST,
     PLACES,
     SPEED,
     TOLD,
-    add_place,
-    add_to_bricks,
     bricks_around,
     bricks_of_round,
+    clear_bricks,
     in_marked_plane,
     node_word,
+    sums_at,
 )
 from piavatar_envs.mpm.shared_layout import end_of_part, record_of_place
 from piavatar_envs.mpm.shared_memory import (
-    clear_words,
     half_word,
     has_bit,
     list_bits,
@@ -40,7 +42,15 @@ from piavatar_envs.mpm.shared_memory import (
     threads_of_block,
     word,
 )
-from piavatar_envs.mpm.shared_units import correct_units, speed_of, speeds_known, sums_hold, unit_of_mass, unit_of_place
+from piavatar_envs.mpm.shared_units import (
+    LOST_UNITS,
+    correct_units,
+    speed_of,
+    speeds_known,
+    sums_hold,
+    unit_of_mass,
+    unit_of_place,
+)
 from piavatar_envs.mpm.stencil import spline
 from piavatar_envs.mpm.transfer import momentum_bounds, moves_finitely, placed, prepare
 from piavatar_envs.mpm.types import (
@@ -103,7 +113,7 @@ def scatter_places(
     """
     t = thread_of_block()
     several = room.speed.shape[1] > 1
-    clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
+    clear_bricks(room, first)
     meet()
     # they are few, and would leave most threads of many warps idle: where there is room behind the bricks, they are
     # listed, which is in one round only, for all but the last are full
@@ -120,7 +130,8 @@ def scatter_places(
     meet()
     for n in range(t, 8 * bricks_of_round(room, first), threads_of_block()):
         at = node_word(room, n)
-        if word(at) != 0 or word(at + 1) != 0 or word(at + 2) != 0 or word(at + 3) != 0:
+        told = sums_at(at)
+        if told[0] != 0 or told[1] != 0 or told[2] != 0 or told[3] != 0:
             marked = half_word(room.places, first + n // 8)
             place = marked % PLACES
             if several or in_marked_plane(marked, n):
@@ -128,8 +139,8 @@ def scatter_places(
                 if several:
                     f = blocks.held[e, place // BLOCK_BRICKS] // grid.num_blocks
                 unit = unit_of_place(f)
-                o = (grid.dx * unit) * wp.vec3(float(word(at)), float(word(at + 1)), float(word(at + 2)))
-                sums.offset[e, record_of_place(place, n % 8)] = wp.vec4(o[0], o[1], o[2], unit * float(word(at + 3)))
+                o = (grid.dx * unit) * wp.vec3(float(told[0]), float(told[1]), float(told[2]))
+                sums.offset[e, record_of_place(place, n % 8)] = wp.vec4(o[0], o[1], o[2], unit * float(told[3]))
             for c in range(4):
                 set_word(at + c, 0)
     meet()
@@ -151,12 +162,18 @@ def scatter_momenta(
     adds: bool,
     clears: bool,
 ):
-    """Find the fastest particle of every field, and where it ``adds``, add masses and momenta of all to the bricks."""
+    """Find the fastest particle of every field, and where it ``adds``, add masses and momenta of all to the bricks.
+
+    Returns the mass that the particles of a thread give [LOST_UNITS].
+    """
     t = thread_of_block()
+    given = int(0)
+    if t == 0:
+        set_word(LOST, 0)
     if t < room.speed.shape[1]:
         set_word(FASTEST + t, 0)
     if clears:
-        clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
+        clear_bricks(room, first)
     meet()
     for p in range(part[0] + t, end_of_part(blocks, failure, e, part), threads_of_block()):
         field = particles.field[p]
@@ -177,12 +194,21 @@ def scatter_momenta(
                     n = bricks_around(grid, blocks, room, e, field, s.base, first)
                     per_mass = 1.0 / unit_of_mass(field)
                     per_momentum = per_mass / number(SPEED + field)
-                    trash = room.bricks + BRICK_WORDS * room.capacity
-                    add_to_bricks(n, trash, s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_mass, per_momentum)
+                    wx = spline(s.f[0])
+                    wy = spline(s.f[1])
+                    wz = spline(s.f[2])
+                    if s.at_base[4] != 0.0 or s.at_base[5] != 0.0 or s.at_base[6] != 0.0:
+                        add_kinematic(room, n, s, wx, wy, wz, per_momentum)
+                    units = s.at_base[0] * per_mass
+                    if word(COUNT) > room.capacity:
+                        units *= share_of_round(room, n, s.base, wx, wy, wz)
+                    given += int(units) // LOST_UNITS
+                    add_to_bricks(n, p, s, wx, wy, wz, per_mass, per_momentum)
         else:
             wp.atomic_or(failure, e, _NONFINITE)
             or_word(FAULTS, _NONFINITE)
     meet()
+    return given
 
 
 @wp.func
@@ -206,8 +232,10 @@ def scatter_round(
     while not hold:
         adds = speeds_known(room, part)
         clears = adds and not unused
-        scatter_momenta(grid, step, particles, moving, blocks, room, sums, failure, e, part, first, adds, clears)
+        given = scatter_momenta(
+            grid, step, particles, moving, blocks, room, sums, failure, e, part, first, adds, clears
+        )
         unused = unused and not adds
-        hold = sums_hold(room, part, first)
+        hold = sums_hold(room, part, first, given)
         if not hold:
             correct_units(room, part)

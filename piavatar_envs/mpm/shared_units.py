@@ -6,20 +6,20 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import has_field
 from piavatar_envs.mpm.shared_grid import (
-    CROWDED,
     FASTEST,
     HEAVIEST,
+    LOST,
     SPEED,
     UNITS,
     bricks_of_round,
     node_word,
 )
 from piavatar_envs.mpm.shared_memory import (
+    add_word,
     meet,
     number,
     power_of_two,
     set_number,
-    set_word,
     thread_of_block,
     threads_of_block,
     word,
@@ -35,6 +35,9 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 SLOWEST = wp.constant(2.0**-20)
 #: Units of mass in a field's heaviest particle where places are told.
 PLACE_UNITS = wp.constant(2.0**20)
+#: Units of mass in which is counted what particles have given and nodes have not got. Where a word has run over, 2^20
+#: are missing at least; what is rounded is far less than half of that.
+LOST_UNITS, MOST_LOST = wp.constant(2**12), wp.constant(2**19)
 
 
 @wp.func
@@ -74,18 +77,19 @@ def speeds_known(room: Room, part: wp.vec3i):
 
 
 @wp.func
-def sums_hold(room: Room, part: wp.vec3i, first: int):
+def sums_hold(room: Room, part: wp.vec3i, first: int, given: int):
     """Whether momenta have been counted at speeds that no particle exceeds, and no word counts more than it can.
 
-    All threads come here.
+    All threads come here; their particles have ``given`` so much mass [LOST_UNITS].
     """
     known = speeds_known(room, part)
     if known:
+        lost = int(given)
         for n in range(thread_of_block(), 8 * bricks_of_round(room, first), threads_of_block()):
-            if word(node_word(room, n)) < 0:
-                set_word(CROWDED, 1)
+            lost -= word(node_word(room, n)) // LOST_UNITS
+        add_word(LOST, lost)
     meet()
-    hold = known and word(CROWDED) == 0
+    hold = known and word(LOST) < MOST_LOST
     for f in range(room.speed.shape[1]):
         hold = hold and (number(FASTEST + f) <= number(SPEED + f) or not has_field(part[2], f))
     return hold
@@ -99,9 +103,8 @@ def correct_units(room: Room, part: wp.vec3i):
     """
     f = thread_of_block()
     meet()
-    if f == 0 and word(CROWDED) != 0:
+    if f == 0 and word(LOST) >= MOST_LOST:
         set_number(UNITS, number(UNITS) / 8.0)
-        set_word(CROWDED, 0)
     if f < room.speed.shape[1]:
         slow = number(SPEED + f) == 0.0 or number(FASTEST + f) > number(SPEED + f)
         if slow and has_field(part[2], f):

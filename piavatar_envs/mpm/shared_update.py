@@ -8,17 +8,18 @@ from piavatar_envs.mpm.blocks import has_field, slots_used
 from piavatar_envs.mpm.grid import meet_boundaries, physical_velocity, place_of, total_velocity
 from piavatar_envs.mpm.shared_grid import (
     BLOCK_BRICKS,
-    BRICK_WORDS,
     NO_BRICK,
     PLACES,
     SPEED,
     bricks_of_round,
     in_marked_plane,
+    kinematic_word,
     node_word,
     set_velocities,
+    sums_at,
 )
 from piavatar_envs.mpm.shared_layout import block_of, place_of_record, record_of_place
-from piavatar_envs.mpm.shared_memory import half_word, meet_warp, number, thread_of_block, threads_of_block, word
+from piavatar_envs.mpm.shared_memory import half_word, number, thread_of_block, threads_of_block, word
 from piavatar_envs.mpm.shared_units import unit_of_mass
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner
 from piavatar_envs.mpm.sums import write_record
@@ -46,16 +47,16 @@ def updated_node(
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
+    room: Room,
     sums: Sums,
     sensors: Sensors,
     e: int,
     n: int,
-    at: int,
     marked: int,
     unit: float,
     speed: float,
 ):
-    """Velocity of node ``n`` of a round, whose sums are at a word; the units are those of one field, if it is the only.
+    """Velocity of node ``n`` of a round, from its sums; the units are those of one field, if it is the only.
 
     See :func:`piavatar_envs.mpm.grid.update_grid`. In a block with several fields they stay sums.
     """
@@ -75,9 +76,11 @@ def updated_node(
             f = held // grid.num_blocks
             m = unit_of_mass(f)
             q = m * number(SPEED + f)
+    physical = sums_at(node_word(room, n))
+    at = kinematic_word(room, n)
     s = vec8(
-        m * float(word(at)), q * float(word(at + 1)), q * float(word(at + 2)), q * float(word(at + 3)),
-        q * float(word(at + 4)), q * float(word(at + 5)), q * float(word(at + 6)), 0.0,
+        m * float(physical[0]), q * float(physical[1]), q * float(physical[2]), q * float(physical[3]),
+        q * float(word(at)), q * float(word(at + 1)), q * float(word(at + 2)), 0.0,
     )  # fmt: skip
     if not several or blocks.fields[e, block] == (1 << f):
         s = total_velocity(step, split, s)
@@ -109,20 +112,15 @@ def update_bricks(
     unit = unit_of_mass(0)
     speed = number(SPEED)
     count = 8 * bricks_of_round(room, first)
-    for start in range(0, count, threads_of_block()):
-        n = start + thread_of_block()
-        s = vec8()
-        if n < count:
-            marked = half_word(room.places, first + n // 8)
-            s = updated_node(
-                grid, step, boundaries, contact, blocks, sums, sensors, e, n, node_word(room, n), marked, unit, speed
-            )  # fmt: skip
-            if writes:
-                write_record(node_velocity, e, record_of_place(marked % PLACES, n % 8), s)
-        if not writes:
-            meet_warp()  # threads of the same warp have read the sums that are where a brick's velocities come to be
-            if n < count:
-                set_velocities(room.bricks + BRICK_WORDS * (n // 8), n % 8, s)
+    for n in range(thread_of_block(), count, threads_of_block()):
+        marked = half_word(room.places, first + n // 8)
+        s = updated_node(
+            grid, step, boundaries, contact, blocks, room, sums, sensors, e, n, marked, unit, speed
+        )  # fmt: skip
+        if writes:
+            write_record(node_velocity, e, record_of_place(marked % PLACES, n % 8), s)
+        else:
+            set_velocities(node_word(room, n), kinematic_word(room, n), s)
 
 
 @wp.func

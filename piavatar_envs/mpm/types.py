@@ -190,6 +190,7 @@ class Room:
     near: int  # bytes of slots: what is near, see :mod:`piavatar_envs.mpm.shared_layout`
     places: int  # of the bricks: 8 slot + brick in block, and bits of planes near boundaries, two a word
     bricks: int
+    kinematic: int  # of kinematic momenta, three a node
     capacity: int  # bricks that the room has; one more takes what is not of this round
     part: wp.array(dtype=wp.vec3i)  # (parts,) first particle, one after the last, bits of the fields that are theirs
     speed: wp.array2d(dtype=float)  # (num_envs, fields) at which momenta are counted [m/s], 0 for not known

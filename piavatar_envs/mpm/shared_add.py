@@ -1,0 +1,148 @@
+"""What a particle adds to the nodes around it in the shared memory of a CUDA block."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.shared_grid import BRICK_WORDS, brick_native, line_in_bricks
+from piavatar_envs.mpm.transfer import Scattered
+from piavatar_envs.mpm.types import Room, vec8i
+
+wp.set_module_options({"enable_backward": False})
+
+
+# Threads that add to the same bank wait for each other. So each has an order of its own, as the bits of its particle's
+# number say: two of them that of the four words of a node; one that of the nodes along each axis, first the lower or
+# the upper one of a brick, then the other, and last what is left
+@wp.func_native(
+    brick_native("""
+const int px = s.base[0] & 1, py = s.base[1] & 1, pz = s.base[2] & 1;
+const int turn = p & 3, turn_x = (p >> 2 ^ px) & 1, turn_y = (p >> 3 ^ py) & 1, turn_z = (p >> 4 ^ pz) & 1;
+// a word at the lowest node, and how it changes along the axes; a mass does not
+float q[4] = {s.at_base[0] * per_mass}, along[4][3] = {};
+for (int c = 0; c < 3; ++c) {
+    q[1 + c] = s.at_base[1 + c] * per_momentum;
+    for (int d = 0; d < 3; ++d) along[1 + c][d] = s.A.data[c][d] * per_momentum;
+}
+auto swap = [](bool yes, float& a, float& b) {
+    const float first = yes ? b : a;
+    b = yes ? a : b, a = first;
+};
+auto take_turn = [&](float& a, float& b, float& c, float& d) {  // word c ^ turn comes to be c
+    swap(turn & 1, a, b), swap(turn & 1, c, d), swap(turn & 2, a, c), swap(turn & 2, b, d);
+};
+take_turn(q[0], q[1], q[2], q[3]);
+for (int d = 0; d < 3; ++d) take_turn(along[0][d], along[1][d], along[2][d], along[3][d]);
+float weight_z[3], at_z[3];
+int word_z[3];
+bool upper_z[3];
+for (int n = 0; n < 3; ++n) {
+    const int l = n < 2 ? n ^ turn_z : 2;
+    weight_z[n] = l == 0 ? wz[0] : l == 1 ? wz[1] : wz[2];
+    at_z[n] = (float)l, word_z[n] = ((pz + l) & 1) * ALONG_Z + turn, upper_z[n] = pz + l > 1;
+}
+#pragma unroll 1
+for (int n = 0; n < 3; ++n) {
+    const int i = n < 2 ? n ^ turn_x : 2;
+    const float wi = i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2];
+    const bool far = px + i > 1;
+    const int b00 = far ? bricks[4] : bricks[0], b01 = far ? bricks[5] : bricks[1];
+    const int b10 = far ? bricks[6] : bricks[2], b11 = far ? bricks[7] : bricks[3];
+    const int plane = ((px + i) & 1) * ALONG_X;
+    const float at_x = i == 0 ? 0.0f : 1.0f;  // the last plane from the one before it
+    for (int c = 0; c < 4; ++c) q[c] += i == 2 ? along[c][0] : 0.0f;
+#pragma unroll 1
+    for (int m = 0; m < 3; ++m) {
+        const int j = m < 2 ? m ^ turn_y : 2;
+        const bool upper = py + j > 1;
+        const int line = plane + ((py + j) & 1) * ALONG_Y;
+        const int first = upper ? b10 : b00, last = upper ? b11 : b01;
+        const float w = wi * (j == 0 ? wy[0] : j == 1 ? wy[1] : wy[2]);
+        float at[4];
+        for (int c = 0; c < 4; ++c) at[c] = q[c] + at_x * along[c][0] + (float)j * along[c][1];
+#pragma unroll
+        for (int l = 0; l < 3; ++l) {
+            const int node = line + (upper_z[l] ? last : first) + word_z[l];  // a multiple of four, and the turn
+            const float wl = w * weight_z[l];
+            for (int c = 0; c < 4; ++c)
+                atomicAdd(room + (node ^ c), __float2int_rn(wl * (at[c] + at_z[l] * along[c][2])));
+        }
+    }
+}
+""")
+)
+def add_to_bricks(
+    bricks: vec8i,
+    p: int,
+    s: Scattered,
+    wx: wp.vec3,
+    wy: wp.vec3,
+    wz: wp.vec3,
+    per_mass: float,
+    per_momentum: float,
+):
+    """Add mass and physical momentum of particle ``p`` to its 27 nodes, in bricks that begin at those words."""
+    ...
+
+
+@wp.func_native(
+    brick_native("""
+const int px = s.base[0] & 1, py = s.base[1] & 1, pz = s.base[2] & 1;
+const float k[3] = {s.at_base[4] * per_momentum, s.at_base[5] * per_momentum, s.at_base[6] * per_momentum};
+#pragma unroll 1
+for (int n = 0; n < 9; ++n) {
+    const int i = n / 3, j = n % 3;
+    const bool far = px + i > 1, upper = py + j > 1;
+    const int first = far ? (upper ? bricks[6] : bricks[4]) : (upper ? bricks[2] : bricks[0]);
+    const int last = far ? (upper ? bricks[7] : bricks[5]) : (upper ? bricks[3] : bricks[1]);
+    const int line = ((px + i) & 1) * ALONG_X + ((py + j) & 1) * ALONG_Y;
+    const float w = (i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2]) * (j == 0 ? wy[0] : j == 1 ? wy[1] : wy[2]);
+    for (int l = 0; l < 3; ++l) {
+        const int node = line + (pz + l > 1 ? last : first) + ((pz + l) & 1) * ALONG_Z;
+        for (int c = 0; c < 3; ++c)
+            atomicAdd(room + kinematic_of(layout, node) + c, __float2int_rn(w * wz[l] * k[c]));
+    }
+}
+""")
+)
+def add_kinematic(
+    layout: Room, bricks: vec8i, s: Scattered, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, per_momentum: float
+):
+    """Add the kinematic momentum of a particle; few have one, so this is as short as can be."""
+    ...
+
+
+@wp.func
+def share_of_round(room: Room, bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3):
+    """Share of a particle that its nodes in bricks of this round get."""
+    share = float(0.0)
+    lines = int(9)
+    for n in range(lines):
+        at = line_in_bricks(bricks, base, n // 3, n % 3)
+        for l in range(3):
+            if at[l] < room.bricks + BRICK_WORDS * room.capacity:
+                share += wx[n // 3] * wy[n % 3] * wz[l]
+    return share
+
+
+@wp.func_native(
+    brick_native("""
+const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
+const float g[3] = {wx[1] + 2.0f * wx[2], wy[1] + 2.0f * wy[2], wz[1] + 2.0f * wz[2]};  // where it is, from the lowest
+const float wi = i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2];
+for (int j = 0; j < 3; ++j)
+    for (int l = 0; l < 3; ++l) {
+        const int b = (px + i > 1 ? 4 : 0) + (py + j > 1 ? 2 : 0) + (pz + l > 1 ? 1 : 0);
+        const int in_plane = ((py + j) & 1) * ALONG_Y + ((pz + l) & 1) * ALONG_Z;
+        int* const node = room + bricks[b] + ((px + i) & 1) * ALONG_X + in_plane;
+        const float m = wi * wy[j] * wz[l] * mass;
+        atomicAdd(node, __float2int_rn(m * ((float)i - g[0])));
+        atomicAdd(node + 1, __float2int_rn(m * ((float)j - g[1])));
+        atomicAdd(node + 2, __float2int_rn(m * ((float)l - g[2])));
+        atomicAdd(node + 3, __float2int_rn(m * seam));
+    }
+""")
+)
+def add_place(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, i: int, mass: float, seam: float):
+    """Tell plane ``i`` of a stencil where a particle is: ``w m (x_i - x_p) / dx``, and ``w m`` of a seam; in units."""
+    ...
