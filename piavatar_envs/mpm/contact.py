@@ -26,8 +26,9 @@ import warp as wp
 from piavatar_envs.mpm.blocks import end_of_fields, first_record, has_field, lowest_field, lowest_other
 from piavatar_envs.mpm.impulses import add_impulse, pair_entry, read_change, write_change
 from piavatar_envs.mpm.normals import MASS_MIN, shared_normal, surface_gap, volume_at
+from piavatar_envs.mpm.records import read_record, write_record
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
-from piavatar_envs.mpm.sums import offset_at, read_record, write_record
+from piavatar_envs.mpm.sums import offset_at
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums, row, vec8
 
 wp.set_module_options({"enable_backward": False})
@@ -104,7 +105,7 @@ def touch(
     a: int,
     b: int,
     node_facing: wp.array2d(dtype=wp.vec4),
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """Contact of the fields ``a < b`` at a node: equal and opposite impulses along one normal."""
@@ -137,7 +138,7 @@ def project_alone(
     e: int,
     block: int,
     local: int,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """The paper's rule: each field loses its approach to the common velocity along its own normal."""
@@ -147,7 +148,7 @@ def project_alone(
     most = float(0.0)
     for f in range(contact.num_fields):
         if has_field(mask, f):
-            v = node_velocity[e, first_record(grid, blocks, e, f, block) + local]
+            v = read_record(node_velocity, e, first_record(grid, blocks, e, f, block) + local)
             if v[0] > MASS_MIN:
                 m += v[0]
                 p += v[0] * wp.vec3(v[1], v[2], v[3])
@@ -160,7 +161,7 @@ def project_alone(
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
-            v = node_velocity[e, r]
+            v = read_record(node_velocity, e, r)
             if v[0] > MASS_MIN:
                 offset = offset_at(grid, sums, e, f, r)
                 out = wp.normalize(wp.vec3(offset[0], offset[1], offset[2]))
@@ -168,7 +169,7 @@ def project_alone(
                 mu = contact.friction[row(e, contact.friction.shape[0]), f * contact.num_fields + other]
                 # against a wall that moves with the common velocity
                 J = coulomb(1.0, 1.0, 2.0 * (wp.vec3(v[1], v[2], v[3]) - common), out, mu)
-                node_velocity[e, r] = v - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0)
+                write_record(node_velocity, e, r, v - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0))
                 book_contact(contact, e, r, other, -J, sensors)
 
 
@@ -183,7 +184,7 @@ def touch_all(
     block: int,
     local: int,
     node_facing: wp.array2d(dtype=wp.vec4),
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """Contact of all fields at a node."""

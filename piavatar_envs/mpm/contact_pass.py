@@ -21,8 +21,9 @@ from piavatar_envs.mpm.contact import book_pair, impulse_between, touch_all
 from piavatar_envs.mpm.grid import meet_boundaries, physical_velocity, place_of, slab_is_near, total_velocity
 from piavatar_envs.mpm.impulses import read_change, write_change
 from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN, normal_from, records_around
+from piavatar_envs.mpm.records import read_record, write_record
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
-from piavatar_envs.mpm.sums import clear_offset, offset_at, read_record, write_record
+from piavatar_envs.mpm.sums import clear_offset, offset_at
 from piavatar_envs.mpm.sweep import THREADS, Sweep
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, vec8
@@ -44,7 +45,7 @@ def settle_node(
     e: int,
     block: int,
     local: int,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """What comes after the contact of the fields of a node: boundaries are met, and velocities become physical."""
@@ -79,7 +80,7 @@ def solve_node(
     blocks: Blocks,
     node_facing: wp.array2d(dtype=wp.vec4),
     sums: Sums,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
     block: int,
@@ -110,7 +111,7 @@ def solve_pair(
     blocks: Blocks,
     node_facing: wp.array2d(dtype=wp.vec4),
     sums: Sums,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
     block: int,
@@ -175,7 +176,7 @@ def solve_contact(
     node_facing: wp.array2d(dtype=wp.vec4),
     # in and out: offsets are read, then cleared; sums become velocities
     sums: Sums,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """Velocity of every node in blocks with several fields, whose sums have been taken.

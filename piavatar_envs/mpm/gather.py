@@ -8,9 +8,9 @@ from piavatar_envs.mpm.blocks import mark_blocks
 from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.matrices import matrix_at, store_matrix
+from piavatar_envs.mpm.records import TO_KINEMATIC, first_of_halves, read_half_from
 from piavatar_envs.mpm.stencil import base_node, grid_position, in_same_brick, spline, stencil_inside
-from piavatar_envs.mpm.stencil_records import ends_of_line, line_of_records, slab_records
-from piavatar_envs.mpm.sums import first_of_records, read_half_from
+from piavatar_envs.mpm.stencil_records import HALVES, ends_of_line, line_of_records, slab_records
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -24,7 +24,6 @@ from piavatar_envs.mpm.types import (
     Moving,
     Particles,
     Step,
-    vec8,
 )
 
 # Warp's own unrolling hides the loops over the stencil from the C++ compiler, which turns them into vector code
@@ -160,14 +159,14 @@ def gather_physical(
         wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
         plane = wp.vec4()
         if i == 0 or ((base[0] + i) & 3) == 0:
-            slab = slab_records(grid, blocks, e, field, base, i)
+            slab = slab_records(grid, blocks, e, field, base, i, HALVES)
         for j in range(3):
             ends = ends_of_line(slab, base, i, j)
             middle = wp.where((base[2] & 3) == 3, ends[1], ends[0])
             w = wi * wy[j]
-            second = (w * wz[1]) * read_half_from(nodes, middle, 1, 0)
-            third = (w * wz[2]) * read_half_from(nodes, ends[1], 2, 0)
-            line = (w * wz[0]) * read_half_from(nodes, ends[0], 0, 0) + second + third
+            second = (w * wz[1]) * read_half_from(nodes, middle, 1)
+            third = (w * wz[2]) * read_half_from(nodes, ends[1], 2)
+            line = (w * wz[0]) * read_half_from(nodes, ends[0], 0) + second + third
             plane += line
             g.along_y += float(j) * line
             g.along_z += second + 2.0 * third
@@ -194,10 +193,11 @@ def gather_kinematic(
     for n in range(lines):
         i = n // 3
         j = n % 3
-        at = line_of_records(slab_records(grid, blocks, e, field, base, i), base, i, j)
+        at = line_of_records(slab_records(grid, blocks, e, field, base, i, HALVES), base, i, j)
         w = wx[i] * wy[j]
         for l in range(3):
-            s = (w * wz[l]) * read_half_from(nodes, at[l], 0, 1)
+            k = read_half_from(nodes, at[l], TO_KINEMATIC)
+            s = (w * wz[l]) * wp.vec4(0.0, k[0], k[1], k[2])
             g.mean += s
             g.along_x += float(i) * s
             g.along_y += float(j) * s
@@ -211,7 +211,7 @@ def gather(
     step: Step,
     particles: Particles,
     boundaries: Boundaries,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     blocks: Blocks,
     moved: Moving,
     failure: wp.array(dtype=int),
@@ -230,7 +230,7 @@ def gather(
     wy = spline(f[1])
     wz = spline(f[2])
     field = particles.field[p]
-    nodes = first_of_records(node_velocity, e)
+    nodes = first_of_halves(node_velocity, e)
     physical = gather_physical(grid, blocks, nodes, e, field, base, wx, wy, wz)
     kinematic = Gradients()
     asked = asks_kinematic(grid, step, boundaries, e, x)
@@ -247,7 +247,7 @@ def grid_to_particles(
     step: Step,
     particles: Particles,
     boundaries: Boundaries,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     # in and out; vk is read
     blocks: Blocks,
     moved: Moving,

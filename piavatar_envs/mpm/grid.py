@@ -8,8 +8,9 @@ from piavatar_envs.mpm.blocks import beside_others, held_by, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_BLOCK, NEAR_SLAB, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.normals import MASS_MIN, face_shared
+from piavatar_envs.mpm.records import write_physical, write_record
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
-from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, write_record
+from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at
 from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import (
@@ -165,7 +166,7 @@ def update_grid(
     blocks: Blocks,
     sums: Sums,
     # out
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     node_facing: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
@@ -193,6 +194,7 @@ def update_grid(
         blocks.swept[e] = used
         blocks.frozen[e] = failure[e]  # the scatter has ended
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    driven = step.decoupling == PAPER  # that variant asks every node for kinematic momentum
     end = BLOCK_NODES * used
     begin = first_node(sweep, thread)
     # asked for early: who waits for one answer after the other waits for most of the pass
@@ -222,11 +224,15 @@ def update_grid(
             is_told = is_near or told
             if r > first + lane:  # on a CPU, where a thread takes a block
                 sum = begin_sum(sums, e, r)
-            s = end_sum(sums, e, f, r, sum, is_told or step.decoupling == PAPER)
+            s = end_sum(sums, e, f, r, sum, is_told or driven)
             total = total_velocity(step, split, s)
             if is_near:  # most skip all of that work
                 x = place_of(grid, corner, r % BLOCK_NODES)
                 total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, total, sensors)
-            write_record(node_velocity, e, r, physical_velocity(split, total))
+            v = physical_velocity(split, total)
+            if is_told or driven:
+                write_record(node_velocity, e, r, v)
+            else:
+                write_physical(node_velocity, e, r, v)
             if is_told:
                 clear_offset(sums, e, r)

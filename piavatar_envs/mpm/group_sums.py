@@ -128,7 +128,7 @@ const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, warps = blockDim.x >
 const bool is_place = kind == PLACE, of_mass = c == 0 || is_place;
 const int most = of_mass ? HEAVIEST : kind == KINEMATIC ? DRIVEN : FASTEST;
 const int word = c > 0 ? c - (kind != 0) : kind == 0 ? 0 : 3;  // of four that lie together
-const int in_record = word + (kind == KINEMATIC ? 4 : 0);  // in floating point
+const int halves = kind == KINEMATIC ? 64 : 0;  // in floating point
 const int within = ((corner & 4) << 2) + ((corner & 2) << 1) + (corner & 1);
 const bool is_fixed = sums.is_fixed != 0;
 // in fixed point: memory takes 32 bytes at a time, a node's high and low parts. Four threads have a node of their own,
@@ -181,7 +181,7 @@ for (int place = warp; place < bricks; place += warps) {{
     else if (is_place)
         atomicAdd((float*)&wp::index(sums.offset, e, record + within) + word, sum * (c > 0 ? unit * grid.dx : unit));
     else
-        atomicAdd((float*)&wp::index(sums.value, e, record + within) + in_record, sum * unit);
+        atomicAdd((float*)&wp::index(sums.value, e, halves + record + (record & ~63) + within) + word, sum * unit);
 }}
 if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 """)

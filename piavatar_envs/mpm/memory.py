@@ -22,7 +22,6 @@ from piavatar_envs.mpm.types import (
     State,
     Sums,
     group,
-    vec8,
     vec8i,
     vec16i,
 )
@@ -130,7 +129,7 @@ def allocate(model: Model) -> tuple[State, Scratch]:
     )
     records = (model.num_envs, int(BLOCK_NODES) * model.max_slots)
     shared = records if model.contact.num_fields > 1 else (1, 1)
-    velocity = _zeros(model, records, vec8)
+    velocity = _zeros(model, (records[0], 2 * records[1]), wp.vec4)
     room, large_room = plan_room(model)
     scratch = Scratch(
         blocks=allocate_blocks(model),
@@ -166,13 +165,13 @@ def allocate_blocks(model: Model) -> Blocks:
 
 def allocate_sums(model: Model, velocity: wp.array) -> Sums:
     """Zeroed sums of the nodes, and their units. Sums from shared memory come to the records of the ``velocity``."""
-    fixed, records = SCATTERS[model.scatter], velocity.shape
+    fixed, records = SCATTERS[model.scatter], (model.num_envs, int(BLOCK_NODES) * model.max_slots)
     mass, momentum = units(model.contact.density.numpy(), model.grid, model.step)
     floats, integers = ((1, 1), records) if fixed else (records, (1, 1))
     return group(
         Sums,
         is_fixed=int(fixed),
-        value=velocity if model.scatter == "shared" else _zeros(model, floats, vec8),
+        value=velocity if model.scatter == "shared" else _zeros(model, (1, 1) if fixed else velocity.shape, wp.vec4),
         fixed=_zeros(model, integers, vec16i),
         offset=_zeros(model, floats, wp.vec4),
         offset_fixed=_zeros(model, integers, vec8i),

@@ -17,8 +17,9 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import first_record, has_field, nodes_shared, shared_block
 from piavatar_envs.mpm.impulses import read_change, write_change
+from piavatar_envs.mpm.records import mass_of, read_record, write_record
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_index, node_in_block
-from piavatar_envs.mpm.sums import move_offset, offset_at, read_record, take_sum, write_record
+from piavatar_envs.mpm.sums import move_offset, offset_at, take_sum
 from piavatar_envs.mpm.sweep import THREADS, Sweep
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, row, vec8, vec8i
 
@@ -49,7 +50,7 @@ def take_sums(
     block: int,
     local: int,
     # out
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
 ):
     """Move the sums of a node to where its velocities will be, and join limbs to their trunk.
 
@@ -93,7 +94,7 @@ def face_node(
     e: int,
     block: int,
     local: int,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     # out
     node_facing: wp.array2d(dtype=wp.vec4),
 ):
@@ -103,7 +104,7 @@ def face_node(
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
-            m = node_velocity[e, r][0]
+            m = mass_of(node_velocity, e, r)
             V = volume_at(grid, contact, e, f, m)
             if V > 0.0:
                 volume += V
@@ -111,7 +112,7 @@ def face_node(
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
-            m = node_velocity[e, r][0]
+            m = mass_of(node_velocity, e, r)
             V = volume_at(grid, contact, e, f, m)
             facing = wp.vec3()
             if V > 0.0 and volume > V:
@@ -131,7 +132,7 @@ def face_shared(
     e: int,
     thread: int,
     # out
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     node_facing: wp.array2d(dtype=wp.vec4),
 ):
     """What every node of a block with several fields says about the normals around it, for the nodes of a thread.
@@ -160,7 +161,7 @@ def find_facing(
     # in and out: taken where several fields are
     sums: Sums,
     # out
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     node_facing: wp.array2d(dtype=wp.vec4),
 ):
     """:func:`face_shared` alone, where no grid pass is launched that could do it as well."""

@@ -98,7 +98,7 @@ def grid_to_particles(
     step: Step,
     particles: Particles,
     boundaries: Boundaries,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     senses: int,
     # in and out; vk is read
     blocks: Blocks,

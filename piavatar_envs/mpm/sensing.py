@@ -6,6 +6,7 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import fields_around, first_record, has_field, record_of
 from piavatar_envs.mpm.impulses import add_impulse, part_entry, read_change
+from piavatar_envs.mpm.records import mass_of
 from piavatar_envs.mpm.stencil import (
     BLOCK_NODES,
     base_node,
@@ -14,9 +15,9 @@ from piavatar_envs.mpm.stencil import (
     spline,
     stencil_inside,
 )
-from piavatar_envs.mpm.stencil_records import line_of_records, slab_records
+from piavatar_envs.mpm.stencil_records import VECTORS, line_of_records, slab_records
 from piavatar_envs.mpm.sweep import THREADS
-from piavatar_envs.mpm.types import Blocks, Contact, Grid, Particles, Sensors, row, vec8
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Particles, Sensors, row
 from piavatar_envs.mpm.warp_blocks import fields_may_meet
 
 # unrolled, the stencil takes so many registers that a GPU has few threads at once
@@ -98,7 +99,7 @@ def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Se
     three = int(3)  # not a constant, where loops are unrolled: what few particles come to is as short as can be
     for i in range(three):
         if i == 0 or ((base[0] + i) & 3) == 0:
-            slab = slab_records(grid, blocks, e, own, base, i)
+            slab = slab_records(grid, blocks, e, own, base, i, VECTORS)
         for j in range(three):
             at = line_of_records(slab, base, i, j)
             w = m * pick(wx, i) * pick(wy, j)
@@ -149,7 +150,7 @@ def sense_penetration(
     contact: Contact,
     x: wp.array2d(dtype=wp.vec3),
     blocks: Blocks,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     failure: wp.array(dtype=int),
     # in and out
     penetration: wp.array2d(dtype=float),
@@ -183,7 +184,7 @@ def sense_penetration(
                             r = record_of(grid, blocks, e, g, base[0] + i, base[1] + j, base[2] + k)
                             # a block that the last gather has marked knows nothing yet
                             if r < BLOCK_NODES * blocks.swept[e]:
-                                m += pick(wx, i) * pick(wy, j) * pick(wz, k) * node_velocity[e, r][0]
+                                m += pick(wx, i) * pick(wy, j) * pick(wz, k) * mass_of(node_velocity, e, r)
             density = contact.density[row(e, contact.density.shape[0]), g]
             fraction += m * grid.inv_dx * grid.inv_dx * grid.inv_dx / density
     depth = grid.dx * (wp.min(fraction, 1.0) - SURFACE) / SURFACE_SLOPE

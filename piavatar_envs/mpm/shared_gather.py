@@ -23,7 +23,6 @@ from piavatar_envs.mpm.types import (
     Particles,
     Room,
     Step,
-    vec8,
     vec8i,
 )
 
@@ -109,7 +108,7 @@ def gather_all(
     step: Step,
     particles: Particles,
     boundaries: Boundaries,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     blocks: Blocks,
     room: Room,
     moved: Moving,

@@ -44,7 +44,6 @@ from piavatar_envs.mpm.types import (
     State,
     Step,
     Sums,
-    vec8,
 )
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -63,7 +62,7 @@ def run_substep(
     moved: Moving,
     failure: wp.array(dtype=int),
     sums: Sums,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
     part: wp.vec3i,
@@ -139,7 +138,7 @@ def substep_kernel(large: bool, gathers: bool) -> wp.Kernel:
         failure: wp.array(dtype=int),
         sums: Sums,
         # out
-        node_velocity: wp.array2d(dtype=vec8),
+        node_velocity: wp.array2d(dtype=wp.vec4),
         sensors: Sensors,
     ):
         e, t = wp.tid()

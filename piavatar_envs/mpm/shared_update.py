@@ -6,6 +6,7 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import has_field, slots_used
 from piavatar_envs.mpm.grid import meet_boundaries, physical_velocity, place_of, total_velocity
+from piavatar_envs.mpm.records import write_record
 from piavatar_envs.mpm.shared_grid import (
     BLOCK_BRICKS,
     NO_BRICK,
@@ -22,7 +23,6 @@ from piavatar_envs.mpm.shared_layout import block_of, place_of_record, record_of
 from piavatar_envs.mpm.shared_memory import half_word, number, thread_of_block, threads_of_block, word
 from piavatar_envs.mpm.shared_units import unit_of_mass
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner
-from piavatar_envs.mpm.sums import write_record
 from piavatar_envs.mpm.types import (
     NO_STRESS,
     SPLIT,
@@ -102,7 +102,7 @@ def update_bricks(
     blocks: Blocks,
     room: Room,
     sums: Sums,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
     first: int,
@@ -128,7 +128,7 @@ def clear_untouched(
     grid: Grid,
     blocks: Blocks,
     room: Room,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
     part: wp.vec3i,

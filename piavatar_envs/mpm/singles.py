@@ -97,8 +97,9 @@ if (is_fixed) records_at = &wp::index(sums.fixed, e, 0);
 if (is_place) records_at = &wp::index(sums.offset, is_fixed ? 0 : e, 0);
 if (is_place && is_fixed) records_at = &wp::index(sums.offset_fixed, e, 0);
 const size_t to = __cvta_generic_to_global(records_at) + 4 * word + (is_fixed ? 16 * part : 0)
-    + (kind == {int(KINEMATIC)} ? (is_fixed ? 32 : 16) : 0);
-const int size = (is_fixed ? 2 : 1) * (is_place ? 16 : 32);  // of a node's record [bytes]
+    + (kind == {int(KINEMATIC)} ? (is_fixed ? 32 : 64 * 16) : 0);
+const int size = is_fixed ? (is_place ? 32 : 64) : 16;  // from a node to the next of a block [bytes]
+const int blocks_apart = is_fixed || is_place ? 1 : 2;  // in floating point, the halves of its records lie apart
 const float per_high = part == 0 ? 1.0f : -0x1p20f, per_all = part == 0 ? 0.0f : 1.0f;
 struct Fixed {{ enum {{ FIXED = 1, SURE = 0 }}; }};
 struct Sure {{ enum {{ FIXED = 1, SURE = 1 }}; }};
@@ -114,7 +115,8 @@ for (int turn = 0; turn < 8; turn += 4) {{
     int lower[4], upper[4];
 #pragma unroll
     for (int n = 0; n < 4; ++n)
-        lower[n] = __shfl_sync(ALL, records[0], first | n), upper[n] = __shfl_sync(ALL, records[1], first | n);
+        lower[n] = blocks_apart * __shfl_sync(ALL, records[0], first | n),
+        upper[n] = blocks_apart * __shfl_sync(ALL, records[1], first | n);
     auto add = [&](auto sum) {{
         constexpr bool FIXED = decltype(sum)::FIXED, SURE = decltype(sum)::SURE;
 #pragma unroll

@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from piavatar_envs.mpm.records import read_physical, read_record, write_physical, write_record
 from piavatar_envs.mpm.types import Grid, Step, Sums, row, vec8, vec8i, vec16i
 
 wp.set_module_options({"enable_backward": False})
@@ -36,87 +37,6 @@ def units(density: np.ndarray, grid: Grid, step: Step) -> tuple[np.ndarray, np.n
     """
     mass = np.asarray(density, float) * grid.dx**3 / UNITS
     return np.exp2(np.round(np.log2(mass))), np.exp2(np.round(np.log2(mass * grid.dx / step.dt)))
-
-
-@wp.func_native("return (wp::uint64)&wp::index(records, e, 0);")
-def first_of_records(records: wp.array2d(dtype=vec8), e: int) -> wp.uint64:
-    """Address of ``records[e, 0]``, for :func:`read_record_from`."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-const float4* at = reinterpret_cast<const float4*>(first) + 2 * r;
-const float4 a = at[0], b = at[1];
-wp::vec_t<8, wp::float32> value;
-value[0] = a.x; value[1] = a.y; value[2] = a.z; value[3] = a.w;
-value[4] = b.x; value[5] = b.y; value[6] = b.z; value[7] = b.w;
-return value;
-#else
-return reinterpret_cast<const wp::vec_t<8, wp::float32>*>(first)[r];
-#endif
-""")
-def read_record_from(first: wp.uint64, r: int) -> vec8:
-    """Record ``r`` after that at the address ``first``, on a GPU in two loads of 16 bytes instead of eight of 4."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-const float4 a = (reinterpret_cast<const float4*>(first) + 2 * (wp::int64)r)[2 * next + half];
-if (half == 0) return wp::vec_t<4, wp::float32>(a.x, a.y, a.z, a.w);
-return wp::vec_t<4, wp::float32>(a.w, a.x, a.y, a.z);
-#else
-const wp::vec_t<4, wp::float32>& a = reinterpret_cast<const wp::vec_t<4, wp::float32>*>(first)[2 * (r + next) + half];
-if (half == 0) return a;
-return wp::vec_t<4, wp::float32>(a[3], a[0], a[1], a[2]);
-#endif
-""")
-def read_half_from(first: wp.uint64, r: int, next: int, half: int) -> wp.vec4:
-    """The physical (``half`` 0) or the kinematic (1) part of a record, in components 1 to 3.
-
-    That is the ``next``-th after :func:`read_record_from`'s: a constant, it takes a GPU no arithmetic.
-    """
-    ...
-
-
-@wp.func
-def read_record(records: wp.array2d(dtype=vec8), e: int, r: int):
-    """``records[e, r]``; for many of an environment, :func:`read_record_from` finds its row once."""
-    return read_record_from(first_of_records(records, e), r)
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-float4* const mine = reinterpret_cast<float4*>(&wp::index(records, e, r));
-const float4 a = make_float4(value[0], value[1], value[2], value[3]);
-const float4 b = make_float4(value[4], value[5], value[6], value[7]);
-constexpr unsigned ALL = 0xffffffffu;
-if (__activemask() != ALL) {
-    mine[0] = a;
-    mine[1] = b;
-    return;
-}
-// memory takes 32 bytes at a time: two threads write one's record, then the other's, with a half each
-const int odd = threadIdx.x & 1;
-const float4 give = odd ? a : b;
-float4 got;
-got.x = __shfl_xor_sync(ALL, give.x, 1);
-got.y = __shfl_xor_sync(ALL, give.y, 1);
-got.z = __shfl_xor_sync(ALL, give.z, 1);
-got.w = __shfl_xor_sync(ALL, give.w, 1);
-float4* const other = (float4*)__shfl_xor_sync(ALL, (unsigned long long)mine, 1);
-__syncwarp();  // the other may have read its own, and will read it again
-(odd ? other : mine)[odd] = odd ? got : a;
-(odd ? mine : other)[odd] = odd ? b : got;
-__syncwarp();
-#else
-wp::index(records, e, r) = value;
-#endif
-""")
-def write_record(records: wp.array2d(dtype=vec8), e: int, r: int, value: vec8):
-    """``records[e, r] = value`` in two stores of 16 bytes; threads of a warp must not write the same record."""
-    ...
 
 
 _READ_PART = """
@@ -225,13 +145,17 @@ def take_sum(sums: Sums, e: int, f: int, r: int):
 def end_sum(sums: Sums, e: int, f: int, r: int, begun: Begun, driven: bool):
     """:func:`take_sum` of what has ``begun``.
 
-    Where it is known that nobody has added kinematic momentum, the record is not ``driven``: that is not read in fixed
-    point, nor cleared.
+    Where it is known that nobody has added kinematic momentum, the record is not ``driven``: that is not read, nor
+    cleared.
     """
     s = vec8()
     if sums.is_fixed == 0:
-        s = read_record(sums.value, e, r)
-        write_record(sums.value, e, r, vec8())
+        if driven:
+            s = read_record(sums.value, e, r)
+            write_record(sums.value, e, r, vec8())
+        else:
+            s = read_physical(sums.value, e, r)
+            write_physical(sums.value, e, r, vec8())
     else:
         a = join_parts(begun.high, begun.low)
         if a[0] > 0.0:  # who adds no mass adds nothing

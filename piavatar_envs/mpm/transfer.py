@@ -12,8 +12,9 @@ from piavatar_envs.mpm.blocks import fields_around, record_of
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.matrices import matrix_at
+from piavatar_envs.mpm.records import TO_KINEMATIC, half_of
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
-from piavatar_envs.mpm.stencil_records import line_of_records, slab_records
+from piavatar_envs.mpm.stencil_records import HALVES, line_of_records, slab_records
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
     FAILURE_NONFINITE,
@@ -152,6 +153,20 @@ def tells_place(
 
 
 @wp.func
+def scatter_kinematic(grid: Grid, blocks: Blocks, sums: Sums, e: int, field: int, s: Scattered):
+    """Tell the nodes how a particle is driven."""
+    wx = spline(s.f[0])
+    wy = spline(s.f[1])
+    wz = spline(s.f[2])
+    k = wp.vec4(s.at_base[4], s.at_base[5], s.at_base[6], 0.0)
+    for i in range(3):
+        for j in range(3):
+            for l in range(3):
+                r = record_of(grid, blocks, e, field, s.base[0] + i, s.base[1] + j, s.base[2] + l)
+                wp.atomic_add(sums.value, e, half_of(r) + TO_KINEMATIC, (wx[i] * wy[j] * wz[l]) * k)
+
+
+@wp.func
 def scatter_offsets(grid: Grid, blocks: Blocks, sums: Sums, e: int, field: int, seam: float, s: Scattered):
     """Tell the nodes where a particle is."""
     wx = spline(s.f[0])
@@ -191,19 +206,19 @@ def particles_to_grid(
     tells = tells_place(grid, particles, boundaries, contact, blocks, e, p, x, base)
     s = prepare(grid, step, particles, moving, e, p, tells)
     A = s.A
-    along_x = vec8(0.0, A[0, 0], A[1, 0], A[2, 0], 0.0, 0.0, 0.0, 0.0)
-    along_y = vec8(0.0, A[0, 1], A[1, 1], A[2, 1], 0.0, 0.0, 0.0, 0.0)
-    along_z = vec8(0.0, A[0, 2], A[1, 2], A[2, 2], 0.0, 0.0, 0.0, 0.0)
+    along_x = wp.vec4(0.0, A[0, 0], A[1, 0], A[2, 0])
+    along_y = wp.vec4(0.0, A[0, 1], A[1, 1], A[2, 1])
+    along_z = wp.vec4(0.0, A[0, 2], A[1, 2], A[2, 2])
     wx = spline(s.f[0])
     wy = spline(s.f[1])
     wz = spline(s.f[2])
     field = particles.field[p]
-    at_i = s.at_base
+    at_i = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
     slab = wp.vec4i()
     for i in range(3):
         at_j = wx[i] * at_i
         if i == 0 or ((base[0] + i) & 3) == 0:
-            slab = slab_records(grid, blocks, e, field, base, i)
+            slab = slab_records(grid, blocks, e, field, base, i, HALVES)
         for j in range(3):
             line = wy[j] * at_j
             step_z = (wx[i] * wy[j]) * along_z
@@ -213,5 +228,7 @@ def particles_to_grid(
             wp.atomic_add(sums.value, e, at[2], wz[2] * (line + 2.0 * step_z))
             at_j += wx[i] * along_y
         at_i += along_x
+    if tells or step.decoupling == PAPER:
+        scatter_kinematic(grid, blocks, sums, e, field, s)
     if tells:
         scatter_offsets(grid, blocks, sums, e, field, particles.seam[p], s)

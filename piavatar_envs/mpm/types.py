@@ -173,7 +173,7 @@ class Sums:
     """
 
     is_fixed: int
-    value: wp.array2d(dtype=vec8)  # mass, physical momentum, kinematic momentum, nothing
+    value: wp.array2d(dtype=wp.vec4)  # halves of records: mass, physical momentum; kinematic momentum, nothing
     fixed: wp.array2d(dtype=vec16i)
     offset: wp.array2d(dtype=wp.vec4)  # sum of w m (x_i - x_p), of w m of seam particles; near others and boundaries
     offset_fixed: wp.array2d(dtype=vec8i)
@@ -296,7 +296,8 @@ class Scratch:
     Attributes:
         blocks: which blocks hold matter in this control step, and their slots.
         sums: what particles have added up.
-        velocity: vec8: mass, physical velocity, kinematic velocity, nothing. In blocks with several fields the sums
+        velocity: vec4: halves of records, see :mod:`piavatar_envs.mpm.records`: mass and physical velocity, kinematic
+            velocity and nothing; the latter only where contact is at hand. In blocks with several fields the sums
             stand here until they have become velocities.
         facing: vec4: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`, and nothing;
             of blocks with several fields only.

@@ -94,7 +94,7 @@ def test_model_is_what_was_asked_for(model_of):
     assert list(model.step.gravity) == [0.0, 1.0, -2.0]
     assert model.particles.mass.numpy() == pytest.approx(np.ones((1, 8)))
     state, scratch = allocate(model)
-    assert state.x.shape == (2, 8) and scratch.velocity.shape == (2, 64 * model.max_slots)
+    assert state.x.shape == (2, 8) and scratch.velocity.shape == (2, 2 * 64 * model.max_slots)
     assert np.array_equal(state.numpy()["F"], np.broadcast_to(np.eye(3), (2, 8, 3, 3)))
 
 

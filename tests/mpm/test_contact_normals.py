@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.mpm.blocks import held_by, record_of
 from piavatar_envs.mpm.normals import find_facing, shared_normal, surface_gap, volume_at
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.records import mass_of
 from piavatar_envs.mpm.solver import record_marks, record_scatter
 from piavatar_envs.mpm.stencil import block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import offset_at
 from piavatar_envs.mpm.sweep import THREADS, plan_shared_sweep
-from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, vec8
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums
 
 DX = 0.05
 #: Two bodies that touch in the plane z = 0: first halves of a cube, then a block on a table.
@@ -28,7 +29,7 @@ def look_at_nodes(
     contact: Contact,
     blocks: Blocks,
     sums: Sums,
-    node_velocity: wp.array2d(dtype=vec8),
+    node_velocity: wp.array2d(dtype=wp.vec4),
     node_facing: wp.array2d(dtype=wp.vec4),
     # out
     volume: wp.array2d(dtype=float),
@@ -45,8 +46,8 @@ def look_at_nodes(
     node = node_of_block(block_corner(grid, held[1]), local)
     a = record_of(grid, blocks, 0, 0, node[0], node[1], node[2])
     b = record_of(grid, blocks, 0, 1, node[0], node[1], node[2])
-    m_a = node_velocity[0, a][0]  # not yet velocities
-    m_b = node_velocity[0, b][0]
+    m_a = mass_of(node_velocity, 0, a)  # not yet velocities
+    m_b = mass_of(node_velocity, 0, b)
     if m_a > 0.0 and m_b > 0.0:
         n = 64 * slot + local
         volume[0, n] = volume_at(grid, contact, 0, 0, m_a)

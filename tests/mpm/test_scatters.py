@@ -67,7 +67,8 @@ def node_sums(sim):
         sums[..., 0] *= scratch.sums.mass_unit.numpy()[0, 0]
         sums[..., 1:] *= scratch.sums.momentum_unit.numpy()[0, 0]
     else:
-        sums = scratch.sums.value.numpy()[..., :7].astype(float)
+        halves = scratch.sums.value.numpy().astype(float).reshape(model.num_envs, -1, 2, 64, 4)
+        sums = np.concatenate([halves[:, :, 0], halves[:, :, 1, :, :3]], axis=-1)
     records = sums.reshape(model.num_envs, model.max_slots, 64, 7)
     return {(e, held[e, s]): records[e, s] for e in range(model.num_envs) for s in range(count[e])}
 

@@ -9,7 +9,8 @@ import pytest
 import warp as wp
 
 from piavatar_envs.mpm import sweep
-from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, read_record, write_record
+from piavatar_envs.mpm.records import mass_of, read_physical, read_record, write_physical, write_record
+from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at
 from piavatar_envs.mpm.types import Grid, Sums, group, vec8, vec8i, vec16i
 
 RECORDS = 64
@@ -73,7 +74,7 @@ def test_fixed_sums(device, driven):
     sums = group(
         Sums,
         is_fixed=1,
-        value=wp.zeros((1, 1), dtype=vec8, device=device),
+        value=wp.zeros((1, 1), dtype=wp.vec4, device=device),
         fixed=wp.array(parts, dtype=vec16i, device=device),
         offset=wp.zeros((1, 1), dtype=wp.vec4, device=device),
         offset_fixed=wp.array(offsets, dtype=vec8i, device=device),
@@ -105,20 +106,29 @@ def test_fixed_sums(device, driven):
 
 
 @wp.kernel
-def count_up(stride: int, records: wp.array2d(dtype=vec8)):
-    """Record ``stride t`` is read and written, as by threads of whole and of broken warps."""
+def count_up(stride: int, records: wp.array2d(dtype=wp.vec4), mass: wp.array(dtype=float)):
+    """Record ``stride t`` is read and written; every second in its first half only."""
     r = stride * wp.tid()
-    write_record(records, 0, r, read_record(records, 0, r) + vec8(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, float(r)))
+    mass[wp.tid()] = mass_of(records, 0, r)
+    summand = vec8(1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, float(r))
+    if wp.tid() % 2 == 0:
+        write_record(records, 0, r, read_record(records, 0, r) + summand)
+    else:
+        write_physical(records, 0, r, read_physical(records, 0, r) + summand)
 
 
-@pytest.mark.parametrize("threads", [32, 45, 64])
 @pytest.mark.parametrize("stride", [1, 3])
-def test_records_are_written_whole(device, threads, stride):
-    start = np.random.default_rng(2).integers(0, 99, (1, RECORDS * stride, 8)).astype(np.float32)
-    records = wp.array(start, dtype=vec8, device=device)
-    wp.launch(count_up, threads, inputs=[stride], outputs=[records], device=device)
-    at = stride * np.arange(threads)
-    expected = start[0].copy()
-    expected[at, :7] += np.arange(1, 8)
-    expected[at, 7] += at
-    np.testing.assert_array_equal(records.numpy()[0], expected)
+def test_records_have_two_halves(device, stride):
+    """Those of a slot's 64 nodes lie one after the other, first the physical ones."""
+    start = np.random.default_rng(2).integers(0, 99, (stride, 2, 64, 4)).astype(np.float32)
+    records = wp.array(start.reshape(1, -1, 4), dtype=wp.vec4, device=device)
+    mass = wp.zeros(RECORDS, dtype=float, device=device)
+    wp.launch(count_up, RECORDS, inputs=[stride], outputs=[records, mass], device=device)
+    at = stride * np.arange(RECORDS)
+    expected = start.copy()
+    slot, node = at // 64, at % 64
+    np.testing.assert_array_equal(mass.numpy(), start[slot, 0, node, 0])
+    expected[slot, 0, node] += np.arange(1, 5)
+    slot, node, last = slot[::2], node[::2], at[::2, None]
+    expected[slot, 1, node] += np.hstack([np.tile(np.arange(5, 8), (len(last), 1)), last])
+    np.testing.assert_array_equal(records.numpy().reshape(start.shape), expected)
