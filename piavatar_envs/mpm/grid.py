@@ -10,7 +10,7 @@ from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.normals import MASS_MIN, face_shared
 from piavatar_envs.mpm.records import write_physical, write_record
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
-from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at
+from piavatar_envs.mpm.sums import Begun, begin_sum, clear_offset, end_sum, offset_at
 from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import (
@@ -153,6 +153,39 @@ def told_by_neighbours(grid: Grid, contact: Contact, blocks: Blocks, e: int, f: 
     return told
 
 
+@wp.func
+def update_node(
+    grid: Grid,
+    step: Step,
+    boundaries: Boundaries,
+    contact: Contact,
+    sums: Sums,
+    begun: Begun,
+    e: int,
+    f: int,
+    r: int,
+    corner: wp.vec3i,
+    is_near: bool,
+    is_told: bool,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
+):
+    """Sums of a node to velocities; kinematic ones where somebody has told them, or the variant asks everybody."""
+    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    driven = is_told or step.decoupling == PAPER
+    total = total_velocity(step, split, end_sum(sums, e, f, r, begun, driven))
+    if is_near:  # most skip all of that work
+        x = place_of(grid, corner, r % BLOCK_NODES)
+        total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, total, sensors)
+    v = physical_velocity(split, total)
+    if driven:
+        write_record(node_velocity, e, r, v)
+    else:
+        write_physical(node_velocity, e, r, v)
+    if is_told:
+        clear_offset(sums, e, r)
+
+
 @wp.kernel(launch_bounds=(THREADS, 7))
 def update_grid(
     grid: Grid,
@@ -193,8 +226,6 @@ def update_grid(
     if thread == 0:
         blocks.swept[e] = used
         blocks.frozen[e] = failure[e]  # the scatter has ended
-    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    driven = step.decoupling == PAPER  # that variant asks every node for kinematic momentum
     end = BLOCK_NODES * used
     begin = first_node(sweep, thread)
     # asked for early: who waits for one answer after the other waits for most of the pass
@@ -221,18 +252,9 @@ def update_grid(
         told = told_by_neighbours(grid, contact, blocks, e, f, corner)
         for r in range(first + lane, first + lane + sweep.share):
             is_near = near_node(about, r % BLOCK_NODES)
-            is_told = is_near or told
             if r > first + lane:  # on a CPU, where a thread takes a block
                 sum = begin_sum(sums, e, r)
-            s = end_sum(sums, e, f, r, sum, is_told or driven)
-            total = total_velocity(step, split, s)
-            if is_near:  # most skip all of that work
-                x = place_of(grid, corner, r % BLOCK_NODES)
-                total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, total, sensors)
-            v = physical_velocity(split, total)
-            if is_told or driven:
-                write_record(node_velocity, e, r, v)
-            else:
-                write_physical(node_velocity, e, r, v)
-            if is_told:
-                clear_offset(sums, e, r)
+            update_node(
+                grid, step, boundaries, contact, sums, sum, e, f, r, corner, is_near, is_near or told, node_velocity,
+                sensors,
+            )  # fmt: skip

@@ -1,10 +1,10 @@
 """The scatter of a GPU for large bodies of few particles a cell, skins for example: each goes to the nodes by itself.
 
 Groups of particles, see :mod:`piavatar_envs.mpm.groups`, take time to find out which nodes they have in common. Where
-these are few, memory is faster asked for all additions. Four threads prepare a particle together: each looks two of the
-eight blocks up that its stencil may lie in, and knows one of the four numbers that are added to a node. Eight add it,
-the particles of both of their fours in turn: a high or a low part of a number each, 32 bytes together, which memory
-takes at a time. What is added are integers: runs repeat bit for bit.
+these are few, memory is faster asked for all additions. A particle has eight threads, all of which know what it
+scatters. Each looks one of the eight blocks up that its stencil may lie in, and to every node all add together, a high
+or a low part of one of four numbers each: 32 bytes, which memory takes at a time. What is added are integers: runs
+repeat bit for bit.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from piavatar_envs.mpm.types import (
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: Threads that prepare a particle.
-TEAM = wp.constant(4)
+#: Threads of a particle. Four, eight of which add the particles of both in turn, need fewer instructions and more time.
+TEAM = wp.constant(8)
 #: Particles of a warp.
 SHARE = wp.constant(32 // int(TEAM))
 #: Threads of a CUDA block.
@@ -45,25 +45,21 @@ THREADS = 128
 
 
 @wp.func
-def record_of_thread(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i, upper: int):
-    """First record of a block that a thread looks up, of the lower or the ``upper`` ones along x.
+def block_of_thread(grid: Grid, base: wp.vec3i):
+    """The one that a thread looks up, of the eight blocks that the stencil at ``base`` may lie in.
 
-    Bits of the thread's place in its team say whether it is the upper along y and z; where the stencil at ``base`` lies
-    in one block along an axis, that is the lower. It exists also where a particle is outside the grid, and takes no
-    part. Returned with whether there is matter of another field.
+    Bits of the thread's place in its team say whether it is the upper along x, y and z; where the stencil lies in one
+    block along an axis, that is the lower. It exists also where a particle is outside the grid, and takes no part.
     """
-    j = base[1] + (lane_of_thread() & 2)
-    block = block_index(grid, base[0] + 2 * upper, j, base[2] + 2 * (lane_of_thread() & 1))
-    block = wp.clamp(block, 0, grid.num_blocks - 1)
-    others = int(0)
-    if blocks.slot.shape[1] > grid.num_blocks:
-        others = blocks.fields[e, block] & ~(1 << field)
-    return wp.vec2i(BLOCK_NODES * blocks.slot[e, field * grid.num_blocks + block], others)
+    upper = lane_of_thread()
+    i = base[0] + 2 * ((upper >> 2) & 1)
+    j = base[1] + (upper & 2)
+    return wp.clamp(block_index(grid, i, j, base[2] + 2 * (upper & 1)), 0, grid.num_blocks - 1)
 
 
 @wp.func_native(
     native(
-        "return (__ballot_sync(0xffffffffu, here) >> (threadIdx.x & 28) & 15u) != 0u;",
+        "return (__ballot_sync(0xffffffffu, here) >> (threadIdx.x & 24) & 255u) != 0u;",
         "return here;",
     )
 )
@@ -104,55 +100,48 @@ const float per_high = part == 0 ? 1.0f : -0x1p20f, per_all = part == 0 ? 0.0f :
 struct Fixed {{ enum {{ FIXED = 1, SURE = 0 }}; }};
 struct Sure {{ enum {{ FIXED = 1, SURE = 1 }}; }};
 struct Floating {{ enum {{ FIXED = 0, SURE = 1 }}; }};
-#pragma unroll 1
-for (int turn = 0; turn < 8; turn += 4) {{
-    const int first = lane & 24 | turn, from = first | c;  // the four threads whose particle it is
-    auto of = [=](auto number) {{ return __shfl_sync(ALL, number, from); }};
-    const float v = of(value), by_x = of(along_x), by_y = of(along_y), by_z = of(along_z), count = of(massive);
-    const float x[3] = {{of(wx[0]), of(wx[1]), of(wx[2])}}, y[3] = {{of(wy[0]), of(wy[1]), of(wy[2])}};
-    const float z[3] = {{of(wz[0]), of(wz[1]), of(wz[2])}};
-    const int bx = of(base[0] & 3), by = of(base[1] & 3), bz = of(base[2] & 3);
-    int lower[4], upper[4];
+const int bx = base[0] & 3, by = base[1] & 3, bz = base[2] & 3;
+int lower[4], upper[4];  // of the threads that have looked them up
 #pragma unroll
-    for (int n = 0; n < 4; ++n)
-        lower[n] = blocks_apart * __shfl_sync(ALL, records[0], first | n),
-        upper[n] = blocks_apart * __shfl_sync(ALL, records[1], first | n);
-    auto add = [&](auto sum) {{
-        constexpr bool FIXED = decltype(sum)::FIXED, SURE = decltype(sum)::SURE;
+for (int n = 0; n < 4; ++n) {{
+    lower[n] = blocks_apart * __shfl_sync(ALL, record, lane & 24 | n);
+    upper[n] = blocks_apart * __shfl_sync(ALL, record, lane & 24 | 4 | n);
+}}
+auto add = [&](auto sum) {{
+    constexpr bool FIXED = decltype(sum)::FIXED, SURE = decltype(sum)::SURE;
 #pragma unroll
-        for (int i = 0; i < 3; ++i) {{
-            const float plane = i == 0 ? v : v + i * by_x;
-            int slab[4];
+    for (int i = 0; i < 3; ++i) {{
+        const float plane = i == 0 ? value : value + i * along_x;
+        int slab[4];
 #pragma unroll
-            for (int n = 0; n < 4; ++n) slab[n] = bx + i > 3 ? upper[n] : lower[n];
+        for (int n = 0; n < 4; ++n) slab[n] = bx + i > 3 ? upper[n] : lower[n];
 #pragma unroll
-            for (int j = 0; j < 3; ++j) {{
-                const int in_block = 16 * (bx + i & 3) + 4 * (by + j & 3);
-                const int near = (by + j > 3 ? slab[2] : slab[0]) + in_block;
-                const int next = (by + j > 3 ? slab[3] : slab[1]) + in_block;
-                const float w_line = x[i] * y[j], line = j == 0 ? plane : plane + j * by_y;
+        for (int j = 0; j < 3; ++j) {{
+            const int in_block = 16 * (bx + i & 3) + 4 * (by + j & 3);
+            const int near = (by + j > 3 ? slab[2] : slab[0]) + in_block;
+            const int next = (by + j > 3 ? slab[3] : slab[1]) + in_block;
+            const float w_line = wx[i] * wy[j], line = j == 0 ? plane : plane + j * along_y;
 #pragma unroll
-                for (int l = 0; l < 3; ++l) {{
-                    const float w = w_line * z[l], number = w * (l == 0 ? line : line + l * by_z);
-                    size_t node;
-                    asm("mad.wide.s32 %0, %1, %2, %3;"
-                        : "=l"(node) : "r"((bz + l > 3 ? next : near) + (bz + l & 3)), "r"(size), "l"(to));
-                    if (FIXED) {{
-                        // the nearest integer, as far as a number has bits; and what is left for the lower part
-                        const float high = __fadd_rn(__fmaf_rn(number, 0x1p-20f, 0x1.8p23f), -0x1.8p23f);
-                        const int added = __float2int_rn(per_high * high + per_all * number);
-                        asm volatile("red.global.add.s32 [%0], %1;"
-                                     :: "l"(node), "r"(SURE || w * count > 0.5f ? added : 0) : "memory");
-                    }} else if (count > 0.0f && part == 0)
-                        asm volatile("red.global.add.f32 [%0], %1;" :: "l"(node), "f"(number) : "memory");
-                }}
+            for (int l = 0; l < 3; ++l) {{
+                const float w = w_line * wz[l], number = w * (l == 0 ? line : line + l * along_z);
+                size_t node;
+                asm("mad.wide.s32 %0, %1, %2, %3;"
+                    : "=l"(node) : "r"((bz + l > 3 ? next : near) + (bz + l & 3)), "r"(size), "l"(to));
+                if (FIXED) {{
+                    // the nearest integer, as far as a number has bits; and what is left for the lower part
+                    const float high = __fadd_rn(__fmaf_rn(number, 0x1p-20f, 0x1.8p23f), -0x1.8p23f);
+                    const int added = __float2int_rn(per_high * high + per_all * number);
+                    asm volatile("red.global.add.s32 [%0], %1;"
+                                 :: "l"(node), "r"(SURE || w * massive > 0.5f ? added : 0) : "memory");
+                }} else if (massive > 0.0f && part == 0)
+                    asm volatile("red.global.add.f32 [%0], %1;" :: "l"(node), "f"(number) : "memory");
             }}
         }}
-    }};
-    if (!is_fixed) add(Floating());
-    else if (sure) add(Sure());
-    else add(Fixed());
-}}
+    }}
+}};
+if (!is_fixed) add(Floating());
+else if (sure) add(Sure());
+else add(Fixed());
 """)
 )
 def add_to_nodes(
@@ -168,13 +157,13 @@ def add_to_nodes(
     s: wp.vec4,
     A: wp.mat33,
     mass: float,
-    records: wp.vec2i,
+    record: int,
     units: wp.vec2,
 ):
     """Add a scalar and a vector to the 27 nodes of a stencil, ``s`` at the lowest node, the latter changing by ``A``.
 
-    ``records`` are those of :func:`record_of_thread`; ``units`` are of mass and of momentum. All threads of a warp come
-    here, with particles of one environment.
+    ``record`` is the first of :func:`block_of_thread`, ``units`` are of mass and of momentum. All threads of a warp
+    come here.
     """
     ...
 
@@ -199,7 +188,7 @@ def singles_to_grid(
     p = at[1]
     takes = bool(False)
     tells = bool(False)
-    records = wp.vec2i()
+    record = int(0)
     units = wp.vec2()
     s = Scattered()
     if p < moving.x.shape[1]:
@@ -208,14 +197,14 @@ def singles_to_grid(
         field = particles.field[p]
         moves = moves_finitely(moving, e, p)
         here = takes_part(blocks, e, failure)
-        base = base_node(grid_position(grid, x))
-        lower = record_of_thread(grid, blocks, e, field, base, 0)
-        upper = record_of_thread(grid, blocks, e, field, base, 1)
-        records = wp.vec2i(lower[0], upper[0])
+        block = block_of_thread(grid, base_node(grid_position(grid, x)))
+        record = BLOCK_NODES * blocks.slot[e, field * grid.num_blocks + block]
         units[0] = sums.mass_unit[row(e, sums.mass_unit.shape[0]), field]
         units[1] = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
+        if contact.num_fields > 1:
+            tells = blocks.fields[e, block] != (1 << field)
         s = scattered(grid, step, particles, moving, e, p, MOMENTUM)
-        tells = (lower[1] | upper[1]) != 0 or near_boundary(grid, boundaries, e, x)
+        tells = tells or near_boundary(grid, boundaries, e, x)
         takes = admitted(here, moves, e, failure)
         if takes:
             takes = bounded(s, units[1], failure, e) >= 0.0
@@ -229,7 +218,7 @@ def singles_to_grid(
         wy = spline(s.f[1])
         wz = spline(s.f[2])
         at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
-        add_to_nodes(grid, sums, e, adds, kind, s.base, wx, wy, wz, at_base, s.A, mass, records, units)
+        add_to_nodes(grid, sums, e, adds, kind, s.base, wx, wy, wz, at_base, s.A, mass, record, units)
         kind += 1
         adds = takes and kind <= PLACE and (tells or (driven and kind == KINEMATIC))
         if adds:
