@@ -8,7 +8,7 @@ from piavatar_envs.mpm.blocks import beside_others, held_by, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_BLOCK, NEAR_SLAB, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.normals import MASS_MIN, face_shared
-from piavatar_envs.mpm.records import write_physical, write_record
+from piavatar_envs.mpm.records import write_kinematic, write_physical
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import Begun, begin_sum, clear_offset, end_sum, offset_at
 from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
@@ -178,10 +178,9 @@ def update_node(
         x = place_of(grid, corner, r % BLOCK_NODES)
         total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, total, sensors)
     v = physical_velocity(split, total)
+    write_physical(node_velocity, e, r, v)
     if driven:
-        write_record(node_velocity, e, r, v)
-    else:
-        write_physical(node_velocity, e, r, v)
+        write_kinematic(node_velocity, e, r, v)
     if is_told:
         clear_offset(sums, e, r)
 

@@ -81,7 +81,13 @@ def write_physical(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec
 
 
 @wp.func
+def write_kinematic(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
+    """The second half of :func:`write_record`."""
+    write_half(halves, e, half_of(r) + TO_KINEMATIC, wp.vec4(value[4], value[5], value[6], value[7]))
+
+
+@wp.func
 def write_record(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
     """Write what :func:`read_record` reads."""
     write_physical(halves, e, r, value)
-    write_half(halves, e, half_of(r) + TO_KINEMATIC, wp.vec4(value[4], value[5], value[6], value[7]))
+    write_kinematic(halves, e, r, value)
