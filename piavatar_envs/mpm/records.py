@@ -42,52 +42,93 @@ def read_half_from(first: wp.uint64, at: int, next: int) -> wp.vec4:
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-reinterpret_cast<float4&>(wp::index(halves, e, at)) = make_float4(value[0], value[1], value[2], value[3]);
-#else
-wp::index(halves, e, at) = value;
-#endif
-""")
-def write_half(halves: wp.array2d(dtype=wp.vec4), e: int, at: int, value: wp.vec4):
-    """``halves[e, at] = value``, on a GPU in one store."""
-    ...
-
-
 @wp.func
 def mass_of(halves: wp.array2d(dtype=wp.vec4), e: int, r: int):
     """Mass in record ``r``."""
     return halves[e, half_of(r)][0]
 
 
+_READ = """
+const auto* const from = &wp::index(halves, e, at);
+wp::vec_t<8, wp::float32> value;
+for (int half = 0; half < %d; ++half) {
+#if defined(__CUDA_ARCH__)
+    const float4 a = *reinterpret_cast<const float4*>(from + 64 * half);
+    value[4 * half] = a.x, value[4 * half + 1] = a.y, value[4 * half + 2] = a.z, value[4 * half + 3] = a.w;
+#else
+    for (int c = 0; c < 4; ++c) value[4 * half + c] = from[64 * half][c];
+#endif
+}
+return value;
+"""
+_WRITE = """
+auto* const to = &wp::index(halves, e, at);
+for (int half = %d; half < %d; ++half) {
+#if defined(__CUDA_ARCH__)
+    *reinterpret_cast<float4*>(to + 64 * half)
+        = make_float4(value[4 * half], value[4 * half + 1], value[4 * half + 2], value[4 * half + 3]);
+#else
+    for (int c = 0; c < 4; ++c) to[64 * half][c] = value[4 * half + c];
+#endif
+}
+"""
+
+
+@wp.func_native(_READ % 1)
+def read_first(halves: wp.array2d(dtype=wp.vec4), e: int, at: int) -> vec8:
+    """The half at a place, and nothing; a GPU reads and writes each half at once."""
+    ...
+
+
+@wp.func_native(_READ % 2)
+def read_both(halves: wp.array2d(dtype=wp.vec4), e: int, at: int) -> vec8:
+    """The half at a place and that which belongs to it."""
+    ...
+
+
+@wp.func_native(_WRITE % (0, 1))
+def write_first(halves: wp.array2d(dtype=wp.vec4), e: int, at: int, value: vec8):
+    """Write what :func:`read_first` reads."""
+    ...
+
+
+@wp.func_native(_WRITE % (1, 2))
+def write_second(halves: wp.array2d(dtype=wp.vec4), e: int, at: int, value: vec8):
+    """Write what only :func:`read_both` reads."""
+    ...
+
+
+@wp.func_native(_WRITE % (0, 2))
+def write_both(halves: wp.array2d(dtype=wp.vec4), e: int, at: int, value: vec8):
+    """Write what :func:`read_both` reads."""
+    ...
+
+
 @wp.func
 def read_physical(halves: wp.array2d(dtype=wp.vec4), e: int, r: int):
     """The first half of :func:`read_record`, and nothing in the second."""
-    a = read_half_from(first_of_halves(halves, e), half_of(r), 0)
-    return vec8(a[0], a[1], a[2], a[3], 0.0, 0.0, 0.0, 0.0)
+    return read_first(halves, e, half_of(r))
 
 
 @wp.func
 def read_record(halves: wp.array2d(dtype=wp.vec4), e: int, r: int):
     """Mass, physical and kinematic vector of record ``r``."""
-    b = read_half_from(first_of_halves(halves, e), half_of(r), TO_KINEMATIC)
-    return read_physical(halves, e, r) + vec8(0.0, 0.0, 0.0, 0.0, b[0], b[1], b[2], b[3])
+    return read_both(halves, e, half_of(r))
 
 
 @wp.func
 def write_physical(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
     """The first half of :func:`write_record`."""
-    write_half(halves, e, half_of(r), wp.vec4(value[0], value[1], value[2], value[3]))
+    write_first(halves, e, half_of(r), value)
 
 
 @wp.func
 def write_kinematic(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
     """The second half of :func:`write_record`."""
-    write_half(halves, e, half_of(r) + TO_KINEMATIC, wp.vec4(value[4], value[5], value[6], value[7]))
+    write_second(halves, e, half_of(r), value)
 
 
 @wp.func
 def write_record(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
     """Write what :func:`read_record` reads."""
-    write_physical(halves, e, r, value)
-    write_kinematic(halves, e, r, value)
+    write_both(halves, e, half_of(r), value)
