@@ -154,8 +154,8 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
         "particles_to_grid": scatter,
         "runs_to_grid": scatter,
         "singles_to_grid": scatter,
-        # sums in, sums cleared, velocities out
-        "update_grid": 2 * sums + nodes * NODE_BYTES,
+        # mass and physical momentum in and cleared, physical velocities out; more where contact is at hand
+        "update_grid": 2 * sums // (2 if SCATTERS[model.scatter] else 1) + nodes * NODE_BYTES // 2,
         # x, F, vk, spin and physical velocities in; x, u, C, F out
         "grid_to_particles": particles * (72 + WRITTEN_BYTES) + nodes * NODE_BYTES // 2,
         # a body's grid stays in shared memory: what the scatter reads, and x, F, vk and spin once more; x, u, C, F out

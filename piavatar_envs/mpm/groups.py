@@ -1,4 +1,4 @@
-"""The scatter of a GPU for large bodies: particles are added up by the group before the nodes are touched.
+"""The scatter of a GPU for large, dense bodies: particles are added up by the group before the nodes are touched.
 
 A group is of neighbours in memory, which should be neighbours in the body: the fewer bricks of nodes they touch, the
 less there is to put down. It has a CUDA block of its own, see :mod:`piavatar_envs.mpm.group_bricks` and

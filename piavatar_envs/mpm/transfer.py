@@ -12,7 +12,7 @@ from piavatar_envs.mpm.blocks import fields_around, record_of
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.matrices import matrix_at
-from piavatar_envs.mpm.records import TO_KINEMATIC, half_of
+from piavatar_envs.mpm.records import TO_KINEMATIC
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
 from piavatar_envs.mpm.stencil_records import HALVES, line_of_records, slab_records
 from piavatar_envs.mpm.types import (
@@ -153,20 +153,6 @@ def tells_place(
 
 
 @wp.func
-def scatter_kinematic(grid: Grid, blocks: Blocks, sums: Sums, e: int, field: int, s: Scattered):
-    """Tell the nodes how a particle is driven."""
-    wx = spline(s.f[0])
-    wy = spline(s.f[1])
-    wz = spline(s.f[2])
-    k = wp.vec4(s.at_base[4], s.at_base[5], s.at_base[6], 0.0)
-    for i in range(3):
-        for j in range(3):
-            for l in range(3):
-                r = record_of(grid, blocks, e, field, s.base[0] + i, s.base[1] + j, s.base[2] + l)
-                wp.atomic_add(sums.value, e, half_of(r) + TO_KINEMATIC, (wx[i] * wy[j] * wz[l]) * k)
-
-
-@wp.func
 def scatter_offsets(grid: Grid, blocks: Blocks, sums: Sums, e: int, field: int, seam: float, s: Scattered):
     """Tell the nodes where a particle is."""
     wx = spline(s.f[0])
@@ -209,6 +195,8 @@ def particles_to_grid(
     along_x = wp.vec4(0.0, A[0, 0], A[1, 0], A[2, 0])
     along_y = wp.vec4(0.0, A[0, 1], A[1, 1], A[2, 1])
     along_z = wp.vec4(0.0, A[0, 2], A[1, 2], A[2, 2])
+    driven = tells or step.decoupling == PAPER
+    kinematic = wp.vec4(s.at_base[4], s.at_base[5], s.at_base[6], 0.0)
     wx = spline(s.f[0])
     wy = spline(s.f[1])
     wz = spline(s.f[2])
@@ -226,9 +214,12 @@ def particles_to_grid(
             wp.atomic_add(sums.value, e, at[0], wz[0] * line)
             wp.atomic_add(sums.value, e, at[1], wz[1] * (line + step_z))
             wp.atomic_add(sums.value, e, at[2], wz[2] * (line + 2.0 * step_z))
+            if driven:
+                k = (wx[i] * wy[j]) * kinematic
+                wp.atomic_add(sums.value, e, at[0] + TO_KINEMATIC, wz[0] * k)
+                wp.atomic_add(sums.value, e, at[1] + TO_KINEMATIC, wz[1] * k)
+                wp.atomic_add(sums.value, e, at[2] + TO_KINEMATIC, wz[2] * k)
             at_j += wx[i] * along_y
         at_i += along_x
-    if tells or step.decoupling == PAPER:
-        scatter_kinematic(grid, blocks, sums, e, field, s)
     if tells:
         scatter_offsets(grid, blocks, sums, e, field, particles.seam[p], s)

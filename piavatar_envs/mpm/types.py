@@ -20,8 +20,8 @@ from piavatar_envs.mpm.matrices import matrices_of
 
 wp.set_module_options({"enable_backward": False})
 
-#: A grid node's record: mass [kg], physical momentum (3), kinematic momentum (3), padding. Eight floats are one
-#: vector register on a CPU and one 32-byte sector on a GPU.
+#: What a grid node has: mass [kg], physical momentum (3), kinematic momentum (3), nothing. How it lies in memory is in
+#: :mod:`piavatar_envs.mpm.records`.
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 #: Records in fixed point, see :mod:`piavatar_envs.mpm.sums`: a sector of mass and physical momentum, and one of
 #: kinematic momentum; one of offsets.
@@ -167,7 +167,9 @@ class Blocks:
 
 @wp.struct
 class Sums:
-    """What particles add up on nodes, ``(num_envs, 64 S)``, zero between substeps; see :mod:`piavatar_envs.mpm.sums`.
+    """What particles add up on nodes, zero between substeps; see :mod:`piavatar_envs.mpm.sums`.
+
+    ``(num_envs, 64 S)``; ``value``, of halves of records, ``(num_envs, 128 S)``.
 
     Either the floating-point or the integer arrays are in use, the others have one entry. Units: ``(rows, F)``.
     """
@@ -291,14 +293,15 @@ class State:
 class Scratch:
     """Grid arrays, rebuilt every substep, and contact sensors.
 
-    A node's records are where its field's block has its slot, see :class:`Blocks`; ``(num_envs, 64 S)``.
+    A node's records are where its field's block has its slot, see :class:`Blocks`; ``(num_envs, 64 S)``, halves of them
+    ``(num_envs, 128 S)``.
 
     Attributes:
         blocks: which blocks hold matter in this control step, and their slots.
         sums: what particles have added up.
         velocity: vec4: halves of records, see :mod:`piavatar_envs.mpm.records`: mass and physical velocity, kinematic
-            velocity and nothing; the latter only where contact is at hand. In blocks with several fields the sums
-            stand here until they have become velocities.
+            velocity and nothing; the latter means nothing where no contact is at hand, but in the paper's variant. In
+            blocks with several fields the sums stand here until they have become velocities.
         facing: vec4: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`, and nothing;
             of blocks with several fields only.
         sensors: what contact did in this control step.

@@ -31,10 +31,16 @@ FAULTS = {
 }
 
 
-@pytest.fixture(scope="module")
-def three(simulate):
-    """Three environments in free fall onto the ground, each with another velocity; a fresh start each call."""
-    sim = simulate(num_envs=3, gravity=(0.0, 0.0, -9.81), planes=[((0.0, 0.0, 1.0), -0.11, 0.5)], pushed=True)
+@pytest.fixture(scope="module", params=[None, "runs", "singles"])
+def three(simulate, device, request):
+    """Three environments in free fall onto the ground, each with another velocity; a fresh start each call.
+
+    On a GPU also with the scatters of large bodies.
+    """
+    if request.param is not None and device == "cpu":
+        pytest.skip("only the plain scatter is for a CPU")
+    falling = {"num_envs": 3, "gravity": (0.0, 0.0, -9.81), "pushed": True, "scatter": request.param}
+    sim = simulate(**falling, planes=[((0.0, 0.0, 1.0), -0.11, 0.5)])
 
     def start():
         for name in ("vk", "C", "failure"):

@@ -217,6 +217,7 @@ def test_what_shared_memory_holds(monkeypatch, bodies, particles, slots, suits):
     [
         (2_900, 200, 90, "shared"),
         (10_475, 3_600, 90, "singles"),
+        (19_757, 530, 90, "runs"),
         (300_000, 4_000, 90, "runs"),
         (10_475, 3_600, 60, "plain"),
     ],
@@ -225,7 +226,9 @@ def test_the_density_of_particles_chooses_the_scatter(monkeypatch, particles, sl
     """A skin's particles share hardly a node; in an interior they are worth adding up first."""
     gpu = SimpleNamespace(is_cuda=True, arch=arch, max_shared_memory_per_block=227 * 1024)
     monkeypatch.setattr(wp, "get_device", lambda name: gpu)
-    assert choose_scatter(None, "cuda:0", np.zeros(particles, int), slots, "split") == chosen
+    assert choose_scatter(None, "cuda:0", np.zeros(particles, int), slots, "split", True) == chosen
+    at_most = choose_scatter(None, "cuda:0", np.zeros(particles, int), slots, "split", False)
+    assert at_most == ("runs" if chosen == "singles" else chosen)  # slots that could be needed tell nothing
 
 
 @pytest.mark.parametrize("copies", [60, 80, 100, 140, 300])
@@ -249,11 +252,10 @@ def test_a_crowd_is_counted_in_larger_units(simulate, device, copies):
     np.testing.assert_array_equal(*moved[1:])  # one round's gather is another kernel
 
 
-def test_runs_repeat_bit_for_bit(collide, device):
-    """The default scatter of a GPU, with contact, sensors and all."""
-    if device == "cpu":
-        pytest.skip("a CPU adds in one order only")
-    first, second = collide().run(3), collide().run(3)
+@pytest.mark.parametrize("scatter", ["shared", "runs", "singles"], indirect=True)
+def test_runs_repeat_bit_for_bit(collide, scatter):
+    """With contact, sensors and all; a CPU adds in one order only."""
+    first, second = (collide(scatter=scatter, max_slots=SLOTS).run(3) for _ in range(2))
     for array in ARRAYS:
         np.testing.assert_array_equal(getattr(first.state, array).numpy(), getattr(second.state, array).numpy())
     for name in ("boundary_impulse", "pair_impulse", "part_impulse"):
