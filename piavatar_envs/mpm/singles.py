@@ -128,7 +128,8 @@ auto add = [&](auto sum) {{
                 asm("mad.wide.s32 %0, %1, %2, %3;"
                     : "=l"(node) : "r"((bz + l > 3 ? next : near) + (bz + l & 3)), "r"(size), "l"(to));
                 if (FIXED) {{
-                    // the nearest integer, as far as a number has bits; and what is left for the lower part
+                    // the nearest integer, as far as a number has bits, and what is left for the lower part (beyond
+                    // 2^42 units, 64 full cells at a spacing a step, a number may lose its last bit)
                     const float high = __fadd_rn(__fmaf_rn(number, 0x1p-20f, 0x1.8p23f), -0x1.8p23f);
                     const int added = __float2int_rn(per_high * high + per_all * number);
                     asm volatile("red.global.add.s32 [%0], %1;"
