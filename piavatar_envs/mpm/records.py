@@ -17,12 +17,6 @@ wp.set_module_options({"enable_backward": False})
 TO_KINEMATIC = wp.constant(64)
 
 
-@wp.func
-def half_of(r: int):
-    """Place of the first half of record ``r`` in its environment's row."""
-    return r + (r & ~(TO_KINEMATIC - 1))
-
-
 @wp.func_native("return (wp::uint64)&wp::index(halves, e, 0);")
 def first_of_halves(halves: wp.array2d(dtype=wp.vec4), e: int) -> wp.uint64:
     """Address of ``halves[e, 0]``, for :func:`read_half_from`."""
@@ -42,93 +36,65 @@ def read_half_from(first: wp.uint64, at: int, next: int) -> wp.vec4:
     ...
 
 
-@wp.func
-def mass_of(halves: wp.array2d(dtype=wp.vec4), e: int, r: int):
-    """Mass in record ``r``."""
-    return halves[e, half_of(r)][0]
-
-
-_READ = """
-const auto* const from = &wp::index(halves, e, at);
+_FIND = f"""
+constexpr int TO_KINEMATIC = {int(TO_KINEMATIC)};
+auto* const first = &wp::index(halves, e, r + (r & ~(TO_KINEMATIC - 1)));
+"""
+_READ = (
+    _FIND
+    + """
 wp::vec_t<8, wp::float32> value;
-for (int half = 0; half < %d; ++half) {
+for (int half = 0; half < 2; ++half) {
 #if defined(__CUDA_ARCH__)
-    const float4 a = *reinterpret_cast<const float4*>(from + 64 * half);
+    const float4 a = *reinterpret_cast<const float4*>(first + TO_KINEMATIC * half);
     value[4 * half] = a.x, value[4 * half + 1] = a.y, value[4 * half + 2] = a.z, value[4 * half + 3] = a.w;
 #else
-    for (int c = 0; c < 4; ++c) value[4 * half + c] = from[64 * half][c];
+    for (int c = 0; c < 4; ++c) value[4 * half + c] = first[TO_KINEMATIC * half][c];
 #endif
 }
 return value;
 """
-_WRITE = """
-auto* const to = &wp::index(halves, e, at);
+)
+_WRITE = (
+    _FIND
+    + """
 for (int half = %d; half < %d; ++half) {
 #if defined(__CUDA_ARCH__)
-    *reinterpret_cast<float4*>(to + 64 * half)
+    *reinterpret_cast<float4*>(first + TO_KINEMATIC * half)
         = make_float4(value[4 * half], value[4 * half + 1], value[4 * half + 2], value[4 * half + 3]);
 #else
-    for (int c = 0; c < 4; ++c) to[64 * half][c] = value[4 * half + c];
+    for (int c = 0; c < 4; ++c) first[TO_KINEMATIC * half][c] = value[4 * half + c];
 #endif
 }
 """
+)
 
 
-@wp.func_native(_READ % 1)
-def read_first(halves: wp.array2d(dtype=wp.vec4), e: int, at: int) -> vec8:
-    """The half at a place, and nothing; a GPU reads and writes each half at once."""
+@wp.func_native(_FIND + "return (*first)[0];")
+def mass_of(halves: wp.array2d(dtype=wp.vec4), e: int, r: int) -> float:
+    """Mass in record ``r``."""
     ...
 
 
-@wp.func_native(_READ % 2)
-def read_both(halves: wp.array2d(dtype=wp.vec4), e: int, at: int) -> vec8:
-    """The half at a place and that which belongs to it."""
+@wp.func_native(_READ)
+def read_record(halves: wp.array2d(dtype=wp.vec4), e: int, r: int) -> vec8:
+    """Mass, physical and kinematic vector of record ``r``; a GPU reads and writes each half at once."""
     ...
 
 
 @wp.func_native(_WRITE % (0, 1))
-def write_first(halves: wp.array2d(dtype=wp.vec4), e: int, at: int, value: vec8):
-    """Write what :func:`read_first` reads."""
+def write_physical(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
+    """The first half of :func:`write_record`."""
     ...
 
 
 @wp.func_native(_WRITE % (1, 2))
-def write_second(halves: wp.array2d(dtype=wp.vec4), e: int, at: int, value: vec8):
-    """Write what only :func:`read_both` reads."""
+def write_kinematic(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
+    """The second half of :func:`write_record`."""
     ...
 
 
 @wp.func_native(_WRITE % (0, 2))
-def write_both(halves: wp.array2d(dtype=wp.vec4), e: int, at: int, value: vec8):
-    """Write what :func:`read_both` reads."""
-    ...
-
-
-@wp.func
-def read_physical(halves: wp.array2d(dtype=wp.vec4), e: int, r: int):
-    """The first half of :func:`read_record`, and nothing in the second."""
-    return read_first(halves, e, half_of(r))
-
-
-@wp.func
-def read_record(halves: wp.array2d(dtype=wp.vec4), e: int, r: int):
-    """Mass, physical and kinematic vector of record ``r``."""
-    return read_both(halves, e, half_of(r))
-
-
-@wp.func
-def write_physical(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
-    """The first half of :func:`write_record`."""
-    write_first(halves, e, half_of(r), value)
-
-
-@wp.func
-def write_kinematic(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
-    """The second half of :func:`write_record`."""
-    write_second(halves, e, half_of(r), value)
-
-
-@wp.func
 def write_record(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
     """Write what :func:`read_record` reads."""
-    write_both(halves, e, half_of(r), value)
+    ...
