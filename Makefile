@@ -34,10 +34,17 @@ $(STAMP): pyproject.toml constraints.txt
 demo: install
 	$(BIN)/python -m agents.demo
 
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+# What is for a GPU runs on a CPU, too (tests/gpu_on_cpu): of that some minutes' worth. All of tests/mpm takes fifteen.
+OF_A_GPU := tests/mpm/test_scatters.py $(addprefix tests/avatar/test_,lanes.py drive_envs.py articulated.py)
+
 # The kernels are compiled once, before the two workers start and would both compile them.
 test: install
 	$(BIN)/python -m piavatar_envs doctor --compile --device $(DEVICE)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal --durations 10 --device $(DEVICE) $(PYTEST_ARGS)
+	$(PYTEST) --durations 10 --device $(DEVICE) $(PYTEST_ARGS)
+ifeq ($(DEVICE):$(PYTEST_ARGS),cpu:)
+	$(PYTEST) --device gpu_on_cpu $(OF_A_GPU)
+endif
 
 lint: install
 	$(BIN)/ruff check .

@@ -22,7 +22,11 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--device", default="cpu", help="Warp device to test on: cpu (default), cuda, cuda:1, ...")
+    parser.addoption(
+        "--device",
+        default="cpu",
+        help="Warp device to test on: cpu (default), cuda, cuda:1, ..., or gpu_on_cpu: what is for a GPU, on the CPU",
+    )
 
 
 @contextmanager
@@ -39,15 +43,20 @@ def only_one_process(name: str) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def device(request: pytest.FixtureRequest) -> str:
-    """The Warp device under test, its kernels compiled.
+def device(request: pytest.FixtureRequest) -> Iterator[str]:
+    """The Warp device under test, its kernels compiled; those of ``gpu_on_cpu`` are compiled as they are launched.
 
     Parallel workers would all compile the same kernels at once, and race each other's files: the first one does it,
     the others wait and find them in the cache.
     """
     from piavatar_envs import doctor
+    from tests import gpu_on_cpu
 
     name = request.config.getoption("--device")
+    if name == gpu_on_cpu.NAME:
+        with gpu_on_cpu.gpu_on_cpu():
+            yield name
+        return
     available = [entry["alias"] for entry in doctor.devices()]
     if name not in available and not (name == "cuda" and "cuda:0" in available):
         pytest.exit(f"--device {name}: this machine has {', '.join(available)}", returncode=4)
@@ -56,7 +65,7 @@ def device(request: pytest.FixtureRequest) -> str:
             doctor.compile_kernels(name, environments=False)
         except Exception as error:  # a kernel that does not compile fails its own tests, not all that use a device
             warnings.warn(f"not every kernel compiles for {name}: {error}", stacklevel=1)
-    return name
+    yield name
 
 
 @pytest.fixture(scope="session")

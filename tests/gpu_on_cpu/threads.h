@@ -1,0 +1,235 @@
+// The threads of a CUDA block on a CPU: what the package's snippets in CUDA ask for, on the fibers of Warp's runtime.
+//
+// The modules that Warp generates include it, see __init__.py. A block's threads run one at a time, and others go on
+// where one waits; so nothing here need be atomic, and a race only shows where that order makes it one.
+#pragma once
+
+namespace gpu {
+
+constexpr int THREADS = WP_TILE_BLOCK_DIM, WARPS = (THREADS + 31) / 32;
+enum State { RUNS, MEETS_BLOCK, MEETS_WARP, LOOKS_AROUND, GONE };
+
+struct Thread {
+    State state;
+    unsigned mask;  // whom it meets; then who has come
+    int place;  // where in the source it looks around
+    unsigned long long value;  // what it tells the others
+    unsigned long long told[32];  // what those who have come have told
+};
+
+static Thread threads[THREADS];
+static unsigned block;
+alignas(16) static int room[58 * 1024];  // its shared memory
+
+inline int own() { return wp_cpu_get_thread_idx(); }
+
+// a thread begins; the first of a block does so first, and says how many there are
+inline void begin(int thread, int count, unsigned of)
+{
+    if (thread != 0) return;
+    for (int t = 0; t < THREADS; ++t) threads[t].state = t < count ? RUNS : GONE;
+    block = of;
+}
+
+inline void end(int thread) { threads[thread].state = GONE; }
+
+inline unsigned in_state(int warp, State state)
+{
+    unsigned mask = 0;
+    for (int lane = 0; lane < 32 && 32 * warp + lane < THREADS; ++lane)
+        if (threads[32 * warp + lane].state == state) mask |= 1u << lane;
+    return mask;
+}
+
+inline unsigned not_there(int warp)
+{
+    unsigned mask = in_state(warp, GONE);
+    for (int lane = THREADS - 32 * warp; lane < 32; ++lane) mask |= 1u << lane;
+    return mask;
+}
+
+// all that have not ended come here
+inline void meet_block()
+{
+    Thread& self = threads[own()];
+    self.state = MEETS_BLOCK;
+    while (self.state == MEETS_BLOCK) {
+        bool all = true;
+        for (int t = 0; t < THREADS && all; ++t) all = threads[t].state == MEETS_BLOCK || threads[t].state == GONE;
+        if (all) {
+            for (int t = 0; t < THREADS; ++t)
+                if (threads[t].state == MEETS_BLOCK) threads[t].state = RUNS;
+        } else
+            wp_cpu_tile_sync();
+    }
+}
+
+// all of a mask that have not ended come here, and learn what the others tell
+inline Thread& meet_warp(unsigned mask, unsigned long long value)
+{
+    const int t = own(), warp = t >> 5, first = warp << 5;
+    Thread& self = threads[t];
+    self.value = value, self.mask = mask, self.state = MEETS_WARP;
+    while (self.state == MEETS_WARP) {
+        const unsigned others = mask & ~not_there(warp);
+        unsigned here = 0;
+        for (int lane = 0; lane < 32; ++lane)
+            if (others >> lane & 1u && threads[first + lane].state == MEETS_WARP && threads[first + lane].mask == mask)
+                here |= 1u << lane;
+        if (here == others) {
+            for (int lane = 0; lane < 32; ++lane)
+                if (here >> lane & 1u) {
+                    for (int n = 0; n < 32; ++n)
+                        threads[first + lane].told[n] = here >> n & 1u ? threads[first + n].value : 0;
+                    threads[first + lane].state = RUNS, threads[first + lane].mask = here;
+                }
+        } else
+            wp_cpu_tile_sync();
+    }
+    return self;
+}
+
+// who has come to the same place when nobody of the warp can go on: they are as much together as they can be
+inline unsigned look_around(int place)
+{
+    const int t = own(), warp = t >> 5, first = warp << 5;
+    Thread& self = threads[t];
+    self.place = place, self.state = LOOKS_AROUND;
+    while (self.state == LOOKS_AROUND) {
+        if (in_state(warp, RUNS) == 0) {
+            unsigned here = 0;
+            for (int lane = 0; lane < 32; ++lane)
+                if (first + lane < THREADS && threads[first + lane].state == LOOKS_AROUND
+                    && threads[first + lane].place == place)
+                    here |= 1u << lane;
+            for (int lane = 0; lane < 32; ++lane)
+                if (here >> lane & 1u) threads[first + lane].state = RUNS, threads[first + lane].mask = here;
+        } else
+            wp_cpu_tile_sync();
+    }
+    return self.mask;
+}
+
+template <class T> unsigned long long bits_of(T value)
+{
+    static_assert(sizeof(T) <= 8, "up to 64 bits");
+    unsigned long long bits = 0;
+    memcpy(&bits, &value, sizeof(T));
+    return bits;
+}
+
+template <class T> T from_bits(unsigned long long bits)
+{
+    T value;
+    memcpy(&value, &bits, sizeof(T));
+    return value;
+}
+
+struct Index { unsigned x; };
+
+}  // namespace gpu
+
+#define GPU_ARCH 900
+#define threadIdx (gpu::Index{(unsigned)gpu::own()})
+#define blockDim (gpu::Index{(unsigned)gpu::THREADS})
+#define blockIdx (gpu::Index{gpu::block})
+#define __shared__ static
+#define __align__(bytes) __attribute__((aligned(bytes)))
+#define __syncthreads() gpu::meet_block()
+#define __activemask() gpu::look_around(__LINE__)
+
+struct alignas(16) int4 { int x, y, z, w; };
+struct alignas(16) uint4 { unsigned x, y, z, w; };
+inline int4 make_int4(int x, int y, int z, int w) { return {x, y, z, w}; }
+inline uint4 make_uint4(unsigned x, unsigned y, unsigned z, unsigned w) { return {x, y, z, w}; }
+inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
+
+inline int __float_as_int(float x) { return gpu::from_bits<int>(gpu::bits_of(x)); }
+inline unsigned __float_as_uint(float x) { return gpu::from_bits<unsigned>(gpu::bits_of(x)); }
+inline float __int_as_float(int x) { return gpu::from_bits<float>(gpu::bits_of(x)); }
+inline float __uint_as_float(unsigned x) { return gpu::from_bits<float>(gpu::bits_of(x)); }
+inline int __float2int_rn(float x) { return (int)rintf(x); }
+inline float __fmaf_rn(float a, float b, float c) { return fmaf(a, b, c); }
+#pragma clang optimize off
+// rounded, never fused with what comes after
+inline float __fadd_rn(float a, float b) { volatile float sum = a + b; return sum; }
+inline float __fmul_rn(float a, float b) { volatile float product = a * b; return product; }
+#pragma clang optimize on
+inline float fminf(float a, float b) { return a < b ? a : b; }
+inline int __popc(unsigned x) { return __builtin_popcount(x); }
+inline int __ffs(unsigned x) { return __builtin_ffs((int)x); }
+inline int __clz(unsigned x) { return x ? __builtin_clz(x) : 32; }
+template <class T> T __ldg(const T* at) { return *at; }
+
+inline int min(int a, int b) { return a < b ? a : b; }
+inline int max(int a, int b) { return a > b ? a : b; }
+inline unsigned min(unsigned a, unsigned b) { return a < b ? a : b; }
+inline unsigned max(unsigned a, unsigned b) { return a > b ? a : b; }
+
+inline void __syncwarp(unsigned mask = 0xffffffffu) { gpu::meet_warp(mask, 0); }
+inline unsigned __ballot_sync(unsigned mask, bool yes)
+{
+    const auto& self = gpu::meet_warp(mask, yes);
+    unsigned all = 0;
+    for (int n = 0; n < 32; ++n) all |= (unsigned)self.told[n] << n;
+    return all;
+}
+inline bool __any_sync(unsigned mask, bool yes) { return __ballot_sync(mask, yes) != 0u; }
+inline bool __all_sync(unsigned mask, bool yes) { return __ballot_sync(mask, !yes) == 0u; }
+template <class T> T __shfl_sync(unsigned mask, T value, int lane)
+{
+    return gpu::from_bits<T>(gpu::meet_warp(mask, gpu::bits_of(value)).told[lane & 31]);
+}
+template <class T> T __shfl_xor_sync(unsigned mask, T value, int distance)
+{
+    return __shfl_sync(mask, value, (gpu::own() ^ distance) & 31);
+}
+template <class T> unsigned __match_any_sync(unsigned mask, T value)
+{
+    const auto& self = gpu::meet_warp(mask, gpu::bits_of(value));
+    unsigned same = 0;
+    for (int n = 0; n < 32; ++n)
+        if (self.mask >> n & 1u && self.told[n] == gpu::bits_of(value)) same |= 1u << n;
+    return same;
+}
+template <class T> unsigned __match_all_sync(unsigned mask, T value, int* all)
+{
+    const unsigned same = __match_any_sync(mask, value), here = gpu::threads[gpu::own()].mask;
+    *all = same == here;
+    return *all ? here : 0u;
+}
+template <class T, class F> T reduced(unsigned mask, T value, F of)
+{
+    const auto& self = gpu::meet_warp(mask, gpu::bits_of(value));
+    T result = value;
+    for (int n = 0; n < 32; ++n)
+        if (self.mask >> n & 1u) result = of(result, gpu::from_bits<T>(self.told[n]));
+    return result;
+}
+template <class T> T __reduce_max_sync(unsigned mask, T value)
+{
+    return reduced(mask, value, [](T a, T b) { return a > b ? a : b; });
+}
+template <class T> T __reduce_min_sync(unsigned mask, T value)
+{
+    return reduced(mask, value, [](T a, T b) { return a < b ? a : b; });
+}
+inline unsigned __reduce_or_sync(unsigned mask, unsigned value)
+{
+    return reduced(mask, value, [](unsigned a, unsigned b) { return a | b; });
+}
+
+template <class T, class F> T changed(T* at, F to)
+{
+    const T before = *at;
+    *at = to(before);
+    return before;
+}
+template <class T, class V> T atomicAdd(T* at, V v) { return changed(at, [=](T b) { return (T)(b + (T)v); }); }
+template <class T, class V> T atomicMax(T* at, V v) { return changed(at, [=](T b) { return b > (T)v ? b : (T)v; }); }
+template <class T, class V> T atomicOr(T* at, V v) { return changed(at, [=](T b) { return (T)(b | (T)v); }); }
+template <class T, class V> T atomicAnd(T* at, V v) { return changed(at, [=](T b) { return (T)(b & (T)v); }); }
+template <class T> T atomicCAS(T* at, T expected, T v) { return changed(at, [=](T b) { return b == expected ? v : b; }); }
+
+inline size_t __cvta_generic_to_global(const void* at) { return (size_t)at; }
+inline size_t __cvta_generic_to_shared(const void* at) { return (size_t)((const char*)at - (const char*)gpu::room); }

@@ -1,0 +1,154 @@
+"""Threads of a GPU on a CPU: they tell each other what those of a GPU do, as CUDA's programming guide has it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.gpu_on_cpu import gpu_on_cpu, on_cpu
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+BLOCK = 96
+
+
+def on_gpu(cuda: str) -> str:
+    """A snippet in CUDA, and nothing for a CPU."""
+    return f"#if defined(__CUDA_ARCH__)\n{cuda}\n#else\nreturn -1;\n#endif\n"
+
+
+@wp.func_native(
+    on_gpu("""
+int sum = value;
+for (int distance = 16; distance > 0; distance >>= 1) sum += __shfl_xor_sync(0xffffffffu, sum, distance);
+__shared__ int warps[3];
+if ((threadIdx.x & 31) == 0) warps[threadIdx.x >> 5] = sum;
+__syncthreads();
+return warps[0] + warps[1] + warps[2] + 1000 * (int)blockIdx.x;
+""")
+)
+def sum_of_block(value: int) -> int:
+    """The block's sum, and a thousand times its number."""
+    ...
+
+
+@wp.func_native(on_gpu("return (int)__ballot_sync(0xffffffffu, value > 0);"))
+def who_is_positive(value: int) -> int:
+    """Bits of the warp's threads."""
+    ...
+
+
+@wp.func_native(
+    on_gpu("""
+if (value > 0)
+    return (int)__activemask();
+else
+    return (int)__activemask();
+""")
+)
+def who_is_here(value: int) -> int:
+    """Bits of the warp's threads that have gone the same way."""
+    ...
+
+
+@wp.func_native(on_gpu("return (int)__match_any_sync(0xffffffffu, value);"))
+def who_has_the_same(value: int) -> int:
+    """Bits of the warp's threads."""
+    ...
+
+
+@wp.func_native(on_gpu("return __reduce_max_sync(0xffffffffu, value) - __shfl_sync(0xffffffffu, value, 7);"))
+def greatest_over_the_seventh(value: int) -> int:
+    """The warp's greatest value, less that of its seventh thread."""
+    ...
+
+
+@wp.kernel
+def ask(value: wp.array(dtype=int), question: int, answer: wp.array(dtype=int)):
+    t = wp.tid()
+    if t >= value.shape[0]:
+        return
+    if question == 0:
+        answer[t] = sum_of_block(value[t])
+    elif question == 1:
+        answer[t] = who_is_positive(value[t])
+    elif question == 2:
+        answer[t] = who_is_here(value[t])
+    elif question == 3:
+        answer[t] = who_has_the_same(value[t])
+    else:
+        answer[t] = greatest_over_the_seventh(value[t])
+
+
+@pytest.fixture(scope="module")
+def answers():
+    """Asks the threads of so many values; the last of their block end before."""
+
+    def ask_all(question: int, values: np.ndarray) -> np.ndarray:
+        value = wp.array(values, dtype=int, device="cpu")
+        answer = wp.zeros(len(values), dtype=int, device="cpu")
+        threads = -(-len(values) // BLOCK) * BLOCK
+        wp.launch(ask, threads, [value, question], [answer], device="cpu", block_dim=BLOCK)
+        return answer.numpy()
+
+    with gpu_on_cpu():
+        yield ask_all
+
+
+def bits(yes: np.ndarray) -> np.ndarray:
+    """Of the warps' threads, told to all of each."""
+    whole = np.zeros(-(-len(yes) // 32) * 32, bool)
+    whole[: len(yes)] = yes
+    masks = (whole.reshape(-1, 32) * (1 << np.arange(32, dtype=np.uint64))).sum(1)
+    return np.repeat(masks, 32)[: len(yes)].astype(np.uint32).view(np.int32)
+
+
+@pytest.fixture(scope="module", params=[BLOCK, 2 * BLOCK, BLOCK + 50])
+def values(request) -> np.ndarray:
+    return np.random.default_rng(request.param).integers(-3, 4, request.param).astype(np.int32)
+
+
+def test_shared_memory_and_shuffles(answers):
+    values = np.arange(2 * BLOCK, dtype=np.int32) % 7
+    sums = values.reshape(2, BLOCK).sum(1) + [0, 1000]
+    np.testing.assert_array_equal(answers(0, values), np.repeat(sums, BLOCK))
+
+
+def test_ballots(answers, values):
+    np.testing.assert_array_equal(answers(1, values), bits(values > 0))
+
+
+def test_who_goes_another_way_is_not_here(answers, values):
+    expected = np.where(values > 0, bits(values > 0), bits(values <= 0))
+    np.testing.assert_array_equal(answers(2, values), expected)
+
+
+def test_matches(answers, values):
+    expected = np.zeros(len(values), np.int32)
+    for value in np.unique(values):
+        expected[values == value] = bits(values == value)[values == value]
+    np.testing.assert_array_equal(answers(3, values), expected)
+
+
+def test_reductions_are_of_those_who_are_there(answers, values):
+    expected = [values[t // 32 * 32 :][:32].max() - values[t // 32 * 32 + 7] for t in range(len(values))]
+    np.testing.assert_array_equal(answers(4, values), expected)
+
+
+def test_the_cpu_is_itself_again(answers):
+    """Outside, the same kernel has nothing for a CPU."""
+    value = wp.ones(4, dtype=int, device="cpu")
+    answer = wp.zeros(4, dtype=int, device="cpu")
+    wp.launch(ask, 4, [value, 1], [answer], device="cpu", block_dim=1)
+    assert answer.numpy().tolist() == [-1] * 4
+
+
+def test_what_is_not_known_is_refused():
+    with pytest.raises(RuntimeError, match="another way"):
+        on_cpu("void nothing() {}")
+    source = '#include "deterministic.h"\n' + "    const size_t task_index = payload->block_first + (size_t)lane;\n"
+    source += "    k_cpu_kernel_forward<false>(*dim, task_index, payload->args);\n"
+    assert "gpu::begin(lane" in on_cpu(source) and "gpu::end(lane)" in on_cpu(source)
+    with pytest.raises(RuntimeError, match=r"asm.*tell"):
+        on_cpu(source + 'asm volatile("brkpt;");\n')
