@@ -129,8 +129,8 @@ class GetUpTask(Task):
     reward_terms = RISING_TERMS
     metrics = (*METRICS, "held_seconds")
 
-    camera_position = (2.2, -3.2, 1.6)
-    camera_target = (0.0, 0.0, 0.5)
+    camera_position = (2.4, -3.6, 1.6)
+    camera_target = (0.0, 0.0, 0.78)
 
     summary = """The avatar lies on the ground, face down or face up (`face_up`), turned about the vertical at random,
 its arms beside it, its joints up to `pose_noise` off that pose; or (`halfway`, a curriculum) it is on the way up from
