@@ -96,6 +96,20 @@ def answers():
         yield ask_all
 
 
+def test_the_cpu_is_itself_before_and_after():
+    """The same kernel has nothing for a CPU; contexts may be inside each other."""
+    value, found = wp.ones(4, dtype=int, device="cpu"), []
+    for inside in (False, True, False):
+        answer = wp.zeros(4, dtype=int, device="cpu")
+        if inside:
+            with gpu_on_cpu() as name, gpu_on_cpu():
+                wp.launch(ask, BLOCK, [value, 1], [answer], device=name, block_dim=BLOCK)
+        else:
+            wp.launch(ask, 4, [value, 1], [answer], device="cpu")
+        found.append(answer.numpy().tolist())
+    assert found == [[-1] * 4, [0b1111] * 4, [-1] * 4]
+
+
 def bits(yes: np.ndarray) -> np.ndarray:
     """Of the warps' threads, told to all of each."""
     whole = np.zeros(-(-len(yes) // 32) * 32, bool)
@@ -136,12 +150,42 @@ def test_reductions_are_of_those_who_are_there(answers, values):
     np.testing.assert_array_equal(answers(4, values), expected)
 
 
-def test_the_cpu_is_itself_again(answers):
-    """Outside, the same kernel has nothing for a CPU."""
-    value = wp.ones(4, dtype=int, device="cpu")
-    answer = wp.zeros(4, dtype=int, device="cpu")
-    wp.launch(ask, 4, [value, 1], [answer], device="cpu", block_dim=1)
-    assert answer.numpy().tolist() == [-1] * 4
+@wp.func_native(
+    on_gpu("""
+__shared__ int written;
+if (threadIdx.x == 0) written = 7;
+if (value > 0) __syncthreads();
+const int seen = written;
+__syncthreads();
+if (threadIdx.x == 0) written = 0;
+__syncthreads();
+return seen;
+""")
+)
+def what_the_first_has_written(value: int) -> int:
+    """What the block's first thread has written, for sure only if all have a positive value."""
+    ...
+
+
+@wp.kernel
+def read_what_is_written(value: wp.array(dtype=int), answer: wp.array(dtype=int)):
+    t = wp.tid()
+    answer[t] = what_the_first_has_written(value[t])
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_a_missing_barrier_shows(waits):
+    """In one of two blocks the first thread is not the first to run."""
+    value = wp.full(2 * BLOCK, 1 if waits else 0, dtype=int, device="cpu")
+    answer = wp.zeros(2 * BLOCK, dtype=int, device="cpu")
+    with gpu_on_cpu():
+        wp.launch(read_what_is_written, 2 * BLOCK, [value], [answer], device="cpu", block_dim=BLOCK)
+    assert (answer.numpy() == 7).all() == waits
+
+
+def test_single_threads_would_be_a_cpus(answers):
+    with pytest.raises(RuntimeError, match="block_dim=1"):
+        wp.launch(ask, 4, [wp.ones(4, dtype=int, device="cpu"), 1], device="cpu", block_dim=1)
 
 
 def test_what_is_not_known_is_refused():
@@ -149,6 +193,6 @@ def test_what_is_not_known_is_refused():
         on_cpu("void nothing() {}")
     source = '#include "deterministic.h"\n' + "    const size_t task_index = payload->block_first + (size_t)lane;\n"
     source += "    k_cpu_kernel_forward<false>(*dim, task_index, payload->args);\n"
-    assert "gpu::begin(lane" in on_cpu(source) and "gpu::end(lane)" in on_cpu(source)
+    assert "gpu::begin(lane" in on_cpu(source) and "gpu::end()" in on_cpu(source)
     with pytest.raises(RuntimeError, match=r"asm.*tell"):
         on_cpu(source + 'asm volatile("brkpt;");\n')

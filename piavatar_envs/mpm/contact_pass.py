@@ -16,7 +16,7 @@ from piavatar_envs.mpm.blocks import (
     nodes_shared,
     shared_block,
 )
-from piavatar_envs.mpm.colliders import NEAR_SLAB
+from piavatar_envs.mpm.colliders import GATED_SLAB
 from piavatar_envs.mpm.contact import book_pair, impulse_between, touch_all
 from piavatar_envs.mpm.grid import meet_boundaries, physical_velocity, place_of, slab_is_near, total_velocity
 from piavatar_envs.mpm.impulses import read_change, write_change
@@ -89,7 +89,7 @@ def solve_node(
 ):
     """A node with any number of fields, those of ``mask``."""
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    near = slab_is_near(grid, boundaries, e, block_corner(grid, block), local, NEAR_SLAB)
+    near = slab_is_near(grid, boundaries, e, block_corner(grid, block), local, GATED_SLAB)
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
@@ -130,7 +130,7 @@ def solve_pair(
     vb = read_record(node_velocity, e, rb)
     offset_a = offset_at(grid, sums, e, a, ra)
     offset_b = offset_at(grid, sums, e, b, rb)
-    near = slab_is_near(grid, boundaries, e, corner, local, NEAR_SLAB)
+    near = slab_is_near(grid, boundaries, e, corner, local, GATED_SLAB)
     grown = vb[0] == GROWN_TOGETHER  # only to a trunk, which comes first
     va = total_velocity(step, split, va)
     vb = total_velocity(step, split, vb)

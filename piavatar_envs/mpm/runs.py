@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _CFL = wp.constant(FAILURE_CFL)
 #: Units of momentum that a particle may have: those of 4,000 full cells that move a grid spacing in a time step.
-MOST_UNITS = wp.constant(float(2**48))
+MOST_COUNTED = wp.constant(float(2**48))
 #: What is added up: mass and momentum; kinematic momentum; places and seams.
 MOMENTUM, KINEMATIC, PLACE = (wp.constant(n) for n in range(3))
 #: Threads of a CUDA block of the gather.
@@ -69,14 +69,14 @@ def fault_of_sums(s: Scattered, unit: float):
     for i in range(3):
         for j in range(3):
             most = wp.max(most, wp.abs(s.A[i, j]))
-    return wp.where(most > MOST_UNITS * unit, _CFL, 0)
+    return wp.where(most > MOST_COUNTED * unit, _CFL, 0)
 
 
 @wp.func
 def fault_within(s: Scattered, bounds: wp.vec3, unit: float):
     """:func:`fault_of_sums`, asked for only where the ``bounds`` of what a particle has leave that open."""
     fault = int(0)
-    if not bounds[0] + bounds[1] + bounds[2] < MOST_UNITS * unit:  # of what is no number, either
+    if not bounds[0] + bounds[1] + bounds[2] < MOST_COUNTED * unit:  # of what is no number, either
         fault = fault_of_sums(s, unit)
     return fault
 

@@ -3,11 +3,13 @@
 Its kernels for a GPU ask for shared memory, and for what the threads of a warp or of a CUDA block tell each other. Warp
 can run the threads of a block on a CPU, as fibers that take turns (``wp.config.enable_cpu_blocks``); ``threads.h`` has
 the rest. Inside :func:`gpu_on_cpu` the package takes the CPU for a GPU, and such kernels are compiled with the CUDA in
-them. That does not find what only real threads do: races, and what a GPU rounds in another way.
+them. It also shows what hangs on the order of the threads, shared memory that is read before it is written or written
+beyond its end, and threads that wait for ever; not what only happens at the same time, nor what a GPU rounds otherwise.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
 import sys
 from collections.abc import Iterator
@@ -28,8 +30,9 @@ _HEADER = Path(__file__).with_name("threads.h")
 _INCLUDES = '#include "deterministic.h"\n'
 _BEGIN = "    const size_t task_index = payload->block_first + (size_t)lane;\n"
 _RUN = r"(    \w+_cpu_kernel_forward<false>\(\*dim, task_index, payload->args\);\n)"
-#: What a snippet has as its shared memory.
+#: What a snippet has as its shared memory, and how many words a kernel reserves.
 _ROOM = "extern __shared__ int piavatar_room[];"
+_RESERVED = r"tile_alloc_empty<wp::int32,wp::tile_shape_t<(\d+)>"
 #: Instructions in PTX, and what they do.
 _PTX = (
     (
@@ -38,16 +41,16 @@ _PTX = (
     ),
     (
         r'asm volatile\("red\.global\.add\.s32 \[%0\], %1;"\s*:: "l"\((.*?)\), "r"\((.*)\) : "memory"\);',
-        r"*(wp::int32*)\1 += \2;",
+        r"*(wp::int32*)(\1) += \2;",
     ),
     (
         r'asm volatile\("red\.global\.add\.f32 \[%0\], %1;"\s*:: "l"\((.*?)\), "f"\((.*)\) : "memory"\);',
-        r"*(wp::float32*)\1 += \2;",
+        r"*(wp::float32*)(\1) += \2;",
     ),
     (
         r'asm volatile\("cp\.async\.ca\.shared\.global \[%0\], \[%1\], 4;"\s*'
         r':: "r"\((.*?)\), "l"\((.*?)\) : "memory"\);',
-        r"*(wp::int32*)((char*)gpu::room + \1) = *\2;",
+        r"*(wp::int32*)((char*)gpu::room + \1) = *(const wp::int32*)(\2);",
     ),
     (r'asm volatile\("cp\.async\.wait_all;" ::: "memory"\);', ""),
     (r'asm volatile\("" : "\+r"\(t\)\);', ""),
@@ -60,15 +63,18 @@ def on_cpu(source: str) -> str:
     Raises:
         RuntimeError: it is not as this version of Warp writes it, or has instructions in PTX that are not known here.
     """
-    source = source.replace(_INCLUDES, f'{_INCLUDES}#include "{_HEADER}"\n', 1)
+    words = max((int(words) for words in re.findall(_RESERVED, source)), default=0)
+    source = source.replace(_INCLUDES, f'{_INCLUDES}#define GPU_ROOM_WORDS {words}\n#include "{_HEADER}"\n', 1)
     source = source.replace("__CUDA_ARCH__", "GPU_ARCH").replace(_ROOM, "int* const piavatar_room = gpu::room;")
     for pattern, replacement in _PTX:
         source = re.sub(pattern, replacement, source)
-    left = "dim->size - payload->block_first"
-    count = f"{left} < gpu::THREADS ? (int)({left}) : gpu::THREADS"
-    begin = f"{_BEGIN}    gpu::begin(lane, {count}, payload->block_first / gpu::THREADS);\n"
+    rest = "dim->size - payload->block_first"
+    begin = f"""\
+    gpu::begin(lane, {rest} < gpu::THREADS ? (int)({rest}) : gpu::THREADS, payload->block_first / gpu::THREADS);
+    const size_t task_index = payload->block_first + (size_t)gpu::own();
+"""
     threads = source.count(_BEGIN)
-    source, ended = re.subn(_RUN, r"\1    gpu::end(lane);\n", source.replace(_BEGIN, begin))
+    source, ended = re.subn(_RUN, r"\1    gpu::end();\n", source.replace(_BEGIN, begin))
     if _HEADER.name not in source or threads != ended or threads == 0:
         raise RuntimeError(f"Warp {wp.__version__} writes modules for a CPU in another way than {__file__} knows")
     if unknown := re.search(r"\basm\b.*", source):
@@ -84,15 +90,22 @@ class EmulatedGpu(str):
     alias = name = NAME
 
 
+def _own_cache() -> Path:
+    """Where to keep what is compiled: not with what a plain CPU has, nor with that of other emulations."""
+    known = hashlib.sha256(_HEADER.read_bytes() + Path(__file__).read_bytes()).hexdigest()[:8]
+    return Path(wp.config.kernel_cache_dir) / f"{NAME}_{known}"
+
+
 @contextmanager
 def gpu_on_cpu() -> Iterator[str]:
     """Let the package build and run on the CPU what it has for a GPU; gives the name of the device.
 
-    What is built inside belongs to it. One process has one.
+    What is built inside belongs to it. Inside another one, it changes nothing.
     """
     wp.init()
-    context.runtime.device_map[NAME] = context.runtime.device_map["cpu"]
-    get_device, compile_cpu, blocks = wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks
+    if NAME in context.runtime.device_map:
+        yield NAME
+        return
     resolve = context._resolve_launch_block_dim
 
     def seen_device(name: Any = None) -> Any:
@@ -100,14 +113,20 @@ def gpu_on_cpu() -> Iterator[str]:
         return EmulatedGpu(NAME) if own else get_device(name)
 
     def threads_of_block(device: Any, block_dim: int | None) -> int:
-        return resolve(device, THREADS if block_dim is None else block_dim)
+        threads = resolve(device, THREADS if block_dim is None else block_dim)
+        if threads == 1:
+            raise RuntimeError("block_dim=1 would run what is beside the CUDA; use 2 threads or more")
+        return threads
 
     def build_cpu(obj_path: str, cpp_path: str, *args: Any, **kwargs: Any) -> Any:
         path = Path(cpp_path)
-        if "_cpu_block_payload_forward" in (source := path.read_text()):
-            path.write_text(on_cpu(source))
+        path.write_text(on_cpu(path.read_text()))
         return compile_cpu(obj_path, cpp_path, *args, **kwargs)
 
+    get_device, compile_cpu, blocks = wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks
+    caches = wp.config.kernel_cache_dir, build._resolved_kernel_cache_dir
+    build.init_kernel_cache(str(_own_cache()))
+    context.runtime.device_map[NAME] = context.runtime.device_map["cpu"]
     wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks = seen_device, build_cpu, True
     context._resolve_launch_block_dim = threads_of_block
     try:
@@ -116,3 +135,4 @@ def gpu_on_cpu() -> Iterator[str]:
         wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks = get_device, compile_cpu, blocks
         context._resolve_launch_block_dim = resolve
         del context.runtime.device_map[NAME]
+        wp.config.kernel_cache_dir, build._resolved_kernel_cache_dir = caches

@@ -1,7 +1,8 @@
 // The threads of a CUDA block on a CPU: what the package's snippets in CUDA ask for, on the fibers of Warp's runtime.
 //
 // The modules that Warp generates include it, see __init__.py. A block's threads run one at a time, and others go on
-// where one waits; so nothing here need be atomic, and a race only shows where that order makes it one.
+// where one waits; so nothing here need be atomic. Every other block begins with its last thread: where results hang on
+// who comes first, most tests see it. Shared memory begins with what is no number, and nobody may write behind it.
 #pragma once
 
 namespace gpu {
@@ -17,21 +18,48 @@ struct Thread {
     unsigned long long told[32];  // what those who have come have told
 };
 
+constexpr int GUARD = 1024, BLANK = 0x7fc0dead;
+constexpr int MOST_TURNS = 4096 * THREADS;  // far more than it takes all to come where they wait for each other
+
 static Thread threads[THREADS];
-static unsigned block;
-alignas(16) static int room[58 * 1024];  // its shared memory
+static unsigned block, blocks_begun;
+static int count, left, turns;
+alignas(16) static int room[GPU_ROOM_WORDS + GUARD];  // the block's shared memory, and what must stay as it is
 
-inline int own() { return wp_cpu_get_thread_idx(); }
-
-// a thread begins; the first of a block does so first, and says how many there are
-inline void begin(int thread, int count, unsigned of)
+// place in the block of the fiber that runs
+inline int own()
 {
-    if (thread != 0) return;
-    for (int t = 0; t < THREADS; ++t) threads[t].state = t < count ? RUNS : GONE;
-    block = of;
+    const int fiber = wp_cpu_get_thread_idx();
+    return blocks_begun % 2 != 0 ? fiber : count - 1 - fiber;
 }
 
-inline void end(int thread) { threads[thread].state = GONE; }
+// a fiber begins; the first does so first, and says how many there are in which block
+inline void begin(int fiber, int fibers, unsigned of)
+{
+    if (fiber != 0) return;
+    for (int t = 0; t < THREADS; ++t) threads[t].state = t < fibers ? RUNS : GONE;
+    for (int& word : room) word = BLANK;
+    block = of, count = left = fibers, turns = 0;
+    ++blocks_begun;
+}
+
+inline void end()
+{
+    threads[own()].state = GONE;
+    turns = 0;
+    if (--left > 0) return;
+    for (int n = 0; n < GUARD; ++n)
+        if (room[GPU_ROOM_WORDS + n] != BLANK) _wp_assert("shared memory is written beyond its end", __FILE__, __LINE__);
+}
+
+// let others go on
+inline void wait()
+{
+    if (++turns > MOST_TURNS) _wp_assert("threads of a block wait for each other for ever", __FILE__, __LINE__);
+    wp_cpu_tile_sync();
+}
+
+inline void go_on(Thread& thread) { thread.state = RUNS, turns = 0; }
 
 inline unsigned in_state(int warp, State state)
 {
@@ -58,9 +86,9 @@ inline void meet_block()
         for (int t = 0; t < THREADS && all; ++t) all = threads[t].state == MEETS_BLOCK || threads[t].state == GONE;
         if (all) {
             for (int t = 0; t < THREADS; ++t)
-                if (threads[t].state == MEETS_BLOCK) threads[t].state = RUNS;
+                if (threads[t].state == MEETS_BLOCK) go_on(threads[t]);
         } else
-            wp_cpu_tile_sync();
+            wait();
     }
 }
 
@@ -81,10 +109,11 @@ inline Thread& meet_warp(unsigned mask, unsigned long long value)
                 if (here >> lane & 1u) {
                     for (int n = 0; n < 32; ++n)
                         threads[first + lane].told[n] = here >> n & 1u ? threads[first + n].value : 0;
-                    threads[first + lane].state = RUNS, threads[first + lane].mask = here;
+                    threads[first + lane].mask = here;
+                    go_on(threads[first + lane]);
                 }
         } else
-            wp_cpu_tile_sync();
+            wait();
     }
     return self;
 }
@@ -103,9 +132,12 @@ inline unsigned look_around(int place)
                     && threads[first + lane].place == place)
                     here |= 1u << lane;
             for (int lane = 0; lane < 32; ++lane)
-                if (here >> lane & 1u) threads[first + lane].state = RUNS, threads[first + lane].mask = here;
+                if (here >> lane & 1u) {
+                    threads[first + lane].mask = here;
+                    go_on(threads[first + lane]);
+                }
         } else
-            wp_cpu_tile_sync();
+            wait();
     }
     return self.mask;
 }
@@ -148,14 +180,18 @@ inline int __float_as_int(float x) { return gpu::from_bits<int>(gpu::bits_of(x))
 inline unsigned __float_as_uint(float x) { return gpu::from_bits<unsigned>(gpu::bits_of(x)); }
 inline float __int_as_float(int x) { return gpu::from_bits<float>(gpu::bits_of(x)); }
 inline float __uint_as_float(unsigned x) { return gpu::from_bits<float>(gpu::bits_of(x)); }
-inline int __float2int_rn(float x) { return (int)rintf(x); }
+inline int __float2int_rn(float x)
+{
+    if (x != x) return 0;
+    return x >= 0x1p31f ? 0x7fffffff : x < -0x1p31f ? (int)0x80000000 : (int)rintf(x);
+}
 inline float __fmaf_rn(float a, float b, float c) { return fmaf(a, b, c); }
 #pragma clang optimize off
 // rounded, never fused with what comes after
 inline float __fadd_rn(float a, float b) { volatile float sum = a + b; return sum; }
 inline float __fmul_rn(float a, float b) { volatile float product = a * b; return product; }
 #pragma clang optimize on
-inline float fminf(float a, float b) { return a < b ? a : b; }
+inline float fminf(float a, float b) { return a != a || b < a ? b : a; }
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
 inline int __ffs(unsigned x) { return __builtin_ffs((int)x); }
 inline int __clz(unsigned x) { return x ? __builtin_clz(x) : 32; }
