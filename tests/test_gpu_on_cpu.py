@@ -191,8 +191,10 @@ def test_single_threads_would_be_a_cpus(answers):
 def test_what_is_not_known_is_refused():
     with pytest.raises(RuntimeError, match="another way"):
         on_cpu("void nothing() {}")
-    source = '#include "deterministic.h"\n' + "    const size_t task_index = payload->block_first + (size_t)lane;\n"
-    source += "    k_cpu_kernel_forward<false>(*dim, task_index, payload->args);\n"
-    assert "gpu::begin(lane" in on_cpu(source) and "gpu::end()" in on_cpu(source)
+    source = '#include "deterministic.h"\n'
+    for way, arguments in (("forward", "payload->args"), ("backward", "payload->args, payload->adj_args")):
+        source += "    const size_t task_index = payload->block_first + (size_t)lane;\n"
+        source += f"    k_cpu_kernel_{way}<false>(*dim, task_index, {arguments});\n"
+    assert on_cpu(source).count("gpu::begin(lane") == on_cpu(source).count("gpu::end()") == 2
     with pytest.raises(RuntimeError, match=r"asm.*tell"):
         on_cpu(source + 'asm volatile("brkpt;");\n')

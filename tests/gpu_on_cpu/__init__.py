@@ -29,7 +29,7 @@ _HEADER = Path(__file__).with_name("threads.h")
 #: Where Warp's modules for a CPU include its own headers, begin and end a thread.
 _INCLUDES = '#include "deterministic.h"\n'
 _BEGIN = "    const size_t task_index = payload->block_first + (size_t)lane;\n"
-_RUN = r"(    \w+_cpu_kernel_forward<false>\(\*dim, task_index, payload->args\);\n)"
+_RUN = r"(    \w+_cpu_kernel_(?:for|back)ward<false>\(\*dim, task_index, payload->args(?:, payload->adj_args)?\);\n)"
 #: What a snippet has as its shared memory, and how many words a kernel reserves.
 _ROOM = "extern __shared__ int piavatar_room[];"
 _RESERVED = r"tile_alloc_empty<wp::int32,wp::tile_shape_t<(\d+)>"
