@@ -68,9 +68,8 @@ def on_cpu(source: str) -> str:
     source = source.replace("__CUDA_ARCH__", "GPU_ARCH").replace(_ROOM, "int* const piavatar_room = gpu::room;")
     for pattern, replacement in _PTX:
         source = re.sub(pattern, replacement, source)
-    rest = "dim->size - payload->block_first"
-    begin = f"""\
-    gpu::begin(lane, {rest} < gpu::THREADS ? (int)({rest}) : gpu::THREADS, payload->block_first / gpu::THREADS);
+    begin = """\
+    gpu::begin(lane, dim->size, payload->block_first);
     const size_t task_index = payload->block_first + (size_t)gpu::own();
 """
     threads = source.count(_BEGIN)

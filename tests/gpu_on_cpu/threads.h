@@ -7,7 +7,7 @@
 
 namespace gpu {
 
-constexpr int THREADS = WP_TILE_BLOCK_DIM, WARPS = (THREADS + 31) / 32;
+constexpr int THREADS = WP_TILE_BLOCK_DIM;
 enum State { RUNS, MEETS_BLOCK, MEETS_WARP, LOOKS_AROUND, GONE };
 
 struct Thread {
@@ -33,13 +33,14 @@ inline int own()
     return blocks_begun % 2 != 0 ? fiber : count - 1 - fiber;
 }
 
-// a fiber begins; the first does so first, and says how many there are in which block
-inline void begin(int fiber, int fibers, unsigned of)
+// a fiber begins; the first does so first, and says which of all threads the block begins with
+inline void begin(int fiber, size_t all, size_t first)
 {
     if (fiber != 0) return;
-    for (int t = 0; t < THREADS; ++t) threads[t].state = t < fibers ? RUNS : GONE;
+    count = left = all - first < THREADS ? (int)(all - first) : THREADS;
+    for (int t = 0; t < THREADS; ++t) threads[t].state = t < count ? RUNS : GONE;
     for (int& word : room) word = BLANK;
-    block = of, count = left = fibers, turns = 0;
+    block = first / THREADS, turns = 0;
     ++blocks_begun;
 }
 
@@ -61,19 +62,23 @@ inline void wait()
 
 inline void go_on(Thread& thread) { thread.state = RUNS, turns = 0; }
 
-inline unsigned in_state(int warp, State state)
+// those of a warp, by its first thread, of whom something is so
+template <class F> unsigned who(int first, F is_so)
 {
     unsigned mask = 0;
-    for (int lane = 0; lane < 32 && 32 * warp + lane < THREADS; ++lane)
-        if (threads[32 * warp + lane].state == state) mask |= 1u << lane;
+    for (int lane = 0; lane < 32 && first + lane < THREADS; ++lane)
+        if (is_so(threads[first + lane])) mask |= 1u << lane;
     return mask;
 }
 
-inline unsigned not_there(int warp)
+// those of a warp who have come go on together
+inline void go_on(int first, unsigned here)
 {
-    unsigned mask = in_state(warp, GONE);
-    for (int lane = THREADS - 32 * warp; lane < 32; ++lane) mask |= 1u << lane;
-    return mask;
+    for (int lane = 0; lane < 32; ++lane)
+        if (here >> lane & 1u) {
+            threads[first + lane].mask = here;
+            go_on(threads[first + lane]);
+        }
 }
 
 // all that have not ended come here
@@ -95,23 +100,18 @@ inline void meet_block()
 // all of a mask that have not ended come here, and learn what the others tell
 inline Thread& meet_warp(unsigned mask, unsigned long long value)
 {
-    const int t = own(), warp = t >> 5, first = warp << 5;
+    const int t = own(), first = t & ~31;
     Thread& self = threads[t];
     self.value = value, self.mask = mask, self.state = MEETS_WARP;
     while (self.state == MEETS_WARP) {
-        const unsigned others = mask & ~not_there(warp);
-        unsigned here = 0;
-        for (int lane = 0; lane < 32; ++lane)
-            if (others >> lane & 1u && threads[first + lane].state == MEETS_WARP && threads[first + lane].mask == mask)
-                here |= 1u << lane;
+        const unsigned others = mask & who(first, [](const Thread& one) { return one.state != GONE; });
+        const auto comes = [=](const Thread& one) { return one.state == MEETS_WARP && one.mask == mask; };
+        const unsigned here = others & who(first, comes);
         if (here == others) {
             for (int lane = 0; lane < 32; ++lane)
-                if (here >> lane & 1u) {
-                    for (int n = 0; n < 32; ++n)
-                        threads[first + lane].told[n] = here >> n & 1u ? threads[first + n].value : 0;
-                    threads[first + lane].mask = here;
-                    go_on(threads[first + lane]);
-                }
+                for (int n = 0; here >> lane & 1u && n < 32; ++n)
+                    threads[first + lane].told[n] = here >> n & 1u ? threads[first + n].value : 0;
+            go_on(first, here);
         } else
             wait();
     }
@@ -121,22 +121,13 @@ inline Thread& meet_warp(unsigned mask, unsigned long long value)
 // who has come to the same place when nobody of the warp can go on: they are as much together as they can be
 inline unsigned look_around(int place)
 {
-    const int t = own(), warp = t >> 5, first = warp << 5;
+    const int t = own(), first = t & ~31;
     Thread& self = threads[t];
     self.place = place, self.state = LOOKS_AROUND;
     while (self.state == LOOKS_AROUND) {
-        if (in_state(warp, RUNS) == 0) {
-            unsigned here = 0;
-            for (int lane = 0; lane < 32; ++lane)
-                if (first + lane < THREADS && threads[first + lane].state == LOOKS_AROUND
-                    && threads[first + lane].place == place)
-                    here |= 1u << lane;
-            for (int lane = 0; lane < 32; ++lane)
-                if (here >> lane & 1u) {
-                    threads[first + lane].mask = here;
-                    go_on(threads[first + lane]);
-                }
-        } else
+        if (who(first, [](const Thread& one) { return one.state == RUNS; }) == 0)
+            go_on(first, who(first, [=](const Thread& one) { return one.state == LOOKS_AROUND && one.place == place; }));
+        else
             wait();
     }
     return self.mask;
@@ -171,9 +162,7 @@ struct Index { unsigned x; };
 #define __activemask() gpu::look_around(__LINE__)
 
 struct alignas(16) int4 { int x, y, z, w; };
-struct alignas(16) uint4 { unsigned x, y, z, w; };
 inline int4 make_int4(int x, int y, int z, int w) { return {x, y, z, w}; }
-inline uint4 make_uint4(unsigned x, unsigned y, unsigned z, unsigned w) { return {x, y, z, w}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
 
 inline int __float_as_int(float x) { return gpu::from_bits<int>(gpu::bits_of(x)); }
@@ -194,7 +183,6 @@ inline float __fmul_rn(float a, float b) { volatile float product = a * b; retur
 inline float fminf(float a, float b) { return a != a || b < a ? b : a; }
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
 inline int __ffs(unsigned x) { return __builtin_ffs((int)x); }
-inline int __clz(unsigned x) { return x ? __builtin_clz(x) : 32; }
 template <class T> T __ldg(const T* at) { return *at; }
 
 inline int min(int a, int b) { return a < b ? a : b; }
@@ -228,12 +216,6 @@ template <class T> unsigned __match_any_sync(unsigned mask, T value)
         if (self.mask >> n & 1u && self.told[n] == gpu::bits_of(value)) same |= 1u << n;
     return same;
 }
-template <class T> unsigned __match_all_sync(unsigned mask, T value, int* all)
-{
-    const unsigned same = __match_any_sync(mask, value), here = gpu::threads[gpu::own()].mask;
-    *all = same == here;
-    return *all ? here : 0u;
-}
 template <class T, class F> T reduced(unsigned mask, T value, F of)
 {
     const auto& self = gpu::meet_warp(mask, gpu::bits_of(value));
@@ -264,7 +246,6 @@ template <class T, class F> T changed(T* at, F to)
 template <class T, class V> T atomicAdd(T* at, V v) { return changed(at, [=](T b) { return (T)(b + (T)v); }); }
 template <class T, class V> T atomicMax(T* at, V v) { return changed(at, [=](T b) { return b > (T)v ? b : (T)v; }); }
 template <class T, class V> T atomicOr(T* at, V v) { return changed(at, [=](T b) { return (T)(b | (T)v); }); }
-template <class T, class V> T atomicAnd(T* at, V v) { return changed(at, [=](T b) { return (T)(b & (T)v); }); }
 template <class T> T atomicCAS(T* at, T expected, T v) { return changed(at, [=](T b) { return b == expected ? v : b; }); }
 
 inline size_t __cvta_generic_to_global(const void* at) { return (size_t)at; }
