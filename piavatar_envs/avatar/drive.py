@@ -131,7 +131,7 @@ class AvatarDrive:
         )
         program.launch(
             place_particles,
-            (n, self.num_points),
+            n * self.num_points,
             [mask, self.body, s.bone_from],
             [state.x, state.u, state.C, state.F, state.kinematic, d.motion, state.failure],
         )

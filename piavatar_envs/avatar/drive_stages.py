@@ -13,6 +13,7 @@ from piavatar_envs.avatar.bone_sums import add_chunks, chunk_corrections, chunk_
 from piavatar_envs.avatar.flesh import apply_correction, blend_corrections, drive_particle
 from piavatar_envs.avatar.free_motion import free_motion, is_free
 from piavatar_envs.avatar.lanes import meet_threads
+from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.posing import carry_anchor, carry_bone, pose_bones, write_record
 from piavatar_envs.avatar.rigid_fit import fit_bone, fit_whole
 from piavatar_envs.avatar.root import hold_root, lay_command
@@ -137,7 +138,9 @@ def drive_body(
     let_go = held.let_go[e] != 0
     center = w.bones.center[e, 0]
     for p in range(body.count):
-        drive_particle(body, drive, x, w.record, center, let_go, e, p, u, motion, driven, w.pull, w.lean)
+        at = vector_at(x, e, body.first + p)
+        before = vector_at(u, e, body.first + p)
+        drive_particle(body, drive, at, before, w.record, center, let_go, e, p, u, motion, driven, w.pull, w.lean)
     if free:
         for c in range(chunks):
             chunk_motion(body, particles, x, driven.vk, w.bones.center, e, c, 0, 1, w.corrections)
@@ -146,7 +149,9 @@ def drive_body(
         chunk_corrections(body, particles, x, w.bones.center, w.pull, w.lean, e, c, 0, 1, w.corrections)
     settle_bones(body, drive, 1, w, e, 0, 1)
     for p in range(body.count):
-        apply_correction(body, drive, x, w.pull, center, w.change, w.removed, free, e, p, u, driven)
+        at = vector_at(x, e, body.first + p)
+        before = vector_at(u, e, body.first + p) + vector_at(w.pull, e, p)
+        apply_correction(body, drive, at, before, center, w.change, w.removed, free, e, p, u, driven)
 
 
 @wp.kernel(launch_bounds=(WARP, BODIES_AT_ONCE))

@@ -24,7 +24,7 @@ from piavatar_envs.avatar.blending import (
     motion_at,
 )
 from piavatar_envs.avatar.free_motion import axial, is_free
-from piavatar_envs.avatar.lanes import BLOCK, first_particle, next_particle, sum_threads12
+from piavatar_envs.avatar.lanes import BLOCK, first_particle, next_of_rounds, sum_threads12
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
@@ -49,7 +49,8 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 def drive_particle(
     body: Body,
     drive: Drive,
-    x: wp.array2d(dtype=wp.vec3),
+    at: wp.vec3,
+    before: wp.vec3,
     record: wp.array2d(dtype=vec44),
     center: wp.vec3,
     let_go: bool,
@@ -69,8 +70,6 @@ def drive_particle(
     that contact has caused along with the bone. Inert flesh misses its share of every change of that velocity.
     ``center`` is the pelvis', where the bones' blended velocity is.
     """
-    at = vector_at(x, e, body.first + p)
-    before = vector_at(u, e, body.first + p)
     inert = number_at(body.inert, row(e, body.inert.shape[0]), p)
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     s = blend_records(record, e, body.joint, body.weight, p, rest)
@@ -92,7 +91,7 @@ def drive_particle(
     store_pair(pull, lean, e, p, pulled, way, drive.tone_rate > 0.0, True)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 7))
+@wp.kernel(launch_bounds=(BLOCK, 6))
 def drive_particles(
     body: Body,
     drive: Drive,
@@ -101,6 +100,7 @@ def drive_particles(
     bones: RigidFits,
     let_go: wp.array(dtype=int),
     failure: wp.array(dtype=int),
+    threads: int,
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     motion: wp.array2d(dtype=wp.vec3),
@@ -111,16 +111,24 @@ def drive_particles(
 ):
     """:func:`drive_particle` of every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
-    own = first_particle(i, body.count)
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return
     p = own[1]
+    last = body.first + body.count - 1
+    following = vector_at(x, e, wp.min(body.first + p, last))
+    following_u = vector_at(u, e, wp.min(body.first + p, last))
+    center = bones.center[e, 0]
+    gone = let_go[e] != 0
     while p < body.count:
-        drive_particle(
-            body, drive, x, record, bones.center[e, 0], let_go[e] != 0, e, p, u, motion, driven, pull, lean
-        )  # fmt: skip
-        p = next_particle(p)
+        at = following
+        before = following_u
+        n = next_of_rounds(p, threads)
+        following = vector_at(x, e, wp.min(body.first + n, last))
+        following_u = vector_at(u, e, wp.min(body.first + n, last))
+        drive_particle(body, drive, at, before, record, center, gone, e, p, u, motion, driven, pull, lean)
+        p = n
 
 
 @wp.func
@@ -185,8 +193,8 @@ def blend_corrections(
 def apply_correction(
     body: Body,
     drive: Drive,
-    x: wp.array2d(dtype=wp.vec3),
-    pull: wp.array2d(dtype=wp.vec3),
+    at: wp.vec3,
+    before: wp.vec3,
     center: wp.vec3,
     change: wp.array2d(dtype=vec8),
     removed: RemovedMotion,
@@ -201,9 +209,8 @@ def apply_correction(
 
     Where the body is ``free``, the rigid part of its commanded motion comes off.
     """
-    at = vector_at(x, e, body.first + p)
     field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - center)
-    store_vector(u, e, body.first + p, vector_at(u, e, body.first + p) + vector_at(pull, e, p) + field, True)
+    store_vector(u, e, body.first + p, before + field, True)
     if free:
         v = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]
         v += removed.turn[e] * (at - removed.center[e] + drive.dt * v)
@@ -214,7 +221,7 @@ def apply_correction(
         driven.spin[e, body.first + p] = w + back + (0.5 * drive.dt) * wp.cross(back, w)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 12))
+@wp.kernel(launch_bounds=(BLOCK, 10))
 def apply_corrections(
     body: Body,
     drive: Drive,
@@ -225,18 +232,32 @@ def apply_corrections(
     removed: RemovedMotion,
     let_go: wp.array(dtype=int),
     failure: wp.array(dtype=int),
+    threads: int,
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     driven: Kinematic,
 ):
     """:func:`apply_correction` to every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
-    own = first_particle(i, body.count)
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return
     free = is_free(drive, let_go[e])
     p = own[1]
+    last = body.count - 1
+    center = bones.center[e, 0]
+    n = wp.min(p, last)
+    following = vector_at(x, e, body.first + n)
+    following_u = vector_at(u, e, body.first + n)
+    following_pull = vector_at(pull, e, n)
     while p < body.count:
-        apply_correction(body, drive, x, pull, bones.center[e, 0], change, removed, free, e, p, u, driven)
-        p = next_particle(p)
+        at = following
+        before = following_u + following_pull
+        q = next_of_rounds(p, threads)
+        n = wp.min(q, last)
+        following = vector_at(x, e, body.first + n)
+        following_u = vector_at(u, e, body.first + n)
+        following_pull = vector_at(pull, e, n)
+        apply_correction(body, drive, at, before, center, change, removed, free, e, p, u, driven)
+        p = q

@@ -15,6 +15,10 @@ wp.set_module_options({"enable_backward": False})
 
 #: Threads of a CUDA block in the drive's launches over particles and over sums.
 BLOCK = 128
+#: Those in sums over chunks: chunks of several bones, which move the same particles, are summed side by side.
+SUM_BLOCK = 512
+#: Particles of a thread in passes that wait for memory: it asks for those of the next one before it goes on with one.
+ROUNDS = 3
 
 
 def warp_threads(device: str) -> int:
@@ -27,12 +31,12 @@ def chunk_threads(device: str, chunks: int) -> int:
     return min(warp_threads(device), 1 << max(0, (chunks - 1) // 2).bit_length())
 
 
-def particle_threads(device: str, count: int) -> int:
-    """Threads that share ``count`` particles of a body: on a GPU as many, in whole CUDA blocks of :data:`BLOCK`.
+def particle_threads(device: str, count: int, rounds: int = 1) -> int:
+    """Threads that share ``count`` particles of a body in so many ``rounds``: on a GPU in whole CUDA blocks.
 
     On a CPU it is one: there a thread costs 7 ns before it does anything, as much as what is done for a particle.
     """
-    return -(-count // BLOCK) * BLOCK if wp.get_device(device).is_cuda else 1
+    return -(-count // (BLOCK * rounds)) * BLOCK if wp.get_device(device).is_cuda else 1
 
 
 # Warp finds a thread's place by divisions of 64 bits, which take a tenth of a short kernel's instructions.
@@ -45,7 +49,22 @@ return wp::vec_t<2, wp::int32>(e, 0);
 #endif
 """)
 def first_particle(e: int, count: int) -> wp.vec2i:
-    """Environment, on a CPU ``e``, and first particle of one of :func:`particle_threads`; there may be none."""
+    """Environment, on a CPU ``e``, and first particle of one of :func:`particle_threads`; there may be none.
+
+    ``count`` is that of the particles, or of the threads if these have several rounds.
+    """
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return p + threads;
+#else
+return p + 1;
+#endif
+""")
+def next_of_rounds(p: int, threads: int) -> int:
+    """The particle after ``p`` that its thread has, where ``threads`` of an environment share them in rounds."""
     ...
 
 

@@ -7,9 +7,10 @@ import warp as wp
 from piavatar_envs.avatar.blending import skinned_place
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.matrices import store_matrix
+from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import Kinematic
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.kernel
@@ -51,7 +52,9 @@ def place_particles(
     failure: wp.array(dtype=int),
 ):
     """Particles of the masked environments to their places in the pose ``bone_from``; the failure is forgiven."""
-    e, p = wp.tid()
+    at = environment_of(wp.tid(), body.count)
+    e = at[0]
+    p = at[1]
     if not mask[e]:
         return
     q = body.first + p

@@ -12,7 +12,7 @@ import warp as wp
 
 from piavatar_envs.avatar import bone_sums, drive_stages, flesh, posing
 from piavatar_envs.avatar.injection import inject_velocity
-from piavatar_envs.avatar.lanes import BLOCK, particle_threads
+from piavatar_envs.avatar.lanes import BLOCK, ROUNDS, SUM_BLOCK, particle_threads
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import (
     Anchor,
@@ -112,26 +112,27 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         return
     chunks, own = (n, drive.num_chunks, drive.threads), [drive.chunk_threads, state.failure, drive.threads]
     inputs = [drive.body, drive.model.particles, state.x, state.u, bench.tracked, state.failure, drive.threads]
-    program.launch(bone_sums.sum_moments, chunks, inputs, [s.moments], block_dim=BLOCK)
+    program.launch(bone_sums.sum_moments, chunks, inputs, [s.moments], block_dim=SUM_BLOCK)
+    shared = particle_threads(drive.model.device, drive.num_points, rounds=ROUNDS)
     bones = (n, drive.threads)
     inputs = [*who, drive.body_mass, step, *own]
     program.launch(drive_stages.prepare_body, bones, inputs, [bench, g.held], block_dim=drive.threads)
     program.launch(
         flesh.drive_particles,
-        (n, particle_threads(drive.model.device, drive.num_points)),
-        [*who, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure],
+        (n, shared),
+        [*who, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure, shared],
         [state.u, drive.state.motion, state.kinematic, s.pull, s.lean],
         block_dim=BLOCK,
     )
     if drive.drive.free_motion or drive.drive.root_rate > 0.0:  # a root that lets go leaves a free body
         _record_free_motion(drive, program, state, bench)
     inputs = [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.threads]
-    program.launch(bone_sums.sum_corrections, chunks, inputs, [s.corrections], block_dim=BLOCK)
+    program.launch(bone_sums.sum_corrections, chunks, inputs, [s.corrections], block_dim=SUM_BLOCK)
     program.launch(drive_stages.settle_body, bones, [*who, *own], [bench], block_dim=drive.threads)
     program.launch(
         flesh.apply_corrections,
-        (n, particle_threads(drive.model.device, drive.num_points)),
-        [*who, state.x, s.pull, g.bones, s.bone_change, g.removed, drive.state.let_go, state.failure],
+        (n, shared),
+        [*who, state.x, s.pull, g.bones, s.bone_change, g.removed, drive.state.let_go, state.failure, shared],
         [state.u, state.kinematic],
         block_dim=BLOCK,
     )

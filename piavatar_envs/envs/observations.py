@@ -13,9 +13,10 @@ from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_ACTUATED, NUM_JOINTS
 from piavatar_envs.avatar.types import Body, Tracked
 from piavatar_envs.mpm.materials import kirchhoff_stress, von_mises_stress
 from piavatar_envs.mpm.matrices import matrix_at
+from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import Particles, Sensors, row
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 _NUM_PARTS = wp.constant(len(BODY_PARTS))
 
@@ -169,6 +170,30 @@ def clear_stress(mask: wp.array(dtype=wp.bool), agent: int, start: int, observat
         observation[e, agent, start + part] = 0.0
 
 
+# neighbours mostly are of the same part: then a warp raises its peak once
+@wp.func_native("""
+wp::float32* const at = &wp::index(observation, e, agent, n);
+#if defined(__CUDA_ARCH__)
+int one = 0;
+const unsigned together = __activemask(), bits = __float_as_uint(value) & 0x7fffffffu;  // in the order of numbers
+__match_all_sync(together, (unsigned long long)at, &one);
+#if __CUDA_ARCH__ >= 800
+if (one) {
+    const unsigned peak = __reduce_max_sync(together, bits);
+    if ((threadIdx.x & 31) == __ffs(together) - 1) atomicMax((unsigned*)at, peak);
+    return;
+}
+#endif
+atomicMax((unsigned*)at, bits);
+#else
+if (value > *at) *at = value;
+#endif
+""")
+def raise_peak(observation: wp.array3d(dtype=float), e: int, agent: int, n: int, value: float):
+    """Make a component of the observation at least ``value``, neither of which is negative."""
+    ...
+
+
 @wp.kernel
 def observe_stress(
     mask: wp.array(dtype=wp.bool),
@@ -183,7 +208,9 @@ def observe_stress(
     observation: wp.array3d(dtype=float),
 ):
     """Peak von Mises stress of each body part, in units of Young's modulus. A maximum does not depend on its order."""
-    e, p = wp.tid()
+    at = environment_of(wp.tid(), body.count)
+    e = at[0]
+    p = at[1]
     if not mask[e]:
         return
     q = body.first + p
@@ -196,7 +223,7 @@ def observe_stress(
     )
     stress = von_mises_stress(tau, wp.determinant(G)) * inverse_modulus
     if wp.isfinite(stress):
-        wp.atomic_max(observation, e, agent, start + part[p], stress)
+        raise_peak(observation, e, agent, start + part[p], stress)
 
 
 @wp.kernel

@@ -81,7 +81,7 @@ class Observer:
         modulus = 1.0 / sim.flesh[agent].physics.young_modulus
         program.launch(
             observe_stress,
-            (n, avatar.num_points),
+            n * avatar.num_points,
             [mask, avatar.body, sim.model.particles, sim.state.F, self._part[agent], agent, start, modulus],
             [observation],
         )

@@ -65,7 +65,7 @@ class Hits:
         program.launch(clear_stress, (env.num_envs, len(BODY_PARTS)), [env.observer.everybody, 0, 0], [self._stress])
         program.launch(
             observe_stress,
-            (env.num_envs, sim.avatar.num_points),
+            env.num_envs * sim.avatar.num_points,
             [
                 env.observer.everybody, sim.avatar.body, sim.model.particles, sim.state.F, self._part, 0, 0,
                 1.0 / sim.flesh[0].physics.young_modulus,

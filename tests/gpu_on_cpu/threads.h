@@ -216,6 +216,12 @@ template <class T> unsigned __match_any_sync(unsigned mask, T value)
         if (self.mask >> n & 1u && self.told[n] == gpu::bits_of(value)) same |= 1u << n;
     return same;
 }
+template <class T> unsigned __match_all_sync(unsigned mask, T value, int* all)
+{
+    const unsigned same = __match_any_sync(mask, value), here = gpu::threads[gpu::own()].mask;
+    *all = same == here;
+    return *all ? here : 0u;
+}
 template <class T, class F> T reduced(unsigned mask, T value, F of)
 {
     const auto& self = gpu::meet_warp(mask, gpu::bits_of(value));
