@@ -68,7 +68,7 @@ def drive_particle(
 
     ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
     that contact has caused along with the bone. Inert flesh misses its share of every change of that velocity.
-    ``center`` is the pelvis', where the bones' blended velocity is.
+    ``at`` is where it is and ``before`` its velocity; ``center`` is the pelvis', where the bones' blended velocity is.
     """
     inert = number_at(body.inert, row(e, body.inert.shape[0]), p)
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
@@ -207,7 +207,8 @@ def apply_correction(
 ):
     """Change the physical velocity by the pull and the bones' blended field.
 
-    Where the body is ``free``, the rigid part of its commanded motion comes off.
+    ``at`` is where the particle is, ``before`` its velocity with the pull. Where the body is ``free``, the
+    rigid part of its commanded motion comes off.
     """
     field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - center)
     store_vector(u, e, body.first + p, before + field, True)

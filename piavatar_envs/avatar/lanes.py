@@ -15,10 +15,11 @@ wp.set_module_options({"enable_backward": False})
 
 #: Threads of a CUDA block in the drive's launches over particles and over sums.
 BLOCK = 128
-#: Those in sums over chunks: chunks of several bones, which move the same particles, are summed side by side.
-SUM_BLOCK = 512
-#: Particles of a thread in passes that wait for memory: it asks for those of the next one before it goes on with one.
-ROUNDS = 3
+#: Particles of a thread, at most, in passes that wait for memory: it asks for what the next one has before it goes on
+#: with one. On an H200 of 1, 3 and 6 the last was best.
+ROUNDS = 6
+#: Threads that a multiprocessor can have.
+RESIDENT = 2048
 
 
 def warp_threads(device: str) -> int:
@@ -29,6 +30,12 @@ def warp_threads(device: str) -> int:
 def chunk_threads(device: str, chunks: int) -> int:
     """Threads that add up the ``chunks`` of a bone, about two each."""
     return min(warp_threads(device), 1 << max(0, (chunks - 1) // 2).bit_length())
+
+
+def particle_rounds(device: str, particles: int) -> int:
+    """Particles of a thread where there are so many in all: up to :data:`ROUNDS`, while none of a GPU's is idle."""
+    gpu = wp.get_device(device)
+    return min(ROUNDS, max(1, particles // (gpu.sm_count * RESIDENT))) if gpu.is_cuda else 1
 
 
 def particle_threads(device: str, count: int, rounds: int = 1) -> int:

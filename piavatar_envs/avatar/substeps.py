@@ -12,7 +12,7 @@ import warp as wp
 
 from piavatar_envs.avatar import bone_sums, drive_stages, flesh, posing
 from piavatar_envs.avatar.injection import inject_velocity
-from piavatar_envs.avatar.lanes import BLOCK, ROUNDS, SUM_BLOCK, particle_threads
+from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import (
     Anchor,
@@ -112,8 +112,9 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         return
     chunks, own = (n, drive.num_chunks, drive.threads), [drive.chunk_threads, state.failure, drive.threads]
     inputs = [drive.body, drive.model.particles, state.x, state.u, bench.tracked, state.failure, drive.threads]
-    program.launch(bone_sums.sum_moments, chunks, inputs, [s.moments], block_dim=SUM_BLOCK)
-    shared = particle_threads(drive.model.device, drive.num_points, rounds=ROUNDS)
+    program.launch(bone_sums.sum_moments, chunks, inputs, [s.moments], block_dim=BLOCK)
+    rounds = particle_rounds(drive.model.device, n * drive.num_points)
+    shared = particle_threads(drive.model.device, drive.num_points, rounds)
     bones = (n, drive.threads)
     inputs = [*who, drive.body_mass, step, *own]
     program.launch(drive_stages.prepare_body, bones, inputs, [bench, g.held], block_dim=drive.threads)
@@ -127,7 +128,7 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
     if drive.drive.free_motion or drive.drive.root_rate > 0.0:  # a root that lets go leaves a free body
         _record_free_motion(drive, program, state, bench)
     inputs = [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.threads]
-    program.launch(bone_sums.sum_corrections, chunks, inputs, [s.corrections], block_dim=SUM_BLOCK)
+    program.launch(bone_sums.sum_corrections, chunks, inputs, [s.corrections], block_dim=BLOCK)
     program.launch(drive_stages.settle_body, bones, [*who, *own], [bench], block_dim=drive.threads)
     program.launch(
         flesh.apply_corrections,

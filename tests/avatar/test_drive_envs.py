@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar import drive, substeps
+from piavatar_envs.avatar import drive, lanes, substeps
 from piavatar_envs.mpm.types import FAILURE_NONFINITE
 
 
@@ -107,6 +107,20 @@ def test_running_twice_gives_the_same_bits_and_eager_equals_recorded(make_rig, w
     first = runs[0].everything()
     assert_same(runs[0], first, runs[1].everything())
     assert_same(runs[0], first, runs[2].everything())
+
+
+@pytest.mark.parametrize("rounds", [2, 6])
+def test_threads_that_have_several_particles_drive_as_one_each_does(make_rig, wild_pose, monkeypatch, rounds):
+    """On a GPU, in batches that leave no thread idle; a particle is driven without knowing of others."""
+    one = disturbed(make_rig, wild_pose)
+    gpu = wp.get_device(one.model.device)
+    if not gpu.is_cuda:
+        pytest.skip("on a CPU one thread has all particles")
+    monkeypatch.setattr(lanes, "RESIDENT", 3 * one.points.num_points // (gpu.sm_count * rounds))
+    assert lanes.particle_rounds(one.model.device, 3 * one.points.num_points) == rounds
+    several = disturbed(make_rig, wild_pose)
+    for name, value in one.everything().items():
+        np.testing.assert_array_equal(several.everything()[name], value, err_msg=name)
 
 
 @pytest.mark.parametrize("root", ["wrench", "free"])
