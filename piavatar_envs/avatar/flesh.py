@@ -24,7 +24,7 @@ from piavatar_envs.avatar.blending import (
     motion_at,
 )
 from piavatar_envs.avatar.free_motion import axial, is_free
-from piavatar_envs.avatar.lanes import BLOCK, first_particle, next_of_rounds, sum_threads12
+from piavatar_envs.avatar.lanes import BLOCK, first_particle, sum_threads12, threads_of_environment
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.pulls import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.rigid_fit import spin_of
@@ -100,7 +100,6 @@ def drive_particles(
     bones: RigidFits,
     let_go: wp.array(dtype=int),
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     motion: wp.array2d(dtype=wp.vec3),
@@ -111,6 +110,7 @@ def drive_particles(
 ):
     """:func:`drive_particle` of every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
+    threads = threads_of_environment(x.shape[0])
     own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
@@ -124,7 +124,7 @@ def drive_particles(
     while p < body.count:
         at = following
         before = following_u
-        n = next_of_rounds(p, threads)
+        n = p + threads
         following = vector_at(x, e, wp.min(body.first + n, last))
         following_u = vector_at(u, e, wp.min(body.first + n, last))
         drive_particle(body, drive, at, before, record, center, gone, e, p, u, motion, driven, pull, lean)
@@ -233,13 +233,13 @@ def apply_corrections(
     removed: RemovedMotion,
     let_go: wp.array(dtype=int),
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     driven: Kinematic,
 ):
     """:func:`apply_correction` to every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
+    threads = threads_of_environment(x.shape[0])
     own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
@@ -255,7 +255,7 @@ def apply_corrections(
     while p < body.count:
         at = following
         before = following_u + following_pull
-        q = next_of_rounds(p, threads)
+        q = p + threads
         n = wp.min(q, last)
         following = vector_at(x, e, body.first + n)
         following_u = vector_at(u, e, body.first + n)

@@ -49,29 +49,29 @@ def particle_threads(device: str, count: int, rounds: int = 1) -> int:
 # Warp finds a thread's place by divisions of 64 bits, which take a tenth of a short kernel's instructions.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-const unsigned blocks = ((unsigned)count + {BLOCK - 1}u) / {BLOCK}u, row = blockIdx.x / blocks;
+const unsigned blocks = ((unsigned)threads + {BLOCK - 1}u) / {BLOCK}u, row = blockIdx.x / blocks;
 return wp::vec_t<2, wp::int32>((int)row, (int)((blockIdx.x - row * blocks) * {BLOCK}u + threadIdx.x));
 #else
 return wp::vec_t<2, wp::int32>(e, 0);
 #endif
 """)
-def first_particle(e: int, count: int) -> wp.vec2i:
+def first_particle(e: int, threads: int) -> wp.vec2i:
     """Environment, on a CPU ``e``, and first particle of one of :func:`particle_threads`; there may be none.
 
-    ``count`` is that of the particles, or of the threads if these have several rounds.
+    ``threads`` is their number, or that of the particles if each has one.
     """
     ...
 
 
-@wp.func_native("""
+@wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-return p + threads;
+return (int)(gridDim.x / (unsigned)num_envs * {BLOCK}u);
 #else
-return p + 1;
+return 1;
 #endif
 """)
-def next_of_rounds(p: int, threads: int) -> int:
-    """The particle after ``p`` that its thread has, where ``threads`` of an environment share them in rounds."""
+def threads_of_environment(num_envs: int) -> int:
+    """:func:`particle_threads` in a launch over ``(num_envs, particle_threads)``, by what is launched."""
     ...
 
 

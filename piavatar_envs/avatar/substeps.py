@@ -121,7 +121,7 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
     program.launch(
         flesh.drive_particles,
         (n, shared),
-        [*who, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure, shared],
+        [*who, state.x, s.bone_record, g.bones, drive.state.let_go, state.failure],
         [state.u, drive.state.motion, state.kinematic, s.pull, s.lean],
         block_dim=BLOCK,
     )
@@ -133,7 +133,7 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
     program.launch(
         flesh.apply_corrections,
         (n, shared),
-        [*who, state.x, s.pull, g.bones, s.bone_change, g.removed, drive.state.let_go, state.failure, shared],
+        [*who, state.x, s.pull, g.bones, s.bone_change, g.removed, drive.state.let_go, state.failure],
         [state.u, state.kinematic],
         block_dim=BLOCK,
     )

@@ -22,7 +22,7 @@ constexpr int GUARD = 1024, BLANK = 0x7fc0dead;
 constexpr int MOST_TURNS = 4096 * THREADS;  // far more than it takes all to come where they wait for each other
 
 static Thread threads[THREADS];
-static unsigned block, blocks_begun;
+static unsigned block, blocks, blocks_begun;
 static int count, left, turns;
 alignas(16) static int room[GPU_ROOM_WORDS + GUARD];  // the block's shared memory, and what must stay as it is
 
@@ -40,7 +40,7 @@ inline void begin(int fiber, size_t all, size_t first)
     count = left = all - first < THREADS ? (int)(all - first) : THREADS;
     for (int t = 0; t < THREADS; ++t) threads[t].state = t < count ? RUNS : GONE;
     for (int& word : room) word = BLANK;
-    block = first / THREADS, turns = 0;
+    block = first / THREADS, blocks = (all + THREADS - 1) / THREADS, turns = 0;
     ++blocks_begun;
 }
 
@@ -156,6 +156,7 @@ struct Index { unsigned x; };
 #define threadIdx (gpu::Index{(unsigned)gpu::own()})
 #define blockDim (gpu::Index{(unsigned)gpu::THREADS})
 #define blockIdx (gpu::Index{gpu::block})
+#define gridDim (gpu::Index{gpu::blocks})
 #define __shared__ static
 #define __align__(bytes) __attribute__((aligned(bytes)))
 #define __syncthreads() gpu::meet_block()
