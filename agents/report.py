@@ -15,7 +15,7 @@ from agents.matches import Match
 from benchmarks.runner import Estimate, describe_run, plain, write_json
 
 _COLORS = ("tab:blue", "tab:green", "tab:purple", "tab:orange")
-_SMOOTH = 20  # episodes in the moving mean of a learning curve
+_SMOOTH = 20  # episodes in the moving mean of a learning curve, at least; of many, one in a hundred
 
 
 def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
@@ -81,7 +81,7 @@ def draw_curve(
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
     axes = figure.subplots()
     axes.plot(steps, returns, ".", color="0.75", markersize=4, label="training episode")
-    window = min(_SMOOTH, len(returns))
+    window = min(max(_SMOOTH, len(returns) // 100), len(returns))
     if window > 1:
         mean = np.convolve(returns, np.full(window, 1.0 / window), mode="valid")
         axes.plot(steps[window - 1 :], mean, color="tab:red", label=f"mean of {window}")
