@@ -199,8 +199,9 @@ class BatchEnv:
 
         Nothing leaves the device, unless shapes are random and not from a pool: those are drawn on the host.
         """
-        # where reading costs nothing, nothing to do costs nothing
-        if wp.get_device(self.device).is_cpu and not self.mask.numpy().any():
+        # where reading costs nothing, nothing to do costs nothing; but for the first time, which others may wait for
+        on_cpu = wp.get_device(self.device).is_cpu
+        if on_cpu and self.reset_program.is_captured and not self.mask.numpy().any():
             return self.observation
         return self._begin()
 

@@ -52,6 +52,11 @@ class Program:
             self._capture()
         wp.capture_launch(self._graph)
 
+    @property
+    def is_captured(self) -> bool:
+        """Whether it has run before: graphs are captured then, one at a time."""
+        return self._graph is not None
+
     def run_eager(self) -> None:
         """Launch one by one without a graph, to compare with :meth:`run`."""
         with wp.ScopedDevice(self.device):

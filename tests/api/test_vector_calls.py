@@ -355,6 +355,19 @@ def test_a_restored_vector_needs_no_reset(device, same):
     fresh.close()
 
 
+def test_threads_never_capture_at_once(device):
+    """Warp records one graph at a time: what was restored captures in turns, though nobody begins an episode yet."""
+    settings = {"device": device, "fidelity": "tiny", "num_threads": 2}
+    vector, fresh = (AvatarVectorEnv("KickBall-v0", 3, **settings) for _ in range(2))
+    vector.reset(seed=1)
+    fresh.set_state(vector.get_state())
+    assert not fresh.episodes.find_ended().any()
+    fresh.episodes.reset_ended()
+    assert all(group.reset_program.is_captured for group in fresh.episodes.groups)
+    vector.close()
+    fresh.close()
+
+
 @pytest.mark.parametrize("how", ["fewer", "missing", "unknown", "double", "particles"])
 def test_a_state_of_others_is_refused_and_changes_nothing(make_vec, how):
     vector = make_vec("PIAvatar/KickBall-v0", 3)
