@@ -1,15 +1,15 @@
-"""Keep what a training has left beside the other results, without what only going on with it would need.
+"""Keep what a training has left beside the other results, and no more than is needed there.
 
 python -m scripts.keep_run runs/walk_sb3_1 --to benchmarks/results/ppo
 
-Settings, scores and pictures are kept as they are. Of a ``policy.zip`` of stable-baselines3 the policy's parameters are
-kept, which are a quarter of it and all that ``agents.play`` reads; ``PPO.load`` wants the rest, too. Of the curve of
-returns, an episode a row, rows are averaged until there are at most :data:`ROWS`.
+Settings, scores, pictures and a ``policy.pt`` are kept as they are. Of a ``policy.zip`` of stable-baselines3 that is
+the parameters of the policy, a quarter of it and all that ``agents.play`` reads; ``PPO.load`` wants the rest, too. Of
+the curve of returns, an episode a row, rows are averaged until there are at most :data:`ROWS`.
 """
 
 from __future__ import annotations
 
-import shutil
+import io
 import sys
 import zipfile
 from pathlib import Path
@@ -36,35 +36,57 @@ def main(
         to: where to.
 
     Raises:
-        ValueError: a folder holds no training that has ended, or is there already; nothing is written then.
+        ValueError: no runs, or two of one name; a folder holds no training that has ended, or something unreadable; or
+            its name is taken there. Nothing is written then.
     """
+    if not runs:
+        raise ValueError("no runs; name their folders")
+    found: dict[Path, dict[str, bytes]] = {}
     for run in runs:
-        missing = [name for name in NEEDED if not (run / name).is_file()]
-        if missing:
-            raise ValueError(f"{run} has no {missing[0]}: has the training ended?")
-        if (to / run.name).exists():
-            raise ValueError(f"{to / run.name} is there already; remove it first")
-    for run in runs:
-        keep(run, to / run.name)
-        print(to / run.name)
+        folder = to / run.resolve().name
+        if folder in found or folder.exists():
+            raise ValueError(f"{folder} is there already; remove it first, or name {run} otherwise")
+        found[folder] = kept(run)
+    for folder, files in found.items():
+        folder.mkdir(parents=True)
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+        print(folder)
     return 0
 
 
-def keep(run: Path, folder: Path) -> None:
-    """Copy one run into a folder, which it makes."""
-    folder.mkdir(parents=True)
-    for name in (*NEEDED, *WELCOME):
-        if (run / name).is_file():
-            shutil.copyfile(run / name, folder / name)
-    if (run / "curve.csv").is_file():
-        (folder / "curve.csv").write_text(shortened((run / "curve.csv").read_text(encoding="utf-8")), encoding="utf-8")
-    if (run / "policy.zip").is_file():
-        with zipfile.ZipFile(run / "policy.zip") as whole, zipfile.ZipFile(folder / "policy.zip", "w") as kept:
-            kept.writestr(zipfile.ZipInfo(_PARAMETERS), whole.read(_PARAMETERS), zipfile.ZIP_DEFLATED)
+def kept(run: Path) -> dict[str, bytes]:
+    """What is kept of a run, by the names of files.
+
+    Raises:
+        ValueError: it has not ended, or something in it cannot be read.
+    """
+    missing = [name for name in NEEDED if not (run / name).is_file()]
+    if missing:
+        raise ValueError(f"{run} has no {missing[0]}: has the training ended?")
+    files = {name: (run / name).read_bytes() for name in (*NEEDED, *WELCOME) if (run / name).is_file()}
+    try:
+        if (run / "curve.csv").is_file():
+            files["curve.csv"] = shortened((run / "curve.csv").read_text(encoding="utf-8")).encode()
+        if (run / "policy.zip").is_file():
+            files["policy.zip"] = parameters_of((run / "policy.zip").read_bytes())
+    except (ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{run} has something else than a training leaves: {error}") from error
+    return files
+
+
+def parameters_of(policy: bytes) -> bytes:
+    """A ``policy.zip`` with the policy's parameters only, as bytes."""
+    left = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(policy)) as whole, zipfile.ZipFile(left, "w") as file:
+        file.writestr(zipfile.ZipInfo(_PARAMETERS), whole.read(_PARAMETERS), zipfile.ZIP_DEFLATED)
+    return left.getvalue()
 
 
 def shortened(curve: str) -> str:
     """A curve as CSV, with rows averaged evenly: the last step of each, and the mean return of its episodes."""
+    if not curve.split():
+        raise ValueError("curve.csv is empty")
     header, *rows = curve.split()
     values = np.array([[float(number) for number in row.split(",")] for row in rows]).reshape(len(rows), 2)
     if len(rows) <= ROWS:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import shutil
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,13 +59,43 @@ def test_a_short_curve_stays(run, tmp_path):
     assert (tmp_path / "walk_1" / "curve.csv").read_text() == "step,return\n10,1.5\n20,2\n"
 
 
-def test_nothing_is_written_where_something_is_wrong(run, tmp_path):
-    unfinished = run.parent / "walk_2"
-    unfinished.mkdir()
-    (unfinished / "config.yaml").write_text("")
-    with pytest.raises(ValueError, match=r"walk_2 has no results\.json"):
-        keep_run.main((run, unfinished), tmp_path / "results")
+def spoilt(run, name, change):
+    """A copy of a run beside it, with something wrong."""
+    other = shutil.copytree(run, run.parent / name)
+    change(other)
+    return other
+
+
+def only_an_optimizer(folder):
+    with zipfile.ZipFile(folder / "policy.zip", "w") as content:
+        content.writestr("policy.optimizer.pth", b"")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda folder: (folder / "results.json").unlink(), r"walk_2 has no results\.json"),
+        (lambda folder: (folder / "policy.zip").write_bytes(b"no archive"), "walk_2 has something else"),
+        (only_an_optimizer, r"policy\.pth"),
+        (lambda folder: (folder / "curve.csv").write_text(""), r"curve\.csv is empty"),
+        (lambda folder: (folder / "curve.csv").write_text("step,return\n1,2,3\n"), "walk_2 has something else"),
+    ],
+)
+def test_nothing_is_written_where_something_is_wrong(run, tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        keep_run.main((run, spoilt(run, "walk_2", change)), tmp_path / "results")
     assert not (tmp_path / "results").exists()
-    keep_run.main((run,), tmp_path / "results")
+
+
+def test_names_are_taken_once(run, tmp_path, monkeypatch):
+    to = tmp_path / "results"
+    with pytest.raises(ValueError, match="no runs"):
+        keep_run.main((), to)
     with pytest.raises(ValueError, match="is there already"):
-        keep_run.main((run,), tmp_path / "results")
+        keep_run.main((run, run), to)
+    assert not to.exists()
+    monkeypatch.chdir(run)
+    keep_run.main((Path("."),), to)
+    assert (to / "walk_1" / "results.json").is_file()
+    with pytest.raises(ValueError, match="is there already"):
+        keep_run.main((run,), to)
