@@ -116,17 +116,17 @@ def drive_particles(
     if failure[e] != 0:
         return
     p = own[1]
-    last = body.first + body.count - 1
-    following = vector_at(x, e, wp.min(body.first + p, last))
-    following_u = vector_at(u, e, wp.min(body.first + p, last))
+    last = body.count - 1
+    following = vector_at(x, e, body.first + wp.min(p, last))
+    following_u = vector_at(u, e, body.first + wp.min(p, last))
     center = bones.center[e, 0]
     gone = let_go[e] != 0
     while p < body.count:
         at = following
         before = following_u
         n = p + threads
-        following = vector_at(x, e, wp.min(body.first + n, last))
-        following_u = vector_at(u, e, wp.min(body.first + n, last))
+        following = vector_at(x, e, body.first + wp.min(n, last))
+        following_u = vector_at(u, e, body.first + wp.min(n, last))
         drive_particle(body, drive, at, before, record, center, gone, e, p, u, motion, driven, pull, lean)
         p = n
 

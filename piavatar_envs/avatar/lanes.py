@@ -33,7 +33,7 @@ def chunk_threads(device: str, chunks: int) -> int:
 
 
 def particle_rounds(device: str, particles: int) -> int:
-    """Particles of a thread where there are so many in all: up to :data:`ROUNDS`, while none of a GPU's is idle."""
+    """Particles of a thread where there are so many in all: as many as leave a GPU full, up to :data:`ROUNDS`."""
     gpu = wp.get_device(device)
     return min(ROUNDS, max(1, particles // (gpu.sm_count * RESIDENT))) if gpu.is_cuda else 1
 

@@ -241,11 +241,13 @@ def build_rig(
     decoupling: str = "split",
     num_substeps: int | None = None,
     room: float = 1.3,
+    others: int = 0,
     **settings,
 ) -> Rig:
     """A standing avatar ``cells`` grid spacings tall.
 
-    ``shapes`` are shape parameters by name, one set an environment; ``room`` is the half width of the domain [m].
+    ``shapes`` are shape parameters by name, one set an environment; ``room`` is the half width of the domain [m]; so
+    many ``others`` are particles that come before the avatar's, in a row in the domain's corner.
     """
     asset = load_body()
     dx = float(np.ptp(asset.vertices[:, 2])) / cells
@@ -258,7 +260,7 @@ def build_rig(
         rest, volume = (np.stack([m[k] for m in morphed]) for k in (0, 1))
         joints = np.stack([body.joints for body in bodies])
     model = build_model(
-        MaterialPoints.uniform(volume, DENSITY),
+        MaterialPoints.uniform(np.pad(volume, ((0, 0), (others, 0)), mode="mean"), DENSITY),
         make_grid((-room, -room, 0.0 if floor else -room), (room, room, 1.2 + room), dx),
         num_envs=num_envs,
         device=device,
@@ -268,10 +270,13 @@ def build_rig(
         colliders=[Collider.plane((0.0, 0.0, 1.0), 0.0, 0.8)] if floor else (),
     )
     state, scratch = allocate(model)
+    x = state.x.numpy()
+    x[:, :others] = [0.7 * room, 0.7 * room, 0.5] + np.linspace(0.0, 0.2, others)[:, None] * [0.0, 0.0, 1.0]
+    state.x.assign(x)
     inert = np.zeros((1, volume.shape[1]), np.float32)
     mass = volume * np.float32(DENSITY)
     points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, inert)
-    drive = AvatarDrive(points, 0, model, DriveSettings(**settings))
+    drive = AvatarDrive(points, others, model, DriveSettings(**settings))
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)
     reset_program, step_program = Program(device), Program(device)
     drive.record_reset(reset_program, state, mask)

@@ -112,13 +112,26 @@ def test_running_twice_gives_the_same_bits_and_eager_equals_recorded(make_rig, w
 @pytest.mark.parametrize("rounds", [2, 6])
 def test_threads_that_have_several_particles_drive_as_one_each_does(make_rig, wild_pose, monkeypatch, rounds):
     """On a GPU, in batches that leave no thread idle; a particle is driven without knowing of others."""
-    one = disturbed(make_rig, wild_pose)
-    gpu = wp.get_device(one.model.device)
+
+    def driven():
+        rng = np.random.default_rng(8)
+        rig = make_rig(num_envs=3, gravity=9.81, floor=True, others=37)
+        u, x = rig.state.u.numpy(), rig.state.x.numpy()
+        u[:, 37:] = 0.3 * np.sin(7.0 * x[:, 37:])
+        u[1, 50] = np.nan  # an environment that fails
+        rig.state.u.assign(u)
+        rig.command(np.stack([wild_pose(rng, 0.1) for _ in range(3)]))
+        rig.step(2)
+        return rig
+
+    one = driven()
+    gpu, particles = wp.get_device(one.model.device), 3 * one.points.num_points
     if not gpu.is_cuda:
         pytest.skip("on a CPU one thread has all particles")
-    monkeypatch.setattr(lanes, "RESIDENT", 3 * one.points.num_points // (gpu.sm_count * rounds))
-    assert lanes.particle_rounds(one.model.device, 3 * one.points.num_points) == rounds
-    several = disturbed(make_rig, wild_pose)
+    monkeypatch.setattr(lanes, "RESIDENT", particles // (gpu.sm_count * rounds))
+    assert lanes.particle_rounds(one.model.device, particles) == rounds
+    several = driven()
+    assert several.state.failure.numpy().tolist() == [0, FAILURE_NONFINITE, 0]
     for name, value in one.everything().items():
         np.testing.assert_array_equal(several.everything()[name], value, err_msg=name)
 
