@@ -26,10 +26,14 @@ class Curve:
         """Control steps taken when the last episode ended."""
         return self.steps[-1] if self.steps else 0
 
+    def csv(self) -> str:
+        """It as CSV, a row an episode."""
+        rows = [f"{step},{value:.6g}" for step, value in zip(self.steps, self.returns, strict=True)]
+        return "\n".join(["step,return", *rows]) + "\n"
+
     def save(self, path: Path) -> None:
         """Write it as CSV."""
-        rows = [f"{step},{value:.6g}" for step, value in zip(self.steps, self.returns, strict=True)]
-        path.write_text("\n".join(["step,return", *rows]) + "\n", encoding="utf-8")
+        path.write_text(self.csv(), encoding="utf-8")
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""

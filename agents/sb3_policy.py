@@ -21,7 +21,7 @@ from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.envs.observations import ObservationLayout
 
 #: The policy's parameters within ``policy.zip``.
-_MEMBER = "policy.pth"
+PARAMETERS = "policy.pth"
 
 
 def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, action_size: int) -> Agent:
@@ -41,7 +41,7 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
     """
     policy = _untrained(config, layout, action_size)
     try:
-        with zipfile.ZipFile(path) as content, content.open(_MEMBER) as file:
+        with zipfile.ZipFile(path) as content, content.open(PARAMETERS) as file:
             policy.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
     except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError, TypeError) as error:
         raise ConfigError(f"{path} holds no policy of its config.yaml: {first_line(error)}") from None

@@ -18,11 +18,13 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from agents.curve import Curve
+from agents.sb3_policy import PARAMETERS
+
 #: Rows of a curve, at most.
 ROWS = 1000
 #: What must be there, and what may.
 NEEDED, WELCOME = ("config.yaml", "results.json"), ("policy.pt", "curve.png")
-_PARAMETERS = "policy.pth"
 
 
 def main(
@@ -79,7 +81,7 @@ def parameters_of(policy: bytes) -> bytes:
     """A ``policy.zip`` with the policy's parameters only, as bytes."""
     left = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(policy)) as whole, zipfile.ZipFile(left, "w") as file:
-        file.writestr(zipfile.ZipInfo(_PARAMETERS), whole.read(_PARAMETERS), zipfile.ZIP_DEFLATED)
+        file.writestr(zipfile.ZipInfo(PARAMETERS), whole.read(PARAMETERS), zipfile.ZIP_DEFLATED)
     return left.getvalue()
 
 
@@ -87,12 +89,12 @@ def shortened(curve: str) -> str:
     """A curve as CSV, with rows averaged evenly: the last step of each, and the mean return of its episodes."""
     if not curve.split():
         raise ValueError("curve.csv is empty")
-    header, *rows = curve.split()
+    _, *rows = curve.split()
     values = np.array([[float(number) for number in row.split(",")] for row in rows]).reshape(len(rows), 2)
     if len(rows) <= ROWS:
         return curve
     parts = np.array_split(values, ROWS)
-    return "\n".join([header, *(f"{part[-1, 0]:.0f},{part[:, 1].mean():.6g}" for part in parts)]) + "\n"
+    return Curve([int(part[-1, 0]) for part in parts], [part[:, 1].mean() for part in parts]).csv()
 
 
 if __name__ == "__main__":

@@ -117,18 +117,19 @@ def drive_particles(
         return
     p = own[1]
     last = body.count - 1
-    following = vector_at(x, e, body.first + wp.min(p, last))
-    following_u = vector_at(u, e, body.first + wp.min(p, last))
     center = bones.center[e, 0]
     gone = let_go[e] != 0
+    n = wp.min(p, last)
+    following = vector_at(x, e, body.first + n)
+    following_u = vector_at(u, e, body.first + n)
     while p < body.count:
         at = following
         before = following_u
-        n = p + threads
-        following = vector_at(x, e, body.first + wp.min(n, last))
-        following_u = vector_at(u, e, body.first + wp.min(n, last))
+        n = wp.min(p + threads, last)
+        following = vector_at(x, e, body.first + n)
+        following_u = vector_at(u, e, body.first + n)
         drive_particle(body, drive, at, before, record, center, gone, e, p, u, motion, driven, pull, lean)
-        p = n
+        p += threads
 
 
 @wp.func
@@ -207,8 +208,8 @@ def apply_correction(
 ):
     """Change the physical velocity by the pull and the bones' blended field.
 
-    ``at`` is where the particle is, ``before`` its velocity with the pull. Where the body is ``free``, the
-    rigid part of its commanded motion comes off.
+    ``at`` is where the particle is, ``before`` its velocity with the pull. Where the body is ``free``, the rigid part
+    of its commanded motion comes off.
     """
     field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - center)
     store_vector(u, e, body.first + p, before + field, True)
@@ -255,10 +256,9 @@ def apply_corrections(
     while p < body.count:
         at = following
         before = following_u + following_pull
-        q = p + threads
-        n = wp.min(q, last)
+        n = wp.min(p + threads, last)
         following = vector_at(x, e, body.first + n)
         following_u = vector_at(u, e, body.first + n)
         following_pull = vector_at(pull, e, n)
         apply_correction(body, drive, at, before, center, change, removed, free, e, p, u, driven)
-        p = q
+        p += threads

@@ -110,8 +110,11 @@ def test_running_twice_gives_the_same_bits_and_eager_equals_recorded(make_rig, w
 
 
 @pytest.mark.parametrize("rounds", [2, 6])
-def test_threads_that_have_several_particles_drive_as_one_each_does(make_rig, wild_pose, monkeypatch, rounds):
+def test_threads_that_have_several_particles_drive_as_one_each_does(device, make_rig, wild_pose, monkeypatch, rounds):
     """On a GPU, in batches that leave no thread idle; a particle is driven without knowing of others."""
+    gpu = wp.get_device(device)
+    if not gpu.is_cuda:
+        pytest.skip("on a CPU one thread has all particles")
 
     def driven():
         rng = np.random.default_rng(8)
@@ -125,15 +128,14 @@ def test_threads_that_have_several_particles_drive_as_one_each_does(make_rig, wi
         return rig
 
     one = driven()
-    gpu, particles = wp.get_device(one.model.device), 3 * one.points.num_points
-    if not gpu.is_cuda:
-        pytest.skip("on a CPU one thread has all particles")
+    particles = 3 * one.points.num_points
     monkeypatch.setattr(lanes, "RESIDENT", particles // (gpu.sm_count * rounds))
-    assert lanes.particle_rounds(one.model.device, particles) == rounds
+    assert lanes.particle_rounds(device, particles) == rounds
     several = driven()
     assert several.state.failure.numpy().tolist() == [0, FAILURE_NONFINITE, 0]
+    found = several.everything()
     for name, value in one.everything().items():
-        np.testing.assert_array_equal(several.everything()[name], value, err_msg=name)
+        np.testing.assert_array_equal(found[name], value, err_msg=name)
 
 
 @pytest.mark.parametrize("root", ["wrench", "free"])
