@@ -249,7 +249,7 @@ def chunk_motion(
     store_sum12(corrections, e, c, total, threads)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 12))
+@wp.kernel(launch_bounds=(BLOCK, 10))
 def sum_motion(
     body: Body,
     drive: Drive,

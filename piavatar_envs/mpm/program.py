@@ -24,8 +24,14 @@ class Program:
         Args:
             device: where to run.
             condition: shape ``(1,)`` int32 on that device. Where it is 0 when the program begins to run, its launches
-                would do nothing, and are left out if a graph can do so: the host reads nothing.
+                are not needed, and left out if graphs can branch there, which CUDA's can since 12.4. The host reads it
+                only for :meth:`run_eager`; :meth:`timed` does not ask for it.
+
+        Raises:
+            ValueError: a condition of another shape or type.
         """
+        if condition is not None and (condition.shape != (1,) or condition.dtype is not wp.int32):
+            raise ValueError(f"a condition of shape {condition.shape} and type {condition.dtype}; use (1,) int32")
         self.device = wp.get_device(device)
         self._condition = condition
         self._launches: list[Callable[[], None]] = []
