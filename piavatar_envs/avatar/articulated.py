@@ -46,7 +46,7 @@ from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_motion import attach_flesh, find_displacement, hand_back, take_over
 from piavatar_envs.avatar.joint_stages import JointBench, Support, act, begin_substep, build_mass, fit_pose
 from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
-from piavatar_envs.avatar.lanes import BLOCK, particle_threads, warp_threads
+from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
@@ -105,7 +105,7 @@ class ArticulatedBody:
             if not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
         self.body, self.model, self.threads = body, model, warp_threads(device)
-        self._points = (n, particle_threads(device, body.count))
+        self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))
         self.springs = group(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
         self.attachment = None if attachment is None else self._upload(attachment)
 

@@ -19,15 +19,16 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 GROUPS = wp.constant(8)
 
 
+#: Entries of a chunk that a thread asks for at once, in sums that wait for memory.
+AT_ONCE = wp.constant(4)
+
+
 @wp.func
 def entry_of(body: Body, n: int, last: int):
-    """Particle of entry ``n`` and the bone's weight in it, or those of the ``last`` entry of the chunk.
-
-    A loop over a chunk that asks for the next entry ahead has its particle's number when it needs it: else all that it
-    reads of the particle would wait for that.
-    """
+    """Particle of entry ``n`` and the bone's weight in it, 0 beyond the ``last`` entry of the chunk."""
     at = wp.min(n, last)
-    return int_at(body.entry, at), float_at(body.entry_weight, at)
+    weight = float_at(body.entry_weight, at)
+    return int_at(body.entry, at), wp.where(n > last, 0.0, weight)
 
 
 @wp.func
@@ -65,17 +66,17 @@ def chunk_moments(
     total = vec16()
     last = body.entry_start[c + 1] - 1
     n = body.entry_start[c] + thread
-    following, weight = entry_of(body, n, last)
     while n <= last:
-        p = body.first + following
-        w = weight * number_at(particles.mass, r, p)
-        n += threads
-        following, weight = entry_of(body, n, last)
-        total += moments_of(w, vector_at(x, e, p) - origin, vector_at(u, e, p))
+        for _ in range(AT_ONCE):
+            entry, weight = entry_of(body, n, last)
+            p = body.first + entry
+            w = weight * number_at(particles.mass, r, p)
+            total += moments_of(w, vector_at(x, e, p) - origin, vector_at(u, e, p))
+            n += threads
     store_sum16(moments, e, c, total, threads)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 10))
+@wp.kernel(launch_bounds=(BLOCK, 8))
 def sum_moments(
     body: Body,
     particles: Particles,
@@ -161,24 +162,23 @@ def chunk_corrections(
     l2 = wp.vec3()
     last = body.entry_start[c + 1] - 1
     n = body.entry_start[c] + thread
-    following, weight = entry_of(body, n, last)
     while n <= last:
-        p = following
-        w = weight * number_at(particles.mass, r, body.first + p)
-        n += threads
-        following, weight = entry_of(body, n, last)
-        d = vector_at(x, e, body.first + p) - origin
-        a = w * vector_at(pull, e, p)
-        p1 += a
-        l1 += wp.cross(d, a)
-        a = w * vector_at(lean, e, p)
-        p2 += a
-        l2 += wp.cross(d, a)
+        for _ in range(AT_ONCE):
+            p, weight = entry_of(body, n, last)
+            w = weight * number_at(particles.mass, r, body.first + p)
+            d = vector_at(x, e, body.first + p) - origin
+            a = w * vector_at(pull, e, p)
+            p1 += a
+            l1 += wp.cross(d, a)
+            a = w * vector_at(lean, e, p)
+            p2 += a
+            l2 += wp.cross(d, a)
+            n += threads
     total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])
     store_sum12(corrections, e, c, total, threads)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 9))
+@wp.kernel(launch_bounds=(BLOCK, 8))
 def sum_corrections(
     body: Body,
     particles: Particles,

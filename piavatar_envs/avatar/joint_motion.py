@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import blend_changes, motion_at, skinned_place
-from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, next_particle
+from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, threads_of_environment
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.pulls import implicit_velocity
@@ -87,7 +87,7 @@ def skinned_motion(body: Body, field: wp.array2d(dtype=vec8), e: int, p: int, ar
     return motion_at(blend_changes(field, e, body.joint, body.weight, p), arm)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 12))
+@wp.kernel(launch_bounds=(BLOCK, 10))
 def take_over(
     body: Body,
     x: wp.array2d(dtype=wp.vec3),
@@ -105,18 +105,28 @@ def take_over(
     Both are motions about where the ``pelvis`` joint is before it moves on [m].
     """
     i, _ = wp.tid()
-    own = first_particle(i, body.count)
+    threads = threads_of_environment(x.shape[0])
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return
     p = own[1]
+    center = pelvis[e]
+    last = body.count - 1
+    n = body.first + wp.min(p, last)
+    following = vector_at(x, e, n)
+    following_u = vector_at(u, e, n)
     while p < body.count:
-        q = body.first + p
-        arm = vector_at(x, e, q) - pelvis[e]
-        after = vector_at(u, e, q) - skinned_motion(body, leaving, e, p, arm)
+        arm = following - center
+        before = following_u
+        n = body.first + wp.min(p + threads, last)
+        following = vector_at(x, e, n)
+        following_u = vector_at(u, e, n)
+        after = before - skinned_motion(body, leaving, e, p, arm)
         now = blend_changes(moving, e, body.joint, body.weight, p)
-        store_velocities(u, driven, e, q, after, motion_at(now, arm), wp.vec3(now[3], now[4], now[5]), True)
-        p = next_particle(p)
+        spin = wp.vec3(now[3], now[4], now[5])
+        store_velocities(u, driven, e, body.first + p, after, motion_at(now, arm), spin, True)
+        p += threads
 
 
 @wp.kernel
@@ -132,7 +142,8 @@ def hand_back(
 ):
     """What a new pose has changed of ``J qdot`` goes to the physical velocity; :func:`take_over` writes the new one."""
     i, _ = wp.tid()
-    own = first_particle(i, body.count)
+    threads = threads_of_environment(x.shape[0])
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return
@@ -140,7 +151,7 @@ def hand_back(
     while p < body.count:
         v = skinned_motion(body, moving, e, p, x[e, body.first + p] - position[e, 0])
         u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
-        p = next_particle(p)
+        p += threads
 
 
 @wp.kernel
@@ -154,7 +165,8 @@ def find_displacement(
 ):
     """Of the particles from where the pose has them by linear blend skinning [m], at their places in the world."""
     i, _ = wp.tid()
-    own = first_particle(i, body.count)
+    threads = threads_of_environment(x.shape[0])
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return
@@ -162,7 +174,7 @@ def find_displacement(
     while p < body.count:
         q = body.first + p
         store_vector(displacement, e, q, vector_at(x, e, q) - skinned_place(body, place, e, p), True)
-        p = next_particle(p)
+        p += threads
 
 
 @wp.kernel
@@ -186,19 +198,28 @@ def attach_flesh(
     ``lost`` is what the pull has taken of the velocity [m/s].
     """
     i, _ = wp.tid()
-    own = first_particle(i, body.count)
+    threads = threads_of_environment(x.shape[0])
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return
     p = own[1]
+    pelvis = position[e, 0]
+    last = body.count - 1
+    n = body.first + wp.min(p, last)
+    following = vector_at(x, e, n)
+    following_v = vector_at(u, e, n) + vector_at(vk, e, n)
     while p < body.count:
-        q = body.first + p
-        at = vector_at(x, e, q)
-        before = vector_at(u, e, q) + vector_at(vk, e, q) - skinned_motion(body, moving, e, p, at - position[e, 0])
+        at = following
+        v = following_v
+        n = body.first + wp.min(p + threads, last)
+        following = vector_at(x, e, n)
+        following_v = vector_at(u, e, n) + vector_at(vk, e, n)
+        before = v - skinned_motion(body, moving, e, p, at - pelvis)
         way = skinned_place(body, place, e, p) - at
         after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
-        store_pair(u, lost, e, q, after, before - after, True, True)
-        p = next_particle(p)
+        store_pair(u, lost, e, body.first + p, after, before - after, True, True)
+        p += threads
 
 
 @wp.func

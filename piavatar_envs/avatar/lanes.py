@@ -38,7 +38,7 @@ def particle_rounds(device: str, particles: int) -> int:
     return min(ROUNDS, max(1, particles // (gpu.sm_count * RESIDENT))) if gpu.is_cuda else 1
 
 
-def particle_threads(device: str, count: int, rounds: int = 1) -> int:
+def particle_threads(device: str, count: int, rounds: int) -> int:
     """Threads that share ``count`` particles of a body in so many ``rounds``: on a GPU in whole CUDA blocks.
 
     On a CPU it is one: there a thread costs 7 ns before it does anything, as much as what is done for a particle.
@@ -56,10 +56,7 @@ return wp::vec_t<2, wp::int32>(e, 0);
 #endif
 """)
 def first_particle(e: int, threads: int) -> wp.vec2i:
-    """Environment, on a CPU ``e``, and first particle of one of :func:`particle_threads`; there may be none.
-
-    ``threads`` is their number, or that of the particles if each has one.
-    """
+    """Environment, on a CPU ``e``, and first particle of one of so many :func:`particle_threads`; there may be none."""
     ...
 
 
@@ -72,18 +69,6 @@ return 1;
 """)
 def threads_of_environment(num_envs: int) -> int:
     """:func:`particle_threads` in a launch over ``(num_envs, particle_threads)``, by what is launched."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return 0x7fffffff;
-#else
-return p + 1;
-#endif
-""")
-def next_particle(p: int) -> int:
-    """The one after ``p`` that its thread has, beyond all if it has none: a GPU's compiler then sees no loop."""
     ...
 
 

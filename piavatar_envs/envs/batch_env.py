@@ -63,7 +63,8 @@ class BatchEnv:
         self._allocate(seed)
         task.allocate(self)
         self.observer.connect(self)
-        self.reset_program, self.step_program, self.observe_program = (Program(self.device) for _ in range(3))
+        self.reset_program = Program(self.device, condition=self._begins)
+        self.step_program, self.observe_program = Program(self.device), Program(self.device)
         self.count_program, self.ended_program = Program(self.device), Program(self.device)
         self._record()
 
@@ -80,6 +81,7 @@ class BatchEnv:
 
         agents = (n, self.num_agents)
         self.mask, self._seeded, self._new_seed = zeros(n, wp.bool), zeros(n, wp.bool), zeros(n, int)
+        self._begins = zeros(1, int)  # whether any episode does
         self.seed = wp.array(_as_int32(seed + np.arange(n)), dtype=int, device=device)
         self.episode = wp.full(n, -1, dtype=int, device=device)
         self.step_count, self.truncated = zeros(n, int), zeros(n, wp.bool)
@@ -96,11 +98,11 @@ class BatchEnv:
         n, sim = self.num_envs, self.simulation
         agents = (n, self.num_agents)
         self.ended_program.launch(find_ended, n, [self.terminated, self.truncated], [self.mask])
-        counters = [self._seeded, self.seed, self.episode]
+        counters = [self._seeded, self.seed, self.episode, self._begins]
         self.count_program.launch(count_episodes, n, [self.mask, self._new_seed], counters)
 
         program = self.reset_program
-        flags = [self.step_count, self.terminated, self.truncated, self.success, self.alive]
+        flags = [self.step_count, self.terminated, self.truncated, self.success, self.alive, self._begins]
         program.launch(begin_episode, agents, [self.mask], flags)
         sim.record_draws(program, self.mask, self.seed, self.episode)
         self.task.record_reset(self, program)
@@ -184,6 +186,7 @@ class BatchEnv:
             self._new_seed.assign(_as_int32(values))
             self._seeded.assign(mask & given)
         self.mask.assign(mask)
+        self._begins.fill_(1)  # whoever asks for observations here gets those of all environments, as they are now
         return self._begin()
 
     def find_ended(self) -> wp.array:
@@ -199,10 +202,6 @@ class BatchEnv:
 
         Nothing leaves the device, unless shapes are random and not from a pool: those are drawn on the host.
         """
-        # where reading costs nothing, nothing to do costs nothing; but for the first time, which others may wait for
-        on_cpu = wp.get_device(self.device).is_cpu
-        if on_cpu and self.reset_program.is_captured and not self.mask.numpy().any():
-            return self.observation
         return self._begin()
 
     def _begin(self) -> wp.array:

@@ -16,11 +16,13 @@ def count_episodes(
     # out
     seed: wp.array(dtype=int),
     episode: wp.array(dtype=int),
+    begins: wp.array(dtype=int),
 ):
-    """The next episode of the masked environments, or the first one of a new seed."""
+    """The next episode of the masked environments, or the first one of a new seed; whether any ``begins``."""
     e = wp.tid()
     if not mask[e]:
         return
+    begins[0] = 1
     episode[e] = episode[e] + 1
     if seeded[e]:
         seeded[e] = False
@@ -53,9 +55,11 @@ def begin_episode(
     truncated: wp.array(dtype=wp.bool),
     success: wp.array2d(dtype=wp.bool),
     alive: wp.array2d(dtype=wp.bool),
+    begins: wp.array(dtype=int),
 ):
-    """Clocks and flags of the masked environments back to the start."""
+    """Clocks and flags of the masked environments back to the start; that any ``begins`` is known by now."""
     e, agent = wp.tid()
+    begins[0] = 0
     if mask[e]:
         step_count[e] = 0
         truncated[e] = False

@@ -18,8 +18,22 @@ class Program:
     Arrays are bound when a launch is recorded: write new values into them, never replace them.
     """
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device: str, condition: wp.array | None = None) -> None:
+        """Begin without launches.
+
+        Args:
+            device: where to run.
+            condition: shape ``(1,)`` int32 on that device. Where it is 0 when the program begins to run, its launches
+                are not needed, and left out if graphs can branch there, which CUDA's can since 12.4. The host reads it
+                only for :meth:`run_eager`; :meth:`timed` does not ask for it.
+
+        Raises:
+            ValueError: a condition of another shape or type.
+        """
+        if condition is not None and (condition.shape != (1,) or condition.dtype is not wp.int32):
+            raise ValueError(f"a condition of shape {condition.shape} and type {condition.dtype}; use (1,) int32")
         self.device = wp.get_device(device)
+        self._condition = condition
         self._launches: list[Callable[[], None]] = []
         self._names: list[str] = []
         self._graph: Any = None
@@ -60,8 +74,7 @@ class Program:
     def run_eager(self) -> None:
         """Launch one by one without a graph, to compare with :meth:`run`."""
         with wp.ScopedDevice(self.device):
-            for launch in self._launches:
-                launch()
+            self._launch_all()
 
     def timed(self, repeats: int = 1) -> dict[str, float]:
         """Seconds spent in each kernel over one run, by name (launches one by one, for profiling).
@@ -83,6 +96,22 @@ class Program:
 
     def _capture(self) -> None:
         with wp.ScopedDevice(self.device), wp.ScopedCapture(self.device) as capture:
+            self._launch_all()
+        self._graph = capture.graph
+
+    def _launch_all(self) -> None:
+        """Launch one after the other, if the condition holds; into a graph, if one is being captured."""
+
+        def launch_all() -> None:
             for launch in self._launches:
                 launch()
-        self._graph = capture.graph
+
+        if self._condition is None or not _can_branch(self._condition.device):
+            launch_all()
+        else:
+            wp.capture_if(self._condition, launch_all)
+
+
+def _can_branch(device: wp.Device) -> bool:
+    """Whether graphs there have branches; CUDA's have them since 12.4."""
+    return device.is_cpu or wp.is_conditional_graph_supported()

@@ -6,6 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 
+from piavatar_envs.envs.parameters import ASSIST, PARAMETERS
+
 STAND = "PIAvatar/Stand-v0"
 SETTINGS = {"fidelity": "tiny", "control": "torque", "pose_noise": 0.0, "episode_seconds": 20.0}
 STEPS = 30
@@ -110,3 +112,17 @@ def test_every_avatar_of_a_world_is_helped(device, num_envs):
     with pytest.raises(ValueError, match="root_assist="):
         env.assist_root(np.zeros(5))
     env.close()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_masked_reset_shows_everybody_the_help_there_is_now(device, threads):
+    """Also environments that go on, in whichever thread."""
+    settings = {**SETTINGS, "observe_parameters": True, "autoreset_mode": "Disabled"}
+    vector = gymnasium.make_vec(STAND, num_envs=2, device=device, num_threads=threads, **settings)
+    vector.reset(seed=0)
+    vector.unwrapped.assist_root(np.array([0.3, 0.9]))
+    observation, _ = vector.reset(options={"reset_mask": np.array([True, False])})
+    told = batches(vector.unwrapped)[0].layout[PARAMETERS]
+    column = told.slice.start + [parameter.name for parameter in told.parameters].index(ASSIST.name)
+    np.testing.assert_allclose(observation[:, column], 2.0 * np.array([0.3, 0.9]) - 1.0, atol=1e-6)
+    vector.close()

@@ -8,6 +8,7 @@ import warp as wp
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar import lanes
 from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.cholesky import (
     Pattern,
@@ -328,6 +329,30 @@ def test_flesh_comes_back_to_the_bones(make_rig):
     off = made.rig.read("x") - made.rig.skinned(local, made.body.state.position.numpy()[0, 0].astype(float))
     assert np.abs(bump).max() > 0.01
     assert np.abs(off).max() < 0.02 * np.abs(bump).max()
+
+
+@pytest.mark.parametrize("attachment", [None, 100.0])
+def test_threads_that_have_several_particles_move_as_one_each_does(joints, monkeypatch, attachment):
+    """On a GPU, in batches that leave no thread idle."""
+
+    def moved():
+        made = joints(stiffness=300.0, damping=10.0, attachment=attachment)
+        program = Program(made.model.device)
+        made.body.record_substep(program, made.state, refresh=True)
+        program.run()
+        program.run()
+        return made
+
+    one = moved()
+    particles = one.rig.points.num_points
+    if not wp.get_device(one.model.device).is_cuda:
+        pytest.skip("on a CPU one thread has all particles")
+    monkeypatch.setattr(lanes, "RESIDENT", 1)
+    assert lanes.particle_rounds(one.model.device, particles) > 1
+    several = moved()
+    for name, value in one.state.numpy().items():
+        np.testing.assert_array_equal(several.state.numpy()[name], value, err_msg=name)
+    assert np.ptp(one.state.u.numpy()) > 0.1
 
 
 @pytest.mark.parametrize("name", ["stiffness", "damping"])

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.materials import MATERIALS
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_substep
+from tests.gpu_on_cpu import NAME as GPU_ON_CPU
 
 ARRAYS = ("x", "u", "C", "F")
 SCENE = {"gravity": (0.0, 0.0, -9.81), "planes": [((0.1, 0.0, 1.0), -0.11, 0.5)], "num_substeps": 25, "margin": 0.3}
 COUNT = 512
+
+wp.set_module_options({"enable_backward": False})
 
 
 def start(sim, seeds):
@@ -119,3 +123,38 @@ def test_a_program_that_has_run_is_closed(simulate, device):
     with pytest.raises(RuntimeError, match=r"cannot append .*has run"):
         record_substep(sim.program, sim.model, sim.state, sim.scratch, 0)
     assert len(Program(device)) == 0
+
+
+@wp.kernel
+def count_runs(runs: wp.array(dtype=int)):
+    runs[wp.tid()] += 1
+
+
+@wp.kernel
+def forget(condition: wp.array(dtype=int)):
+    condition[0] = 0
+
+
+def test_a_program_with_a_condition_runs_where_it_holds(device):
+    """The condition is asked once, before the first launch: the program itself may change it."""
+    if wp.get_device(device).is_cuda and device != GPU_ON_CPU and not wp.is_conditional_graph_supported():
+        pytest.skip("graphs of this CUDA have no branches")
+    condition, runs = wp.zeros(1, dtype=int, device=device), wp.zeros(3, dtype=int, device=device)
+    program = Program(device, condition)
+    program.launch(forget, 1, [], [condition])
+    program.launch(count_runs, 3, [], [runs])
+    for holds, expected in ((0, 0), (1, 1), (0, 1), (2, 2), (0, 2)):
+        condition.assign(np.array([holds], np.int32))
+        program.run()
+        assert runs.numpy().tolist() == [expected] * 3
+        program.run()  # it has been forgotten
+        assert runs.numpy().tolist() == [expected] * 3
+    condition.assign(np.array([1], np.int32))
+    program.run_eager()
+    assert runs.numpy().tolist() == [3] * 3 and condition.numpy()[0] == 0
+
+
+@pytest.mark.parametrize("shape, dtype", [((2,), int), ((1,), float), ((1, 1), int)])
+def test_bad_conditions(device, shape, dtype):
+    with pytest.raises(ValueError, match=r"use \(1,\) int32"):
+        Program(device, wp.zeros(shape, dtype=dtype, device=device))
