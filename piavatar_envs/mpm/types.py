@@ -25,7 +25,8 @@ wp.set_module_options({"enable_backward": False})
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 #: Records in fixed point, see :mod:`piavatar_envs.mpm.sums`: a sector of mass and physical momentum, and one of
 #: kinematic momentum; one of offsets.
-vec16i = wp.types.vector(length=16, dtype=wp.int32)
+vec8l = wp.types.vector(length=8, dtype=wp.int64)
+vec4l = wp.types.vector(length=4, dtype=wp.int64)
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
 # Why an environment failed: bits of ``State.failure``.
@@ -176,9 +177,9 @@ class Sums:
 
     is_fixed: int
     value: wp.array2d(dtype=wp.vec4)  # halves of records: mass, physical momentum; kinematic momentum, nothing
-    fixed: wp.array2d(dtype=vec16i)
+    fixed: wp.array2d(dtype=vec8l)
     offset: wp.array2d(dtype=wp.vec4)  # sum of w m (x_i - x_p), of w m of seam particles; near others and boundaries
-    offset_fixed: wp.array2d(dtype=vec8i)
+    offset_fixed: wp.array2d(dtype=vec4l)
     mass_unit: wp.array2d(dtype=float)  # [kg]
     momentum_unit: wp.array2d(dtype=float)  # [kg m/s]
 

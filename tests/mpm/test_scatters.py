@@ -62,8 +62,7 @@ def node_sums(sim):
     program.run()
     count, held = scratch.blocks.count.numpy(), scratch.blocks.held.numpy()
     if scratch.sums.is_fixed:
-        parts = scratch.sums.fixed.numpy().astype(float).reshape(model.num_envs, -1, 2, 2, 4)
-        sums = (2.0**20 * parts[..., 0, :] + parts[..., 1, :]).reshape(model.num_envs, -1, 8)[..., :7]
+        sums = scratch.sums.fixed.numpy().astype(float)[..., :7]
         sums[..., 0] *= scratch.sums.mass_unit.numpy()[0, 0]
         sums[..., 1:] *= scratch.sums.momentum_unit.numpy()[0, 0]
     else:
