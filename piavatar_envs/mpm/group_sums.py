@@ -128,12 +128,12 @@ const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, warps = blockDim.x >
 const bool is_place = kind == PLACE, of_mass = c == 0 || is_place;
 const int most = of_mass ? HEAVIEST : kind == KINEMATIC ? DRIVEN : FASTEST;
 const int word = c > 0 ? c - (kind != 0) : kind == 0 ? 0 : 3;  // of four that lie together
-const int halves = kind == KINEMATIC ? 64 : 0;  // in floating point
+const int halves = kind == KINEMATIC ? 64 : 0;
 const int within = ((corner & 4) << 2) + ((corner & 2) << 1) + (corner & 1);
 const bool is_fixed = sums.is_fixed != 0;
 char* const to = (is_place ? (char*)&wp::index(sums.offset_fixed, is_fixed ? e : 0, 0)
                            : (char*)&wp::index(sums.fixed, is_fixed ? e : 0, 0))
-    + 8 * ((is_place ? 4 : 8) * within + (kind == KINEMATIC ? 4 : 0) + word);
+    + 32 * (within + halves) + 8 * word;
 float unit = 0.0f;
 int shift = 0, most_counted = 0;
 auto count_in = [&](int field) {{  // the group's units are not smaller than those of the sums: shifted, they are exact
@@ -164,8 +164,9 @@ for (int place = warp; place < bricks; place += warps) {{
             too_much = true;
             sum = 0;
         }}
+        const size_t at = is_place ? record : record + (record & ~63u);
         const long long added = (long long)sum << shift;  // memory takes the four numbers of a node at a time
-        if (sum != 0) atomicAdd((unsigned long long*)(to + 8 * (is_place ? 4 : 8) * (size_t)record), added);
+        if (sum != 0) atomicAdd((unsigned long long*)(to + 32 * at), added);
     }} else if (sum == 0)
         continue;
     else if (is_place)

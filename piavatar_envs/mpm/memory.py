@@ -23,7 +23,6 @@ from piavatar_envs.mpm.types import (
     Sums,
     group,
     vec4l,
-    vec8l,
 )
 
 #: Blocks with matter that a body may come to need, over those that it needs at rest. Random full-scale actions, also of
@@ -172,7 +171,7 @@ def allocate_sums(model: Model, velocity: wp.array) -> Sums:
         Sums,
         is_fixed=int(fixed),
         value=velocity if model.scatter == "shared" else _zeros(model, (1, 1) if fixed else velocity.shape, wp.vec4),
-        fixed=_zeros(model, integers, vec8l),
+        fixed=_zeros(model, velocity.shape if fixed else (1, 1), vec4l),
         offset=_zeros(model, floats, wp.vec4),
         offset_fixed=_zeros(model, integers, vec4l),
         mass_unit=wp.array(mass.astype(np.float32), dtype=float, device=model.device),

@@ -93,9 +93,9 @@ if (is_fixed) records_at = &wp::index(sums.fixed, e, 0);
 if (is_place) records_at = &wp::index(sums.offset, is_fixed ? 0 : e, 0);
 if (is_place && is_fixed) records_at = &wp::index(sums.offset_fixed, e, 0);
 const size_t to = __cvta_generic_to_global(records_at) + (is_fixed ? 8 : 4) * word
-    + (kind == {int(KINEMATIC)} ? (is_fixed ? 32 : 64 * 16) : 0);
-const int size = is_fixed ? (is_place ? 32 : 64) : 16;  // from a node to the next of a block [bytes]
-const int blocks_apart = is_fixed || is_place ? 1 : 2;  // in floating point, the halves of its records lie apart
+    + (kind == {int(KINEMATIC)} ? 64 * (is_fixed ? 32 : 16) : 0);
+const int size = is_fixed ? 32 : 16;  // from a node to the next of a block [bytes]
+const int blocks_apart = is_place ? 1 : 2;  // the halves of records lie apart
 struct Fixed {{ enum {{ FIXED = 1, SURE = 0 }}; }};
 struct Sure {{ enum {{ FIXED = 1, SURE = 1 }}; }};
 struct Floating {{ enum {{ FIXED = 0, SURE = 1 }}; }};

@@ -6,9 +6,9 @@ do not, and a run can be repeated bit for bit. 32 bits are too few: they leave a
 10^4 such cells, and there is room for thousands of them. Summands are rounded to the nearest unit, which is unbiased:
 rounding masses up would slow all motion down.
 
-Four numbers lie together: 32 bytes, which a GPU's memory takes at a time. They are mass and physical momentum;
-kinematic momentum and nothing; offsets and the mass of seams. So what is added up together, and the first without the
-second, is of whole such sectors, and four threads add to one at once.
+Four numbers lie together: 32 bytes, which a GPU's memory takes at a time. They are mass and physical momentum, and
+elsewhere kinematic momentum and nothing, as in :mod:`piavatar_envs.mpm.records`; offsets and the mass of seams. So what
+is added up together, and the first without the second, is of whole such sectors, and four threads add to one at once.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.records import read_record, write_record
-from piavatar_envs.mpm.types import Grid, Step, Sums, row, vec4l, vec8, vec8l
+from piavatar_envs.mpm.records import half_of, read_record, write_record
+from piavatar_envs.mpm.types import Grid, Step, Sums, row, vec4l, vec8
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,72 +35,45 @@ def units(density: np.ndarray, grid: Grid, step: Step) -> tuple[np.ndarray, np.n
     return np.exp2(np.round(np.log2(mass))), np.exp2(np.round(np.log2(mass * grid.dx / step.dt)))
 
 
-_READ_SECTOR = """
-const auto* const numbers = reinterpret_cast<const wp::int64*>(&wp::index(records, e, r)) + 4 * sector;
+@wp.func_native("""
+const wp::int64* const own = reinterpret_cast<const wp::int64*>(&wp::index(numbers, e, at));
 #if defined(__CUDA_ARCH__)
-const longlong2 a = reinterpret_cast<const longlong2*>(numbers)[0], b = reinterpret_cast<const longlong2*>(numbers)[1];
+const longlong2 a = reinterpret_cast<const longlong2*>(own)[0], b = reinterpret_cast<const longlong2*>(own)[1];
 return wp::vec_t<4, wp::int64>(a.x, a.y, b.x, b.y);
 #else
-return wp::vec_t<4, wp::int64>(numbers[0], numbers[1], numbers[2], numbers[3]);
+return wp::vec_t<4, wp::int64>(own[0], own[1], own[2], own[3]);
 #endif
-"""
-_CLEAR = """
+""")
+def numbers_at(numbers: wp.array2d(dtype=vec4l), e: int, at: int) -> vec4l:
+    """``numbers[e, at]``, on a GPU in two loads."""
+    ...
+
+
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
-constexpr int PARTS = sizeof(wp::index(records, e, r)) / 16;
-int4* const mine = reinterpret_cast<int4*>(&wp::index(records, e, r));
+int4* const mine = reinterpret_cast<int4*>(&wp::index(numbers, e, at));
 const int4 zero = make_int4(0, 0, 0, 0);
 constexpr unsigned ALL = 0xffffffffu;
 if (__activemask() == ALL) {
     const int lane = threadIdx.x & 31;
     int4* const first = (int4*)__shfl_sync(ALL, (unsigned long long)mine, 0);
-    if (__all_sync(ALL, mine == first + PARTS * lane)) {  // a warp's records lie together: cleared as they lie
+    if (__all_sync(ALL, mine == first + 2 * lane)) {  // those of a warp lie together, and are cleared as they lie
+        const unsigned cleared = __ballot_sync(ALL, clears);
+        __syncwarp();  // all have read theirs
 #pragma unroll
-        for (int sector = 0; sector < PARTS; sector += 2) {
-            const unsigned cleared = __ballot_sync(ALL, clears && sector < 2 * sectors);
-            __syncwarp();  // all have read theirs
-            if (cleared == 0u) break;
-#pragma unroll
-            for (int part = lane; part < 64; part += 32)
-                if (cleared >> (part >> 1) & 1u) first[PARTS * (part >> 1) + sector + (part & 1)] = zero;
-        }
+        for (int half = lane; half < 64; half += 32)
+            if (cleared >> (half >> 1) & 1u) first[half] = zero;
         __syncwarp();
         return;
     }
 }
-if (clears) {
-#pragma unroll
-    for (int part = 0; part < PARTS; ++part)
-        if (part < 2 * sectors) mine[part] = zero;
-}
+if (clears) mine[0] = zero, mine[1] = zero;
 #else
-auto& record = wp::index(records, e, r);
-if (clears)
-    for (int n = 0; n < 4 * sectors; ++n) record[n] = 0;
+if (clears) wp::index(numbers, e, at) = wp::vec_t<4, wp::int64>(0, 0, 0, 0);
 #endif
-"""
-
-
-@wp.func_native(_READ_SECTOR)
-def sector_of_sum(records: wp.array2d(dtype=vec8l), e: int, r: int, sector: int) -> vec4l:
-    """Numbers ``4 sector`` to ``4 sector + 3`` of ``records[e, r]``, on a GPU in two loads."""
-    ...
-
-
-@wp.func_native(_READ_SECTOR)
-def sector_of_offset(records: wp.array2d(dtype=vec4l), e: int, r: int, sector: int) -> vec4l:
-    """:func:`sector_of_sum` of offsets."""
-    ...
-
-
-@wp.func_native(_CLEAR)
-def clear_fixed_sum(records: wp.array2d(dtype=vec8l), e: int, r: int, sectors: int, clears: bool):
-    """Zero the first ``sectors`` of ``records[e, r]`` if ``clears``; at best all threads of a warp come here."""
-    ...
-
-
-@wp.func_native(_CLEAR)
-def clear_fixed_offset(records: wp.array2d(dtype=vec4l), e: int, r: int, sectors: int, clears: bool):
-    """:func:`clear_fixed_sum` of offsets."""
+""")
+def clear_numbers(numbers: wp.array2d(dtype=vec4l), e: int, at: int, clears: bool):
+    """Zero ``numbers[e, at]`` if ``clears``; at best all threads of a warp come here."""
     ...
 
 
@@ -118,7 +91,7 @@ def begin_sum(sums: Sums, e: int, r: int):
     """
     s = vec4l()
     if sums.is_fixed != 0:
-        s = sector_of_sum(sums.fixed, e, r, 0)
+        s = numbers_at(sums.fixed, e, half_of(r, 0))
     return s
 
 
@@ -146,9 +119,11 @@ def end_sum(sums: Sums, e: int, f: int, r: int, begun: vec4l, driven: bool):
             p = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
             s = vec8(m * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
             if driven:
-                b = counted(sector_of_sum(sums.fixed, e, r, 1))
+                b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
                 s = s + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
-        clear_fixed_sum(sums.fixed, e, r, wp.where(driven, 2, 1), a[0] > 0.0)
+        clear_numbers(sums.fixed, e, half_of(r, 0), a[0] > 0.0)
+        if driven:
+            clear_numbers(sums.fixed, e, half_of(r, 1), a[0] > 0.0)
     return s
 
 
@@ -163,7 +138,7 @@ def offset_at(grid: Grid, sums: Sums, e: int, f: int, r: int):
     """Sum of ``w m (x_i - x_p)`` [kg m] and of the mass of seam particles [kg] at record ``r`` of field ``f``."""
     if sums.is_fixed == 0:
         return sums.offset[e, r]
-    s = offset_unit(grid, sums, e, f) * counted(sector_of_offset(sums.offset_fixed, e, r, 0))
+    s = offset_unit(grid, sums, e, f) * counted(numbers_at(sums.offset_fixed, e, r))
     return wp.vec4(s[0], s[1], s[2], s[3] / grid.dx)
 
 
@@ -182,4 +157,4 @@ def clear_offset(sums: Sums, e: int, r: int):
     if sums.is_fixed == 0:
         sums.offset[e, r] = wp.vec4(0.0)
     else:
-        clear_fixed_offset(sums.offset_fixed, e, r, 1, True)
+        clear_numbers(sums.offset_fixed, e, r, True)

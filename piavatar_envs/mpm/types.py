@@ -25,7 +25,6 @@ wp.set_module_options({"enable_backward": False})
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 #: Records in fixed point, see :mod:`piavatar_envs.mpm.sums`: a sector of mass and physical momentum, and one of
 #: kinematic momentum; one of offsets.
-vec8l = wp.types.vector(length=8, dtype=wp.int64)
 vec4l = wp.types.vector(length=4, dtype=wp.int64)
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
@@ -170,14 +169,14 @@ class Blocks:
 class Sums:
     """What particles add up on nodes, zero between substeps; see :mod:`piavatar_envs.mpm.sums`.
 
-    ``(num_envs, 64 S)``; ``value``, of halves of records, ``(num_envs, 128 S)``.
+    ``(num_envs, 64 S)``; ``value`` and ``fixed``, of halves of records, ``(num_envs, 128 S)``.
 
     Either the floating-point or the integer arrays are in use, the others have one entry. Units: ``(rows, F)``.
     """
 
     is_fixed: int
     value: wp.array2d(dtype=wp.vec4)  # halves of records: mass, physical momentum; kinematic momentum, nothing
-    fixed: wp.array2d(dtype=vec8l)
+    fixed: wp.array2d(dtype=vec4l)  # the same in units
     offset: wp.array2d(dtype=wp.vec4)  # sum of w m (x_i - x_p), of w m of seam particles; near others and boundaries
     offset_fixed: wp.array2d(dtype=vec4l)
     mass_unit: wp.array2d(dtype=float)  # [kg]

@@ -11,7 +11,7 @@ import warp as wp
 from piavatar_envs.mpm import sweep
 from piavatar_envs.mpm.records import mass_of, read_record, write_physical, write_record
 from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at
-from piavatar_envs.mpm.types import Grid, Sums, group, vec4l, vec8, vec8l
+from piavatar_envs.mpm.types import Grid, Sums, group, vec4l, vec8
 
 RECORDS = 64
 
@@ -64,17 +64,17 @@ def test_fixed_sums(device, driven):
     Where nobody is driven, kinematic momentum is left alone.
     """
     rng = np.random.default_rng(1)
-    numbers = rng.integers(-(2**50), 2**50, (1, RECORDS, 8))
-    numbers[..., 0] = np.abs(numbers[..., 0]) + 1
-    numbers[..., 7] = 0
-    numbers[0, ::3] = 0
+    numbers = rng.integers(-(2**50), 2**50, (2, RECORDS, 4))  # halves of the records of a slot
+    numbers[0, :, 0] = np.abs(numbers[0, :, 0]) + 1
+    numbers[1, :, 3] = 0
+    numbers[:, ::3] = 0
     offsets = rng.integers(-(2**50), 2**50, (1, RECORDS, 4))
     unit = np.array([[1.0, 2.0**-30]], np.float32), np.array([[1.0, 2.0**-28]], np.float32)
     sums = group(
         Sums,
         is_fixed=1,
         value=wp.zeros((1, 1), dtype=wp.vec4, device=device),
-        fixed=wp.array(numbers, dtype=vec8l, device=device),
+        fixed=wp.array(numbers.reshape(1, -1, 4), dtype=vec4l, device=device),
         offset=wp.zeros((1, 1), dtype=wp.vec4, device=device),
         offset_fixed=wp.array(offsets, dtype=vec4l, device=device),
         mass_unit=wp.array(unit[0], dtype=float, device=device),
@@ -86,14 +86,14 @@ def test_fixed_sums(device, driven):
     found = wp.zeros(RECORDS, dtype=wp.vec4, device=device)
     wp.launch(take_all, RECORDS, inputs=[grid, sums, driven], outputs=[taken, found], device=device)
     scale = np.array([2.0**-30] + 7 * [2.0**-28])
-    left, expected = sums.fixed.numpy()[0], numbers[0].astype(float)
-    assert not left[:, :4].any()
+    left, expected = sums.fixed.numpy().reshape(numbers.shape), numbers.astype(float)
+    assert not left[0].any()
     if driven:
-        assert not left[:, 4:].any()
+        assert not left[1].any()
     else:
-        assert np.array_equal(left[:, 4:], numbers[0, :, 4:])
-        expected[:, 4:] = 0.0
-    np.testing.assert_allclose(taken.numpy(), scale * expected, rtol=1e-6)
+        assert np.array_equal(left[1], numbers[1])
+        expected[1] = 0.0
+    np.testing.assert_allclose(taken.numpy(), scale * np.concatenate(expected, axis=1), rtol=1e-6)
     scale = np.array(3 * [0.25 * 2.0**-30] + [2.0**-30])
     np.testing.assert_allclose(found.numpy(), scale * offsets[0], rtol=1e-6)
     left = sums.offset_fixed.numpy()[0]
