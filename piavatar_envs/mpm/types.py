@@ -23,9 +23,9 @@ wp.set_module_options({"enable_backward": False})
 #: What a grid node has: mass [kg], physical momentum (3), kinematic momentum (3), nothing. How it lies in memory is in
 #: :mod:`piavatar_envs.mpm.records`.
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
-#: Records in fixed point, see :mod:`piavatar_envs.mpm.sums`: a sector of mass and physical momentum, and one of
-#: kinematic momentum; one of offsets.
+#: Half of a record in fixed point, or an offset, see :mod:`piavatar_envs.mpm.sums`.
 vec4l = wp.types.vector(length=4, dtype=wp.int64)
+#: What eight bricks or blocks around a particle have.
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
 # Why an environment failed: bits of ``State.failure``.
