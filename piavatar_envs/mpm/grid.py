@@ -10,7 +10,7 @@ from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.normals import MASS_MIN, face_shared
 from piavatar_envs.mpm.records import write_kinematic, write_physical
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
-from piavatar_envs.mpm.sums import Begun, begin_sum, clear_offset, end_sum, offset_at
+from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at
 from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import (
@@ -24,6 +24,7 @@ from piavatar_envs.mpm.types import (
     Sensors,
     Step,
     Sums,
+    vec4l,
     vec8,
 )
 
@@ -160,7 +161,7 @@ def update_node(
     boundaries: Boundaries,
     contact: Contact,
     sums: Sums,
-    begun: Begun,
+    begun: vec4l,
     e: int,
     f: int,
     r: int,

@@ -128,24 +128,19 @@ const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, warps = blockDim.x >
 const bool is_place = kind == PLACE, of_mass = c == 0 || is_place;
 const int most = of_mass ? HEAVIEST : kind == KINEMATIC ? DRIVEN : FASTEST;
 const int word = c > 0 ? c - (kind != 0) : kind == 0 ? 0 : 3;  // of four that lie together
-const int halves = kind == KINEMATIC ? 64 : 0;  // in floating point
+const int halves = kind == KINEMATIC ? 64 : 0;
 const int within = ((corner & 4) << 2) + ((corner & 2) << 1) + (corner & 1);
 const bool is_fixed = sums.is_fixed != 0;
-// in fixed point: memory takes 32 bytes at a time, a node's high and low parts. Four threads have a node of their own,
-// next to another four: they exchange one part for the other, and all eight add to the one node, then to the other
-const int odd = corner & 1, words = is_place ? 8 : 16;
-char* const one_at = (is_place ? (char*)&wp::index(sums.offset_fixed, is_fixed ? e : 0, 0)
-                               : (char*)&wp::index(sums.fixed, is_fixed ? e : 0, 0))
-    + 4 * (words * (within - odd) + (kind == KINEMATIC ? 8 : 0) + 4 * odd + word);
-char* const other_at = one_at + 4 * words;
+char* const to = (is_place ? (char*)&wp::index(sums.offset_fixed, is_fixed ? e : 0, 0)
+                           : (char*)&wp::index(sums.fixed, is_fixed ? e : 0, 0))
+    + 32 * (within + halves) + 8 * word;
 float unit = 0.0f;
-int shift = 0, right = 0, left = 0, half = 0, most_high = 0;
+int shift = 0, most_counted = 0;
 auto count_in = [&](int field) {{  // the group's units are not smaller than those of the sums: shifted, they are exact
     unit = power_of_two(room[most + field]) * (is_place && c > 0 ? 0x1p-24f : 0x1p-25f);
     const int counted = room[(of_mass ? MASS_UNIT : MOMENTUM_UNIT) + field];
     shift = (__float_as_int(unit) - counted) >> 23;
-    right = max(20 - shift, 0), left = max(shift - 20, 0), half = (1 << right) >> 1;
-    most_high = shift > 31 ? 0 : 1 << (28 - left);
+    most_counted = shift > 48 ? 0 : shift < 18 ? 0x7fffffff : 1 << (48 - shift);
 }};
 const int bricks = room[COUNT];
 int counted_in = num_fields > 1 && bricks > 0 ? room[BRICKS] : 0;  // where nobody takes part, nothing is there
@@ -165,17 +160,13 @@ for (int place = warp; place < bricks; place += warps) {{
     if (num_fields > 1 && room[BRICKS + place] != counted_in) count_in(counted_in = room[BRICKS + place]);
     if (!(massive >> (lane & 28) & 1u)) sum = 0;
     if (is_fixed) {{
-        int high = (sum + half) >> right;
-        if (abs(high) > most_high) {{
+        if (abs(sum) > most_counted) {{
             too_much = true;
-            high = sum = 0;
+            sum = 0;
         }}
-        high <<= left;
-        const int low = (int)(((unsigned)sum << shift) - ((unsigned)high << 20));
-        const int got = __shfl_xor_sync(ALL, odd ? high : low, 4), one = odd ? got : high, other = odd ? low : got;
-        const size_t from = (size_t)record * (size_t)(4 * words);
-        if (one != 0) atomicAdd((int*)(one_at + from), one);
-        if (other != 0) atomicAdd((int*)(other_at + from), other);
+        const size_t at = is_place ? record : record + (record & ~63u);
+        const long long added = (long long)sum << shift;  // memory takes the four numbers of a node at a time
+        if (sum != 0) atomicAdd((unsigned long long*)(to + 32 * at), added);
     }} else if (sum == 0)
         continue;
     else if (is_place)

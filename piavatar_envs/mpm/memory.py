@@ -22,8 +22,7 @@ from piavatar_envs.mpm.types import (
     State,
     Sums,
     group,
-    vec8i,
-    vec16i,
+    vec4l,
 )
 
 #: Blocks with matter that a body may come to need, over those that it needs at rest. Random full-scale actions, also of
@@ -172,9 +171,9 @@ def allocate_sums(model: Model, velocity: wp.array) -> Sums:
         Sums,
         is_fixed=int(fixed),
         value=velocity if model.scatter == "shared" else _zeros(model, (1, 1) if fixed else velocity.shape, wp.vec4),
-        fixed=_zeros(model, integers, vec16i),
+        fixed=_zeros(model, velocity.shape if fixed else (1, 1), vec4l),
         offset=_zeros(model, floats, wp.vec4),
-        offset_fixed=_zeros(model, integers, vec8i),
+        offset_fixed=_zeros(model, integers, vec4l),
         mass_unit=wp.array(mass.astype(np.float32), dtype=float, device=model.device),
         momentum_unit=wp.array(momentum.astype(np.float32), dtype=float, device=model.device),
     )

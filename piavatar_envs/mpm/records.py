@@ -17,6 +17,12 @@ wp.set_module_options({"enable_backward": False})
 TO_KINEMATIC = wp.constant(64)
 
 
+@wp.func_native(f"return r + (r & ~{int(TO_KINEMATIC) - 1}) + half * {int(TO_KINEMATIC)};")
+def half_of(r: int, half: int) -> int:
+    """Where the first half of record ``r`` is, or with ``half`` 1 the second."""
+    ...
+
+
 @wp.func_native("return (wp::uint64)&wp::index(halves, e, 0);")
 def first_of_halves(halves: wp.array2d(dtype=wp.vec4), e: int) -> wp.uint64:
     """Address of ``halves[e, 0]``, for :func:`read_half_from`."""

@@ -2,9 +2,8 @@
 
 Groups of particles, see :mod:`piavatar_envs.mpm.groups`, take time to find out which nodes they have in common. Where
 these are few, memory is faster asked for all additions. A particle has eight threads, all of which know what it
-scatters. Each looks one of the eight blocks up that its stencil may lie in, and to every node all add together, a high
-or a low part of one of four numbers each: 32 bytes, which memory takes at a time. What is added are integers: runs
-repeat bit for bit.
+scatters. Each looks one of the eight blocks up that its stencil may lie in, and to every node four add together, one of
+four numbers each: 32 bytes, which memory takes at a time. What is added are integers: runs repeat bit for bit.
 """
 
 from __future__ import annotations
@@ -72,7 +71,8 @@ def any_of_team(here: bool) -> bool:
     native(f"""
 constexpr unsigned ALL = 0xffffffffu;
 if (!__any_sync(ALL, takes)) return;
-const int lane = threadIdx.x & 31, c = lane & 3, part = lane >> 2 & 1;  // of the four numbers, and of their two parts
+const int lane = threadIdx.x & 31, c = lane & 3;  // of the four numbers
+const bool is_second = lane & 4;  // of the two who add up one number, on every other line of nodes
 const bool is_place = kind == {int(PLACE)}, is_fixed = sums.is_fixed != 0;
 // units are powers of two: one over them is exact, however the module divides
 auto per = [](float unit) {{ return __int_as_float(0x7f000000 - __float_as_int(unit)); }};
@@ -92,11 +92,10 @@ const void* records_at = &wp::index(sums.value, is_fixed ? 0 : e, 0);
 if (is_fixed) records_at = &wp::index(sums.fixed, e, 0);
 if (is_place) records_at = &wp::index(sums.offset, is_fixed ? 0 : e, 0);
 if (is_place && is_fixed) records_at = &wp::index(sums.offset_fixed, e, 0);
-const size_t to = __cvta_generic_to_global(records_at) + 4 * word + (is_fixed ? 16 * part : 0)
-    + (kind == {int(KINEMATIC)} ? (is_fixed ? 32 : 64 * 16) : 0);
-const int size = is_fixed ? (is_place ? 32 : 64) : 16;  // from a node to the next of a block [bytes]
-const int blocks_apart = is_fixed || is_place ? 1 : 2;  // in floating point, the halves of its records lie apart
-const float per_high = part == 0 ? 1.0f : -0x1p20f, per_all = part == 0 ? 0.0f : 1.0f;
+const size_t to = __cvta_generic_to_global(records_at) + (is_fixed ? 8 : 4) * word
+    + (kind == {int(KINEMATIC)} ? 64 * (is_fixed ? 32 : 16) : 0);
+const int size = is_fixed ? 32 : 16;  // from a node to the next of a block [bytes]
+const int blocks_apart = is_place ? 1 : 2;  // the halves of records lie apart
 struct Fixed {{ enum {{ FIXED = 1, SURE = 0 }}; }};
 struct Sure {{ enum {{ FIXED = 1, SURE = 1 }}; }};
 struct Floating {{ enum {{ FIXED = 0, SURE = 1 }}; }};
@@ -110,33 +109,27 @@ for (int n = 0; n < 4; ++n) {{
 auto add = [&](auto sum) {{
     constexpr bool FIXED = decltype(sum)::FIXED, SURE = decltype(sum)::SURE;
 #pragma unroll
-    for (int i = 0; i < 3; ++i) {{
-        const float plane = i == 0 ? value : value + i * along_x;
-        int slab[4];
+    for (int pair = 0; pair < 5; ++pair) {{
+        if (pair == 4 && is_second) break;
+        const int first = 2 * pair, second = first < 8 ? first + 1 : first;
+        const int i = is_second ? second / 3 : first / 3, j = is_second ? second % 3 : first % 3;
+        const float w_line = is_second ? wx[second / 3] * wy[second % 3] : wx[first / 3] * wy[first % 3];
+        const float line = value + (float)i * along_x + (float)j * along_y;
+        const bool is_upper = bx + i > 3, is_far = by + j > 3;
+        const int in_block = 16 * (bx + i & 3) + 4 * (by + j & 3);
+        const int near = (is_far ? (is_upper ? upper[2] : lower[2]) : (is_upper ? upper[0] : lower[0])) + in_block;
+        const int next = (is_far ? (is_upper ? upper[3] : lower[3]) : (is_upper ? upper[1] : lower[1])) + in_block;
 #pragma unroll
-        for (int n = 0; n < 4; ++n) slab[n] = bx + i > 3 ? upper[n] : lower[n];
-#pragma unroll
-        for (int j = 0; j < 3; ++j) {{
-            const int in_block = 16 * (bx + i & 3) + 4 * (by + j & 3);
-            const int near = (by + j > 3 ? slab[2] : slab[0]) + in_block;
-            const int next = (by + j > 3 ? slab[3] : slab[1]) + in_block;
-            const float w_line = wx[i] * wy[j], line = j == 0 ? plane : plane + j * along_y;
-#pragma unroll
-            for (int l = 0; l < 3; ++l) {{
-                const float w = w_line * wz[l], number = w * (l == 0 ? line : line + l * along_z);
-                size_t node;
-                asm("mad.wide.s32 %0, %1, %2, %3;"
-                    : "=l"(node) : "r"((bz + l > 3 ? next : near) + (bz + l & 3)), "r"(size), "l"(to));
-                if (FIXED) {{
-                    // the nearest integer, as far as a number has bits, and what is left for the lower part (beyond
-                    // 2^42 units, 64 full cells at a spacing a step, a number may lose its last bit)
-                    const float high = __fadd_rn(__fmaf_rn(number, 0x1p-20f, 0x1.8p23f), -0x1.8p23f);
-                    const int added = __float2int_rn(per_high * high + per_all * number);
-                    asm volatile("red.global.add.s32 [%0], %1;"
-                                 :: "l"(node), "r"(SURE || w * massive > 0.5f ? added : 0) : "memory");
-                }} else if (massive > 0.0f && part == 0)
-                    asm volatile("red.global.add.f32 [%0], %1;" :: "l"(node), "f"(number) : "memory");
-            }}
+        for (int l = 0; l < 3; ++l) {{
+            const float w = w_line * wz[l], number = w * (l == 0 ? line : line + l * along_z);
+            size_t node;
+            asm("mad.wide.s32 %0, %1, %2, %3;"
+                : "=l"(node) : "r"((bz + l > 3 ? next : near) + (bz + l & 3)), "r"(size), "l"(to));
+            if (FIXED) {{
+                const long long added = SURE || w * massive > 0.5f ? __float2ll_rn(number) : 0ll;
+                asm volatile("red.global.add.u64 [%0], %1;" :: "l"(node), "l"(added) : "memory");
+            }} else if (massive > 0.0f)
+                asm volatile("red.global.add.f32 [%0], %1;" :: "l"(node), "f"(number) : "memory");
         }}
     }}
 }};

@@ -2,15 +2,13 @@
 
 Floating-point sums depend on the order of their summands, which on a GPU is another one every time. In fixed point they
 do not, and a run can be repeated bit for bit. 32 bits are too few: they leave an affine velocity right to 1e-4 only.
-64-bit additions are slow where many threads add to neighbouring numbers. So a number is kept in two integers,
-``high 2^20 + low``, to which the two parts of a summand are added one by one; ``low`` has room for the carries of two
-thousand summands. Together they count units of 2^-36 of what a full cell of matter has, at rest or at a grid spacing a
-time step, and reach 10^4 such cells. Summands are rounded to the nearest unit, which is unbiased: rounding masses up
-would slow all motion down.
+64 count units of 2^-36 of what a full cell of matter has, at rest or at a grid spacing a time step; a summand may be of
+4,000 such cells, and there is room for thousands of them. Summands are rounded to the nearest unit, which is unbiased:
+rounding masses up would slow all motion down.
 
-Four numbers lie together, their high parts before their low ones: 32 bytes, which a GPU's memory takes at a time. They
-are mass and physical momentum; kinematic momentum and nothing; offsets and the mass of seams. So what is added up
-together, and the first without the second, is of whole such sectors.
+Four numbers lie together: 32 bytes, which a GPU's memory takes at a time. They are mass and physical momentum, and
+elsewhere kinematic momentum and nothing, as in :mod:`piavatar_envs.mpm.records`; offsets and the mass of seams. So what
+is added up together, and the first without the second, is of whole such sectors, and four threads add to one at once.
 """
 
 from __future__ import annotations
@@ -18,15 +16,13 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.records import read_record, write_record
-from piavatar_envs.mpm.types import Grid, Step, Sums, row, vec8, vec8i, vec16i
+from piavatar_envs.mpm.records import half_of, read_record, write_record
+from piavatar_envs.mpm.types import Grid, Step, Sums, row, vec4l, vec8
 
 wp.set_module_options({"enable_backward": False})
 
 #: Units in a full cell.
 UNITS = 2.0**36
-#: Units in one of the high part.
-HIGH = wp.constant(float(2**20))
 
 
 def units(density: np.ndarray, grid: Grid, step: Step) -> tuple[np.ndarray, np.ndarray]:
@@ -39,99 +35,63 @@ def units(density: np.ndarray, grid: Grid, step: Step) -> tuple[np.ndarray, np.n
     return np.exp2(np.round(np.log2(mass))), np.exp2(np.round(np.log2(mass * grid.dx / step.dt)))
 
 
-_READ_PART = """
+@wp.func_native("""
+const wp::int64* const own = reinterpret_cast<const wp::int64*>(&wp::index(numbers, e, at));
 #if defined(__CUDA_ARCH__)
-const int4 n = reinterpret_cast<const int4*>(&wp::index(records, e, r))[part];
-return wp::vec_t<4, wp::int32>(n.x, n.y, n.z, n.w);
+const longlong2 a = reinterpret_cast<const longlong2*>(own)[0], b = reinterpret_cast<const longlong2*>(own)[1];
+return wp::vec_t<4, wp::int64>(a.x, a.y, b.x, b.y);
 #else
-const auto& n = wp::index(records, e, r);
-return wp::vec_t<4, wp::int32>(n[4 * part], n[4 * part + 1], n[4 * part + 2], n[4 * part + 3]);
+return wp::vec_t<4, wp::int64>(own[0], own[1], own[2], own[3]);
 #endif
-"""
-_CLEAR = """
+""")
+def numbers_at(numbers: wp.array2d(dtype=vec4l), e: int, at: int) -> vec4l:
+    """``numbers[e, at]``, on a GPU in two loads."""
+    ...
+
+
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
-constexpr int PARTS = sizeof(wp::index(records, e, r)) / 16;
-int4* const mine = reinterpret_cast<int4*>(&wp::index(records, e, r));
+int4* const mine = reinterpret_cast<int4*>(&wp::index(numbers, e, at));
 const int4 zero = make_int4(0, 0, 0, 0);
 constexpr unsigned ALL = 0xffffffffu;
 if (__activemask() == ALL) {
     const int lane = threadIdx.x & 31;
     int4* const first = (int4*)__shfl_sync(ALL, (unsigned long long)mine, 0);
-    if (__all_sync(ALL, mine == first + PARTS * lane)) {  // a warp's records lie together: cleared as they lie
+    if (__all_sync(ALL, mine == first + 2 * lane)) {  // those of a warp lie together, and are cleared as they lie
+        const unsigned cleared = __ballot_sync(ALL, clears);
+        __syncwarp();  // all have read theirs
 #pragma unroll
-        for (int sector = 0; sector < PARTS; sector += 2) {
-            const unsigned cleared = __ballot_sync(ALL, clears && sector < 2 * sectors);
-            __syncwarp();  // all have read theirs
-            if (cleared == 0u) break;
-#pragma unroll
-            for (int part = lane; part < 64; part += 32)
-                if (cleared >> (part >> 1) & 1u) first[PARTS * (part >> 1) + sector + (part & 1)] = zero;
-        }
+        for (int half = lane; half < 64; half += 32)
+            if (cleared >> (half >> 1) & 1u) first[half] = zero;
         __syncwarp();
         return;
     }
 }
-if (clears) {
-#pragma unroll
-    for (int part = 0; part < PARTS; ++part)
-        if (part < 2 * sectors) mine[part] = zero;
-}
+if (clears) mine[0] = zero, mine[1] = zero;
 #else
-auto& record = wp::index(records, e, r);
-if (clears)
-    for (int n = 0; n < 8 * sectors; ++n) record[n] = 0;
+if (clears) wp::index(numbers, e, at) = wp::vec_t<4, wp::int64>(0, 0, 0, 0);
 #endif
-"""
-
-
-@wp.func_native(_READ_PART)
-def part_of_sum(records: wp.array2d(dtype=vec16i), e: int, r: int, part: int) -> wp.vec4i:
-    """Integers ``4 part`` to ``4 part + 3`` of ``records[e, r]``, on a GPU in one load."""
-    ...
-
-
-@wp.func_native(_READ_PART)
-def part_of_offset(records: wp.array2d(dtype=vec8i), e: int, r: int, part: int) -> wp.vec4i:
-    """:func:`part_of_sum` of offsets."""
-    ...
-
-
-@wp.func_native(_CLEAR)
-def clear_fixed_sum(records: wp.array2d(dtype=vec16i), e: int, r: int, sectors: int, clears: bool):
-    """Zero the first ``sectors`` of ``records[e, r]`` if ``clears``; at best all threads of a warp come here."""
-    ...
-
-
-@wp.func_native(_CLEAR)
-def clear_fixed_offset(records: wp.array2d(dtype=vec8i), e: int, r: int, sectors: int, clears: bool):
-    """:func:`clear_fixed_sum` of offsets."""
+""")
+def clear_numbers(numbers: wp.array2d(dtype=vec4l), e: int, at: int, clears: bool):
+    """Zero ``numbers[e, at]`` if ``clears``; at best all threads of a warp come here."""
     ...
 
 
 @wp.func
-def join_parts(high: wp.vec4i, low: wp.vec4i):
-    """Four numbers, from their parts."""
-    n = wp.vec4()
-    for c in range(4):
-        n[c] = HIGH * float(high[c]) + float(low[c])
-    return n
-
-
-@wp.struct
-class Begun:
-    """The first half of a sum in fixed point, in its two parts: mass and physical momentum."""
-
-    high: wp.vec4i
-    low: wp.vec4i
+def counted(n: vec4l):
+    """How many units there are, in floating point."""
+    return wp.vec4(float(n[0]), float(n[1]), float(n[2]), float(n[3]))
 
 
 @wp.func
 def begin_sum(sums: Sums, e: int, r: int):
-    """What :func:`end_sum` begins with, to be asked for early; nothing where sums are in floating point."""
-    s = Begun()
+    """What :func:`end_sum` begins with, mass and physical momentum in fixed point, to be asked for early.
+
+    Nothing where sums are in floating point.
+    """
+    s = vec4l()
     if sums.is_fixed != 0:
-        s.high = part_of_sum(sums.fixed, e, r, 0)
-        s.low = part_of_sum(sums.fixed, e, r, 1)
+        s = numbers_at(sums.fixed, e, half_of(r, 0))
     return s
 
 
@@ -142,7 +102,7 @@ def take_sum(sums: Sums, e: int, f: int, r: int):
 
 
 @wp.func
-def end_sum(sums: Sums, e: int, f: int, r: int, begun: Begun, driven: bool):
+def end_sum(sums: Sums, e: int, f: int, r: int, begun: vec4l, driven: bool):
     """:func:`take_sum` of what has ``begun``.
 
     Where it is known that nobody has added kinematic momentum, the record is not ``driven``: that is not read in fixed
@@ -153,15 +113,17 @@ def end_sum(sums: Sums, e: int, f: int, r: int, begun: Begun, driven: bool):
         s = read_record(sums.value, e, r)
         write_record(sums.value, e, r, vec8())
     else:
-        a = join_parts(begun.high, begun.low)
+        a = counted(begun)
         if a[0] > 0.0:  # who adds no mass adds nothing
             m = sums.mass_unit[row(e, sums.mass_unit.shape[0]), f]
             p = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
             s = vec8(m * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
             if driven:
-                b = join_parts(part_of_sum(sums.fixed, e, r, 2), part_of_sum(sums.fixed, e, r, 3))
+                b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
                 s = s + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
-        clear_fixed_sum(sums.fixed, e, r, wp.where(driven, 2, 1), a[0] > 0.0)
+        clear_numbers(sums.fixed, e, half_of(r, 0), a[0] > 0.0)
+        if driven:
+            clear_numbers(sums.fixed, e, half_of(r, 1), a[0] > 0.0)
     return s
 
 
@@ -176,8 +138,7 @@ def offset_at(grid: Grid, sums: Sums, e: int, f: int, r: int):
     """Sum of ``w m (x_i - x_p)`` [kg m] and of the mass of seam particles [kg] at record ``r`` of field ``f``."""
     if sums.is_fixed == 0:
         return sums.offset[e, r]
-    n = join_parts(part_of_offset(sums.offset_fixed, e, r, 0), part_of_offset(sums.offset_fixed, e, r, 1))
-    s = offset_unit(grid, sums, e, f) * n
+    s = offset_unit(grid, sums, e, f) * counted(numbers_at(sums.offset_fixed, e, r))
     return wp.vec4(s[0], s[1], s[2], s[3] / grid.dx)
 
 
@@ -196,4 +157,4 @@ def clear_offset(sums: Sums, e: int, r: int):
     if sums.is_fixed == 0:
         sums.offset[e, r] = wp.vec4(0.0)
     else:
-        clear_fixed_offset(sums.offset_fixed, e, r, 1, True)
+        clear_numbers(sums.offset_fixed, e, r, True)

@@ -23,9 +23,9 @@ wp.set_module_options({"enable_backward": False})
 #: What a grid node has: mass [kg], physical momentum (3), kinematic momentum (3), nothing. How it lies in memory is in
 #: :mod:`piavatar_envs.mpm.records`.
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
-#: Records in fixed point, see :mod:`piavatar_envs.mpm.sums`: a sector of mass and physical momentum, and one of
-#: kinematic momentum; one of offsets.
-vec16i = wp.types.vector(length=16, dtype=wp.int32)
+#: Half of a record in fixed point, or an offset, see :mod:`piavatar_envs.mpm.sums`.
+vec4l = wp.types.vector(length=4, dtype=wp.int64)
+#: What eight bricks or blocks around a particle have.
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
 # Why an environment failed: bits of ``State.failure``.
@@ -169,16 +169,16 @@ class Blocks:
 class Sums:
     """What particles add up on nodes, zero between substeps; see :mod:`piavatar_envs.mpm.sums`.
 
-    ``(num_envs, 64 S)``; ``value``, of halves of records, ``(num_envs, 128 S)``.
+    ``(num_envs, 64 S)``; ``value`` and ``fixed``, of halves of records, ``(num_envs, 128 S)``.
 
     Either the floating-point or the integer arrays are in use, the others have one entry. Units: ``(rows, F)``.
     """
 
     is_fixed: int
     value: wp.array2d(dtype=wp.vec4)  # halves of records: mass, physical momentum; kinematic momentum, nothing
-    fixed: wp.array2d(dtype=vec16i)
+    fixed: wp.array2d(dtype=vec4l)  # the same in units
     offset: wp.array2d(dtype=wp.vec4)  # sum of w m (x_i - x_p), of w m of seam particles; near others and boundaries
-    offset_fixed: wp.array2d(dtype=vec8i)
+    offset_fixed: wp.array2d(dtype=vec4l)
     mass_unit: wp.array2d(dtype=float)  # [kg]
     momentum_unit: wp.array2d(dtype=float)  # [kg m/s]
 

@@ -40,8 +40,8 @@ _PTX = (
         r"\1 = \4 + (size_t)((long long)(\2) * (\3));",
     ),
     (
-        r'asm volatile\("red\.global\.add\.s32 \[%0\], %1;"\s*:: "l"\((.*?)\), "r"\((.*)\) : "memory"\);',
-        r"*(wp::int32*)(\1) += \2;",
+        r'asm volatile\("red\.global\.add\.u64 \[%0\], %1;"\s*:: "l"\((.*?)\), "l"\((.*)\) : "memory"\);',
+        r"*(wp::int64*)(\1) += \2;",
     ),
     (
         r'asm volatile\("red\.global\.add\.f32 \[%0\], %1;"\s*:: "l"\((.*?)\), "f"\((.*)\) : "memory"\);',

@@ -163,6 +163,7 @@ struct Index { unsigned x; };
 #define __activemask() gpu::look_around(__LINE__)
 
 struct alignas(16) int4 { int x, y, z, w; };
+struct alignas(16) longlong2 { long long x, y; };
 inline int4 make_int4(int x, int y, int z, int w) { return {x, y, z, w}; }
 inline float4 make_float4(float x, float y, float z, float w) { return {x, y, z, w}; }
 
@@ -174,6 +175,11 @@ inline int __float2int_rn(float x)
 {
     if (x != x) return 0;
     return x >= 0x1p31f ? 0x7fffffff : x < -0x1p31f ? (int)0x80000000 : (int)rintf(x);
+}
+inline long long __float2ll_rn(float x)  // what is no number becomes the least, unlike in 32 bits
+{
+    if (x != x || x < -0x1p63f) return -0x7fffffffffffffffll - 1;
+    return x >= 0x1p63f ? 0x7fffffffffffffffll : (long long)rintf(x);
 }
 inline float __fmaf_rn(float a, float b, float c) { return fmaf(a, b, c); }
 #pragma clang optimize off

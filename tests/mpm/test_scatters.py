@@ -61,14 +61,12 @@ def node_sums(sim):
     record_scatter(program, model, sim.state, scratch)
     program.run()
     count, held = scratch.blocks.count.numpy(), scratch.blocks.held.numpy()
+    own = scratch.sums.fixed if scratch.sums.is_fixed else scratch.sums.value
+    halves = own.numpy().astype(float).reshape(model.num_envs, -1, 2, 64, 4)
+    sums = np.concatenate([halves[:, :, 0], halves[:, :, 1, :, :3]], axis=-1)
     if scratch.sums.is_fixed:
-        parts = scratch.sums.fixed.numpy().astype(float).reshape(model.num_envs, -1, 2, 2, 4)
-        sums = (2.0**20 * parts[..., 0, :] + parts[..., 1, :]).reshape(model.num_envs, -1, 8)[..., :7]
         sums[..., 0] *= scratch.sums.mass_unit.numpy()[0, 0]
         sums[..., 1:] *= scratch.sums.momentum_unit.numpy()[0, 0]
-    else:
-        halves = scratch.sums.value.numpy().astype(float).reshape(model.num_envs, -1, 2, 64, 4)
-        sums = np.concatenate([halves[:, :, 0], halves[:, :, 1, :, :3]], axis=-1)
     records = sums.reshape(model.num_envs, model.max_slots, 64, 7)
     return {(e, held[e, s]): records[e, s] for e in range(model.num_envs) for s in range(count[e])}
 

@@ -11,10 +11,10 @@ import warp as wp
 from piavatar_envs.mpm import sweep
 from piavatar_envs.mpm.records import mass_of, read_record, write_physical, write_record
 from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at
-from piavatar_envs.mpm.types import Grid, Sums, group, vec8, vec8i, vec16i
+from piavatar_envs.mpm.types import Grid, Sums, group, vec4l, vec8
 
 RECORDS = 64
-LOW = 2**20
+SLOTS = 3
 
 
 @pytest.mark.parametrize("cuda", [False, True])
@@ -49,60 +49,67 @@ def test_every_node_of_shared_blocks_has_one_thread(monkeypatch, cuda, num_envs,
 
 
 @wp.kernel
-def take_all(grid: Grid, sums: Sums, driven: bool, taken: wp.array(dtype=vec8), offset: wp.array(dtype=wp.vec4)):
-    """Records of field 1."""
+def take_all(
+    grid: Grid,
+    sums: Sums,
+    driven: wp.array(dtype=bool),
+    taken: wp.array(dtype=vec8),
+    offset: wp.array(dtype=wp.vec4),
+):
+    """Records of field 1 in environment 1."""
     r = wp.tid()
-    taken[r] = end_sum(sums, 0, 1, r, begin_sum(sums, 0, r), driven)
-    offset[r] = offset_at(grid, sums, 0, 1, r)
+    taken[r] = end_sum(sums, 1, 1, r, begin_sum(sums, 1, r), driven[r])
+    offset[r] = offset_at(grid, sums, 1, 1, r)
     if r % 2 == 0:
-        clear_offset(sums, 0, r)
+        clear_offset(sums, 1, r)
 
 
-@pytest.mark.parametrize("driven", [True, False])
+@pytest.mark.parametrize("driven", ["all", "none", "slabs", "some"])
 def test_fixed_sums(device, driven):
-    """High and low parts make a number; a record with mass is cleared when it is taken, one without is not touched.
+    """A record with mass is cleared when it is taken, one without is not touched.
 
-    Where nobody is driven, kinematic momentum is left alone.
+    Where nobody is driven, kinematic momentum is left alone, also beside a node of the same warp where somebody is.
     """
-    rng = np.random.default_rng(1)
-    parts = rng.integers(-900, 900, (1, RECORDS, 16)).astype(np.int32)
-    parts[..., 0] = np.abs(parts[..., 0]) + 1
-    parts[..., [11, 15]] = 0
-    parts[0, ::3] = 0
-    offsets = rng.integers(-900, 900, (1, RECORDS, 8)).astype(np.int32)
+    rng, shape = np.random.default_rng(1), (2, SLOTS, 2, 64, 4)  # environments, slots, halves, nodes
+    numbers = rng.integers(-(2**50), 2**50, shape)
+    numbers[:, :, 0, :, 0] = np.abs(numbers[:, :, 0, :, 0]) + 1
+    numbers[:, :, 1, :, 3] = 0
+    numbers[:, :, 0, ::3, 0] = 0
+    records = np.arange(64 * SLOTS)
+    asks = {"all": records >= 0, "none": records < 0, "slabs": records // 16 % 2 == 0, "some": records % 5 == 0}[driven]
+    offsets = rng.integers(-(2**50), 2**50, (2, 64 * SLOTS, 4))
     unit = np.array([[1.0, 2.0**-30]], np.float32), np.array([[1.0, 2.0**-28]], np.float32)
     sums = group(
         Sums,
         is_fixed=1,
         value=wp.zeros((1, 1), dtype=wp.vec4, device=device),
-        fixed=wp.array(parts, dtype=vec16i, device=device),
+        fixed=wp.array(numbers.reshape(2, -1, 4), dtype=vec4l, device=device),
         offset=wp.zeros((1, 1), dtype=wp.vec4, device=device),
-        offset_fixed=wp.array(offsets, dtype=vec8i, device=device),
+        offset_fixed=wp.array(offsets, dtype=vec4l, device=device),
         mass_unit=wp.array(unit[0], dtype=float, device=device),
         momentum_unit=wp.array(unit[1], dtype=float, device=device),
     )
     grid = Grid()
     grid.dx = 0.25
-    taken = wp.zeros(RECORDS, dtype=vec8, device=device)
-    found = wp.zeros(RECORDS, dtype=wp.vec4, device=device)
-    wp.launch(take_all, RECORDS, inputs=[grid, sums, driven], outputs=[taken, found], device=device)
+    taken = wp.zeros(64 * SLOTS, dtype=vec8, device=device)
+    found = wp.zeros(64 * SLOTS, dtype=wp.vec4, device=device)
+    inputs = [grid, sums, wp.array(asks, dtype=bool, device=device)]
+    wp.launch(take_all, 64 * SLOTS, inputs=inputs, outputs=[taken, found], device=device)
+    expected, left = numbers[1].astype(float), sums.fixed.numpy().reshape(shape)
+    asked, massive = asks.reshape(SLOTS, 64), numbers[1, :, 0, :, 0] > 0
+    expected[:, 0][~massive] = 0.0
+    expected[:, 1][~(massive & asked)] = 0.0
+    kept = numbers.copy()
+    kept[1, :, 0][massive] = 0
+    kept[1, :, 1][massive & asked] = 0
+    np.testing.assert_array_equal(left, kept)
     scale = np.array([2.0**-30] + 7 * [2.0**-28])
-    sectors = parts[0].astype(float).reshape(RECORDS, 2, 2, 4)
-    numbers = LOW * sectors[:, :, 0] + sectors[:, :, 1]
-    left = sums.fixed.numpy().reshape(RECORDS, 2, 8)
-    assert not left[:, 0].any()
-    if driven:
-        assert not left[:, 1].any()
-    else:
-        assert np.array_equal(left[:, 1], parts.reshape(RECORDS, 2, 8)[:, 1])
-        numbers[:, 1] = 0.0
-    np.testing.assert_allclose(taken.numpy(), scale * numbers.reshape(RECORDS, 8), rtol=1e-6)
+    halves = np.concatenate([expected[:, 0], expected[:, 1]], axis=2).reshape(-1, 8)
+    np.testing.assert_allclose(taken.numpy(), scale * halves, rtol=1e-6)
     scale = np.array(3 * [0.25 * 2.0**-30] + [2.0**-30])
-    np.testing.assert_allclose(
-        found.numpy(), scale * (LOW * offsets[0, :, :4].astype(float) + offsets[0, :, 4:]), rtol=1e-6
-    )
-    left = sums.offset_fixed.numpy()[0]
-    assert not left[::2].any() and np.array_equal(left[1::2], offsets[0, 1::2])
+    np.testing.assert_allclose(found.numpy(), scale * offsets[1], rtol=1e-6)
+    offsets[1, ::2] = 0
+    np.testing.assert_array_equal(sums.offset_fixed.numpy(), offsets)
 
 
 @wp.kernel
