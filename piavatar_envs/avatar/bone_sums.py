@@ -20,7 +20,7 @@ GROUPS = wp.constant(8)
 
 
 #: Entries of a chunk that a thread asks for at once, in sums that wait for memory.
-AT_ONCE = wp.constant(4)
+AT_ONCE = wp.constant(2)
 
 
 @wp.func
@@ -76,7 +76,7 @@ def chunk_moments(
     store_sum16(moments, e, c, total, threads)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 8))
+@wp.kernel(launch_bounds=(BLOCK, 9))
 def sum_moments(
     body: Body,
     particles: Particles,
@@ -178,7 +178,7 @@ def chunk_corrections(
     store_sum12(corrections, e, c, total, threads)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 8))
+@wp.kernel(launch_bounds=(BLOCK, 9))
 def sum_corrections(
     body: Body,
     particles: Particles,
