@@ -24,8 +24,6 @@ from rich.markdown import Markdown
 from agents import compare
 from benchmarks.runner import describe_run, plain, write_json
 
-#: Agents that are not trained: the same in all runs of an environment.
-UNTRAINED = ("zero", "random")
 _COLUMNS = ("agent", "seeds", "return", "succeeds at the end", "at some time", "steps", "trained for")
 #: Returns of the same actions in the same episodes, on another device.
 _ALIKE = 1.0e-3
@@ -53,7 +51,7 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     for (env_id, script), group in sorted(groups.items()):
         for row in _rows(group):
             agent = row["case"] if row["case"] != "trained" else script
-            if agent in UNTRAINED:
+            if agent in compare.UNTRAINED:
                 twins = [r for r in rows if r["env_id"] == env_id and r["agent"].startswith(agent)]
                 if any(math.isclose(r["return_mean"], row["return_mean"], rel_tol=_ALIKE) for r in twins):
                     continue
@@ -78,7 +76,7 @@ def _rows(group: Mapping[str, Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]
         return compare.summarize(group)["results"]
     (run,) = group.values()
     trained = "training_s" in run
-    return [row | {"seeds": 1 if trained and row["case"] not in UNTRAINED else None} for row in run["results"]]
+    return [row | {"seeds": 1 if trained and row["case"] not in compare.UNTRAINED else None} for row in run["results"]]
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.acts import BALL_RADIUS, CHEST, ball
-from benchmarks.limbs import Options, critical_damping
+from benchmarks.limbs import Options, critical_damping, widest
 from benchmarks.stage import Act, Stage, keyed
 from piavatar_envs.avatar.muscles import spring_rows
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
@@ -80,10 +80,11 @@ def hit(options: Options, mass: float, stiffness: float) -> dict[str, Any]:
     before = subject_totals(stage, 1)
     stage.step()  # which builds the mass matrix; the ball is still on its way
     set_stiffness(stage, stiffness)
-    errors = []
+    errors, gaps = [], []
     for _ in range(FINER * options.steps):
         stage.step()
         errors.append(joint_errors(stage))
+        gaps.append(stage.gaps())
     errors, last = np.array(errors), max(1, round(SETTLING * len(errors)))
     body, after = subject_totals(stage, 0), subject_totals(stage, 1)
     lost = before.momentum - after.momentum
@@ -96,6 +97,7 @@ def hit(options: Options, mass: float, stiffness: float) -> dict[str, Any]:
         "ball_lost_n_s": float(np.linalg.norm(lost)),
         "mismatch_rel": float(np.linalg.norm(body.momentum - lost) / np.linalg.norm(lost)),
         "ball_speed_m_s": float(after.momentum[1] / after.mass),
+        **widest(gaps),
         "failed": bool(stage.simulation.state.failure.numpy()[0]),
     }
 
@@ -109,12 +111,14 @@ class Kick:
         toes: of the right foot, shape ``(T, 3)`` [m].
         pelvis: its velocity and spin, shape ``(T, 6)`` [m/s], [rad/s].
         support: force and torque of the springs that hold the pelvis, shape ``(T, 6)`` [N s], [N m s].
+        gaps: between bones, shape ``(T, 21)`` [m].
     """
 
     stage: Stage
     toes: np.ndarray
     pelvis: np.ndarray
     support: np.ndarray
+    gaps: np.ndarray
 
 
 def swing(options: Options, held: bool, *props: PropConfig) -> Kick:
@@ -122,14 +126,15 @@ def swing(options: Options, held: bool, *props: PropConfig) -> Kick:
     act = afloat("kick", *props, script=keyed(*SWING), drive={"root_assist": float(held)})
     stage = Stage(act, options.fidelity, options.device)
     drive, joints = stage.simulation.avatar.state, stage.simulation.avatar.joints.state
-    toes, pelvis, support = [], [], []
+    toes, pelvis, support, gaps = [], [], [], []
     for _ in range(round(KICK_SECONDS / stage.dt)):
         stage.step()
         toes.append(joints.position.numpy()[0, FOOT].copy())
         pelvis.append(joints.velocity.numpy()[0, :6].copy())
         wrench = np.r_[drive.wrench_force.numpy()[0], drive.wrench_torque.numpy()[0]]
         support.append(stage.dt * wrench)
-    return Kick(stage, np.array(toes), np.array(pelvis), np.array(support))
+        gaps.append(stage.gaps())
+    return Kick(stage, np.array(toes), np.array(pelvis), np.array(support), np.array(gaps))
 
 
 def kick(options: Options, mass: float, held: bool, alone: Kick) -> dict[str, Any]:
@@ -154,6 +159,8 @@ def kick(options: Options, mass: float, held: bool, alone: Kick) -> dict[str, An
         "pelvis_recoil_rad_s": float(np.linalg.norm(felt[:, 3:], axis=1).max()),
         "support_n_s": float(np.linalg.norm(change[:, :3].sum(0))),
         "support_peak_n": float(np.linalg.norm(change[:, :3], axis=1).max() / seen.stage.dt),
+        **widest(seen.gaps),
+        "gap_without_ball_mm": float(1e3 * alone.gaps.max()),
         "failed": bool(seen.stage.simulation.state.failure.numpy()[0]),
     }
 

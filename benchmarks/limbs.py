@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks import runner
-from benchmarks.rig import Rig, World
+from benchmarks.rig import Rig, World, joint_gaps
 from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.settings import DriveSettings
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, forward_kinematics, joint_index
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 
@@ -100,11 +102,18 @@ class Limbs:
         return (position[joint_index(f"{side}_wrist")] - position[joint_index(f"{side}_shoulder")]).astype(float)
 
     def gaps(self) -> np.ndarray:
-        """How far tracked joints are from where their parents have them [m], shape ``(21,)``."""
+        """How far joints are from where their parents have them, as the particles are now [m], shape ``(21,)``."""
         program = Program(self.rig.model.device)
         self.rig.avatar.record_tracking(program, self.rig.state)
         program.run()
-        return self.rig.pose_errors()["relative_translation"][0]
+        return joint_gaps(self.rig.avatar.tracked, self.rig.points.joints)[0]
+
+
+def widest(gaps: Sequence[np.ndarray]) -> dict[str, Any]:
+    """What a row says of the gaps ``(T, 21)`` [m] of a course: the largest, and of which joint."""
+    found = np.array(gaps)
+    joint = int(found.max(0).argmax())
+    return {"largest_gap_mm": float(1e3 * found.max()), "widest_joint": JOINT_NAMES[1 + joint]}
 
 
 def critical_damping(body: ArticulatedBody, stiffness: np.ndarray | float) -> np.ndarray:

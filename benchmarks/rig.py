@@ -16,6 +16,7 @@ from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
 from piavatar_envs.avatar.sampling import morph, sample_particles, spacing_for
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
+from piavatar_envs.avatar.types import Tracked
 from piavatar_envs.envs.simulation import GRID_PER_HEIGHT
 from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
@@ -196,16 +197,12 @@ class Rig:
             return Rotation.from_quat(array.numpy().reshape(-1, 4).astype(float))
 
         error = (rotation(tracked.local).inv() * rotation(drive.goal_rotation)).magnitude().reshape(n, NUM_JOINTS)
-        world = rotation(tracked.rotation).as_matrix().reshape(n, NUM_JOINTS, 3, 3)
-        position, parents = tracked.position.numpy().astype(float), np.asarray(PARENTS)[1:]
-        # where a joint sits in its parent's frame, against the fixed offset of the skeleton
-        offset = np.einsum("ebji,ebj->ebi", world[:, parents], position[:, 1:] - position[:, parents])
-        rest = self.points.joints[:, 1:] - self.points.joints[:, parents]
+        position = tracked.position.numpy()[:, 0].astype(float)
         return {
             "root_rotation": error[:, 0],
-            "root_translation": np.linalg.norm(position[:, 0] - drive.goal_root.numpy(), axis=1),
+            "root_translation": np.linalg.norm(position - drive.goal_root.numpy(), axis=1),
             "relative_rotation": error[:, 1:],
-            "relative_translation": np.linalg.norm(offset - rest, axis=2),
+            "relative_translation": joint_gaps(tracked, self.points.joints),
         }
 
     def strain(self) -> np.ndarray:
@@ -216,6 +213,21 @@ class Rig:
         F = matrices_of(self.state.F).astype(float)
         squared = np.linalg.eigvalsh(np.swapaxes(F, 2, 3) @ F)
         return np.linalg.norm(np.sqrt(np.maximum(squared, 0.0)) - 1.0, axis=2).mean(1)
+
+
+def joint_gaps(tracked: Tracked, joints: np.ndarray) -> np.ndarray:
+    """How far joints are from where their parents have them [m], shape ``(num_envs, 21)``.
+
+    Args:
+        tracked: bones as the particles have them.
+        joints: of the bodies at rest [m], shape ``(1 or num_envs, 22, 3)``.
+    """
+    position, parents = tracked.position.numpy().astype(float), np.asarray(PARENTS)[1:]
+    world = Rotation.from_quat(tracked.rotation.numpy().reshape(-1, 4).astype(float)).as_matrix()
+    world = world.reshape(len(position), NUM_JOINTS, 3, 3)
+    # where a joint sits in its parent's frame, against the fixed offset of the skeleton
+    offset = np.einsum("ebji,ebj->ebi", world[:, parents], position[:, 1:] - position[:, parents])
+    return np.linalg.norm(offset - (joints[:, 1:] - joints[:, parents]), axis=2)
 
 
 @lru_cache(maxsize=64)

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from benchmarks.rig import joint_gaps
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.motion import Motion
 from piavatar_envs.avatar.motion.interpolation import ease
@@ -153,6 +154,11 @@ class Stage:
         self.steps_done += 1
         self._command("goal", self.act.script(self.steps_done * self.dt))
         self._step.run()
+
+    def gaps(self) -> np.ndarray:
+        """How far the avatar's joints are from where their parents have them [m], shape ``(21,)``."""
+        avatar = self.simulation.avatar
+        return joint_gaps(avatar.tracked, avatar.body.rest_joint.numpy().astype(float))[0]
 
     def _command(self, which: str, pose: Pose) -> None:
         state = self.simulation.avatar.state

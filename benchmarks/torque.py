@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import blows, runner, stability, timing
 from benchmarks.blows import afloat
-from benchmarks.limbs import Limbs, Options, critical_damping
+from benchmarks.limbs import Limbs, Options, critical_damping, widest
 from benchmarks.poses import random_pose
+from benchmarks.rig import joint_gaps
 from benchmarks.stage import Pose, Stage, standing
 from piavatar_envs.avatar import joint_motion, joint_stages, mass_pairs
 from piavatar_envs.avatar.asset import load_body
@@ -53,7 +54,7 @@ def flail(options: Options, rate: float) -> dict[str, Any]:
         limbs.program.run()
 
     row = {"case": f"free_float_{'attached' if rate > 0.0 else 'loose'}"}
-    return row | drift(options, limbs.rig.model, limbs.rig.state, step)
+    return row | drift(options, limbs.rig.model, limbs.rig.state, step, limbs.gaps)
 
 
 def flail_under_pd(options: Options, rates: tuple[float, float]) -> dict[str, Any]:
@@ -68,7 +69,7 @@ def flail_under_pd(options: Options, rates: tuple[float, float]) -> dict[str, An
     stage = Stage(act, options.fidelity, options.device)
     simulation = stage.simulation
     row = {"case": f"free_float_pd_{'attached' if rates[0] > 0.0 else 'loose'}"}
-    return row | drift(options, simulation.model, simulation.state, lambda _index: stage.step())
+    return row | drift(options, simulation.model, simulation.state, lambda _index: stage.step(), stage.gaps)
 
 
 def flailing(options: Options) -> list[np.ndarray]:
@@ -77,19 +78,23 @@ def flailing(options: Options) -> list[np.ndarray]:
     return [random_pose(rng)[0] * joints for _ in range(1 + options.steps // FLAIL_EVERY)]
 
 
-def drift(options: Options, model: Model, state: State, step: Callable[[int], None]) -> dict[str, Any]:
-    """How far the momenta of a body at rest go astray while ``step(index)`` moves it."""
-    start, scale, found = totals(model, state), 0.0, np.zeros(2)
+def drift(
+    options: Options, model: Model, state: State, step: Callable[[int], None], gaps: Callable[[], np.ndarray]
+) -> dict[str, Any]:
+    """How far the momenta of a body at rest go astray, and its bones apart, while ``step(index)`` moves it."""
+    start, scale, found, apart = totals(model, state), 0.0, np.zeros(2), []
     for index in range(options.steps):
         step(index)
         now = totals(model, state)
         scale = max(scale, now.momentum_scale)
         changes = now.momentum - start.momentum, now.angular_momentum - start.angular_momentum
         found = np.maximum(found, [np.linalg.norm(change) for change in changes])
+        apart.append(gaps())
     return {
         "linear_momentum_rel": found[0] / scale,
         "angular_momentum_rel": found[1] / scale,
         "momentum_scale": scale,
+        **widest(apart),
         "failed": bool(state.failure.numpy()[0]),
     }
 
@@ -116,7 +121,7 @@ def stretch_arms(options: Options, stiffness: float) -> dict[str, Any]:
     return {
         "case": f"t_pose_kp_{stiffness:g}",
         "arm_sag_deg": float(np.mean(sag)),
-        "largest_gap_mm": float(1e3 * limbs.gaps().max()),
+        **widest([limbs.gaps()]),
         "speed_m_s": float(np.abs(limbs.rig.state.u.numpy() + limbs.rig.state.vk.numpy()).max()),
         "failed": bool(limbs.rig.state.failure.numpy()[0]),
     }
@@ -155,7 +160,8 @@ def stand(options: Options, assist: float) -> dict[str, Any]:
     settings = {"control": "pd", "root_assist": assist, "fidelity": options.fidelity, "pose_noise": 0.0}
     env = BatchEnv(task(load_config(task.Config, None, settings)), 1, options.device)
     env.reset(seeds=[0])
-    tracked, state, dt = env.simulation.avatar.tracked, env.simulation.state, env.config.physics.control_dt
+    avatar, state, dt = env.simulation.avatar, env.simulation.state, env.config.physics.control_dt
+    tracked = avatar.tracked
     stood = 0.0
     for _ in range(round(STAND_SECONDS / dt)):
         env.step()
@@ -168,6 +174,7 @@ def stand(options: Options, assist: float) -> dict[str, Any]:
         "stood_s": stood,
         "tilt_deg": float(np.degrees(np.arccos(min(1.0, up)))),
         "speed_m_s": float(np.abs(state.u.numpy() + state.vk.numpy()).max()),
+        **widest([joint_gaps(tracked, avatar.body.rest_joint.numpy().astype(float))[0]]),
         "failed": bool(env.failure.numpy()[0]),
     }
 

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
 
-from benchmarks import runner, stability, torque
+from benchmarks import limbs, runner, stability, torque
 from benchmarks.limbs import Options
+from benchmarks.rig import joint_gaps
+from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, forward_kinematics, joint_index
 
 RESULTS = runner.ROOT / "benchmarks" / "results" / "torque.json"
 FLOATS = [f"free_float_{how}" for how in ("loose", "attached", "pd_loose", "pd_attached")]
@@ -85,6 +91,34 @@ def test_heavier_balls_take_more_and_fly_slower(rows):
         seen = [rows[f"kick_{mass}_{how}"] for mass in ("0.45", "1.5", "8")]
         assert np.all(np.diff([row["ball_n_s"] for row in seen]) > 0.0)
         assert np.all(np.diff([row["ball_m_s"] for row in seen]) < 0.0)
+
+
+def test_bones_gape_little_where_they_rest_and_more_where_they_are_struck(rows):
+    assert rows["t_pose_kp_1000"]["largest_gap_mm"] < rows["t_pose_kp_50"]["largest_gap_mm"]
+    for row in (rows[case] for case in CASES if case.startswith(("free", "ball", "kick", "t_pose", "stand"))):
+        assert 0.0 < row["largest_gap_mm"] < 100.0 and row["widest_joint"] in JOINT_NAMES[1:]
+    for kp in (100, 300, 1000):
+        assert rows[f"ball_8_kp_{kp}"]["largest_gap_mm"] > rows[f"ball_0.45_kp_{kp}"]["largest_gap_mm"]
+    for how in ("floating", "held"):
+        assert rows[f"kick_8_{how}"]["largest_gap_mm"] >= rows[f"kick_8_{how}"]["gap_without_ball_mm"]
+
+
+def test_a_gap_is_what_a_joint_is_off_its_parent():
+    """A bent body without gaps, but for an elbow that is moved: that joint is off, and the wrist is off the elbow."""
+    rest = load_body().mean_body().joints.astype(float)
+    turns = Rotation.from_rotvec(np.random.default_rng(0).normal(0.0, 0.4, (len(JOINT_NAMES), 3)))
+    world, position = forward_kinematics(turns.as_matrix(), np.array([0.3, -0.2, 1.1]), rest)
+    elbow, moved = joint_index("left_elbow"), np.array([0.0, 0.003, -0.004])
+    position[elbow] += moved
+    tracked = SimpleNamespace(
+        rotation=wp.array(Rotation.from_matrix(world).as_quat()[None].astype(np.float32), dtype=wp.quat, device="cpu"),
+        position=wp.array(position[None].astype(np.float32), dtype=wp.vec3, device="cpu"),
+    )
+    gaps = joint_gaps(tracked, rest[None])[0]
+    off = [elbow - 1, joint_index("left_wrist") - 1]
+    np.testing.assert_allclose(gaps[off], 0.005, atol=1e-6)
+    np.testing.assert_allclose(np.delete(gaps, off), 0.0, atol=1e-6)
+    assert limbs.widest([0.5 * gaps, gaps])["largest_gap_mm"] == pytest.approx(5.0, abs=1e-3)
 
 
 def test_halving_finds_an_edge():

@@ -40,6 +40,18 @@ def test_runs_of_several_seeds_become_one_table(runs, tmp_path, capsys):
     assert "trained with 3 seeds" in shown and "zero" in shown and "random" in shown
 
 
+def test_the_untrained_are_no_sample_where_round_off_sets_them_apart(runs):
+    """Runs of other devices or commits: the same episodes and actions are not several agents."""
+    reports = [json.loads((run / "results.json").read_text()) for run in runs]
+    for report in reports[1:]:
+        for row in report["results"]:
+            row["return_mean"] += 1e-6
+    zero, random, trained = compare.summarize(dict(zip("abc", reports, strict=True)))["results"]
+    assert zero == {**reports[0]["results"][0], "seeds": None}
+    assert random == {**reports[0]["results"][1], "seeds": None}
+    assert trained["seeds"] == 3
+
+
 def test_how_often_a_training_is_saved_does_not_matter(runs):
     first, second = (json.loads((run / "results.json").read_text()) for run in runs[:2])
     second["config"]["checkpoint_every"] = 12345
