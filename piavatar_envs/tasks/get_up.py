@@ -12,6 +12,7 @@ from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.config import DriveConfig, EnvConfig
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.mpm.types import row
@@ -35,6 +36,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: How far the assisted pelvis is led: upwards [m] and towards upright [rad].
 LEAD, LEAD_TURN = wp.constant(0.15), wp.constant(0.3)
+#: Room to each side, besides what a fall takes: bodies that have got up seldom stand still at once [m].
+ASIDE = 3.0
 
 
 class GetUpConfig(EnvConfig):
@@ -159,6 +162,10 @@ there is nothing to be learnt."""
 
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         return (Drawn(self.lies_up),)
+
+    def domain(self) -> Domain:
+        places = [avatar.position for avatar in self.scene.avatars]
+        return Domain().around([(x + way, y + way) for x, y, *_ in places for way in (-ASIDE, ASIDE)])
 
     def allocate(self, env) -> None:
         n, device, config = env.num_envs, env.device, self.config

@@ -152,3 +152,17 @@ def test_assistance_lifts_a_lying_body(make_env):
         env.reset(seed=0)
         heights[share] = [env.step(still(env))[4]["pelvis_height"] for _ in range(60)]
     assert max(heights[0.0][20:]) < 0.25 and max(heights[1.0]) > 0.5
+
+
+def test_there_is_room_to_wander(make_env):
+    """A body 4 m from where it began goes on as it would there; policies that had got up left the world."""
+    env = make_env(GET_UP, pose_noise=0.0)
+    env.reset(seed=0)
+    state = env.get_state()
+    placed = ("particles.x", "joints_0.position", "tracked_0.position", "drive_0.goal_root", "drive_0.command_root")
+    away = np.array([4.0, -4.0, 0.0], np.float32)
+    env.set_state({name: value + away if name in placed else value for name, value in state.items()})
+    for _ in range(3):
+        _, _, terminated, _, info = env.step(still(env))
+        assert not terminated and info["failure"] is None
+    np.testing.assert_allclose(env.get_state()["particles.x"].mean(axis=(0, 1))[:2], away[:2], atol=0.3)
