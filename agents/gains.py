@@ -81,7 +81,9 @@ def gains_for(
     return Gains(*columns, limit=limit if limit.ndim == 2 else limit[:, None], inertia=load.inertia[:, None])
 
 
-def gains_by_strength(limit: np.ndarray, stiffness: float, damping_time: float, integral_time: float = np.inf) -> Gains:
+def gains_by_strength(
+    limit: np.ndarray, stiffness: float, damping_time: float, integral_time: float | np.ndarray = np.inf
+) -> Gains:
     """Gains by how strong a joint is, which follows what it has to bear: those of a body that stands on its legs.
 
     There what hangs on a joint is not what it carries. How light it is matters to a controller that acts in steps all
@@ -91,7 +93,7 @@ def gains_by_strength(limit: np.ndarray, stiffness: float, damping_time: float, 
         limit: largest torques [N m], ``(joints, 3)``.
         stiffness: share of the largest torque of a joint about any axis that an error of 1 rad asks for [1/rad].
         damping_time: ``kd / kp`` [s].
-        integral_time: ``kp / ki`` [s]; infinite for no integral.
+        integral_time: ``kp / ki`` [s]; infinite for no integral. For all joints, or ``(joints, 1)``.
 
     Returns:
         Gains for a controller of shape ``(n, joints, 3)``.

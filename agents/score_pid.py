@@ -7,7 +7,7 @@ which ``agents.scores`` takes as it takes those of trainings.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import tyro
@@ -16,7 +16,7 @@ from agents.batches import in_every_seat, play_beside_baselines
 from agents.command import read_options
 from agents.config import EvaluationSettings
 from agents.film import check_every, film
-from agents.pid_agent import make_pid_agent
+from agents.pid_agent import Design, make_pid_agent
 from agents.report import conclude, versions
 from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
@@ -35,6 +35,8 @@ class Options:
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: how many episodes, and from which seed on
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    #: numbers of the controller
+    design: Design = field(default_factory=Design)
     #: folder to write to; by default runs/pid_ and the name of the task
     out: Path | None = None
     #: where to simulate
@@ -55,7 +57,7 @@ def main(args: list[str] | None = None) -> None:
         task_class = load_task(options.env_id)
         config = load_config(task_class.Config, {"control": "torque"}, parse_assignments(options.settings))
         batch = BatchedEpisodes(task_class(config), episodes, options.device)
-        agent = make_pid_agent(options.env_id, config.model_dump(mode="json"))
+        agent = make_pid_agent(options.env_id, config.model_dump(mode="json"), options.design)
     except (ConfigError, ValueError) as error:
         sys.exit(f"error: {error}")
     results = play_beside_baselines("PID", in_every_seat(agent), batch, first)
@@ -63,7 +65,7 @@ def main(args: list[str] | None = None) -> None:
     name = options.env_id.rpartition("/")[2].removesuffix("-v0")
     folder = options.out or Path("runs") / f"pid_{name}"
     folder.mkdir(parents=True, exist_ok=True)
-    settings = {"env_id": options.env_id, "env": config.model_dump(mode="json")}
+    settings = {"env_id": options.env_id, "env": config.model_dump(mode="json"), "design": asdict(options.design)}
     (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
     about = versions("score_pid", options.device) | {"seed": 0, "config": settings}
     conclude(folder, about, results, {}, "config.yaml, results.json")

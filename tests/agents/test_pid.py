@@ -298,6 +298,8 @@ def test_gains_by_strength_ask_for_the_whole_torque_at_one_angle():
     np.testing.assert_allclose(gains.kp * 0.5, [[100.0], [20.0]])  # at 1 / stiffness, about the strongest axis
     np.testing.assert_allclose(gains.kd, 0.1 * gains.kp)
     np.testing.assert_allclose(gains.ki, gains.kp / 4.0)
+    of_one = gains_by_strength(limit, 2.0, 0.1, np.array([[4.0], [np.inf]]))
+    np.testing.assert_allclose(of_one.ki, gains.kp * [[0.25], [0.0]])
     strong = PID(gains, 0.01, (1, 2, 3)).step(np.full((1, 2, 3), 0.6), np.zeros((1, 2, 3)))
     np.testing.assert_allclose(strong[0], limit)
 

@@ -7,8 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import agents.pid_agent
-from agents.pid_agent import Design, PIDAgent, make_pid_agent
+from agents.pid import motion_poses
+from agents.pid_agent import Design, PIDAgent, make_pid_agent, rest_poses
+from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.limits import joint_limits
+from piavatar_envs.avatar.motion import load_motion
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import load_config
@@ -52,6 +55,12 @@ def standing(device):
 def held(device):
     """A body whose pelvis is held."""
     return make(1, device, fidelity="tiny", root_assist=1.0, pose_noise=0.0)
+
+
+def missing(env: BatchEnv, target: np.ndarray) -> np.ndarray:
+    """Angles of the first environment's joints from a pose ``(21, 3)`` [rad], ``(21,)``."""
+    local = Rotation.from_quat(env.simulation.avatar.tracked.local.numpy()[0, 1:])
+    return (local.inv() * Rotation.from_rotvec(target)).magnitude()
 
 
 def alone(matrix: np.ndarray, torque: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
@@ -103,17 +112,20 @@ def test_joints_go_to_the_pose_that_is_asked_for_and_follow_one_that_moves(held)
     goal[places] = np.random.default_rng(0).uniform(0.5 * lower, 0.5 * upper)[places]
 
     def errors(target: np.ndarray) -> np.ndarray:
-        local = Rotation.from_quat(held.simulation.avatar.tracked.local.numpy()[0, 1:])
-        return (local.inv() * Rotation.from_rotvec(target)).magnitude()[places]
+        return missing(held, target)[places]
 
     def share(times: np.ndarray) -> np.ndarray:
         return 1.0 - np.cos(np.minimum(times, 1.5) * np.pi / 1.5)  # there and back is one second and a half each
 
-    design = Design(integral_time=2.0)
-    agent = PIDAgent(held, design, lambda times: np.broadcast_to(goal, (len(times), *goal.shape)))
-    play(held, agent, 2.0, np.array([0]))
+    def hold(times: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(goal, (len(times), *goal.shape))
+
+    play(held, PIDAgent(held, poses=hold), 2.0, np.array([0]))
     assert errors(0.0 * goal).mean() > 0.4
     assert errors(goal).mean() < 0.1 and errors(goal).max() < 0.25
+    steady = errors(goal).mean()
+    play(held, PIDAgent(held, Design(integral_time=np.inf), hold), 2.0, np.array([0]))
+    assert errors(goal).mean() > 1.2 * steady
     moving = PIDAgent(held, poses=lambda times: 0.5 * share(times)[:, None, None] * goal)
     play(held, moving, 0.9, np.array([0]))
     now = 0.5 * share(np.array([0.9]))[0] * goal
@@ -136,6 +148,65 @@ def test_bodies_know_nothing_of_each_other_and_rounds_begin_anew(standing):
     assert np.abs(many(seen[0]) - first).max() > 1e-3  # it remembers
     many.begin(len(SEEDS))
     np.testing.assert_array_equal(many(seen[0]), first)
+
+
+def test_only_joints_above_the_legs_have_an_integral(standing):
+    agent = PIDAgent(standing)
+    agent.begin(1)
+    ki = np.broadcast_to(agent.pid.pid.gains.ki, (NUM_JOINTS - 1, 1))[:, 0]
+    assert [name for name, gain in zip(JOINT_NAMES[1:], ki, strict=True) if gain > 0.0] == ABOVE
+    play(standing, agent, 0.2, SEEDS)
+    moved = np.abs(agent.pid.pid.integral).max(axis=(0, 2)) > 0.0
+    assert [name for name, integral in zip(JOINT_NAMES[1:], moved, strict=True) if integral] == ABOVE
+
+
+def test_the_gains_of_a_leg_go_with_its_load(standing, monkeypatch):
+    """Of one that is about to fall to a side, of one that stands, and of one that is in the air."""
+    agent, factors = PIDAgent(standing, Design(unloaded=0.25)), []
+    agent.begin(4)
+    step = agent.pid.step
+
+    def watched(*args, factor, **kwargs):
+        factors.append(np.broadcast_to(factor, (4, NUM_JOINTS - 1, 3)))
+        return step(*args, factor=factor, **kwargs)
+
+    monkeypatch.setattr(agent.pid, "step", watched)
+    standing.reset(seeds=SEEDS)
+    rows = np.repeat(standing.observation.numpy()[:1, 0].astype(float), 4, axis=0)
+    weight = agent.bones.mass.sum() * 9.81
+    root = Rotation.from_matrix(agent.posture(rows).rotation[0, 0])
+    for row, (speed, load) in enumerate([(1.0, 1.0), (-1.0, 1.0), (0.0, 1.0), (0.0, 0.0)]):  # left is +x
+        velocity = root.apply([speed, 0.0, 0.0], inverse=True)
+        rows[row, agent.layout["bone_velocities"].slice] = np.tile(velocity, NUM_JOINTS)
+        impulse = root.apply([0.0, 0.0, load * weight * agent.dt], inverse=True)
+        rows[row, agent.layout["ground_impulse"].slice] = impulse
+    agent(rows)
+    knees = [JOINT_NAMES.index(f"{side}_knee") - 1 for side in ("left", "right")]
+    to_left, to_right, still, in_air = factors[0][:, knees, 0]
+    np.testing.assert_allclose(to_left, [1.0, 0.25])
+    np.testing.assert_allclose(to_right, [0.25, 1.0])
+    assert still.max() == 1.0 and still.min() > 0.6
+    np.testing.assert_allclose(in_air, 0.25)
+    np.testing.assert_array_equal(factors[0][:, [JOINT_NAMES.index(name) - 1 for name in ABOVE]], 1.0)
+
+
+def test_it_follows_the_clip_that_the_task_shows(device):
+    """The pose and the rate that the motion itself has at every time, and the body with them."""
+    settings = {"fidelity": "tiny", "motion": "arm_wave", "root_assist": 1.0, "impulse": 0.0, "random_start": False}
+    env = make(1, device, "TrackMotion-v0", **settings)
+    motion = load_motion("arm_wave", load_body())
+    poses = motion_poses(motion, list(range(1, NUM_JOINTS)))
+    play(env, PIDAgent(env), 0.9, np.array([0]))
+    now = poses(np.array([0.9]))[0]
+    arm = JOINT_NAMES.index("left_shoulder") - 1
+    followed = missing(env, now)
+    play(env, PIDAgent(env, poses=rest_poses), 0.9, np.array([0]))
+    held = missing(env, now)
+    assert held[arm] > 0.6 > 0.2 > followed[arm]
+    assert followed.mean() < 0.5 * held.mean()
+    without = tuple(name for name in JOINT_NAMES[1:] if name != "left_shoulder")
+    play(env, PIDAgent(env, Design(followed=without)), 0.9, np.array([0]))
+    assert missing(env, now)[arm] > 0.6
 
 
 @pytest.mark.parametrize("task", ["PushRecovery-v0", "GetUp-v0", "Walk-v0", "TrackMotion-v0"])
