@@ -11,6 +11,7 @@ import warp as wp
 
 from piavatar_envs.mpm.boundaries import Collider, make_boundaries
 from piavatar_envs.mpm.fields import Fields
+from piavatar_envs.mpm.groups import begin_groups
 from piavatar_envs.mpm.materials import lame_parameters, material_index
 from piavatar_envs.mpm.memory import bound_slots, check_memory
 from piavatar_envs.mpm.shared_room import MOST_LISTED, MOST_PARTICLES, most_particles, suits_shared
@@ -257,6 +258,7 @@ def upload_points(points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, devic
     particles.volume, particles.mu, particles.lam = upload(points.volume, float), upload(mu, float), upload(lam, float)
     particles.material = upload(points.material, int)
     particles.field = upload(points.fields, int)
+    particles.groups = wp.array(begin_groups(points.fields), dtype=wp.vec2i, device=device)
     particles.seam = upload(np.zeros(count) if points.seam is None else points.seam, float)
     particles.sensor = upload(np.full(count, -1) if points.sensor is None else points.sensor, int)
     return particles
