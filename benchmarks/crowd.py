@@ -218,6 +218,7 @@ class Crowd:
             colliders=[Collider.plane((0.0, 0.0, 1.0), 0.0, FRICTION)],
             fields=Fields(tuple(range(count)), FRICTION, DENSITY, num_sensors=count * len(BODY_PARTS)),
             max_slots=count * estimate_slots(_one_a_cell(points.rest[0], scale.dx), None, scale.dx),
+            rest=np.tile(points.rest[0], (count, 1)),
             scatter=scatter,
         )
         self.state, self.scratch = allocate(self.model)

@@ -55,8 +55,9 @@ for (int c = 0; c < 3; ++c) {
 def in_group(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
     names = "CAPACITY REACH MORE LEFT FIRST HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT LOWEST HIGHEST RECORDS"
-    names += " MASSIVE NODES BRICK_WORDS SHARED KINEMATIC PLACE"
-    known = ", ".join(f"{name} = {int(globals()[name])}" for name in names.split())
+    names += " MASSIVE NODES BRICK_WORDS SHARED"
+    values = {name: globals()[name] for name in names.split()} | {"KINEMATIC": KINEMATIC, "PLACE": PLACE}
+    known = ", ".join(f"{name} = {int(value)}" for name, value in values.items())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
 
 
@@ -178,7 +179,8 @@ for (int n = threadIdx.x; n < bricks; n += blockDim.x) {
     if (num_fields > 1 && wp::index(blocks.fields, e, block) != 1 << field) within |= SHARED;
     room[MASSIVE + n] = within;
 }
-""")
+"""
+    )
 )
 def fetch_slots(grid: Grid, blocks: Blocks, num_fields: int, e: int, field: int):
     """Ask for the slots of the bricks' blocks, which nobody waits for before :func:`note_records`."""

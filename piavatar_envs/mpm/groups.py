@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from piavatar_envs.mpm.group_bricks import (
@@ -36,6 +35,7 @@ from piavatar_envs.mpm.group_bricks import (
     raise_most,
     widen_box,
 )
+from piavatar_envs.mpm.group_plan import THREADS, share_of
 from piavatar_envs.mpm.group_sums import put_down
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattered
@@ -61,29 +61,6 @@ from piavatar_envs.mpm.types import (
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls: a
 # warp with a few particles waits for its instructions as much as for its numbers
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
-
-#: Particles of a group, at most, a thread each.
-THREADS = 128
-#: Up to how many particles of an environment a group has so many: smaller worlds fill a GPU with small groups only. The
-#: numbers must not depend on the batch: units do on the group.
-SHARES = ((16384, 32), (65536, 64), (2**31, THREADS))
-
-
-def share_of(per_env: int) -> int:
-    """Particles of a group, at most, where an environment has ``per_env``."""
-    return next(share for most, share in SHARES if per_env <= most)
-
-
-def begin_groups(field: np.ndarray) -> np.ndarray:
-    """First particles and velocity fields of groups, ``(G + 1, 2)`` int32, of particles of velocity fields ``field``.
-
-    A group is of one field; the last row says where the others end.
-    """
-    share, changes = share_of(len(field)), np.flatnonzero(np.diff(field)) + 1
-    bounds = np.concatenate([[0], changes, [len(field)]])
-    first = np.concatenate([np.arange(*ends, share) for ends in zip(bounds[:-1], bounds[1:], strict=True)])
-    begins = np.append(first, len(field))
-    return np.column_stack([begins, np.append(field[first], 0)]).astype(np.int32)
 
 
 @wp.func
@@ -236,9 +213,7 @@ def runs_to_grid(
     at = wp.vec3i(e, p, begins[1])
     goes_on = bool(True)
     while goes_on:
-        left = scatter_turn(
-            grid, step, particles, moving, blocks, failure, sums, contact.num_fields, at, left, near
-        )
+        left = scatter_turn(grid, step, particles, moving, blocks, failure, sums, contact.num_fields, at, left, near)
         goes_on = word(LEFT) != 0
         if goes_on:
             meet()
