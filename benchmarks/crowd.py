@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.asset import AvatarAsset, dense_weights, load_body, mesh_volume, top_weights
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
-from piavatar_envs.avatar.sampling import order_along_curve, sample_particles
+from piavatar_envs.avatar.sampling import order_along_curve, order_in_boxes, sample_particles
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_JOINTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.substeps import record_drive
@@ -121,6 +121,7 @@ def interior_body(count: int, seed: int = 0) -> tuple[BodyPoints, np.ndarray]:
     found = np.flatnonzero(particles.bone < 0)
     dropped = np.random.default_rng(seed).choice(found, len(particles) - count, replace=False)
     keep = np.setdiff1d(np.arange(len(particles)), dropped)
+    keep = keep[order_in_boxes(particles.rest_positions[keep])]
     volume = particles.volumes[keep].astype(np.float64)
     volume = (volume * (particles.volumes.sum(dtype=np.float64) / volume.sum())).astype(np.float32)
     joints, weights = particles.skin_joints[keep], particles.skin_weights[keep]
@@ -217,6 +218,7 @@ class Crowd:
             colliders=[Collider.plane((0.0, 0.0, 1.0), 0.0, FRICTION)],
             fields=Fields(tuple(range(count)), FRICTION, DENSITY, num_sensors=count * len(BODY_PARTS)),
             max_slots=count * estimate_slots(_one_a_cell(points.rest[0], scale.dx), None, scale.dx),
+            rest=np.tile(points.rest[0], (count, 1)),
             scatter=scatter,
         )
         self.state, self.scratch = allocate(self.model)

@@ -22,6 +22,7 @@ SPACING_PER_DX = 0.57  # lattice spacing over grid spacing: about 5 particles a 
 SUBDIVISIONS = 3  # points per axis and cell that decide how much of it is inside
 MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
 SMALL_BODY = 8192  # particles up to which they are in the order of their bones
+BOXES = (128, 64, 32)  # particles that lie together in larger ones, as many as P2G takes together or a warp has
 LINK_LENGTH = 1.8  # of a link between neighbouring particles, over the spacing
 SHELL = 0.75  # depth of the particles that simply follow the skin, over the spacing
 INSET = 0.05  # depth of a particle that a change of shape would leave outside, over the spacing
@@ -110,7 +111,8 @@ def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rin
     skin_joints, skin_weights = top_weights(_local(weights))
     volumes = _volumes(positions, bone, interior, mesh_volume(asset.vertices, asset.faces))
     depth = np.maximum(-distance, 0.0)
-    order = order_by_bones(skin_joints, skin_weights)
+    small = len(positions) <= SMALL_BODY
+    order = order_by_bones(skin_joints, skin_weights) if small else order_in_boxes(positions)
     links = np.argsort(order).astype(np.int32)[links]
     first = (positions, volumes, skin_joints, skin_weights, bone)
     rest = (anchors, coordinates, shell, depth)
@@ -235,11 +237,29 @@ def order_by_bones(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndar
     """Order ``(P,)`` in which particles of one bone come first, then those of two, and so on; else it stays.
 
     Threads that work together then blend as many bones, and mostly the same: one that blends four makes 31 others wait.
-    Large bodies stay as they are: their neighbours are alike anyway, and their P2G adds up by cells what lies together.
+    Neighbours of large bodies are alike anyway, see :func:`order_in_boxes`.
     """
-    if len(skin_joints) > SMALL_BODY:
-        return np.arange(len(skin_joints))
     return np.lexsort((skin_joints[:, 0], (skin_weights > 0.0).sum(axis=1)))
+
+
+def order_in_boxes(positions: np.ndarray) -> np.ndarray:
+    """Order ``(P,)`` in which each ``BOXES[0]`` particles have a compact box of their own, each ``BOXES[1]`` in it, ...
+
+    Boxes are halved along their longest edge; in the smallest, particles stay as they are. The P2G of large bodies
+    takes so many together and adds up on the nodes of the box around them, which a curve's jumps would make large.
+    """
+
+    def halve(inside: np.ndarray, level: int) -> list[np.ndarray]:
+        while level < len(BOXES) and len(inside) <= BOXES[level]:
+            level += 1
+        if level == len(BOXES):
+            return [np.sort(inside)]
+        along = positions[inside, np.ptp(positions[inside], axis=0).argmax()]
+        order = inside[np.argsort(along, kind="stable")]
+        lower = BOXES[level] * -(-len(order) // (2 * BOXES[level]))
+        return halve(order[:lower], level) + halve(order[lower:], level)
+
+    return np.concatenate(halve(np.arange(len(positions)), 0))
 
 
 def _links(

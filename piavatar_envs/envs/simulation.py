@@ -107,6 +107,7 @@ class Simulation:
             colliders=self.subjects.colliders,
             fields=self.subjects.fields,
             max_slots=estimate_slots(rest, self.subjects.matter.field, self.dx),
+            rest=rest,
             sound_speed=wave,
         )
         self.state, self.scratch = allocate(self.model)

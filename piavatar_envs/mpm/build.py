@@ -11,6 +11,7 @@ import warp as wp
 
 from piavatar_envs.mpm.boundaries import Collider, make_boundaries
 from piavatar_envs.mpm.fields import Fields
+from piavatar_envs.mpm.group_plan import begin_groups
 from piavatar_envs.mpm.materials import lame_parameters, material_index
 from piavatar_envs.mpm.memory import bound_slots, check_memory
 from piavatar_envs.mpm.shared_room import MOST_LISTED, MOST_PARTICLES, most_particles, suits_shared
@@ -163,16 +164,18 @@ def build_model(
     fields: Fields | None = None,
     sound_speed: float | None = None,
     max_slots: int | None = None,
+    rest: np.ndarray | None = None,
     scatter: str | None = None,
 ) -> Model:
     """Constants of a simulation on ``device``.
 
     ``num_substeps`` is chosen from the CFL limit unless given; the limit comes from the points, or from
     ``sound_speed`` [m/s] where parameters will be randomised. ``max_slots`` bounds the blocks with matter of an
-    environment, each field's counted; if not given, no state can exceed it. ``scatter`` is a key of ``SCATTERS``;
-    if not given, ``"shared"`` on a GPU whose shared memory holds an environment's grid; on another one that can match
-    within a warp, ``"singles"`` where ``max_slots`` says that few particles share a block of nodes, else ``"runs"``;
-    else ``"plain"``.
+    environment, each field's counted; if not given, no state can exceed it. ``rest``, shape ``(P, 3)``, is where
+    particles are when their body is at rest [m]; on a GPU, those of large bodies are added up by compact groups then.
+    ``scatter`` is a key of ``SCATTERS``; if not given, ``"shared"`` on a GPU whose shared memory holds an environment's
+    grid; on another one that can match within a warp, ``"singles"`` where ``max_slots`` says that few particles share a
+    block of nodes, else ``"runs"``; else ``"plain"``.
 
     Raises:
         ValueError: bad material, unstable time step, a scatter that the device does not know, or more memory than it
@@ -201,7 +204,7 @@ def build_model(
         device=device,
         grid=grid,
         step=step,
-        particles=upload_points(points, mu, lam, device),
+        particles=upload_points(points, mu, lam, rest, grid.dx, device),
         boundaries=make_boundaries(colliders, fields.num_fields, num_envs, device),
         contact=fields.upload(grid.dx, num_envs, device),
         num_substeps=num_substeps,
@@ -245,8 +248,10 @@ def choose_scatter(
     return scatter
 
 
-def upload_points(points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, device: str) -> Particles:
-    """Per-particle constants on the device."""
+def upload_points(
+    points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, rest: np.ndarray | None, dx: float, device: str
+) -> Particles:
+    """Per-particle constants on the device; ``rest`` and ``dx`` as for :func:`begin_groups`."""
     particles, count = Particles(), points.num_particles
 
     def upload(value, dtype):
@@ -257,6 +262,7 @@ def upload_points(points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, devic
     particles.volume, particles.mu, particles.lam = upload(points.volume, float), upload(mu, float), upload(lam, float)
     particles.material = upload(points.material, int)
     particles.field = upload(points.fields, int)
+    particles.groups = wp.array(begin_groups(points.fields, rest, dx), dtype=wp.vec2i, device=device)
     particles.seam = upload(np.zeros(count) if points.seam is None else points.seam, float)
     particles.sensor = upload(np.full(count, -1) if points.sensor is None else points.sensor, int)
     return particles

@@ -1,15 +1,12 @@
 """The nodes of a group of particles in the shared memory of its CUDA block, in CUDA: where they lie.
 
-They lie in bricks of 2 x 2 x 2 nodes, numbered as they come. A brick's key says where it is on the grid and of which
-velocity field; a sparse table, where hardly any two keys meet, leads from keys to numbers. So it does not matter how a
-group lies. Particles of a warp that lie in the same brick list it once, and all threads look the neighbors of what is
-listed up. Numbers depend on who comes first, sums do not: integers are added, and whether there is room depends on how
-many bricks there are.
+They are those of a box around the particles' stencils, in bricks of 2 x 2 x 2 nodes, so where a node is follows from
+where it is on the grid. A group whose box has too many bricks goes in turns: each takes the particles that are near the
+first of those that are left, and a box around that one. Whose turn comes when depends on the particles' places only.
 
-Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; the table of keys, and of numbers in half
-words; of every brick its key, later its field, its record, and which nodes have got mass; four sums of every node, one
-after the other; where in the table the bricks are that were looked up, in half words; what is handed to other threads,
-first the list of bricks.
+Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; of every brick its record, and which nodes have
+got mass; four sums of every node, one brick after the other. A brick has a word in each of the 32 banks, as in
+:mod:`piavatar_envs.mpm.shared_grid`.
 """
 
 from __future__ import annotations
@@ -17,39 +14,27 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.runs import KINEMATIC, PLACE
-from piavatar_envs.mpm.shared_memory import APPEND, native
-from piavatar_envs.mpm.transfer import Scattered
-from piavatar_envs.mpm.types import Blocks, Grid
+from piavatar_envs.mpm.shared_grid import BRICK_WORDS
+from piavatar_envs.mpm.shared_memory import native
+from piavatar_envs.mpm.types import Blocks, Grid, vec8i
 
 wp.set_module_options({"enable_backward": False})
 
-#: Bricks that there is room for: a multiprocessor of 228 KB holds six groups.
-CAPACITY = wp.constant(184)
-#: Places of the table, a power of two: with so many more than bricks, a key is mostly found at the first.
-TABLE_BITS = wp.constant(9)
-TABLE = wp.constant(1 << int(TABLE_BITS))
-#: Particles of a group, at most; so many threads it has, whatever their number.
-THREADS = wp.constant(128)
-#: Particles of a group of which a thread takes a plane of nodes instead, at most.
-MOST_SPLIT = wp.constant(int(THREADS) // 2)
-#: Words of the header: how many bricks there are, or more than there is room for; bits of what else is added up; how
-#: many bricks are listed whose neighbors are sought; and of each of up to 32 fields, the most that a particle has of
-#: mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units.
-COUNT, MORE, LISTED = (wp.constant(n) for n in range(3))
-HEAVIEST, FASTEST, DRIVEN = (wp.constant(n) for n in (4, 36, 68))
-MASS_UNIT, MOMENTUM_UNIT = (wp.constant(n) for n in (100, 132))
-KEYS = wp.constant(164)
-NUMBERS = wp.constant(int(KEYS) + int(TABLE))
-BRICKS = wp.constant(int(NUMBERS) + int(TABLE) // 2)
-RECORDS = wp.constant(int(BRICKS) + int(CAPACITY))
+#: Bricks that there is room for, enough for a box of ``REACH`` grid spacings to each side of a particle.
+CAPACITY = wp.constant(128)
+REACH = wp.constant(3)
+#: Words of the header: bits of what else is added up; whether some particles are left for another turn; the first of
+#: these; the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units;
+#: the least and the greatest lowest node of a stencil, along three axes.
+MORE, LEFT, FIRST = (wp.constant(n) for n in range(3))
+HEAVIEST, FASTEST, DRIVEN = (wp.constant(n) for n in range(3, 6))
+MASS_UNIT, MOMENTUM_UNIT = (wp.constant(n) for n in (6, 7))
+LOWEST, HIGHEST = (wp.constant(n) for n in (8, 12))
+RECORDS = wp.constant(16)
 MASSIVE = wp.constant(int(RECORDS) + int(CAPACITY))
-NODES = wp.constant(int(MASSIVE) + int(CAPACITY))
-#: From a sum of a node to its next; the four of eight nodes lie in 32 banks.
-ALONG = wp.constant(8 * int(CAPACITY) + 8)
-FOUND = wp.constant(int(NODES) + 4 * int(ALONG))
-HANDED = wp.constant(int(FOUND) + 4 * int(THREADS))
+NODES = wp.constant(-(-(int(MASSIVE) + int(CAPACITY)) // 32) * 32)
 #: Words of a room.
-WORDS = wp.constant(int(HANDED) + 21 * int(MOST_SPLIT))
+WORDS = wp.constant(int(NODES) + int(BRICK_WORDS) * int(CAPACITY))
 #: Units of the most that a particle has.
 UNITS = wp.constant(float(2**25))
 #: What a brick's record has besides it, if there is matter of another field in its block.
@@ -57,12 +42,20 @@ SHARED = wp.constant(1 << 30)
 
 #: The least power of two that is not below the positive number in a word.
 POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fffff) & 0x7f800000); };"
+#: How many bricks a box has along each axis, none if nobody is in it.
+SIZE = """
+int lowest[3], size[3];
+for (int c = 0; c < 3; ++c) {
+    lowest[c] = room[LOWEST + c] >> 1;
+    size[c] = max((room[HIGHEST + c] + 2 >> 1) - lowest[c] + 1, 0);
+}
+"""
 
 
 def in_group(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
-    names = "CAPACITY TABLE_BITS TABLE COUNT LISTED HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT KEYS NUMBERS BRICKS"
-    names += " RECORDS MASSIVE NODES ALONG FOUND HANDED MOST_SPLIT SHARED"
+    names = "CAPACITY REACH MORE LEFT FIRST HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT LOWEST HIGHEST RECORDS"
+    names += " MASSIVE NODES BRICK_WORDS SHARED"
     values = {name: globals()[name] for name in names.split()} | {"KINEMATIC": KINEMATIC, "PLACE": PLACE}
     known = ", ".join(f"{name} = {int(value)}" for name, value in values.items())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
@@ -70,151 +63,144 @@ def in_group(cuda: str, otherwise: str = "") -> str:
 
 @wp.func_native(
     in_group("""
-const int lane = threadIdx.x & 31;
-const int some = __ffs(__ballot_sync(ALL, takes) | 1u << 31) - 1, of_some = __shfl_sync(ALL, field, some);
-const bool one = __all_sync(ALL, !takes || field == of_some);
-int mass = takes ? __float_as_int(s.at_base[0]) : 0, most = takes ? __float_as_int(momentum) : 0;
+if (threadIdx.x != 0) return;
+room[LEFT] = 0, room[FIRST] = 0x7fffffff;
+room[MORE] = driven ? 1 << KINEMATIC : 0;
+for (int c = 0; c < 3; ++c) room[LOWEST + c] = 0x7fffffff, room[HIGHEST + c] = -1;
+""")
+)
+def begin_turn(driven: bool):
+    """Nobody is in the box; kinematic momentum is added up everywhere where bodies are ``driven`` by its gradient."""
+    ...
+
+
+@wp.func_native(
+    in_group("""
+int mass = takes ? __float_as_int(scalar) : 0, most = takes ? __float_as_int(momentum) : 0;
 #if __CUDA_ARCH__ >= 800
-if (one) {
-    mass = __reduce_max_sync(ALL, mass), most = __reduce_max_sync(ALL, most);
-    takes = lane == 0;
-    field = of_some;
-}
+mass = __reduce_max_sync(ALL, mass), most = __reduce_max_sync(ALL, most);
+takes = (threadIdx.x & 31) == 0;
 #endif
-int* const of_mass = room + HEAVIEST + field;
-int* const of_vector = room + (kind == 0 ? FASTEST : DRIVEN) + field;
-if (takes && mass > *of_mass) atomicMax(of_mass, mass);  // it is 0 where it is not asked for
+int* const of_vector = room + (kind == 0 ? FASTEST : DRIVEN);
+if (takes && mass > room[HEAVIEST]) atomicMax(room + HEAVIEST, mass);  // it is 0 where it is not asked for
 if (takes && most > *of_vector) atomicMax(of_vector, most);
 """)
 )
-def raise_most(takes: bool, field: int, kind: int, s: Scattered, momentum: float):
+def raise_most(takes: bool, kind: int, scalar: float, momentum: float):
     """See that the group's units are large enough for a particle's momenta; all threads of a warp come here."""
     ...
 
 
 @wp.func_native(
-    in_group(
-        APPEND
-        + """
-const int lane = threadIdx.x & 31, i = base[0], j = base[1], k = base[2];
-const unsigned block = field * grid.num_blocks + ((i >> 2) * grid.blocks[1] + (j >> 2)) * grid.blocks[2] + (k >> 2);
-const unsigned own = takes ? 8u * block + ((i & 2) << 1) + (j & 2) + ((k & 2) >> 1) + 1 : 0u;  // 0 is for nobody's
-if (!__any_sync(ALL, takes)) return 0;
-const int first = __ffs(__match_any_sync(ALL, own)) - 1;
-const bool is_first = takes && first == lane;
-const int place = append(room + LISTED, __ballot_sync(ALL, is_first), first);
-if (is_first) room[HANDED + place] = (int)own;
-return place;
-""",
-        "return 0;",
-    )
-)
-def list_brick(grid: Grid, takes: bool, field: int, base: wp.vec3i) -> int:
-    """List the brick that a stencil begins in, once a warp, for :func:`seek_bricks`; all threads of a warp come here.
-
-    Returns its place in the list, for :func:`bricks_found`.
-    """
-    ...
-
-
-@wp.func_native(
     in_group("""
-const int ny = grid.blocks[1], nz = grid.blocks[2], items = 8 * room[LISTED];
-volatile unsigned* const keys = reinterpret_cast<unsigned*>(room + KEYS);
-unsigned short* const numbers = reinterpret_cast<unsigned short*>(room + NUMBERS);
-unsigned short* const found_at = reinterpret_cast<unsigned short*>(room + FOUND);
-for (int item = threadIdx.x; item < items; item += blockDim.x) {
-    // when there are too many, it does not matter who they are; and the table is never full
-    if (*(volatile int*)(room + COUNT) > CAPACITY) break;
-    const int b = item & 7;
-    unsigned key = (unsigned)room[HANDED + (item >> 3)];
-    const unsigned lowest = key - 1u;
-    if (b & 4) key += lowest & 4u ? 8 * ny * nz - 4 : 4;
-    if (b & 2) key += lowest & 2u ? 8 * nz - 2 : 2;
-    if (b & 1) key += lowest & 1u ? 7 : 1;
-    unsigned at = key * 0x9e3779b1u >> (32 - TABLE_BITS), got;
-    while ((got = keys[at]) != key) {
-        if (got == 0u) {
-            got = atomicCAS((unsigned*)keys + at, 0u, key);
-            if (got == key) break;
-            if (got == 0u) {
-                const int number = atomicAdd(room + COUNT, 1);
-                if (number < CAPACITY) room[BRICKS + number] = (int)key;
-                numbers[at] = (unsigned short)number;
-                break;
-            }
-        }
-        at = at + 1 & TABLE - 1;
-    }
-    found_at[item] = (unsigned short)at;
+for (int c = 0; c < 3; ++c) {
+    int low = takes ? base[c] : 0x7fffffff, high = takes ? base[c] : -1;
+    bool tells = takes;
+#if __CUDA_ARCH__ >= 800
+    low = __reduce_min_sync(ALL, low), high = __reduce_max_sync(ALL, high);
+    tells = (threadIdx.x & 31) == 0;
+#endif
+    if (tells) atomicMin(room + LOWEST + c, low), atomicMax(room + HIGHEST + c, high);
 }
 """)
 )
-def seek_bricks(grid: Grid):
-    """See that the listed bricks and their upper neighbors have numbers, if there is room, a thread each of them.
+def widen_box(takes: bool, base: wp.vec3i):
+    """See that a stencil is in the box; all threads of a warp come here."""
+    ...
 
-    All threads of the group come here, and have met before; when they meet again, :func:`bricks_found` finds them.
+
+@wp.func_native(
+    in_group(
+        SIZE
+        + """
+const bool fits = (float)size[0] * (float)size[1] * (float)size[2] <= (float)CAPACITY;
+if (threadIdx.x == 0) room[LEFT] = !fits;
+if (fits) return takes;
+__syncthreads();  // all have seen it
+if (takes) atomicMin(room + FIRST, (int)threadIdx.x);
+__syncthreads();
+if (threadIdx.x == room[FIRST])
+    for (int c = 0; c < 3; ++c) {
+        room[LOWEST + c] = max(base[c] - REACH, 0);
+        room[HIGHEST + c] = min(base[c] + REACH, grid.nodes[c] - 3);
+    }
+__syncthreads();
+for (int c = 0; c < 3; ++c) takes = takes && base[c] >= room[LOWEST + c] && base[c] <= room[HIGHEST + c];
+return takes;
+""",
+        "return takes;",
+    )
+)
+def has_turn(grid: Grid, takes: bool, base: wp.vec3i) -> bool:
+    """Whether it is a particle's turn: that of all who take part, or of some, for whom the box is made smaller.
+
+    All threads come here, and have met since the box was widened. Whether some are left is in word ``LEFT``.
     """
     ...
 
 
 @wp.func_native(
     in_group(
-        """
-const int4 at = *reinterpret_cast<const int4*>(room + FOUND + 4 * place);
-const unsigned short* const numbers = reinterpret_cast<const unsigned short*>(room + NUMBERS);
-auto both = [=](int two) { return 8 * (numbers[two & 0xffff] | numbers[(unsigned)two >> 16] << 16); };
-return wp::vec_t<4, wp::int32>(both(at.x), both(at.y), both(at.z), both(at.w));
+        SIZE
+        + """
+const int along_y = BRICK_WORDS * size[2], along_x = along_y * size[1];
+const int first = NODES + ((base[0] >> 1) - lowest[0]) * along_x + ((base[1] >> 1) - lowest[1]) * along_y
+    + ((base[2] >> 1) - lowest[2]) * BRICK_WORDS;
+wp::vec_t<8, wp::int32> bricks;
+for (int n = 0; n < 8; ++n)
+    bricks[n] = first + (n & 4 ? along_x : 0) + (n & 2 ? along_y : 0) + (n & 1 ? BRICK_WORDS : 0);
+return bricks;
 """,
-        "return wp::vec_t<4, wp::int32>();",
+        "return wp::vec_t<8, wp::int32>();",
     )
 )
-def bricks_found(place: int) -> wp.vec4i:
-    """First nodes of the bricks of a stencil: for the lower and the upper along x and y, of the two along z in 16 bits.
-
-    Its own is at a ``place`` of the list; and there has been room for them, see :func:`seek_bricks`.
-    """
+def bricks_around(base: wp.vec3i) -> vec8i:
+    """Words at which the bricks of a stencil begin, that of its lowest node and its upper neighbors; z varies first."""
     ...
 
 
 @wp.func_native(
-    in_group("""
-for (int n = threadIdx.x; n < room[COUNT]; n += blockDim.x) {
-    const int held = (int)((unsigned)(room[BRICKS + n] - 1) >> 3);  // field and block
-    const int* const slot = &wp::index(blocks.slot, e, held);
+    in_group(
+        SIZE
+        + """
+const int bricks = size[0] * size[1] * size[2];
+for (int n = threadIdx.x; n < bricks; n += blockDim.x) {
+    const int line = n / size[2], plane = line / size[1];
+    const int i = lowest[0] + plane, j = lowest[1] + line - plane * size[1], l = lowest[2] + n - line * size[2];
+    const int block = ((i >> 1) * grid.blocks[1] + (j >> 1)) * grid.blocks[2] + (l >> 1);
+    int within = ((i & 1) << 5) + ((j & 1) << 3) + ((l & 1) << 1);
+    const int* const slot = &wp::index(blocks.slot, e, field * grid.num_blocks + block);
 #if __CUDA_ARCH__ >= 800
     const unsigned to = (unsigned)__cvta_generic_to_shared(room + RECORDS + n);
     asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" :: "r"(to), "l"(slot) : "memory");
 #else
     room[RECORDS + n] = *slot;
 #endif
+    if (num_fields > 1 && wp::index(blocks.fields, e, block) != 1 << field) within |= SHARED;
+    room[MASSIVE + n] = within;
 }
-""")
+"""
+    )
 )
-def fetch_slots(blocks: Blocks, e: int):
+def fetch_slots(grid: Grid, blocks: Blocks, num_fields: int, e: int, field: int):
     """Ask for the slots of the bricks' blocks, which nobody waits for before :func:`note_records`."""
     ...
 
 
 @wp.func_native(
-    in_group("""
-for (int n = threadIdx.x; n < room[COUNT]; n += blockDim.x) {
-    const int brick = room[BRICKS + n] - 1;
-    int record = ((brick & 4) << 3) + ((brick & 2) << 2) + ((brick & 1) << 1);
-    if (num_fields > 1) {
-        const int held = (int)((unsigned)brick >> 3), field = held / grid.num_blocks;
-        if (wp::index(blocks.fields, e, held - field * grid.num_blocks) != 1 << field) record |= SHARED;
-        room[BRICKS + n] = field;
-    }
+    in_group(
+        SIZE
+        + """
 #if __CUDA_ARCH__ >= 800
-    asm volatile("cp.async.wait_all;" ::: "memory");
+asm volatile("cp.async.wait_all;" ::: "memory");
 #endif
-    room[RECORDS + n] = record + 64 * room[RECORDS + n];
-}
-""")
+const int bricks = size[0] * size[1] * size[2];
+for (int n = threadIdx.x; n < bricks; n += blockDim.x) room[RECORDS + n] = 64 * room[RECORDS + n] + room[MASSIVE + n];
+"""
+    )
 )
-def note_records(grid: Grid, blocks: Blocks, num_fields: int, e: int):
-    """Find the record of every brick's first node, and whether its block is shared; its field takes its key's place.
+def note_records():
+    """Find the record of every brick's first node, and whether its block is shared.
 
     The slots are those that the same threads have fetched.
     """
@@ -225,13 +211,13 @@ def note_records(grid: Grid, blocks: Blocks, num_fields: int, e: int):
     in_group(
         """
 int all = 0;
-for (int n = 0; n < 4; ++n) all |= room[RECORDS + (bricks[n] & 0xffff) / 8] | room[RECORDS + (bricks[n] >> 16) / 8];
+for (int n = 0; n < 8; ++n) all |= room[RECORDS + (bricks[n] - NODES) / BRICK_WORDS];
 return (all & SHARED) != 0;
 """,
         "return false;",
     )
 )
-def is_shared(bricks: wp.vec4i) -> bool:
+def is_shared(bricks: vec8i) -> bool:
     """Whether a block of a particle's stencil has matter of another field."""
     ...
 

@@ -117,7 +117,7 @@ def record_scatter(program: Program, model: Model, state: State, scratch: Scratc
     elif m.scatter in ("singles", "singles_float"):
         record_singles(program, inputs, s.x.shape, s.failure, scratch.sums)
     else:
-        record_runs(program, inputs, s.x.shape, s.failure, scratch.sums)
+        record_runs(program, inputs, m.particles, s.failure, scratch.sums)
 
 
 def _moving(s: State) -> Moving:

@@ -258,6 +258,7 @@ template <class T, class F> T changed(T* at, F to)
 }
 template <class T, class V> T atomicAdd(T* at, V v) { return changed(at, [=](T b) { return (T)(b + (T)v); }); }
 template <class T, class V> T atomicMax(T* at, V v) { return changed(at, [=](T b) { return b > (T)v ? b : (T)v; }); }
+template <class T, class V> T atomicMin(T* at, V v) { return changed(at, [=](T b) { return b < (T)v ? b : (T)v; }); }
 template <class T, class V> T atomicOr(T* at, V v) { return changed(at, [=](T b) { return (T)(b | (T)v); }); }
 template <class T> T atomicCAS(T* at, T expected, T v) { return changed(at, [=](T b) { return b == expected ? v : b; }); }
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm import groups
+from piavatar_envs.mpm import group_plan
 from piavatar_envs.mpm.build import choose_scatter
 from piavatar_envs.mpm.memory import estimate_slots
 from piavatar_envs.mpm.program import Program
@@ -140,12 +140,12 @@ def test_scatters_agree(collide, scatter):
             np.testing.assert_allclose(other.get(array, e), plain.get(array, e), atol=atol, err_msg=array)
 
 
-@pytest.mark.parametrize("share", [21, 64, 128])
+@pytest.mark.parametrize("share", [32, 64, 128])
 def test_groups_of_any_size_agree(collide, device, monkeypatch, share):
-    """Of particles that one thread adds, or three; their units are their own."""
+    """Their units are their own, and some groups go in turns."""
     if device == "cpu":
         pytest.skip("groups are a GPU's")
-    monkeypatch.setattr(groups, "SHARES", ((2**31, share),))
+    monkeypatch.setattr(group_plan, "SHARES", ((2**31, share),))
     grouped, plain = collide(scatter="runs", max_slots=SLOTS).run(2), collide(scatter="plain").run(2)
     for e in range(3):
         for array, atol in zip(ARRAYS, (1e-5, 2e-3, 2e-1, 1e-3), strict=True):
@@ -311,3 +311,18 @@ def test_slots_do_not_grow_with_the_grid(simulate):
     near, far = simulate(margin=0.3).run(), simulate(margin=3.0).run()
     assert near.scratch.blocks.count.numpy()[0] <= 27 and far.scratch.blocks.count.numpy()[0] <= 27
     assert far.model.num_blocks > 20 * near.model.num_blocks
+
+
+def test_groups_are_compact_and_of_one_field():
+    """Two clouds of particles in one order, two fields: whoever is far from the others has a group of their own."""
+    rng = np.random.default_rng(7)
+    near, far = rng.uniform(0.0, 0.05, (200, 3)), rng.uniform(0.0, 0.05, (56, 3)) + [0.0, 2.0, 0.0]
+    rest, field = np.concatenate([near, far, near[:30]]), np.repeat([3, 1], [256, 30])
+    groups = group_plan.begin_groups(field, rest, 0.01)
+    begins, ends = groups[:-1, 0], groups[1:, 0]
+    assert begins[0] == 0 and ends[-1] == len(rest)
+    assert (np.diff(groups[:, 0]) > 0).all() and (ends - begins <= 32).all()
+    for begin, end, own in zip(begins, ends, groups[:-1, 1], strict=True):
+        assert (field[begin:end] == own).all()
+        assert np.ptp(rest[begin:end], axis=0).max() < 0.06
+    assert len(group_plan.begin_groups(field, None, 0.01)) - 1 == 8 + 1
