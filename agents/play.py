@@ -138,7 +138,10 @@ def main(args: list[str] | None = None) -> None:
     console = Console(highlight=False, soft_wrap=True)
     show_table([evaluation], console)
     if options.out:
-        about = versions("play", options.device) | {"run": options.run.name, "env": config.model_dump(mode="json")}
+        about = versions("play", options.device) | {
+            "run": options.run.resolve().name,
+            "env": config.model_dump(mode="json"),
+        }
         write_results(options.out, about, [evaluation], {"num_envs": episodes})
     if options.film:
         make = EnvFactory(run.env_id, config.model_dump(mode="json"), options.device)

@@ -5,6 +5,9 @@ one configuration that differ in their seed become one row (:mod:`agents.compare
 what no training changes (zero and random actions) stands in it once, unless an environment's settings change what an
 action means. Beside the JSON file comes the same as Markdown. Environments that none of the runs is about can keep the
 rows that an earlier table has of them (``--keep FILE.json``).
+
+A policy can be scored anew without training it anew: ``python -m agents.play RUN --out RUN/evaluation.json``. Its row
+then takes the place of the training's own; what the training took, and zero and random actions, stay as they were.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from agents import compare
+from agents.checkpoint import flattened
 from benchmarks.runner import describe_run, plain, write_json
 
 _COLUMNS = ("agent", "seeds", "return", "succeeds at the end", "at some time", "steps", "trained for")
@@ -148,6 +152,37 @@ def _read(path: Path) -> dict[str, Any]:
     return run
 
 
+def _read_run(folder: Path) -> dict[str, Any]:
+    """Its ``results.json``; with a later evaluation, that one's row of the policy, and all of it as ``evaluation``."""
+    run, path = _read(folder / "results.json"), folder / "evaluation.json"
+    if not path.is_file():
+        return run
+    evaluation = json.loads(path.read_text(encoding="utf-8"))
+    _check_evaluation(evaluation, run, folder, path)
+    (trained,) = evaluation["results"]
+    rows = [trained if row["case"] == "trained" else row for row in run["results"]]
+    return run | {"results": rows, "evaluation": evaluation}
+
+
+def _check_evaluation(evaluation: Mapping[str, Any], run: Mapping[str, Any], folder: Path, path: Path) -> None:
+    """Refuse what is no evaluation of this run's policy in the same episodes; a task is known by its settings."""
+    seeds = {row["case"]: row["first_seed"] for row in run["results"] if row["case"] == "trained"}
+    if not seeds:
+        raise ValueError(f"{path} is of a policy, but {folder / 'results.json'} has no row 'trained'; remove {path}")
+    # a run that is named by a link has the name of its folder
+    wanted = {"benchmark": "play", "run": folder.resolve().name}
+    wanted |= flattened({"env": run["config"]["env"], "first_seed": seeds})
+    found = {key: evaluation.get(key) for key in ("benchmark", "run")}
+    seeds = {row["case"]: row["first_seed"] for row in evaluation.get("results", ())}
+    found |= flattened({"env": evaluation.get("env", {}), "first_seed": seeds})
+    for key in wanted | found:
+        if found.get(key) != wanted.get(key):
+            raise ValueError(
+                f"{path} has {key}={found.get(key)!r}, of this run it would have {wanted.get(key)!r}; write it anew: "
+                f"python -m agents.play {folder} --out {path}"
+            )
+
+
 def _kept(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What an earlier table says of environments that ``rows`` are not about, with its devices and commits."""
     if path is None:
@@ -176,14 +211,15 @@ def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = tyro.cli(Options, prog="python -m agents.scores", args=args)
     try:
-        runs = {str(path): _read(path / "results.json") for path in options.runs}
+        runs = {str(path): _read_run(path) for path in options.runs}
         rows = scores(runs)
         kept = _kept(options.keep, rows)
     except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")
     rows = sorted([*kept["results"], *rows], key=lambda row: row["env_id"])
-    devices = sorted({run["device"]["name"] for run in runs.values()} | set(kept["devices"]))
-    commits = sorted({str(run["commit"])[:12] for run in runs.values()} | set(kept["commits"]))
+    measured = [*runs.values(), *(run["evaluation"] for run in runs.values() if "evaluation" in run)]
+    devices = sorted({one["device"]["name"] for one in measured} | set(kept["devices"]))
+    commits = sorted({str(one["commit"])[:12] for one in measured} | set(kept["commits"]))
     about = (
         f"{', '.join(devices)}; commits {', '.join(commits)}. Brackets are 95 % intervals: over seeds where there are "
         "several, else over episodes."

@@ -24,7 +24,7 @@ from agents.sb3_policy import PARAMETERS
 #: Rows of a curve, at most.
 ROWS = 1000
 #: What must be there, and what may.
-NEEDED, WELCOME = ("config.yaml", "results.json"), ("policy.pt", "curve.png")
+NEEDED, WELCOME = ("config.yaml", "results.json"), ("policy.pt", "curve.png", "evaluation.json")
 
 
 def main(

@@ -19,7 +19,7 @@ def run(tmp_path):
     """A training that has ended, as it lies in its folder."""
     folder = tmp_path / "runs" / "walk_1"
     folder.mkdir(parents=True)
-    for name in ("config.yaml", "results.json"):
+    for name in ("config.yaml", "results.json", "evaluation.json"):
         (folder / name).write_text(f"of {name}\n")
     rng = np.random.default_rng(2)
     rows = [f"{10 * n},{value:.6g}" for n, value in enumerate(rng.normal(100.0, 9.0, 4321), 1)]
@@ -39,7 +39,7 @@ def read(path):
 def test_what_is_kept_says_the_same(run, tmp_path):
     kept = tmp_path / "results" / "walk_1"
     assert keep_run.main((run,), kept.parent) == 0
-    for name in ("config.yaml", "results.json"):
+    for name in ("config.yaml", "results.json", "evaluation.json"):
         assert (kept / name).read_bytes() == (run / name).read_bytes()
     with zipfile.ZipFile(kept / "policy.zip") as content:
         assert content.namelist() == ["policy.pth"]

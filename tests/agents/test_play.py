@@ -12,7 +12,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra train")
 pytest.importorskip("stable_baselines3", reason="needs the extra train")
 
-from agents import play, train  # noqa: E402
+from agents import play, scores, train  # noqa: E402
 from agents.play import open_run  # noqa: E402
 from piavatar_envs.envs.config import ConfigError  # noqa: E402
 
@@ -39,12 +39,13 @@ def run_of(kind: str, folder, device: str) -> None:
 @pytest.mark.parametrize("kind", ["rsl", *SB3])
 def test_what_was_trained_plays_as_it_did(kind, device, tmp_path, capsys):
     run_of(kind, tmp_path / "run", device)
-    play.main([str(tmp_path / "run"), "--device", device, "--out", str(tmp_path / "again.json")])
-    then, now = (json.loads((tmp_path / name).read_text()) for name in ("run/results.json", "again.json"))
+    play.main([str(tmp_path / "run"), "--device", device, "--out", str(tmp_path / "run" / "evaluation.json")])
+    then, now = (json.loads((tmp_path / "run" / name).read_text()) for name in ("results.json", "evaluation.json"))
     (trained,) = (row for row in then["results"] if row["case"] == "trained")
     assert now["results"] == [trained], "the same episodes, the same actions"
     untrained = next(row for row in then["results"] if row["case"] == "zero")
     assert trained["return_mean"] != untrained["return_mean"]
+    scores.main([str(tmp_path / "run")])  # takes it for an evaluation of this run
 
 
 def test_settings_win_and_a_film_is_written(device, tmp_path, capsys):

@@ -23,7 +23,7 @@ def row(case: str, value: float, **more) -> dict:
 def run(script: str, env_id: str, seed: int, *rows: dict, seconds: float = 60.0) -> dict:
     return {
         "benchmark": script, "commit": "abc", "device": {"name": "some GPU"}, "versions": {}, "seed": seed,
-        "config": {"env_id": env_id, "seed": seed, "ppo": {"epochs": 5}},
+        "config": {"env_id": env_id, "seed": seed, "ppo": {"epochs": 5}, "env": {"physics": {"fidelity": "coarse"}}},
         "training_s": seconds, "train_steps": 2_000_000,
         "results": [row("zero", 3.0), row("random", 2.0), *rows],
     }  # fmt: skip
@@ -73,6 +73,52 @@ def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     assert "| 0 to 5 | 50% of 10 |" in text
     with pytest.raises(SystemExit, match=r"error: .*nowhere"):
         scores.main([str(tmp_path / "nowhere")])
+
+
+def later(folder, **more) -> None:
+    """Leave an evaluation of a run as ``agents.play`` does."""
+    about = {"benchmark": "play", "commit": "def", "device": {"name": "another GPU"}, "run": folder.name}
+    env = {"physics": {"fidelity": "coarse"}}
+    content = about | {"env": env, "results": [row("trained", 60.0, failures=1)]} | more
+    (folder / "evaluation.json").write_text(json.dumps(content))
+
+
+def test_a_later_evaluation_takes_the_place_of_the_trainings_own(runs, tmp_path, capsys):
+    for name in ("stand_0", "stand_1"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "results.json").write_text(json.dumps(runs[name]))
+    later(tmp_path / "runs" / "stand_0")
+    (tmp_path / "link").symlink_to(tmp_path / "runs" / "stand_0")
+    scores.main([str(tmp_path / "link"), str(tmp_path / "runs" / "stand_1"), "--out", str(tmp_path / "table.json")])
+    report = json.loads((tmp_path / "table.json").read_text())
+    *untrained, trained = report["results"]
+    assert trained["return_mean"] == 75.0 and trained["failures"] == 1, "60 in place of 80, beside 90"
+    assert trained["training_s"] == 70.0 and trained["train_steps"] == 2_000_000
+    assert [r["return_mean"] for r in untrained] == [2.0, 3.0]
+    assert report["commits"] == ["abc", "def"] and report["devices"] == ["another GPU", "some GPU"]
+
+
+@pytest.mark.parametrize(
+    ("run_name", "more", "words"),
+    [
+        ("push", {"benchmark": "train"}, "benchmark='train', of this run it would have 'play'"),
+        ("push", {"run": "push_1"}, "run='push_1', of this run it would have 'push'"),
+        ("push", {"env": {"physics": {"fidelity": "tiny"}}}, "env.physics.fidelity='tiny', .* 'coarse'"),
+        ("push", {"env": {}}, "env.physics.fidelity=None, .* 'coarse'"),
+        ("push", {"env": {"physics": {"fidelity": "coarse"}, "speed": 1.0}}, "env.speed=1.0, .* None"),
+        ("push", {"results": [row("trained", 60.0, first_seed=8)]}, "first_seed.trained=8, .* 7"),
+        ("push", {"results": []}, "first_seed.trained=None, .* 7"),
+        ("stand_pid", {}, r"is of a policy, but .*results.json has no row 'trained'; remove"),
+    ],
+)
+def test_evaluations_of_something_else_are_refused(run_name, more, words, runs, tmp_path):
+    folder = tmp_path / run_name
+    folder.mkdir()
+    (folder / "results.json").write_text(json.dumps(runs[run_name]))
+    later(folder, **more)
+    with pytest.raises(SystemExit, match=f"error: .*evaluation.json (has )?{words}") as refused:
+        scores.main([str(folder)])
+    assert run_name == "stand_pid" or f"python -m agents.play {folder} --out" in str(refused.value)
 
 
 def test_other_environments_keep_their_rows(runs, tmp_path, capsys):
