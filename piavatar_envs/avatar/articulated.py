@@ -26,7 +26,14 @@ are. When the mass matrix is built anew the pose is fitted to the particles, too
 
 Flesh may be held to the bones by a pull, implicit and critically damped, ``u' = (u + dt w^2 d)/(1 + dt w)^2`` with
 ``d`` from the particle to its skinned place; the joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, with
-exactly its momentum.
+exactly its momentum. The grid blurs what a pull gives a single particle, and under load a particle slips from its place
+for the pull to carry it: by millimetres where cells have centimetres. Particles of bones may therefore follow the bones
+through their flesh, too, by a share ``s`` of the way in every substep. It is a motion of the particle's own, as
+``J qdot`` is, of which the physical velocity knows the opposite, so no momentum changes, and the flesh makes way:
+
+    c = s d / dt,   u <- u - c,   vk = J qdot + c
+
+The next pull acts on ``u + vk - J qdot - c``: else it would brake by what is no slip.
 
 Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
@@ -67,7 +74,8 @@ class ArticulatedBody:
         springs: of the pelvis and of all joints.
         strength: limits of what springs and torques of the joints do; none until :meth:`set_strength`.
         tissue: what resists in the joints; nothing until :meth:`set_tissue`.
-        attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s], or None.
+        attachment: rates of the pulls that hold flesh to bones [1/s], and shares of the way that particles of bones
+            follow them by, vec2 ``(1 or num_envs, num_points)``, or None.
         mass: the mass matrix.
         impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` is what held the pelvis.
         support: force and torque of what holds the pelvis: every substep adds its share of a control step's mean.
@@ -81,6 +89,7 @@ class ArticulatedBody:
         stiffness: np.ndarray,
         damping: np.ndarray,
         attachment: np.ndarray | None = None,
+        follow: np.ndarray | None = None,
     ) -> None:
         """Allocate.
 
@@ -92,22 +101,31 @@ class ArticulatedBody:
             damping: likewise.
             attachment: rates of the pulls that hold flesh to bones, shape ``(1 or num_envs, num_points)`` [1/s];
                 without them flesh is held by its own stiffness only.
+            follow: share of its way to its place that a particle goes in a substep besides, shape ``(num_points,)``,
+                0 for flesh; none if not given. Needs ``attachment``.
 
         Raises:
-            ValueError: a stiffness, damping or rate is negative or not finite, or the shape is another one.
+            ValueError: a stiffness, damping, rate or share is negative or not finite, or the shape is another one;
+                particles are to follow bones that do not hold them.
         """
         n, device = model.num_envs, model.device
         rates = np.zeros((1, points.num_points)) if attachment is None else attachment
         sizes = (("stiffness", stiffness, 1 + NUM_JOINTS), ("damping", damping, 1 + NUM_JOINTS))
-        for name, value, size in (*sizes, ("attachment", rates, points.num_points)):
+        shares = np.zeros((1, points.num_points)) if follow is None else np.asarray(follow)[None]
+        sizes += (("attachment", rates, points.num_points), ("follow", shares, points.num_points))
+        for name, value, size in sizes:
             if value.shape not in ((1, size), (n, size)):
                 raise ValueError(f"{name} has shape {value.shape}, expected (1 or {n}, {size})")
             if not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
+        if attachment is None and shares.any():
+            raise ValueError("particles cannot follow bones that do not hold them; give an attachment")
         self.body, self.model, self.threads = body, model, warp_threads(device)
         self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))
         self.springs = group(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
-        self.attachment = None if attachment is None else self._upload(attachment)
+        self.attachment = None
+        if attachment is not None:
+            self.attachment = self._upload(np.stack(np.broadcast_arrays(attachment, shares), axis=-1), wp.vec2)
 
         def zeros(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -119,6 +137,7 @@ class ArticulatedBody:
             velocity=zeros((n, NUM_DOF), float),
             outside=zeros((n, NUM_DOF), float),
             torque=zeros(bones, wp.vec3),
+            followed=zeros((n, points.num_points if shares.any() else 1), wp.vec3),
         )
         self.pose = group(Pose, rotation=self.state.rotation, position=self.state.position)
         target = {"rotation": zeros(bones, wp.quat), "root": zeros(n, wp.vec3)}
@@ -235,7 +254,8 @@ class ArticulatedBody:
         # hand back; flesh may be pulled to the bones, too: one pass over the particles sums what both leave
         if self.attachment is not None:
             inputs = [self.body, dt, state.x, position, w.place, w.moving, self.attachment, state.vk, state.failure]
-            program.launch(attach_flesh, points, inputs, [state.u, self._displacement], block_dim=BLOCK)
+            outputs = [state.u, self.state.followed, self._displacement]
+            program.launch(attach_flesh, points, inputs, outputs, block_dim=BLOCK)
             vectors = [self._displacement, state.u]
         else:
             inputs = [self.body, state.x, position, w.moving, state.vk, state.failure]
@@ -244,5 +264,5 @@ class ArticulatedBody:
         self._record_moments(program, state, vectors)
         inputs = [self.body, dt, 1.0 / model.control_dt, len(vectors), self.target, self.springs, self.tissue]
         self._record_stage(program, act, [*inputs, self.strength], state, self.support)
-        inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, state.failure]
+        inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, self.state.followed, state.failure]
         program.launch(take_over, points, inputs, [state.u, state.kinematic], block_dim=BLOCK)

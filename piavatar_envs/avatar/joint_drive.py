@@ -50,11 +50,13 @@ class JointSettings:
         muscles: of the reference adult; those of the body follow from its weight times its height.
         assist: of the pelvis at first, 0 to 1.
         attachment: rates of the pulls that hold flesh to bones, shape ``(P,)`` [1/s].
+        follow: share of the way by which particles of bones follow them in a substep, shape ``(P,)``.
     """
 
     muscles: Muscles
     assist: float
     attachment: np.ndarray
+    follow: np.ndarray
 
 
 @wp.kernel
@@ -151,6 +153,14 @@ def set_joints_in_motion(
     set_part(velocity, e, 3 + 3 * b, spin)
 
 
+@wp.kernel
+def forget_followed(mask: wp.array(dtype=wp.bool), followed: wp.array2d(dtype=wp.vec3)):
+    """No particle of the masked environments is on its way to a bone."""
+    e, p = wp.tid()
+    if mask[e]:
+        followed[e, p] = wp.vec3(0.0)
+
+
 class JointDrive:
     """What turns the joints of one avatar in every environment.
 
@@ -174,7 +184,7 @@ class JointDrive:
         self.drive = drive
         attachment = settings.attachment[None] if settings.attachment.any() else None
         rows = np.zeros((n, 1 + NUM_JOINTS))
-        self.body = ArticulatedBody(points, drive.body, model, rows, rows, attachment)
+        self.body = ArticulatedBody(points, drive.body, model, rows, rows, attachment, settings.follow)
         self.body.set_strength(muscles.lower, muscles.upper, n)
         ranges = muscles.range_lower, muscles.range_upper
         locked = [joint_index(name) for name in LOCKED_JOINTS]
@@ -215,6 +225,7 @@ class JointDrive:
             [mask, posed.pose_rotation, posed.pose_position],
             [s.rotation, s.position, s.torque, s.velocity, s.outside],
         )
+        program.launch(forget_followed, s.followed.shape, [mask], [s.followed])
 
     def record_motion(self, program: Program, mask: wp.array, after: Pose) -> None:
         """Append: joints of the masked environments, reset already, reach a pose after a control step."""

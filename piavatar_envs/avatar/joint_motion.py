@@ -11,7 +11,7 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import blend_changes, motion_at, skinned_place
 from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, threads_of_environment
-from piavatar_envs.avatar.loads import number_at, vector_at
+from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.rotation import quat_exp
@@ -94,6 +94,7 @@ def take_over(
     pelvis: wp.array(dtype=wp.vec3),
     leaving: wp.array2d(dtype=vec8),
     moving: wp.array2d(dtype=vec8),
+    followed: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
@@ -102,7 +103,8 @@ def take_over(
 ):
     """Take from the physical velocity what leaves it for the joints, and write ``J qdot``.
 
-    Both are motions about where the ``pelvis`` joint is before it moves on [m].
+    Both are motions about where the ``pelvis`` joint is before it moves on [m]. So does the velocity by which particles
+    of bones have ``followed`` them, where there are such.
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -125,7 +127,10 @@ def take_over(
         after = before - skinned_motion(body, leaving, e, p, arm)
         now = blend_changes(moving, e, body.joint, body.weight, p)
         spin = wp.vec3(now[3], now[4], now[5])
-        store_velocities(u, driven, e, body.first + p, after, motion_at(now, arm), spin, True)
+        through = wp.vec3()
+        if p < followed.shape[1]:
+            through = followed[e, p]
+        store_velocities(u, driven, e, body.first + p, after - through, motion_at(now, arm) + through, spin, True)
         p += threads
 
 
@@ -185,17 +190,20 @@ def attach_flesh(
     position: wp.array2d(dtype=wp.vec3),
     place: wp.array2d(dtype=wp.mat44),
     moving: wp.array2d(dtype=vec8),
-    rate: wp.array2d(dtype=float),
+    hold: wp.array2d(dtype=wp.vec2),
     vk: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
+    followed: wp.array2d(dtype=wp.vec3),
     # out
     lost: wp.array2d(dtype=wp.vec3),
 ):
     """:func:`hand_back`, and pull every particle to its place on the bones, implicit in time and critically damped.
 
-    ``lost`` is what the pull has taken of the velocity [m/s].
+    ``hold`` is the rate of the pull [1/s], and the share of its way that a bone's particle goes in this substep
+    besides, through its flesh. ``lost`` is what the pull has taken of the velocity, ``followed`` the velocity of that
+    way [m/s]; the pull does not know of the last one's.
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -217,7 +225,12 @@ def attach_flesh(
         following_v = vector_at(u, e, n) + vector_at(vk, e, n)
         before = v - skinned_motion(body, moving, e, p, at - pelvis)
         way = skinned_place(body, place, e, p) - at
-        after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
+        held = hold[row(e, hold.shape[0]), p]
+        through = wp.vec3()
+        if held[1] > 0.0:
+            through = followed[e, p]
+            followed[e, p] = (held[1] / dt) * way
+        after = implicit_velocity(held[0], dt, way, before - through) + through
         store_pair(u, lost, e, body.first + p, after, before - after, True, True)
         p += threads
 

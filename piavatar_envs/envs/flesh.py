@@ -155,7 +155,14 @@ class Flesh:
             muscles=make_muscles(d.joint_stiffness, d.joint_damping, d.strength),
             assist=d.root_assist,
             attachment=attachment_rates(sampled.depth, distance, firm, *d.flesh_rate),
+            follow=d.bone_follow * self.carried,
         )
+
+    @property
+    def carried(self) -> np.ndarray:
+        """Which particles are of bones that they follow, shape ``(P,)`` bool."""
+        follows = self.drive.control != "pose" and self.drive.bone_follow > 0.0
+        return (self.sampled.bone >= 0) & follows
 
     def masses(self, volume: np.ndarray) -> np.ndarray:
         """Nominal masses [kg] of particles of these volumes [m^3], shape ``(rows, P)``."""

@@ -99,6 +99,13 @@ class DriveConfig(BaseModel):
     flesh_rate: Annotated[tuple[float, float], AfterValidator(_check_flesh_rate)] = Field(
         (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
     )
+    bone_follow: float = Field(
+        0.0,
+        ge=0.0,
+        le=1.0,
+        description="share of the way to their places by which particles of bones follow them in a substep, through "
+        "their flesh: 0.5, with a flesh_rate of (30, 3000), keeps tracked bones together to half a millimetre [-]",
+    )
     drive: Literal["increment", "target"] = Field(
         "increment",
         description="increment (the tracked pose plus the command's change) or target (to the command's absolute pose; "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -135,7 +135,11 @@ def assemble(
         num_sensors=len(flesh) * NUM_PARTS,
     )
     colliders = (*_colliders(scene, pairs[: len(names), len(names) :][owner_index]), *walls)
-    matter = _join(parts, rows, np.concatenate(local), np.concatenate(seam), sensor)
+    carried = np.zeros(first[-1], np.int32)
+    for index, body in enumerate(flesh):
+        carried[first[index] : first[index + 1]] = body.carried
+    matter = replace(_join(parts, rows), field=np.concatenate(local), seam=np.concatenate(seam), sensor=sensor)
+    matter = replace(matter, carried=carried)
     return Subjects(names, tuple(int(i) for i in first), matter, fields, colliders, solids)
 
 
@@ -170,9 +174,7 @@ def _colliders(scene: SceneConfig, frictions: np.ndarray) -> tuple[Collider, ...
     return (*ground, *others)
 
 
-def _join(
-    parts: Sequence[MaterialPoints], rows: int, field: np.ndarray, seam: np.ndarray, sensor: np.ndarray
-) -> MaterialPoints:
+def _join(parts: Sequence[MaterialPoints], rows: int) -> MaterialPoints:
     """Matter of several subjects side by side."""
 
     def side_by_side(name: str) -> np.ndarray:
@@ -180,4 +182,4 @@ def _join(
         return np.concatenate([np.broadcast_to(a, (max(rows, len(a)), a.shape[1])) for a in arrays], axis=1)
 
     names = ("volume", "density", "young_modulus", "poisson_ratio", "material")
-    return MaterialPoints(**{name: side_by_side(name) for name in names}, field=field, seam=seam, sensor=sensor)
+    return MaterialPoints(**{name: side_by_side(name) for name in names})

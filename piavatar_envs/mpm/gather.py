@@ -122,7 +122,7 @@ def finish_gather(
         grad_vk = gradient_of(grid, kinematic, f)
     elif step.decoupling == SPLIT or step.decoupling == NO_STRESS:
         own = moved.vk[e, p]
-        if asked:
+        if asked and particles.carried[p] == 0:
             seen = wp.vec3(kinematic.mean[1], kinematic.mean[2], kinematic.mean[3])
             own = seen + remove_approach(boundaries, e, x, own - seen, CONTACT_GATE * grid.dx)
         advection += own
