@@ -26,6 +26,8 @@ BALLS = (0.45, 1.5, 8.0)  # [kg]
 SPEED, DISTANCE = 5.0, 0.1  # of a ball that is thrown at the chest [m/s], and its way there [m]
 STIFFNESSES = (100.0, 300.0, 1000.0)  # of all joints of a body that is hit [N m/rad]
 BOUNDLESS = 1000.0  # factor on the torques of muscles, which are not to be the limit here
+# settings of ``drive`` with which particles of bones slip from them under load, as by default, and follow them
+HOLDS: dict[str, dict[str, Any]] = {"": {}, "_firm": {"flesh_rate": (30.0, 3000.0), "bone_follow": 1.0}}
 FINER = 4  # control steps in one of the environments': peaks are short
 SETTLING = 0.2  # last share of the time over which an error is averaged
 SPACE = Domain().including((-3.0, -10.0, -2.5), (3.0, 4.0, 5.0))  # room for what flies off
@@ -71,11 +73,12 @@ def set_stiffness(stage: Stage, stiffness: float) -> None:
         array.assign(spring_rows(np.r_[0.0, row]).astype(np.float32))
 
 
-def hit(options: Options, mass: float, stiffness: float) -> dict[str, Any]:
-    """A ball at the chest of a floating body."""
+def hit(options: Options, mass: float, stiffness: float, hold: str = "") -> dict[str, Any]:
+    """A ball at the chest of a floating body, whose bones are held as a key of :data:`HOLDS` says."""
     start = (0.0, CHEST[1] - BALL_RADIUS - DISTANCE, CHEST[2])
     prop = ball(mass, start, (0.0, SPEED, 0.0))
-    act = afloat("hit", prop, drive={"strength": BOUNDLESS}, physics={"control_dt": PhysicsConfig().control_dt / FINER})
+    drive = {"strength": BOUNDLESS, **HOLDS[hold]}
+    act = afloat("hit", prop, drive=drive, physics={"control_dt": PhysicsConfig().control_dt / FINER})
     stage = Stage(act, options.fidelity, options.device)
     before = subject_totals(stage, 1)
     stage.step()  # which builds the mass matrix; the ball is still on its way
@@ -89,7 +92,7 @@ def hit(options: Options, mass: float, stiffness: float) -> dict[str, Any]:
     body, after = subject_totals(stage, 0), subject_totals(stage, 1)
     lost = before.momentum - after.momentum
     return {
-        "case": f"ball_{mass:g}_kp_{stiffness:g}",
+        "case": f"ball_{mass:g}_kp_{stiffness:g}{hold}",
         "peak_deg": float(errors.max()),
         "worst_joint": JOINT_NAMES[1 + int(errors.max(0).argmax())],
         "settled_deg": float(errors[-last:].mean(0).max()),
@@ -121,9 +124,9 @@ class Kick:
     gaps: np.ndarray
 
 
-def swing(options: Options, held: bool, *props: PropConfig) -> Kick:
+def swing(options: Options, held: bool, hold: str, *props: PropConfig) -> Kick:
     """Swing the leg, with a ball in its way or none."""
-    act = afloat("kick", *props, script=keyed(*SWING), drive={"root_assist": float(held)})
+    act = afloat("kick", *props, script=keyed(*SWING), drive={"root_assist": float(held), **HOLDS[hold]})
     stage = Stage(act, options.fidelity, options.device)
     drive, joints = stage.simulation.avatar.state, stage.simulation.avatar.joints.state
     toes, pelvis, support, gaps = [], [], [], []
@@ -137,19 +140,19 @@ def swing(options: Options, held: bool, *props: PropConfig) -> Kick:
     return Kick(stage, np.array(toes), np.array(pelvis), np.array(support), np.array(gaps))
 
 
-def kick(options: Options, mass: float, held: bool, alone: Kick) -> dict[str, Any]:
+def kick(options: Options, mass: float, held: bool, hold: str, alone: Kick) -> dict[str, Any]:
     """A ball where the toes would be fastest; ``alone`` is the same swing without one."""
     step = np.diff(alone.toes, axis=0)
     fastest = int(np.linalg.norm(step, axis=1).argmax())
     place = alone.toes[fastest] + (BALL_RADIUS + LEAD) * step[fastest] / np.linalg.norm(step[fastest])
-    seen = swing(options, held, ball(mass, tuple(place.tolist())))
+    seen = swing(options, held, hold, ball(mass, tuple(place.tolist())))
     body, kicked = subject_totals(seen.stage, 0), subject_totals(seen.stage, 1)
     # the body began at rest: what it has, and has not from its support, is the ball's doing
     recoil, size = body.momentum - seen.support.sum(0)[:3], np.linalg.norm(kicked.momentum)
     change = seen.support - alone.support
     felt = seen.pelvis - alone.pelvis
     return {
-        "case": f"kick_{mass:g}_{'held' if held else 'floating'}",
+        "case": f"kick_{mass:g}_{'held' if held else 'floating'}{hold}",
         "toes_m_s": float(np.linalg.norm(step[fastest]) / seen.stage.dt),
         "ball_m_s": float(size / kicked.mass),
         "ball_n_s": float(size),
@@ -166,11 +169,12 @@ def kick(options: Options, mass: float, held: bool, alone: Kick) -> dict[str, An
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Balls of every mass at joints of every stiffness; kicks, floating and held."""
-    for mass in BALLS:
-        for stiffness in STIFFNESSES:
-            yield hit(options, mass, stiffness)
-    for held in (False, True):
-        alone = swing(options, held)
+    """Balls of every mass at joints of every stiffness; kicks, floating and held; both with bones that slip and not."""
+    for hold in HOLDS:
         for mass in BALLS:
-            yield kick(options, mass, held, alone)
+            for stiffness in STIFFNESSES:
+                yield hit(options, mass, stiffness, hold)
+        for held in (False, True):
+            alone = swing(options, held, hold)
+            for mass in BALLS:
+                yield kick(options, mass, held, hold, alone)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks import blows, runner, stability, timing
-from benchmarks.blows import afloat
+from benchmarks.blows import HOLDS, afloat
 from benchmarks.limbs import Limbs, Options, critical_damping, widest
 from benchmarks.poses import random_pose
 from benchmarks.rig import joint_gaps
@@ -25,7 +25,7 @@ from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.bone_sums import sum_moments, sum_moments_of_both
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import DriveConfig, PhysicsConfig, load_config
+from piavatar_envs.envs.config import PhysicsConfig, load_config
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.types import Model, State
 from piavatar_envs.tasks import load_task
@@ -57,7 +57,7 @@ def flail(options: Options, rate: float) -> dict[str, Any]:
     return row | drift(options, limbs.rig.model, limbs.rig.state, step, limbs.gaps)
 
 
-def flail_under_pd(options: Options, rates: tuple[float, float]) -> dict[str, Any]:
+def flail_under_pd(options: Options, name: str, hold: dict[str, Any]) -> dict[str, Any]:
     """The same under ``control="pd"`` of the environments: muscles with their limits, tissue, locked feet."""
     poses, (rest, root) = flailing(options), standing(0.0)
     interval = FLAIL_EVERY * PhysicsConfig().control_dt
@@ -65,10 +65,10 @@ def flail_under_pd(options: Options, rates: tuple[float, float]) -> dict[str, An
     def script(time: float) -> Pose:
         return (rest if time == 0.0 else poses[int(time / interval - 1e-6)]), root
 
-    act = afloat("flail", script=script, drive={"flesh_rate": rates})
+    act = afloat("flail", script=script, drive=hold)
     stage = Stage(act, options.fidelity, options.device)
     simulation = stage.simulation
-    row = {"case": f"free_float_pd_{'attached' if rates[0] > 0.0 else 'loose'}"}
+    row = {"case": f"free_float_pd_{name}"}
     return row | drift(options, simulation.model, simulation.state, lambda _index: stage.step(), stage.gaps)
 
 
@@ -154,10 +154,10 @@ def press(options: Options, damping: float) -> dict[str, Any]:
     }
 
 
-def stand(options: Options, assist: float) -> dict[str, Any]:
+def stand(options: Options, assist: float, hold: str) -> dict[str, Any]:
     """Ten seconds of zero actions under ``control="pd"``, in the default environment of that resolution."""
     task = load_task("PIAvatar/Reach-v0")
-    settings = {"control": "pd", "root_assist": assist, "fidelity": options.fidelity, "pose_noise": 0.0}
+    settings = {"control": "pd", "root_assist": assist, "fidelity": options.fidelity, "pose_noise": 0.0} | HOLDS[hold]
     env = BatchEnv(task(load_config(task.Config, None, settings)), 1, options.device)
     env.reset(seeds=[0])
     avatar, state, dt = env.simulation.avatar, env.simulation.state, env.config.physics.control_dt
@@ -170,7 +170,7 @@ def stand(options: Options, assist: float) -> dict[str, Any]:
             break
         stood += dt
     return {
-        "case": f"stand_assist_{assist:g}",
+        "case": f"stand_assist_{assist:g}{hold}",
         "stood_s": stood,
         "tilt_deg": float(np.degrees(np.arccos(min(1.0, up)))),
         "speed_m_s": float(np.abs(state.u.numpy() + state.vk.numpy()).max()),
@@ -211,14 +211,15 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
     """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, stability, the cost."""
     for rate in (0.0, RATE):
         yield flail(options, rate)
-    for rates in ((0.0, 0.0), DriveConfig().flesh_rate):
-        yield flail_under_pd(options, rates)
+    for name, hold in {"loose": {"flesh_rate": (0.0, 0.0)}, "attached": {}, "firm": HOLDS["_firm"]}.items():
+        yield flail_under_pd(options, name, hold)
     for stiffness in STIFFNESSES:
         yield stretch_arms(options, stiffness)
     for damping in DAMPINGS:
         yield press(options, damping)
-    for assist in (0.0, 1.0):
-        yield stand(options, assist)
+    for hold in HOLDS:
+        for assist in (0.0, 1.0):
+            yield stand(options, assist, hold)
     yield from blows.cases(options)
     yield from stability.cases(options)
     yield cost(options)

@@ -18,15 +18,16 @@ from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, forward_kinematics, joint_index
 
 RESULTS = runner.ROOT / "benchmarks" / "results" / "torque.json"
-FLOATS = [f"free_float_{how}" for how in ("loose", "attached", "pd_loose", "pd_attached")]
+FLOATS = [f"free_float_{how}" for how in ("loose", "attached", "pd_loose", "pd_attached", "pd_firm")]
 KICKS = [f"kick_{mass}_{how}" for mass in ("0.45", "1.5", "8") for how in ("floating", "held")]
+HOLDS = ("", "_firm")
 CASES = {
     *FLOATS,
     *(f"t_pose_kp_{k}" for k in (50, 200, 1000)),
     *(f"press_kd_{d}" for d in (2, 20, 200)),
-    *(f"stand_assist_{share}" for share in (0, 1)),
-    *(f"ball_{mass}_kp_{k}" for mass in ("0.45", "1.5", "8") for k in (100, 300, 1000)),
-    *KICKS,
+    *(f"stand_assist_{share}{hold}" for share in (0, 1) for hold in HOLDS),
+    *(f"ball_{mass}_kp_{k}{hold}" for mass in ("0.45", "1.5", "8") for k in (100, 300, 1000) for hold in HOLDS),
+    *(kick + hold for kick in KICKS for hold in HOLDS),
     *(f"longest_step_{name}" for name in ("floating", "standing", "soft_floating")),
     *(f"largest_{kind}_{how}" for kind in ("kp", "kd", "kp_kd") for how in ("limited", "boundless")),
     "cost",
@@ -49,6 +50,20 @@ def test_every_case_is_measured(rows):
 def test_the_committed_results_are_complete():
     report = json.loads(RESULTS.read_text(encoding="utf-8"))
     assert report["complete"] and {row["case"] for row in report["results"]} == CASES
+
+
+def test_bones_that_are_followed_stay_together():
+    """To a millimetre, but for the toes while they hit a ball."""
+    gaps = {
+        row["case"]: row["largest_gap_mm"]
+        for row in json.loads(RESULTS.read_text(encoding="utf-8"))["results"]
+        if "largest_gap_mm" in row
+    }
+    firm = {case: gap for case, gap in gaps.items() if case.endswith("_firm")}
+    assert all(gap < 1.0 for case, gap in firm.items() if case not in [kick + "_firm" for kick in KICKS])
+    assert all(
+        gap < 0.5 * gaps[case.removesuffix("_firm")] for case, gap in firm.items() if case.startswith(("stand", "kick"))
+    )
 
 
 @pytest.mark.parametrize("case", FLOATS)
