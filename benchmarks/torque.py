@@ -20,7 +20,7 @@ from benchmarks.limbs import Limbs, Options, critical_damping, widest
 from benchmarks.poses import random_pose
 from benchmarks.rig import joint_gaps
 from benchmarks.stage import Pose, Stage, standing
-from piavatar_envs.avatar import joint_motion, joint_stages, mass_pairs
+from piavatar_envs.avatar import attachment, joint_motion, joint_stages, mass_pairs
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.bone_sums import sum_moments, sum_moments_of_both
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
@@ -41,7 +41,7 @@ ANKLES = ("left_ankle", "right_ankle")
 STAND_SECONDS, FALLEN = 10.0, 30.0  # how long a body is to stand [s], and the tilt of the pelvis at which it has not
 RATE = 300.0  # of the pulls that hold flesh to bones [1/s]
 REPLAYS = 30  # of a control step whose cost is measured
-MODULES = (joint_motion, joint_stages, mass_pairs)
+MODULES = (attachment, joint_motion, joint_stages, mass_pairs)
 
 
 def flail(options: Options, rate: float) -> dict[str, Any]:
