@@ -28,6 +28,8 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 
 #: Nodes lighter than this [kg] carry nothing but round-off.
 MASS_MIN = wp.constant(1.0e-15)
+#: Volume of two fields [cells] at a node below which there is nothing: less than the least mass has.
+EMPTY = wp.constant(1.0e-30)
 #: Mass of a record whose field has grown together with its subject's trunk at a node.
 GROWN_TOGETHER = wp.constant(-1.0)
 
@@ -98,28 +100,17 @@ def face_node(
     # out
     node_facing: wp.array2d(dtype=wp.vec4),
 ):
-    """Summands of a node, a vector a field."""
-    volume = float(0.0)
-    outward = wp.vec3()
+    """What a node says of every field: its weighted outward gradient, and its volume [cells]."""
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
             m = mass_of(node_velocity, e, r)
             V = volume_at(grid, contact, e, f, m)
+            facing = wp.vec4()
             if V > 0.0:
-                volume += V
-                outward += weighted_gradient(grid, V, m, offset_at(grid, sums, e, f, r))
-    for f in range(contact.num_fields):
-        if has_field(mask, f):
-            r = first_record(grid, blocks, e, f, block) + local
-            m = mass_of(node_velocity, e, r)
-            V = volume_at(grid, contact, e, f, m)
-            facing = wp.vec3()
-            if V > 0.0 and volume > V:
-                reduced = V * (volume - V) / volume
-                own = weighted_gradient(grid, V, m, offset_at(grid, sums, e, f, r))
-                facing = (reduced * reduced) * (2.0 * own - outward)
-            write_change(node_facing, e, r, wp.vec4(facing[0], facing[1], facing[2], 0.0))
+                outward = weighted_gradient(grid, V, m, offset_at(grid, sums, e, f, r))
+                facing = wp.vec4(outward[0], outward[1], outward[2], V)
+            write_change(node_facing, e, r, facing)
 
 
 @wp.func
@@ -137,8 +128,8 @@ def face_shared(
 ):
     """What every node of a block with several fields says about the normals around it, for the nodes of a thread.
 
-    It is the summand of the module's formula, with all other fields of the node as ``b``; zero where there is none.
-    Limbs grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
+    Gradients and volumes of its fields, from which a pair makes its own summand: a third body has no say in it. Limbs
+    grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
     """
     end = nodes_shared(blocks, e)
     for turn in range(sweep.turns):
@@ -235,7 +226,8 @@ def normal_from(
                 # what does not count is the node itself, times 0: all are read before the first has come
                 of_a = read_change(node_facing, e, wp.where(counts, to_a + n, ra))
                 of_b = read_change(node_facing, e, wp.where(counts, to_b + n, rb))
-                facing += wp.where(counts, c, 0.0) * (of_a - of_b)
+                reduced = of_a[3] * of_b[3] / wp.max(of_a[3] + of_b[3], EMPTY)
+                facing += (wp.where(counts, c, 0.0) * reduced * reduced) * (of_a - of_b)
     # summands of nearly empty nodes are so small that their squares are not
     n_ab = wp.vec3(facing[0], facing[1], facing[2])
     largest = wp.max(wp.abs(n_ab))

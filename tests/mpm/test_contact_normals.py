@@ -41,7 +41,7 @@ def look_at_nodes(
     """The nodes of the blocks that both fields share, where the first of them has its slot."""
     slot, local = wp.tid()
     held = held_by(grid, blocks, 0, slot)
-    if held[0] != 0 or blocks.fields[0, held[1]] != 3:
+    if held[0] != 0 or (blocks.fields[0, held[1]] & 3) != 3:
         return
     node = node_of_block(block_corner(grid, held[1]), local)
     a = record_of(grid, blocks, 0, 0, node[0], node[1], node[2])
@@ -104,6 +104,18 @@ def placed(meet, boxes, gap=0.0, turn=None, **kwargs):
     sim = meet([{"box": upper}, {"box": boxes[1]}], spacing=0.5 * DX, dx=DX, **kwargs)
     turn = turn or Rotation.identity()
     return sim.set(x=turn.apply(sim.rest) + (0.013, 0.007, 0.004))
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.5, 1.0, 2.0])
+def test_a_third_body_turns_no_normal(meet, apart):
+    """One beside the other two, on both, ``apart`` [grid spacings]; it shares blocks and nodes with either."""
+    side = {"box": ((0.2 + apart * DX, -0.1, -0.1), (0.3 + apart * DX, 0.1, 0.1))}
+    pair = [{"box": box} for box in HALVES]
+    two, three = Look(meet(pair)), Look(meet([*pair, side], max_slots=400))
+    assert len(two.position) == len(three.position) > 100
+    first, second = (np.lexsort(np.round(look.position / DX).T) for look in (two, three))
+    np.testing.assert_allclose(three.position[second], two.position[first], atol=1e-6)
+    np.testing.assert_allclose(three.normal[second], two.normal[first], atol=1e-5)
 
 
 @pytest.mark.parametrize("gap", [-0.2, 0.0, 0.3, 0.6])
