@@ -138,7 +138,7 @@ class Flesh:
         """How its joints are driven; None where its pose is.
 
         Raises:
-            ConfigError: torques with a scheme of one velocity.
+            ConfigError: torques with a scheme of one velocity; particles are to follow bones that do not hold them.
         """
         d = self.drive
         if d.control == "pose":
@@ -147,6 +147,11 @@ class Flesh:
             raise ConfigError(
                 f"drive.control={d.control!r} needs two velocities: physics.decoupling={self.physics.decoupling!r} has "
                 "one; use split or no_stress"
+            )
+        if d.bone_follow > 0.0 and not any(d.flesh_rate):
+            raise ConfigError(
+                f"drive.bone_follow={d.bone_follow:g} needs flesh that is held, but drive.flesh_rate is zero; "
+                "use (30, 3000)"
             )
         sampled = self.sampled
         distance = bone_distance(sampled.rest_positions, sampled.bone)

@@ -104,7 +104,7 @@ class DriveConfig(BaseModel):
         ge=0.0,
         le=1.0,
         description="share of the way to their places by which particles of bones follow them in a substep, through "
-        "their flesh: 0.5, with a flesh_rate of (30, 3000), keeps tracked bones together to half a millimetre [-]",
+        "their flesh: 1, with a flesh_rate of (30, 3000), keeps tracked bones together [-]",
     )
     drive: Literal["increment", "target"] = Field(
         "increment",

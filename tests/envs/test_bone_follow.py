@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks.rig import joint_gaps
+from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.config import ConfigError, load_config
 from piavatar_envs.mpm.diagnostics import totals
+from piavatar_envs.multi.sumo_v0 import SumoTask
 
 REACH = "PIAvatar/Reach-v0"
 FIRM = {"control": "pd", "bone_follow": 1.0, "flesh_rate": (30.0, 3000.0)}
@@ -78,3 +81,41 @@ def test_flesh_and_commanded_poses_are_left_alone(make_batch):
         assert not other.simulation.model.particles.carried.numpy().any()
         if other.simulation.avatar.joints is not None:
             assert other.simulation.avatar.joints.state.followed.shape[1] == 1
+
+
+def test_two_bodies_that_collide_keep_their_momentum(device):
+    """The particles of the second body's bones are carried as the first one's are, and nobody's flesh."""
+    settings = {"fidelity": "tiny", "joints": None, "start_distance": 0.6, "gravity": 0.0, **FIRM}
+    config = load_config(SumoTask.Config, None, settings | {"scene": {"ground": False, "walls": False}})
+    batch = BatchEnv(SumoTask(config), 1, device)
+    batch.reset(seeds=[0])
+    simulation = batch.simulation
+    model, state, first = simulation.model, simulation.state, simulation.subjects.first
+    carried, bodies = model.particles.carried.numpy(), [slice(*first[i : i + 2]) for i in range(2)]
+    x, u = state.x.numpy()[0], state.u.numpy()
+    way = x[bodies[1]].mean(0) - x[bodies[0]].mean(0)
+    for body, speed in zip(bodies, (0.7, -0.7), strict=True):
+        u[0, body] += speed * way / np.linalg.norm(way)
+    state.u.assign(u)
+    start, pushed, gaps = totals(model, state), 0.0, []
+    rng = np.random.default_rng(0)
+    for _ in range(15):
+        batch.action.assign(0.5 * rng.uniform(-1.0, 1.0, batch.action.shape).astype(np.float32))
+        batch.step()
+        pushed += np.linalg.norm(simulation.sensors.pair_impulse.numpy()[0], axis=-1).max()
+        rests = [avatar.body.rest_joint.numpy().astype(float) for avatar in simulation.avatars]
+        gaps.append([joint_gaps(a.tracked, rest).max() for a, rest in zip(simulation.avatars, rests, strict=True)])
+    now = totals(model, state)
+    assert pushed > 5.0
+    assert (np.median(gaps, axis=0) < 1e-3).all()
+    for change in (now.momentum - start.momentum, now.angular_momentum - start.angular_momentum):
+        assert np.linalg.norm(change) < 1e-5 * now.momentum_scale
+    for body, flesh, avatar in zip(bodies, simulation.flesh, simulation.avatars, strict=True):
+        of_bone = flesh.sampled.bone >= 0
+        np.testing.assert_array_equal(carried[body] != 0, of_bone)
+        np.testing.assert_array_equal(avatar.joints.state.followed.numpy()[0].any(axis=1), of_bone)
+
+
+def test_bones_that_hold_nothing_cannot_be_followed(make_batch):
+    with pytest.raises(ConfigError, match="flesh_rate is zero"):
+        make_batch(REACH, 1, **FIRM | {"flesh_rate": (0.0, 0.0)})
