@@ -304,8 +304,8 @@ class Scratch:
         velocity: vec4: halves of records, see :mod:`piavatar_envs.mpm.records`: mass and physical velocity, kinematic
             velocity and nothing; the latter means nothing where no contact is at hand, but in the paper's variant. In
             blocks with several fields the sums stand here until they have become velocities.
-        facing: vec4: what a node says about the normals around it, see :mod:`piavatar_envs.mpm.normals`: outward gradient
-            and volume; of blocks with several fields only.
+        facing: vec4: what a node says about the normals around it, outward gradient and volume, see
+            :mod:`piavatar_envs.mpm.normals`; of blocks with several fields only.
         sensors: what contact did in this control step.
         room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
     """
