@@ -28,7 +28,7 @@ def find_displacement(
     """Of the particles from where the pose has them by linear blend skinning [m], at their places in the world."""
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, threads)
+    own = first_particle(i, x.shape[0])
     e = own[0]
     if failure[e] != 0:
         return
@@ -64,7 +64,7 @@ def attach_flesh(
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, threads)
+    own = first_particle(i, x.shape[0])
     e = own[0]
     if failure[e] != 0:
         return
