@@ -47,15 +47,16 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.attachment import attach_flesh, find_displacement
+from piavatar_envs.avatar.attachment import attach_flesh, sum_displacement
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.bone_sums import sum_moments, sum_moments_of_both
+from piavatar_envs.avatar.bone_sums import sum_moments
 from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_motion import hand_back, take_over
 from piavatar_envs.avatar.joint_stages import JointBench, Support, act, begin_substep, build_mass, fit_pose
 from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
+from piavatar_envs.avatar.part_sums import divide
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
 from piavatar_envs.mpm.program import Program
@@ -121,7 +122,8 @@ class ArticulatedBody:
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
         if attachment is None and shares.any():
             raise ValueError("particles cannot follow bones that do not hold them; give an attachment")
-        self.body, self.model, self.threads = body, model, warp_threads(device)
+        self.body, self._parts = divide(points, body, device)
+        self.model, self.threads = model, warp_threads(device)
         self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))
         self.springs = group(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
         self.attachment = None
@@ -145,7 +147,7 @@ class ArticulatedBody:
         self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
         self.target.rotation.fill_(wp.quat_identity())
         self.mass = JointMass(points, body, model)
-        self._displacement = zeros((n, model.num_particles), wp.vec3)
+        self._scratch = zeros(points.num_points if self.threads == 1 else 0, vec12)
         self.impulse = zeros((n, NUM_DOF), float)
         self.support = group(Support, force=zeros(n, wp.vec3), torque=zeros(n, wp.vec3))
         self._bench = self._allocate()
@@ -215,24 +217,31 @@ class ArticulatedBody:
 
     def _record_fit(self, program: Program, state: State) -> None:
         """Append: fit the pose to the particles, by a share. No velocity changes."""
-        inputs = [self.body, state.x, self._bench.place, state.failure]
-        program.launch(find_displacement, self._points, inputs, [self._displacement], block_dim=BLOCK)
-        self._record_moments(program, state, [self._displacement])
+        self._record_parts(program, sum_displacement, [self.body, self._parts], [state.x, state.failure])
         self._record_stage(program, fit_pose, [self.body, FIT_SHARE], state)
+
+    def _record_parts(
+        self, program: Program, kernel: wp.Kernel, body: list, inputs: list, outputs: Sequence[wp.array] = ()
+    ) -> None:
+        """Append a pass over particles that sums what it finds: a CUDA block a part of the body."""
+        block = BLOCK if self.threads > 1 else 1
+        dim = (self.model.num_envs, self._parts.start.shape[0] - 1, block)
+        inputs = [*body, self.model.particles.mass, *inputs, self._scratch]
+        program.launch(kernel, dim, inputs, [*outputs, self._bench], block_dim=BLOCK)
 
     def _record_stage(self, program: Program, stage: wp.Kernel, inputs: list, state: State, *more: Support) -> None:
         """Append what a warp does for an environment."""
         inputs, outputs = [*inputs, state.failure, self.threads], [*more, self._bench]
         program.launch(stage, (self.model.num_envs, self.threads), inputs, outputs, block_dim=self.threads)
 
-    def _record_moments(self, program: Program, state: State, vectors: Sequence[wp.array]) -> None:
-        """Append: moments of the chunks of one or two vectors at the particles."""
-        w, one = self._bench, len(vectors) == 1
+    def _record_moments(self, program: Program, state: State) -> None:
+        """Append: moments of the chunks of the physical velocity."""
+        w = self._bench
         program.launch(
-            sum_moments if one else sum_moments_of_both,
+            sum_moments,
             (*w.moments.shape, self.threads),
-            [self.body, self.model.particles, state.x, *vectors, self.state.position, state.failure, self.threads],
-            [w.moments] if one else [w.moments, w.other_moments],
+            [self.body, self.model.particles, state.x, state.u, self.state.position, state.failure, self.threads],
+            [w.moments],
             block_dim=BLOCK,
         )
 
@@ -252,18 +261,17 @@ class ArticulatedBody:
             self._record_fit(program, state)
         else:
             self._record_stage(program, begin_substep, [self.body], state)
-        # hand back; flesh may be pulled to the bones, too: one pass over the particles sums what both leave
+        # hand back; flesh may be pulled to the bones, too: what it leaves and what it takes is summed in the same pass
+        velocities = 1 if self.attachment is None else 2
         if self.attachment is not None:
-            inputs = [self.body, dt, state.x, position, w.place, w.moving, self.attachment, state.vk, state.failure]
-            outputs = [state.u, self.state.followed, self._displacement]
-            program.launch(attach_flesh, points, inputs, outputs, block_dim=BLOCK)
-            vectors = [self._displacement, state.u]
+            inputs = [state.x, self.attachment, state.vk, state.failure]
+            outputs = [state.u, self.state.followed]
+            self._record_parts(program, attach_flesh, [self.body, self._parts, dt], inputs, outputs)
         else:
             inputs = [self.body, state.x, position, w.moving, state.vk, state.failure]
             program.launch(hand_back, points, inputs, [state.u], block_dim=BLOCK)
-            vectors = [state.u]
-        self._record_moments(program, state, vectors)
-        inputs = [self.body, dt, 1.0 / model.control_dt, len(vectors), self.target, self.springs, self.tissue]
+            self._record_moments(program, state)
+        inputs = [self.body, dt, 1.0 / model.control_dt, velocities, self.target, self.springs, self.tissue]
         self._record_stage(program, act, [*inputs, self.strength], state, self.support)
         inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, self.state.followed, state.failure]
         program.launch(take_over, points, inputs, [state.u, state.kinematic], block_dim=BLOCK)

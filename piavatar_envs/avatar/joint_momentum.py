@@ -48,7 +48,7 @@ def gather_other(
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
 ):
-    """The two momenta of a second velocity, from :func:`piavatar_envs.avatar.bone_sums.sum_moments_of_both`."""
+    """The two momenta of a velocity, in row ``row``, from :mod:`piavatar_envs.avatar.part_sums`."""
     for b in range(thread, BONES, threads):
         P = wp.vec3()
         L = wp.vec3()

@@ -104,14 +104,11 @@ def begin(body: Body, e: int, thread: int, threads: int, w: JointBench):
 def find_shares(
     body: Body, velocities: int, into: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench
 ):
-    """The shares ``dq = M^-1 J^T m v`` that the joints can take of one or two velocities.
+    """The shares ``dq = M^-1 J^T m v`` that the joints can take of one or two velocities, from the bones' momenta.
 
     The first is share ``into`` of the environment, 0 or 1.
     """
     n = w.pose.position.shape[0]
-    gather_bones(body, w.moments, e, thread, threads, w.bones, w.linear, w.angular)
-    if velocities > 1:
-        gather_other(body, w.other_moments, e, n + e, thread, threads, w.linear, w.angular)
     meet_threads(threads)
     for which in range(thread, velocities, threads):
         pass_down(body, w.pose.position, e, which * n + e, w.linear, w.angular, w.momentum)
@@ -215,6 +212,7 @@ def fit_pose(
     e, thread = wp.tid()
     if failure[e] != 0:
         return
+    gather_other(body, w.other_moments, e, e, thread, threads, w.linear, w.angular)
     find_shares(body, 1, 0, e, thread, threads, room_of_warp(), w)
     spread_motion(body, w.pose.position, w.shares, e, e, thread, threads, w.moving)
     move_joints(body, share, w.moving, e, thread, threads, w.pose.rotation, w.pose.position)
@@ -260,6 +258,9 @@ def act(
         return
     room = room_of_warp()
     taken = failure.shape[0] + e
+    gather_bones(body, w.moments, e, thread, threads, w.bones, w.linear, w.angular)
+    if velocities > 1:
+        gather_other(body, w.other_moments, e, taken, thread, threads, w.linear, w.angular)
     find_shares(body, velocities, 2 - velocities, e, thread, threads, room, w)
     if velocities > 1:
         pull_bones(body, e, thread, threads, w)

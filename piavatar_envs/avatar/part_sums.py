@@ -1,0 +1,182 @@
+"""Sums over bones in the pass over particles that finds what is to be summed.
+
+A body's particles are in parts that follow each other in memory. On a GPU a CUDA block has a part: what its threads
+find of the particles meets in shared memory, from where a warp at a time sums the chunks of bones that are in the part.
+On a CPU a body is one part, and its particles meet in an array that all bodies use after each other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.body import BodyPoints, bone_lists
+from piavatar_envs.avatar.bone_sums import moments_of
+from piavatar_envs.avatar.lanes import BLOCK, store_sum12, store_sum16
+from piavatar_envs.avatar.loads import float_at, int_at
+from piavatar_envs.avatar.types import Body, vec12, vec16
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+#: Particles of a part on a GPU. More have fewer chunks, which are what sums cost that few particles share; their CUDA
+#: blocks need more shared memory, so fewer of them fit. It is the same for any number of environments, as sums are.
+PART = 3 * BLOCK
+_WORDS = 12
+
+
+@wp.struct
+class Parts:
+    """The particles of a body in parts: part ``i`` has those from ``i * size`` on."""
+
+    size: int
+    start: wp.array(dtype=int)  # (parts + 1,) part i has chunks chunk[start[i] : start[i + 1]], the longest first
+    chunk: wp.array(dtype=int)
+
+
+def divide(points: BodyPoints, body: Body, device: str) -> tuple[Body, Parts]:
+    """The body with chunks that are each in one part, and these parts."""
+    size = PART if wp.get_device(device).is_cuda else points.num_points
+    divided, parts = Body(), Parts()
+    for name in Body.vars:
+        setattr(divided, name, getattr(body, name))
+    lists = bone_lists(points, size)
+    for name, numbers in lists.items():
+        dtype = float if name == "entry_weight" else int
+        setattr(divided, name, wp.array(numbers, dtype=dtype, device=device))
+    part = lists["entry"][lists["entry_start"][:-1]] // size
+    order = np.lexsort((-np.diff(lists["entry_start"]), part))
+    parts.size = size
+    borders = np.searchsorted(part[order], np.arange(-(-points.num_points // size) + 1))
+    parts.start = wp.array(borders.astype(np.int32), dtype=int, device=device)
+    parts.chunk = wp.array(order.astype(np.int32), dtype=int, device=device)
+    return divided, parts
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+const unsigned rows = (unsigned)num_envs, own = blockIdx.x / rows;
+return wp::vec_t<3, wp::int32>((int)(blockIdx.x - own * rows), (int)own, (int)threadIdx.x);
+#else
+return wp::vec_t<3, wp::int32>(e, part, thread);
+#endif
+""")
+def place_in_parts(e: int, part: int, thread: int, num_envs: int) -> wp.vec3i:
+    """Environment, part and thread in a launch over ``(num_envs, parts, BLOCK)``, on a CPU as Warp says.
+
+    As in :func:`piavatar_envs.avatar.lanes.first_particle`, blocks that have the same part follow each other.
+    """
+    ...
+
+
+# Three words of four each: lanes that read particles which follow each other read from different banks.
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+__shared__ float __align__(16) particles[{_WORDS * PART}];
+return reinterpret_cast<wp::uint64>(particles);
+#else
+return reinterpret_cast<wp::uint64>(scratch.data);
+#endif
+""")
+def room_of_particles(scratch: wp.array(dtype=vec12)) -> wp.uint64:
+    """Where the particles of a part meet: in a CUDA block's shared memory, on a CPU in ``scratch``."""
+    ...
+
+
+@wp.func_native(f"""
+float* const to = reinterpret_cast<float*>(room) + {_WORDS} * n;
+#if defined(__CUDA_ARCH__)
+reinterpret_cast<float4*>(to)[0] = make_float4(x[0], x[1], x[2], m);
+reinterpret_cast<float4*>(to)[1] = make_float4(first[0], first[1], first[2], 0.0f);
+reinterpret_cast<float4*>(to)[2] = make_float4(second[0], second[1], second[2], 0.0f);
+#else
+for (int c = 0; c < 3; ++c) to[c] = x[c], to[4 + c] = first[c], to[8 + c] = second[c];
+to[3] = m;
+#endif
+""")
+def bring_particle(room: wp.uint64, n: int, m: float, x: wp.vec3, first: wp.vec3, second: wp.vec3):
+    """Mass, place and two vectors of particle ``n`` of a part."""
+    ...
+
+
+@wp.func_native(f"""
+const float* const from = reinterpret_cast<const float*>(room) + {_WORDS} * n;
+wp::vec_t<12, wp::float32> value;
+#if defined(__CUDA_ARCH__)
+#pragma unroll
+for (int c = 0; c < 3; ++c) {{
+    const float4 four = reinterpret_cast<const float4*>(from)[c];
+    value[4 * c] = four.x, value[4 * c + 1] = four.y, value[4 * c + 2] = four.z, value[4 * c + 3] = four.w;
+}}
+#else
+for (int c = 0; c < 12; ++c) value[c] = from[c];
+#endif
+return value;
+""")
+def particle_brought(room: wp.uint64, n: int) -> vec12:
+    """What :func:`bring_particle` has brought: place, mass, one vector, nothing, the other one, nothing."""
+    ...
+
+
+@wp.func
+def sum_both(
+    body: Body,
+    room: wp.uint64,
+    first: int,
+    origin: wp.vec3,
+    e: int,
+    c: int,
+    thread: int,
+    threads: int,
+    # out
+    moments: wp.array2d(dtype=vec16),
+    other_moments: wp.array2d(dtype=vec12),
+):
+    """Moments of one chunk, of a part whose ``first`` particle this is, about ``origin``, with the first velocity.
+
+    Of the second one momentum and angular momentum, six of twelve numbers.
+    """
+    total = vec16()
+    P = wp.vec3()
+    L = wp.vec3()
+    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
+        s = particle_brought(room, int_at(body.entry, n) - first)
+        w = float_at(body.entry_weight, n) * s[3]
+        d = wp.vec3(s[0], s[1], s[2]) - origin
+        total += moments_of(w, d, wp.vec3(s[4], s[5], s[6]))
+        momentum = w * wp.vec3(s[8], s[9], s[10])
+        P += momentum
+        L += wp.cross(d, momentum)
+    store_sum16(moments, e, c, total, threads)
+    store_momenta(other_moments, e, c, P, L, threads)
+
+
+@wp.func
+def sum_one(
+    body: Body,
+    room: wp.uint64,
+    first: int,
+    origin: wp.vec3,
+    e: int,
+    c: int,
+    thread: int,
+    threads: int,
+    # out
+    momenta: wp.array2d(dtype=vec12),
+):
+    """Momentum and angular momentum of one chunk with the first velocity; otherwise as :func:`sum_both`."""
+    P = wp.vec3()
+    L = wp.vec3()
+    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
+        s = particle_brought(room, int_at(body.entry, n) - first)
+        w = float_at(body.entry_weight, n) * s[3]
+        v = wp.vec3(s[4], s[5], s[6])
+        P += w * v
+        L += wp.cross(w * (wp.vec3(s[0], s[1], s[2]) - origin), v)
+    store_momenta(momenta, e, c, P, L, threads)
+
+
+@wp.func
+def store_momenta(into: wp.array2d(dtype=vec12), e: int, c: int, P: wp.vec3, L: wp.vec3, threads: int):
+    """Sums over the threads of a warp of a chunk's momentum and angular momentum."""
+    value = vec12(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    store_sum12(into, e, c, value, threads)
