@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.cholesky import Pattern, factorize, fetch_factor, keep_factor, solve
+from piavatar_envs.avatar.cholesky import Pattern, factorize, fetch_factor, keep_factor, solve, solve_both
 from piavatar_envs.avatar.joint_momentum import balance, gather_bones, gather_other, pass_down
 from piavatar_envs.avatar.joint_motion import add_change, go_on, move_joints, part_of, spread_motion
 from piavatar_envs.avatar.joint_torques import (
@@ -106,16 +106,17 @@ def find_shares(
 ):
     """The shares ``dq = M^-1 J^T m v`` that the joints can take of one or two velocities, from the bones' momenta.
 
-    The first is share ``into`` of the environment, 0 or 1.
+    One alone is share ``into`` of the environment, 0 or 1; two are both.
     """
     n = w.pose.position.shape[0]
     meet_threads(threads)
     for which in range(thread, velocities, threads):
         pass_down(body, w.pose.position, e, which * n + e, w.linear, w.angular, w.momentum)
     fetch_factor(w.factors, e, threads, room)
-    for which in range(velocities):
-        here = (into + which) * n + e
-        solve(w.pattern, w.factors, e, w.momentum, which * n + e, here, thread, threads, room, w.shares)
+    if velocities > 1:
+        solve_both(w.pattern, w.factors, e, w.momentum, e, n + e, thread, threads, room, w.shares)
+    else:
+        solve(w.pattern, w.factors, e, w.momentum, e, into * n + e, thread, threads, room, w.shares)
 
 
 @wp.func
