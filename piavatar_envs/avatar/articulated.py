@@ -50,9 +50,10 @@ import warp as wp
 from piavatar_envs.avatar.attachment import attach_flesh, sum_displacement
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.bone_sums import sum_moments
+from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_motion import hand_back, take_over
-from piavatar_envs.avatar.joint_stages import JointBench, Support, act, begin_substep, build_mass, fit_pose
+from piavatar_envs.avatar.joint_stages import Support, act, begin_substep, build_mass, fit_pose
 from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF

@@ -5,8 +5,9 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import skinned_place
+from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import skinned_motion
-from piavatar_envs.avatar.joint_stages import WARP, JointBench
+from piavatar_envs.avatar.joint_stages import WARP
 from piavatar_envs.avatar.lanes import BLOCK
 from piavatar_envs.avatar.loads import number_at, vector_at
 from piavatar_envs.avatar.part_sums import Parts, bring_particle, place_in_parts, room_of_particles, sum_both, sum_one

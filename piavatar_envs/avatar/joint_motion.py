@@ -223,6 +223,7 @@ def add_change(
 def go_on(
     change: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
+    own: int,
     row: int,
     e: int,
     thread: int,
@@ -233,9 +234,9 @@ def go_on(
 ):
     """The velocity that joints will have if all else does again what it did; what this takes from the particles.
 
-    The joints' own ``change`` is in row ``e``, what was ``taken`` already in ``row``.
+    The joints' own ``change`` is in row ``own``, what was ``taken`` already in ``row``.
     """
     meet_threads(threads)
     for i in range(thread, q.shape[1], threads):
-        q[e, i] = q[e, i] + change[e, i] + outside[e, i]
+        q[e, i] = q[e, i] + change[own, i] + outside[e, i]
         taken[row, i] = taken[row, i] + outside[e, i]

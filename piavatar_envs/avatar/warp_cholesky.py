@@ -13,22 +13,11 @@ wp.set_module_options({"enable_backward": False})
 #: Rows of the largest matrix that there is room for.
 MOST_ROWS = 72
 _FACTOR = MOST_ROWS * (MOST_ROWS + 1) // 2
-#: Words of shared memory of a warp: a factor, and three rows of it by columns.
-ROOM = _FACTOR + 4 * MOST_ROWS
+#: Words of shared memory of a warp: a factor, and from :data:`SPARE` on three rows of it by columns, while it is found,
+#: or what is divided by, while it is solved with.
+SPARE = _FACTOR
+ROOM = SPARE + 4 * MOST_ROWS
 _AT = "float* const room = reinterpret_cast<float*>(at);"
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-__shared__ float __align__(16) room[{ROOM}];
-return reinterpret_cast<wp::uint64>(room);
-#else
-return 0;
-#endif
-""")
-def room_of_warp() -> wp.uint64:
-    """Room of a warp that has a CUDA block of its own."""
-    ...
 
 
 # The rows of a joint are eliminated together, so that an entry is read and written once for three of them. What it

@@ -19,10 +19,10 @@ from piavatar_envs.avatar.cholesky import (
     keep_factor,
     solve,
 )
+from piavatar_envs.avatar.joint_bench import room_of_warp
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
-from piavatar_envs.avatar.warp_cholesky import room_of_warp
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 
