@@ -35,23 +35,30 @@ def set_part(q: wp.array2d(dtype=float), e: int, first: int, v: wp.vec3):
 
 
 @wp.func
-def spread_to_bone(
-    body: Body,
-    position: wp.array2d(dtype=wp.vec3),
-    q: wp.array2d(dtype=float),
-    row: int,
-    e: int,
-    b: int,
-    field: wp.array2d(dtype=vec8),
-):
-    """Rigid motion of one bone, whose parent's is known."""
+def joint_alone(position: wp.array2d(dtype=wp.vec3), q: wp.array2d(dtype=float), row: int, e: int, b: int):
+    """Rigid motion that joint ``b`` alone gives to what it carries; the pelvis' place moves with the first one."""
     w = part_of(q, row, 3 + 3 * b)
-    v = part_of(q, row, 0)
-    if b > 0:
-        above = field[e, body.parent[b]]
-        v = wp.vec3(above[0], above[1], above[2]) + wp.cross(w, position[e, 0] - position[e, b])
-        w += wp.vec3(above[3], above[4], above[5])
-    field[e, b] = vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
+    v = wp.vec3()
+    if b == 0:
+        v = part_of(q, row, 0)
+    else:
+        v = wp.cross(w, position[e, 0] - position[e, b])
+    return vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
+
+
+@wp.func
+def level_of(body: Body, b: int, threads: int):
+    """When the threads of a warp come to bone ``b``, -1 if there is none; one that is alone goes from bone to bone."""
+    level = int(-1)
+    if b < BONES:
+        level = wp.where(threads > 1, body.depth[b], 0)
+    return level
+
+
+@wp.func
+def rounds_of(threads: int):
+    """Bones that threads go through together, some of which there may not be: all threads come to every level."""
+    return (BONES + threads - 1) // threads * threads
 
 
 @wp.func
@@ -68,16 +75,22 @@ def spread_motion(
 ):
     """Rigid motion of every bone under generalised velocity ``q[row]``: velocity where the pelvis joint is, and spin.
 
-    A thread that is alone goes through the bones in their order, parents first; the threads of a warp do so level by
-    level.
+    A thread that is alone goes through the bones in their order, parents first. The threads of a warp, which is as many
+    as there are bones at least, do so level by level, and have all else ready before.
     """
     meet_threads(threads)
     levels = wp.where(threads > 1, body.levels, 1)
-    for level in range(levels):
-        for b in range(thread, BONES, threads):
-            if threads == 1 or body.depth[b] == level:
-                spread_to_bone(body, position, q, row, e, b, field)
-        meet_threads(threads)
+    for n in range(thread, rounds_of(threads), threads):
+        b = wp.min(n, BONES - 1)
+        own = level_of(body, n, threads)
+        parent = body.parent[b]
+        motion = joint_alone(position, q, row, e, b)
+        for level in range(levels):
+            if own == level:
+                if b > 0:
+                    motion = field[e, parent] + motion
+                field[e, b] = motion
+            meet_threads(threads)
 
 
 @wp.func
@@ -159,27 +172,6 @@ def hand_back(
 
 
 @wp.func
-def move_bone(
-    body: Body,
-    dt: float,
-    s: vec8,
-    e: int,
-    b: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-):
-    """Turn one bone, whose parent has been moved, by its spin over ``dt``."""
-    if b == 0:
-        position[e, b] = position[e, b] + dt * wp.vec3(s[0], s[1], s[2])
-    else:
-        a = body.parent[b]
-        r = row(e, body.rest_joint.shape[0])
-        offset = body.rest_joint[r, b] - body.rest_joint[r, a]
-        position[e, b] = position[e, a] + wp.quat_rotate(rotation[e, a], offset)
-    rotation[e, b] = wp.normalize(quat_exp(dt * wp.vec3(s[3], s[4], s[5])) * rotation[e, b])
-
-
-@wp.func
 def move_joints(
     body: Body,
     dt: float,
@@ -193,12 +185,25 @@ def move_joints(
 ):
     """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together. Threads as above."""
     meet_threads(threads)
+    r = row(e, body.rest_joint.shape[0])
+    for b in range(thread, BONES, threads):
+        s = field[e, b]
+        rotation[e, b] = wp.normalize(quat_exp(dt * wp.vec3(s[3], s[4], s[5])) * rotation[e, b])
+    meet_threads(threads)
     levels = wp.where(threads > 1, body.levels, 1)
-    for level in range(levels):
-        for b in range(thread, BONES, threads):
-            if threads == 1 or body.depth[b] == level:
-                move_bone(body, dt, field[e, b], e, b, rotation, position)
-        meet_threads(threads)
+    for n in range(thread, rounds_of(threads), threads):
+        b = wp.min(n, BONES - 1)
+        own = level_of(body, n, threads)
+        parent = wp.max(body.parent[b], 0)
+        offset = wp.quat_rotate(rotation[e, parent], body.rest_joint[r, b] - body.rest_joint[r, parent])
+        for level in range(levels):
+            if own == level:
+                if b == 0:
+                    s = field[e, b]
+                    position[e, b] = position[e, b] + dt * wp.vec3(s[0], s[1], s[2])
+                else:
+                    position[e, b] = position[e, parent] + offset
+            meet_threads(threads)
 
 
 @wp.func
