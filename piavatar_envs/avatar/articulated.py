@@ -53,7 +53,7 @@ from piavatar_envs.avatar.bone_sums import sum_moments
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_motion import hand_back, take_over
-from piavatar_envs.avatar.joint_stages import Support, act, begin_substep, build_mass, fit_pose
+from piavatar_envs.avatar.joint_stages import MASS_BLOCK, Support, act, begin_substep, build_mass, fit_pose
 from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
@@ -212,7 +212,7 @@ class ArticulatedBody:
     def record_mass(self, program: Program, state: State) -> None:
         """Append: build the mass matrix where particles and joints are, and what follows from it."""
         self.mass.record_sums(program, state, self.state.position)
-        threads = 2 * self.threads if self.threads > 1 else 1  # a warp for each of the two factors
+        threads = MASS_BLOCK if self.threads > 1 else 1
         inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure, threads]
         program.launch(build_mass, (self.model.num_envs, threads), inputs, [self._bench], block_dim=threads)
 

@@ -1,7 +1,7 @@
 """What the joints of an environment do between two passes over its particles, in a launch each.
 
-On a GPU an environment has a CUDA block, so that nothing is launched for what one warp does in a few microseconds: two
-warps build the mass matrix, and a factor each; one does all else. On a CPU it is one thread.
+On a GPU an environment has a CUDA block, so that nothing is launched for what one warp does in a few microseconds: four
+warps build the mass matrix, two a factor each; one does all else. On a CPU it is one thread.
 
 There are two of what particles do to the joints, flesh that is pulled and what the joints take over, and two factors of
 the mass matrix, with locked joints alone and with all that is implicit. Both of a kind are in one array: the first of
@@ -45,6 +45,8 @@ from piavatar_envs.mpm.types import row
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 WARP = wp.constant(32)
+#: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
+MASS_BLOCK = 128
 #: The pelvis' place, then all joints.
 PARTS = wp.constant(1 + int(BONES))
 _ROOM = wp.constant(ROOM)
@@ -141,7 +143,7 @@ def turn_joints(
     balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, own, thread, threads, w.shares)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(MASS_BLOCK, 8))
 def build_mass(
     body: Body,
     pairs: Pairs,
