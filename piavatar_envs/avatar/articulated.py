@@ -57,7 +57,7 @@ from piavatar_envs.avatar.joint_stages import MASS_BLOCK, Support, act, begin_su
 from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
-from piavatar_envs.avatar.part_sums import divide
+from piavatar_envs.avatar.part_sums import PART_BLOCK, divide
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
 from piavatar_envs.mpm.program import Program
@@ -225,10 +225,10 @@ class ArticulatedBody:
         self, program: Program, kernel: wp.Kernel, body: list, inputs: list, outputs: Sequence[wp.array] = ()
     ) -> None:
         """Append a pass over particles that sums what it finds: a CUDA block a part of the body."""
-        block = BLOCK if self.threads > 1 else 1
+        block = PART_BLOCK if self.threads > 1 else 1
         dim = (self.model.num_envs, self._parts.start.shape[0] - 1, block)
         inputs = [*body, self.model.particles.mass, *inputs, self._scratch]
-        program.launch(kernel, dim, inputs, [*outputs, self._bench], block_dim=BLOCK)
+        program.launch(kernel, dim, inputs, [*outputs, self._bench], block_dim=PART_BLOCK)
 
     def _record_stage(self, program: Program, stage: wp.Kernel, inputs: list, state: State, *more: Support) -> None:
         """Append what a warp does for an environment."""

@@ -7,20 +7,29 @@ import warp as wp
 from piavatar_envs.avatar.blending import skinned_place
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import skinned_motion
-from piavatar_envs.avatar.joint_stages import WARP
-from piavatar_envs.avatar.lanes import BLOCK
-from piavatar_envs.avatar.loads import number_at, vector_at
-from piavatar_envs.avatar.part_sums import Parts, bring_particle, place_in_parts, room_of_particles, sum_both, sum_one
+from piavatar_envs.avatar.loads import int_at, number_at, vector_at
+from piavatar_envs.avatar.part_sums import (
+    PART_BLOCK,
+    WORDS,
+    Parts,
+    bring_particle,
+    lane_of_warp,
+    place_in_parts,
+    room_of_particles,
+    store_second,
+    sum_both,
+    sum_one,
+    warp_of_block,
+)
 from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.types import Body, vec12
 from piavatar_envs.mpm.shared_memory import meet, threads_of_block
-from piavatar_envs.mpm.stores import store_vector
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
-@wp.kernel(launch_bounds=(BLOCK, 10))
+@wp.kernel(launch_bounds=(PART_BLOCK, 5))
 def sum_displacement(
     body: Body,
     parts: Parts,
@@ -33,7 +42,7 @@ def sum_displacement(
 ):
     """Of the particles from where the pose has them by linear blend skinning: its two momenta, of every chunk.
 
-    Over ``(num_envs, parts, BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
+    Over ``(num_envs, parts, PART_BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
     """
     i, j, k = wp.tid()
     at = place_in_parts(i, j, k, x.shape[0])
@@ -50,16 +59,22 @@ def sum_displacement(
         n = body.first + p
         place = vector_at(x, e, n)
         none = wp.vec3()
-        bring_particle(room, p - first, number_at(mass, r, n), place, place - skinned_place(body, w.place, e, p), none)
+        bring_particle(
+            room, WORDS * (p - first), number_at(mass, r, n), place, place - skinned_place(body, w.place, e, p), none
+        )
     meet()
-    lanes = wp.min(threads, WARP)
-    for n in range(parts.start[at[1]] + thread // lanes, parts.start[at[1] + 1], threads // lanes):
-        c = parts.chunk[n]
-        origin = w.pose.position[e, body.chunk_bone[c]]
-        sum_one(body, room, first, origin, e, c, thread % lanes, lanes, w.other_moments)
+    warp = warp_of_block()
+    lane = lane_of_warp()
+    n = int_at(parts.start, at[1]) + warp[0]
+    end = int_at(parts.start, at[1] + 1)
+    while n < end:
+        c = int_at(parts.chunk, n)
+        origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c))
+        sum_one(body, parts, room, origin, e, c, lane[0], lane[1], w.other_moments)
+        n += warp[1]
 
 
-@wp.kernel(launch_bounds=(BLOCK, 8))
+@wp.kernel(launch_bounds=(PART_BLOCK, 4))
 def attach_flesh(
     body: Body,
     parts: Parts,
@@ -113,12 +128,16 @@ def attach_flesh(
             through = followed[e, p]
             followed[e, p] = (held[1] / dt) * way
         after = implicit_velocity(held[0], dt, way, before - through) + through
-        bring_particle(room, p - first, number_at(mass, r, body.first + p), place, before - after, after)
-        store_vector(u, e, body.first + p, after, True)
+        bring_particle(room, WORDS * (p - first), number_at(mass, r, body.first + p), place, before - after, after)
         p += threads
     meet()
-    lanes = wp.min(threads, WARP)
-    for n in range(parts.start[at[1]] + thread // lanes, parts.start[at[1] + 1], threads // lanes):
-        c = parts.chunk[n]
-        origin = w.pose.position[e, body.chunk_bone[c]]
-        sum_both(body, room, first, origin, e, c, thread % lanes, lanes, w.moments, w.other_moments)
+    store_second(room, last - first, thread, threads, e, body.first + first, u)
+    warp = warp_of_block()
+    lane = lane_of_warp()
+    n = int_at(parts.start, at[1]) + warp[0]
+    end = int_at(parts.start, at[1] + 1)
+    while n < end:
+        c = int_at(parts.chunk, n)
+        origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c))
+        sum_both(body, parts, room, origin, e, c, lane[0], lane[1], w.moments, w.other_moments)
+        n += warp[1]
