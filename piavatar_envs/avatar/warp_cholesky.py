@@ -10,9 +10,10 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Rows of the largest matrix that there is room for.
-MOST_ROWS = 72
-_FACTOR = MOST_ROWS * (MOST_ROWS + 1) // 2
+#: Rows of the largest matrix that there is room for: as many as an avatar has. 16 warps have room in a multiprocessor,
+#: so that those of 2,048 environments are all at work at once.
+MOST_ROWS = 69
+_FACTOR = -(-MOST_ROWS * (MOST_ROWS + 1) // 2 // 4) * 4
 #: Words of shared memory of a warp: a factor, and from :data:`SPARE` on three rows of it by columns, while it is found,
 #: or what is divided by, while it is solved with.
 SPARE = _FACTOR
