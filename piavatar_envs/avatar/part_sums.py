@@ -37,9 +37,14 @@ class Parts:
     entry: wp.array(dtype=wp.vec2i)  # as the body's: where a particle is in its part [words], bits of the weight
 
 
+def part_size(device: str, count: int) -> int:
+    """Particles of a part of a body of ``count``; on a CPU all."""
+    return PART if wp.get_device(device).is_cuda else count
+
+
 def divide(points: BodyPoints, body: Body, device: str) -> tuple[Body, Parts]:
     """The body with chunks that are each in one part, and these parts."""
-    size = PART if wp.get_device(device).is_cuda else points.num_points
+    size = part_size(device, points.num_points)
     divided, parts = Body(), Parts()
     for name in Body.vars:
         setattr(divided, name, getattr(body, name))

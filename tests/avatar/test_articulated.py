@@ -8,7 +8,7 @@ import warp as wp
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar import lanes
+from piavatar_envs.avatar import lanes, part_sums
 from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.cholesky import (
     Pattern,
@@ -363,6 +363,29 @@ def test_threads_that_have_several_particles_move_as_one_each_does(joints, monke
     for name, value in one.state.numpy().items():
         np.testing.assert_array_equal(several.state.numpy()[name], value, err_msg=name)
     assert np.ptp(one.state.u.numpy()) > 0.1
+
+
+@pytest.mark.parametrize("attachment", [None, 100.0])
+def test_a_body_in_many_parts_moves_as_in_one(joints, monkeypatch, attachment):
+    """The same sums in another order; parts end within the particles of a warp and of a bone."""
+
+    def moved():
+        made = joints(stiffness=300.0, damping=10.0, attachment=attachment)
+        program = Program(made.model.device)
+        made.body.record_substep(program, made.state, refresh=True)
+        program.run()
+        return made
+
+    whole = moved()
+    monkeypatch.setattr(part_sums, "part_size", lambda device, count: 100)
+    divided = moved()
+    assert divided.body.body.chunk_bone.shape[0] > whole.body.body.chunk_bone.shape[0]
+    assert divided.rig.points.num_points > 200
+    for name in ("u", "vk"):
+        expected = whole.rig.read(name)
+        np.testing.assert_allclose(divided.rig.read(name), expected, atol=2e-5 * np.abs(expected).max(), err_msg=name)
+    speed = whole.body.state.velocity.numpy()
+    np.testing.assert_allclose(divided.body.state.velocity.numpy(), speed, atol=2e-5 * np.abs(speed).max())
 
 
 @pytest.mark.parametrize("name", ["stiffness", "damping"])
