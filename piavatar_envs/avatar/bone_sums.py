@@ -90,7 +90,7 @@ def sum_moments(
 ):
     """:func:`chunk_moments` of every chunk, over ``(num_envs, chunks, threads)``."""
     i, j, k = wp.tid()
-    at = place_in_chunks(i, j, k, x.shape[0])
+    at = place_in_chunks(i, j, k, body.chunk_bone.shape[0])
     e = at[0]
     c = at[1]
     thread = at[2]
@@ -153,7 +153,7 @@ def sum_corrections(
 ):
     """:func:`chunk_corrections` of every chunk, over ``(num_envs, chunks, threads)``."""
     i, j, k = wp.tid()
-    at = place_in_chunks(i, j, k, x.shape[0])
+    at = place_in_chunks(i, j, k, body.chunk_bone.shape[0])
     e = at[0]
     c = at[1]
     thread = at[2]

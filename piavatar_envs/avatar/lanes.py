@@ -80,18 +80,14 @@ def threads_of_environment(num_envs: int) -> int:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-const unsigned warp = blockIdx.x * (blockDim.x >> 5) + (threadIdx.x >> 5), rows = (unsigned)num_envs;
-const unsigned chunk = warp / rows;
-return wp::vec_t<3, wp::int32>((int)(warp - chunk * rows), (int)chunk, (int)(threadIdx.x & 31));
+const unsigned warp = blockIdx.x * (blockDim.x >> 5) + (threadIdx.x >> 5), row = warp / (unsigned)chunks;
+return wp::vec_t<3, wp::int32>((int)row, (int)(warp - row * (unsigned)chunks), (int)(threadIdx.x & 31));
 #else
 return wp::vec_t<3, wp::int32>(e, c, thread);
 #endif
 """)
-def place_in_chunks(e: int, c: int, thread: int, num_envs: int) -> wp.vec3i:
-    """Environment, chunk and lane in a launch over ``(num_envs, chunks, warp_threads)``, on a CPU as Warp says.
-
-    Warps that have the same chunk in different environments follow each other, as blocks do above.
-    """
+def place_in_chunks(e: int, c: int, thread: int, chunks: int) -> wp.vec3i:
+    """Environment, chunk and lane in a launch over ``(num_envs, chunks, warp_threads)``, as Warp says, too."""
     ...
 
 

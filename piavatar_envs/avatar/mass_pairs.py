@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body import CHUNK, BodyPoints
-from piavatar_envs.avatar.lanes import place_in_chunks, store_sum12
+from piavatar_envs.avatar.lanes import store_sum12
 from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12
@@ -86,11 +86,7 @@ def sum_pairs(
 
     ``position`` are those of the joints [m].
     """
-    i, j, k = wp.tid()
-    at = place_in_chunks(i, j, k, x.shape[0])
-    e = at[0]
-    c = at[1]
-    thread = at[2]
+    e, c, thread = wp.tid()
     origin = position[e, pairs.first[pairs.chunk_pair[c]]]
     r = row(e, particles.mass.shape[0])
     m = float(0.0)
