@@ -111,7 +111,7 @@ def drive_particles(
     """:func:`drive_particle` of every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, x.shape[0])
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return
@@ -241,7 +241,7 @@ def apply_corrections(
     """:func:`apply_correction` to every particle, over ``(num_envs, particle_threads)``."""
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, x.shape[0])
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return

@@ -120,7 +120,7 @@ def take_over(
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, x.shape[0])
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return
@@ -160,7 +160,7 @@ def hand_back(
     """What a new pose has changed of ``J qdot`` goes to the physical velocity; :func:`take_over` writes the new one."""
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, x.shape[0])
+    own = first_particle(i, threads)
     e = own[0]
     if failure[e] != 0:
         return

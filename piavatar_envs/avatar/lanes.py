@@ -46,23 +46,17 @@ def particle_threads(device: str, count: int, rounds: int) -> int:
     return -(-count // (BLOCK * rounds)) * BLOCK if wp.get_device(device).is_cuda else 1
 
 
-# Warp finds a thread's place by divisions of 64 bits, which take a tenth of a short kernel's instructions. And it would
-# have the blocks of an environment run side by side. Here those do that have the same particles of different ones: what
-# is constant of these (bones, weights, places at rest), as much as what they read of the state, comes from the
-# second-level cache once for all blocks of a multiprocessor. Its bandwidth is what such passes are bound by.
+# Warp finds a thread's place by divisions of 64 bits, which take a tenth of a short kernel's instructions.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-const unsigned rows = (unsigned)num_envs, block = blockIdx.x / rows;
-return wp::vec_t<2, wp::int32>((int)(blockIdx.x - block * rows), (int)(block * {BLOCK}u + threadIdx.x));
+const unsigned blocks = ((unsigned)threads + {BLOCK - 1}u) / {BLOCK}u, row = blockIdx.x / blocks;
+return wp::vec_t<2, wp::int32>((int)row, (int)((blockIdx.x - row * blocks) * {BLOCK}u + threadIdx.x));
 #else
 return wp::vec_t<2, wp::int32>(e, 0);
 #endif
 """)
-def first_particle(e: int, num_envs: int) -> wp.vec2i:
-    """Environment, on a CPU ``e``, and first particle of a thread in a launch over ``(num_envs, particle_threads)``.
-
-    There may be no such particle.
-    """
+def first_particle(e: int, threads: int) -> wp.vec2i:
+    """Environment, on a CPU ``e``, and first particle of one of so many :func:`particle_threads`; there may be none."""
     ...
 
 
