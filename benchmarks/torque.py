@@ -68,7 +68,7 @@ def flail_under_pd(options: Options, name: str, hold: dict[str, Any]) -> dict[st
     act = afloat("flail", script=script, drive=hold)
     stage = Stage(act, options.fidelity, options.device)
     simulation = stage.simulation
-    row = {"case": f"free_float_pd_{name}"}
+    row = {"case": f"free_float_pd{name}"}
     return row | drift(options, simulation.model, simulation.state, lambda _index: stage.step(), stage.gaps)
 
 
@@ -211,7 +211,8 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
     """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, stability, the cost."""
     for rate in (0.0, RATE):
         yield flail(options, rate)
-    for name, hold in {"loose": {"flesh_rate": (0.0, 0.0)}, "attached": {}, "firm": HOLDS["_firm"]}.items():
+    loose = {"flesh_rate": (0.0, 0.0), **HOLDS["_slipping"]}
+    for name, hold in {"_loose": loose, **HOLDS}.items():
         yield flail_under_pd(options, name, hold)
     for stiffness in STIFFNESSES:
         yield stretch_arms(options, stiffness)

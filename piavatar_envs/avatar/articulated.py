@@ -27,13 +27,10 @@ are. When the mass matrix is built anew the pose is fitted to the particles, too
 Flesh may be held to the bones by a pull, implicit and critically damped, ``u' = (u + dt w^2 d)/(1 + dt w)^2`` with
 ``d`` from the particle to its skinned place; the joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, with
 exactly its momentum. The grid blurs what a pull gives a single particle, and under load a particle slips from its place
-for the pull to carry it: by millimetres where cells have centimetres. Particles of bones may therefore follow the bones
-through their flesh, too, by a share ``s`` of the way in every substep. It is a motion of the particle's own, as
-``J qdot`` is, of which the physical velocity knows the opposite, so no momentum changes, and the flesh makes way:
-
-    c = s d / dt,   u <- u - c,   vk = J qdot + c
-
-The next pull acts on ``u + vk - J qdot - c``: else it would brake by what is no slip.
+for the pull to carry it: by millimetres where cells have centimetres. After every control step particles of bones are
+therefore put into their places, if these are not beyond a boundary. No velocity changes, so momentum is kept; what a
+way ``d`` has of angular momentum, ``m d x v``, the affine velocity of the particle takes back. The centre of mass moves
+by the mean of these ways: hundredths of a millimetre, in all directions.
 
 Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
@@ -47,7 +44,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.attachment import attach_flesh, sum_displacement
+from piavatar_envs.avatar.attachment import attach_flesh, put_in_place, sum_displacement
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.bone_sums import sum_moments
 from piavatar_envs.avatar.joint_bench import JointBench
@@ -77,8 +74,8 @@ class ArticulatedBody:
         springs: of the pelvis and of all joints.
         strength: limits of what springs and torques of the joints do; none until :meth:`set_strength`.
         tissue: what resists in the joints; nothing until :meth:`set_tissue`.
-        attachment: rates of the pulls that hold flesh to bones [1/s], and shares of the way that particles of bones
-            follow them by, vec2 ``(1 or num_envs, num_points)``, or None.
+        attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s], or None.
+        firm: particles that are put into their places on the bones, by index in the body.
         mass: the mass matrix.
         impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` is what held the pelvis.
         support: force and torque of what holds the pelvis: every substep adds its share of a control step's mean.
@@ -92,7 +89,7 @@ class ArticulatedBody:
         stiffness: np.ndarray,
         damping: np.ndarray,
         attachment: np.ndarray | None = None,
-        follow: np.ndarray | None = None,
+        firm: np.ndarray | None = None,
     ) -> None:
         """Allocate.
 
@@ -104,32 +101,28 @@ class ArticulatedBody:
             damping: likewise.
             attachment: rates of the pulls that hold flesh to bones, shape ``(1 or num_envs, num_points)`` [1/s];
                 without them flesh is held by its own stiffness only.
-            follow: share of its way to its place that a particle goes in a substep besides, shape ``(num_points,)``,
-                0 for flesh; none if not given. Needs ``attachment``.
+            firm: which particles are put into their places on the bones after every control step, shape
+                ``(num_points,)`` bool; none if not given.
 
         Raises:
-            ValueError: a stiffness, damping, rate or share is negative or not finite, or the shape is another one;
-                particles are to follow bones that do not hold them.
+            ValueError: a stiffness, damping or rate is negative or not finite, or the shape is another one.
         """
         n, device = model.num_envs, model.device
         rates = np.zeros((1, points.num_points)) if attachment is None else attachment
         sizes = (("stiffness", stiffness, 1 + NUM_JOINTS), ("damping", damping, 1 + NUM_JOINTS))
-        shares = np.zeros((1, points.num_points)) if follow is None else np.asarray(follow)[None]
-        sizes += (("attachment", rates, points.num_points), ("follow", shares, points.num_points))
+        sizes += (("attachment", rates, points.num_points),)
         for name, value, size in sizes:
             if value.shape not in ((1, size), (n, size)):
                 raise ValueError(f"{name} has shape {value.shape}, expected (1 or {n}, {size})")
             if not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
-        if attachment is None and shares.any():
-            raise ValueError("particles cannot follow bones that do not hold them; give an attachment")
         self.body, self._parts = divide(points, body, device)
         self.model, self.threads = model, warp_threads(device)
         self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))
         self.springs = group(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
-        self.attachment = None
-        if attachment is not None:
-            self.attachment = self._upload(np.stack(np.broadcast_arrays(attachment, shares), axis=-1), wp.vec2)
+        self.attachment = None if attachment is None else self._upload(attachment)
+        chosen = np.flatnonzero(np.zeros(points.num_points) if firm is None else firm)
+        self.firm = wp.array(chosen.astype(np.int32), dtype=int, device=device)
 
         def zeros(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -141,7 +134,6 @@ class ArticulatedBody:
             velocity=zeros((n, NUM_DOF), float),
             outside=zeros((n, NUM_DOF), float),
             torque=zeros(bones, wp.vec3),
-            followed=zeros((n, points.num_points if shares.any() else 1), wp.vec3),
         )
         self.pose = group(Pose, rotation=self.state.rotation, position=self.state.position)
         target = {"rotation": zeros(bones, wp.quat), "root": zeros(n, wp.vec3)}
@@ -266,13 +258,24 @@ class ArticulatedBody:
         velocities = 1 if self.attachment is None else 2
         if self.attachment is not None:
             inputs = [state.x, self.attachment, state.vk, state.failure]
-            outputs = [state.u, self.state.followed]
-            self._record_parts(program, attach_flesh, [self.body, self._parts, dt], inputs, outputs)
+            self._record_parts(program, attach_flesh, [self.body, self._parts, dt], inputs, [state.u])
         else:
             inputs = [self.body, state.x, position, w.moving, state.vk, state.failure]
             program.launch(hand_back, points, inputs, [state.u], block_dim=BLOCK)
             self._record_moments(program, state)
         inputs = [self.body, dt, 1.0 / model.control_dt, velocities, self.target, self.springs, self.tissue]
         self._record_stage(program, act, [*inputs, self.strength], state, self.support)
-        inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, self.state.followed, state.failure]
+        inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, state.failure]
         program.launch(take_over, points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
+
+    def record_end(self, program: Program, state: State) -> None:
+        """Append what ends a control step: firm particles are put into their places on the bones as they are now.
+
+        Blocks of the grid are not marked where they come to: the next control step marks all anew.
+        """
+        if self.firm.size == 0:
+            return
+        model, w = self.model, self._bench
+        self._record_stage(program, begin_substep, [self.body], state)
+        inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, state.u, state.vk, state.failure]
+        program.launch(put_in_place, (model.num_envs, self.firm.size), inputs, [state.x, state.C])

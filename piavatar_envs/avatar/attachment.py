@@ -23,8 +23,10 @@ from piavatar_envs.avatar.part_sums import (
 )
 from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.types import Body, vec12
+from piavatar_envs.mpm.colliders import signed_distance
+from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.shared_memory import meet, threads_of_block
-from piavatar_envs.mpm.types import row
+from piavatar_envs.mpm.types import Boundaries, Grid, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -81,22 +83,19 @@ def attach_flesh(
     dt: float,
     mass: wp.array2d(dtype=float),
     x: wp.array2d(dtype=wp.vec3),
-    hold: wp.array2d(dtype=wp.vec2),
+    rate: wp.array2d(dtype=float),
     vk: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     scratch: wp.array(dtype=vec12),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
-    followed: wp.array2d(dtype=wp.vec3),
     w: JointBench,
 ):
     """Hand back, and pull every particle to its place on the bones, implicit in time and critically damped.
 
     What a new pose has changed of ``J qdot`` goes to the physical velocity, as
-    :func:`piavatar_envs.avatar.joint_motion.hand_back` has it. ``hold`` is the rate of the pull [1/s], and the share of
-    its way that a bone's particle goes in this substep besides, through its flesh; ``followed`` is the velocity of that
-    way [m/s], of which the pull does not know. Of what the pull has taken of the velocity, and of what it leaves, the
-    bones get the moments. Launched as :func:`sum_displacement`.
+    :func:`piavatar_envs.avatar.joint_motion.hand_back` has it. ``rate`` is the pull's [1/s]. Of what it has taken of
+    the velocity, and of what it leaves, the bones get the moments. Launched as :func:`sum_displacement`.
     """
     i, j, k = wp.tid()
     at = place_in_parts(i, j, k, x.shape[0])
@@ -122,12 +121,7 @@ def attach_flesh(
         following_v = vector_at(u, e, n) + vector_at(vk, e, n)
         before = v - skinned_motion(body, w.moving, e, p, place - pelvis)
         way = skinned_place(body, w.place, e, p) - place
-        held = hold[row(e, hold.shape[0]), p]
-        through = wp.vec3()
-        if held[1] > 0.0:
-            through = followed[e, p]
-            followed[e, p] = (held[1] / dt) * way
-        after = implicit_velocity(held[0], dt, way, before - through) + through
+        after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
         bring_particle(room, WORDS * (p - first), number_at(mass, r, body.first + p), place, before - after, after)
         p += threads
     meet()
@@ -141,3 +135,43 @@ def attach_flesh(
         origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c))
         sum_both(body, parts, room, origin, e, c, lane[0], lane[1], w.moments, w.other_moments)
         n += warp[1]
+
+
+@wp.func
+def keep_outside(boundaries: Boundaries, e: int, x: wp.vec3):
+    """The place ``x`` [m], or the nearest one on the surface that it lies beyond, in the order of the boundaries."""
+    for b in range(boundaries.count):
+        d = signed_distance(boundaries, e, b, x)
+        x = x - wp.min(d[3], 0.0) * wp.vec3(d[0], d[1], d[2])
+    return x
+
+
+@wp.kernel
+def put_in_place(
+    body: Body,
+    grid: Grid,
+    boundaries: Boundaries,
+    firm: wp.array(dtype=int),
+    place: wp.array2d(dtype=wp.mat44),
+    u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    # in and out
+    x: wp.array2d(dtype=wp.vec3),
+    C: wp.array3d(dtype=float),
+):
+    """Put the ``firm`` particles where their bones have them, though not beyond boundaries; over ``(E, firm ones)``.
+
+    No particle's velocity ``v`` changes. Of the angular momentum that is ``m d x v`` for a way of ``d``, and the affine
+    velocity takes it back: the grid gets ``m (dx^2/4) eps C`` of it (Jiang et al. 2015, quadratic weights).
+    """
+    e, n = wp.tid()
+    if failure[e] != 0:
+        return
+    p = firm[n]
+    q = body.first + p
+    at = keep_outside(boundaries, e, skinned_place(body, place, e, p))
+    way = at - x[e, q]
+    x[e, q] = at
+    spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, u[e, q] + vk[e, q])
+    store_matrix(C, e, q, matrix_at(C, e, q) - wp.skew(spin))

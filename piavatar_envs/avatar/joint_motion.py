@@ -106,7 +106,6 @@ def take_over(
     pelvis: wp.array(dtype=wp.vec3),
     leaving: wp.array2d(dtype=vec8),
     moving: wp.array2d(dtype=vec8),
-    followed: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
@@ -115,8 +114,7 @@ def take_over(
 ):
     """Take from the physical velocity what leaves it for the joints, and write ``J qdot``.
 
-    Both are motions about where the ``pelvis`` joint is before it moves on [m]. So does the velocity by which particles
-    of bones have ``followed`` them, where there are such.
+    Both are motions about where the ``pelvis`` joint is before it moves on [m].
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -139,10 +137,7 @@ def take_over(
         after = before - skinned_motion(body, leaving, e, p, arm)
         now = blend_changes(moving, e, body.joint, body.weight, p)
         spin = wp.vec3(now[3], now[4], now[5])
-        through = wp.vec3()
-        if p < followed.shape[1]:
-            through = followed[e, p]
-        store_velocities(u, driven, e, body.first + p, after - through, motion_at(now, arm) + through, spin, True)
+        store_velocities(u, driven, e, body.first + p, after, motion_at(now, arm), spin, True)
         p += threads
 
 

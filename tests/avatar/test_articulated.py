@@ -67,12 +67,11 @@ def carried_by() -> np.ndarray:
 class Joints:
     """An articulated body beside a rig's particles, and programs of its parts."""
 
-    def __init__(self, rig, stiffness=0.0, damping=0.0, attachment=None, follow=0.0):
+    def __init__(self, rig, stiffness=0.0, damping=0.0, attachment=None):
         self.rig, self.model, self.state = rig, rig.model, rig.state
         rates = None if attachment is None else np.broadcast_to(attachment, (1, rig.points.num_points))
         body = rig.points, rig.drive.body, rig.model
-        shares = follow * (rig.points.bone >= 0)
-        self.body = ArticulatedBody(*body, stiffness * GAINS, damping * GAINS, rates, shares)
+        self.body = ArticulatedBody(*body, stiffness * GAINS, damping * GAINS, rates)
 
     def pose(self, rotvec, root=None):
         """Put pose and particles where the local rotation vectors have them, at rest."""
@@ -204,11 +203,10 @@ def test_joints_take_over_all_they_can_and_change_no_velocity(joints):
     np.testing.assert_allclose(made.rig.read("spin"), weights @ bones, atol=1e-4)
 
 
-@pytest.mark.parametrize("follow", [0.0, 0.5])
 @pytest.mark.parametrize("stale", [False, True], ids=["fresh", "stale"])
-def test_torques_change_neither_momentum(joints, wild_pose, stale, follow):
+def test_torques_change_neither_momentum(joints, wild_pose, stale):
     """Springs, dampers, torques of 1000 N m, flesh on bones; also with a mass matrix of another place."""
-    made = joints(1, stiffness=300.0, damping=10.0, attachment=200.0, follow=follow)
+    made = joints(1, stiffness=300.0, damping=10.0, attachment=200.0)
     rng = np.random.default_rng(3)
     if stale:
         made.state.x.assign(made.state.x.numpy() + rng.normal(0.0, 2e-2, made.state.x.numpy().shape).astype(np.float32))
@@ -312,14 +310,6 @@ def test_free_float_keeps_momentum(make_rig, wild_pose):
     assert rig.state.failure.numpy().sum() == 0
     assert largest > 10.0  # it did move [kg m/s]
     assert (worst < 1e-5 * largest).all(), worst / largest
-
-
-def test_particles_follow_what_holds_them_only(make_rig):
-    rig = make_rig(cells=16)
-    with pytest.raises(ValueError, match="cannot follow bones that do not hold them"):
-        Joints(rig, follow=0.5)
-    with pytest.raises(ValueError, match=r"follow must be finite and not negative, its least is -0\.5"):
-        Joints(rig, attachment=100.0, follow=-0.5)
 
 
 def test_flesh_comes_back_to_the_bones(make_rig):
