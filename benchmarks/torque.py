@@ -22,7 +22,7 @@ from benchmarks.rig import joint_gaps
 from benchmarks.stage import Pose, Stage, standing
 from piavatar_envs.avatar import attachment, joint_motion, joint_stages, mass_pairs
 from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.bone_sums import sum_moments, sum_moments_of_both
+from piavatar_envs.avatar.bone_sums import sum_moments
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import PhysicsConfig, load_config
@@ -68,7 +68,7 @@ def flail_under_pd(options: Options, name: str, hold: dict[str, Any]) -> dict[st
     act = afloat("flail", script=script, drive=hold)
     stage = Stage(act, options.fidelity, options.device)
     simulation = stage.simulation
-    row = {"case": f"free_float_pd_{name}"}
+    row = {"case": f"free_float_pd{name}"}
     return row | drift(options, simulation.model, simulation.state, lambda _index: stage.step(), stage.gaps)
 
 
@@ -196,7 +196,7 @@ def cost(options: Options) -> dict[str, Any]:
     whole, alone = 1e3 * np.min(times, axis=0)
     kernels = {kernel for module in MODULES for kernel in vars(module) if hasattr(vars(module)[kernel], "adj")}
     launched = timing.kernel_times(limbs.program, repeats=5)
-    kernels |= {sum_moments.key, sum_moments_of_both.key}
+    kernels.add(sum_moments.key)
     joints = sum(time.ms for name, time in launched.items() if name in kernels)
     return {
         "case": "cost",
@@ -211,7 +211,8 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
     """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, stability, the cost."""
     for rate in (0.0, RATE):
         yield flail(options, rate)
-    for name, hold in {"loose": {"flesh_rate": (0.0, 0.0)}, "attached": {}, "firm": HOLDS["_firm"]}.items():
+    loose = {"flesh_rate": (0.0, 0.0), **HOLDS["_slipping"]}
+    for name, hold in {"_loose": loose, **HOLDS}.items():
         yield flail_under_pd(options, name, hold)
     for stiffness in STIFFNESSES:
         yield stretch_arms(options, stiffness)

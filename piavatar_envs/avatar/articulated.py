@@ -27,13 +27,10 @@ are. When the mass matrix is built anew the pose is fitted to the particles, too
 Flesh may be held to the bones by a pull, implicit and critically damped, ``u' = (u + dt w^2 d)/(1 + dt w)^2`` with
 ``d`` from the particle to its skinned place; the joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, with
 exactly its momentum. The grid blurs what a pull gives a single particle, and under load a particle slips from its place
-for the pull to carry it: by millimetres where cells have centimetres. Particles of bones may therefore follow the bones
-through their flesh, too, by a share ``s`` of the way in every substep. It is a motion of the particle's own, as
-``J qdot`` is, of which the physical velocity knows the opposite, so no momentum changes, and the flesh makes way:
-
-    c = s d / dt,   u <- u - c,   vk = J qdot + c
-
-The next pull acts on ``u + vk - J qdot - c``: else it would brake by what is no slip.
+for the pull to carry it: by millimetres where cells have centimetres. After every control step particles of bones are
+therefore put into their places, if these are not beyond a boundary. No velocity changes, so momentum is kept; what a
+way ``d`` has of angular momentum, ``m d x v``, the affine velocity of the particle takes back. The centre of mass moves
+by the mean of these ways: hundredths of a millimetre, in all directions.
 
 Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
@@ -47,15 +44,17 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.attachment import attach_flesh, find_displacement
+from piavatar_envs.avatar.attachment import attach_flesh, put_in_place, sum_displacement
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.bone_sums import sum_moments, sum_moments_of_both
+from piavatar_envs.avatar.bone_sums import sum_moments
+from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_mass import JointMass
 from piavatar_envs.avatar.joint_motion import hand_back, take_over
-from piavatar_envs.avatar.joint_stages import JointBench, Support, act, begin_substep, build_mass, fit_pose
+from piavatar_envs.avatar.joint_stages import MASS_BLOCK, Support, act, begin_substep, build_mass, fit_pose
 from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
+from piavatar_envs.avatar.part_sums import PART_BLOCK, divide
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
 from piavatar_envs.mpm.program import Program
@@ -75,8 +74,8 @@ class ArticulatedBody:
         springs: of the pelvis and of all joints.
         strength: limits of what springs and torques of the joints do; none until :meth:`set_strength`.
         tissue: what resists in the joints; nothing until :meth:`set_tissue`.
-        attachment: rates of the pulls that hold flesh to bones [1/s], and shares of the way that particles of bones
-            follow them by, vec2 ``(1 or num_envs, num_points)``, or None.
+        attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s], or None.
+        firm: particles that are put into their places on the bones, by index in the body.
         mass: the mass matrix.
         impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` is what held the pelvis.
         support: force and torque of what holds the pelvis: every substep adds its share of a control step's mean.
@@ -90,7 +89,7 @@ class ArticulatedBody:
         stiffness: np.ndarray,
         damping: np.ndarray,
         attachment: np.ndarray | None = None,
-        follow: np.ndarray | None = None,
+        firm: np.ndarray | None = None,
     ) -> None:
         """Allocate.
 
@@ -102,31 +101,28 @@ class ArticulatedBody:
             damping: likewise.
             attachment: rates of the pulls that hold flesh to bones, shape ``(1 or num_envs, num_points)`` [1/s];
                 without them flesh is held by its own stiffness only.
-            follow: share of its way to its place that a particle goes in a substep besides, shape ``(num_points,)``,
-                0 for flesh; none if not given. Needs ``attachment``.
+            firm: which particles are put into their places on the bones after every control step, shape
+                ``(num_points,)`` bool; none if not given.
 
         Raises:
-            ValueError: a stiffness, damping, rate or share is negative or not finite, or the shape is another one;
-                particles are to follow bones that do not hold them.
+            ValueError: a stiffness, damping or rate is negative or not finite, or the shape is another one.
         """
         n, device = model.num_envs, model.device
         rates = np.zeros((1, points.num_points)) if attachment is None else attachment
         sizes = (("stiffness", stiffness, 1 + NUM_JOINTS), ("damping", damping, 1 + NUM_JOINTS))
-        shares = np.zeros((1, points.num_points)) if follow is None else np.asarray(follow)[None]
-        sizes += (("attachment", rates, points.num_points), ("follow", shares, points.num_points))
+        sizes += (("attachment", rates, points.num_points),)
         for name, value, size in sizes:
             if value.shape not in ((1, size), (n, size)):
                 raise ValueError(f"{name} has shape {value.shape}, expected (1 or {n}, {size})")
             if not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
-        if attachment is None and shares.any():
-            raise ValueError("particles cannot follow bones that do not hold them; give an attachment")
-        self.body, self.model, self.threads = body, model, warp_threads(device)
+        self.body, self._parts = divide(points, body, device)
+        self.model, self.threads = model, warp_threads(device)
         self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))
         self.springs = group(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
-        self.attachment = None
-        if attachment is not None:
-            self.attachment = self._upload(np.stack(np.broadcast_arrays(attachment, shares), axis=-1), wp.vec2)
+        self.attachment = None if attachment is None else self._upload(attachment)
+        chosen = np.flatnonzero(np.zeros(points.num_points) if firm is None else firm)
+        self.firm = wp.array(chosen.astype(np.int32), dtype=int, device=device)
 
         def zeros(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -138,14 +134,13 @@ class ArticulatedBody:
             velocity=zeros((n, NUM_DOF), float),
             outside=zeros((n, NUM_DOF), float),
             torque=zeros(bones, wp.vec3),
-            followed=zeros((n, points.num_points if shares.any() else 1), wp.vec3),
         )
         self.pose = group(Pose, rotation=self.state.rotation, position=self.state.position)
         target = {"rotation": zeros(bones, wp.quat), "root": zeros(n, wp.vec3)}
         self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
         self.target.rotation.fill_(wp.quat_identity())
         self.mass = JointMass(points, body, model)
-        self._displacement = zeros((n, model.num_particles), wp.vec3)
+        self._scratch = zeros(points.num_points if self.threads == 1 else 0, vec12)
         self.impulse = zeros((n, NUM_DOF), float)
         self.support = group(Support, force=zeros(n, wp.vec3), torque=zeros(n, wp.vec3))
         self._bench = self._allocate()
@@ -209,30 +204,37 @@ class ArticulatedBody:
     def record_mass(self, program: Program, state: State) -> None:
         """Append: build the mass matrix where particles and joints are, and what follows from it."""
         self.mass.record_sums(program, state, self.state.position)
-        threads = 2 * self.threads if self.threads > 1 else 1  # a warp for each of the two factors
+        threads = MASS_BLOCK if self.threads > 1 else 1
         inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure, threads]
         program.launch(build_mass, (self.model.num_envs, threads), inputs, [self._bench], block_dim=threads)
 
     def _record_fit(self, program: Program, state: State) -> None:
         """Append: fit the pose to the particles, by a share. No velocity changes."""
-        inputs = [self.body, state.x, self._bench.place, state.failure]
-        program.launch(find_displacement, self._points, inputs, [self._displacement], block_dim=BLOCK)
-        self._record_moments(program, state, [self._displacement])
+        self._record_parts(program, sum_displacement, [self.body, self._parts], [state.x, state.failure])
         self._record_stage(program, fit_pose, [self.body, FIT_SHARE], state)
+
+    def _record_parts(
+        self, program: Program, kernel: wp.Kernel, body: list, inputs: list, outputs: Sequence[wp.array] = ()
+    ) -> None:
+        """Append a pass over particles that sums what it finds: a CUDA block a part of the body."""
+        block = PART_BLOCK if self.threads > 1 else 1
+        dim = (self.model.num_envs, self._parts.start.shape[0] - 1, block)
+        inputs = [*body, self.model.particles.mass, *inputs, self._scratch]
+        program.launch(kernel, dim, inputs, [*outputs, self._bench], block_dim=PART_BLOCK)
 
     def _record_stage(self, program: Program, stage: wp.Kernel, inputs: list, state: State, *more: Support) -> None:
         """Append what a warp does for an environment."""
         inputs, outputs = [*inputs, state.failure, self.threads], [*more, self._bench]
         program.launch(stage, (self.model.num_envs, self.threads), inputs, outputs, block_dim=self.threads)
 
-    def _record_moments(self, program: Program, state: State, vectors: Sequence[wp.array]) -> None:
-        """Append: moments of the chunks of one or two vectors at the particles."""
-        w, one = self._bench, len(vectors) == 1
+    def _record_moments(self, program: Program, state: State) -> None:
+        """Append: moments of the chunks of the physical velocity."""
+        w = self._bench
         program.launch(
-            sum_moments if one else sum_moments_of_both,
+            sum_moments,
             (*w.moments.shape, self.threads),
-            [self.body, self.model.particles, state.x, *vectors, self.state.position, state.failure, self.threads],
-            [w.moments] if one else [w.moments, w.other_moments],
+            [self.body, self.model.particles, state.x, state.u, self.state.position, state.failure, self.threads],
+            [w.moments],
             block_dim=BLOCK,
         )
 
@@ -252,18 +254,28 @@ class ArticulatedBody:
             self._record_fit(program, state)
         else:
             self._record_stage(program, begin_substep, [self.body], state)
-        # hand back; flesh may be pulled to the bones, too: one pass over the particles sums what both leave
+        # hand back; flesh may be pulled to the bones, too: what it leaves and what it takes is summed in the same pass
+        velocities = 1 if self.attachment is None else 2
         if self.attachment is not None:
-            inputs = [self.body, dt, state.x, position, w.place, w.moving, self.attachment, state.vk, state.failure]
-            outputs = [state.u, self.state.followed, self._displacement]
-            program.launch(attach_flesh, points, inputs, outputs, block_dim=BLOCK)
-            vectors = [self._displacement, state.u]
+            inputs = [state.x, self.attachment, state.vk, state.failure]
+            self._record_parts(program, attach_flesh, [self.body, self._parts, dt], inputs, [state.u])
         else:
             inputs = [self.body, state.x, position, w.moving, state.vk, state.failure]
             program.launch(hand_back, points, inputs, [state.u], block_dim=BLOCK)
-            vectors = [state.u]
-        self._record_moments(program, state, vectors)
-        inputs = [self.body, dt, 1.0 / model.control_dt, len(vectors), self.target, self.springs, self.tissue]
+            self._record_moments(program, state)
+        inputs = [self.body, dt, 1.0 / model.control_dt, velocities, self.target, self.springs, self.tissue]
         self._record_stage(program, act, [*inputs, self.strength], state, self.support)
-        inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, self.state.followed, state.failure]
+        inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, state.failure]
         program.launch(take_over, points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
+
+    def record_end(self, program: Program, state: State) -> None:
+        """Append what ends a control step: firm particles are put into their places on the bones as they are now.
+
+        Blocks of the grid are not marked where they come to: the next control step marks all anew.
+        """
+        if self.firm.size == 0:
+            return
+        model, w = self.model, self._bench
+        self._record_stage(program, begin_substep, [self.body], state)
+        inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, state.u, state.vk, state.failure]
+        program.launch(put_in_place, (model.num_envs, self.firm.size), inputs, [state.x, state.C])

@@ -5,88 +5,173 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import skinned_place
+from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import skinned_motion
-from piavatar_envs.avatar.lanes import first_particle, threads_of_environment
-from piavatar_envs.avatar.loads import vector_at
+from piavatar_envs.avatar.loads import int_at, number_at, vector_at
+from piavatar_envs.avatar.part_sums import (
+    PART_BLOCK,
+    WORDS,
+    Parts,
+    bring_particle,
+    lane_of_warp,
+    place_in_parts,
+    room_of_particles,
+    store_second,
+    sum_both,
+    sum_one,
+    warp_of_block,
+)
 from piavatar_envs.avatar.pulls import implicit_velocity
-from piavatar_envs.avatar.types import Body, vec8
-from piavatar_envs.mpm.stores import store_pair, store_vector
-from piavatar_envs.mpm.types import row
+from piavatar_envs.avatar.types import Body, vec12
+from piavatar_envs.mpm.colliders import signed_distance
+from piavatar_envs.mpm.matrices import matrix_at, store_matrix
+from piavatar_envs.mpm.shared_memory import meet, threads_of_block
+from piavatar_envs.mpm.types import Boundaries, Grid, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
-@wp.kernel
-def find_displacement(
+@wp.kernel(launch_bounds=(PART_BLOCK, 5))
+def sum_displacement(
     body: Body,
+    parts: Parts,
+    mass: wp.array2d(dtype=float),
     x: wp.array2d(dtype=wp.vec3),
-    place: wp.array2d(dtype=wp.mat44),
     failure: wp.array(dtype=int),
-    # out
-    displacement: wp.array2d(dtype=wp.vec3),
+    scratch: wp.array(dtype=vec12),
+    # in and out
+    w: JointBench,
 ):
-    """Of the particles from where the pose has them by linear blend skinning [m], at their places in the world."""
-    i, _ = wp.tid()
-    threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, threads)
-    e = own[0]
+    """Of the particles from where the pose has them by linear blend skinning: its two momenta, of every chunk.
+
+    Over ``(num_envs, parts, PART_BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
+    """
+    i, j, k = wp.tid()
+    at = place_in_parts(i, j, k, x.shape[0])
+    e = at[0]
     if failure[e] != 0:
         return
-    p = own[1]
-    while p < body.count:
-        q = body.first + p
-        store_vector(displacement, e, q, vector_at(x, e, q) - skinned_place(body, place, e, p), True)
+    thread = at[2]
+    threads = threads_of_block()
+    room = room_of_particles(scratch)
+    first = at[1] * parts.size
+    last = wp.min(first + parts.size, body.count)
+    r = row(e, mass.shape[0])
+    for p in range(first + thread, last, threads):
+        n = body.first + p
+        place = vector_at(x, e, n)
+        none = wp.vec3()
+        bring_particle(
+            room, WORDS * (p - first), number_at(mass, r, n), place, place - skinned_place(body, w.place, e, p), none
+        )
+    meet()
+    warp = warp_of_block()
+    lane = lane_of_warp()
+    n = int_at(parts.start, at[1]) + warp[0]
+    end = int_at(parts.start, at[1] + 1)
+    while n < end:
+        c = int_at(parts.chunk, n)
+        origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c))
+        sum_one(body, parts, room, origin, e, c, lane[0], lane[1], w.other_moments)
+        n += warp[1]
+
+
+@wp.kernel(launch_bounds=(PART_BLOCK, 4))
+def attach_flesh(
+    body: Body,
+    parts: Parts,
+    dt: float,
+    mass: wp.array2d(dtype=float),
+    x: wp.array2d(dtype=wp.vec3),
+    rate: wp.array2d(dtype=float),
+    vk: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    scratch: wp.array(dtype=vec12),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    w: JointBench,
+):
+    """Hand back, and pull every particle to its place on the bones, implicit in time and critically damped.
+
+    What a new pose has changed of ``J qdot`` goes to the physical velocity, as
+    :func:`piavatar_envs.avatar.joint_motion.hand_back` has it. ``rate`` is the pull's [1/s]. Of what it has taken of
+    the velocity, and of what it leaves, the bones get the moments. Launched as :func:`sum_displacement`.
+    """
+    i, j, k = wp.tid()
+    at = place_in_parts(i, j, k, x.shape[0])
+    e = at[0]
+    if failure[e] != 0:
+        return
+    thread = at[2]
+    threads = threads_of_block()
+    room = room_of_particles(scratch)
+    first = at[1] * parts.size
+    last = wp.min(first + parts.size, body.count)
+    r = row(e, mass.shape[0])
+    p = first + thread
+    pelvis = w.pose.position[e, 0]
+    n = body.first + wp.min(p, last - 1)
+    following = vector_at(x, e, n)
+    following_v = vector_at(u, e, n) + vector_at(vk, e, n)
+    while p < last:
+        place = following
+        v = following_v
+        n = body.first + wp.min(p + threads, last - 1)
+        following = vector_at(x, e, n)
+        following_v = vector_at(u, e, n) + vector_at(vk, e, n)
+        before = v - skinned_motion(body, w.moving, e, p, place - pelvis)
+        way = skinned_place(body, w.place, e, p) - place
+        after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
+        bring_particle(room, WORDS * (p - first), number_at(mass, r, body.first + p), place, before - after, after)
         p += threads
+    meet()
+    store_second(room, last - first, thread, threads, e, body.first + first, u)
+    warp = warp_of_block()
+    lane = lane_of_warp()
+    n = int_at(parts.start, at[1]) + warp[0]
+    end = int_at(parts.start, at[1] + 1)
+    while n < end:
+        c = int_at(parts.chunk, n)
+        origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c))
+        sum_both(body, parts, room, origin, e, c, lane[0], lane[1], w.moments, w.other_moments)
+        n += warp[1]
+
+
+@wp.func
+def keep_outside(boundaries: Boundaries, e: int, x: wp.vec3):
+    """The place ``x`` [m], or the nearest one on the surface that it lies beyond, in the order of the boundaries."""
+    for b in range(boundaries.count):
+        d = signed_distance(boundaries, e, b, x)
+        x = x - wp.min(d[3], 0.0) * wp.vec3(d[0], d[1], d[2])
+    return x
 
 
 @wp.kernel
-def attach_flesh(
+def put_in_place(
     body: Body,
-    dt: float,
-    x: wp.array2d(dtype=wp.vec3),
-    position: wp.array2d(dtype=wp.vec3),
+    grid: Grid,
+    boundaries: Boundaries,
+    firm: wp.array(dtype=int),
     place: wp.array2d(dtype=wp.mat44),
-    moving: wp.array2d(dtype=vec8),
-    hold: wp.array2d(dtype=wp.vec2),
+    u: wp.array2d(dtype=wp.vec3),
     vk: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     # in and out
-    u: wp.array2d(dtype=wp.vec3),
-    followed: wp.array2d(dtype=wp.vec3),
-    # out
-    lost: wp.array2d(dtype=wp.vec3),
+    x: wp.array2d(dtype=wp.vec3),
+    C: wp.array3d(dtype=float),
 ):
-    """:func:`hand_back`, and pull every particle to its place on the bones, implicit in time and critically damped.
+    """Put the ``firm`` particles where their bones have them, though not beyond boundaries; over ``(E, firm ones)``.
 
-    ``hold`` is the rate of the pull [1/s], and the share of its way that a bone's particle goes in this substep
-    besides, through its flesh. ``lost`` is what the pull has taken of the velocity, ``followed`` the velocity of that
-    way [m/s]; the pull does not know of the last one's.
+    No particle's velocity ``v`` changes. Of the angular momentum that is ``m d x v`` for a way of ``d``, and the affine
+    velocity takes it back: the grid gets ``m (dx^2/4) eps C`` of it (Jiang et al. 2015, quadratic weights).
     """
-    i, _ = wp.tid()
-    threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, threads)
-    e = own[0]
+    e, n = wp.tid()
     if failure[e] != 0:
         return
-    p = own[1]
-    pelvis = position[e, 0]
-    last = body.count - 1
-    n = body.first + wp.min(p, last)
-    following = vector_at(x, e, n)
-    following_v = vector_at(u, e, n) + vector_at(vk, e, n)
-    while p < body.count:
-        at = following
-        v = following_v
-        n = body.first + wp.min(p + threads, last)
-        following = vector_at(x, e, n)
-        following_v = vector_at(u, e, n) + vector_at(vk, e, n)
-        before = v - skinned_motion(body, moving, e, p, at - pelvis)
-        way = skinned_place(body, place, e, p) - at
-        held = hold[row(e, hold.shape[0]), p]
-        through = wp.vec3()
-        if held[1] > 0.0:
-            through = followed[e, p]
-            followed[e, p] = (held[1] / dt) * way
-        after = implicit_velocity(held[0], dt, way, before - through) + through
-        store_pair(u, lost, e, body.first + p, after, before - after, True, True)
-        p += threads
+    p = firm[n]
+    q = body.first + p
+    at = keep_outside(boundaries, e, skinned_place(body, place, e, p))
+    way = at - x[e, q]
+    x[e, q] = at
+    spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, u[e, q] + vk[e, q])
+    store_matrix(C, e, q, matrix_at(C, e, q) - wp.skew(spin))

@@ -24,7 +24,8 @@ STEP, VELOCITY, SPIN = wp.constant(33), wp.constant(36), wp.constant(39)
 AT_PLACE, AT_LEAN, AT_STEP = wp.constant(0), wp.constant(3), wp.constant(6)
 AT_VELOCITY, AT_SPIN = wp.constant(18), wp.constant(21)
 
-# What a particle is skinned to, in loads of 16 bytes.
+# What a particle is skinned to, in loads of 16 bytes. The bones of an environment follow each other in memory: to find
+# each by itself would take as long as to blend it.
 _INFLUENCES = """
 #if defined(__CUDA_ARCH__)
 int4 j4 = *reinterpret_cast<const int4*>(&joint.data[p]);
@@ -62,11 +63,12 @@ const auto add = [&](const wp::float32* bone, wp::float32 w) {
     for (int i = 0; i < 6; ++i) sum[18 + i] += w * bone[36 + i];
 };
 #if defined(__CUDA_ARCH__)
+const auto* const own = &wp::index(record, e, 0);
 // one bone at a time: a thread that read all of them at once would need so many registers that few threads fit
 #pragma unroll 1
 for (int n = 0; n < 4; ++n) {
     if (w4.x > 0.0f) {
-        const float4* const from = reinterpret_cast<const float4*>(&wp::index(record, e, j4.x));
+        const float4* const from = reinterpret_cast<const float4*>(own + j4.x);
         float4 bone[11];
 #pragma unroll
         for (int q = 0; q < 11; ++q) bone[q] = from[q];
@@ -129,11 +131,12 @@ def store_record(record: wp.array2d(dtype=vec44), e: int, b: int, value: vec44):
     _INFLUENCES
     + """
 wp::vec_t<8, wp::float32> sum;
+const auto* const own = &wp::index(change, e, 0);
 #pragma unroll
 for (int n = 0; n < 4; ++n) {
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
-    const auto& bone = wp::index(change, e, bones[n]);
+    const auto& bone = own[bones[n]];
 #if defined(__CUDA_ARCH__)
     const float4* const from = reinterpret_cast<const float4*>(&bone);
     const float4 a = from[0], b = from[1];
@@ -161,11 +164,12 @@ def blend_changes(
     _INFLUENCES
     + """
 wp::vec3 sum;
+const auto* const own = &wp::index(place, e, 0);
 #pragma unroll
 for (int n = 0; n < 4; ++n) {
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
-    const auto& bone = wp::index(place, e, bones[n]);
+    const auto& bone = own[bones[n]];
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
 #if defined(__CUDA_ARCH__)

@@ -47,28 +47,37 @@ class BodyPoints:
         return self.rest.shape[1]
 
 
-def _bone_lists(
-    points: BodyPoints, skin_weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Chunked lists of the particles that each bone moves: chunk_start, chunk_bone, entry_start, entry, weight."""
+def normal_weights(points: BodyPoints) -> np.ndarray:
+    """Skinning weights that sum to one in single precision, so that fields blended over bones keep momentum."""
+    return points.skin_weights / points.skin_weights.sum(1)[:, None]
+
+
+def bone_lists(points: BodyPoints, part: int) -> dict[str, np.ndarray]:
+    """Chunked lists of the particles that each bone moves, as :class:`Body` has them.
+
+    The particles of a chunk are in one of the parts that the body has, of ``part`` particles each.
+    """
+    skin_weights = normal_weights(points)
     chunk_start, chunk_bone, entry_start, entries, weights = [0], [], [0], [], []
     chunk = max(CHUNK, 32 * -(-np.count_nonzero(skin_weights > 0.0) // (32 * MOST_CHUNKS)))
     for bone in range(NUM_JOINTS):
         point, slot = np.nonzero((points.skin_joints == bone) & (skin_weights > 0.0))
-        for begin in range(0, len(point), chunk):
-            part = slice(begin, begin + chunk)
-            entries.append(point[part])
-            weights.append(skin_weights[point[part], slot[part]])
-            entry_start.append(entry_start[-1] + len(point[part]))
-            chunk_bone.append(bone)
+        borders = np.searchsorted(point, np.arange(0, points.num_points, part))
+        for first, last in zip(borders, [*borders[1:], len(point)], strict=True):
+            for begin in range(first, last, chunk):
+                inside = slice(begin, min(begin + chunk, last))
+                entries.append(point[inside])
+                weights.append(skin_weights[point[inside], slot[inside]])
+                entry_start.append(entry_start[-1] + len(point[inside]))
+                chunk_bone.append(bone)
         chunk_start.append(len(chunk_bone))
-    return (
-        np.array(chunk_start),
-        np.array(chunk_bone),
-        np.array(entry_start),
-        np.concatenate(entries),
-        np.concatenate(weights),
-    )
+    return {
+        "chunk_start": np.array(chunk_start, np.int32),
+        "chunk_bone": np.array(chunk_bone, np.int32),
+        "entry_start": np.array(entry_start, np.int32),
+        "entry": np.concatenate(entries).astype(np.int32),
+        "entry_weight": np.concatenate(weights).astype(np.float32),
+    }
 
 
 def _joint_depths() -> list[int]:
@@ -105,9 +114,6 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     fewest = min(range(NUM_JOINTS), key=lambda b: len(trackers[b]))
     if len(trackers[fewest]) < MIN_TRACKERS:
         raise ValueError(f"bone {fewest} has {len(trackers[fewest])} tracking particles; {MIN_TRACKERS} are needed")
-    # weights that sum to one in single precision, so that fields blended over bones keep momentum
-    weight = points.skin_weights / sums[:, None]
-    chunk_start, chunk_bone, entry_start, entry, entry_weight = _bone_lists(points, weight)
     bone_mass, center = bone_masses(points)
 
     def upload(value, dtype):
@@ -118,7 +124,7 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.first, body.count = first, points.num_points
     body.rest = upload(points.rest, wp.vec3)
     body.joint = upload(points.skin_joints, wp.vec4i)
-    body.weight = upload(weight, wp.vec4)
+    body.weight = upload(normal_weights(points), wp.vec4)
     body.inert = upload(points.inert, float)
     body.rest_joint = upload(points.joints, wp.vec3)
     body.rest_center = upload(center, wp.vec3)
@@ -127,7 +133,6 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.parent, body.depth, body.levels = upload(PARENTS, int), upload(depths, int), max(depths) + 1
     body.tracker_start = upload(np.cumsum([0, *map(len, trackers)]), int)
     body.tracker = upload(np.concatenate(trackers), int)
-    body.chunk_start, body.chunk_bone = upload(chunk_start, int), upload(chunk_bone, int)
-    body.entry_start, body.entry = upload(entry_start, int), upload(entry, int)
-    body.entry_weight = upload(entry_weight, float)
+    for name, numbers in bone_lists(points, points.num_points).items():
+        setattr(body, name, upload(numbers, float if name == "entry_weight" else int))
     return body

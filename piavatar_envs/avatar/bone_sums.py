@@ -98,46 +98,6 @@ def sum_moments(
         chunk_moments(body, particles, x, u, reference, e, c, thread, threads, moments)
 
 
-@wp.kernel(launch_bounds=(BLOCK, 8))
-def sum_moments_of_both(
-    body: Body,
-    particles: Particles,
-    x: wp.array2d(dtype=wp.vec3),
-    u: wp.array2d(dtype=wp.vec3),
-    other: wp.array2d(dtype=wp.vec3),
-    reference: wp.array2d(dtype=wp.vec3),
-    failure: wp.array(dtype=int),
-    threads: int,
-    # out
-    moments: wp.array2d(dtype=vec16),
-    other_moments: wp.array2d(dtype=vec12),
-):
-    """:func:`sum_moments` of ``u``; of an ``other`` velocity momentum and angular momentum, six of twelve numbers."""
-    i, j, k = wp.tid()
-    at = place_in_chunks(i, j, k, body.chunk_bone.shape[0])
-    e = at[0]
-    c = at[1]
-    thread = at[2]
-    if failure[e] != 0:
-        return
-    origin = reference[e, body.chunk_bone[c]]
-    r = row(e, particles.mass.shape[0])
-    total = vec16()
-    P = wp.vec3()
-    L = wp.vec3()
-    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
-        p = body.first + int_at(body.entry, n)
-        w = float_at(body.entry_weight, n) * number_at(particles.mass, r, p)
-        d = vector_at(x, e, p) - origin
-        total += moments_of(w, d, vector_at(u, e, p))
-        momentum = w * vector_at(other, e, p)
-        P += momentum
-        L += wp.cross(d, momentum)
-    store_sum16(moments, e, c, total, threads)
-    others = vec12(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    store_sum12(other_moments, e, c, others, threads)
-
-
 @wp.func
 def chunk_corrections(
     body: Body,

@@ -20,6 +20,7 @@ from piavatar_envs.avatar.warp_cholesky import (
     MOST_ROWS,
     factorize_together,
     load_factor,
+    solve_both_together,
     solve_together,
     store_factor,
 )
@@ -33,6 +34,12 @@ class Pattern:
 
     start: wp.array(dtype=int)  # (rows + 1,)
     column: wp.array(dtype=int)  # in a row from the first to the last
+    # for a warp
+    entry: wp.array(dtype=int)  # all entries, those of the diagonal, too: 256 row + column
+    # entries that change when joint c is eliminated: pair[pair_start[c] : pair_start[c + 1]], place in the factor times
+    # 2^16, and which two of the joint's columns they are in, the first one times 2^8
+    pair_start: wp.array(dtype=int)
+    pair: wp.array(dtype=int)
 
 
 def find_pattern(filled: np.ndarray, device: str) -> Pattern:
@@ -51,10 +58,20 @@ def find_pattern(filled: np.ndarray, device: str) -> Pattern:
         filled[np.ix_(found, found)] = True
         columns.append(found)
     columns.reverse()
+    pairs = []
+    for own in columns[::3]:
+        i, j = np.tril_indices(len(own))
+        pairs.append((own[i] * (own[i] + 1) // 2 + own[j]) << 16 | i << 8 | j)
+    lists = {
+        "start": np.cumsum([0, *map(len, columns)]),
+        "column": np.concatenate(columns),
+        "entry": np.concatenate([k << 8 | np.r_[own, k] for k, own in enumerate(columns)]),
+        "pair_start": np.cumsum([0, *map(len, pairs)]),
+        "pair": np.concatenate(pairs),
+    }
     pattern = Pattern()
-    start = np.cumsum([0, *map(len, columns)])
-    pattern.start = wp.array(start.astype(np.int32), dtype=int, device=device)
-    pattern.column = wp.array(np.concatenate(columns).astype(np.int32), dtype=int, device=device)
+    for name, numbers in lists.items():
+        setattr(pattern, name, wp.array(numbers.astype(np.int32), dtype=int, device=device))
     return pattern
 
 
@@ -199,7 +216,8 @@ def factorize(
     if threads == 1:
         factorize_alone(pattern, matrix, diagonal, source, e, f, factor)
     else:
-        factorize_together(pattern.start, pattern.column, matrix, diagonal, source, e, room)
+        p = pattern
+        factorize_together(p.start, p.column, p.entry, p.pair_start, p.pair, matrix, diagonal, source, e, room)
 
 
 @wp.func
@@ -231,12 +249,43 @@ def solve(
     x: wp.array2d(dtype=float),
 ):
     """``x[row]`` with ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its room."""
+    copy_row(right, e, row, thread, threads, x)
+    if threads == 1:
+        solve_alone(pattern, factor, f, row, x)
+    else:
+        solve_together(room, row, row, x)
+        meet_threads(threads)
+
+
+@wp.func
+def solve_both(
+    pattern: Pattern,
+    factor: wp.array2d(dtype=float),
+    f: int,
+    right: wp.array2d(dtype=float),
+    first: int,
+    second: int,
+    thread: int,
+    threads: int,
+    room: wp.uint64,
+    # out
+    x: wp.array2d(dtype=float),
+):
+    """:func:`solve` of rows ``first`` and ``second``, at once in a warp."""
+    copy_row(right, first, first, thread, threads, x)
+    copy_row(right, second, second, thread, threads, x)
+    if threads == 1:
+        solve_alone(pattern, factor, f, first, x)
+        solve_alone(pattern, factor, f, second, x)
+    else:
+        solve_both_together(room, first, second, x)
+        meet_threads(threads)
+
+
+@wp.func
+def copy_row(right: wp.array2d(dtype=float), e: int, row: int, thread: int, threads: int, x: wp.array2d(dtype=float)):
+    """``x[row] = right[e]``, when all threads have come."""
     meet_threads(threads)
     for i in range(thread, x.shape[1], threads):
         x[row, i] = right[e, i]
     meet_threads(threads)
-    if threads == 1:
-        solve_alone(pattern, factor, f, row, x)
-    else:
-        solve_together(room, row, x)
-        meet_threads(threads)

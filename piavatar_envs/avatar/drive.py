@@ -172,6 +172,7 @@ class AvatarDrive:
         """Append what ends a control step: the goal has been commanded. Where torques act, nothing is."""
         d = self.state
         if self.joints:
+            self.joints.record_end(program, state)
             return
         program.launch(
             posing.end_control,

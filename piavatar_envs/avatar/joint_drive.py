@@ -33,6 +33,9 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: Age that a mass matrix may reach [s]: a little older, and fast limbs are unstable.
 LONGEST_REFRESH = 0.005
+#: Substeps that a mass matrix may be used in. What the joints take over by an old one is wrong by more than itself in
+#: directions in which a turned limb is much heavier than it was, and that grows from substep to substep.
+MOST_USES = 2
 #: Longest substep with joints under torques [s].
 LONGEST_SUBSTEP = 0.004
 #: Of the assisting spring that turns the pelvis upright [N m/rad].
@@ -50,13 +53,13 @@ class JointSettings:
         muscles: of the reference adult; those of the body follow from its weight times its height.
         assist: of the pelvis at first, 0 to 1.
         attachment: rates of the pulls that hold flesh to bones, shape ``(P,)`` [1/s].
-        follow: share of the way by which particles of bones follow them in a substep, shape ``(P,)``.
+        firm: which particles are put into their places on the bones after every control step, shape ``(P,)`` bool.
     """
 
     muscles: Muscles
     assist: float
     attachment: np.ndarray
-    follow: np.ndarray
+    firm: np.ndarray
 
 
 @wp.kernel
@@ -153,14 +156,6 @@ def set_joints_in_motion(
     set_part(velocity, e, 3 + 3 * b, spin)
 
 
-@wp.kernel
-def forget_followed(mask: wp.array(dtype=wp.bool), followed: wp.array2d(dtype=wp.vec3)):
-    """No particle of the masked environments is on its way to a bone."""
-    e, p = wp.tid()
-    if mask[e]:
-        followed[e, p] = wp.vec3(0.0)
-
-
 class JointDrive:
     """What turns the joints of one avatar in every environment.
 
@@ -184,7 +179,7 @@ class JointDrive:
         self.drive = drive
         attachment = settings.attachment[None] if settings.attachment.any() else None
         rows = np.zeros((n, 1 + NUM_JOINTS))
-        self.body = ArticulatedBody(points, drive.body, model, rows, rows, attachment, settings.follow)
+        self.body = ArticulatedBody(points, drive.body, model, rows, rows, attachment, settings.firm)
         self.body.set_strength(muscles.lower, muscles.upper, n)
         ranges = muscles.range_lower, muscles.range_upper
         locked = [joint_index(name) for name in LOCKED_JOINTS]
@@ -202,7 +197,7 @@ class JointDrive:
         span = float(joints[joint_index("head"), 2] - joints[joint_index("left_foot"), 2])
         self._per_size = float(np.ptp(rest[:, 2])) / span / (REFERENCE_MASS * REFERENCE_HEIGHT)
         self.first: tuple[wp.array, wp.array] | None = None
-        self.refresh = max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6))
+        self.refresh = min(MOST_USES, max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6)))
 
     @property
     def state(self):
@@ -225,7 +220,6 @@ class JointDrive:
             [mask, posed.pose_rotation, posed.pose_position],
             [s.rotation, s.position, s.torque, s.velocity, s.outside],
         )
-        program.launch(forget_followed, s.followed.shape, [mask], [s.followed])
 
     def record_motion(self, program: Program, mask: wp.array, after: Pose) -> None:
         """Append: joints of the masked environments, reset already, reach a pose after a control step."""
@@ -254,6 +248,10 @@ class JointDrive:
     def record_substep(self, program: Program, state: State, step: int) -> None:
         """Append what the joints do before substep ``step`` of a control step."""
         self.body.record_substep(program, state, refresh=step % self.refresh == 0)
+
+    def record_end(self, program: Program, state: State) -> None:
+        """Append what ends a control step: particles of bones are in their places."""
+        self.body.record_end(program, state)
 
 
 def checked_assist(share: float | np.ndarray, num_envs: int) -> np.ndarray:

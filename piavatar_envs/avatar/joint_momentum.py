@@ -6,7 +6,7 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import motion_at
 from piavatar_envs.avatar.joint_motion import set_part
-from piavatar_envs.avatar.lanes import sum_threads16
+from piavatar_envs.avatar.lanes import add_rows12, add_rows16, sum_threads16
 from piavatar_envs.avatar.mass_matrix import BONES, I3
 from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
@@ -19,6 +19,7 @@ def gather_bones(
     body: Body,
     moments: wp.array2d(dtype=vec16),
     e: int,
+    row: int,
     thread: int,
     threads: int,
     # out
@@ -26,14 +27,15 @@ def gather_bones(
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
 ):
-    """Moments of the bones about their joints from those of their chunks, and from them two momenta each."""
+    """Moments of the bones about their joints from those of their chunks, and from them two momenta each.
+
+    These are in row ``row``.
+    """
     for b in range(thread, BONES, threads):
-        s = vec16()
-        for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
-            s += moments[e, c]
+        s = add_rows16(moments, e, body.chunk_start[b], body.chunk_start[b + 1])
         bones[e, b] = s
-        linear[e, b] = wp.vec3(s[4], s[5], s[6])
-        angular[e, b] = wp.vec3(s[13], s[14], s[15])
+        linear[row, b] = wp.vec3(s[4], s[5], s[6])
+        angular[row, b] = wp.vec3(s[13], s[14], s[15])
 
 
 @wp.func
@@ -48,16 +50,11 @@ def gather_other(
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
 ):
-    """The two momenta of a second velocity, from :func:`piavatar_envs.avatar.bone_sums.sum_moments_of_both`."""
+    """The two momenta of a velocity, in row ``row``, from :mod:`piavatar_envs.avatar.part_sums`."""
     for b in range(thread, BONES, threads):
-        P = wp.vec3()
-        L = wp.vec3()
-        for c in range(body.chunk_start[b], body.chunk_start[b + 1]):
-            t = moments[e, c]
-            P += wp.vec3(t[0], t[1], t[2])
-            L += wp.vec3(t[3], t[4], t[5])
-        linear[row, b] = P
-        angular[row, b] = L
+        t = add_rows12(moments, e, body.chunk_start[b], body.chunk_start[b + 1])
+        linear[row, b] = wp.vec3(t[0], t[1], t[2])
+        angular[row, b] = wp.vec3(t[3], t[4], t[5])
 
 
 @wp.func
@@ -93,12 +90,13 @@ def balance(
     moment: wp.vec3,
     field: wp.array2d(dtype=vec8),
     e: int,
+    row: int,
     thread: int,
     threads: int,
     # in and out
     change: wp.array2d(dtype=float),
 ):
-    """Give a change of the joints' velocities, whose motion of the bones is ``field``, the momentum that it must have.
+    """Give ``change[row]`` of the joints' velocities, that moves bones as ``field``, the momentum that it must have.
 
     That is ``support``, an impulse, and its ``moment`` about the pelvis joint, and with ``reaction`` 1 what the bones'
     sums say. A rigid motion of the body makes up the difference. The blend of the bones' motions has the momenta of the
@@ -142,5 +140,5 @@ def balance(
     W = spin_of(I - point_inertia(t[0], center), L - wp.cross(center, P))
     V = P / t[0] - wp.cross(W, center)
     for i in range(3):
-        change[e, i] = change[e, i] - V[i]
-        change[e, 3 + i] = change[e, 3 + i] - W[i]
+        change[row, i] = change[row, i] - V[i]
+        change[row, 3 + i] = change[row, 3 + i] - W[i]

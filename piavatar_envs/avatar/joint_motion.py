@@ -35,23 +35,30 @@ def set_part(q: wp.array2d(dtype=float), e: int, first: int, v: wp.vec3):
 
 
 @wp.func
-def spread_to_bone(
-    body: Body,
-    position: wp.array2d(dtype=wp.vec3),
-    q: wp.array2d(dtype=float),
-    row: int,
-    e: int,
-    b: int,
-    field: wp.array2d(dtype=vec8),
-):
-    """Rigid motion of one bone, whose parent's is known."""
+def joint_alone(position: wp.array2d(dtype=wp.vec3), q: wp.array2d(dtype=float), row: int, e: int, b: int):
+    """Rigid motion that joint ``b`` alone gives to what it carries; the pelvis' place moves with the first one."""
     w = part_of(q, row, 3 + 3 * b)
-    v = part_of(q, row, 0)
-    if b > 0:
-        above = field[e, body.parent[b]]
-        v = wp.vec3(above[0], above[1], above[2]) + wp.cross(w, position[e, 0] - position[e, b])
-        w += wp.vec3(above[3], above[4], above[5])
-    field[e, b] = vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
+    v = wp.vec3()
+    if b == 0:
+        v = part_of(q, row, 0)
+    else:
+        v = wp.cross(w, position[e, 0] - position[e, b])
+    return vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
+
+
+@wp.func
+def level_of(body: Body, b: int, threads: int):
+    """When the threads of a warp come to bone ``b``, -1 if there is none; one that is alone goes from bone to bone."""
+    level = int(-1)
+    if b < BONES:
+        level = wp.where(threads > 1, body.depth[b], 0)
+    return level
+
+
+@wp.func
+def rounds_of(threads: int):
+    """Bones that threads go through together, some of which there may not be: all threads come to every level."""
+    return (BONES + threads - 1) // threads * threads
 
 
 @wp.func
@@ -68,16 +75,22 @@ def spread_motion(
 ):
     """Rigid motion of every bone under generalised velocity ``q[row]``: velocity where the pelvis joint is, and spin.
 
-    A thread that is alone goes through the bones in their order, parents first; the threads of a warp do so level by
-    level.
+    A thread that is alone goes through the bones in their order, parents first. The threads of a warp, which is as many
+    as there are bones at least, do so level by level, and have all else ready before.
     """
     meet_threads(threads)
     levels = wp.where(threads > 1, body.levels, 1)
-    for level in range(levels):
-        for b in range(thread, BONES, threads):
-            if threads == 1 or body.depth[b] == level:
-                spread_to_bone(body, position, q, row, e, b, field)
-        meet_threads(threads)
+    for n in range(thread, rounds_of(threads), threads):
+        b = wp.min(n, BONES - 1)
+        own = level_of(body, n, threads)
+        parent = body.parent[b]
+        motion = joint_alone(position, q, row, e, b)
+        for level in range(levels):
+            if own == level:
+                if b > 0:
+                    motion = field[e, parent] + motion
+                field[e, b] = motion
+            meet_threads(threads)
 
 
 @wp.func
@@ -93,7 +106,6 @@ def take_over(
     pelvis: wp.array(dtype=wp.vec3),
     leaving: wp.array2d(dtype=vec8),
     moving: wp.array2d(dtype=vec8),
-    followed: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
@@ -102,8 +114,7 @@ def take_over(
 ):
     """Take from the physical velocity what leaves it for the joints, and write ``J qdot``.
 
-    Both are motions about where the ``pelvis`` joint is before it moves on [m]. So does the velocity by which particles
-    of bones have ``followed`` them, where there are such.
+    Both are motions about where the ``pelvis`` joint is before it moves on [m].
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -126,10 +137,7 @@ def take_over(
         after = before - skinned_motion(body, leaving, e, p, arm)
         now = blend_changes(moving, e, body.joint, body.weight, p)
         spin = wp.vec3(now[3], now[4], now[5])
-        through = wp.vec3()
-        if p < followed.shape[1]:
-            through = followed[e, p]
-        store_velocities(u, driven, e, body.first + p, after - through, motion_at(now, arm) + through, spin, True)
+        store_velocities(u, driven, e, body.first + p, after, motion_at(now, arm), spin, True)
         p += threads
 
 
@@ -159,27 +167,6 @@ def hand_back(
 
 
 @wp.func
-def move_bone(
-    body: Body,
-    dt: float,
-    s: vec8,
-    e: int,
-    b: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-):
-    """Turn one bone, whose parent has been moved, by its spin over ``dt``."""
-    if b == 0:
-        position[e, b] = position[e, b] + dt * wp.vec3(s[0], s[1], s[2])
-    else:
-        a = body.parent[b]
-        r = row(e, body.rest_joint.shape[0])
-        offset = body.rest_joint[r, b] - body.rest_joint[r, a]
-        position[e, b] = position[e, a] + wp.quat_rotate(rotation[e, a], offset)
-    rotation[e, b] = wp.normalize(quat_exp(dt * wp.vec3(s[3], s[4], s[5])) * rotation[e, b])
-
-
-@wp.func
 def move_joints(
     body: Body,
     dt: float,
@@ -193,12 +180,25 @@ def move_joints(
 ):
     """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together. Threads as above."""
     meet_threads(threads)
+    r = row(e, body.rest_joint.shape[0])
+    for b in range(thread, BONES, threads):
+        s = field[e, b]
+        rotation[e, b] = wp.normalize(quat_exp(dt * wp.vec3(s[3], s[4], s[5])) * rotation[e, b])
+    meet_threads(threads)
     levels = wp.where(threads > 1, body.levels, 1)
-    for level in range(levels):
-        for b in range(thread, BONES, threads):
-            if threads == 1 or body.depth[b] == level:
-                move_bone(body, dt, field[e, b], e, b, rotation, position)
-        meet_threads(threads)
+    for n in range(thread, rounds_of(threads), threads):
+        b = wp.min(n, BONES - 1)
+        own = level_of(body, n, threads)
+        parent = wp.max(body.parent[b], 0)
+        offset = wp.quat_rotate(rotation[e, parent], body.rest_joint[r, b] - body.rest_joint[r, parent])
+        for level in range(levels):
+            if own == level:
+                if b == 0:
+                    s = field[e, b]
+                    position[e, b] = position[e, b] + dt * wp.vec3(s[0], s[1], s[2])
+                else:
+                    position[e, b] = position[e, parent] + offset
+            meet_threads(threads)
 
 
 @wp.func
@@ -223,6 +223,7 @@ def add_change(
 def go_on(
     change: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
+    own: int,
     row: int,
     e: int,
     thread: int,
@@ -233,9 +234,9 @@ def go_on(
 ):
     """The velocity that joints will have if all else does again what it did; what this takes from the particles.
 
-    The joints' own ``change`` is in row ``e``, what was ``taken`` already in ``row``.
+    The joints' own ``change`` is in row ``own``, what was ``taken`` already in ``row``.
     """
     meet_threads(threads)
     for i in range(thread, q.shape[1], threads):
-        q[e, i] = q[e, i] + change[e, i] + outside[e, i]
+        q[e, i] = q[e, i] + change[own, i] + outside[e, i]
         taken[row, i] = taken[row, i] + outside[e, i]

@@ -1,7 +1,7 @@
 """What the joints of an environment do between two passes over its particles, in a launch each.
 
-On a GPU an environment has a CUDA block, so that nothing is launched for what one warp does in a few microseconds: two
-warps build the mass matrix, and a factor each; one does all else. On a CPU it is one thread.
+On a GPU an environment has a CUDA block, so that nothing is launched for what one warp does in a few microseconds: four
+warps build the mass matrix, two a factor each; one does all else. On a CPU it is one thread.
 
 There are two of what particles do to the joints, flesh that is pulled and what the joints take over, and two factors of
 the mass matrix, with locked joints alone and with all that is implicit. Both of a kind are in one array: the first of
@@ -12,7 +12,15 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.cholesky import Pattern, factorize, fetch_factor, keep_factor, solve
+from piavatar_envs.avatar.cholesky import factorize, fetch_factor, keep_factor, solve, solve_both
+from piavatar_envs.avatar.joint_bench import (
+    JointBench,
+    enter_room,
+    keep_leaving,
+    leave_room,
+    room_of_warp,
+    row_in_room,
+)
 from piavatar_envs.avatar.joint_momentum import balance, gather_bones, gather_other, pass_down
 from piavatar_envs.avatar.joint_motion import add_change, go_on, move_joints, part_of, spread_motion
 from piavatar_envs.avatar.joint_torques import (
@@ -29,52 +37,19 @@ from piavatar_envs.avatar.lanes import meet_threads, sum_threads
 from piavatar_envs.avatar.mass_matrix import BONES, compose_mass, room_of_records
 from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.rotation import rigid_matrix
-from piavatar_envs.avatar.types import Body, Pose, vec8, vec12, vec16
-from piavatar_envs.avatar.warp_cholesky import ROOM, room_of_warp
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.avatar.warp_cholesky import ROOM
 from piavatar_envs.mpm.shared_memory import meet
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 WARP = wp.constant(32)
+#: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
+MASS_BLOCK = 128
 #: The pelvis' place, then all joints.
 PARTS = wp.constant(1 + int(BONES))
 _ROOM = wp.constant(ROOM)
-
-
-@wp.struct
-class JointBench:
-    """What the joints work on in a substep; rows are environments', where there are two of a kind twice as many."""
-
-    pose: Pose
-    velocity: wp.array2d(dtype=float)  # (num_envs, 69) as in JointState
-    outside: wp.array2d(dtype=float)
-    # the mass matrix
-    pair_sums: wp.array2d(dtype=vec12)  # (num_envs, chunks of pairs)
-    records: wp.array(dtype=vec16)
-    pattern: Pattern
-    matrix: wp.array3d(dtype=float)  # (num_envs, 69, 69)
-    diagonals: wp.array2d(dtype=float)  # (2 num_envs, 69) what factors have besides
-    factors: wp.array2d(dtype=float)  # (2 num_envs, entries)
-    cut: wp.array2d(dtype=float)  # (1, entries) factor where muscles reach their limits; on a CPU
-    stop: wp.array2d(dtype=float)  # (num_envs, bones) stiffness beyond the range [N m/rad]
-    # what particles have
-    moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)
-    other_moments: wp.array2d(dtype=vec12)
-    bones: wp.array2d(dtype=vec16)  # (num_envs, bones)
-    linear: wp.array2d(dtype=wp.vec3)  # (2 num_envs, bones)
-    angular: wp.array2d(dtype=wp.vec3)
-    momentum: wp.array2d(dtype=float)  # (2 num_envs, 69)
-    shares: wp.array2d(dtype=float)  # (2 num_envs, 69) changes of the velocity: the joints' own, what is taken over
-    # what the joints do
-    muscle: wp.array2d(dtype=float)  # (num_envs, 69) impulses
-    impulse: wp.array2d(dtype=float)
-    left: wp.array2d(dtype=float)  # (num_envs, 69) diagonal without muscles that have reached their limits
-    # what particles get
-    place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to where bones are
-    leaving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion that leaves the physical velocity
-    moving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion of the joints
-    pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) joint about which these are motions [m]
 
 
 @wp.struct
@@ -102,32 +77,29 @@ def begin(body: Body, e: int, thread: int, threads: int, w: JointBench):
 
 @wp.func
 def find_shares(
-    body: Body, velocities: int, into: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench
+    body: Body, velocities: int, own: int, into: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench
 ):
-    """The shares ``dq = M^-1 J^T m v`` that the joints can take of one or two velocities.
+    """The shares ``dq = M^-1 J^T m v`` that the joints can take of one or two velocities, from the bones' momenta.
 
-    The first is share ``into`` of the environment, 0 or 1.
+    One alone has momenta in row ``own``, and is share ``into``; of two the second has momenta and share in that row.
     """
-    n = w.pose.position.shape[0]
-    gather_bones(body, w.moments, e, thread, threads, w.bones, w.linear, w.angular)
-    if velocities > 1:
-        gather_other(body, w.other_moments, e, n + e, thread, threads, w.linear, w.angular)
     meet_threads(threads)
     for which in range(thread, velocities, threads):
-        pass_down(body, w.pose.position, e, which * n + e, w.linear, w.angular, w.momentum)
+        pass_down(body, w.pose.position, e, wp.where(which == 0, own, into), w.linear, w.angular, w.momentum)
     fetch_factor(w.factors, e, threads, room)
-    for which in range(velocities):
-        here = (into + which) * n + e
-        solve(w.pattern, w.factors, e, w.momentum, which * n + e, here, thread, threads, room, w.shares)
+    if velocities > 1:
+        solve_both(w.pattern, w.factors, e, w.momentum, own, into, thread, threads, room, w.shares)
+    else:
+        solve(w.pattern, w.factors, e, w.momentum, own, into, thread, threads, room, w.shares)
 
 
 @wp.func
-def pull_bones(body: Body, e: int, thread: int, threads: int, w: JointBench):
+def pull_bones(body: Body, own: int, e: int, thread: int, threads: int, w: JointBench):
     """The joints get what the pull of the flesh has taken from the particles, with exactly its momentum."""
-    spread_motion(body, w.pose.position, w.shares, e, e, thread, threads, w.moving)
+    spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     none = wp.vec3(0.0)
-    balance(w.pose.position, w.bones, 1.0, none, none, w.moving, e, thread, threads, w.shares)
-    add_change(w.shares, e, e, thread, threads, w.velocity, w.outside)
+    balance(w.pose.position, w.bones, 1.0, none, none, w.moving, e, own, thread, threads, w.shares)
+    add_change(w.shares, own, e, thread, threads, w.velocity, w.outside)
 
 
 @wp.func
@@ -138,39 +110,40 @@ def turn_joints(
     springs: Springs,
     tissue: Tissue,
     strength: Strength,
+    driven: int,
+    own: int,
     e: int,
     thread: int,
     threads: int,
     room: wp.uint64,
     w: JointBench,
 ):
-    """Springs, torques and tissue change the velocity of the joints."""
-    driven = w.pose.position.shape[0] + e
+    """Springs, torques and tissue change the velocity of the joints, by share ``own``; ``driven`` is their factor."""
     meet_threads(threads)
     for k in range(thread, PARTS, threads):
         joint_impulse(
             body, dt, w.pose, target, springs, tissue, w.stop, w.velocity, w.outside, e, k, w.muscle, w.impulse
         )
     fetch_factor(w.factors, driven, threads, room)
-    solve(w.pattern, w.factors, driven, w.impulse, e, e, thread, threads, room, w.shares)
+    solve(w.pattern, w.factors, driven, w.impulse, e, own, thread, threads, room, w.shares)
     limited = float(0.0)
     for k in range(thread, PARTS, threads):
         rest = w.diagonals[driven, 3 * k]
         limited += limit_torque(
-            body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, e, k, w.impulse, w.left
+            body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, e, k, w.impulse, w.left
         )  # fmt: skip
     meet_threads(threads)
     if sum_threads(limited, threads) > 0.0:
         factorize(w.pattern, w.matrix, w.left, e, e, threads, room, 0, w.cut)
-        solve(w.pattern, w.cut, 0, w.impulse, e, e, thread, threads, room, w.shares)
-    find_given(w.left, w.shares, e, thread, threads, w.impulse)
-    spread_motion(body, w.pose.position, w.shares, e, e, thread, threads, w.moving)
+        solve(w.pattern, w.cut, 0, w.impulse, e, own, thread, threads, room, w.shares)
+    find_given(w.left, w.shares, own, e, thread, threads, w.impulse)
+    spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     support = part_of(w.impulse, e, 0)
     moment = part_of(w.impulse, e, 3)
-    balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, thread, threads, w.shares)
+    balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, own, thread, threads, w.shares)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(MASS_BLOCK, 8))
 def build_mass(
     body: Body,
     pairs: Pairs,
@@ -215,10 +188,14 @@ def fit_pose(
     e, thread = wp.tid()
     if failure[e] != 0:
         return
-    find_shares(body, 1, 0, e, thread, threads, room_of_warp(), w)
-    spread_motion(body, w.pose.position, w.shares, e, e, thread, threads, w.moving)
-    move_joints(body, share, w.moving, e, thread, threads, w.pose.rotation, w.pose.position)
-    begin(body, e, thread, threads, w)
+    own = row_in_room(e, 0)
+    near = enter_room(w, e)
+    gather_other(body, w.other_moments, e, own, thread, threads, near.linear, near.angular)
+    find_shares(body, 1, own, own, e, thread, threads, room_of_warp(), near)
+    spread_motion(body, near.pose.position, near.shares, own, e, thread, threads, near.moving)
+    move_joints(body, share, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
+    begin(body, e, thread, threads, near)
+    leave_room(w, e, near)
 
 
 @wp.kernel
@@ -259,17 +236,25 @@ def act(
     if failure[e] != 0:
         return
     room = room_of_warp()
-    taken = failure.shape[0] + e
-    find_shares(body, velocities, 2 - velocities, e, thread, threads, room, w)
+    n = failure.shape[0]
+    own = row_in_room(e, 0)
+    taken = row_in_room(n + e, 1)
+    near = enter_room(w, e)
+    gather_bones(body, w.moments, e, own, thread, threads, near.bones, near.linear, near.angular)
     if velocities > 1:
-        pull_bones(body, e, thread, threads, w)
-    add_change(w.shares, taken, e, thread, threads, w.velocity, w.outside)
-    turn_joints(body, dt, target, springs, tissue, strength, e, thread, threads, room, w)
-    go_on(w.shares, w.outside, taken, e, thread, threads, w.velocity, w.shares)
-    spread_motion(body, w.pose.position, w.shares, taken, e, thread, threads, w.leaving)
-    spread_motion(body, w.pose.position, w.velocity, e, e, thread, threads, w.moving)
+        gather_other(body, w.other_moments, e, taken, thread, threads, near.linear, near.angular)
+    find_shares(body, velocities, own, taken, e, thread, threads, room, near)
+    if velocities > 1:
+        pull_bones(body, own, e, thread, threads, near)
+    add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)
+    turn_joints(body, dt, target, springs, tissue, strength, n + e, own, e, thread, threads, room, near)
+    go_on(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
+    spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.leaving)
+    keep_leaving(w, e, near)
+    spread_motion(body, near.pose.position, w.velocity, e, e, thread, threads, near.moving)
     if thread == 0:
-        w.pelvis[e] = w.pose.position[e, 0]
+        w.pelvis[e] = near.pose.position[e, 0]
         support.force[e] = support.force[e] + per_time * part_of(w.impulse, e, 0)
         support.torque[e] = support.torque[e] + per_time * part_of(w.impulse, e, 3)
-    move_joints(body, dt, w.moving, e, thread, threads, w.pose.rotation, w.pose.position)
+    move_joints(body, dt, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
+    leave_room(w, e, near)

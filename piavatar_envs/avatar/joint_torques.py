@@ -224,6 +224,7 @@ def limit_torque(
     muscle: wp.array2d(dtype=float),
     rest: float,
     change: wp.array2d(dtype=float),
+    row_of_change: int,
     e: int,
     n: int,
     # in and out
@@ -242,7 +243,7 @@ def limit_torque(
         before = part_of(muscle, e, 3 * n)
         frame = above(body, pose.rotation, e, n - 1)
         limit = dt * strength.factor[row(e, strength.factor.shape[0])]
-        own = wp.quat_rotate_inv(frame, before - A * part_of(change, e, 3 * n))
+        own = wp.quat_rotate_inv(frame, before - A * part_of(change, row_of_change, 3 * n))
         cut = wp.max(limit * strength.lower[n - 1], wp.min(own, limit * strength.upper[n - 1]))
         if wp.length_sq(cut - own) > 0.0:
             rest -= A
@@ -256,6 +257,7 @@ def limit_torque(
 def find_given(
     left: wp.array2d(dtype=float),
     change: wp.array2d(dtype=float),
+    row_of_change: int,
     e: int,
     thread: int,
     threads: int,
@@ -264,4 +266,4 @@ def find_given(
 ):
     """The impulses that joints and pelvis really get, implicit as they are."""
     for i in range(thread, impulse.shape[1], threads):
-        impulse[e, i] = impulse[e, i] - left[e, i] * change[e, i]
+        impulse[e, i] = impulse[e, i] - left[e, i] * change[row_of_change, i]

@@ -166,3 +166,36 @@ if (threads > 1) __syncwarp();
 def meet_threads(threads: int):
     """What one thread of a warp has stored, the others see from here on."""
     ...
+
+
+# Several rows are asked for at once, by 16 bytes.
+_ADD_ROWS = """
+constexpr int WORDS = %d;
+wp::vec_t<WORDS, wp::float32> sum;
+const auto* const from = &wp::index(rows, e, 0);
+#if defined(__CUDA_ARCH__)
+#pragma unroll 4
+for (int n = first; n < last; ++n)
+#pragma unroll
+    for (int q = 0; q < WORDS / 4; ++q) {
+        const float4 four = reinterpret_cast<const float4*>(from + n)[q];
+        sum[4 * q] += four.x, sum[4 * q + 1] += four.y, sum[4 * q + 2] += four.z, sum[4 * q + 3] += four.w;
+    }
+#else
+for (int n = first; n < last; ++n)
+    for (int k = 0; k < WORDS; ++k) sum[k] += from[n][k];
+#endif
+return sum;
+"""
+
+
+@wp.func_native(_ADD_ROWS % 12)
+def add_rows12(rows: wp.array2d(dtype=vec12), e: int, first: int, last: int) -> vec12:
+    """Sum of ``rows[e, first : last]``, one after the other."""
+    ...
+
+
+@wp.func_native(_ADD_ROWS % 16)
+def add_rows16(rows: wp.array2d(dtype=vec16), e: int, first: int, last: int) -> vec16:
+    """:func:`add_rows12` of sixteen numbers each."""
+    ...

@@ -22,6 +22,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.lanes import add_rows12
 from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.rigid_fit import symmetric
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
@@ -135,9 +136,7 @@ def place_pair(
     pair = pairs.of[c * BONES + d]
     if pair < 0:
         return vec16()
-    s = vec12()
-    for chunk in range(pairs.chunk_start[pair], pairs.chunk_start[pair + 1]):
-        s += sums[e, chunk]
+    s = add_rows12(sums, e, pairs.chunk_start[pair], pairs.chunk_start[pair + 1])
     second = symmetric(wp.vec3(s[4], s[5], s[6]), wp.vec3(s[7], s[8], s[9]))
     origin = position[e, pairs.first[pair]]
     return moved(two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second), origin - position[e, c], origin - position[e, d])

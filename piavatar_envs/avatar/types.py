@@ -212,7 +212,6 @@ class JointState:
     outside: wp.array  # (num_envs, 69) how all but the joints themselves changed it in the last substep
     # (num_envs, bones) torques, of the reference adult, about the rest pose's axes as the parent has turned them [N m]
     torque: wp.array
-    followed: wp.array  # (num_envs, P) velocity by which bones' particles follow them through flesh [m/s]; or one entry
 
 
 @dataclass

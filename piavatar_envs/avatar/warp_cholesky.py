@@ -10,86 +10,72 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Rows of the largest matrix that there is room for.
-MOST_ROWS = 72
-_FACTOR = MOST_ROWS * (MOST_ROWS + 1) // 2
-#: Words of shared memory of a warp: a factor, and three rows of it by columns.
-ROOM = _FACTOR + 4 * MOST_ROWS
+#: Rows of the largest matrix that there is room for: as many as an avatar has. 16 warps have room in a multiprocessor,
+#: so that those of 2,048 environments are all at work at once.
+MOST_ROWS = 69
+_FACTOR = -(-MOST_ROWS * (MOST_ROWS + 1) // 2 // 4) * 4
+#: Words of shared memory of a warp: a factor, and from :data:`SPARE` on three rows of it by columns, while it is found,
+#: or what is divided by, while it is solved with.
+SPARE = _FACTOR
+ROOM = SPARE + 4 * MOST_ROWS
 _AT = "float* const room = reinterpret_cast<float*>(at);"
 
 
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-__shared__ float __align__(16) room[{ROOM}];
-return reinterpret_cast<wp::uint64>(room);
-#else
-return 0;
-#endif
-""")
-def room_of_warp() -> wp.uint64:
-    """Room of a warp that has a CUDA block of its own."""
-    ...
-
-
-# The rows of a joint are eliminated together, so that an entry is read and written once for three of them. Lanes have
-# columns; the three numbers of a row i, and where it starts, all lanes read at once. Four rows are read before one is
-# written, or each would wait for the one before.
+# The rows of a joint are eliminated together, so that an entry is read and written once for three of them. What it
+# loses is the product of two of the joint's columns: which, and where it is, a list says, or most lanes of a warp would
+# go through rows that have no entries. Four are read before one is written, or each would wait for the one before.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
 {_AT}
 float4* const joint = reinterpret_cast<float4*>(room + {_FACTOR});
-const int lane = threadIdx.x & 31, size = matrix.shape[1];
+const int lane = threadIdx.x & 31, size = matrix.shape[1], entries = entry.shape[0];
 const float* const from = &wp::index(matrix, source, 0, 0);
 const float* const more = &wp::index(diagonal, e, 0);
-for (int part = 0; part < size; part += 32) {{
-    const int j = part + lane;
+for (int n = lane; n < {_FACTOR} / 4; n += 32) reinterpret_cast<float4*>(room)[n] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+__syncwarp();
 #pragma unroll 8
-    for (int i = part; i < size; ++i)
-        if (j <= i) room[i * (i + 1) / 2 + j] = from[i * size + j] + (j == i ? more[i] : 0.0f);
+for (int n = lane; n < entries; n += 32) {{
+    const int i = __ldg(entry.data + n) >> 8, j = __ldg(entry.data + n) & 255;
+    room[i * (i + 1) / 2 + j] = from[i * size + j] + (j == i ? more[i] : 0.0f);
 }}
 __syncwarp();
 for (int k = size - 3; k >= 0; k -= 3) {{
     const int first = __ldg(start.data + k), count = __ldg(start.data + k + 1) - first;
+    const int last_pair = __ldg(pair_start.data + k / 3 + 1);
     const int* const column = columns.data + first;
     float* const row0 = room + k * (k + 1) / 2;
     float* const row1 = row0 + k + 1;
     float* const row2 = row1 + k + 2;
-    const float d2 = sqrtf(row2[k + 2]), over2 = 1.0f / d2, l21 = row2[k + 1] * over2, l20 = row2[k] * over2;
-    const float d1 = sqrtf(row1[k + 1] - l21 * l21), over1 = 1.0f / d1, l10 = (row1[k] - l21 * l20) * over1;
-    const float d0 = sqrtf(row0[k] - l20 * l20 - l10 * l10), over0 = 1.0f / d0;
+    const float s2 = row2[k + 2], over2 = rsqrtf(s2), l21 = row2[k + 1] * over2, l20 = row2[k] * over2;
+    const float s1 = row1[k + 1] - l21 * l21, over1 = rsqrtf(s1), l10 = (row1[k] - l21 * l20) * over1;
+    const float s0 = row0[k] - l20 * l20 - l10 * l10, over0 = rsqrtf(s0);
     __syncwarp();
     if (lane == 0) {{
-        row2[k + 2] = d2; row2[k + 1] = l21; row2[k] = l20;
-        row1[k + 1] = d1; row1[k] = l10;
-        row0[k] = d0;
+        row2[k + 2] = s2 * over2; row2[k + 1] = l21; row2[k] = l20;
+        row1[k + 1] = s1 * over1; row1[k] = l10;
+        row0[k] = s0 * over0;
     }}
     for (int n = lane; n < count; n += 32) {{
         const int j = __ldg(column + n);
         const float a2 = row2[j] * over2, a1 = (row1[j] - l21 * a2) * over1;
         const float a0 = (row0[j] - l20 * a2 - l10 * a1) * over0;
         row2[j] = a2; row1[j] = a1; row0[j] = a0;
-        joint[n] = make_float4(a0, a1, a2, __int_as_float(j * (j + 1) / 2));
+        joint[n] = make_float4(a0, a1, a2, 0.0f);
     }}
     __syncwarp();
-    for (int part = 0; part < count; part += 32) {{
-        const int n = part + lane;
-        const bool has = n < count;
-        const int j = has ? __ldg(column + n) : 0;
-        const float4 own = joint[has ? n : 0];
-        for (int m = part; m < count; m += 4) {{
-            float value[4];
-            int at[4];
+    for (int n = __ldg(pair_start.data + k / 3) + lane; n < last_pair; n += 128) {{
+        float value[4];
+        int at[4];
 #pragma unroll
-            for (int q = 0; q < 4; ++q) {{
-                const bool mine = has && m + q >= n && m + q < count;
-                const float4 a = joint[m + q < count ? m + q : 0];
-                at[q] = mine ? __float_as_int(a.w) + j : -1;
-                value[q] = (mine ? room[at[q]] : 0.0f) - a.x * own.x - a.y * own.y - a.z * own.z;
-            }}
-#pragma unroll
-            for (int q = 0; q < 4; ++q)
-                if (at[q] >= 0) room[at[q]] = value[q];
+        for (int q = 0; q < 4; ++q) {{
+            const int which = n + 32 * q < last_pair ? __ldg(pair.data + n + 32 * q) : 0;
+            const float4 a = joint[which >> 8 & 255], b = joint[which & 255];
+            at[q] = n + 32 * q < last_pair ? which >> 16 : -1;
+            value[q] = room[which >> 16] - a.x * b.x - a.y * b.y - a.z * b.z;
         }}
+#pragma unroll
+        for (int q = 0; q < 4; ++q)
+            if (at[q] >= 0) room[at[q]] = value[q];
     }}
     __syncwarp();
 }}
@@ -98,6 +84,9 @@ for (int k = size - 3; k >= 0; k -= 3) {{
 def factorize_together(
     start: wp.array(dtype=int),
     columns: wp.array(dtype=int),
+    entry: wp.array(dtype=int),
+    pair_start: wp.array(dtype=int),
+    pair: wp.array(dtype=int),
     matrix: wp.array3d(dtype=float),
     diagonal: wp.array2d(dtype=float),
     source: int,
@@ -126,7 +115,7 @@ def store_factor(at: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
 {_AT}
 const float4* const from = reinterpret_cast<const float4*>(&wp::index(factor, f, 0));
 __syncwarp();
-#pragma unroll 4
+#pragma unroll 10
 for (int n = threadIdx.x & 31; n < factor.shape[1] / 4; n += 32) reinterpret_cast<float4*>(room)[n] = from[n];
 __syncwarp();
 #endif
@@ -136,47 +125,86 @@ def load_factor(factor: wp.array2d(dtype=float), f: int, at: wp.uint64):
     ...
 
 
-# Lanes have the components of x in registers, and tell each other the one that is found next. Both substitutions go by
-# columns of what is left: triangular numbers of 32 rows differ modulo 32, so lanes read from different banks.
-@wp.func_native(f"""
+# Lanes have the components of one or two vectors in registers, thirty of a part so that those of a joint are together,
+# and tell each other the three of a joint at once. Both substitutions go by columns of what is left: triangular numbers
+# of 32 rows differ modulo 32, so lanes read from different banks.
+_SOLVE = """
 #if defined(__CUDA_ARCH__)
-{_AT}
+%(at)s
+constexpr int VECTORS = %(vectors)d, PARTS = %(parts)d, PART = 30;
 const int lane = threadIdx.x & 31, size = x.shape[1];
-float* const result = &wp::index(x, e, 0);
-constexpr int PARTS = {-(-MOST_ROWS // 32)};
-float value[PARTS], over[PARTS];
-__syncwarp();
-#pragma unroll
-for (int q = 0; q < PARTS; ++q) {{
-    const int i = 32 * q + lane;
-    value[q] = i < size ? result[i] : 0.0f;
-    over[q] = i < size ? 1.0f / room[i * (i + 1) / 2 + i] : 0.0f;
-}}
-#pragma unroll
-for (int part = PARTS - 1; part >= 0; --part)
-    for (int k = min(size, 32 * part + 32) - 1; k >= 32 * part; --k) {{
-        const float found = __shfl_sync(0xffffffffu, value[part] * over[part], k & 31);
-        if (lane == (k & 31)) value[part] = found;
-#pragma unroll
-        for (int q = 0; q <= part; ++q)
-            if (32 * q + lane < k) value[q] -= room[k * (k + 1) / 2 + 32 * q + lane] * found;
-    }}
-#pragma unroll
-for (int part = 0; part < PARTS; ++part)
-    for (int k = 32 * part; k < min(size, 32 * part + 32); ++k) {{
-        const float found = __shfl_sync(0xffffffffu, value[part] * over[part], k & 31);
-        if (lane == (k & 31)) value[part] = found;
-#pragma unroll
-        for (int q = part; q < PARTS; ++q) {{
-            const int i = 32 * q + lane;
-            if (i > k && i < size) value[q] -= room[i * (i + 1) / 2 + k] * found;
-        }}
-    }}
+float* const over = room + %(factor)d;
+float* const results[2] = {&wp::index(x, first, 0), &wp::index(x, second, 0)};
+float value[VECTORS][PARTS];
+for (int i = lane; i < size; i += 32) over[i] = 1.0f / room[i * (i + 1) / 2 + i];
 #pragma unroll
 for (int q = 0; q < PARTS; ++q)
-    if (32 * q + lane < size) result[32 * q + lane] = value[q];
+#pragma unroll
+    for (int v = 0; v < VECTORS; ++v)
+        value[v][q] = lane < PART && PART * q + lane < size ? results[v][PART * q + lane] : 0.0f;
+__syncwarp();
+#pragma unroll
+for (int part = PARTS - 1; part >= 0; --part)
+    for (int k = min(size, PART * part + PART) - 3; k >= PART * part; k -= 3) {
+        const float* const row0 = room + k * (k + 1) / 2;
+        const float* const row1 = row0 + k + 1;
+        const float* const row2 = row1 + k + 2;
+        const float o0 = over[k], o1 = over[k + 1], o2 = over[k + 2], l10 = row1[k], l20 = row2[k], l21 = row2[k + 1];
+        const int own = k - PART * part;
+#pragma unroll
+        for (int v = 0; v < VECTORS; ++v) {
+            const float f0 = __shfl_sync(0xffffffffu, value[v][part], own);
+            const float f1 = __shfl_sync(0xffffffffu, value[v][part], own + 1);
+            const float x2 = __shfl_sync(0xffffffffu, value[v][part], own + 2) * o2;
+            const float x1 = (f1 - l21 * x2) * o1, x0 = (f0 - l20 * x2 - l10 * x1) * o0;
+            if (lane >= own && lane < own + 3) value[v][part] = lane == own ? x0 : lane == own + 1 ? x1 : x2;
+#pragma unroll
+            for (int q = 0; q <= part; ++q) {
+                const int j = PART * q + lane;
+                if (lane < PART && j < k) value[v][q] -= row2[j] * x2 + row1[j] * x1 + row0[j] * x0;
+            }
+        }
+    }
+#pragma unroll
+for (int part = 0; part < PARTS; ++part)
+    for (int k = PART * part; k < min(size, PART * part + PART); k += 3) {
+        const float* const row1 = room + (k + 1) * (k + 2) / 2;
+        const float* const row2 = row1 + k + 2;
+        const float o0 = over[k], o1 = over[k + 1], o2 = over[k + 2], l10 = row1[k], l20 = row2[k], l21 = row2[k + 1];
+        const int own = k - PART * part;
+#pragma unroll
+        for (int v = 0; v < VECTORS; ++v) {
+            const float f1 = __shfl_sync(0xffffffffu, value[v][part], own + 1);
+            const float f2 = __shfl_sync(0xffffffffu, value[v][part], own + 2);
+            const float x0 = __shfl_sync(0xffffffffu, value[v][part], own) * o0;
+            const float x1 = (f1 - l10 * x0) * o1, x2 = (f2 - l20 * x0 - l21 * x1) * o2;
+            if (lane >= own && lane < own + 3) value[v][part] = lane == own ? x0 : lane == own + 1 ? x1 : x2;
+#pragma unroll
+            for (int q = part; q < PARTS; ++q) {
+                const int i = PART * q + lane;
+                const float* const row = room + i * (i + 1) / 2 + k;
+                if (lane < PART && i > k + 2 && i < size) value[v][q] -= row[0] * x0 + row[1] * x1 + row[2] * x2;
+            }
+        }
+    }
+#pragma unroll
+for (int q = 0; q < PARTS; ++q)
+#pragma unroll
+    for (int v = 0; v < VECTORS; ++v)
+        if (lane < PART && PART * q + lane < size) results[v][PART * q + lane] = value[v][q];
+__syncwarp();  // over is free
 #endif
-""")
-def solve_together(at: wp.uint64, e: int, x: wp.array2d(dtype=float)):
-    """What is solved with the factor in a warp's room; ``x[e]`` has the right-hand side at first."""
+"""
+_SIZES = {"at": _AT, "factor": _FACTOR, "parts": -(-MOST_ROWS // 30)}
+
+
+@wp.func_native(_SOLVE % (_SIZES | {"vectors": 1}))
+def solve_together(at: wp.uint64, first: int, second: int, x: wp.array2d(dtype=float)):
+    """Row ``first`` of what is solved with the factor in a warp's room; it has the right-hand side at first."""
+    ...
+
+
+@wp.func_native(_SOLVE % (_SIZES | {"vectors": 2}))
+def solve_both_together(at: wp.uint64, first: int, second: int, x: wp.array2d(dtype=float)):
+    """:func:`solve_together` of two rows."""
     ...

@@ -138,7 +138,7 @@ class Flesh:
         """How its joints are driven; None where its pose is.
 
         Raises:
-            ConfigError: torques with a scheme of one velocity; particles are to follow bones that do not hold them.
+            ConfigError: torques with a scheme of one velocity.
         """
         d = self.drive
         if d.control == "pose":
@@ -148,11 +148,6 @@ class Flesh:
                 f"drive.control={d.control!r} needs two velocities: physics.decoupling={self.physics.decoupling!r} has "
                 "one; use split or no_stress"
             )
-        if d.bone_follow > 0.0 and not any(d.flesh_rate):
-            raise ConfigError(
-                f"drive.bone_follow={d.bone_follow:g} needs flesh that is held, but drive.flesh_rate is zero; "
-                "use (30, 3000)"
-            )
         sampled = self.sampled
         distance = bone_distance(sampled.rest_positions, sampled.bone)
         firm = firmness(sampled.skin_joints, sampled.skin_weights)
@@ -160,14 +155,8 @@ class Flesh:
             muscles=make_muscles(d.joint_stiffness, d.joint_damping, d.strength),
             assist=d.root_assist,
             attachment=attachment_rates(sampled.depth, distance, firm, *d.flesh_rate),
-            follow=d.bone_follow * self.carried,
+            firm=(sampled.bone >= 0) & d.firm_bones,
         )
-
-    @property
-    def carried(self) -> np.ndarray:
-        """Which particles are of bones that they follow, shape ``(P,)`` bool."""
-        follows = self.drive.control != "pose" and self.drive.bone_follow > 0.0
-        return (self.sampled.bone >= 0) & follows
 
     def masses(self, volume: np.ndarray) -> np.ndarray:
         """Nominal masses [kg] of particles of these volumes [m^3], shape ``(rows, P)``."""

@@ -99,12 +99,10 @@ class DriveConfig(BaseModel):
     flesh_rate: Annotated[tuple[float, float], AfterValidator(_check_flesh_rate)] = Field(
         (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
     )
-    bone_follow: float = Field(
-        0.0,
-        ge=0.0,
-        le=1.0,
-        description="share of the way to their places by which particles of bones follow them in a substep, through "
-        "their flesh: 1, with a flesh_rate of (30, 3000), keeps tracked bones together [-]",
+    firm_bones: bool = Field(
+        True,
+        description="whether particles of bones, which slip from them under load, are put into their places after "
+        "every control step, unless these lie beyond a surface",
     )
     drive: Literal["increment", "target"] = Field(
         "increment",

@@ -135,11 +135,7 @@ def assemble(
         num_sensors=len(flesh) * NUM_PARTS,
     )
     colliders = (*_colliders(scene, pairs[: len(names), len(names) :][owner_index]), *walls)
-    carried = np.zeros(first[-1], np.int32)
-    for index, body in enumerate(flesh):
-        carried[first[index] : first[index + 1]] = body.carried
     matter = replace(_join(parts, rows), field=np.concatenate(local), seam=np.concatenate(seam), sensor=sensor)
-    matter = replace(matter, carried=carried)
     return Subjects(names, tuple(int(i) for i in first), matter, fields, colliders, solids)
 
 

@@ -45,8 +45,6 @@ class MaterialPoints:
         field: velocity field, shape ``(num_particles,)`` int; the first for all if not given.
         seam: 1 where fields of a subject grow together, shape ``(num_particles,)``; nowhere if not given.
         sensor: row of the contact sensor, -1 for none, shape ``(num_particles,)`` int; none if not given.
-        carried: 1 for particles of bones that boundaries do not keep from following them, shape ``(num_particles,)``
-            int; none if not given.
     """
 
     volume: np.ndarray
@@ -57,7 +55,6 @@ class MaterialPoints:
     field: np.ndarray | None = None
     seam: np.ndarray | None = None
     sensor: np.ndarray | None = None
-    carried: np.ndarray | None = None
 
     @classmethod
     def uniform(
@@ -268,5 +265,4 @@ def upload_points(
     particles.groups = wp.array(begin_groups(points.fields, rest, dx), dtype=wp.vec2i, device=device)
     particles.seam = upload(np.zeros(count) if points.seam is None else points.seam, float)
     particles.sensor = upload(np.full(count, -1) if points.sensor is None else points.sensor, int)
-    particles.carried = upload(np.zeros(count) if points.carried is None else points.carried, int)
     return particles

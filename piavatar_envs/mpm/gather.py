@@ -109,9 +109,8 @@ def finish_gather(
     """Particle ``p``, which is ``f`` from node ``base``, a substep later; the blocks that it comes to are marked.
 
     It is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking exact
-    (1e-5 m against 1e-2 m). What the grid did not see of it is projected out of the boundaries, but not where a bone
-    carries the particle: that may come to lie beyond a surface. ``kinematic`` has nothing where it was not ``asked``
-    for, see :func:`asks_kinematic`.
+    (1e-5 m against 1e-2 m). What the grid did not see of it is projected out of the boundaries. ``kinematic`` has
+    nothing where it was not ``asked`` for, see :func:`asks_kinematic`.
     """
     x = moved.x[e, p]
     advection = wp.vec3(physical.mean[1], physical.mean[2], physical.mean[3])
@@ -123,7 +122,7 @@ def finish_gather(
         grad_vk = gradient_of(grid, kinematic, f)
     elif step.decoupling == SPLIT or step.decoupling == NO_STRESS:
         own = moved.vk[e, p]
-        if asked and particles.carried[p] == 0:
+        if asked:
             seen = wp.vec3(kinematic.mean[1], kinematic.mean[2], kinematic.mean[3])
             own = seen + remove_approach(boundaries, e, x, own - seen, CONTACT_GATE * grid.dx)
         advection += own

@@ -99,7 +99,6 @@ class Particles:
     field: wp.array(dtype=int)  # (num_particles,) velocity field
     seam: wp.array(dtype=float)  # (num_particles,) 1 where two fields of a subject grow together, else 0
     sensor: wp.array(dtype=int)  # (num_particles,) row of the contact sensor, -1 for none
-    carried: wp.array(dtype=int)  # (num_particles,) 1 of a bone that boundaries do not keep it from, else 0
     groups: wp.array(dtype=wp.vec2i)  # (G + 1,) :func:`piavatar_envs.mpm.group_plan.begin_groups`
 
 

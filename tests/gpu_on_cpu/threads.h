@@ -181,6 +181,7 @@ inline long long __float2ll_rn(float x)  // what is no number becomes the least,
     if (x != x || x < -0x1p63f) return -0x7fffffffffffffffll - 1;
     return x >= 0x1p63f ? 0x7fffffffffffffffll : (long long)rintf(x);
 }
+inline float rsqrtf(float x) { return 1.0f / sqrtf(x); }
 inline float __fmaf_rn(float a, float b, float c) { return fmaf(a, b, c); }
 #pragma clang optimize off
 // rounded, never fused with what comes after

@@ -79,7 +79,7 @@ def test_feet_share_the_load(make_env):
     assert loads[0.0][0] == pytest.approx(loads[0.0][1], rel=0.05) and loads[0.0].min() > 1.0
     leaning = (loads[0.6] - loads[-0.6]) / loads[0.6].sum()
     # about y a positive turn takes the head to the left
-    assert leaning[0] > 0.1 and leaning[1] == pytest.approx(-leaning[0], rel=0.2)
+    assert leaning[0] > 0.05 and leaning[1] == pytest.approx(-leaning[0], rel=0.2)
     assert rest.joints[0, joint_index("left_ankle"), 0] > 0.0
 
 
@@ -267,7 +267,7 @@ def test_who_leaves_the_way_is_out(make_env):
     terminated = False
     while not terminated and steps < 20:
         observation, _, terminated, _, _ = env.step(still(env))
-        assert terminated == (float(seen(env, observation, "way_offset")[0]) > 0.3)
+        assert terminated == (seen(env, observation, "way_offset")[0] > np.float32(0.3))
         steps += 1
     assert 7 < steps < 14
 

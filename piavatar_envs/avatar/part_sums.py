@@ -1,0 +1,280 @@
+"""Sums over bones in the pass over particles that finds what is to be summed.
+
+A body's particles are in parts that follow each other in memory. On a GPU a CUDA block has a part: what its threads
+find of the particles meets in shared memory, from where a warp at a time sums the chunks of bones that are in the part.
+On a CPU a body is one part, and its particles meet in an array that all bodies use after each other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.body import BodyPoints, bone_lists
+from piavatar_envs.avatar.bone_sums import moments_of
+from piavatar_envs.avatar.lanes import store_sum12
+from piavatar_envs.avatar.loads import int_at
+from piavatar_envs.avatar.types import Body, vec12, vec16
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+#: Threads of a CUDA block that has a part.
+PART_BLOCK = 256
+#: Particles of a part on a GPU. More have fewer chunks, whose sums cost as much as those of many particles; their CUDA
+#: blocks need more shared memory, so fewer of them fit. It is the same for any number of environments, as sums are.
+PART = 3 * PART_BLOCK
+#: Words of a particle: three times four, so that lanes whose particles follow each other read from different banks.
+WORDS = wp.constant(12)
+
+
+@wp.struct
+class Parts:
+    """The particles of a body in parts: part ``i`` has those from ``i * size`` on."""
+
+    size: int
+    start: wp.array(dtype=int)  # (parts + 1,) part i has chunks chunk[start[i] : start[i + 1]], the longest first
+    chunk: wp.array(dtype=int)
+    entry: wp.array(dtype=wp.vec2i)  # as the body's: where a particle is in its part [words], bits of the weight
+
+
+def part_size(device: str, count: int) -> int:
+    """Particles of a part of a body of ``count``; on a CPU all."""
+    return PART if wp.get_device(device).is_cuda else count
+
+
+def divide(points: BodyPoints, body: Body, device: str) -> tuple[Body, Parts]:
+    """The body with chunks that are each in one part, and these parts."""
+    size = part_size(device, points.num_points)
+    divided, parts = Body(), Parts()
+    for name in Body.vars:
+        setattr(divided, name, getattr(body, name))
+    lists = bone_lists(points, size)
+    for name, numbers in lists.items():
+        dtype = float if name == "entry_weight" else int
+        setattr(divided, name, wp.array(numbers, dtype=dtype, device=device))
+    part = lists["entry"][lists["entry_start"][:-1]] // size
+    order = np.lexsort((-np.diff(lists["entry_start"]), part))
+    parts.size = size
+    borders = np.searchsorted(part[order], np.arange(-(-points.num_points // size) + 1))
+    parts.start = wp.array(borders.astype(np.int32), dtype=int, device=device)
+    parts.chunk = wp.array(order.astype(np.int32), dtype=int, device=device)
+    entry = np.stack([int(WORDS) * (lists["entry"] % size), lists["entry_weight"].view(np.int32)], axis=1)
+    parts.entry = wp.array(entry.astype(np.int32), dtype=wp.vec2i, device=device)
+    return divided, parts
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+const unsigned rows = (unsigned)num_envs, own = blockIdx.x / rows;
+return wp::vec_t<3, wp::int32>((int)(blockIdx.x - own * rows), (int)own, (int)threadIdx.x);
+#else
+return wp::vec_t<3, wp::int32>(e, part, thread);
+#endif
+""")
+def place_in_parts(e: int, part: int, thread: int, num_envs: int) -> wp.vec3i:
+    """Environment, part and thread in a launch over ``(num_envs, parts, PART_BLOCK)``, on a CPU as Warp says.
+
+    As in :func:`piavatar_envs.avatar.lanes.first_particle`, blocks that have the same part follow each other.
+    """
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return wp::vec_t<2, wp::int32>((int)(threadIdx.x >> 5), (int)(blockDim.x >> 5));
+#else
+return wp::vec_t<2, wp::int32>(0, 1);
+#endif
+""")
+def warp_of_block() -> wp.vec2i:
+    """Which warp of its CUDA block a thread is in, and of how many; on a CPU of one."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return wp::vec_t<2, wp::int32>((int)(threadIdx.x & 31), 32);
+#else
+return wp::vec_t<2, wp::int32>(0, 1);
+#endif
+""")
+def lane_of_warp() -> wp.vec2i:
+    """Which thread of its warp a thread is, and of how many; on a CPU of one."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+__shared__ float __align__(16) particles[{int(WORDS) * PART}];
+return reinterpret_cast<wp::uint64>(particles);
+#else
+return reinterpret_cast<wp::uint64>(scratch.data);
+#endif
+""")
+def room_of_particles(scratch: wp.array(dtype=vec12)) -> wp.uint64:
+    """Where the particles of a part meet: in a CUDA block's shared memory, on a CPU in ``scratch``."""
+    ...
+
+
+@wp.func_native("""
+float* const to = reinterpret_cast<float*>(room) + at;
+#if defined(__CUDA_ARCH__)
+reinterpret_cast<float4*>(to)[0] = make_float4(x[0], x[1], x[2], m);
+reinterpret_cast<float4*>(to)[1] = make_float4(first[0], first[1], first[2], 0.0f);
+reinterpret_cast<float4*>(to)[2] = make_float4(second[0], second[1], second[2], 0.0f);
+#else
+for (int c = 0; c < 3; ++c) to[c] = x[c], to[4 + c] = first[c], to[8 + c] = second[c];
+to[3] = m;
+#endif
+""")
+def bring_particle(room: wp.uint64, at: int, m: float, x: wp.vec3, first: wp.vec3, second: wp.vec3):
+    """Mass, place and two vectors of the particle at word ``at`` of a part."""
+    ...
+
+
+@wp.func_native("""
+const float* const from = reinterpret_cast<const float*>(room) + at;
+wp::vec_t<12, wp::float32> value;
+#if defined(__CUDA_ARCH__)
+#pragma unroll
+for (int c = 0; c < 3; ++c) {
+    const float4 four = reinterpret_cast<const float4*>(from)[c];
+    value[4 * c] = four.x, value[4 * c + 1] = four.y, value[4 * c + 2] = four.z, value[4 * c + 3] = four.w;
+}
+#else
+for (int c = 0; c < 12; ++c) value[c] = from[c];
+#endif
+return value;
+""")
+def particle_brought(room: wp.uint64, at: int) -> vec12:
+    """What :func:`bring_particle` has brought: place, mass, one vector, nothing, the other one, nothing."""
+    ...
+
+
+@wp.func_native(f"""
+const float* const from = reinterpret_cast<const float*>(room) + 8;
+float* const to = reinterpret_cast<float*>(&wp::index(into, e, first));
+for (int n = thread; n < 3 * count; n += threads) to[n] = from[{int(WORDS)} * (n / 3) + n % 3];
+""")
+def store_second(
+    room: wp.uint64, count: int, thread: int, threads: int, e: int, first: int, into: wp.array2d(dtype=wp.vec3)
+):
+    """The second vectors of the ``count`` particles of a part to ``into[e, first:]``, as they lie in memory."""
+    ...
+
+
+@wp.func_native("return entries.data[n];")
+def entry_at(entries: wp.array(dtype=wp.vec2i), n: int) -> wp.vec2i:
+    """``entries[n]``."""
+    ...
+
+
+@wp.func_native("float weight;\nmemcpy(&weight, &entry[1], sizeof(weight));\nreturn weight;")
+def weight_of(entry: wp.vec2i) -> float:
+    """The weight of an entry of a part."""
+    ...
+
+
+@wp.func
+def sum_both(
+    body: Body,
+    parts: Parts,
+    room: wp.uint64,
+    origin: wp.vec3,
+    e: int,
+    c: int,
+    thread: int,
+    threads: int,
+    # out
+    moments: wp.array2d(dtype=vec16),
+    other_moments: wp.array2d(dtype=vec12),
+):
+    """Moments about ``origin`` of one chunk of the part in the room, with the first vector as velocity.
+
+    Of the second one momentum and angular momentum, six of twelve numbers.
+    """
+    total = vec16()
+    P = wp.vec3()
+    L = wp.vec3()
+    n = int_at(body.entry_start, c) + thread
+    last = int_at(body.entry_start, c + 1)
+    while n < last:
+        entry = entry_at(parts.entry, n)
+        s = particle_brought(room, entry[0])
+        w = weight_of(entry) * s[3]
+        d = wp.vec3(s[0], s[1], s[2]) - origin
+        total += moments_of(w, d, wp.vec3(s[4], s[5], s[6]))
+        momentum = w * wp.vec3(s[8], s[9], s[10])
+        P += momentum
+        L += wp.cross(d, momentum)
+        n += threads
+    store_both(moments, other_moments, e, c, total, P, L, threads)
+
+
+@wp.func
+def sum_one(
+    body: Body,
+    parts: Parts,
+    room: wp.uint64,
+    origin: wp.vec3,
+    e: int,
+    c: int,
+    thread: int,
+    threads: int,
+    # out
+    momenta: wp.array2d(dtype=vec12),
+):
+    """Momentum and angular momentum of one chunk with the first vector as velocity; otherwise as :func:`sum_both`."""
+    P = wp.vec3()
+    L = wp.vec3()
+    n = int_at(body.entry_start, c) + thread
+    last = int_at(body.entry_start, c + 1)
+    while n < last:
+        entry = entry_at(parts.entry, n)
+        s = particle_brought(room, entry[0])
+        w = weight_of(entry) * s[3]
+        v = wp.vec3(s[4], s[5], s[6])
+        P += w * v
+        L += wp.cross(w * (wp.vec3(s[0], s[1], s[2]) - origin), v)
+        n += threads
+    value = vec12(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    store_sum12(momenta, e, c, value, threads)
+
+
+# As piavatar_envs.avatar.lanes has it for sixteen numbers; here are 22, of which a lane stores one.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+if (threads == 32) {
+    constexpr int WORDS = 22;
+    const int lane = threadIdx.x & 31;
+    float part[WORDS];
+#pragma unroll
+    for (int k = 0; k < WORDS; ++k) part[k] = k < 16 ? value[k] : k < 19 ? P[k - 16] : L[k - 19];
+#define HALVE(half)                                                                               \\
+    _Pragma("unroll") for (int k = 0; k < half; ++k) {                                            \\
+        const bool upper = lane & half, pair = k + half < WORDS;                                  \\
+        const float other = part[pair ? k + half : k], away = pair && !upper ? other : part[k];   \\
+        part[k] = (pair && upper ? other : part[k]) + __shfl_xor_sync(0xffffffffu, away, half);   \\
+    }
+    HALVE(16) HALVE(8) HALVE(4) HALVE(2) HALVE(1)
+#undef HALVE
+    if (lane < 16) reinterpret_cast<float*>(&wp::index(into, e, c))[lane] = part[0];
+    else if (lane < WORDS) reinterpret_cast<float*>(&wp::index(other_into, e, c))[lane - 16] = part[0];
+    return;
+}
+#endif
+wp::index(into, e, c) = value;
+for (int k = 0; k < 3; ++k) wp::index(other_into, e, c)[k] = P[k], wp::index(other_into, e, c)[3 + k] = L[k];
+""")
+def store_both(
+    into: wp.array2d(dtype=vec16),
+    other_into: wp.array2d(dtype=vec12),
+    e: int,
+    c: int,
+    value: vec16,
+    P: wp.vec3,
+    L: wp.vec3,
+    threads: int,
+):
+    """``into[e, c]`` = the sum of ``value`` over the threads of a warp, and six numbers of ``other_into[e, c]``."""
+    ...
