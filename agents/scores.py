@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,8 @@ from rich.markdown import Markdown
 from agents import compare
 from agents.checkpoint import flattened
 from benchmarks.runner import describe_run, plain, write_json
+from piavatar_envs.envs.config import load_config
+from piavatar_envs.tasks import load_task
 
 _COLUMNS = ("agent", "seeds", "episodes", "return", "succeeds at the end", "at some time", "steps", "trained for")
 #: Script of runs that are random actions of several streams.
@@ -57,10 +59,14 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
         groups.setdefault((run["config"]["env_id"], _learner(run)), {})[name] = run
     streams = [run for run in runs.values() if run["benchmark"] == STREAMS]
     rows: list[dict[str, Any]] = []
+    shown: list[tuple[str, Mapping[str, Any]]] = []
     for (env_id, script), group in sorted(groups.items()):
-        for row in _rows(group, streams):
+        for run, row in _rows(group, streams):
             agent = row["case"] if row["case"] != "trained" else script
             if agent in compare.UNTRAINED:
+                if any(other == agent and _same_environment(one, run) for other, one in shown):
+                    continue
+                shown.append((agent, run))
                 twins = [r for r in rows if r["env_id"] == env_id and r["agent"].startswith(agent)]
                 if any(math.isclose(r["return_mean"], row["return_mean"], rel_tol=_ALIKE) for r in twins):
                     continue
@@ -79,24 +85,37 @@ def _learner(run: Mapping[str, Any]) -> str:
     return "sb3_sac" if run["config"].get("sac") else "sb3_ppo"
 
 
-def _rows(group: Mapping[str, Mapping[str, Any]], streams: Sequence[Mapping[str, Any]]) -> Iterable[Mapping[str, Any]]:
-    """Of the runs of one script in one environment, random actions of several streams if there are any of them."""
+def _rows(
+    group: Mapping[str, Mapping[str, Any]], streams: Sequence[Mapping[str, Any]]
+) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """Of the runs of one script in one environment, each with a run of its settings.
+
+    Random actions are those of several streams, where there are any of these settings.
+    """
     first = next(iter(group.values()))
     if first["benchmark"] == STREAMS:
-        return [row for run in group.values() for row in run["results"]]
+        return [(run, row) for run in group.values() for row in run["results"]]
     if len(group) > 1:
         rows = compare.summarize(group)["results"]
     else:
         own = 1 if "training_s" in first else None
         rows = [row | {"seeds": None if row["case"] in compare.UNTRAINED else own} for row in first["results"]]
     several = next((run["results"][0] for run in streams if _same_environment(run, first)), None)
-    return [several if several and row["case"] == several["case"] else row for row in rows]
+    return [(first, several if several and row["case"] == several["case"] else row) for row in rows]
 
 
 def _same_environment(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two runs have one environment; settings that only one knows came or went between their commits."""
-    first, second = ({"env_id": run["config"]["env_id"]} | flattened(run["config"]["env"]) for run in (one, other))
-    return all(first[key] == second[key] for key in first.keys() & second.keys())
+    """Whether two runs have one environment; a setting that a run does not know yet has its default there."""
+    return _environment(one) == _environment(other)
+
+
+def _environment(run: Mapping[str, Any]) -> dict[str, Any]:
+    env_id, settings = run["config"]["env_id"], run["config"]["env"]
+    try:
+        known = load_config(load_task(env_id).Config, settings).model_dump(mode="json")
+    except ValueError:  # a world of several agents, or settings that are no longer there
+        known = settings
+    return {"env_id": env_id} | flattened(known)
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

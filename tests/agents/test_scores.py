@@ -69,7 +69,6 @@ def streams(env_id: str, value: float, **env) -> dict:
 
 def test_several_streams_of_random_actions_take_the_place_of_single_ones(runs):
     """In all runs of their settings: of one that has others, the single stream stays."""
-    runs["push"]["config"]["env"]["newer"] = 1.0  # what only one of them knows makes no difference
     runs["stand_pid"]["config"]["env"]["joints"] = ["head"]
     runs["stand_pid"]["results"][1]["return_mean"] = 1.5
     rows = scores.scores(
@@ -83,6 +82,14 @@ def test_several_streams_of_random_actions_take_the_place_of_single_ones(runs):
     assert found["Stand-v0", "random, as score_pid"] == (1.5, None, 10)
     assert found["Stand-v0", "random, as score_random"] == (2.9, 5, 4)
     assert len(rows) == 9 and found["Stand-v0", "zero"] == (3.0, None, 10)
+
+
+def test_the_untrained_of_one_environment_stand_once_also_in_fewer_episodes(runs):
+    runs["stand_pid"]["results"][:2] = [row("zero", 3.4, episodes=4), row("random", 2.4, episodes=4)]
+    found = [(r["agent"], r["return_mean"]) for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
+    assert found == [("random", 2.0), ("zero", 3.0), ("PID", 40.0), ("rsl_ppo", 85.0)]
+    runs["stand_pid"]["config"]["env"]["physics"]["fidelity"] = "fine"
+    assert {r["agent"] for r in scores.scores(runs)} >= {"random, as score_pid", "zero, as score_pid"}
 
 
 def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
@@ -184,6 +191,7 @@ def test_other_files_are_refused(runs, tmp_path):
 
 
 def test_untrained_agents_stand_twice_where_actions_mean_something_else(runs):
+    runs["stand_pid"]["config"]["env"]["episode_seconds"] = 5.0
     runs["stand_pid"]["results"][0]["return_mean"] = 3.0001  # rounding, on another device
     runs["stand_pid"]["results"][1]["return_mean"] = 2.5
     agents = [r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
