@@ -258,7 +258,7 @@ def main(args: list[str] | None = None) -> None:
     commits = sorted({str(one["commit"])[:12] for one in measured} | set(kept["commits"]))
     about = (
         f"{', '.join(devices)}; commits {', '.join(commits)}. Brackets are 95 % intervals: over seeds where there are "
-        "several, else over episodes."
+        "several, else over episodes; each seed has played so many episodes."
     )
     text = markdown(rows, about)
     if options.out is not None:
