@@ -10,6 +10,7 @@ import pytest
 from benchmarks import cholesky
 from benchmarks.cholesky import CUSOLVER, PLAIN, Options, make_systems
 from piavatar_envs.avatar.cholesky import find_pattern
+from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 
 TIMES = ("factorise_us", "solve_us", "together_us")
@@ -67,13 +68,13 @@ def test_what_cannot_be_built_says_why(systems, options, monkeypatch):
         raise RuntimeError("Failed to compile LTO 'potrf_72'")
 
     monkeypatch.setattr(cholesky, "tile_kernels", refuse)
-    row = cholesky.measure_tiles(systems, options, 72, 1, cusolver=False)
+    row = cholesky.measure_tiles(systems, options, 72, warp_threads(options.device), cusolver=False)
     assert row["failed"] == "RuntimeError: Failed to compile LTO 'potrf_72'" and not set(TIMES) & set(row)
     with pytest.raises(ValueError, match="rows=66 must be >= 69"):
-        cholesky.measure_tiles(systems, options, 66, 1, cusolver=False)
+        cholesky.measure_tiles(systems, options, 66, 32, cusolver=False)
 
 
 def test_solutions_that_are_none_have_no_times(systems, options):
     broken = replace(systems, matrix=-systems.matrix)
-    row = cholesky.measure_tiles(broken, options, 72, 1, cusolver=False)
+    row = cholesky.measure_tiles(broken, options, 72, warp_threads(options.device), cusolver=False)
     assert row["failed"].startswith("ArithmeticError: ") and not set(TIMES) & set(row)
