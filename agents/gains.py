@@ -1,4 +1,4 @@
-"""Gains of a PID by joint, and schedules that scale them: by what a joint carries, and by the phase of a gait.
+"""Gains of a PID by joint, by what it carries or how strong it is, and a schedule that scales them by the load on legs.
 
 A schedule is anything that is called with what it depends on, a row an environment, and returns factors
 ``(n, joints, 1)`` for :meth:`agents.pid.PosePID.step`. Factors of several schedules are multiplied.
@@ -100,38 +100,6 @@ def gains_by_strength(
     """
     kp = stiffness * np.max(limit, axis=-1, keepdims=True)
     return Gains(kp, kp * damping_time, kp / integral_time, limit=limit)
-
-
-@dataclass(frozen=True)
-class PhaseSchedule:
-    """Factors on a circle of phases, with straight lines between knots, such as a stiff stance and a soft swing.
-
-    Attributes:
-        phases: of the knots in [0, 1), ascending, ``(knots,)``.
-        factors: at the knots, ``(knots, joints)``.
-    """
-
-    phases: np.ndarray
-    factors: np.ndarray
-
-    def __post_init__(self) -> None:
-        """Check the knots.
-
-        Raises:
-            ValueError: phases that are not ascending in [0, 1), factors that are negative or do not fit them.
-        """
-        phases, factors = np.asarray(self.phases, float), np.asarray(self.factors, float)
-        if phases.ndim != 1 or phases.min() < 0.0 or phases.max() >= 1.0 or (np.diff(phases) <= 0.0).any():
-            raise ValueError(f"phases={phases.tolist()} must ascend in [0, 1)")
-        if factors.shape[:1] != phases.shape or factors.min() < 0.0:
-            raise ValueError(
-                f"factors have shape {factors.shape} and least value {factors.min()}; give >= 0, a row a knot"
-            )
-
-    def __call__(self, phase: np.ndarray) -> np.ndarray:
-        """Factors ``(n, joints, 1)`` at phases ``(n,)``, of which whole rounds do not count."""
-        columns = [np.interp(phase, self.phases, column, period=1.0) for column in np.transpose(self.factors)]
-        return np.stack(columns, axis=-1)[..., None]
 
 
 @dataclass(frozen=True)

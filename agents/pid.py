@@ -4,7 +4,7 @@ It knows plain arrays only and needs no simulation. :class:`PID` works on any de
 :class:`PosePID` on joints that are local rotations ``(n, joints, 3)``::
 
     controller = PosePID(PID(gains, dt, (n, joints, 3)))
-    torque = controller.step(rotation, target, rate=rate, target_rate=target_rate, factor=schedule(phase))
+    torque = controller.step(rotation, target, rate=rate, target_rate=target_rate, factor=schedule(forces))
 
 The law is that of Astrom & Murray, "Feedback Systems", 2nd ed. 2021, chapter 11, a degree of freedom each::
 

@@ -73,7 +73,8 @@ class Design:
         foot_width: within which ankles can hold it sideways [m].
         gain: of the balance, see :class:`~agents.balance.Balance`.
         hip_threshold, hip_gain: of the hip strategy, see :class:`~agents.balance.Balance`.
-        hip_share: share of the strength of both hips that it has [-].
+        hip_share: share of the strength of both hips that it has [-]. A body that walks is beyond the threshold all
+            the time: after DeepMimic's walk it falls later without (12 episodes: after 0.6 instead of 0.4 s).
     """
 
     stiffness: float = 1.75

@@ -1,10 +1,12 @@
 """A table of scores out of many runs: ``python -m agents.scores runs/* --out benchmarks/results/NAME.json``.
 
-Every run is a folder with the ``results.json`` of ``agents.train``, ``agents.rsl_ppo`` or ``agents.score_pid``. Runs of
-one configuration that differ in their seed become one row (:mod:`agents.compare`), runs of one environment one table;
-what no training changes (zero and random actions) stands in it once, unless an environment's settings change what an
-action means. Beside the JSON file comes the same as Markdown. Environments that none of the runs is about can keep the
-rows that an earlier table has of them (``--keep FILE.json``).
+Every run is a folder with the ``results.json`` of ``agents.train``, ``agents.rsl_ppo``, ``agents.score_pid`` or
+``agents.score_random``. Runs of one configuration that differ in their seed become one row (:mod:`agents.compare`),
+runs of one environment one table; what no training changes (zero and random actions) stands in it once, unless an
+environment's settings change what an action means. A run has played one stream of random actions; the row of an
+``agents.score_random`` of the same settings, which is of several, takes its place. Beside the JSON file comes the same
+as Markdown. Environments that none of the runs is about can keep the rows that an earlier table has of them
+(``--keep FILE.json``).
 
 A policy can be scored anew without training it anew: ``python -m agents.play RUN --out RUN/evaluation.json``. Its row
 then takes the place of the training's own; what the training took, and zero and random actions, stay as they were.
@@ -27,8 +29,12 @@ from rich.markdown import Markdown
 from agents import compare
 from agents.checkpoint import flattened
 from benchmarks.runner import describe_run, plain, write_json
+from piavatar_envs.envs.config import load_config
+from piavatar_envs.tasks import load_task
 
-_COLUMNS = ("agent", "seeds", "return", "succeeds at the end", "at some time", "steps", "trained for")
+_COLUMNS = ("agent", "seeds", "episodes", "return", "succeeds at the end", "at some time", "steps", "trained for")
+#: Script of runs that are random actions of several streams.
+STREAMS = "score_random"
 #: Returns of the same actions in the same episodes, on another device.
 _ALIKE = 1.0e-3
 
@@ -51,11 +57,16 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     groups: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for name, run in runs.items():
         groups.setdefault((run["config"]["env_id"], _learner(run)), {})[name] = run
+    streams = [run for run in runs.values() if run["benchmark"] == STREAMS]
     rows: list[dict[str, Any]] = []
+    shown: list[tuple[str, Mapping[str, Any]]] = []
     for (env_id, script), group in sorted(groups.items()):
-        for row in _rows(group):
+        for run, row in _rows(group, streams):
             agent = row["case"] if row["case"] != "trained" else script
             if agent in compare.UNTRAINED:
+                if any(other == agent and _same_environment(one, run) for other, one in shown):
+                    continue
+                shown.append((agent, run))
                 twins = [r for r in rows if r["env_id"] == env_id and r["agent"].startswith(agent)]
                 if any(math.isclose(r["return_mean"], row["return_mean"], rel_tol=_ALIKE) for r in twins):
                     continue
@@ -74,13 +85,37 @@ def _learner(run: Mapping[str, Any]) -> str:
     return "sb3_sac" if run["config"].get("sac") else "sb3_ppo"
 
 
-def _rows(group: Mapping[str, Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
-    """Of the runs of one script in one environment."""
+def _rows(
+    group: Mapping[str, Mapping[str, Any]], streams: Sequence[Mapping[str, Any]]
+) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
+    """Of the runs of one script in one environment, each with a run of its settings.
+
+    Random actions are those of several streams, where there are any of these settings.
+    """
+    first = next(iter(group.values()))
+    if first["benchmark"] == STREAMS:
+        return [(run, row) for run in group.values() for row in run["results"]]
     if len(group) > 1:
-        return compare.summarize(group)["results"]
-    (run,) = group.values()
-    trained = "training_s" in run
-    return [row | {"seeds": 1 if trained and row["case"] not in compare.UNTRAINED else None} for row in run["results"]]
+        rows = compare.summarize(group)["results"]
+    else:
+        own = 1 if "training_s" in first else None
+        rows = [row | {"seeds": None if row["case"] in compare.UNTRAINED else own} for row in first["results"]]
+    several = next((run["results"][0] for run in streams if _same_environment(run, first)), None)
+    return [(first, several if several and row["case"] == several["case"] else row) for row in rows]
+
+
+def _same_environment(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two runs have one environment; a setting that a run does not know yet has its default there."""
+    return _environment(one) == _environment(other)
+
+
+def _environment(run: Mapping[str, Any]) -> dict[str, Any]:
+    env_id, settings = run["config"]["env_id"], run["config"]["env"]
+    try:
+        known = load_config(load_task(env_id).Config, settings).model_dump(mode="json")
+    except ValueError:  # a world of several agents, or settings that are no longer there
+        known = settings
+    return {"env_id": env_id} | flattened(known)
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -114,6 +149,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     return [
         row["agent"],
         str(row["seeds"] or ""),
+        str(row["episodes"]),
         _with(row["return_mean"], row["return_interval"], ".1f"),
         _with(row["success_at_end"], row["success_at_end_interval"], ".0%"),
         _with(row["success_once"], row["success_once_interval"], ".0%"),
@@ -222,7 +258,7 @@ def main(args: list[str] | None = None) -> None:
     commits = sorted({str(one["commit"])[:12] for one in measured} | set(kept["commits"]))
     about = (
         f"{', '.join(devices)}; commits {', '.join(commits)}. Brackets are 95 % intervals: over seeds where there are "
-        "several, else over episodes."
+        "several, else over episodes; each seed has played so many episodes."
     )
     text = markdown(rows, about)
     if options.out is not None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from agents.gains import LoadSchedule, PhaseSchedule, gains_by_strength, gains_for, subtrees
+from agents.gains import LoadSchedule, gains_by_strength, gains_for, subtrees
 from agents.pid import PID, Gains, PosePID, difference, follow, motion_poses, turned
 
 M, L, G = 2.0, 0.5, 9.81
@@ -302,16 +302,6 @@ def test_gains_by_strength_ask_for_the_whole_torque_at_one_angle():
     np.testing.assert_allclose(of_one.ki, gains.kp * [[0.25], [0.0]])
     strong = PID(gains, 0.01, (1, 2, 3)).step(np.full((1, 2, 3), 0.6), np.zeros((1, 2, 3)))
     np.testing.assert_allclose(strong[0], limit)
-
-
-def test_a_phase_schedule_is_a_closed_line_through_its_knots():
-    schedule = PhaseSchedule(np.array([0.0, 0.5]), np.array([[1.0, 0.2], [0.4, 1.0]]))
-    factors = schedule(np.array([0.0, 0.25, 0.5, 0.75, 1.0, 3.5]))
-    assert factors.shape == (6, 2, 1)
-    np.testing.assert_allclose(factors[:, 0, 0], [1.0, 0.7, 0.4, 0.7, 1.0, 0.4])
-    np.testing.assert_allclose(factors[:, 1, 0], [0.2, 0.6, 1.0, 0.6, 0.2, 1.0])
-    with pytest.raises(ValueError, match=r"phases=\[0.5, 0.2\] must ascend"):
-        PhaseSchedule(np.array([0.5, 0.2]), np.ones((2, 1)))
 
 
 def test_a_leg_that_carries_is_stiff():

@@ -11,7 +11,7 @@ from agents.pid import motion_poses
 from agents.pid_agent import Design, PIDAgent, make_pid_agent, rest_poses
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.limits import joint_limits
-from piavatar_envs.avatar.motion import load_motion
+from piavatar_envs.avatar.motion import deepmimic, load_motion
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import load_config
@@ -207,6 +207,17 @@ def test_it_follows_the_clip_that_the_task_shows(device):
     without = tuple(name for name in JOINT_NAMES[1:] if name != "left_shoulder")
     play(env, PIDAgent(env, Design(followed=without)), 0.9, np.array([0]))
     assert missing(env, now)[arm] > 0.6
+
+
+@pytest.mark.skipif(deepmimic.clip_folder() is None, reason="needs the extra motions: DeepMimic's clips")
+def test_after_a_walk_it_falls_later_than_no_torques_and_latest_without_the_hip_strategy(device):
+    clip = {"motion": "deepmimic:walk", "impulse": 0.0, "root_action": False, "fail_distance": 0.3}
+    env, seeds = make(4, device, "TrackMotion-v0", **clip), np.arange(4)
+    limp = np.zeros((4, env.action_spec.size))
+    without = play(env, PIDAgent(env, Design(hip_share=0.0)), 1.0, seeds)
+    for other in (lambda _: limp, PIDAgent(env)):
+        assert without.mean() > play(env, other, 1.0, seeds).mean() + 0.1
+    assert without.max() < 0.9  # and falls
 
 
 @pytest.mark.parametrize("task", ["PushRecovery-v0", "GetUp-v0", "Walk-v0", "TrackMotion-v0"])

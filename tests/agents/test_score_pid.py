@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra train")
 
 from agents import score_pid, scores
+from piavatar_envs.avatar.motion import deepmimic
 
 SHORT = ("PIAvatar/Stand-v0", "fidelity=tiny", "episode_seconds=0.2")
 
@@ -26,6 +27,17 @@ def test_scores_are_those_of_the_episodes_and_go_into_the_table(device, tmp_path
     assert (out / "config.yaml").read_text().count("control: torque") == 1
     table = scores.scores({"pid_stand": report})
     assert [row["agent"] for row in table] == ["random", "zero", "PID"]
+
+
+@pytest.mark.skipif(deepmimic.clip_folder() is None, reason="needs the extra motions: DeepMimic's clips")
+def test_it_plays_the_walk_of_deepmimic(device, tmp_path):
+    walk = ("PIAvatar/TrackMotion-v0", "motion=deepmimic:walk", "impulse=0", "root_action=false", *SHORT[1:])
+    score_pid.main([*walk, "--evaluation.episodes", "2", "--out", str(tmp_path), "--device", device])
+    report = json.loads((tmp_path / "results.json").read_text())
+    assert report["config"]["env"]["motion"] == "deepmimic:walk"
+    assert report["config"]["env"]["drive"]["control"] == "torque"
+    zero, _, pid = (row["return_mean"] for row in report["results"])
+    assert pid > 0.0 and pid != zero
 
 
 def test_bodies_that_no_torques_move_are_refused():

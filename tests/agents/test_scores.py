@@ -60,6 +60,38 @@ def test_seeds_become_one_row_and_the_untrained_stand_once(runs):
     assert rows[2]["by_push"][0]["lasted"] == 0.5
 
 
+def streams(env_id: str, value: float, **env) -> dict:
+    """A run of random actions of several seeds."""
+    content = run("score_random", env_id, 0)
+    content["config"]["env"] |= env
+    return content | {"results": [row("random", value, seeds=5, episodes=4)]}
+
+
+def test_several_streams_of_random_actions_take_the_place_of_single_ones(runs):
+    """In all runs of their settings: of one that has others, the single stream stays."""
+    runs["stand_pid"]["config"]["env"]["joints"] = ["head"]
+    runs["stand_pid"]["results"][1]["return_mean"] = 1.5
+    rows = scores.scores(
+        runs
+        | {"a": streams("Push-v0", 2.5), "b": streams("Stand-v0", 2.7, joints=None)}
+        | {"c": streams("Stand-v0", 2.9, joints=["neck"])}
+    )
+    found = {(r["env_id"], r["agent"]): (r["return_mean"], r["seeds"], r["episodes"]) for r in rows}
+    assert found["Push-v0", "random"] == (2.5, 5, 4)
+    assert found["Stand-v0", "random"] == (2.7, 5, 4)
+    assert found["Stand-v0", "random, as score_pid"] == (1.5, None, 10)
+    assert found["Stand-v0", "random, as score_random"] == (2.9, 5, 4)
+    assert len(rows) == 9 and found["Stand-v0", "zero"] == (3.0, None, 10)
+
+
+def test_the_untrained_of_one_environment_stand_once_also_in_fewer_episodes(runs):
+    runs["stand_pid"]["results"][:2] = [row("zero", 3.4, episodes=4), row("random", 2.4, episodes=4)]
+    found = [(r["agent"], r["return_mean"]) for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
+    assert found == [("random", 2.0), ("zero", 3.0), ("PID", 40.0), ("rsl_ppo", 85.0)]
+    runs["stand_pid"]["config"]["env"]["physics"]["fidelity"] = "fine"
+    assert {r["agent"] for r in scores.scores(runs)} >= {"random, as score_pid", "zero, as score_pid"}
+
+
 def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     for name, content in runs.items():
         (tmp_path / name).mkdir()
@@ -69,7 +101,7 @@ def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     assert len(report["results"]) == 7 and report["devices"] == ["some GPU"] and report["commits"] == ["abc"]
     text = (tmp_path / "table.md").read_text()
     assert text.index("## Push-v0") < text.index("## Stand-v0")
-    assert "| rsl_ppo | 2 | 85.0 (21.5 to 148.5) |" in text and "2 M steps, 70 s" in text
+    assert "| rsl_ppo | 2 | 10 | 85.0 (21.5 to 148.5) |" in text and "2 M steps, 70 s" in text
     assert "| 0 to 5 | 50% of 10 |" in text
     with pytest.raises(SystemExit, match=r"error: .*nowhere"):
         scores.main([str(tmp_path / "nowhere")])
@@ -159,6 +191,7 @@ def test_other_files_are_refused(runs, tmp_path):
 
 
 def test_untrained_agents_stand_twice_where_actions_mean_something_else(runs):
+    runs["stand_pid"]["config"]["env"]["episode_seconds"] = 5.0
     runs["stand_pid"]["results"][0]["return_mean"] = 3.0001  # rounding, on another device
     runs["stand_pid"]["results"][1]["return_mean"] = 2.5
     agents = [r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]

@@ -1,0 +1,106 @@
+"""Scores of random actions, of several seeds: ``python -m agents.score_random RUN --out FOLDER``.
+
+Plays the environment of a run, which is any folder with the ``results.json`` of a training or of ``agents.score_pid``.
+Every seed is a stream of actions of its own, in the episodes that all agents are evaluated in, and counts as a
+training's does: intervals are over seeds. ``agents.scores`` puts this row in the place of those of single streams, in
+all runs of these settings.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from agents import seeds
+from agents.batches import in_every_seat, play
+from agents.command import read_options
+from agents.config import EvaluationSettings
+from agents.evaluate import over_seeds, random_agent
+from agents.report import versions
+from benchmarks.runner import plain, write_json
+from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.doctor import quiet_warp
+from piavatar_envs.envs.config import ConfigError, load_config, parse_assignments
+from piavatar_envs.tasks import load_task
+
+
+@dataclass(frozen=True)
+class Options:
+    """Score random actions in the environment of a run with one avatar."""
+
+    #: folder of the run
+    run: tyro.conf.Positional[Path]
+    #: settings of the environment that win over the run's: fidelity=tiny
+    settings: tyro.conf.Positional[tuple[str, ...]] = ()
+    #: streams of random actions
+    seeds: int = 5
+    #: how many episodes each, and from which seed on
+    evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
+    #: folder to write to; by default runs/random_ and the name of the run
+    out: Path | None = None
+    #: where to simulate
+    device: str = "cpu"
+
+
+def score(batch: BatchedEpisodes, first_seed: int, count: int) -> dict[str, Any]:
+    """One row for ``count`` streams of random actions.
+
+    Args:
+        batch: plays an episode in each of its environments.
+        first_seed: of the episodes, the same for all streams.
+        count: of streams; the seed of each is the one with which a training of that place would begin.
+
+    Raises:
+        ConfigError: a count that has no interval, or is larger than that of the seeds that trainings can have.
+    """
+    if not 2 <= count <= seeds.MOST_RUNS:
+        raise ConfigError(f"seeds={count} must be >= 2 and <= {seeds.MOST_RUNS}: of one there is no interval")
+    streams = [random_agent(batch.action_size, seeds.first_seed(stream)) for stream in range(count)]
+    return over_seeds([play("random", in_every_seat(stream), batch, first_seed).row() for stream in streams])
+
+
+def main(args: list[str] | None = None) -> None:
+    """The command line."""
+    options = read_options(Options, "score_random", args)
+    quiet_warp()
+    try:
+        env_id, env = environment_of(options.run)
+        task_class = load_task(env_id)
+        config = load_config(task_class.Config, dict(env), parse_assignments(options.settings))
+        batch = BatchedEpisodes(task_class(config), options.evaluation.episodes, options.device)
+        row = score(batch, options.evaluation.first_seed, options.seeds)
+    except (ConfigError, ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
+    batch.close()
+    row["first_seed"] = options.evaluation.first_seed
+    folder = options.out or Path("runs") / f"random_{options.run.resolve().name}"
+    settings = {"env_id": env_id, "env": config.model_dump(mode="json")}
+    about = versions("score_random", options.device) | {"seed": 0, "config": settings}
+    write_json(folder / "results.json", plain({**about, "results": [row]}, "results"))
+    low, high = row["return_interval"]
+    print(f"random, {options.seeds} seeds: {row['return_mean']:.1f} ({low:.1f} to {high:.1f})")
+    print(f"in {folder}: results.json")
+
+
+def environment_of(folder: Path) -> tuple[str, Mapping[str, Any]]:
+    """Id and settings of a run's environment.
+
+    Raises:
+        ConfigError: the folder's file is not that of a run.
+        OSError: the folder has no ``results.json``.
+    """
+    path = folder / "results.json"
+    config = json.loads(path.read_text(encoding="utf-8")).get("config", {})
+    if not {"env_id", "env"} <= set(config):
+        raise ConfigError(f"{path} has no config.env_id and config.env; give the folder of a training or of score_pid")
+    return config["env_id"], config["env"]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,59 @@
+"""Scores of several streams of random actions, from the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs the extra train")
+
+from agents import score_pid, score_random, scores
+from agents.batches import in_every_seat, play
+from agents.evaluate import random_agent
+from agents.seeds import first_seed
+from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.envs.config import load_config
+from piavatar_envs.tasks import load_task
+
+
+@pytest.fixture(scope="module")
+def run(device, tmp_path_factory):
+    """A folder as a run leaves it."""
+    folder = tmp_path_factory.mktemp("pid_stand")
+    short = ("PIAvatar/Stand-v0", "fidelity=tiny", "episode_seconds=0.4", "--evaluation.episodes", "2")
+    score_pid.main([*short, "--out", str(folder), "--device", device])
+    return folder
+
+
+def test_every_seed_is_a_stream_of_its_own_in_the_same_episodes(run, device, tmp_path, capsys):
+    arguments = [str(run), "--seeds", "3", "--evaluation.episodes", "2", "--device", device]
+    score_random.main([*arguments, "--out", str(tmp_path)])
+    report = json.loads((tmp_path / "results.json").read_text())
+    (row,) = report["results"]
+    assert (row["case"], row["seeds"], row["episodes"], row["first_seed"]) == ("random", 3, 2, 1_000_000)
+    env = report["config"]["env"]
+    assert env == json.loads((run / "results.json").read_text())["config"]["env"]
+    task = load_task("Stand-v0")
+    batch = BatchedEpisodes(task(load_config(task.Config, env)), 2, device)
+    agents = [random_agent(batch.action_size, first_seed(seed)) for seed in range(3)]
+    means = [play("random", in_every_seat(agent), batch, 1_000_000).returns.mean() for agent in agents]
+    batch.close()
+    assert np.ptp(means) > 0.0
+    assert row["return_mean"] == pytest.approx(np.mean(means))
+    half = 4.303 * np.std(means, ddof=1) / np.sqrt(3.0)  # Student's t of two degrees of freedom
+    assert row["return_interval"] == pytest.approx([np.mean(means) - half, np.mean(means) + half], rel=1e-3)
+    pid = json.loads((run / "results.json").read_text())
+    table = {found["agent"]: found["seeds"] for found in scores.scores({"pid": pid, "random": report})}
+    assert table == {"random": 3, "zero": None, "PID": None}
+
+
+def test_what_is_no_run_and_one_seed_are_refused(run, tmp_path):
+    with pytest.raises(SystemExit, match=r"error: .*No such file"):
+        score_random.main([str(tmp_path)])
+    (tmp_path / "results.json").write_text("{}")
+    with pytest.raises(SystemExit, match=r"has no config.env_id and config.env"):
+        score_random.main([str(tmp_path)])
+    with pytest.raises(SystemExit, match="seeds=1 must be >= 2"):
+        score_random.main([str(run), "--seeds", "1"])
