@@ -33,7 +33,7 @@ from piavatar_envs.avatar.joint_torques import (
     joint_impulse,
     limit_torque,
 )
-from piavatar_envs.avatar.lanes import meet_threads, sum_threads
+from piavatar_envs.avatar.lanes import meet_threads, place_in_block, sum_threads
 from piavatar_envs.avatar.mass_matrix import BONES, compose_mass, room_of_records
 from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.rotation import rigid_matrix
@@ -46,7 +46,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 WARP = wp.constant(32)
 #: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
-MASS_BLOCK = 128
+MASS_BLOCK = wp.constant(128)
 #: The pelvis' place, then all joints.
 PARTS = wp.constant(1 + int(BONES))
 _ROOM = wp.constant(ROOM)
@@ -143,7 +143,7 @@ def turn_joints(
     balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, own, thread, threads, w.shares)
 
 
-@wp.kernel(launch_bounds=(MASS_BLOCK, 8))
+@wp.kernel(launch_bounds=(int(MASS_BLOCK), 8))
 def build_mass(
     body: Body,
     pairs: Pairs,
@@ -151,12 +151,15 @@ def build_mass(
     springs: Springs,
     tissue: Tissue,
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     w: JointBench,
 ):
-    """The mass matrix, its factors and where the bones are, over ``(num_envs, threads)``; a CUDA block has one."""
-    e, thread = wp.tid()
+    """The mass matrix, its factors and where the bones are, over ``(num_envs, MASS_BLOCK)``; a CUDA block has one."""
+    i, _ = wp.tid()
+    at = place_in_block(i, MASS_BLOCK)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
     if failure[e] != 0:
         return
     records = room_of_records(w.records, 0)
@@ -180,12 +183,15 @@ def fit_pose(
     body: Body,
     share: float,
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     w: JointBench,
 ):
-    """Fit the pose to the particles, by a ``share``; over ``(num_envs, threads)``, a warp a CUDA block."""
-    e, thread = wp.tid()
+    """Fit the pose to the particles, by a ``share``; over ``(num_envs, WARP)``, a CUDA block each."""
+    i, _ = wp.tid()
+    at = place_in_block(i, WARP)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
     if failure[e] != 0:
         return
     own = row_in_room(e, 0)
@@ -202,12 +208,15 @@ def fit_pose(
 def begin_substep(
     body: Body,
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     w: JointBench,
 ):
     """:func:`begin` where the pose has not been fitted; launched likewise."""
-    e, thread = wp.tid()
+    i, _ = wp.tid()
+    at = place_in_block(i, WARP)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
     if failure[e] == 0:
         begin(body, e, thread, threads, w)
 
@@ -223,7 +232,6 @@ def act(
     tissue: Tissue,
     strength: Strength,
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     support: Support,
     w: JointBench,
@@ -232,7 +240,11 @@ def act(
 
     ``per_time`` is the share of an impulse in the support [1/s]. Launched as :func:`fit_pose`.
     """
-    e, thread = wp.tid()
+    i, _ = wp.tid()
+    at = place_in_block(i, WARP)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
     if failure[e] != 0:
         return
     room = room_of_warp()
