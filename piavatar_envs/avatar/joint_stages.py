@@ -83,9 +83,7 @@ def find_shares(
 
     One alone has momenta in row ``own``, and is share ``into``; of two the second has momenta and share in that row.
     """
-    meet_threads(threads)
-    for which in range(thread, velocities, threads):
-        pass_down(body, w.pose.position, e, wp.where(which == 0, own, into), w.linear, w.angular, w.momentum)
+    pass_down(body, w.pose.position, e, velocities, own, into, thread, threads, w.linear, w.angular, w.momentum)
     fetch_factor(w.factors, e, threads, room)
     if velocities > 1:
         solve_both(w.pattern, w.factors, e, w.momentum, own, into, thread, threads, room, w.shares)

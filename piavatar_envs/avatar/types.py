@@ -41,6 +41,7 @@ class Body:
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
     bone_mass: wp.array2d(dtype=float)  # (rows, bones) skinning-weighted mass [kg]
     parent: wp.array(dtype=int)  # (bones,)
+    children: wp.array(dtype=int)  # (bones,) a bit for each bone that hangs on a bone
     depth: wp.array(dtype=int)  # (bones,) joints between a bone and the root
     levels: int  # different depths
     # particles that track bone b: tracker[tracker_start[b] : tracker_start[b + 1]]
