@@ -23,7 +23,8 @@ _AT = "float* const room = reinterpret_cast<float*>(at);"
 
 # The rows of a joint are eliminated together, so that an entry is read and written once for three of them. What it
 # loses is the product of two of the joint's columns: which, and where it is, a list says, or most lanes of a warp would
-# go through rows that have no entries. Four are read before one is written, or each would wait for the one before.
+# go through rows that have no entries. A lane has three entries of a row at a time, of which those beyond the diagonal
+# are none; two of these are read before one is written, or each would wait for the one before.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
 {_AT}
@@ -63,19 +64,27 @@ for (int k = size - 3; k >= 0; k -= 3) {{
         joint[n] = make_float4(a0, a1, a2, 0.0f);
     }}
     __syncwarp();
-    for (int n = __ldg(pair_start.data + k / 3) + lane; n < last_pair; n += 128) {{
-        float value[4];
-        int at[4];
+    for (int n = __ldg(pair_start.data + k / 3) + lane; n < last_pair; n += 64) {{
+        float value[2][3];
+        int at[2], own[2];
 #pragma unroll
-        for (int q = 0; q < 4; ++q) {{
+        for (int q = 0; q < 2; ++q) {{
             const int which = n + 32 * q < last_pair ? __ldg(pair.data + n + 32 * q) : 0;
-            const float4 a = joint[which >> 8 & 255], b = joint[which & 255];
-            at[q] = n + 32 * q < last_pair ? which >> 16 : -1;
-            value[q] = room[which >> 16] - a.x * b.x - a.y * b.y - a.z * b.z;
+            const int i = which >> 8 & 255, j = which & 255;
+            const float4 a = joint[i];
+            at[q] = which >> 16;
+            own[q] = n + 32 * q < last_pair ? i - j : -1;
+#pragma unroll
+            for (int c = 0; c < 3; ++c) {{
+                const float4 b = joint[j + c];
+                value[q][c] = room[at[q] + c] - a.x * b.x - a.y * b.y - a.z * b.z;
+            }}
         }}
 #pragma unroll
-        for (int q = 0; q < 4; ++q)
-            if (at[q] >= 0) room[at[q]] = value[q];
+        for (int q = 0; q < 2; ++q)
+#pragma unroll
+            for (int c = 0; c < 3; ++c)
+                if (c <= own[q]) room[at[q] + c] = value[q][c];
     }}
     __syncwarp();
 }}
