@@ -18,6 +18,7 @@ import warp as wp
 from piavatar_envs.avatar.lanes import meet_threads
 from piavatar_envs.avatar.warp_cholesky import (
     MOST_ROWS,
+    eliminate_together,
     factorize_together,
     load_factor,
     solve_both_together,
@@ -219,6 +220,13 @@ def factorize(
     else:
         p = pattern
         factorize_together(p.start, p.column, p.entry, p.pair_start, p.pair, matrix, diagonal, source, e, room)
+
+
+@wp.func
+def factorize_in_room(pattern: Pattern, diagonal: wp.array2d(dtype=float), e: int, room: wp.uint64):
+    """:func:`factorize` for a warp that has the matrix in its room."""
+    p = pattern
+    eliminate_together(p.start, p.column, p.pair_start, p.pair, diagonal, e, room)
 
 
 @wp.func

@@ -6,7 +6,7 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import motion_at
 from piavatar_envs.avatar.joint_motion import set_part
-from piavatar_envs.avatar.lanes import add_rows12, add_rows16, meet_threads, sum_threads16
+from piavatar_envs.avatar.lanes import add_rows12, add_rows16, highest_bit, meet_threads, sum_threads16
 from piavatar_envs.avatar.mass_matrix import BONES, I3
 from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
@@ -55,18 +55,6 @@ def gather_other(
         t = add_rows12(moments, e, body.chunk_start[b], body.chunk_start[b + 1])
         linear[row, b] = wp.vec3(t[0], t[1], t[2])
         angular[row, b] = wp.vec3(t[3], t[4], t[5])
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return 31 - __clz(bits);
-#else
-return 0;
-#endif
-""")
-def highest_bit(bits: int) -> int:
-    """The highest of ``bits``, of which there are any; on a CPU nobody asks."""
-    ...
 
 
 @wp.func

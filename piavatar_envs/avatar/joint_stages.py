@@ -12,7 +12,14 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.cholesky import factorize, fetch_factor, keep_factor, solve, solve_both
+from piavatar_envs.avatar.cholesky import (
+    factorize,
+    factorize_in_room,
+    fetch_factor,
+    keep_factor,
+    solve,
+    solve_both,
+)
 from piavatar_envs.avatar.joint_bench import (
     JointBench,
     enter_room,
@@ -39,7 +46,6 @@ from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.rotation import rigid_matrix
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.avatar.warp_cholesky import ROOM
-from piavatar_envs.mpm.shared_memory import meet
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -160,19 +166,21 @@ def build_mass(
     threads = at[2]
     if failure[e] != 0:
         return
-    records = room_of_records(w.records, 0)
-    compose_mass(body, pairs, w.pair_sums, w.pose.position, records, e, thread, threads, w.matrix)
     n = failure.shape[0]
     for k in range(thread, PARTS, threads):
         implicit_diagonal(body, dt, w.pose, springs, tissue, e, k, n + e, w.stop, w.diagonals)
     place_bones(body, e, thread, threads, w)
-    meet()
+    records = room_of_records(w.records, 0)
+    compose_mass(body, pairs, w.pair_sums, w.pose.position, records, e, thread, threads, w.matrix)
     lanes = wp.min(threads, WARP)
     warp = thread // lanes
-    room = room_of_records(w.records, warp * _ROOM)  # records are not needed any more
     for which in range(warp, 2, threads // lanes):
         system = which * n + e
-        factorize(w.pattern, w.matrix, w.diagonals, e, system, lanes, room, system, w.factors)
+        room = room_of_records(w.records, which * _ROOM)
+        if threads == 1:
+            factorize(w.pattern, w.matrix, w.diagonals, e, system, lanes, room, system, w.factors)
+        else:
+            factorize_in_room(w.pattern, w.diagonals, system, room)
         keep_factor(lanes, room, system, w.factors)
 
 

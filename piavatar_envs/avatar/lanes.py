@@ -216,3 +216,15 @@ def add_rows12(rows: wp.array2d(dtype=vec12), e: int, first: int, last: int) -> 
 def add_rows16(rows: wp.array2d(dtype=vec16), e: int, first: int, last: int) -> vec16:
     """:func:`add_rows12` of sixteen numbers each."""
     ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 31 - __clz(bits);
+#else
+return 0;
+#endif
+""")
+def highest_bit(bits: int) -> int:
+    """The highest of ``bits``, of which there are any; on a CPU nobody asks."""
+    ...

@@ -25,21 +25,8 @@ _AT = "float* const room = reinterpret_cast<float*>(at);"
 # loses is the product of two of the joint's columns: which, and where it is, a list says, or most lanes of a warp would
 # go through rows that have no entries. A lane has three entries of a row at a time, of which those beyond the diagonal
 # are none; two of these are read before one is written, or each would wait for the one before.
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-{_AT}
+_ELIMINATE = f"""
 float4* const joint = reinterpret_cast<float4*>(room + {_FACTOR});
-const int lane = threadIdx.x & 31, size = matrix.shape[1], entries = entry.shape[0];
-const float* const from = &wp::index(matrix, source, 0, 0);
-const float* const more = &wp::index(diagonal, e, 0);
-for (int n = lane; n < {_FACTOR} / 4; n += 32) reinterpret_cast<float4*>(room)[n] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-__syncwarp();
-#pragma unroll 8
-for (int n = lane; n < entries; n += 32) {{
-    const int i = __ldg(entry.data + n) >> 8, j = __ldg(entry.data + n) & 255;
-    room[i * (i + 1) / 2 + j] = from[i * size + j] + (j == i ? more[i] : 0.0f);
-}}
-__syncwarp();
 for (int k = size - 3; k >= 0; k -= 3) {{
     const int first = __ldg(start.data + k), count = __ldg(start.data + k + 1) - first;
     const int last_pair = __ldg(pair_start.data + k / 3 + 1);
@@ -88,6 +75,24 @@ for (int k = size - 3; k >= 0; k -= 3) {{
     }}
     __syncwarp();
 }}
+"""
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_AT}
+const int lane = threadIdx.x & 31, size = matrix.shape[1], entries = entry.shape[0];
+const float* const from = &wp::index(matrix, source, 0, 0);
+const float* const more = &wp::index(diagonal, e, 0);
+for (int n = lane; n < {_FACTOR} / 4; n += 32) reinterpret_cast<float4*>(room)[n] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+__syncwarp();
+#pragma unroll 8
+for (int n = lane; n < entries; n += 32) {{
+    const int i = __ldg(entry.data + n) >> 8, j = __ldg(entry.data + n) & 255;
+    room[i * (i + 1) / 2 + j] = from[i * size + j] + (j == i ? more[i] : 0.0f);
+}}
+__syncwarp();
+{_ELIMINATE}
 #endif
 """)
 def factorize_together(
@@ -103,6 +108,47 @@ def factorize_together(
     at: wp.uint64,
 ):
     """The factor of matrix ``source`` and diagonal ``e``, as :mod:`piavatar_envs.avatar.cholesky` has it."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_AT}
+const int lane = threadIdx.x & 31, size = diagonal.shape[1];
+for (int i = lane; i < size; i += 32) room[i * (i + 1) / 2 + i] += wp::index(diagonal, e, i);
+for (int n = size * (size + 1) / 2 + lane; n < {_FACTOR}; n += 32) room[n] = 0.0f;
+__syncwarp();
+{_ELIMINATE}
+#endif
+""")
+def eliminate_together(
+    start: wp.array(dtype=int),
+    columns: wp.array(dtype=int),
+    pair_start: wp.array(dtype=int),
+    pair: wp.array(dtype=int),
+    diagonal: wp.array2d(dtype=float),
+    e: int,
+    at: wp.uint64,
+):
+    """:func:`factorize_together` of the matrix that :func:`set_in_rooms` has written to the room."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_AT}
+#pragma unroll
+for (int a = 0; a < 3; ++a)
+#pragma unroll
+    for (int b = 0; b < 3; ++b)
+        if (j + b <= i + a) {{
+            float* const to = room + (i + a) * (i + a + 1) / 2 + j + b;
+            to[0] = to[{ROOM}] = block.data[a][b];
+        }}
+#endif
+""")
+def set_in_rooms(at: wp.uint64, i: int, j: int, block: wp.mat33):
+    """Write 3 x 3 entries, from row ``i`` and column ``j`` on, to a matrix in each of two rooms, if in the triangle."""
     ...
 
 
