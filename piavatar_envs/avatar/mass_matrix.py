@@ -133,16 +133,26 @@ def write_pair(records: wp.uint64, c: int, d: int, value: vec16):
 
 @wp.func
 def place_pair(
-    pairs: Pairs, sums: wp.array2d(dtype=vec12), position: wp.array2d(dtype=wp.vec3), e: int, c: int, d: int
+    pairs: Pairs,
+    sums: wp.array2d(dtype=vec12),
+    position: wp.array2d(dtype=wp.vec3),
+    e: int,
+    pair: int,
+    # out
+    records: wp.uint64,
 ):
-    """Moments of what two bones both move, about their joints; zero where they share nothing."""
-    pair = pairs.of[c * BONES + d]
-    if pair < 0:
-        return vec16()
+    """Moments of what two bones both move, about their joints, for either as the first."""
+    c = pairs.first[pair]
+    d = pairs.second[pair]
     s = add_rows12(sums, e, pairs.chunk_start[pair], pairs.chunk_start[pair + 1])
     second = symmetric(wp.vec3(s[4], s[5], s[6]), wp.vec3(s[7], s[8], s[9]))
-    origin = position[e, pairs.first[pair]]
-    return moved(two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second), origin - position[e, c], origin - position[e, d])
+    own = two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second)
+    origin = position[e, c]  # about which the sums are
+    to_c = origin - position[e, c]
+    to_d = origin - position[e, d]
+    write_pair(records, c, d, moved(own, to_c, to_d))
+    if c != d:
+        write_pair(records, d, c, moved(own, to_d, to_c))
 
 
 @wp.func
@@ -295,8 +305,10 @@ def compose_mass(
     other. The threads of a CUDA block share the bones.
     """
     for n in range(thread, BONES * BONES, threads):
-        c = n // BONES
-        write_pair(records, c, n % BONES, place_pair(pairs, sums, position, e, c, n % BONES))
+        write_pair(records, n // BONES, n % BONES, vec16())
+    meet()
+    for pair in range(thread, pairs.first.shape[0], threads):
+        place_pair(pairs, sums, position, e, pair, records)
     meet()
     if threads == 1:
         compose_alone(body, position, records, e)
