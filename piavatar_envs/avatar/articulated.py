@@ -204,8 +204,8 @@ class ArticulatedBody:
     def record_mass(self, program: Program, state: State) -> None:
         """Append: build the mass matrix where particles and joints are, and what follows from it."""
         self.mass.record_sums(program, state, self.state.position)
-        threads = MASS_BLOCK if self.threads > 1 else 1
-        inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure, threads]
+        threads = int(MASS_BLOCK) if self.threads > 1 else 1
+        inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure]
         program.launch(build_mass, (self.model.num_envs, threads), inputs, [self._bench], block_dim=threads)
 
     def _record_fit(self, program: Program, state: State) -> None:
@@ -224,7 +224,7 @@ class ArticulatedBody:
 
     def _record_stage(self, program: Program, stage: wp.Kernel, inputs: list, state: State, *more: Support) -> None:
         """Append what a warp does for an environment."""
-        inputs, outputs = [*inputs, state.failure, self.threads], [*more, self._bench]
+        inputs, outputs = [*inputs, state.failure], [*more, self._bench]
         program.launch(stage, (self.model.num_envs, self.threads), inputs, outputs, block_dim=self.threads)
 
     def _record_moments(self, program: Program, state: State) -> None:

@@ -131,6 +131,9 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.bone_mass = upload(bone_mass, float)
     depths = _joint_depths()
     body.parent, body.depth, body.levels = upload(PARENTS, int), upload(depths, int), max(depths) + 1
+    body.level_start = upload(np.searchsorted(depths, np.arange(body.levels + 1)), int)  # they are in order
+    children = [sum(1 << child for child, parent in enumerate(PARENTS) if parent == b) for b in range(NUM_JOINTS)]
+    body.children = upload(children, int)
     body.tracker_start = upload(np.cumsum([0, *map(len, trackers)]), int)
     body.tracker = upload(np.concatenate(trackers), int)
     for name, numbers in bone_lists(points, points.num_points).items():

@@ -18,6 +18,7 @@ import warp as wp
 from piavatar_envs.avatar.lanes import meet_threads
 from piavatar_envs.avatar.warp_cholesky import (
     MOST_ROWS,
+    eliminate_together,
     factorize_together,
     load_factor,
     solve_both_together,
@@ -36,8 +37,8 @@ class Pattern:
     column: wp.array(dtype=int)  # in a row from the first to the last
     # for a warp
     entry: wp.array(dtype=int)  # all entries, those of the diagonal, too: 256 row + column
-    # entries that change when joint c is eliminated: pair[pair_start[c] : pair_start[c + 1]], place in the factor times
-    # 2^16, and which two of the joint's columns they are in, the first one times 2^8
+    # entries that change when joint c is eliminated, three of a row at a time: pair[pair_start[c] : pair_start[c + 1]],
+    # place of the first in the factor times 2^16, and which of the joint's columns are its row, times 2^8, and its own
     pair_start: wp.array(dtype=int)
     pair: wp.array(dtype=int)
 
@@ -60,7 +61,8 @@ def find_pattern(filled: np.ndarray, device: str) -> Pattern:
     columns.reverse()
     pairs = []
     for own in columns[::3]:
-        i, j = np.tril_indices(len(own))
+        i, j = np.nonzero(np.tri(len(own), dtype=bool))
+        i, j = i[j % 3 == 0], j[j % 3 == 0]
         pairs.append((own[i] * (own[i] + 1) // 2 + own[j]) << 16 | i << 8 | j)
     lists = {
         "start": np.cumsum([0, *map(len, columns)]),
@@ -218,6 +220,13 @@ def factorize(
     else:
         p = pattern
         factorize_together(p.start, p.column, p.entry, p.pair_start, p.pair, matrix, diagonal, source, e, room)
+
+
+@wp.func
+def factorize_in_room(pattern: Pattern, diagonal: wp.array2d(dtype=float), e: int, room: wp.uint64):
+    """:func:`factorize` for a warp that has the matrix in its room."""
+    p = pattern
+    eliminate_together(p.start, p.column, p.pair_start, p.pair, diagonal, e, room)
 
 
 @wp.func

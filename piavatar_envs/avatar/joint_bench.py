@@ -91,6 +91,7 @@ _SEE = """
 #if defined(__CUDA_ARCH__)
 rows.data = reinterpret_cast<decltype(rows.data)>(reinterpret_cast<float*>(room) + at);
 rows.strides[0] = 4 * words;
+rows.strides[1] = sizeof(*rows.data);  // known when it is compiled
 #endif
 return rows;
 """

@@ -6,7 +6,7 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import motion_at
 from piavatar_envs.avatar.joint_motion import set_part
-from piavatar_envs.avatar.lanes import add_rows12, add_rows16, sum_threads16
+from piavatar_envs.avatar.lanes import add_rows12, add_rows16, highest_bit, meet_threads, sum_threads16
 from piavatar_envs.avatar.mass_matrix import BONES, I3
 from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
@@ -58,27 +58,69 @@ def gather_other(
 
 
 @wp.func
+def take_child(
+    position: wp.array2d(dtype=wp.vec3),
+    e: int,
+    row: int,
+    a: int,
+    b: int,
+    # in and out
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+):
+    """Add the momenta of bone ``b`` and all beyond to those of ``a``, which it hangs on."""
+    arm = position[e, b] - position[e, a]
+    angular[row, a] = angular[row, a] + angular[row, b] + wp.cross(arm, linear[row, b])
+    linear[row, a] = linear[row, a] + linear[row, b]
+
+
+@wp.func
 def pass_down(
     body: Body,
     position: wp.array2d(dtype=wp.vec3),
     e: int,
-    row: int,
+    velocities: int,
+    own: int,
+    into: int,
+    thread: int,
+    threads: int,
     # in and out
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
     # out
     momentum: wp.array2d(dtype=float),
 ):
-    """``J^T m u`` from the momenta of the bones about their joints: each joint has what all beyond it have."""
-    for back in range(BONES - 1):
-        b = BONES - 1 - back  # children come after their parents
-        a = body.parent[b]
-        arm = position[e, b] - position[e, a]
-        angular[row, a] = angular[row, a] + angular[row, b] + wp.cross(arm, linear[row, b])
-        linear[row, a] = linear[row, a] + linear[row, b]
-        set_part(momentum, row, 3 + 3 * b, angular[row, b])
-    set_part(momentum, row, 0, linear[row, 0])
-    set_part(momentum, row, 3, angular[row, 0])
+    """``J^T m u`` from the momenta of the bones about their joints: each joint has what all beyond it have.
+
+    Of one velocity, in row ``own``, or of two, the second in row ``into``. A thread that is alone goes from bone to
+    bone, the lanes of a warp from level to level, a bone each.
+    """
+    meet_threads(threads)
+    step = into - own
+    if threads == 1:
+        for v in range(velocities):
+            for back in range(BONES - 1):
+                b = BONES - 1 - back  # children come after their parents
+                take_child(position, e, own + v * step, body.parent[b], b, linear, angular)
+    else:
+        depth = int(-1)
+        children = int(0)
+        if thread < BONES:
+            depth = body.depth[thread]
+            children = body.children[thread]
+        for back in range(body.levels - 1):
+            if depth == body.levels - 2 - back:
+                while children != 0:
+                    b = highest_bit(children)
+                    children -= 1 << b
+                    for v in range(velocities):
+                        take_child(position, e, own + v * step, thread, b, linear, angular)
+            meet_threads(threads)
+    for v in range(velocities):
+        for b in range(thread, BONES, threads):
+            set_part(momentum, own + v * step, 3 + 3 * b, angular[own + v * step, b])
+        if thread == 0:
+            set_part(momentum, own + v * step, 0, linear[own + v * step, 0])
 
 
 @wp.func

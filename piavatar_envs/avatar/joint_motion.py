@@ -46,19 +46,35 @@ def joint_alone(position: wp.array2d(dtype=wp.vec3), q: wp.array2d(dtype=float),
     return vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
 
 
-@wp.func
-def level_of(body: Body, b: int, threads: int):
-    """When the threads of a warp come to bone ``b``, -1 if there is none; one that is alone goes from bone to bone."""
-    level = int(-1)
-    if b < BONES:
-        level = wp.where(threads > 1, body.depth[b], 0)
-    return level
+# In every round a bone takes what its ancestor has found, who is twice as far as in the round before.
+_ADD_ANCESTORS = """
+#if defined(__CUDA_ARCH__)
+int up = parent;
+for (int reach = 1; reach < levels; reach *= 2) {
+    const int from = up < 0 ? 0 : up;
+#pragma unroll
+    for (int k = 0; k < %d; ++k) {
+        const float more = __shfl_sync(0xffffffffu, value[k], from);
+        value[k] += up < 0 ? 0.0f : more;
+    }
+    const int next = __shfl_sync(0xffffffffu, up, from);
+    up = up < 0 ? -1 : next;
+}
+#endif
+return value;
+"""
 
 
-@wp.func
-def rounds_of(threads: int):
-    """Bones that threads go through together, some of which there may not be: all threads come to every level."""
-    return (BONES + threads - 1) // threads * threads
+@wp.func_native(_ADD_ANCESTORS % 6)
+def add_ancestors6(value: vec8, parent: int, levels: int) -> vec8:
+    """Sum of what the lanes of a warp have, of a bone each, over all from the root to a lane's own; six numbers."""
+    ...
+
+
+@wp.func_native(_ADD_ANCESTORS % 3)
+def add_ancestors3(value: wp.vec3, parent: int, levels: int) -> wp.vec3:
+    """:func:`add_ancestors6` of a vector."""
+    ...
 
 
 @wp.func
@@ -75,22 +91,21 @@ def spread_motion(
 ):
     """Rigid motion of every bone under generalised velocity ``q[row]``: velocity where the pelvis joint is, and spin.
 
-    A thread that is alone goes through the bones in their order, parents first. The threads of a warp, which is as many
-    as there are bones at least, do so level by level, and have all else ready before.
+    A thread that is alone goes through the bones in their order, parents first. Each lane of a warp has a bone.
     """
     meet_threads(threads)
-    levels = wp.where(threads > 1, body.levels, 1)
-    for n in range(thread, rounds_of(threads), threads):
-        b = wp.min(n, BONES - 1)
-        own = level_of(body, n, threads)
-        parent = body.parent[b]
-        motion = joint_alone(position, q, row, e, b)
-        for level in range(levels):
-            if own == level:
-                if b > 0:
-                    motion = field[e, parent] + motion
-                field[e, b] = motion
-            meet_threads(threads)
+    if threads == 1:
+        for b in range(BONES):
+            motion = joint_alone(position, q, row, e, b)
+            if b > 0:
+                motion = field[e, body.parent[b]] + motion
+            field[e, b] = motion
+    else:
+        own = wp.min(thread, BONES - 1)
+        whole = add_ancestors6(joint_alone(position, q, row, e, own), body.parent[own], body.levels)
+        if thread < BONES:
+            field[e, own] = whole
+    meet_threads(threads)
 
 
 @wp.func
@@ -167,6 +182,25 @@ def hand_back(
 
 
 @wp.func
+def next_position(
+    body: Body,
+    dt: float,
+    field: wp.array2d(dtype=vec8),
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    r: int,
+    e: int,
+    b: int,
+):
+    """Where a joint will be from its parent's, which has turned already [m]; the pelvis', in the world."""
+    if b == 0:
+        s = field[e, 0]
+        return position[e, 0] + dt * wp.vec3(s[0], s[1], s[2])
+    a = body.parent[b]
+    return wp.quat_rotate(rotation[e, a], body.rest_joint[r, b] - body.rest_joint[r, a])
+
+
+@wp.func
 def move_joints(
     body: Body,
     dt: float,
@@ -185,20 +219,18 @@ def move_joints(
         s = field[e, b]
         rotation[e, b] = wp.normalize(quat_exp(dt * wp.vec3(s[3], s[4], s[5])) * rotation[e, b])
     meet_threads(threads)
-    levels = wp.where(threads > 1, body.levels, 1)
-    for n in range(thread, rounds_of(threads), threads):
-        b = wp.min(n, BONES - 1)
-        own = level_of(body, n, threads)
-        parent = wp.max(body.parent[b], 0)
-        offset = wp.quat_rotate(rotation[e, parent], body.rest_joint[r, b] - body.rest_joint[r, parent])
-        for level in range(levels):
-            if own == level:
-                if b == 0:
-                    s = field[e, b]
-                    position[e, b] = position[e, b] + dt * wp.vec3(s[0], s[1], s[2])
-                else:
-                    position[e, b] = position[e, parent] + offset
-            meet_threads(threads)
+    if threads == 1:
+        for b in range(BONES):
+            position[e, b] = next_position(body, dt, field, rotation, position, r, e, b)
+            if b > 0:
+                position[e, b] = position[e, body.parent[b]] + position[e, b]
+    else:
+        own = wp.min(thread, BONES - 1)
+        step = next_position(body, dt, field, rotation, position, r, e, own)
+        place = add_ancestors3(step, body.parent[own], body.levels)
+        if thread < BONES:
+            position[e, own] = place
+    meet_threads(threads)
 
 
 @wp.func

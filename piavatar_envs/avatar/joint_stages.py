@@ -12,7 +12,14 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.cholesky import factorize, fetch_factor, keep_factor, solve, solve_both
+from piavatar_envs.avatar.cholesky import (
+    factorize,
+    factorize_in_room,
+    fetch_factor,
+    keep_factor,
+    solve,
+    solve_both,
+)
 from piavatar_envs.avatar.joint_bench import (
     JointBench,
     enter_room,
@@ -33,20 +40,19 @@ from piavatar_envs.avatar.joint_torques import (
     joint_impulse,
     limit_torque,
 )
-from piavatar_envs.avatar.lanes import meet_threads, sum_threads
+from piavatar_envs.avatar.lanes import meet_threads, place_in_block, sum_threads
 from piavatar_envs.avatar.mass_matrix import BONES, compose_mass, room_of_records
 from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.rotation import rigid_matrix
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.avatar.warp_cholesky import ROOM
-from piavatar_envs.mpm.shared_memory import meet
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 WARP = wp.constant(32)
 #: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
-MASS_BLOCK = 128
+MASS_BLOCK = wp.constant(128)
 #: The pelvis' place, then all joints.
 PARTS = wp.constant(1 + int(BONES))
 _ROOM = wp.constant(ROOM)
@@ -83,9 +89,7 @@ def find_shares(
 
     One alone has momenta in row ``own``, and is share ``into``; of two the second has momenta and share in that row.
     """
-    meet_threads(threads)
-    for which in range(thread, velocities, threads):
-        pass_down(body, w.pose.position, e, wp.where(which == 0, own, into), w.linear, w.angular, w.momentum)
+    pass_down(body, w.pose.position, e, velocities, own, into, thread, threads, w.linear, w.angular, w.momentum)
     fetch_factor(w.factors, e, threads, room)
     if velocities > 1:
         solve_both(w.pattern, w.factors, e, w.momentum, own, into, thread, threads, room, w.shares)
@@ -143,7 +147,7 @@ def turn_joints(
     balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, own, thread, threads, w.shares)
 
 
-@wp.kernel(launch_bounds=(MASS_BLOCK, 8))
+@wp.kernel(launch_bounds=(int(MASS_BLOCK), 8))
 def build_mass(
     body: Body,
     pairs: Pairs,
@@ -151,27 +155,32 @@ def build_mass(
     springs: Springs,
     tissue: Tissue,
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     w: JointBench,
 ):
-    """The mass matrix, its factors and where the bones are, over ``(num_envs, threads)``; a CUDA block has one."""
-    e, thread = wp.tid()
+    """The mass matrix, its factors and where the bones are, over ``(num_envs, MASS_BLOCK)``; a CUDA block has one."""
+    i, _ = wp.tid()
+    at = place_in_block(i, MASS_BLOCK)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
     if failure[e] != 0:
         return
-    records = room_of_records(w.records, 0)
-    compose_mass(body, pairs, w.pair_sums, w.pose.position, records, e, thread, threads, w.matrix)
     n = failure.shape[0]
     for k in range(thread, PARTS, threads):
         implicit_diagonal(body, dt, w.pose, springs, tissue, e, k, n + e, w.stop, w.diagonals)
     place_bones(body, e, thread, threads, w)
-    meet()
+    records = room_of_records(w.records, 0)
+    compose_mass(body, pairs, w.pair_sums, w.pose.position, records, e, thread, threads, w.matrix)
     lanes = wp.min(threads, WARP)
     warp = thread // lanes
-    room = room_of_records(w.records, warp * _ROOM)  # records are not needed any more
     for which in range(warp, 2, threads // lanes):
         system = which * n + e
-        factorize(w.pattern, w.matrix, w.diagonals, e, system, lanes, room, system, w.factors)
+        room = room_of_records(w.records, which * _ROOM)
+        if threads == 1:
+            factorize(w.pattern, w.matrix, w.diagonals, e, system, lanes, room, system, w.factors)
+        else:
+            factorize_in_room(w.pattern, w.diagonals, system, room)
         keep_factor(lanes, room, system, w.factors)
 
 
@@ -180,12 +189,15 @@ def fit_pose(
     body: Body,
     share: float,
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     w: JointBench,
 ):
-    """Fit the pose to the particles, by a ``share``; over ``(num_envs, threads)``, a warp a CUDA block."""
-    e, thread = wp.tid()
+    """Fit the pose to the particles, by a ``share``; over ``(num_envs, WARP)``, a CUDA block each."""
+    i, _ = wp.tid()
+    at = place_in_block(i, WARP)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
     if failure[e] != 0:
         return
     own = row_in_room(e, 0)
@@ -202,12 +214,15 @@ def fit_pose(
 def begin_substep(
     body: Body,
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     w: JointBench,
 ):
     """:func:`begin` where the pose has not been fitted; launched likewise."""
-    e, thread = wp.tid()
+    i, _ = wp.tid()
+    at = place_in_block(i, WARP)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
     if failure[e] == 0:
         begin(body, e, thread, threads, w)
 
@@ -223,7 +238,6 @@ def act(
     tissue: Tissue,
     strength: Strength,
     failure: wp.array(dtype=int),
-    threads: int,
     # in and out
     support: Support,
     w: JointBench,
@@ -232,7 +246,11 @@ def act(
 
     ``per_time`` is the share of an impulse in the support [1/s]. Launched as :func:`fit_pose`.
     """
-    e, thread = wp.tid()
+    i, _ = wp.tid()
+    at = place_in_block(i, WARP)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
     if failure[e] != 0:
         return
     room = room_of_warp()

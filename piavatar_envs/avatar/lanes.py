@@ -85,6 +85,23 @@ def place_in_chunks(e: int, c: int, thread: int, chunks: int) -> wp.vec3i:
     ...
 
 
+# As numbers that are known when a kernel is compiled: loops over a body's bones have one round then or are gone, as is
+# all that a thread that is alone would do. That is a third of the instructions, and they must all be fetched.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return wp::vec_t<3, wp::int32>((int)blockIdx.x, (int)threadIdx.x & (block - 1), block);
+#else
+return wp::vec_t<3, wp::int32>(e, 0, 1);
+#endif
+""")
+def place_in_block(e: int, block: int) -> wp.vec3i:
+    """Environment, thread and number of threads in a launch over ``(num_envs, block)``, a CUDA block each; or 0 of 1.
+
+    On a CPU the launch is over ``(num_envs, 1)``, ``e`` as Warp says.
+    """
+    ...
+
+
 _SUM = """
 #if defined(__CUDA_ARCH__)
 const unsigned group = threads >= 32 ? 0xffffffffu : ((1u << threads) - 1u) << (threadIdx.x & 31 & -threads);
@@ -198,4 +215,16 @@ def add_rows12(rows: wp.array2d(dtype=vec12), e: int, first: int, last: int) -> 
 @wp.func_native(_ADD_ROWS % 16)
 def add_rows16(rows: wp.array2d(dtype=vec16), e: int, first: int, last: int) -> vec16:
     """:func:`add_rows12` of sixteen numbers each."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 31 - __clz(bits);
+#else
+return 0;
+#endif
+""")
+def highest_bit(bits: int) -> int:
+    """The highest of ``bits``, of which there are any; on a CPU nobody asks."""
     ...

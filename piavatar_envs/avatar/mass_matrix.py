@@ -22,11 +22,12 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.lanes import add_rows12
+from piavatar_envs.avatar.lanes import add_rows12, highest_bit
 from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.rigid_fit import symmetric
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
+from piavatar_envs.avatar.warp_cholesky import set_in_rooms
 from piavatar_envs.mpm.shared_memory import meet
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -34,6 +35,8 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 #: Components of a generalised velocity: the pelvis' velocity, then the angular velocities of all joints.
 NUM_DOF = 3 + 3 * NUM_JOINTS
 BONES = wp.constant(NUM_JOINTS)
+#: Pairs of bones whose blocks are in the lower triangle.
+LOWER = wp.constant(NUM_JOINTS * (NUM_JOINTS + 1) // 2)
 I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 
 
@@ -130,16 +133,26 @@ def write_pair(records: wp.uint64, c: int, d: int, value: vec16):
 
 @wp.func
 def place_pair(
-    pairs: Pairs, sums: wp.array2d(dtype=vec12), position: wp.array2d(dtype=wp.vec3), e: int, c: int, d: int
+    pairs: Pairs,
+    sums: wp.array2d(dtype=vec12),
+    position: wp.array2d(dtype=wp.vec3),
+    e: int,
+    pair: int,
+    # out
+    records: wp.uint64,
 ):
-    """Moments of what two bones both move, about their joints; zero where they share nothing."""
-    pair = pairs.of[c * BONES + d]
-    if pair < 0:
-        return vec16()
+    """Moments of what two bones both move, about their joints, for either as the first."""
+    c = pairs.first[pair]
+    d = pairs.second[pair]
     s = add_rows12(sums, e, pairs.chunk_start[pair], pairs.chunk_start[pair + 1])
     second = symmetric(wp.vec3(s[4], s[5], s[6]), wp.vec3(s[7], s[8], s[9]))
-    origin = position[e, pairs.first[pair]]
-    return moved(two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second), origin - position[e, c], origin - position[e, d])
+    own = two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second)
+    origin = position[e, c]  # about which the sums are
+    to_c = origin - position[e, c]
+    to_d = origin - position[e, d]
+    write_pair(records, c, d, moved(own, to_c, to_d))
+    if c != d:
+        write_pair(records, d, c, moved(own, to_d, to_c))
 
 
 @wp.func
@@ -156,27 +169,75 @@ def transposed(s: vec16, away: wp.vec3):
 
 
 @wp.func
-def compose_rows(body: Body, position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, other: int):
-    """Add what every bone has in common with an ``other`` to what its parent has."""
-    for n in range(BONES - 1):
-        b = BONES - 1 - n  # children come after their parents
-        a = body.parent[b]
-        step = position[e, b] - position[e, a]
-        lifted = lift(read_pair(records, b, other), step, position[e, b] - position[e, other])
-        write_pair(records, a, other, read_pair(records, a, other) + lifted)
+def take_row(position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, a: int, b: int, other: int):
+    """What bone ``b``, with all beyond, has in common with an ``other``, as bone ``a`` has it, which it hangs on."""
+    step = position[e, b] - position[e, a]
+    return lift(read_pair(records, b, other), step, position[e, b] - position[e, other])
 
 
 @wp.func
-def compose_columns(body: Body, position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, other: int):
+def take_column(position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, a: int, b: int, other: int):
     """Likewise for the second bone of a pair, where the first is the ``other``."""
-    for n in range(BONES - 1):
-        b = BONES - 1 - n
-        a = body.parent[b]
-        step = position[e, b] - position[e, a]
-        away = position[e, other] - position[e, b]
-        lifted = lift(transposed(read_pair(records, other, b), away), step, -away)
-        back = transposed(lifted, position[e, a] - position[e, other])
-        write_pair(records, other, a, read_pair(records, other, a) + back)
+    step = position[e, b] - position[e, a]
+    away = position[e, other] - position[e, b]
+    lifted = lift(transposed(read_pair(records, other, b), away), step, -away)
+    return transposed(lifted, position[e, a] - position[e, other])
+
+
+@wp.func
+def compose_alone(body: Body, position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int):
+    """Add what every bone has in common with another to what its parent has, for both sides; a thread, bone by bone."""
+    for other in range(BONES):
+        for back in range(BONES - 1):
+            b = BONES - 1 - back  # children come after their parents
+            a = body.parent[b]
+            taken = take_row(position, records, e, a, b, other)
+            write_pair(records, a, other, read_pair(records, a, other) + taken)
+    for other in range(BONES):
+        for back in range(BONES - 1):
+            b = BONES - 1 - back
+            a = body.parent[b]
+            taken = take_column(position, records, e, a, b, other)
+            write_pair(records, other, a, read_pair(records, other, a) + taken)
+
+
+@wp.func
+def compose_together(
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    records: wp.uint64,
+    e: int,
+    rows: bool,
+    thread: int,
+    threads: int,
+):
+    """:func:`compose_alone` of one side: the threads of a CUDA block share a level's bones and all others."""
+    for back in range(body.levels - 1):
+        level = body.levels - 2 - back
+        first = body.level_start[level]
+        for n in range(thread, (body.level_start[level + 1] - first) * BONES, threads):
+            a = first + n // BONES
+            other = n % BONES
+            children = body.children[a]
+            if children != 0:
+                c = wp.where(rows, a, other)
+                d = wp.where(rows, other, a)
+                own = read_pair(records, c, d)
+                while children != 0:
+                    b = highest_bit(children)
+                    children -= 1 << b
+                    if rows:
+                        own += take_row(position, records, e, a, b, other)
+                    else:
+                        own += take_column(position, records, e, a, b, other)
+                write_pair(records, c, d, own)
+        meet()
+
+
+@wp.func_native("return (int)((sqrtf(8.0f * (float)n + 1.0f) - 1.0f) * 0.5f);")
+def row_of_pair(n: int) -> int:
+    """Row of entry ``n`` of a lower triangle whose rows follow each other."""
+    ...
 
 
 @wp.func
@@ -188,15 +249,41 @@ def set_block(matrix: wp.array3d(dtype=float), e: int, i: int, j: int, block: wp
 
 
 @wp.func
-def fill_blocks(s: vec16, e: int, c: int, d: int, mass: wp.array3d(dtype=float)):
+def fill_blocks(s: vec16, e: int, c: int, d: int, rooms: wp.uint64, mass: wp.array3d(dtype=float)):
     """The block of two joints of the mass matrix; those of the pelvis' velocity with the first joint's."""
     both = second_moment(s)
-    set_block(mass, e, 3 + 3 * c, 3 + 3 * d, wp.trace(both) * I3 - both)
+    block = wp.trace(both) * I3 - both
+    set_block(mass, e, 3 + 3 * c, 3 + 3 * d, block)
+    set_in_rooms(rooms, 3 + 3 * c, 3 + 3 * d, block)
     if d == 0:
-        lever = -wp.skew(wp.vec3(s[1], s[2], s[3]))  # v_0 . (w x a)
-        set_block(mass, e, 3 + 3 * c, 0, wp.transpose(lever))
+        block = wp.skew(wp.vec3(s[1], s[2], s[3]))  # of v_0 . (w x a), transposed
+        set_block(mass, e, 3 + 3 * c, 0, block)
+        set_in_rooms(rooms, 3 + 3 * c, 0, block)
         if c == 0:
             set_block(mass, e, 0, 0, s[0] * I3)
+            set_in_rooms(rooms, 0, 0, s[0] * I3)
+
+
+@wp.func
+def fill_mass(records: wp.uint64, e: int, thread: int, threads: int, mass: wp.array3d(dtype=float)):
+    """The mass matrix from its records; a CUDA block writes it to two rooms for factors, too, where records are."""
+    if threads == 1:
+        for c in range(BONES):
+            for d in range(c + 1):
+                fill_blocks(read_pair(records, c, d), e, c, d, records, mass)
+    else:  # a thread has two blocks of the lower triangle, or one
+        n = wp.min(thread + threads, LOWER - 1)
+        c = row_of_pair(thread)
+        d = thread - c * (c + 1) // 2
+        far_c = row_of_pair(n)
+        far_d = n - far_c * (far_c + 1) // 2
+        s = read_pair(records, c, d)
+        far = read_pair(records, far_c, far_d)
+        meet()
+        fill_blocks(s, e, c, d, records, mass)
+        if thread + threads < LOWER:
+            fill_blocks(far, e, far_c, far_d, records, mass)
+    meet()
 
 
 @wp.func
@@ -218,17 +305,14 @@ def compose_mass(
     other. The threads of a CUDA block share the bones.
     """
     for n in range(thread, BONES * BONES, threads):
-        c = n // BONES
-        write_pair(records, c, n % BONES, place_pair(pairs, sums, position, e, c, n % BONES))
+        write_pair(records, n // BONES, n % BONES, vec16())
     meet()
-    for other in range(thread, BONES, threads):
-        compose_rows(body, position, records, e, other)
+    for pair in range(thread, pairs.first.shape[0], threads):
+        place_pair(pairs, sums, position, e, pair, records)
     meet()
-    for other in range(thread, BONES, threads):
-        compose_columns(body, position, records, e, other)
-    meet()
-    for n in range(thread, BONES * BONES, threads):
-        c = n // BONES
-        d = n % BONES
-        if d <= c:
-            fill_blocks(read_pair(records, c, d), e, c, d, mass)
+    if threads == 1:
+        compose_alone(body, position, records, e)
+    else:
+        compose_together(body, position, records, e, True, thread, threads)
+        compose_together(body, position, records, e, False, thread, threads)
+    fill_mass(records, e, thread, threads, mass)

@@ -24,6 +24,7 @@ class Pairs:
 
     of: wp.array(dtype=int)  # (bones * bones,) pair of two bones; -1 where they have no particle in common
     first: wp.array(dtype=int)  # (pairs,) one of the bones of a pair, about whose joint its moments are
+    second: wp.array(dtype=int)  # (pairs,) the other one, or the same
     chunk_pair: wp.array(dtype=int)  # (chunks,)
     # pair q owns chunks chunk_start[q] : chunk_start[q + 1], chunk c holds entries entry_start[c] : entry_start[c + 1]
     chunk_start: wp.array(dtype=int)
@@ -60,6 +61,7 @@ def build_pairs(points: BodyPoints, device: str) -> Pairs:
     lists = {
         "of": of.ravel(),
         "first": [a for a, _ in sorted(particles)],
+        "second": [b for _, b in sorted(particles)],
         "chunk_pair": chunk_pair,
         "chunk_start": chunk_start,
         "entry_start": entry_start,

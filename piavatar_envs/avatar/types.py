@@ -41,8 +41,10 @@ class Body:
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
     bone_mass: wp.array2d(dtype=float)  # (rows, bones) skinning-weighted mass [kg]
     parent: wp.array(dtype=int)  # (bones,)
+    children: wp.array(dtype=int)  # (bones,) a bit for each bone that hangs on a bone
     depth: wp.array(dtype=int)  # (bones,) joints between a bone and the root
     levels: int  # different depths
+    level_start: wp.array(dtype=int)  # (levels + 1,) bones of depth d are level_start[d] ... level_start[d + 1] - 1
     # particles that track bone b: tracker[tracker_start[b] : tracker_start[b + 1]]
     tracker_start: wp.array(dtype=int)
     tracker: wp.array(dtype=int)

@@ -23,22 +23,10 @@ _AT = "float* const room = reinterpret_cast<float*>(at);"
 
 # The rows of a joint are eliminated together, so that an entry is read and written once for three of them. What it
 # loses is the product of two of the joint's columns: which, and where it is, a list says, or most lanes of a warp would
-# go through rows that have no entries. Four are read before one is written, or each would wait for the one before.
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-{_AT}
+# go through rows that have no entries. A lane has three entries of a row at a time, of which those beyond the diagonal
+# are none; two of these are read before one is written, or each would wait for the one before.
+_ELIMINATE = f"""
 float4* const joint = reinterpret_cast<float4*>(room + {_FACTOR});
-const int lane = threadIdx.x & 31, size = matrix.shape[1], entries = entry.shape[0];
-const float* const from = &wp::index(matrix, source, 0, 0);
-const float* const more = &wp::index(diagonal, e, 0);
-for (int n = lane; n < {_FACTOR} / 4; n += 32) reinterpret_cast<float4*>(room)[n] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-__syncwarp();
-#pragma unroll 8
-for (int n = lane; n < entries; n += 32) {{
-    const int i = __ldg(entry.data + n) >> 8, j = __ldg(entry.data + n) & 255;
-    room[i * (i + 1) / 2 + j] = from[i * size + j] + (j == i ? more[i] : 0.0f);
-}}
-__syncwarp();
 for (int k = size - 3; k >= 0; k -= 3) {{
     const int first = __ldg(start.data + k), count = __ldg(start.data + k + 1) - first;
     const int last_pair = __ldg(pair_start.data + k / 3 + 1);
@@ -63,22 +51,48 @@ for (int k = size - 3; k >= 0; k -= 3) {{
         joint[n] = make_float4(a0, a1, a2, 0.0f);
     }}
     __syncwarp();
-    for (int n = __ldg(pair_start.data + k / 3) + lane; n < last_pair; n += 128) {{
-        float value[4];
-        int at[4];
+    for (int n = __ldg(pair_start.data + k / 3) + lane; n < last_pair; n += 64) {{
+        float value[2][3];
+        int at[2], own[2];
 #pragma unroll
-        for (int q = 0; q < 4; ++q) {{
+        for (int q = 0; q < 2; ++q) {{
             const int which = n + 32 * q < last_pair ? __ldg(pair.data + n + 32 * q) : 0;
-            const float4 a = joint[which >> 8 & 255], b = joint[which & 255];
-            at[q] = n + 32 * q < last_pair ? which >> 16 : -1;
-            value[q] = room[which >> 16] - a.x * b.x - a.y * b.y - a.z * b.z;
+            const int i = which >> 8 & 255, j = which & 255;
+            const float4 a = joint[i];
+            at[q] = which >> 16;
+            own[q] = n + 32 * q < last_pair ? i - j : -1;
+#pragma unroll
+            for (int c = 0; c < 3; ++c) {{
+                const float4 b = joint[j + c];
+                value[q][c] = room[at[q] + c] - a.x * b.x - a.y * b.y - a.z * b.z;
+            }}
         }}
 #pragma unroll
-        for (int q = 0; q < 4; ++q)
-            if (at[q] >= 0) room[at[q]] = value[q];
+        for (int q = 0; q < 2; ++q)
+#pragma unroll
+            for (int c = 0; c < 3; ++c)
+                if (c <= own[q]) room[at[q] + c] = value[q][c];
     }}
     __syncwarp();
 }}
+"""
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_AT}
+const int lane = threadIdx.x & 31, size = matrix.shape[1], entries = entry.shape[0];
+const float* const from = &wp::index(matrix, source, 0, 0);
+const float* const more = &wp::index(diagonal, e, 0);
+for (int n = lane; n < {_FACTOR} / 4; n += 32) reinterpret_cast<float4*>(room)[n] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+__syncwarp();
+#pragma unroll 8
+for (int n = lane; n < entries; n += 32) {{
+    const int i = __ldg(entry.data + n) >> 8, j = __ldg(entry.data + n) & 255;
+    room[i * (i + 1) / 2 + j] = from[i * size + j] + (j == i ? more[i] : 0.0f);
+}}
+__syncwarp();
+{_ELIMINATE}
 #endif
 """)
 def factorize_together(
@@ -94,6 +108,47 @@ def factorize_together(
     at: wp.uint64,
 ):
     """The factor of matrix ``source`` and diagonal ``e``, as :mod:`piavatar_envs.avatar.cholesky` has it."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_AT}
+const int lane = threadIdx.x & 31, size = diagonal.shape[1];
+for (int i = lane; i < size; i += 32) room[i * (i + 1) / 2 + i] += wp::index(diagonal, e, i);
+for (int n = size * (size + 1) / 2 + lane; n < {_FACTOR}; n += 32) room[n] = 0.0f;
+__syncwarp();
+{_ELIMINATE}
+#endif
+""")
+def eliminate_together(
+    start: wp.array(dtype=int),
+    columns: wp.array(dtype=int),
+    pair_start: wp.array(dtype=int),
+    pair: wp.array(dtype=int),
+    diagonal: wp.array2d(dtype=float),
+    e: int,
+    at: wp.uint64,
+):
+    """:func:`factorize_together` of the matrix that :func:`set_in_rooms` has written to the room."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_AT}
+#pragma unroll
+for (int a = 0; a < 3; ++a)
+#pragma unroll
+    for (int b = 0; b < 3; ++b)
+        if (j + b <= i + a) {{
+            float* const to = room + (i + a) * (i + a + 1) / 2 + j + b;
+            to[0] = to[{ROOM}] = block.data[a][b];
+        }}
+#endif
+""")
+def set_in_rooms(at: wp.uint64, i: int, j: int, block: wp.mat33):
+    """Write 3 x 3 entries, from row ``i`` and column ``j`` on, to a matrix in each of two rooms, if in the triangle."""
     ...
 
 

@@ -190,6 +190,7 @@ inline float __fmul_rn(float a, float b) { volatile float product = a * b; retur
 #pragma clang optimize on
 inline float fminf(float a, float b) { return a != a || b < a ? b : a; }
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
+inline int __clz(int x) { return x == 0 ? 32 : __builtin_clz((unsigned)x); }
 inline int __ffs(unsigned x) { return __builtin_ffs((int)x); }
 template <class T> T __ldg(const T* at) { return *at; }
 
