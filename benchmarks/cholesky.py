@@ -37,11 +37,11 @@ from piavatar_envs.avatar.cholesky import (
     keep_factor,
     solve,
 )
+from piavatar_envs.avatar.joint_bench import room_of_warp
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF, filled_entries
 from piavatar_envs.avatar.mass_pairs import build_pairs
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
-from piavatar_envs.avatar.warp_cholesky import room_of_warp
 from piavatar_envs.mpm.program import Program
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
