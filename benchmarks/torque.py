@@ -211,8 +211,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
     """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, stability, the cost."""
     for rate in (0.0, RATE):
         yield flail(options, rate)
-    loose = {"flesh_rate": (0.0, 0.0), **HOLDS["_slipping"]}
-    for name, hold in {"_loose": loose, **HOLDS}.items():
+    for name, hold in {"_loose": {"flesh_rate": (0.0, 0.0)}, **HOLDS}.items():
         yield flail_under_pd(options, name, hold)
     for stiffness in STIFFNESSES:
         yield stretch_arms(options, stiffness)

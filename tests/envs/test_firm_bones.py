@@ -13,7 +13,7 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.multi.sumo_v0 import SumoTask
 
 REACH = "PIAvatar/Reach-v0"
-PD = {"control": "pd", "pose_noise": 0.0}
+PD = {"control": "pd", "pose_noise": 0.0, "firm_bones": True}
 EMPTY = {"gravity": 0.0, "scene": {"ground": False, "walls": False}}
 
 
@@ -45,7 +45,7 @@ def test_bones_stay_together(make_batch):
     """Under random targets; where they slip they are millimetres apart."""
     worst = {}
     for firm in (True, False):
-        batch = make_batch(REACH, 2, firm_bones=firm, **PD, **EMPTY)
+        batch = make_batch(REACH, 2, **PD | {"firm_bones": firm}, **EMPTY)
         batch.reset(seeds=[1, 2])
         worst[firm] = swing(batch, 30).max()
         assert not batch.failure.numpy().any()
@@ -118,13 +118,13 @@ def test_flesh_and_commanded_poses_are_left_alone(make_batch):
     batch = make_batch(REACH, 1, **PD)
     np.testing.assert_array_equal(batch.simulation.avatar.joints.body.firm.numpy(), np.flatnonzero(of_bones(batch)))
     assert 0 < of_bones(batch).sum() < 0.9 * len(of_bones(batch))
-    assert make_batch(REACH, 1, firm_bones=False, **PD).simulation.avatar.joints.body.firm.size == 0
-    assert make_batch(REACH, 1).simulation.avatar.joints is None
+    assert make_batch(REACH, 1, control="pd").simulation.avatar.joints.body.firm.size == 0
+    assert make_batch(REACH, 1, firm_bones=True).simulation.avatar.joints is None
 
 
 def test_two_bodies_that_collide_keep_their_momentum(device):
     """The particles of the second body's bones are put in place as the first one's are."""
-    settings = {"fidelity": "tiny", "joints": None, "start_distance": 0.6, "control": "pd", **EMPTY}
+    settings = {"fidelity": "tiny", "joints": None, "start_distance": 0.6, "control": "pd", "firm_bones": True, **EMPTY}
     batch = BatchEnv(SumoTask(load_config(SumoTask.Config, None, settings)), 1, device)
     batch.reset(seeds=[0])
     simulation = batch.simulation
