@@ -27,10 +27,11 @@ are. When the mass matrix is built anew the pose is fitted to the particles, too
 Flesh may be held to the bones by a pull, implicit and critically damped, ``u' = (u + dt w^2 d)/(1 + dt w)^2`` with
 ``d`` from the particle to its skinned place; the joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, with
 exactly its momentum. The grid blurs what a pull gives a single particle, and under load a particle slips from its place
-for the pull to carry it: by millimetres where cells have centimetres. After every control step particles of bones are
-therefore put into their places, if these are not beyond a boundary. No velocity changes, so momentum is kept; what a
+for the pull to carry it: by millimetres where cells have centimetres. After every control step firm particles, those of
+bones, may be put into their places, if these are not beyond a boundary. No velocity changes, and no momentum; what a
 way ``d`` has of angular momentum, ``m d x v``, the affine velocity of the particle takes back. The centre of mass moves
-by the mean of these ways: hundredths of a millimetre, in all directions.
+by the mean of these ways: hundredths of a millimetre, in all directions. But the pull that ``d`` gave rise to is gone,
+and what it carried begins to slip anew: feet that press hard on the ground do not come to rest.
 
 Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
