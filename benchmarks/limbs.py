@@ -47,9 +47,15 @@ class Limbs:
     """
 
     def __init__(
-        self, options: Options, gravity: float, rotations: np.ndarray, rate: float = 0.0, ground: bool = False
+        self,
+        options: Options,
+        gravity: float,
+        rotations: np.ndarray,
+        rate: float = 0.0,
+        ground: bool = False,
+        firm: bool = False,
     ) -> None:
-        """Build it in a pose of rotation vectors ``(22, 3)``; ``rate`` holds flesh to bones, where it is not zero."""
+        """Build it in a pose of rotation vectors ``(22, 3)``; ``rate`` holds flesh to bones, if not zero."""
         world = World(
             fidelity=options.fidelity, num_substeps=None, gravity=gravity, ground=ground, device=options.device
         )
@@ -58,7 +64,8 @@ class Limbs:
         self.rig.reset(rotations[None])
         rates = np.full((1, self.rig.points.num_points), rate) if rate > 0.0 else None
         none = np.zeros((1, 1 + NUM_JOINTS))
-        self.body = ArticulatedBody(self.rig.points, self.rig.avatar.body, self.rig.model, none, none, rates)
+        chosen = firm & (self.rig.points.bone >= 0)
+        self.body = ArticulatedBody(self.rig.points, self.rig.avatar.body, self.rig.model, none, none, rates, chosen)
         local, joints = Rotation.from_rotvec(rotations), self.rig.points.joints[0].astype(float)
         world_rotations, positions = forward_kinematics(local.as_matrix(), joints[0], joints)
         self.body.state.rotation.assign(Rotation.from_matrix(world_rotations).as_quat()[None].astype(np.float32))
@@ -82,6 +89,8 @@ class Limbs:
                 self.body.record_substep(program, rig.state, refresh=step % refresh == 0)
             record_substep(program, rig.model, rig.state, rig.scratch, step)
         record_end(program, rig.model, rig.state, rig.scratch)
+        if refresh is not None:
+            self.body.record_end(program, rig.state)
         return program
 
     def set_springs(self, stiffness: np.ndarray | float, damping: np.ndarray | float, held: bool = False) -> None:

@@ -127,9 +127,10 @@ def stretch_arms(options: Options, stiffness: float) -> dict[str, Any]:
     }
 
 
-def press(options: Options, damping: float) -> dict[str, Any]:
+def press(options: Options, damping: float, hold: str) -> dict[str, Any]:
     """Ankles press the toes of a held, weightless body on the floor: what of their springs' torque arrives."""
-    limbs, ankles = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), RATE, ground=True), [*map(joint_index, ANKLES)]
+    firm, ankles = bool(HOLDS[hold]), [*map(joint_index, ANKLES)]
+    limbs = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), RATE, ground=True, firm=firm)
     limbs.set_springs(3000.0, 100.0, held=True)
     springs = limbs.body.springs
     for array, value in ((springs.stiffness, PRESSING), (springs.damping, damping)):
@@ -146,10 +147,11 @@ def press(options: Options, damping: float) -> dict[str, Any]:
     turned = np.array([(world[PARENTS[b]].inv() * world[b]).as_rotvec()[0] for b in ankles])
     torque = np.array([world[PARENTS[b]].inv().apply(impulse[b])[0] for b in ankles])
     return {
-        "case": f"press_kd_{damping:g}",
+        "case": f"press_kd_{damping:g}{hold}",
         "torque_nm": float(torque.mean()),
         "torque_over_spring": float((torque / (PRESSING * (0.3 - turned))).mean()),
         "floor_n": float(limbs.rig.scratch.sensors.boundary_impulse.numpy()[0, 0, 2] / limbs.rig.model.control_dt),
+        "speed_m_s": float(np.abs(limbs.rig.state.u.numpy() + limbs.rig.state.vk.numpy()).max()),
         "failed": bool(limbs.rig.state.failure.numpy()[0]),
     }
 
@@ -215,8 +217,9 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
         yield flail_under_pd(options, name, hold)
     for stiffness in STIFFNESSES:
         yield stretch_arms(options, stiffness)
-    for damping in DAMPINGS:
-        yield press(options, damping)
+    for hold in HOLDS:
+        for damping in DAMPINGS:
+            yield press(options, damping, hold)
     for hold in HOLDS:
         for assist in (0.0, 1.0):
             yield stand(options, assist, hold)

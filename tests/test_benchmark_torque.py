@@ -24,7 +24,7 @@ HOLDS = ("", "_firm")
 CASES = {
     *FLOATS,
     *(f"t_pose_kp_{k}" for k in (50, 200, 1000)),
-    *(f"press_kd_{d}" for d in (2, 20, 200)),
+    *(f"press_kd_{d}{hold}" for d in (2, 20, 200) for hold in HOLDS),
     *(f"stand_assist_{share}{hold}" for share in (0, 1) for hold in HOLDS),
     *(f"ball_{mass}_kp_{k}{hold}" for mass in ("0.45", "1.5", "8") for k in (100, 300, 1000) for hold in HOLDS),
     *(kick + hold for kick in KICKS for hold in HOLDS),
@@ -50,6 +50,14 @@ def test_every_case_is_measured(rows):
 def test_the_committed_results_are_complete():
     report = json.loads(RESULTS.read_text(encoding="utf-8"))
     assert report["complete"] and {row["case"] for row in report["results"]} == CASES
+
+
+def test_feet_that_press_come_to_rest_and_give_the_springs_torque():
+    """Whatever the damper, and whether bones slip or are put in place."""
+    rows = {row["case"]: row for row in json.loads(RESULTS.read_text(encoding="utf-8"))["results"]}
+    for case in (case for case in CASES if case.startswith("press")):
+        assert rows[case]["torque_over_spring"] == pytest.approx(1.0, abs=0.01)
+        assert rows[case]["speed_m_s"] < 0.01 and rows[case]["floor_n"] > 500.0
 
 
 def test_firm_bones_stay_together():

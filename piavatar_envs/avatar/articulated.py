@@ -30,8 +30,9 @@ exactly its momentum. The grid blurs what a pull gives a single particle, and un
 for the pull to carry it: by millimetres where cells have centimetres. After every control step firm particles, those of
 bones, may be put into their places, if these are not beyond a boundary. No velocity changes, and no momentum; what a
 way ``d`` has of angular momentum, ``m d x v``, the affine velocity of the particle takes back. The centre of mass moves
-by the mean of these ways: hundredths of a millimetre, in all directions. But the pull that ``d`` gave rise to is gone,
-and what it carried begins to slip anew: feet that press hard on the ground do not come to rest.
+by the mean of these ways: hundredths of a millimetre, in all directions. The pull, and the fit of the pose, go on as if
+the particle were where it was: it remembers the way. Else the load would begin to slip anew, and feet that press on the
+ground would not come to rest.
 
 Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
@@ -135,6 +136,7 @@ class ArticulatedBody:
             velocity=zeros((n, NUM_DOF), float),
             outside=zeros((n, NUM_DOF), float),
             torque=zeros(bones, wp.vec3),
+            slip=zeros((n, points.num_points if chosen.size else 1), wp.vec3),
         )
         self.pose = group(Pose, rotation=self.state.rotation, position=self.state.position)
         target = {"rotation": zeros(bones, wp.quat), "root": zeros(n, wp.vec3)}
@@ -183,6 +185,7 @@ class ArticulatedBody:
             place=zeros(wp.mat44, n, NUM_JOINTS),
             leaving=zeros(vec8, n, NUM_JOINTS),
             moving=zeros(vec8, n, NUM_JOINTS),
+            slip=self.state.slip,
             pelvis=zeros(wp.vec3, n),
         )
 
@@ -279,4 +282,4 @@ class ArticulatedBody:
         model, w = self.model, self._bench
         self._record_stage(program, begin_substep, [self.body], state)
         inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, state.u, state.vk, state.failure]
-        program.launch(put_in_place, (model.num_envs, self.firm.size), inputs, [state.x, state.C])
+        program.launch(put_in_place, (model.num_envs, self.firm.size), inputs, [state.x, state.C, self.state.slip])

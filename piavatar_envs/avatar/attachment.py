@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import skinned_place
+from piavatar_envs.avatar.blending import blend_places, skinned_place
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import skinned_motion
 from piavatar_envs.avatar.loads import int_at, number_at, vector_at
@@ -29,6 +29,15 @@ from piavatar_envs.mpm.shared_memory import meet, threads_of_block
 from piavatar_envs.mpm.types import Boundaries, Grid, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.func
+def pulled_place(body: Body, e: int, p: int, w: JointBench):
+    """Where a particle is pulled to [m]: its place on the bones; a firm one beyond, by what it was put back."""
+    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+    if p < w.slip.shape[1]:
+        rest += vector_at(w.slip, e, p)
+    return blend_places(w.place, e, body.joint, body.weight, p, rest)
 
 
 @wp.kernel(launch_bounds=(PART_BLOCK, 5))
@@ -62,7 +71,7 @@ def sum_displacement(
         place = vector_at(x, e, n)
         none = wp.vec3()
         bring_particle(
-            room, WORDS * (p - first), number_at(mass, r, n), place, place - skinned_place(body, w.place, e, p), none
+            room, WORDS * (p - first), number_at(mass, r, n), place, place - pulled_place(body, e, p, w), none
         )
     meet()
     warp = warp_of_block()
@@ -120,7 +129,7 @@ def attach_flesh(
         following = vector_at(x, e, n)
         following_v = vector_at(u, e, n) + vector_at(vk, e, n)
         before = v - skinned_motion(body, w.moving, e, p, place - pelvis)
-        way = skinned_place(body, w.place, e, p) - place
+        way = pulled_place(body, e, p, w) - place
         after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
         bring_particle(room, WORDS * (p - first), number_at(mass, r, body.first + p), place, before - after, after)
         p += threads
@@ -159,19 +168,29 @@ def put_in_place(
     # in and out
     x: wp.array2d(dtype=wp.vec3),
     C: wp.array3d(dtype=float),
+    slip: wp.array2d(dtype=wp.vec3),
 ):
     """Put the ``firm`` particles where their bones have them, though not beyond boundaries; over ``(E, firm ones)``.
 
-    No particle's velocity ``v`` changes. Of the angular momentum that is ``m d x v`` for a way of ``d``, and the affine
-    velocity takes it back: the grid gets ``m (dx^2/4) eps C`` of it (Jiang et al. 2015, quadratic weights).
+    No particle's velocity ``v`` changes. What a way of ``d`` gives of angular momentum, ``m d x v``, the affine
+    velocity takes back: the grid gets ``m (dx^2/4) eps C`` of it (Jiang et al. 2015, quadratic weights). The ``slip``
+    remembers the way, in the frame of the rest pose.
     """
     e, n = wp.tid()
     if failure[e] != 0:
         return
     p = firm[n]
     q = body.first + p
-    at = keep_outside(boundaries, e, skinned_place(body, place, e, p))
+    home = skinned_place(body, place, e, p)
+    at = keep_outside(boundaries, e, home)
     way = at - x[e, q]
     x[e, q] = at
+    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+    turned = wp.vec3()
+    for i in range(3):
+        axis = wp.vec3()
+        axis[i] = 1.0
+        turned[i] = wp.dot(blend_places(place, e, body.joint, body.weight, p, rest + axis) - home, way)
+    slip[e, p] = slip[e, p] + turned
     spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, u[e, q] + vk[e, q])
     store_matrix(C, e, q, matrix_at(C, e, q) - wp.skew(spin))

@@ -47,6 +47,7 @@ class JointBench:
     place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to where bones are
     leaving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion that leaves the physical velocity
     moving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion of the joints
+    slip: wp.array2d(dtype=wp.vec3)  # (num_envs, P) as in JointState
     pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) joint about which these are motions [m]
 
 

@@ -156,6 +156,14 @@ def set_joints_in_motion(
     set_part(velocity, e, 3 + 3 * b, spin)
 
 
+@wp.kernel
+def forget_slip(mask: wp.array(dtype=wp.bool), slip: wp.array2d(dtype=wp.vec3)):
+    """No particle of the masked environments has slipped."""
+    e, p = wp.tid()
+    if mask[e]:
+        slip[e, p] = wp.vec3(0.0)
+
+
 class JointDrive:
     """What turns the joints of one avatar in every environment.
 
@@ -220,6 +228,7 @@ class JointDrive:
             [mask, posed.pose_rotation, posed.pose_position],
             [s.rotation, s.position, s.torque, s.velocity, s.outside],
         )
+        program.launch(forget_slip, s.slip.shape, [mask], [s.slip])
 
     def record_motion(self, program: Program, mask: wp.array, after: Pose) -> None:
         """Append: joints of the masked environments, reset already, reach a pose after a control step."""

@@ -214,6 +214,8 @@ class JointState:
     outside: wp.array  # (num_envs, 69) how all but the joints themselves changed it in the last substep
     # (num_envs, bones) torques, of the reference adult, about the rest pose's axes as the parent has turned them [N m]
     torque: wp.array
+    # (num_envs, P) by how much firm particles have been put back, in the frame of the rest pose [m]; or one entry
+    slip: wp.array
 
 
 @dataclass

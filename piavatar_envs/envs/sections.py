@@ -102,8 +102,7 @@ class DriveConfig(BaseModel):
     firm_bones: bool = Field(
         False,
         description="whether particles of bones, which slip from them under load, are put into their places after "
-        "every control step, unless these lie beyond a surface: tracked bones stay together, but feet that press hard "
-        "on the ground do not come to rest",
+        "every control step, unless these lie beyond a surface: tracked bones stay together",
     )
     drive: Literal["increment", "target"] = Field(
         "increment",

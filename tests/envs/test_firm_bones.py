@@ -98,6 +98,26 @@ def test_the_affine_velocity_takes_back_what_moves_give(make_batch):
     assert np.linalg.norm(after.angular_momentum - before.angular_momentum) < 1e-6 * before.momentum_scale
 
 
+def test_the_pull_goes_on_as_if_particles_had_not_been_put_in_place(make_batch):
+    """Once shaken particles have been put in place, the next substep does to velocities what it does to shaken ones."""
+    changes = {}
+    for firm in (True, False):
+        batch = make_batch(REACH, 1, **PD | {"firm_bones": firm}, **EMPTY)
+        batch.reset(seeds=[0])
+        state, rng = batch.simulation.state, np.random.default_rng(5)
+        shaken = rng.normal(0.0, 5e-3, state.x.numpy().shape) * of_bones(batch)[None, :, None]
+        state.x.assign(state.x.numpy() + shaken.astype(np.float32))
+        put_in_place(batch)
+        joints = batch.simulation.avatar.joints
+        program = Program(batch.simulation.model.device)
+        joints.record_substep(program, state, 0)
+        before = state.u.numpy() + state.vk.numpy()
+        program.run()
+        changes[firm] = (state.u.numpy() + state.vk.numpy() - before)[0]
+    assert np.abs(changes[False][of_bones(batch)]).max() > 0.5  # [m/s]
+    assert np.linalg.norm(changes[True] - changes[False]) < 0.1 * np.linalg.norm(changes[False])  # levers differ
+
+
 def test_no_particle_is_put_into_the_floor(make_batch):
     """The pose alone goes down by 5 cm: particles go with it as far as the floor lets them."""
     batch = make_batch(REACH, 1, **PD)
