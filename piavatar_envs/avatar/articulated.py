@@ -112,8 +112,7 @@ class ArticulatedBody:
         n, device = model.num_envs, model.device
         rates = np.zeros((1, points.num_points)) if attachment is None else attachment
         sizes = (("stiffness", stiffness, 1 + NUM_JOINTS), ("damping", damping, 1 + NUM_JOINTS))
-        sizes += (("attachment", rates, points.num_points),)
-        for name, value, size in sizes:
+        for name, value, size in (*sizes, ("attachment", rates, points.num_points)):
             if value.shape not in ((1, size), (n, size)):
                 raise ValueError(f"{name} has shape {value.shape}, expected (1 or {n}, {size})")
             if not (np.isfinite(value).all() and (value >= 0.0).all()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_places, skinned_place
+from piavatar_envs.avatar.blending import blend_places
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import skinned_motion
 from piavatar_envs.avatar.loads import int_at, number_at, vector_at
@@ -51,7 +51,7 @@ def sum_displacement(
     # in and out
     w: JointBench,
 ):
-    """Of the particles from where the pose has them by linear blend skinning: its two momenta, of every chunk.
+    """Of the particles from where the pose has them, see :func:`pulled_place`: its two momenta, of every chunk.
 
     Over ``(num_envs, parts, PART_BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
     """
@@ -181,11 +181,11 @@ def put_in_place(
         return
     p = firm[n]
     q = body.first + p
-    home = skinned_place(body, place, e, p)
+    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+    home = blend_places(place, e, body.joint, body.weight, p, rest)
     at = keep_outside(boundaries, e, home)
     way = at - x[e, q]
     x[e, q] = at
-    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     turned = wp.vec3()
     for i in range(3):
         axis = wp.vec3()

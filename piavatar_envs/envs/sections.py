@@ -85,7 +85,7 @@ class DriveConfig(BaseModel):
     control: Literal["pose", "pd", "torque"] = Field(
         "pose",
         description="what actions are: pose (increments of a pose that moves the body), pd (joint targets of springs "
-        "with limited torques) or torque (torques of the joints); root_assist to flesh_rate are for pd and torque, all "
+        "with limited torques) or torque (torques of the joints); root_assist to firm_bones are for pd and torque, all "
         "other settings of this section for pose",
     )
     root_assist: float = Field(
