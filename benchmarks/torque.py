@@ -3,7 +3,8 @@
 ``python -m benchmarks.torque --out FILE.json``. A body that flails in empty space, one whose pelvis is held while it
 stretches its arms out or presses its toes on the floor, and one that is asked for the rest pose (``control="pd"``, zero
 actions), with an assisted pelvis and without; what balls do to it and what it does to balls
-(:mod:`benchmarks.blows`), and up to which time step and gains it is stable (:mod:`benchmarks.stability`).
+(:mod:`benchmarks.blows`), whether its matter stays at the bones (:mod:`benchmarks.wear`), and up to which time step and
+gains it is stable (:mod:`benchmarks.stability`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks import blows, runner, stability, timing
+from benchmarks import blows, runner, stability, timing, wear
 from benchmarks.blows import HOLDS, afloat
 from benchmarks.limbs import Limbs, Options, critical_damping, widest
 from benchmarks.poses import random_pose
@@ -210,7 +211,7 @@ def cost(options: Options) -> dict[str, Any]:
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, stability, the cost."""
+    """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, wear, stability, the cost."""
     for rate in (0.0, RATE):
         yield flail(options, rate)
     for name, hold in {"_loose": {"flesh_rate": (0.0, 0.0)}, **HOLDS}.items():
@@ -224,6 +225,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
         for assist in (0.0, 1.0):
             yield stand(options, assist, hold)
     yield from blows.cases(options)
+    yield from wear.cases(options)
     yield from stability.cases(options)
     yield cost(options)
 

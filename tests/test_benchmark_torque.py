@@ -28,6 +28,8 @@ CASES = {
     *(f"stand_assist_{share}{hold}" for share in (0, 1) for hold in HOLDS),
     *(f"ball_{mass}_kp_{k}{hold}" for mass in ("0.45", "1.5", "8") for k in (100, 300, 1000) for hold in HOLDS),
     *(kick + hold for kick in KICKS for hold in HOLDS),
+    "spin",
+    *(f"thrash_{place}{hold}" for place in ("upright", "lying") for hold in HOLDS),
     *(f"longest_step_{name}" for name in ("floating", "standing", "soft_floating")),
     *(f"largest_{kind}_{how}" for kind in ("kp", "kd", "kp_kd") for how in ("limited", "boundless")),
     "cost",
@@ -58,6 +60,13 @@ def test_feet_that_press_come_to_rest_and_give_the_springs_torque():
     for case in (case for case in CASES if case.startswith("press")):
         assert rows[case]["torque_over_spring"] == pytest.approx(1.0, abs=0.01)
         assert rows[case]["speed_m_s"] < 0.01 and rows[case]["floor_n"] > 500.0
+
+
+def test_matter_stays_at_the_bones():
+    """What spins does not swell as it would on straight ways; nor do forearms after 10 s of random torques."""
+    rows = {row["case"]: row for row in json.loads(RESULTS.read_text(encoding="utf-8"))["results"]}
+    assert rows["spin"]["straight_growth"] > 0.1 > 0.02 > rows["spin"]["largest_growth"]
+    assert rows["thrash_upright"]["forearms_off_mm"] < 5.0
 
 
 def test_firm_bones_stay_together():

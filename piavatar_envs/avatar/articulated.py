@@ -4,11 +4,12 @@ The velocity of a particle is ``v = u + J qdot``: what the joints cannot do, and
 Jacobian ``J`` at the particles. Every substep gives the joints what they can take over of the physical velocity, and
 lets torques act on them:
 
-    dq = M^-1 J^T m u,   qdot <- qdot + dq,   u <- u - J dq,   c <- c + dq
+    M dq = J^T m u,   qdot <- qdot + dq,   u <- u - J dq,   c <- c + dq
     (M + A) d = dt (K e + tau) - A (qdot + c),   A = dt D + dt^2 K
     qdot <- qdot + d + c,   u <- u - J c,   vk = J qdot
 
-``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each.
+``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each. To
+``M = J^T m J`` light joints have some inertia added, see :func:`piavatar_envs.avatar.joint_mass.grid_inertia`.
 ``c`` is what all else, contact, weight and flesh, did to the joints in the last substep, and is expected to do again.
 The springs know of it, see :mod:`piavatar_envs.avatar.joint_torques`, and so does the split: the joints go on with
 the velocity that will be left of their push, and the rest of the push, ``-J c``, waits in ``u`` for what is to stop
@@ -34,6 +35,10 @@ by the mean of these ways: hundredths of a millimetre, in all directions. The pu
 the particle were where it was: it remembers the way. Else the load would begin to slip anew, and feet that press on the
 ground would not come to rest.
 
+The last ``J`` is that of the middle of the substep, particles and pose half a step on, by the velocity they begin with
+(the explicit midpoint rule): limbs that turn keep their width. The velocity of a particle stays what it was; what the
+new ``J qdot`` is less is more in ``u``.
+
 Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
 of more than some 5 ms ago makes fast limbs unstable.
@@ -50,7 +55,7 @@ from piavatar_envs.avatar.attachment import attach_flesh, put_in_place, sum_disp
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.bone_sums import sum_moments
 from piavatar_envs.avatar.joint_bench import JointBench
-from piavatar_envs.avatar.joint_mass import JointMass
+from piavatar_envs.avatar.joint_mass import JointMass, grid_inertia
 from piavatar_envs.avatar.joint_motion import hand_back, take_over
 from piavatar_envs.avatar.joint_stages import MASS_BLOCK, Support, act, begin_substep, build_mass, fit_pose
 from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
@@ -142,6 +147,7 @@ class ArticulatedBody:
         self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
         self.target.rotation.fill_(wp.quat_identity())
         self.mass = JointMass(points, body, model)
+        self._inertia = grid_inertia(points, model.grid.dx)
         self._scratch = zeros(points.num_points if self.threads == 1 else 0, vec12)
         self.impulse = zeros((n, NUM_DOF), float)
         self.support = group(Support, force=zeros(n, wp.vec3), torque=zeros(n, wp.vec3))
@@ -182,7 +188,7 @@ class ArticulatedBody:
             impulse=self.impulse,
             left=zeros(float, n, NUM_DOF),
             place=zeros(wp.mat44, n, NUM_JOINTS),
-            leaving=zeros(vec8, n, NUM_JOINTS),
+            lacking=zeros(vec8, n, NUM_JOINTS),
             moving=zeros(vec8, n, NUM_JOINTS),
             slip=self.state.slip,
             pelvis=zeros(wp.vec3, n),
@@ -199,10 +205,11 @@ class ArticulatedBody:
         self, damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int]
     ) -> None:
         """Let joints resist; see :func:`make_tissue`. To be called before anything is recorded."""
-        self.tissue = make_tissue(damping, stop, lower, upper, locked, self.model.device)
-        locks = np.r_[np.zeros(3), np.repeat(self.tissue.lock.numpy(), 3)]
+        device = self.model.device
+        self.tissue = make_tissue(damping, stop, lower, upper, self._inertia, locked, device)
+        besides = np.r_[np.zeros(3), np.repeat(self.tissue.inertia.numpy(), 3)]
         own = self._bench.diagonals[: self.model.num_envs]
-        own.assign(np.broadcast_to(locks.astype(np.float32), own.shape))
+        own.assign(np.broadcast_to(besides.astype(np.float32), own.shape))
 
     def record_mass(self, program: Program, state: State) -> None:
         """Append: build the mass matrix where particles and joints are, and what follows from it."""
@@ -268,7 +275,7 @@ class ArticulatedBody:
             self._record_moments(program, state)
         inputs = [self.body, dt, 1.0 / model.control_dt, velocities, self.target, self.springs, self.tissue]
         self._record_stage(program, act, [*inputs, self.strength], state, self.support)
-        inputs = [self.body, state.x, w.pelvis, w.leaving, w.moving, state.failure]
+        inputs = [self.body, dt, state.x, w.pelvis, w.lacking, w.moving, state.failure]
         program.launch(take_over, points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
 
     def record_end(self, program: Program, state: State) -> None:

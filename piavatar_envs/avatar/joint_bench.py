@@ -45,10 +45,10 @@ class JointBench:
     left: wp.array2d(dtype=float)  # (num_envs, 69) diagonal without muscles that have reached their limits
     # what particles get
     place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to where bones are
-    leaving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion that leaves the physical velocity
+    lacking: wp.array2d(dtype=vec8)  # (num_envs, bones) what the physical velocity lacks of the whole one
     moving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion of the joints
     slip: wp.array2d(dtype=wp.vec3)  # (num_envs, P) as in JointState
-    pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) joint about which these are motions [m]
+    pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) where its joint begins the substep [m]
 
 
 # Words of shared memory of a warp: the factor's, whose spare ones have the bones' momenta until something is solved
@@ -151,7 +151,7 @@ def enter_room(w: JointBench, e: int):
     w.momentum = see_numbers(w.momentum, room, _SHARES, _ROWS)
     w.shares = see_numbers(w.shares, room, _SHARES, _ROWS)
     w.moving = see_motions(w.moving, room, _MOVING, 0)
-    w.leaving = see_motions(w.leaving, room, _MOVING, 0)
+    w.lacking = see_motions(w.lacking, room, _MOVING, 0)
     w.pose.rotation = see_turns(w.pose.rotation, room, _ROTATION, 0)
     w.pose.position = see_vectors(w.pose.position, room, _POSITION, 0)
     return w
@@ -170,9 +170,9 @@ __syncwarp();
 """
 
 
-@wp.func_native(_KEEP % f"keep(near.leaving, w.leaving, {8 * NUM_JOINTS});")
-def keep_leaving(w: JointBench, e: int, near: JointBench):
-    """Write the motion that leaves the physical velocity from the room, where the next one comes."""
+@wp.func_native(_KEEP % f"keep(near.lacking, w.lacking, {8 * NUM_JOINTS});")
+def keep_lacking(w: JointBench, e: int, near: JointBench):
+    """Write what the physical velocity lacks from the room, where the next motion comes."""
     ...
 
 

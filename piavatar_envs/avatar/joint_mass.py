@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.body import BodyPoints, normal_weights
 from piavatar_envs.avatar.cholesky import factor_size, find_pattern
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF, filled_entries
@@ -13,6 +14,26 @@ from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import Model, State
+
+#: What joints know of the inertia that flesh has on the grid. Without it 14 of 32 ``tiny`` bodies that lie on the floor
+#: fail within 200 control steps of random torques; with it, and with half of it, none of 64 does.
+GRID_SHARE = 0.25
+
+
+def grid_inertia(points: BodyPoints, dx: float) -> np.ndarray:
+    """Inertia of joints besides that of the limbs they move, for the grid's sake, ``(22,)`` [kg m^2].
+
+    Between particles and nodes matter is spread: with quadratic weights by ``dx^2/4`` along each axis, as mean square
+    (``D_p`` of Jiang et al. 2015), so that flesh of mass ``m`` turns on the grid with ``m dx^2/2`` besides its own
+    inertia. Joints that know nothing of it turn a hand that is smaller than a cell by more than the grid lets it go,
+    and the two throw it about until it fails. A share of it is enough; what it is for has a name in other engines,
+    ``armature``. The mass is that of the bones' own flesh in the shape that the body is built with. The pelvis, which
+    turns against nothing, has none.
+    """
+    shares = normal_weights(points) * points.mass[0][:, None]
+    mass = np.bincount(points.skin_joints.ravel(), shares.ravel(), minlength=NUM_JOINTS)
+    mass[0] = 0.0
+    return GRID_SHARE * 0.5 * dx**2 * mass
 
 
 class JointMass:

@@ -117,9 +117,10 @@ def skinned_motion(body: Body, field: wp.array2d(dtype=vec8), e: int, p: int, ar
 @wp.kernel(launch_bounds=(BLOCK, 10))
 def take_over(
     body: Body,
+    dt: float,
     x: wp.array2d(dtype=wp.vec3),
     pelvis: wp.array(dtype=wp.vec3),
-    leaving: wp.array2d(dtype=vec8),
+    lacking: wp.array2d(dtype=vec8),
     moving: wp.array2d(dtype=vec8),
     failure: wp.array(dtype=int),
     # in and out
@@ -127,9 +128,12 @@ def take_over(
     # out
     driven: Kinematic,
 ):
-    """Take from the physical velocity what leaves it for the joints, and write ``J qdot``.
+    """Write ``J qdot`` of the middle of the substep, and leave the physical velocity what it is not of the whole one.
 
-    Both are motions about where the ``pelvis`` joint is before it moves on [m].
+    Particle and bones are half a step on there. Moved by ``J qdot`` of its beginning, a straight way, what turns by
+    ``theta`` in a substep would be ``theta^2 / 2`` further from its axis, of which no stress knows: limbs would swell
+    within seconds. The whole velocity is the physical one and what that is ``lacking``, a motion about where the
+    ``pelvis`` joint begins [m]; what the bones are ``moving`` with is one about where it is half-way.
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -139,6 +143,7 @@ def take_over(
         return
     p = own[1]
     center = pelvis[e]
+    root = moving[e, 0]
     last = body.count - 1
     n = body.first + wp.min(p, last)
     following = vector_at(x, e, n)
@@ -149,10 +154,11 @@ def take_over(
         n = body.first + wp.min(p + threads, last)
         following = vector_at(x, e, n)
         following_u = vector_at(u, e, n)
-        after = before - skinned_motion(body, leaving, e, p, arm)
+        whole = before + skinned_motion(body, lacking, e, p, arm)
         now = blend_changes(moving, e, body.joint, body.weight, p)
-        spin = wp.vec3(now[3], now[4], now[5])
-        store_velocities(u, driven, e, body.first + p, after, motion_at(now, arm), spin, True)
+        half = 0.5 * dt * (motion_at(now, arm) - wp.vec3(root[0], root[1], root[2]))
+        vk = motion_at(now, arm + half)
+        store_velocities(u, driven, e, body.first + p, whole - vk, vk, wp.vec3(now[3], now[4], now[5]), True)
         p += threads
 
 
@@ -264,11 +270,13 @@ def go_on(
     q: wp.array2d(dtype=float),
     taken: wp.array2d(dtype=float),
 ):
-    """The velocity that joints will have if all else does again what it did; what this takes from the particles.
+    """The velocity that joints will have if all else does again what it did; what particles lack without it.
 
-    The joints' own ``change`` is in row ``own``, what was ``taken`` already in ``row``.
+    The joints' own ``change`` is in row ``own``; what was ``taken`` of the particles before is in ``row``, where what
+    they lack of their whole velocity comes.
     """
     meet_threads(threads)
     for i in range(thread, q.shape[1], threads):
-        q[e, i] = q[e, i] + change[own, i] + outside[e, i]
-        taken[row, i] = taken[row, i] + outside[e, i]
+        after = q[e, i] + change[own, i] + outside[e, i]
+        q[e, i] = after
+        taken[row, i] = after - taken[row, i] - outside[e, i]

@@ -23,7 +23,7 @@ from piavatar_envs.avatar.cholesky import (
 from piavatar_envs.avatar.joint_bench import (
     JointBench,
     enter_room,
-    keep_leaving,
+    keep_lacking,
     leave_room,
     room_of_warp,
     row_in_room,
@@ -140,7 +140,7 @@ def turn_joints(
     if sum_threads(limited, threads) > 0.0:
         factorize(w.pattern, w.matrix, w.left, e, e, threads, room, 0, w.cut)
         solve(w.pattern, w.cut, 0, w.impulse, e, own, thread, threads, room, w.shares)
-    find_given(w.left, w.shares, own, e, thread, threads, w.impulse)
+    find_given(tissue, w.left, w.shares, own, e, thread, threads, w.impulse)
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     support = part_of(w.impulse, e, 0)
     moment = part_of(w.impulse, e, 3)
@@ -267,12 +267,14 @@ def act(
     add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)
     turn_joints(body, dt, target, springs, tissue, strength, n + e, own, e, thread, threads, room, near)
     go_on(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
-    spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.leaving)
-    keep_leaving(w, e, near)
+    spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.lacking)
+    keep_lacking(w, e, near)
     spread_motion(body, near.pose.position, w.velocity, e, e, thread, threads, near.moving)
     if thread == 0:
         w.pelvis[e] = near.pose.position[e, 0]
         support.force[e] = support.force[e] + per_time * part_of(w.impulse, e, 0)
         support.torque[e] = support.torque[e] + per_time * part_of(w.impulse, e, 3)
-    move_joints(body, dt, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
+    move_joints(body, 0.5 * dt, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
+    spread_motion(body, near.pose.position, w.velocity, e, e, thread, threads, near.moving)
+    move_joints(body, 0.5 * dt, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
     leave_room(w, e, near)
