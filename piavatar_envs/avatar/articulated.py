@@ -36,8 +36,10 @@ the particle were where it was: it remembers the way. Else the load would begin 
 ground would not come to rest.
 
 The last ``J`` is that of the middle of the substep, particles and pose half a step on, by the velocity they begin with
-(the explicit midpoint rule): limbs that turn keep their width. The velocity of a particle stays what it was; what the
-new ``J qdot`` is less is more in ``u``.
+(the explicit midpoint rule): limbs that turn keep their width. To it comes what skinning does besides: where bones have
+a particle at different places, each turns its own (:func:`piavatar_envs.avatar.joint_motion.motion_apart`). So ``vk``
+takes particles from their skinned places to their skinned places, however joints turn and bend. The velocity of a
+particle stays what it was; what ``vk`` is less is more in ``u``.
 
 Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
@@ -267,11 +269,11 @@ class ArticulatedBody:
         # hand back; flesh may be pulled to the bones, too: what it leaves and what it takes is summed in the same pass
         velocities = 1 if self.attachment is None else 2
         if self.attachment is not None:
-            inputs = [state.x, self.attachment, state.vk, state.failure]
-            self._record_parts(program, attach_flesh, [self.body, self._parts, dt], inputs, [state.u])
+            inputs = [state.x, self.attachment, state.failure]
+            self._record_parts(program, attach_flesh, [self.body, self._parts, dt], inputs, [state.u, state.vk])
         else:
-            inputs = [self.body, state.x, position, w.moving, state.vk, state.failure]
-            program.launch(hand_back, points, inputs, [state.u], block_dim=BLOCK)
+            inputs = [self.body, state.x, position, w.place, w.moving, state.failure]
+            program.launch(hand_back, points, inputs, [state.u, state.vk], block_dim=BLOCK)
             self._record_moments(program, state)
         inputs = [self.body, dt, 1.0 / model.control_dt, velocities, self.target, self.springs, self.tissue]
         self._record_stage(program, act, [*inputs, self.strength], state, self.support)

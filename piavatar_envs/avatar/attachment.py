@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_places
+from piavatar_envs.avatar.blending import blend_changes, blend_images, blend_places, motion_at
 from piavatar_envs.avatar.joint_bench import JointBench
-from piavatar_envs.avatar.joint_motion import skinned_motion
+from piavatar_envs.avatar.joint_motion import motion_apart
 from piavatar_envs.avatar.loads import int_at, number_at, vector_at
 from piavatar_envs.avatar.part_sums import (
     PART_BLOCK,
@@ -32,12 +32,18 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
-def pulled_place(body: Body, e: int, p: int, w: JointBench):
-    """Where a particle is pulled to [m]: its place on the bones; a firm one beyond, by what it was put back."""
+def pulled_rest(body: Body, e: int, p: int, w: JointBench):
+    """What of the rest pose a particle is pulled to [m]: its own place; a firm one beyond, by what it was put back."""
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     if p < w.slip.shape[1]:
         rest += vector_at(w.slip, e, p)
-    return blend_places(w.place, e, body.joint, body.weight, p, rest)
+    return rest
+
+
+@wp.func
+def pulled_place(body: Body, e: int, p: int, w: JointBench):
+    """Where a particle is pulled to on the bones [m]."""
+    return blend_places(w.place, e, body.joint, body.weight, p, pulled_rest(body, e, p, w))
 
 
 @wp.kernel(launch_bounds=(PART_BLOCK, 5))
@@ -93,17 +99,17 @@ def attach_flesh(
     mass: wp.array2d(dtype=float),
     x: wp.array2d(dtype=wp.vec3),
     rate: wp.array2d(dtype=float),
-    vk: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     scratch: wp.array(dtype=vec12),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
     w: JointBench,
 ):
     """Hand back, and pull every particle to its place on the bones, implicit in time and critically damped.
 
-    What a new pose has changed of ``J qdot`` goes to the physical velocity, as
-    :func:`piavatar_envs.avatar.joint_motion.hand_back` has it. ``rate`` is the pull's [1/s]. Of what it has taken of
+    What a new pose has changed of ``J qdot`` goes to the physical velocity, and ``vk`` keeps a part, as
+    :func:`piavatar_envs.avatar.joint_motion.hand_back` has them. ``rate`` is the pull's [1/s]. Of what it has taken of
     the velocity, and of what it leaves, the bones get the moments. Launched as :func:`sum_displacement`.
     """
     i, j, k = wp.tid()
@@ -128,8 +134,12 @@ def attach_flesh(
         n = body.first + wp.min(p + threads, last - 1)
         following = vector_at(x, e, n)
         following_v = vector_at(u, e, n) + vector_at(vk, e, n)
-        before = v - skinned_motion(body, w.moving, e, p, place - pelvis)
-        way = pulled_place(body, e, p, w) - place
+        now = blend_changes(w.moving, e, body.joint, body.weight, p)
+        images = blend_images(w.place, w.moving, e, body.joint, body.weight, p, pulled_rest(body, e, p, w), pelvis)
+        apart = motion_apart(images, now)
+        before = v - motion_at(now, place - pelvis) - apart
+        way = wp.vec3(images[0], images[1], images[2]) + pelvis - place
+        vk[e, body.first + p] = apart
         after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
         bring_particle(room, WORDS * (p - first), number_at(mass, r, body.first + p), place, before - after, after)
         p += threads

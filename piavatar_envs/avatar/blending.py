@@ -196,6 +196,57 @@ def blend_places(
     ...
 
 
+@wp.func_native(
+    _INFLUENCES
+    + """
+wp::vec_t<8, wp::float32> sum;
+const auto* const places = &wp::index(place, e, 0);
+const auto* const motions = &wp::index(motion, e, 0);
+#pragma unroll
+for (int n = 0; n < 4; ++n) {
+    const wp::float32 w = weights[n];
+    if (w <= 0.0f) continue;
+    const auto& bone = places[bones[n]];
+    const auto& own = motions[bones[n]];
+    wp::float32 image[3];
+#if defined(__CUDA_ARCH__)
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        const float4 row = reinterpret_cast<const float4*>(&bone)[i];
+        image[i] = row.x * rest[0] + row.y * rest[1] + row.z * rest[2] + row.w - center[i];
+    }
+    const float4* const from = reinterpret_cast<const float4*>(&own);
+    const float4 a = from[0], b = from[1];
+    const wp::float32 s0 = a.w, s1 = b.x, s2 = b.y;
+#else
+    for (int i = 0; i < 3; ++i) {
+        const auto& row = bone.data[i];
+        image[i] = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3] - center[i];
+    }
+    const wp::float32 s0 = own[3], s1 = own[4], s2 = own[5];
+#endif
+    for (int i = 0; i < 3; ++i) sum[i] += w * image[i];
+    sum[3] += w * (s1 * image[2] - s2 * image[1]);
+    sum[4] += w * (s2 * image[0] - s0 * image[2]);
+    sum[5] += w * (s0 * image[1] - s1 * image[0]);
+}
+return sum;
+"""
+)
+def blend_images(
+    place: wp.array2d(dtype=wp.mat44),
+    motion: wp.array2d(dtype=vec8),
+    e: int,
+    joint: wp.array(dtype=wp.vec4i),
+    weight: wp.array(dtype=wp.vec4),
+    p: int,
+    rest: wp.vec3,
+    center: wp.vec3,
+) -> vec8:
+    """:func:`blend_places` less the ``center``, and of its bones' spins what they do to their own places."""
+    ...
+
+
 @wp.func
 def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int):
     """Where linear blend skinning has a particle [m]; ``place`` takes bones from rest to where they are."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_changes, motion_at
+from piavatar_envs.avatar.blending import blend_changes, blend_images, motion_at
 from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, threads_of_environment
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
@@ -114,6 +114,18 @@ def skinned_motion(body: Body, field: wp.array2d(dtype=vec8), e: int, p: int, ar
     return motion_at(blend_changes(field, e, body.joint, body.weight, p), arm)
 
 
+@wp.func
+def motion_apart(images: vec8, change: vec8):
+    """What bones move a particle by besides the blend of their motions at its place, see :func:`blend_images` [m/s].
+
+    Linear blend skinning has a particle where its bones have it in the mean. In a bent joint they have it at places
+    that are centimetres apart, and each turns its own: the mean of that is not what their mean motion does to the mean
+    place. Without it particles would leave their places with every turn. Rigid motion has nothing of it.
+    """
+    mean = wp.vec3(images[0], images[1], images[2])
+    return wp.vec3(images[3], images[4], images[5]) - wp.cross(wp.vec3(change[3], change[4], change[5]), mean)
+
+
 @wp.kernel(launch_bounds=(BLOCK, 10))
 def take_over(
     body: Body,
@@ -125,7 +137,6 @@ def take_over(
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
-    # out
     driven: Kinematic,
 ):
     """Write ``J qdot`` of the middle of the substep, and leave the physical velocity what it is not of the whole one.
@@ -134,6 +145,7 @@ def take_over(
     ``theta`` in a substep would be ``theta^2 / 2`` further from its axis, of which no stress knows: limbs would swell
     within seconds. The whole velocity is the physical one and what that is ``lacking``, a motion about where the
     ``pelvis`` joint begins [m]; what the bones are ``moving`` with is one about where it is half-way.
+    To that comes what ``vk`` has kept, see :func:`hand_back`.
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -158,7 +170,8 @@ def take_over(
         now = blend_changes(moving, e, body.joint, body.weight, p)
         half = 0.5 * dt * (motion_at(now, arm) - wp.vec3(root[0], root[1], root[2]))
         vk = motion_at(now, arm + half)
-        store_velocities(u, driven, e, body.first + p, whole - vk, vk, wp.vec3(now[3], now[4], now[5]), True)
+        apart = vector_at(driven.vk, e, body.first + p)
+        store_velocities(u, driven, e, body.first + p, whole - vk, vk + apart, wp.vec3(now[3], now[4], now[5]), True)
         p += threads
 
 
@@ -167,13 +180,17 @@ def hand_back(
     body: Body,
     x: wp.array2d(dtype=wp.vec3),
     position: wp.array2d(dtype=wp.vec3),
+    place: wp.array2d(dtype=wp.mat44),
     moving: wp.array2d(dtype=vec8),
-    vk: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
 ):
-    """What a new pose has changed of ``J qdot`` goes to the physical velocity; :func:`take_over` writes the new one."""
+    """What a new pose has changed of ``J qdot`` goes to the physical velocity; :func:`take_over` writes the new one.
+
+    What the bones move a particle by besides, :func:`motion_apart`, stays in ``vk``, as it is now.
+    """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
     own = first_particle(i, threads)
@@ -182,8 +199,13 @@ def hand_back(
         return
     p = own[1]
     while p < body.count:
-        v = skinned_motion(body, moving, e, p, x[e, body.first + p] - position[e, 0])
+        center = position[e, 0]
+        rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+        now = blend_changes(moving, e, body.joint, body.weight, p)
+        apart = motion_apart(blend_images(place, moving, e, body.joint, body.weight, p, rest, center), now)
+        v = motion_at(now, x[e, body.first + p] - center) + apart
         u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
+        vk[e, body.first + p] = apart
         p += threads
 
 

@@ -118,14 +118,24 @@ class Joints:
                 J[:, :, 3 + 3 * c + axis] = share[:, c, None] * np.cross(np.eye(3)[axis], arm)
         return J
 
-    def halfway(self, velocity) -> np.ndarray:
-        """``J`` half a step on, bones and particles moved by a velocity of the joints."""
-        s, half, rest = self.body.state, 0.5 * self.model.step.dt, self.rig.points.joints[0].astype(float)
+    def moved(self, velocity, time) -> tuple[np.ndarray, np.ndarray]:
+        """Local rotations, ``(22, 3, 3)``, and place of the pelvis after a time [s] at a velocity of the joints."""
+        s = self.body.state
         spin = carried_by().T @ velocity[3:].reshape(NUM_JOINTS, 3)  # a bone spins with all joints that carry it
         begin = Rotation.from_quat(s.rotation.numpy()[0].astype(float))
-        world = (Rotation.from_rotvec(half * spin) * begin).as_matrix()
+        world = (Rotation.from_rotvec(time * spin) * begin).as_matrix()
         local = np.stack([world[0], *(world[PARENTS[b]].T @ world[b] for b in range(1, NUM_JOINTS))])
-        _, positions = forward_kinematics(local, s.position.numpy()[0, 0] + half * velocity[:3], rest)
+        return local, s.position.numpy()[0, 0].astype(float) + time * velocity[:3]
+
+    def skinning(self, velocity) -> np.ndarray:
+        """Velocity of the skinned places, by central differences, shape ``(P, 3)``."""
+        after, before = (self.rig.skinned(*self.moved(velocity, time)) for time in (1e-4, -1e-4))
+        return (after - before) / 2e-4
+
+    def halfway(self, velocity) -> np.ndarray:
+        """``J`` half a step on, bones and particles moved by a velocity of the joints."""
+        half = 0.5 * self.model.step.dt
+        _, positions = forward_kinematics(*self.moved(velocity, half), self.rig.points.joints[0].astype(float))
         return self.jacobian_at(self.rig.read("x") + half * (self.jacobian @ velocity), positions)
 
     @property
@@ -228,6 +238,28 @@ def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
     bones = carried_by().T @ got[3:].reshape(NUM_JOINTS, 3)  # a bone spins with all joints that carry it
     weights = made.rig.weights / made.rig.weights.sum(1, keepdims=True)
     np.testing.assert_allclose(made.rig.read("spin"), weights @ bones, atol=1e-4)
+
+
+@pytest.mark.parametrize("attachment", [None, 200.0])
+def test_particles_go_from_skinned_places_to_skinned_places(make_rig, wild_pose, attachment):
+    """Where a wild pose bends the joints, too: there ``J qdot`` alone, at a particle, is another velocity."""
+    rng = np.random.default_rng(2)
+    made = Joints(make_rig(cells=16), attachment=attachment).pose(wild_pose(rng))
+    velocity = rng.normal(0.0, 3.0, NUM_DOF)
+    made.body.state.velocity.assign(velocity[None].astype(np.float32))
+    made.state.u.zero_()
+    made.state.vk.assign(made.skinning(velocity)[None].astype(np.float32))
+    home, dt = made.rig.read("x"), made.model.step.dt
+    alone = made.halfway(velocity) @ velocity
+    made.run("record_substep", refresh=False)
+    got, now = made.body.state.velocity.numpy()[0].astype(float), made.body.state.rotation.numpy()[0].astype(float)
+    np.testing.assert_allclose(got, velocity, atol=0.02 * np.abs(velocity).max())
+    world = Rotation.from_quat(now).as_matrix()
+    local = np.stack([world[0], *(world[PARENTS[b]].T @ world[b] for b in range(1, NUM_JOINTS))])
+    way = made.rig.skinned(local, made.body.state.position.numpy()[0, 0].astype(float)) - home
+    off = np.linalg.norm(dt * made.rig.read("vk") - way, axis=1).max()
+    assert off < 0.1 * np.linalg.norm(dt * alone - way, axis=1).max()
+    assert np.linalg.norm(dt * alone - way, axis=1).max() > 1e-3 * np.linalg.norm(way, axis=1).max()
 
 
 @pytest.mark.parametrize("stale", [False, True], ids=["fresh", "stale"])
