@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_changes, blend_images, blend_places, motion_at
+from piavatar_envs.avatar.blending import blend_images, blend_places
 from piavatar_envs.avatar.joint_bench import JointBench
-from piavatar_envs.avatar.joint_motion import motion_apart
+from piavatar_envs.avatar.joint_motion import blended_motion, motion_apart
 from piavatar_envs.avatar.loads import int_at, number_at, vector_at
 from piavatar_envs.avatar.part_sums import (
     PART_BLOCK,
@@ -134,11 +134,10 @@ def attach_flesh(
         n = body.first + wp.min(p + threads, last - 1)
         following = vector_at(x, e, n)
         following_v = vector_at(u, e, n) + vector_at(vk, e, n)
-        now = blend_changes(w.moving, e, body.joint, body.weight, p)
-        images = blend_images(w.place, w.moving, e, body.joint, body.weight, p, pulled_rest(body, e, p, w), pelvis)
-        apart = motion_apart(images, now)
-        before = v - motion_at(now, place - pelvis) - apart
-        way = wp.vec3(images[0], images[1], images[2]) + pelvis - place
+        now = blend_images(w.place, w.moving, e, body.joint, body.weight, p, pulled_rest(body, e, p, w), pelvis)
+        apart = motion_apart(now)
+        before = v - blended_motion(now, place - pelvis) - apart
+        way = wp.vec3(now[6], now[7], now[8]) + pelvis - place
         vk[e, body.first + p] = apart
         after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
         bring_particle(room, WORDS * (p - first), number_at(mass, r, body.first + p), place, before - after, after)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.loads import vector_at
-from piavatar_envs.avatar.types import Body, vec8, vec24, vec44
+from piavatar_envs.avatar.types import Body, vec8, vec12, vec24, vec44
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False})
@@ -199,7 +199,7 @@ def blend_places(
 @wp.func_native(
     _INFLUENCES
     + """
-wp::vec_t<8, wp::float32> sum;
+wp::vec_t<12, wp::float32> sum;
 const auto* const places = &wp::index(place, e, 0);
 const auto* const motions = &wp::index(motion, e, 0);
 #pragma unroll
@@ -217,18 +217,22 @@ for (int n = 0; n < 4; ++n) {
     }
     const float4* const from = reinterpret_cast<const float4*>(&own);
     const float4 a = from[0], b = from[1];
-    const wp::float32 s0 = a.w, s1 = b.x, s2 = b.y;
+    const wp::float32 v[3] = {a.x, a.y, a.z}, s[3] = {a.w, b.x, b.y};
 #else
     for (int i = 0; i < 3; ++i) {
         const auto& row = bone.data[i];
         image[i] = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3] - center[i];
     }
-    const wp::float32 s0 = own[3], s1 = own[4], s2 = own[5];
+    const wp::float32 v[3] = {own[0], own[1], own[2]}, s[3] = {own[3], own[4], own[5]};
 #endif
-    for (int i = 0; i < 3; ++i) sum[i] += w * image[i];
-    sum[3] += w * (s1 * image[2] - s2 * image[1]);
-    sum[4] += w * (s2 * image[0] - s0 * image[2]);
-    sum[5] += w * (s0 * image[1] - s1 * image[0]);
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
+        sum[i] += w * v[i];
+        sum[3 + i] += w * s[i];
+        sum[6 + i] += w * image[i];
+        sum[9 + i] += w * (s[j] * image[k] - s[k] * image[j]);
+    }
 }
 return sum;
 """
@@ -242,8 +246,11 @@ def blend_images(
     p: int,
     rest: wp.vec3,
     center: wp.vec3,
-) -> vec8:
-    """:func:`blend_places` less the ``center``, and of its bones' spins what they do to their own places."""
+) -> vec12:
+    """Of a motion :func:`blend_changes`; :func:`blend_places` less the ``center``; and what the bones' spins do there.
+
+    Each bone's spin turns its own place of the particle about the centre.
+    """
     ...
 
 

@@ -14,7 +14,7 @@ from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, thre
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.avatar.types import Body, vec8
+from piavatar_envs.avatar.types import Body, vec8, vec12
 from piavatar_envs.mpm.stores import store_velocities
 from piavatar_envs.mpm.types import Kinematic, row
 
@@ -115,15 +115,20 @@ def skinned_motion(body: Body, field: wp.array2d(dtype=vec8), e: int, p: int, ar
 
 
 @wp.func
-def motion_apart(images: vec8, change: vec8):
-    """What bones move a particle by besides the blend of their motions at its place, see :func:`blend_images` [m/s].
+def motion_apart(b: vec12):
+    """What bones move a particle by besides the blend of their motions at its place; of :func:`blend_images` [m/s].
 
     Linear blend skinning has a particle where its bones have it in the mean. In a bent joint they have it at places
     that are centimetres apart, and each turns its own: the mean of that is not what their mean motion does to the mean
     place. Without it particles would leave their places with every turn. Rigid motion has nothing of it.
     """
-    mean = wp.vec3(images[0], images[1], images[2])
-    return wp.vec3(images[3], images[4], images[5]) - wp.cross(wp.vec3(change[3], change[4], change[5]), mean)
+    return wp.vec3(b[9], b[10], b[11]) - wp.cross(wp.vec3(b[3], b[4], b[5]), wp.vec3(b[6], b[7], b[8]))
+
+
+@wp.func
+def blended_motion(b: vec12, arm: wp.vec3):
+    """The blend of the bones' motions, ``arm`` from where their velocity is; of :func:`blend_images` [m/s]."""
+    return wp.vec3(b[0], b[1], b[2]) + wp.cross(wp.vec3(b[3], b[4], b[5]), arm)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 10))
@@ -168,10 +173,11 @@ def take_over(
         following_u = vector_at(u, e, n)
         whole = before + skinned_motion(body, lacking, e, p, arm)
         now = blend_changes(moving, e, body.joint, body.weight, p)
-        half = 0.5 * dt * (motion_at(now, arm) - wp.vec3(root[0], root[1], root[2]))
-        vk = motion_at(now, arm + half)
+        spin = wp.vec3(now[3], now[4], now[5])
+        vk = motion_at(now, arm)
+        vk += wp.cross(0.5 * dt * spin, vk - wp.vec3(root[0], root[1], root[2]))
         apart = vector_at(driven.vk, e, body.first + p)
-        store_velocities(u, driven, e, body.first + p, whole - vk, vk + apart, wp.vec3(now[3], now[4], now[5]), True)
+        store_velocities(u, driven, e, body.first + p, whole - vk, vk + apart, spin, True)
         p += threads
 
 
@@ -201,9 +207,9 @@ def hand_back(
     while p < body.count:
         center = position[e, 0]
         rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-        now = blend_changes(moving, e, body.joint, body.weight, p)
-        apart = motion_apart(blend_images(place, moving, e, body.joint, body.weight, p, rest, center), now)
-        v = motion_at(now, x[e, body.first + p] - center) + apart
+        now = blend_images(place, moving, e, body.joint, body.weight, p, rest, center)
+        apart = motion_apart(now)
+        v = blended_motion(now, x[e, body.first + p] - center) + apart
         u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
         vk[e, body.first + p] = apart
         p += threads
