@@ -8,8 +8,9 @@ lets torques act on them:
     (M + A) d = dt (K e + tau) - A (qdot + c),   A = dt D + dt^2 K
     qdot <- qdot + d + c,   u <- u - J c,   vk = J qdot
 
-``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each. To
-``M = J^T m J`` light joints have some inertia added, see :func:`piavatar_envs.avatar.joint_mass.grid_inertia`.
+``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each.
+Light joints take over less than all: to the first ``M = J^T m J`` some inertia is added, of which torques know nothing,
+see :func:`piavatar_envs.avatar.joint_mass.grid_inertia`.
 ``c`` is what all else, contact, weight and flesh, did to the joints in the last substep, and is expected to do again.
 The springs know of it, see :mod:`piavatar_envs.avatar.joint_torques`, and so does the split: the joints go on with
 the velocity that will be left of their push, and the rest of the push, ``-J c``, waits in ``u`` for what is to stop
@@ -207,9 +208,8 @@ class ArticulatedBody:
         self, damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int]
     ) -> None:
         """Let joints resist; see :func:`make_tissue`. To be called before anything is recorded."""
-        device = self.model.device
-        self.tissue = make_tissue(damping, stop, lower, upper, self._inertia, locked, device)
-        besides = np.r_[np.zeros(3), np.repeat(self.tissue.inertia.numpy(), 3)]
+        self.tissue = make_tissue(damping, stop, lower, upper, locked, self.model.device)
+        besides = np.r_[np.zeros(3), np.repeat(self._inertia + self.tissue.lock.numpy(), 3)]
         own = self._bench.diagonals[: self.model.num_envs]
         own.assign(np.broadcast_to(besides.astype(np.float32), own.shape))
 

@@ -10,31 +10,35 @@ from piavatar_envs.avatar.cholesky import factor_size, find_pattern
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF, filled_entries
 from piavatar_envs.avatar.mass_pairs import build_pairs, sum_pairs
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import Model, State
 
-#: What joints know of the inertia that flesh has on the grid. Without it 14 of 32 ``tiny`` bodies that lie on the floor
-#: fail within 200 control steps of random torques; with it none of 48 does, nor with three times as many substeps.
-GRID_SHARE = 0.25
-TRUNK = ("pelvis", "spine1", "spine2", "spine3")
+#: What joints know of the inertia that flesh has on the grid. Without it 20 of 48 ``tiny`` bodies that lie on the floor
+#: fail within 200 control steps of random torques, with it 1 of 96.
+GRID_SHARE = 0.5
+#: Joints whose limbs are thinner than a cell.
+LIGHT = ("left_elbow", "right_elbow", "left_wrist", "right_wrist")
 
 
 def grid_inertia(points: BodyPoints, dx: float) -> np.ndarray:
-    """Inertia of joints besides that of the limbs they move, for the grid's sake, ``(22,)`` [kg m^2].
+    """Inertia besides that of its limb with which a light joint takes over what particles do, ``(22,)`` [kg m^2].
 
     Between particles and nodes matter is spread: with quadratic weights by ``dx^2/4`` along each axis, as mean square
     (``D_p`` of Jiang et al. 2015), so that flesh of mass ``m`` turns on the grid with ``m dx^2/2`` besides its own
-    inertia. Joints that know nothing of it turn a hand that is smaller than a cell by more than the grid lets it go,
-    and the two throw it about until it fails. A share of it is enough; what it is for has a name in other engines,
-    ``armature``. The mass is that of the bones' own flesh in the shape that the body is built with. The trunk, which is
-    several cells thick, has none: a spine that resists so would bend by a tenth more under a ball of 8 kg.
+    inertia. Joints that know nothing of it take over more from a hand than the grid lets it have, and the two throw it
+    about until it fails. A share of it is enough. What is not taken over stays with the particles: no momentum is
+    lost, and no load that stays. The mass is that of the bones' own flesh in the shape that the body is built with.
+
+    Torques are to know nothing of it, or what reaches the ground of them would be less by this inertia than what a
+    joint gives. Other joints neither: they take over from flesh that is pulled to bones, too, of which more would be
+    missing with each (a knee that bears 23 N m would give one more).
     """
     shares = normal_weights(points) * points.mass[0][:, None]
     mass = np.bincount(points.skin_joints.ravel(), shares.ravel(), minlength=NUM_JOINTS)
-    mass[[joint_index(name) for name in TRUNK]] = 0.0
-    return GRID_SHARE * 0.5 * dx**2 * mass
+    light = np.isin(JOINT_NAMES, LIGHT)
+    return np.where(light, GRID_SHARE * 0.5 * dx**2 * mass, 0.0)
 
 
 class JointMass:

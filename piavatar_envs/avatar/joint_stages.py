@@ -140,7 +140,7 @@ def turn_joints(
     if sum_threads(limited, threads) > 0.0:
         factorize(w.pattern, w.matrix, w.left, e, e, threads, room, 0, w.cut)
         solve(w.pattern, w.cut, 0, w.impulse, e, own, thread, threads, room, w.shares)
-    find_given(tissue, w.left, w.shares, own, e, thread, threads, w.impulse)
+    find_given(w.left, w.shares, own, e, thread, threads, w.impulse)
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     support = part_of(w.impulse, e, 0)
     moment = part_of(w.impulse, e, 3)

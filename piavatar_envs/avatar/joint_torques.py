@@ -76,7 +76,7 @@ class Tissue:
     stop: wp.array(dtype=float)  # stiffness beyond the range [N m/rad]
     lower: wp.array(dtype=wp.vec3)  # range of the rotation vector relative to the rest pose [rad]
     upper: wp.array(dtype=wp.vec3)
-    inertia: wp.array(dtype=float)  # besides that of what a joint moves [kg m^2]; LOCK of what does not move at all
+    lock: wp.array(dtype=float)  # inertia of what does not move at all, else 0 [kg m^2]
 
 
 def make_strength(lower: np.ndarray, upper: np.ndarray, rows: int, device: str) -> Strength:
@@ -90,13 +90,7 @@ def make_strength(lower: np.ndarray, upper: np.ndarray, rows: int, device: str) 
 
 
 def make_tissue(
-    damping: np.ndarray,
-    stop: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    inertia: np.ndarray,
-    locked: Sequence[int],
-    device: str,
+    damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int], device: str
 ) -> Tissue:
     """What resists passively.
 
@@ -105,13 +99,12 @@ def make_tissue(
         stop: stiffness beyond their ranges, shape ``(22,)`` [N m/rad].
         lower: of the ranges of the rotation vectors, shape ``(22, 3)`` [rad].
         upper: likewise.
-        inertia: besides that of what a joint moves, shape ``(22,)`` [kg m^2].
         locked: joints that do not move: what they carry belongs to their parents.
         device: Warp device.
     """
-    inertia = inertia.copy()
-    inertia[list(locked)] = LOCK
-    numbers = {"damping": damping, "stop": stop, "inertia": inertia}
+    lock = np.zeros(len(damping))
+    lock[list(locked)] = LOCK
+    numbers = {"damping": damping, "stop": stop, "lock": lock}
     arrays = {name: wp.array(v.astype(np.float32), dtype=float, device=device) for name, v in numbers.items()}
     for name, bound in (("lower", lower), ("upper", upper)):
         arrays[name] = wp.array(bound.astype(np.float32), dtype=wp.vec3, device=device)
@@ -173,7 +166,7 @@ def implicit_diagonal(
         if wp.length(beyond(local, tissue.lower[b], tissue.upper[b])) > 0.0:
             stiff = tissue.stop[b]
         stop[e, b] = stiff
-        value += implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) + tissue.inertia[b]
+        value += implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) + tissue.lock[b]
     set_part(diagonal, into, 3 * n, wp.vec3(value))
 
 
@@ -262,7 +255,6 @@ def limit_torque(
 
 @wp.func
 def find_given(
-    tissue: Tissue,
     left: wp.array2d(dtype=float),
     change: wp.array2d(dtype=float),
     row_of_change: int,
@@ -272,9 +264,6 @@ def find_given(
     # in and out
     impulse: wp.array2d(dtype=float),
 ):
-    """The impulses that springs, muscles and tissue really give, implicit as they are."""
+    """The impulses that joints and pelvis really get, implicit as they are."""
     for i in range(thread, impulse.shape[1], threads):
-        implicit = left[e, i]
-        if i >= 6:
-            implicit -= tissue.inertia[i // 3 - 1]
-        impulse[e, i] = impulse[e, i] - implicit * change[row_of_change, i]
+        impulse[e, i] = impulse[e, i] - left[e, i] * change[row_of_change, i]

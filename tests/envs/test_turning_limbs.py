@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.wear import set_spinning, straight_growth, widths
-from piavatar_envs.avatar.joint_mass import GRID_SHARE, TRUNK
+from piavatar_envs.avatar.joint_mass import GRID_SHARE, LIGHT
 from piavatar_envs.avatar.joint_torques import LOCK
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS, joint_index
 from piavatar_envs.mpm.diagnostics import totals
 
 REACH = "PIAvatar/Reach-v0"
@@ -35,16 +36,73 @@ def test_limbs_that_turn_do_not_swell(make_batch):
     assert np.abs(widths(batch) / before - 1.0).max() < 0.1 * swelling
 
 
-def test_light_joints_have_a_share_of_the_inertia_of_the_grid(make_batch):
-    """Of ``m dx^2/2``, whatever limb hangs on them; toes are locked, and the trunk has none."""
+def test_light_joints_take_over_with_a_share_of_the_inertia_of_the_grid(make_batch):
+    """Of ``m dx^2/2``, with ``m`` of the limb that hangs on them; others have none. Toes are locked."""
     batch = make_batch(REACH, 1, control="torque")
     simulation = batch.simulation
-    inertia, sampled = simulation.avatar.joints.body.tissue.inertia.numpy(), simulation.flesh[0].sampled
-    mass, wrist = simulation.model.particles.mass.numpy()[0].astype(float), joint_index("left_wrist")
-    share = np.where(sampled.skin_joints == wrist, sampled.skin_weights, 0.0).sum(1) / sampled.skin_weights.sum(1)
-    assert inertia[wrist] == pytest.approx(GRID_SHARE * 0.5 * simulation.dx**2 * (share @ mass[: len(share)]), rel=1e-5)
-    assert all(inertia[joint_index(name)] == 0.0 for name in TRUNK)
-    assert inertia[joint_index("left_foot")] == pytest.approx(LOCK)
+    joints, sampled = simulation.avatar.joints.body, simulation.flesh[0].sampled
+    besides = joints._bench.diagonals.numpy()[0, 3:].reshape(-1, 3)
+    mass = simulation.model.particles.mass.numpy()[0].astype(float)
+    for bone, name in enumerate(JOINT_NAMES):
+        share = np.where(sampled.skin_joints == bone, sampled.skin_weights, 0.0).sum(1) / sampled.skin_weights.sum(1)
+        grid = GRID_SHARE * 0.5 * simulation.dx**2 * (share @ mass[: len(share)])
+        expected = LOCK if name.endswith("foot") else grid if name in LIGHT else 0.0
+        np.testing.assert_allclose(besides[bone], expected, rtol=1e-5)
+
+
+def weight_about_joints(batch) -> np.ndarray:
+    """Moment of the weight that hangs on each joint about it, in the world's axes, ``(22, 3)`` [N m]."""
+    simulation = batch.simulation
+    sampled, at = simulation.flesh[0].sampled, simulation.avatar.joints.state.position.numpy()[0].astype(float)
+    mass, x = simulation.model.particles.mass.numpy()[0].astype(float), simulation.state.x.numpy()[0].astype(float)
+    share = np.zeros((len(mass), len(PARENTS)))
+    for column in range(sampled.skin_joints.shape[1]):
+        np.add.at(share, (np.arange(len(mass)), sampled.skin_joints[:, column]), sampled.skin_weights[:, column])
+    share /= share.sum(1, keepdims=True)
+    for bone in reversed(range(1, len(PARENTS))):
+        share[:, PARENTS[bone]] += share[:, bone]
+    force = np.array([0.0, 0.0, -9.81]) * mass[:, None]
+    return np.stack([share[:, b] @ np.cross(x - at[b], force) for b in range(len(PARENTS))])
+
+
+def spring_torques(batch) -> np.ndarray:
+    """What the springs of the joints pull with, towards the rest pose, in the world's axes, ``(22, 3)`` [N m]."""
+    joints = batch.simulation.avatar.joints
+    world = Rotation.from_quat(joints.state.rotation.numpy()[0].astype(float))
+    stiffness = joints.body.springs.stiffness.numpy()[0, 1:]
+    above = [world[max(PARENTS[b], 0)] for b in range(len(PARENTS))]
+    return np.stack([-k * a.apply((a.inv() * w).as_rotvec()) for k, a, w in zip(stiffness, above, world, strict=True)])
+
+
+def test_a_joint_at_rest_bears_the_weight_that_hangs_on_it(make_batch):
+    """Springs give exactly its moment: what light joints know of the grid's inertia resists no load that stays."""
+    batch = make_batch(REACH, 1, control="pd", pose_noise=0.0, root_assist=1.0, joints=None, scene=EMPTY["scene"])
+    batch.reset(seeds=[0])
+    for _ in range(150):
+        batch.step()
+    spring, weight = spring_torques(batch), weight_about_joints(batch)
+    moving = [b for b in range(1, len(PARENTS)) if batch.simulation.avatar.joints.body.tissue.lock.numpy()[b] == 0.0]
+    assert len(moving) == len(PARENTS) - 3  # toes are locked
+    assert np.linalg.norm(weight[moving], axis=1).min() > 0.05
+    np.testing.assert_allclose(spring[moving], -weight[moving], rtol=0.003, atol=0.01)
+
+
+@pytest.mark.parametrize("name", ["ankle", "knee"])
+def test_legs_bear_what_stands_on_them(make_batch, name):
+    """Feet press the ground, and springs give the moment of all above a joint: its weight and what holds the pelvis."""
+    batch = make_batch(REACH, 1, control="pd", pose_noise=0.0, root_assist=1.0, joints=None, episode_seconds=20.0)
+    batch.reset(seeds=[0])
+    for _ in range(100):
+        batch.step()
+    simulation, joints = batch.simulation, [joint_index(f"{side}_{name}") for side in ("left", "right")]
+    pelvis, at = simulation.avatar.joints.body.support, simulation.avatar.joints.state.position.numpy()[0].astype(float)
+    axis = at[joints].mean(0)
+    mass, x = simulation.model.particles.mass.numpy()[0].astype(float), simulation.state.x.numpy()[0].astype(float)
+    weight = np.cross(x - axis, np.array([0.0, 0.0, -9.81]) * mass[:, None]).sum(0)
+    held = pelvis.torque.numpy()[0] + np.cross(at[0] - axis, pelvis.force.numpy()[0])
+    above = weight - weight_about_joints(batch)[joints].sum(0) + held
+    assert above[0] > 15.0  # [N m]
+    assert spring_torques(batch)[joints, 0].sum() == pytest.approx(above[0], rel=0.04)
 
 
 @pytest.mark.parametrize("firm", [False, True])
