@@ -165,18 +165,20 @@ def take_over(
     n = body.first + wp.min(p, last)
     following = vector_at(x, e, n)
     following_u = vector_at(u, e, n)
+    following_apart = vector_at(driven.vk, e, n)
     while p < body.count:
         arm = following - center
         before = following_u
+        apart = following_apart
         n = body.first + wp.min(p + threads, last)
         following = vector_at(x, e, n)
         following_u = vector_at(u, e, n)
+        following_apart = vector_at(driven.vk, e, n)
         whole = before + skinned_motion(body, lacking, e, p, arm)
         now = blend_changes(moving, e, body.joint, body.weight, p)
         spin = wp.vec3(now[3], now[4], now[5])
         vk = motion_at(now, arm)
         vk += wp.cross(0.5 * dt * spin, vk - wp.vec3(root[0], root[1], root[2]))
-        apart = vector_at(driven.vk, e, body.first + p)
         store_velocities(u, driven, e, body.first + p, whole - vk, vk + apart, spin, True)
         p += threads
 
