@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.wear import set_spinning, straight_growth, widths
-from piavatar_envs.avatar.joint_mass import GRID_SHARE, LIGHT
+from piavatar_envs.avatar.joint_mass import GRID_SHARES
 from piavatar_envs.avatar.joint_torques import LOCK
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS, joint_index
 from piavatar_envs.mpm.diagnostics import totals
@@ -45,8 +45,8 @@ def test_light_joints_take_over_with_a_share_of_the_inertia_of_the_grid(make_bat
     mass = simulation.model.particles.mass.numpy()[0].astype(float)
     for bone, name in enumerate(JOINT_NAMES):
         share = np.where(sampled.skin_joints == bone, sampled.skin_weights, 0.0).sum(1) / sampled.skin_weights.sum(1)
-        grid = GRID_SHARE * 0.5 * simulation.dx**2 * (share @ mass[: len(share)])
-        expected = LOCK if name.endswith("foot") else grid if name in LIGHT else 0.0
+        known = GRID_SHARES.get(name.split("_")[-1], 0.0)
+        expected = LOCK if name.endswith("foot") else known * 0.5 * simulation.dx**2 * (share @ mass[: len(share)])
         np.testing.assert_allclose(besides[bone], expected, rtol=1e-5)
 
 
