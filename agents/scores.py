@@ -14,6 +14,7 @@ then takes the place of the training's own; what the training took, and zero and
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import sys
@@ -105,17 +106,17 @@ def _rows(
 
 
 def _same_environment(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two runs have one environment; a setting that a run does not know yet has its default there."""
-    return _environment(one) == _environment(other)
+    """Whether two runs have one environment."""
+    first, second = one["config"], other["config"]
+    alike = first["env_id"] == second["env_id"]
+    return alike and _known(first["env_id"], first["env"]) == _known(second["env_id"], second["env"])
 
 
-def _environment(run: Mapping[str, Any]) -> dict[str, Any]:
-    env_id, settings = run["config"]["env_id"], run["config"]["env"]
-    try:
-        known = load_config(load_task(env_id).Config, settings).model_dump(mode="json")
-    except ValueError:  # a world of several agents, or settings that are no longer there
-        known = settings
-    return {"env_id": env_id} | flattened(known)
+def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """All settings of an environment by dotted name; one that a run does not know yet has its default there."""
+    with contextlib.suppress(ValueError):  # a world of several agents, or settings that are no longer there
+        settings = load_config(load_task(env_id).Config, settings).model_dump(mode="json")
+    return flattened({"env": settings})
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -207,10 +208,11 @@ def _check_evaluation(evaluation: Mapping[str, Any], run: Mapping[str, Any], fol
         raise ValueError(f"{path} is of a policy, but {folder / 'results.json'} has no row 'trained'; remove {path}")
     # a run that is named by a link has the name of its folder
     wanted = {"benchmark": "play", "run": folder.resolve().name}
-    wanted |= flattened({"env": run["config"]["env"], "first_seed": seeds})
+    env_id = run["config"]["env_id"]
+    wanted |= _known(env_id, run["config"]["env"]) | flattened({"first_seed": seeds})
     found = {key: evaluation.get(key) for key in ("benchmark", "run")}
     seeds = {row["case"]: row["first_seed"] for row in evaluation.get("results", ())}
-    found |= flattened({"env": evaluation.get("env", {}), "first_seed": seeds})
+    found |= _known(env_id, evaluation.get("env", {})) | flattened({"first_seed": seeds})
     for key in wanted | found:
         if found.get(key) != wanted.get(key):
             raise ValueError(

@@ -130,6 +130,18 @@ def test_a_later_evaluation_takes_the_place_of_the_trainings_own(runs, tmp_path,
     assert report["commits"] == ["abc", "def"] and report["devices"] == ["another GPU", "some GPU"]
 
 
+def test_a_setting_that_the_training_did_not_know_has_its_default_in_a_later_evaluation(runs, tmp_path, capsys):
+    env_id, folder = "PIAvatar/Stand-v0", tmp_path / "stand_0"
+    folder.mkdir()
+    older = runs["stand_0"]["config"] | {"env_id": env_id, "env": {"physics": {"fidelity": "coarse"}}}
+    (folder / "results.json").write_text(json.dumps(runs["stand_0"] | {"config": older}))
+    later(folder, env=older["env"] | {"drive": {"firm_bones": False}})
+    scores.main([str(folder), "--out", str(tmp_path / "table.json")])
+    later(folder, env=older["env"] | {"drive": {"firm_bones": True}})
+    with pytest.raises(SystemExit, match=r"env\.drive\.firm_bones=True, of this run it would have False"):
+        scores.main([str(folder)])
+
+
 @pytest.mark.parametrize(
     ("run_name", "more", "words"),
     [
