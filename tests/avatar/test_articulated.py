@@ -222,6 +222,7 @@ def test_mass_matrix_is_that_of_the_jacobian(joints, seed):
 def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
     """``(M + I) dq = J^T m v``; they move with ``J dq`` half a step on, and what is left is physical."""
     made = joints()
+    made.state.u.assign(0.5 * made.state.u.numpy())  # half a step turns joints by 0.09 rad at most
     before, J, m = made.total, made.jacobian, made.rig.mass
     expected = np.linalg.solve(np.einsum("p,pia,pib->ab", m, J, J) + np.diag(made.besides), momentum_of(J, m, before))
     vk = made.halfway(expected) @ expected
@@ -234,7 +235,7 @@ def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
     size = np.sqrt(np.einsum("p,pia,pia->a", m, J, J))
     assert np.abs(left / size).max() < 2e-3 * np.abs(momentum_of(J, m, before) / size).max()
     straight = np.abs(vk - J @ expected).max()
-    assert np.abs(made.rig.read("vk") - vk).max() < max(1e-4, 0.1 * straight)
+    assert np.abs(made.rig.read("vk") - vk).max() < max(1e-4, 0.05 * straight)
     bones = carried_by().T @ got[3:].reshape(NUM_JOINTS, 3)  # a bone spins with all joints that carry it
     weights = made.rig.weights / made.rig.weights.sum(1, keepdims=True)
     np.testing.assert_allclose(made.rig.read("spin"), weights @ bones, atol=1e-4)

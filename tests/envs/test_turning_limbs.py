@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.wear import set_spinning, straight_growth, widths
+from piavatar_envs.avatar.asset import dense_weights
 from piavatar_envs.avatar.joint_mass import GRID_SHARES
 from piavatar_envs.avatar.joint_torques import LOCK
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS, joint_index
@@ -42,11 +43,12 @@ def test_light_joints_take_over_with_a_share_of_the_inertia_of_the_grid(make_bat
     simulation = batch.simulation
     joints, sampled = simulation.avatar.joints.body, simulation.flesh[0].sampled
     besides = joints._bench.diagonals.numpy()[0, 3:].reshape(-1, 3)
-    mass = simulation.model.particles.mass.numpy()[0].astype(float)
+    mass = simulation.model.particles.mass.numpy()[0].astype(float) @ dense_weights(
+        sampled.skin_joints, sampled.skin_weights
+    )
     for bone, name in enumerate(JOINT_NAMES):
-        share = np.where(sampled.skin_joints == bone, sampled.skin_weights, 0.0).sum(1) / sampled.skin_weights.sum(1)
         known = GRID_SHARES.get(name.split("_")[-1], 0.0)
-        expected = LOCK if name.endswith("foot") else known * 0.5 * simulation.dx**2 * (share @ mass[: len(share)])
+        expected = LOCK if name.endswith("foot") else known * 0.5 * simulation.dx**2 * mass[bone]
         np.testing.assert_allclose(besides[bone], expected, rtol=1e-5)
 
 
@@ -55,10 +57,7 @@ def weight_about_joints(batch) -> np.ndarray:
     simulation = batch.simulation
     sampled, at = simulation.flesh[0].sampled, simulation.avatar.joints.state.position.numpy()[0].astype(float)
     mass, x = simulation.model.particles.mass.numpy()[0].astype(float), simulation.state.x.numpy()[0].astype(float)
-    share = np.zeros((len(mass), len(PARENTS)))
-    for column in range(sampled.skin_joints.shape[1]):
-        np.add.at(share, (np.arange(len(mass)), sampled.skin_joints[:, column]), sampled.skin_weights[:, column])
-    share /= share.sum(1, keepdims=True)
+    share = dense_weights(sampled.skin_joints, sampled.skin_weights)
     for bone in reversed(range(1, len(PARENTS))):
         share[:, PARENTS[bone]] += share[:, bone]
     force = np.array([0.0, 0.0, -9.81]) * mass[:, None]
