@@ -212,7 +212,8 @@ def _check_evaluation(evaluation: Mapping[str, Any], run: Mapping[str, Any], fol
     wanted |= _known(env_id, run["config"]["env"]) | flattened({"first_seed": seeds})
     found = {key: evaluation.get(key) for key in ("benchmark", "run")}
     seeds = {row["case"]: row["first_seed"] for row in evaluation.get("results", ())}
-    found |= _known(env_id, evaluation.get("env", {})) | flattened({"first_seed": seeds})
+    env = evaluation.get("env")  # what names none has not got the defaults
+    found |= (_known(env_id, env) if env else {}) | flattened({"first_seed": seeds})
     for key in wanted | found:
         if found.get(key) != wanted.get(key):
             raise ValueError(
