@@ -28,7 +28,7 @@ def grid_inertia(points: BodyPoints, dx: float) -> np.ndarray:
     (``D_p`` of Jiang et al. 2015), so that flesh of mass ``m`` turns on the grid with ``m dx^2/2`` besides its own
     inertia. Joints that know nothing of it take over more from a hand than the grid lets it have, and the two throw it
     about until it fails. A share of it is enough. What is not taken over stays with the particles: no momentum is
-    lost, and no load that stays. The mass is that of the bones' own flesh in the shape that the body is built with.
+    lost. The mass is that of the bones' own flesh in the shape that the body is built with.
 
     Torques are to know nothing of it, or what reaches the ground of them would be less by this inertia than what a
     joint gives. Heavier joints neither: they take over from flesh that is pulled to bones, too, and something of that
