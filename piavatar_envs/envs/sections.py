@@ -100,7 +100,7 @@ class DriveConfig(BaseModel):
         (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
     )
     firm_bones: bool = Field(
-        False,
+        True,
         description="whether particles of bones, which slip from them under load, are put into their places after "
         "every control step, unless these lie beyond a surface: tracked bones stay together",
     )
