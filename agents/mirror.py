@@ -27,6 +27,7 @@ _SCALAR, _ASIDE = (1.0,), (-1.0,)
 _VECTOR, _SPIN = (-1.0, 1.0, 1.0), (1.0, -1.0, -1.0)
 _ROOT = (-1.0, 1.0, -1.0)  # x, y, yaw
 _ROTATION = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # two columns
+_HALF_A_STRIDE = (-1.0, -1.0)  # sine and cosine of a clock
 _SIDES, _BODY, _JOINTS, _PARTS = ("left", "right"), JOINT_NAMES, JOINT_NAMES[1:], tuple(BODY_PARTS)
 
 #: What terms of observations hold: the signs of one item, and the names of the items.
@@ -50,6 +51,7 @@ _TERMS: Mapping[str, tuple[tuple[float, ...], Sequence[str]]] = {
     "reference_turns": (_SPIN, _JOINTS),
     "way_direction": (_VECTOR, ("way",)),
     "way_offset": (_ASIDE, ("way",)),
+    "gait_phase": (_HALF_A_STRIDE, ("clock",)),
 }
 
 

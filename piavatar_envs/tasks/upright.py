@@ -123,6 +123,13 @@ def still_rule(config: StillConfig) -> Still:
 
 
 @wp.func
+def tilt_of(rotation: wp.quat):
+    """Angle of a bone from the vertical, as it is in the rest pose [rad]."""
+    up = wp.quat_rotate(rotation, wp.vec3(0.0, 0.0, 1.0))
+    return wp.acos(wp.clamp(up[2], -1.0, 1.0))
+
+
+@wp.func
 def posture_of(
     rule: Upright, body: Body, e: int, rotation: wp.array2d(dtype=wp.quat), position: wp.array2d(dtype=wp.vec3)
 ):
@@ -131,8 +138,7 @@ def posture_of(
     heights = heights_of(body, e, position)
     now.head = heights[0]
     now.pelvis = heights[1]
-    up = wp.quat_rotate(rotation[e, _CHEST], wp.vec3(0.0, 0.0, 1.0))
-    now.tilt = wp.acos(wp.clamp(up[2], -1.0, 1.0))
+    now.tilt = tilt_of(rotation[e, _CHEST])
     now.high = tolerance(1.0 - now.head, 0.05, rule.height_margin)
     now.straight = tolerance(now.tilt, 0.1, rule.tilt_margin)
     return now
@@ -239,6 +245,13 @@ def foot_share(left: wp.vec3, right: wp.vec3, impulse: wp.vec3, moment: wp.vec3)
     return wp.clamp(wp.dot(center, apart) / wp.max(wp.length_sq(apart), 1.0e-6), 0.0, 1.0)
 
 
+@wp.func
+def left_foot_share(position: wp.array2d(dtype=wp.vec3), sensors: Sensors, e: int, agent: int):
+    """What the left foot bears of the ground's upward impulse in the last step, from 0 to 1."""
+    moment = sensors.boundary_moment[e, agent]
+    return foot_share(position[e, _LEFT], position[e, _RIGHT], sensors.boundary_impulse[e, agent], moment)
+
+
 @wp.kernel
 def observe_upright(
     agent: int,
@@ -252,10 +265,10 @@ def observe_upright(
     """Terms of :data:`UPRIGHT_TERMS`, from component ``start``."""
     e = wp.tid()
     write_vector(observation, e, agent, start, wp.quat_rotate_inv(rotation[e, 0], wp.vec3(0.0, 0.0, -1.0)))
-    J = sensors.boundary_impulse[e, agent]
-    share = foot_share(position[e, _LEFT], position[e, _RIGHT], J, sensors.boundary_moment[e, agent])
-    observation[e, agent, start + 3] = share * J[2]
-    observation[e, agent, start + 4] = (1.0 - share) * J[2]
+    upward = sensors.boundary_impulse[e, agent][2]
+    share = left_foot_share(position, sensors, e, agent)
+    observation[e, agent, start + 3] = share * upward
+    observation[e, agent, start + 4] = (1.0 - share) * upward
 
 
 def record_standing_outcome(env: BatchEnv, program: Program, rule: Upright, still: Still) -> None:

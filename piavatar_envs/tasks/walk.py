@@ -1,4 +1,4 @@
-"""Walk: go straight ahead at a given speed, on one's own feet."""
+"""Walk: go straight ahead at a given speed, on one's own feet, one after the other."""
 
 from __future__ import annotations
 
@@ -9,23 +9,39 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
+from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.config import DriveConfig, EnvConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.fall import FallConfig, is_down
+from piavatar_envs.tasks.gait import (
+    GAIT_DOC,
+    GAIT_TERM,
+    Gait,
+    GaitConfig,
+    gait_rule,
+    hang_arms,
+    record_observe_gait,
+    swing_arms,
+    turn_taken,
+)
 from piavatar_envs.tasks.ground import Grounding, forward_of
 from piavatar_envs.tasks.place import PlaceRule, home
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
+from piavatar_envs.tasks.spawn import record_standing
 from piavatar_envs.tasks.upright import (
     FALL_DOC,
     METRIC_DOCS,
     UPRIGHT_TERMS,
     Upright,
     UprightConfig,
+    left_foot_share,
     posture_of,
     record_observe_upright,
+    tilt_of,
     upright_rule,
     write_posture,
 )
@@ -34,6 +50,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: Mean speed over the target's that no walker shall exceed: the domain ends there.
 FASTEST = 1.5
+#: Components of what is observed of the way.
+_WAY_SIZE = 4
 
 
 class WalkConfig(EnvConfig):
@@ -42,7 +60,10 @@ class WalkConfig(EnvConfig):
     drive: DriveConfig = Field(
         default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
     )
-    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
+    upright: UprightConfig = Field(
+        default_factory=lambda: UprightConfig(tilt_margin=0.4), description="what counts as standing"
+    )
+    gait: GaitConfig = Field(default_factory=GaitConfig, description="whose turn it is to bear the body")
     fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     target_speed: float = Field(1.0, gt=0.0, le=5.0, description="how fast to go [m/s]")
@@ -63,6 +84,8 @@ class Way:
     heading_margin: float  # [rad]
     control_dt: float  # [s]
     least: wp.vec2  # shares of head and pelvis below which it has fallen
+    upright: Upright
+    gait: Gait
 
 
 @wp.func
@@ -74,24 +97,35 @@ def way_gone(way: Way, body: Body, e: int, pelvis: wp.vec3):
     return wp.vec2(wp.dot(off, ahead), wp.dot(off, left))
 
 
+@wp.func
+def fastness(way: Way, speed: float):
+    """From 0 at rest and backwards to 1 at a tenth less than the target's speed; from a tenth more on it falls.
+
+    In a straight line, as in the DeepMind Control Suite's walkers: a Gaussian about the target is flat where it matters
+    first, and who steps on the spot stays there.
+    """
+    return wp.clamp(speed / (0.9 * way.speed), 0.0, 1.0) * tolerance(speed, 1.1 * way.speed, way.speed)
+
+
 @wp.kernel
 def judge_walk(
     way: Way,
-    rule: Upright,
     body: Body,
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
     velocity: wp.array2d(dtype=wp.vec3),
     step_count: wp.array(dtype=int),
     action: wp.array3d(dtype=float),
+    sensors: Sensors,
     # out
     terms: wp.array3d(dtype=float),
     metrics: wp.array3d(dtype=float),
     success: wp.array2d(dtype=wp.bool),
     terminated: wp.array2d(dtype=wp.bool),
 ):
-    """Reward of going ahead upright, and its cost. The step counter has not moved yet."""
+    """Reward of going ahead upright and foot by foot, and its cost. The step counter has not moved yet."""
     e = wp.tid()
+    rule = way.upright
     now = posture_of(rule, body, e, rotation, position)
     ahead = forward_of(way.start.place[2])
     speed = wp.dot(velocity[e, 0], ahead)
@@ -100,11 +134,16 @@ def judge_walk(
     off_way = wp.acos(wp.clamp(wp.dot(wp.normalize(facing), ahead), -1.0, 1.0))
     gone = way_gone(way, body, e, position[e, 0])
     mean_speed = gone[0] / (way.control_dt * float(step_count[e] + 1))
-    terms[e, 0, 0] = 0.7 * now.high * tolerance(wp.abs(speed - way.speed), 0.1 * way.speed, way.speed)
-    terms[e, 0, 1] = 0.1 * now.high * tolerance(off_way, 0.1, way.heading_margin)
-    terms[e, 0, 2] = 0.1 * now.high
-    terms[e, 0, 3] = 0.1 * now.straight
-    terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
+    share = left_foot_share(position, sensors, e, 0)
+    in_turn = turn_taken(way.gait, step_count[e], share, sensors.boundary_impulse[e, 0][2])
+    hips_straight = tolerance(tilt_of(rotation[e, 0]), 0.1, rule.tilt_margin)
+    fast = fastness(way, speed)
+    terms[e, 0, 0] = 0.4 * now.high * fast
+    terms[e, 0, 1] = 0.2 * now.high * in_turn * 0.5 * (1.0 + fast)
+    terms[e, 0, 2] = 0.1 * now.high * tolerance(off_way, 0.1, way.heading_margin)
+    terms[e, 0, 3] = 0.1 * now.high
+    terms[e, 0, 4] = 0.2 * wp.min(now.straight, hips_straight)
+    terms[e, 0, 5] = -rule.control_cost * mean_square_action(action, e, 0)
     write_posture(now, e, metrics)
     metrics[e, 0, 3] = speed
     metrics[e, 0, 4] = mean_speed
@@ -141,23 +180,27 @@ class WalkTask(Task):
         *UPRIGHT_TERMS,
         ObservationTerm("way_direction", 3, "-", "root", "where to go: a unit vector"),
         ObservationTerm("way_offset", 1, "m", "world", "distance of the pelvis from the way, to the left"),
+        GAIT_TERM,
     )
-    reward_terms = ("speed", "heading", "height", "upright", "control")
+    reward_terms = ("speed", "gait", "heading", "height", "upright", "control")
     metrics = ("head_height", "pelvis_height", "tilt_deg", "speed", "mean_speed", "distance")
+    targets_about_reference = True
 
     summary = """The avatar stands on the ground with its joints a little bent at random (`pose_noise`) and shall walk
 straight ahead at `target_speed`, where it faces at first; nothing holds it but what its joints can do. Faster is no
-better than slower. The way is as long as one comes in an episode at 1.5 times the target; it ends at `lane` to either
-side."""
+better than slower, and feet shall bear the body in turn, by a clock that it sees. The way is as long as one comes in an
+episode at 1.5 times the target; it ends at `lane` to either side. The reference pose has arms that hang, and that swing
+with the clock against the legs: where arms do not act they do just that (not under `control="pose"`)."""
     reward_docs: ClassVar[Mapping[str, str]] = {
-        "speed": "0.7 while the pelvis moves ahead at `target_speed` give or take a tenth; beyond it a Gaussian that "
-        "has fallen to 0.07 after another `target_speed`; all times `height` / 0.1",
+        "speed": "from 0 for a pelvis that does not move ahead to 0.4 at 0.9 `target_speed` in a straight line; above "
+        "1.1 `target_speed` a Gaussian that has fallen to 0.04 after another one; all times `height` / 0.1",
+        "gait": f"0.2 {GAIT_DOC}; all times `height` / 0.1, and half of it times `speed` / 0.4, too",
         "heading": "0.1 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.01 "
         "after another `heading_margin`; all times `height` / 0.1",
         "height": "0.1 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that "
         "has fallen to 0.01 after another `upright.height_margin` of that height",
-        "upright": "0.1 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.01 after "
-        "another `upright.tilt_margin`",
+        "upright": "0.2 while neither chest nor pelvis tilts by more than 0.1 rad; beyond it a Gaussian that has "
+        "fallen to 0.02 after another `upright.tilt_margin`",
         "control": "`-control_cost` times the mean of the squared action components",
     }
     metric_docs: ClassVar[Mapping[str, str]] = {
@@ -173,8 +216,7 @@ side."""
     termination_doc = f"{FALL_DOC};\n- the pelvis is more than `lane` aside of the way, or beyond its end"
     picture_seconds = 0.3
     picture_actions: ClassVar[Mapping[str, float]] = {
-        "left_hip.x": 0.4, "left_knee.x": 0.1, "right_hip.x": -0.22, "right_knee.x": 0.15, "left_shoulder.x": -0.2,
-        "right_shoulder.x": 0.3,
+        "left_hip.x": 0.4, "left_knee.x": 0.1, "right_hip.x": -0.22, "right_knee.x": 0.15,
     }  # fmt: skip
 
     config: WalkConfig
@@ -193,18 +235,32 @@ side."""
         return FASTEST * self.config.target_speed * self.config.episode_seconds
 
     def allocate(self, env) -> None:
-        config, way = self.config, Way()
-        self.rule = upright_rule(config.upright, config.control_cost)
+        config, way, start = self.config, Way(), PlaceRule()
         self.grounding = Grounding(env)
-        start = PlaceRule()
+        self.reference_rotation = wp.zeros((env.num_envs, NUM_JOINTS), dtype=wp.quat, device=env.device)
         start.place = wp.vec3(*self._place())
         way.start, way.speed, way.lane, way.length = start, config.target_speed, config.lane, self._length()
         way.heading_margin, way.control_dt = config.heading_margin, config.physics.control_dt
-        way.least = config.fall.least
+        way.least, way.upright = config.fall.least, upright_rule(config.upright, config.control_cost)
+        way.gait = gait_rule(config.gait, config.physics.control_dt)
         self.way = way
 
     def record_reset(self, env, program) -> None:
-        self.grounding.record_standing(env, program, self.config.pose_noise)
+        if env.control == "pose":
+            self.grounding.record_standing(env, program, self.config.pose_noise)
+            return
+        record_standing(env, program, self.config.pose_noise)
+        command = env.simulation.avatar.state.command_rotation
+        program.launch(hang_arms, command.shape, [env.mask, self.way.gait], [command])
+        self.grounding.record_reset(env, program)
+
+    def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
+        if env.control == "pose":
+            return super().record_references(env, program)
+        state, reference = env.simulation.avatar.state, self.reference_rotation
+        inputs = [self.way.gait, env.step_count, state.command_rotation]
+        program.launch(swing_arms, reference.shape, inputs, [reference])
+        return [(reference, state.command_root)]
 
     def record_outcome(self, env, program) -> None:
         avatar = env.simulation.avatar
@@ -212,9 +268,12 @@ side."""
         program.launch(
             judge_walk,
             env.num_envs,
-            [self.way, self.rule, avatar.body, t.rotation, t.position, t.velocity, env.step_count, env.action],
+            [
+                self.way, avatar.body, t.rotation, t.position, t.velocity, env.step_count, env.action,
+                env.simulation.sensors,
+            ],
             [env.terms, env.metrics, env.success, env.terminated],
-        )
+        )  # fmt: skip
 
     def record_observe(self, env, program, agent: int, start: int) -> None:
         avatar = env.simulation.avatars[agent]
@@ -225,6 +284,7 @@ side."""
             [self.way, avatar.body, agent, at, avatar.tracked.rotation, avatar.tracked.position],
             [env.observation],
         )
+        record_observe_gait(env, program, self.way.gait, agent, at + _WAY_SIZE)
 
 
 TASK = WalkTask

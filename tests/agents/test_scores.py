@@ -135,13 +135,13 @@ def test_a_setting_that_the_training_did_not_know_has_its_default_in_a_later_eva
     folder.mkdir()
     older = runs["stand_0"]["config"] | {"env_id": env_id, "env": {"physics": {"fidelity": "coarse"}}}
     (folder / "results.json").write_text(json.dumps(runs["stand_0"] | {"config": older}))
-    later(folder, env=older["env"] | {"drive": {"firm_bones": False}})
+    later(folder, env=older["env"] | {"drive": {"firm_bones": True}})
     scores.main([str(folder), "--out", str(tmp_path / "table.json")])
     later(folder, env={})
     with pytest.raises(SystemExit, match=r"has env\.\S+=None, of this run it would have"):
         scores.main([str(folder)])
-    later(folder, env=older["env"] | {"drive": {"firm_bones": True}})
-    with pytest.raises(SystemExit, match=r"env\.drive\.firm_bones=True, of this run it would have False"):
+    later(folder, env=older["env"] | {"drive": {"firm_bones": False}})
+    with pytest.raises(SystemExit, match=r"env\.drive\.firm_bones=False, of this run it would have True"):
         scores.main([str(folder)])
 
 

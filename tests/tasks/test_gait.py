@@ -1,0 +1,101 @@
+"""A gait's clock: whose turn it is to bear the body, what that is worth, and arms that swing with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from agents.mirror import Mirror
+from piavatar_envs.avatar.skeleton import joint_index
+
+WALK = "PIAvatar/Walk-v0"
+SHOULDERS = [joint_index("left_shoulder"), joint_index("right_shoulder")]
+WRISTS = [joint_index("left_wrist"), joint_index("right_wrist")]
+
+
+def still(env) -> np.ndarray:
+    return np.zeros(env.action_space.shape, np.float32)
+
+
+def seen(env, observation, name: str) -> np.ndarray:
+    return env.observation_layout.split(observation)[name]
+
+
+def left_share(time: float, stride: float) -> float:
+    """A trapezoid: all in the first half of a stride, none in the second, a tenth of it to go over."""
+    return float(np.clip(0.5 + 0.5 * np.sin(2.0 * np.pi * time / stride) / np.sin(0.1 * np.pi), 0.0, 1.0))
+
+
+@pytest.mark.parametrize("stride", [1.0, 0.7])
+def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride):
+    """A body that leans on one foot and then on the other: the reward is that of its load and of the time."""
+    env = make_env(WALK, root_assist=0.3, pose_noise=0.0, **{"gait.stride_seconds": stride})
+    observation, _ = env.reset(seed=0)
+    assert seen(env, observation, "gait_phase") == pytest.approx([0.0, 1.0])
+    paid, dt = [], env.config.physics.control_dt
+    for step in range(60):
+        action = still(env)
+        for name in ("spine1.y", "spine2.y", "spine3.y"):
+            action[env.action_names.index(name)] = np.sign(np.sin(2.0 * np.pi * step / 40.0))
+        observation, *_, info = env.step(action)
+        phase = 2.0 * np.pi * (step + 1) * dt / stride
+        assert seen(env, observation, "gait_phase") == pytest.approx([np.sin(phase), np.cos(phase)], abs=1e-4)
+        left, right = seen(env, observation, "foot_impulses")
+        off = abs(left / (left + right) - left_share((step + 0.5) * dt, stride)) if left + right > 0.0 else np.inf
+        worth = 0.1 * 10.0 ** -((max(off - 0.2, 0.0) / 0.4) ** 2)
+        high, fast = info["reward_terms"]["height"] / 0.1, info["reward_terms"]["speed"] / 0.4
+        assert info["reward_terms"]["gait"] == pytest.approx(worth * (high + fast), abs=2e-3)
+        paid.append(info["reward_terms"]["gait"])
+    assert min(paid) < 0.02 and max(paid) > 0.09
+
+
+def test_who_does_not_stand_on_anything_is_not_in_turn(make_env):
+    env = make_env(WALK, gravity=0.0, pose_noise=0.0, ground=False)
+    env.reset(seed=0)
+    assert all(env.step(still(env))[4]["reward_terms"]["gait"] == 0.0 for _ in range(5))
+
+
+@pytest.mark.parametrize("swing", [0.3, 0.0])
+def test_arms_hang_and_swing_against_the_legs(make_env, swing):
+    """Held joints follow the reference: the left hand is in front when the clock has the right foot there."""
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, **{"gait.arm_swing": swing})
+    env.reset(seed=0)
+    tracked, ahead = env.batch.simulation.avatar.tracked, []
+    for _ in range(60):
+        env.step(still(env))
+        at = tracked.position.numpy()[0]
+        arms = at[WRISTS] - at[SHOULDERS]
+        ahead.append(-arms[:, 1])
+        assert (np.abs(arms[:, 0]) < 0.25).all() and (arms[:, 2] < -0.25).all()
+    ahead = np.array(ahead)[30:]
+    amplitude = np.ptp(ahead, axis=0) / 2.0
+    if swing == 0.0:
+        assert (amplitude < 0.01).all()
+        return
+    apart = ahead[:, 0] - ahead[:, 1]
+    # by springs that are a little late: the left hand is foremost near half a stride
+    assert (amplitude > 0.05).all() and 14 <= np.argmax(apart) <= 20 and np.argmin(apart) in (*range(6), 29)
+
+
+def test_in_pose_mode_arms_are_the_actions_own(make_env):
+    env = make_env(WALK, control="pose", pose_noise=0.0)
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(still(env))
+    local = env.batch.simulation.avatar.tracked.local.numpy()[0, SHOULDERS]
+    assert (Rotation.from_quat(local.astype(float)).magnitude() < 0.05).all()
+
+
+def test_the_mirror_is_half_a_stride_on(make_env):
+    """The same moment of the other side: who is paid for the left foot's load is, mirrored, for the right one's."""
+    env = make_env(WALK)
+    terms = [env.observation_layout["gait_phase"], env.observation_layout["foot_impulses"]]
+    mirror = Mirror(terms, ("left_hip", "right_hip"), "cpu")
+    time = 0.13
+    clock = [np.sin(2.0 * np.pi * time), np.cos(2.0 * np.pi * time)]
+    changed = mirror.observations(torch.tensor([*clock, 3.0, 1.0])).numpy()
+    later = 2.0 * np.pi * (time + 0.5)
+    assert changed == pytest.approx([np.sin(later), np.cos(later), 1.0, 3.0], abs=1e-6)
+    assert left_share(time, 1.0) == pytest.approx(1.0 - left_share(time + 0.5, 1.0))
