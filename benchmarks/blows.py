@@ -26,8 +26,8 @@ BALLS = (0.45, 1.5, 8.0)  # [kg]
 SPEED, DISTANCE = 5.0, 0.1  # of a ball that is thrown at the chest [m/s], and its way there [m]
 STIFFNESSES = (100.0, 300.0, 1000.0)  # of all joints of a body that is hit [N m/rad]
 BOUNDLESS = 1000.0  # factor on the torques of muscles, which are not to be the limit here
-# settings of ``drive``: particles of bones slip from them under load, or are put into their places after a control step
-HOLDS: dict[str, dict[str, Any]] = {"": {}, "_firm": {"firm_bones": True}}
+# settings of ``drive``: particles of bones are put into their places after a control step, or slip from them under load
+HOLDS: dict[str, dict[str, Any]] = {"": {}, "_slipping": {"firm_bones": False}}
 FINER = 4  # control steps in one of the environments': peaks are short
 SETTLING = 0.2  # last share of the time over which an error is averaged
 SPACE = Domain().including((-3.0, -10.0, -2.5), (3.0, 4.0, 5.0))  # room for what flies off
@@ -169,7 +169,7 @@ def kick(options: Options, mass: float, held: bool, hold: str, alone: Kick) -> d
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Balls of every mass at joints of every stiffness; kicks, floating and held; both with bones that slip and not."""
+    """Balls of every mass at joints of every stiffness; kicks, floating and held; with firm bones and slipping ones."""
     for hold in HOLDS:
         for mass in BALLS:
             for stiffness in STIFFNESSES:

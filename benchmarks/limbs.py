@@ -53,9 +53,12 @@ class Limbs:
         rotations: np.ndarray,
         rate: float = 0.0,
         ground: bool = False,
-        firm: bool = False,
+        firm_bones: bool = True,
     ) -> None:
-        """Build it in a pose of rotation vectors ``(22, 3)``; ``rate`` holds flesh to bones, if not zero."""
+        """Build it in a pose of rotation vectors ``(22, 3)``; ``rate`` holds flesh to bones, if not zero.
+
+        With ``firm_bones`` particles of bones are put into their places after every control step, as in environments.
+        """
         world = World(
             fidelity=options.fidelity, num_substeps=None, gravity=gravity, ground=ground, device=options.device
         )
@@ -64,7 +67,7 @@ class Limbs:
         self.rig.reset(rotations[None])
         rates = np.full((1, self.rig.points.num_points), rate) if rate > 0.0 else None
         none = np.zeros((1, 1 + NUM_JOINTS))
-        chosen = firm & (self.rig.points.bone >= 0)
+        chosen = firm_bones & (self.rig.points.bone >= 0)
         self.body = ArticulatedBody(self.rig.points, self.rig.avatar.body, self.rig.model, none, none, rates, chosen)
         local, joints = Rotation.from_rotvec(rotations), self.rig.points.joints[0].astype(float)
         world_rotations, positions = forward_kinematics(local.as_matrix(), joints[0], joints)

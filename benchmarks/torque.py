@@ -4,7 +4,8 @@
 stretches its arms out or presses its toes on the floor, and one that is asked for the rest pose (``control="pd"``, zero
 actions), with an assisted pelvis and without; what balls do to it and what it does to balls
 (:mod:`benchmarks.blows`), whether its matter stays at the bones (:mod:`benchmarks.wear`), and up to which time step and
-gains it is stable (:mod:`benchmarks.stability`).
+gains it is stable (:mod:`benchmarks.stability`). All but stability is measured both ways of
+:data:`benchmarks.blows.HOLDS`: with firm bones, as environments have them, and with slipping ones.
 """
 
 from __future__ import annotations
@@ -41,24 +42,26 @@ ARM = ("collar", "shoulder", "elbow", "wrist")
 ANKLES = ("left_ankle", "right_ankle")
 STAND_SECONDS, FALLEN = 10.0, 30.0  # how long a body is to stand [s], and the tilt of the pelvis at which it has not
 RATE = 300.0  # of the pulls that hold flesh to bones [1/s]
+# settings of ``drive``: flesh is held to bones as in environments, or by its own stiffness only
+FLESH: dict[str, dict[str, Any]] = {"_loose": {"flesh_rate": (0.0, 0.0)}, "": {}}
 REPLAYS = 30  # of a control step whose cost is measured
 MODULES = (attachment, joint_motion, joint_stages, mass_pairs)
 
 
-def flail(options: Options, rate: float) -> dict[str, Any]:
-    """A body in empty space is given one random pose after the other."""
-    limbs, poses = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), rate), flailing(options)
+def flail(options: Options, rate: float, hold: str) -> dict[str, Any]:
+    """A body in empty space is given one random pose after the other; ``hold`` is a key of :data:`HOLDS`."""
+    limbs, poses = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), rate, **HOLDS[hold]), flailing(options)
     limbs.set_springs(*FLAILING)
 
     def step(index: int) -> None:
         limbs.aim(poses[index // FLAIL_EVERY])
         limbs.program.run()
 
-    row = {"case": f"free_float_{'attached' if rate > 0.0 else 'loose'}"}
+    row = {"case": f"free_float_{'attached' if rate > 0.0 else 'loose'}{hold}"}
     return row | drift(options, limbs.rig.model, limbs.rig.state, step, limbs.gaps)
 
 
-def flail_under_pd(options: Options, name: str, hold: dict[str, Any]) -> dict[str, Any]:
+def flail_under_pd(options: Options, flesh: str, hold: str) -> dict[str, Any]:
     """The same under ``control="pd"`` of the environments: muscles with their limits, tissue, locked feet."""
     poses, (rest, root) = flailing(options), standing(0.0)
     interval = FLAIL_EVERY * PhysicsConfig().control_dt
@@ -66,10 +69,10 @@ def flail_under_pd(options: Options, name: str, hold: dict[str, Any]) -> dict[st
     def script(time: float) -> Pose:
         return (rest if time == 0.0 else poses[int(time / interval - 1e-6)]), root
 
-    act = afloat("flail", script=script, drive=hold)
+    act = afloat("flail", script=script, drive={**FLESH[flesh], **HOLDS[hold]})
     stage = Stage(act, options.fidelity, options.device)
     simulation = stage.simulation
-    row = {"case": f"free_float_pd{name}"}
+    row = {"case": f"free_float_pd{flesh}{hold}"}
     return row | drift(options, simulation.model, simulation.state, lambda _index: stage.step(), stage.gaps)
 
 
@@ -100,7 +103,7 @@ def drift(
     }
 
 
-def stretch_arms(options: Options, stiffness: float) -> dict[str, Any]:
+def stretch_arms(options: Options, stiffness: float, hold: str) -> dict[str, Any]:
     """A body whose pelvis is held stretches its arms to the sides, under gravity and against springs alone.
 
     Only the springs of the arms have the ``stiffness`` [N m/rad]; those of trunk and legs have :data:`TRUNK`.
@@ -111,7 +114,7 @@ def stretch_arms(options: Options, stiffness: float) -> dict[str, Any]:
         hanging = joints[joint_index(f"{side}_wrist")] - joints[shoulder]
         turn, _ = Rotation.align_vectors([[outwards, 0.0, 0.0]], [hanging / np.linalg.norm(hanging)])
         rotations[shoulder] = turn.as_rotvec()
-    limbs = Limbs(options, 9.81, rotations, RATE)
+    limbs = Limbs(options, 9.81, rotations, RATE, **HOLDS[hold])
     of_arms = np.isin(JOINT_NAMES[1:], [f"{side}_{name}" for side in ("left", "right") for name in ARM])
     springs = np.where(of_arms, stiffness, TRUNK)
     limbs.set_springs(springs, critical_damping(limbs.body, springs), held=True)
@@ -120,7 +123,7 @@ def stretch_arms(options: Options, stiffness: float) -> dict[str, Any]:
         limbs.program.run()
     sag = [_angle(before[side], limbs.arm(side)) for side in before]
     return {
-        "case": f"t_pose_kp_{stiffness:g}",
+        "case": f"t_pose_kp_{stiffness:g}{hold}",
         "arm_sag_deg": float(np.mean(sag)),
         **widest([limbs.gaps()]),
         "speed_m_s": float(np.abs(limbs.rig.state.u.numpy() + limbs.rig.state.vk.numpy()).max()),
@@ -130,8 +133,8 @@ def stretch_arms(options: Options, stiffness: float) -> dict[str, Any]:
 
 def press(options: Options, damping: float, hold: str) -> dict[str, Any]:
     """Ankles press the toes of a held, weightless body on the floor: what of their springs' torque arrives."""
-    firm, ankles = bool(HOLDS[hold]), [*map(joint_index, ANKLES)]
-    limbs = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), RATE, ground=True, firm=firm)
+    ankles = [*map(joint_index, ANKLES)]
+    limbs = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), RATE, ground=True, **HOLDS[hold])
     limbs.set_springs(3000.0, 100.0, held=True)
     springs = limbs.body.springs
     for array, value in ((springs.stiffness, PRESSING), (springs.damping, damping)):
@@ -186,13 +189,13 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1.0, 1.0))))
 
 
-def cost(options: Options) -> dict[str, Any]:
+def cost(options: Options, hold: str) -> dict[str, Any]:
     """What the joints cost beside the Material Point Method alone: whole control steps, and launch by launch.
 
     Steps are replayed as they are in environments, with joints and without in turn, and the fastest of each
     counts: what interrupts a thread is not its cost. Nothing weighs anything: the body stays where it is in either.
     """
-    limbs = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), RATE)
+    limbs = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), RATE, **HOLDS[hold])
     limbs.set_springs(*FLAILING, held=True)
     programs = limbs.program, limbs.record(None)
     times = [[timing.wall_times(options.device, program.run, 1)[0] for program in programs] for _ in range(REPLAYS)]
@@ -202,7 +205,7 @@ def cost(options: Options) -> dict[str, Any]:
     kernels.add(sum_moments.key)
     joints = sum(time.ms for name, time in launched.items() if name in kernels)
     return {
-        "case": "cost",
+        "case": f"cost{hold}",
         "joints_ms": whole - alone,
         "mpm_ms": alone,
         "joints_over_mpm": whole / alone - 1.0,
@@ -212,22 +215,22 @@ def cost(options: Options) -> dict[str, Any]:
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
     """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, wear, stability, the cost."""
-    for rate in (0.0, RATE):
-        yield flail(options, rate)
-    for name, hold in {"_loose": {"flesh_rate": (0.0, 0.0)}, **HOLDS}.items():
-        yield flail_under_pd(options, name, hold)
-    for stiffness in STIFFNESSES:
-        yield stretch_arms(options, stiffness)
     for hold in HOLDS:
+        for rate in (0.0, RATE):
+            yield flail(options, rate, hold)
+        for flesh in FLESH:
+            yield flail_under_pd(options, flesh, hold)
+        for stiffness in STIFFNESSES:
+            yield stretch_arms(options, stiffness, hold)
         for damping in DAMPINGS:
             yield press(options, damping, hold)
-    for hold in HOLDS:
         for assist in (0.0, 1.0):
             yield stand(options, assist, hold)
     yield from blows.cases(options)
     yield from wear.cases(options)
     yield from stability.cases(options)
-    yield cost(options)
+    for hold in HOLDS:
+        yield cost(options, hold)
 
 
 if __name__ == "__main__":

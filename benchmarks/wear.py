@@ -96,17 +96,17 @@ def straight_growth(env: BatchEnv, rate: float, steps: int) -> float:
     return float(np.expm1(0.5 * rate**2 * physics.step.dt * steps * physics.control_dt))
 
 
-def spin(options: Options) -> dict[str, Any]:
+def spin(options: Options, hold: str) -> dict[str, Any]:
     """A body in empty space that holds its pose by springs spins as a whole."""
     empty = {"gravity": 0.0, "scene": {"ground": False, "walls": False}, "root_assist": 0.0, "control": "pd"}
-    env = make(options, "PIAvatar/Reach-v0", **empty)
+    env = make(options, "PIAvatar/Reach-v0", **empty, **HOLDS[hold])
     before, steps = widths(env), round(SPIN_SECONDS / env.config.physics.control_dt)
     set_spinning(env, SPIN)
     for _ in range(steps):
         env.step()
     grown = widths(env) / before - 1.0
     return {
-        "case": "spin",
+        "case": f"spin{hold}",
         "rad_s": SPIN,
         "seconds": SPIN_SECONDS,
         "largest_growth": float(np.abs(grown).max()),
@@ -116,8 +116,8 @@ def spin(options: Options) -> dict[str, Any]:
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """A spinning body, then bodies that thrash."""
-    yield spin(options)
+    """A spinning body, then bodies that thrash; with firm bones and slipping ones."""
     for hold in HOLDS:
+        yield spin(options, hold)
         for place in PLACES:
             yield thrash(options, place, hold)
