@@ -1,6 +1,6 @@
 """Feet that bear the body in turn, by a clock, and arms that swing with them.
 
-A clock makes walking out of what gets ahead: without one, hopping on both feet does as well (Siekmann, Godse, Fern &
+A clock makes a gait out of what gets ahead: without one, hopping on both feet does as well (Siekmann, Godse, Fern &
 Hurst, "Sim-to-Real Learning of All Common Bipedal Gaits via Periodic Reward Composition", ICRA 2021). At phase 0 the
 left foot has just come down in front; it bears while the right one swings, and from half a stride on the right one
 bears. In the mirror the clock is half a stride on.
@@ -30,9 +30,9 @@ GAIT_TERM = ObservationTerm(
     "gait_phase", 2, "-", "-", "sine and cosine of the gait's clock: while the sine is positive the left foot bears"
 )
 GAIT_DOC = (
-    "while the left foot's share of what the ground bears is within 0.2 of the clock's: all of it in the first half of "
-    "every `gait.stride_seconds`, none in the second, and from one foot to the other in a tenth each; beyond it a "
-    "Gaussian that has fallen to a tenth of that after another 0.4; nothing while neither foot bears"
+    "(0 by default) while the left foot's share of what the ground bears is within 0.2 of the clock's: all of it in "
+    "the first half of every `gait.stride_seconds`, none in the second, a tenth each to go over; beyond it a Gaussian "
+    "that has fallen to a tenth after another 0.4; nothing while neither foot bears"
 )
 
 #: Share of a stride in which the load goes from one foot to the other: adults have 0.1, twice a stride (Perry &
@@ -47,10 +47,13 @@ _HANGING, _BENT = wp.constant(0.6), wp.constant(0.3)
 
 
 class GaitConfig(BaseModel):
-    """The clock of a gait."""
+    """A gait, and the clock by which it goes."""
 
     model_config = FROZEN
 
+    worth: float = Field(
+        0.0, ge=0.0, le=0.7, description="reward for feet that bear in turn, out of that of speed; 0 for no clock [-]"
+    )
     stride_seconds: float = Field(1.0, ge=0.2, le=5.0, description="time of two steps, one of each foot [s]")
     arm_swing: float = Field(
         0.3, ge=0.0, le=0.6, description="how far shoulders that do not act swing to the front and to the back [rad]"
@@ -61,6 +64,7 @@ class GaitConfig(BaseModel):
 class Gait:
     """Constants of a gait."""
 
+    worth: float  # reward
     stride: float  # [control steps]
     arm_swing: float  # [rad]
 
@@ -68,6 +72,7 @@ class Gait:
 def gait_rule(config: GaitConfig, control_dt: float) -> Gait:
     """Kernel argument."""
     rule = Gait()
+    rule.worth = config.worth
     rule.stride, rule.arm_swing = config.stride_seconds / control_dt, config.arm_swing
     return rule
 

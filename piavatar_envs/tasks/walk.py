@@ -11,7 +11,7 @@ from pydantic import Field
 
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.config import DriveConfig, EnvConfig
+from piavatar_envs.envs.config import ConfigError, DriveConfig, EnvConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.mpm.types import Sensors
@@ -60,10 +60,8 @@ class WalkConfig(EnvConfig):
     drive: DriveConfig = Field(
         default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
     )
-    upright: UprightConfig = Field(
-        default_factory=lambda: UprightConfig(tilt_margin=0.4), description="what counts as standing"
-    )
-    gait: GaitConfig = Field(default_factory=GaitConfig, description="whose turn it is to bear the body")
+    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
+    gait: GaitConfig = Field(default_factory=GaitConfig, description="feet that bear the body in turn")
     fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     target_speed: float = Field(1.0, gt=0.0, le=5.0, description="how fast to go [m/s]")
@@ -97,16 +95,6 @@ def way_gone(way: Way, body: Body, e: int, pelvis: wp.vec3):
     return wp.vec2(wp.dot(off, ahead), wp.dot(off, left))
 
 
-@wp.func
-def fastness(way: Way, speed: float):
-    """From 0 at rest and backwards to 1 at a tenth less than the target's speed; from a tenth more on it falls.
-
-    In a straight line, as in the DeepMind Control Suite's walkers: a Gaussian about the target is flat where it matters
-    first, and who steps on the spot stays there.
-    """
-    return wp.clamp(speed / (0.9 * way.speed), 0.0, 1.0) * tolerance(speed, 1.1 * way.speed, way.speed)
-
-
 @wp.kernel
 def judge_walk(
     way: Way,
@@ -137,12 +125,12 @@ def judge_walk(
     share = left_foot_share(position, sensors, e, 0)
     in_turn = turn_taken(way.gait, step_count[e], share, sensors.boundary_impulse[e, 0][2])
     hips_straight = tolerance(tilt_of(rotation[e, 0]), 0.1, rule.tilt_margin)
-    fast = fastness(way, speed)
-    terms[e, 0, 0] = 0.4 * now.high * fast
-    terms[e, 0, 1] = 0.2 * now.high * in_turn * 0.5 * (1.0 + fast)
+    fast = now.high * tolerance(wp.abs(speed - way.speed), 0.1 * way.speed, way.speed)
+    terms[e, 0, 0] = (0.7 - way.gait.worth) * fast
+    terms[e, 0, 1] = way.gait.worth * fast * in_turn * hips_straight
     terms[e, 0, 2] = 0.1 * now.high * tolerance(off_way, 0.1, way.heading_margin)
     terms[e, 0, 3] = 0.1 * now.high
-    terms[e, 0, 4] = 0.2 * wp.min(now.straight, hips_straight)
+    terms[e, 0, 4] = 0.1 * now.straight
     terms[e, 0, 5] = -rule.control_cost * mean_square_action(action, e, 0)
     write_posture(now, e, metrics)
     metrics[e, 0, 3] = speed
@@ -180,27 +168,28 @@ class WalkTask(Task):
         *UPRIGHT_TERMS,
         ObservationTerm("way_direction", 3, "-", "root", "where to go: a unit vector"),
         ObservationTerm("way_offset", 1, "m", "world", "distance of the pelvis from the way, to the left"),
-        GAIT_TERM,
     )
     reward_terms = ("speed", "gait", "heading", "height", "upright", "control")
     metrics = ("head_height", "pelvis_height", "tilt_deg", "speed", "mean_speed", "distance")
-    targets_about_reference = True
 
     summary = """The avatar stands on the ground with its joints a little bent at random (`pose_noise`) and shall walk
 straight ahead at `target_speed`, where it faces at first; nothing holds it but what its joints can do. Faster is no
-better than slower, and feet shall bear the body in turn, by a clock that it sees. The way is as long as one comes in an
-episode at 1.5 times the target; it ends at `lane` to either side. The reference pose has arms that hang, and that swing
-with the clock against the legs: where arms do not act they do just that (not under `control="pose"`)."""
+better than slower. The way is as long as one comes in an episode at 1.5 times the target; it ends at `lane` to either
+side. How it gets ahead is its own affair, and hopping on both feet does, unless `gait.worth` is set, for `control="pd"`
+or `"torque"`: then feet shall bear the body in turn, by a clock that the avatar sees (`gait_phase`), and the pose that
+targets are counted from has arms that hang and swing with the clock against the legs. Where arms do not act they do
+just that."""
     reward_docs: ClassVar[Mapping[str, str]] = {
-        "speed": "from 0 for a pelvis that does not move ahead to 0.4 at 0.9 `target_speed` in a straight line; above "
-        "1.1 `target_speed` a Gaussian that has fallen to 0.04 after another one; all times `height` / 0.1",
-        "gait": f"0.2 {GAIT_DOC}; all times `height` / 0.1, and half of it times `speed` / 0.4, too",
+        "speed": "0.7, or 0.7 - `gait.worth`, while the pelvis moves ahead at `target_speed` give or take a tenth; "
+        "beyond it a Gaussian that has fallen to 0.07 after another `target_speed`; all times `height` / 0.1",
+        "gait": f"`gait.worth` {GAIT_DOC}; all times what `speed` is of its greatest, and less where the pelvis tilts, "
+        "as `upright` is where the chest does",
         "heading": "0.1 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.01 "
         "after another `heading_margin`; all times `height` / 0.1",
         "height": "0.1 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that "
         "has fallen to 0.01 after another `upright.height_margin` of that height",
-        "upright": "0.2 while neither chest nor pelvis tilts by more than 0.1 rad; beyond it a Gaussian that has "
-        "fallen to 0.02 after another `upright.tilt_margin`",
+        "upright": "0.1 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.01 after "
+        "another `upright.tilt_margin`",
         "control": "`-control_cost` times the mean of the squared action components",
     }
     metric_docs: ClassVar[Mapping[str, str]] = {
@@ -220,6 +209,20 @@ with the clock against the legs: where arms do not act they do just that (not un
     }  # fmt: skip
 
     config: WalkConfig
+
+    def __init__(self, config: WalkConfig) -> None:
+        super().__init__(config)
+        #: whether there is a clock
+        self.clocked = config.gait.worth > 0.0
+        self.targets_about_reference = self.clocked
+        if self.clocked and config.drive.control == "pose":
+            raise ConfigError(
+                f"gait.worth={config.gait.worth} is for joints that are moved by their own strength; use "
+                'drive.control="pd" or "torque", or gait.worth=0'
+            )
+
+    def terms(self) -> tuple[ObservationTerm, ...]:
+        return (*self.observation_terms, GAIT_TERM) if self.clocked else self.observation_terms
 
     def domain(self) -> Domain:
         """Room on the whole way and beside it."""
@@ -246,16 +249,14 @@ with the clock against the legs: where arms do not act they do just that (not un
         self.way = way
 
     def record_reset(self, env, program) -> None:
-        if env.control == "pose":
-            self.grounding.record_standing(env, program, self.config.pose_noise)
-            return
         record_standing(env, program, self.config.pose_noise)
-        command = env.simulation.avatar.state.command_rotation
-        program.launch(hang_arms, command.shape, [env.mask, self.way.gait], [command])
+        if self.clocked:
+            command = env.simulation.avatar.state.command_rotation
+            program.launch(hang_arms, command.shape, [env.mask, self.way.gait], [command])
         self.grounding.record_reset(env, program)
 
     def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
-        if env.control == "pose":
+        if not self.clocked:
             return super().record_references(env, program)
         state, reference = env.simulation.avatar.state, self.reference_rotation
         inputs = [self.way.gait, env.step_count, state.command_rotation]
@@ -284,7 +285,8 @@ with the clock against the legs: where arms do not act they do just that (not un
             [self.way, avatar.body, agent, at, avatar.tracked.rotation, avatar.tracked.position],
             [env.observation],
         )
-        record_observe_gait(env, program, self.way.gait, agent, at + _WAY_SIZE)
+        if self.clocked:
+            record_observe_gait(env, program, self.way.gait, agent, at + _WAY_SIZE)
 
 
 TASK = WalkTask

@@ -65,7 +65,7 @@ def test_a_symmetric_clip_is_its_own_mirror_image(device):
 @pytest.mark.parametrize("control", ["pd", "torque"])
 def test_mirrored_actions_have_mirrored_consequences(control, device):
     """The body, its muscles, the ground and what is observed of them are the same on both sides."""
-    settings = {"pose_noise": 0.0, "gait": {"arm_swing": 0.0}, "drive": {"control": control}}
+    settings = {"pose_noise": 0.0, "gait": {"worth": 0.3, "arm_swing": 0.0}, "drive": {"control": control}}
     episodes = batch("Walk-v0", 2, device, **settings)
     mirror = mirror_of(episodes)
     episodes.reset([0, 0])

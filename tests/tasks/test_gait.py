@@ -9,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from agents.mirror import Mirror
 from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.tasks import load_task
 
 WALK = "PIAvatar/Walk-v0"
 SHOULDERS = [joint_index("left_shoulder"), joint_index("right_shoulder")]
@@ -23,6 +25,10 @@ def seen(env, observation, name: str) -> np.ndarray:
     return env.observation_layout.split(observation)[name]
 
 
+def tolerance(value: float, bound: float, margin: float) -> float:
+    return 10.0 ** -((max(value - bound, 0.0) / margin) ** 2)
+
+
 def left_share(time: float, stride: float) -> float:
     """A trapezoid: all in the first half of a stride, none in the second, a tenth of it to go over."""
     return float(np.clip(0.5 + 0.5 * np.sin(2.0 * np.pi * time / stride) / np.sin(0.1 * np.pi), 0.0, 1.0))
@@ -31,10 +37,10 @@ def left_share(time: float, stride: float) -> float:
 @pytest.mark.parametrize("stride", [1.0, 0.7])
 def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride):
     """A body that leans on one foot and then on the other: the reward is that of its load and of the time."""
-    env = make_env(WALK, root_assist=0.3, pose_noise=0.0, **{"gait.stride_seconds": stride})
+    env = make_env(WALK, root_assist=0.3, pose_noise=0.0, **{"gait.worth": 0.3, "gait.stride_seconds": stride})
     observation, _ = env.reset(seed=0)
     assert seen(env, observation, "gait_phase") == pytest.approx([0.0, 1.0])
-    paid, dt = [], env.config.physics.control_dt
+    paid, dt, tracked = [], env.config.physics.control_dt, env.batch.simulation.avatar.tracked
     for step in range(60):
         action = still(env)
         for name in ("spine1.y", "spine2.y", "spine3.y"):
@@ -44,23 +50,26 @@ def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride):
         assert seen(env, observation, "gait_phase") == pytest.approx([np.sin(phase), np.cos(phase)], abs=1e-4)
         left, right = seen(env, observation, "foot_impulses")
         off = abs(left / (left + right) - left_share((step + 0.5) * dt, stride)) if left + right > 0.0 else np.inf
-        worth = 0.1 * 10.0 ** -((max(off - 0.2, 0.0) / 0.4) ** 2)
-        high, fast = info["reward_terms"]["height"] / 0.1, info["reward_terms"]["speed"] / 0.4
-        assert info["reward_terms"]["gait"] == pytest.approx(worth * (high + fast), abs=2e-3)
-        paid.append(info["reward_terms"]["gait"])
-    assert min(paid) < 0.02 and max(paid) > 0.09
+        pelvis = Rotation.from_quat(tracked.rotation.numpy()[0, 0].astype(float)).apply([0.0, 0.0, 1.0])
+        worth = tolerance(off, 0.2, 0.4) * tolerance(np.arccos(min(pelvis[2], 1.0)), 0.1, 0.6)
+        terms = info["reward_terms"]
+        assert terms["gait"] / 0.3 == pytest.approx(terms["speed"] / 0.4 * worth, abs=2e-3)
+        paid.append(worth)
+    assert min(paid) < 0.05 and max(paid) > 0.9
 
 
 def test_who_does_not_stand_on_anything_is_not_in_turn(make_env):
-    env = make_env(WALK, gravity=0.0, pose_noise=0.0, ground=False)
+    env = make_env(WALK, gravity=0.0, pose_noise=0.0, ground=False, **{"gait.worth": 0.3})
     env.reset(seed=0)
-    assert all(env.step(still(env))[4]["reward_terms"]["gait"] == 0.0 for _ in range(5))
+    for _ in range(5):
+        terms = env.step(still(env))[4]["reward_terms"]
+        assert terms["gait"] == 0.0 and terms["speed"] == pytest.approx(0.4 * tolerance(1.0, 0.1, 1.0), abs=5e-3)
 
 
 @pytest.mark.parametrize("swing", [0.3, 0.0])
 def test_arms_hang_and_swing_against_the_legs(make_env, swing):
     """Held joints follow the reference: the left hand is in front when the clock has the right foot there."""
-    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, **{"gait.arm_swing": swing})
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, **{"gait.worth": 0.3, "gait.arm_swing": swing})
     env.reset(seed=0)
     tracked, ahead = env.batch.simulation.avatar.tracked, []
     for _ in range(60):
@@ -79,18 +88,25 @@ def test_arms_hang_and_swing_against_the_legs(make_env, swing):
     assert (amplitude > 0.05).all() and 14 <= np.argmax(apart) <= 20 and np.argmin(apart) in (*range(6), 29)
 
 
-def test_in_pose_mode_arms_are_the_actions_own(make_env):
-    env = make_env(WALK, control="pose", pose_noise=0.0)
+def test_without_a_gait_there_is_no_clock_and_arms_are_at_rest(make_env):
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0)
+    assert "gait_phase" not in env.observation_layout
     env.reset(seed=0)
-    for _ in range(5):
-        env.step(still(env))
+    for _ in range(15):
+        assert env.step(still(env))[4]["reward_terms"]["gait"] == 0.0
     local = env.batch.simulation.avatar.tracked.local.numpy()[0, SHOULDERS]
-    assert (Rotation.from_quat(local.astype(float)).magnitude() < 0.05).all()
+    assert (Rotation.from_quat(local.astype(float)).magnitude() < 0.1).all()
+
+
+def test_a_commanded_body_has_no_gait():
+    task = load_task(WALK)
+    with pytest.raises(ConfigError, match=r"gait\.worth=0\.2 is for joints .* drive\.control=\"pd\""):
+        task(load_config(task.Config, {"control": "pose"}, {"gait.worth": 0.2}))
 
 
 def test_the_mirror_is_half_a_stride_on(make_env):
     """The same moment of the other side: who is paid for the left foot's load is, mirrored, for the right one's."""
-    env = make_env(WALK)
+    env = make_env(WALK, **{"gait.worth": 0.3})
     terms = [env.observation_layout["gait_phase"], env.observation_layout["foot_impulses"]]
     mirror = Mirror(terms, ("left_hip", "right_hip"), "cpu")
     time = 0.13
