@@ -205,7 +205,8 @@ just that."""
     termination_doc = f"{FALL_DOC};\n- the pelvis is more than `lane` aside of the way, or beyond its end"
     picture_seconds = 0.3
     picture_actions: ClassVar[Mapping[str, float]] = {
-        "left_hip.x": 0.4, "left_knee.x": 0.1, "right_hip.x": -0.22, "right_knee.x": 0.15,
+        "left_hip.x": 0.4, "left_knee.x": 0.1, "right_hip.x": -0.22, "right_knee.x": 0.15, "left_shoulder.x": -0.2,
+        "right_shoulder.x": 0.3,
     }  # fmt: skip
 
     config: WalkConfig
