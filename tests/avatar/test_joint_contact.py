@@ -15,7 +15,7 @@ from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.soft_tissue import bone_distance
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
-from tests.avatar.test_articulated import Joints
+from tests.avatar.jointed import Joints
 
 ANKLES = [joint_index("left_ankle"), joint_index("right_ankle")]
 TOES = [joint_index("left_foot"), joint_index("right_foot")]

@@ -1,0 +1,119 @@
+"""An articulated body in a test: its pose, its parts one by one, and its Jacobian in double precision."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.avatar.articulated import ArticulatedBody
+from piavatar_envs.avatar.mass_matrix import NUM_DOF
+from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics
+from piavatar_envs.mpm.program import Program
+
+#: Springs of the joints, none of the pelvis.
+GAINS = np.r_[0.0, 0.0, np.ones(NUM_JOINTS - 1)][None]
+
+
+def carried_by() -> np.ndarray:
+    """Whether joint ``c`` carries bone ``b``, shape ``(c, b)``."""
+    carries = np.eye(NUM_JOINTS)
+    for bone in range(NUM_JOINTS - 1, 0, -1):
+        above = PARENTS[bone]
+        while above >= 0:
+            carries[above, bone] = 1.0
+            above = PARENTS[above]
+    return carries
+
+
+def momentum_of(J: np.ndarray, m: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Generalised momentum ``J^T m v`` of velocities of the particles, shape ``(69,)``."""
+    return np.einsum("pia,p,pi->a", J, m, v)
+
+
+class Joints:
+    """An articulated body beside a rig's particles, and programs of its parts."""
+
+    def __init__(self, rig, stiffness=0.0, damping=0.0, attachment=None):
+        self.rig, self.model, self.state = rig, rig.model, rig.state
+        rates = None if attachment is None else np.broadcast_to(attachment, (1, rig.points.num_points))
+        body = rig.points, rig.drive.body, rig.model
+        self.body = ArticulatedBody(*body, stiffness * GAINS, damping * GAINS, rates)
+
+    def pose(self, rotvec, root=None):
+        """Put pose and particles where the local rotation vectors have them, at rest."""
+        joints = self.rig.points.joints[0].astype(float)
+        rotations = Rotation.from_rotvec(np.asarray(rotvec)).as_matrix()
+        root = joints[0] if root is None else root
+        world, positions = forward_kinematics(rotations, root, joints)
+        n = self.model.num_envs
+        quaternions = Rotation.from_matrix(world).as_quat().astype(np.float32)
+        self.body.state.rotation.assign(np.broadcast_to(quaternions, (n, NUM_JOINTS, 4)).copy())
+        self.body.state.position.assign(np.broadcast_to(positions.astype(np.float32), (n, NUM_JOINTS, 3)).copy())
+        self.state.x.assign(
+            np.broadcast_to(self.rig.skinned(rotations, root).astype(np.float32), self.state.x.shape + (3,)).copy()
+        )
+        self.run("record_mass")
+        return self
+
+    def run(self, part: str, **options) -> None:
+        program = Program(self.model.device)
+        getattr(self.body, part)(program, self.state, **options)
+        program.run()
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """``J`` at the particles, shape ``(P, 3, 69)``."""
+        return self.jacobian_at(self.rig.read("x"), self.body.state.position.numpy()[0].astype(float))
+
+    def jacobian_at(self, x, position) -> np.ndarray:
+        """``J`` where particles and joints are at other places [m]."""
+        share = self.rig.weights.astype(float)
+        share = (share / share.sum(1, keepdims=True)) @ carried_by().T
+        J = np.zeros((len(x), 3, NUM_DOF))
+        J[:, :, :3] = np.eye(3)
+        for c in range(NUM_JOINTS):
+            arm = x - position[c]
+            for axis in range(3):
+                J[:, :, 3 + 3 * c + axis] = share[:, c, None] * np.cross(np.eye(3)[axis], arm)
+        return J
+
+    def moved(self, velocity, time) -> tuple[np.ndarray, np.ndarray]:
+        """Local rotations, ``(22, 3, 3)``, and place of the pelvis after a time [s] at a velocity of the joints."""
+        s = self.body.state
+        spin = carried_by().T @ velocity[3:].reshape(NUM_JOINTS, 3)  # a bone spins with all joints that carry it
+        begin = Rotation.from_quat(s.rotation.numpy()[0].astype(float))
+        world = (Rotation.from_rotvec(time * spin) * begin).as_matrix()
+        local = np.stack([world[0], *(world[PARENTS[b]].T @ world[b] for b in range(1, NUM_JOINTS))])
+        return local, s.position.numpy()[0, 0].astype(float) + time * velocity[:3]
+
+    def skinning(self, velocity) -> np.ndarray:
+        """Velocity of the skinned places, by central differences, shape ``(P, 3)``."""
+        after, before = (self.rig.skinned(*self.moved(velocity, time)) for time in (1e-4, -1e-4))
+        return (after - before) / 2e-4
+
+    def halfway(self, velocity) -> np.ndarray:
+        """``J`` half a step on, bones and particles moved by a velocity of the joints."""
+        half = 0.5 * self.model.step.dt
+        _, positions = forward_kinematics(*self.moved(velocity, half), self.rig.points.joints[0].astype(float))
+        return self.jacobian_at(self.rig.read("x") + half * (self.jacobian @ velocity), positions)
+
+    @property
+    def besides(self) -> np.ndarray:
+        """Inertia with which joints take over, besides that of the limbs they move, shape ``(69,)``."""
+        return self.body._bench.diagonals.numpy()[0].astype(float)
+
+    @property
+    def mass(self) -> np.ndarray:
+        """The mass matrix, of which the lower triangle is built, shape ``(69, 69)``."""
+        lower = np.tril(self.body.mass.matrix.numpy()[0].astype(float))
+        return lower + np.tril(lower, -1).T
+
+    @property
+    def total(self) -> np.ndarray:
+        """Velocity of the particles [m/s]."""
+        return self.rig.read("u") + self.rig.read("vk")
+
+    def momenta(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Momentum, angular momentum, and the sum of ``m |v|``."""
+        m, x, v = self.rig.mass, self.rig.read("x"), self.total
+        return m @ v, m @ np.cross(x, v), float(m @ np.linalg.norm(v, axis=1))

@@ -1,0 +1,76 @@
+"""Factors of mass matrices against LAPACK's solutions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from piavatar_envs.avatar.cholesky import (
+    Pattern,
+    factor_size,
+    factorize,
+    fetch_factor,
+    find_pattern,
+    keep_factor,
+    solve,
+)
+from piavatar_envs.avatar.joint_bench import room_of_warp
+from piavatar_envs.avatar.lanes import warp_threads
+from piavatar_envs.avatar.mass_matrix import NUM_DOF
+
+
+@wp.kernel(enable_backward=False)
+def factorize_and_solve(
+    pattern: Pattern,
+    matrix: wp.array3d(dtype=float),
+    diagonal: wp.array2d(dtype=float),
+    right: wp.array2d(dtype=float),
+    threads: int,
+    factor: wp.array2d(dtype=float),
+    x: wp.array2d(dtype=float),
+):
+    """Two diagonals of every matrix, over ``(num_envs, threads)``; all is solved after both factors have been found."""
+    e, thread = wp.tid()
+    n, room = matrix.shape[0], room_of_warp()
+    for which in range(2):
+        system = which * n + e
+        factorize(pattern, matrix, diagonal, e, system, threads, room, system, factor)
+        keep_factor(threads, room, system, factor)
+    for which in range(2):
+        system = which * n + e
+        fetch_factor(factor, system, threads, room)
+        solve(pattern, factor, system, right, system, system, thread, threads, room, x)
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_factors_solve(device, sparse):
+    """Two of each environment; the dense one has more rows than two warps have lanes."""
+    rng, size, n, threads = np.random.default_rng(0), 39 if sparse else NUM_DOF, 3, warp_threads(device)
+    root = rng.normal(size=(n, size, size))
+    filled = np.ones((size, size), bool)
+    if sparse:  # two limbs on a trunk, of which the first is entered by what the elimination of a finger fills
+        filled[9:21, 21:] = filled[21:, 9:21] = False
+        filled[3:6, 12:15] = filled[12:15, 3:6] = False
+    matrix = np.where(filled, root @ root.transpose(0, 2, 1), 0.0)
+    matrix = (matrix + (2.0 + np.abs(matrix).sum(2).max()) * np.eye(size)).astype(np.float32)
+    diagonal, right = rng.uniform(0.0, 3.0, (2 * n, size)), rng.normal(size=(2 * n, size))
+    arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in (matrix, diagonal, right)]
+    factor, x = (wp.zeros((2 * n, rows), dtype=float, device=device) for rows in (factor_size(size), size))
+    inputs = [find_pattern(filled, device), *arrays, threads]
+    wp.launch(factorize_and_solve, (n, threads), inputs, [factor, x], block_dim=threads, device=device)
+    whole = np.tile(matrix, (2, 1, 1)) + diagonal[:, :, None] * np.eye(size)
+    L = np.zeros((2 * n, size, size))
+    rows, columns = np.tril_indices(size)
+    L[:, rows, columns] = factor.numpy()[:, : len(rows)]
+    np.testing.assert_allclose(L.transpose(0, 2, 1) @ L, whole, atol=1e-5 * np.abs(whole).max())
+    solved = np.linalg.solve(whole, right[..., None])[..., 0]
+    np.testing.assert_allclose(x.numpy(), solved, atol=1e-5 * np.abs(solved).max())
+
+
+def test_factors_of_odd_patterns_are_refused():
+    filled = np.ones((6, 6), bool)
+    filled[1, 4] = filled[4, 1] = False
+    for wrong in (filled, np.ones((72, 72), bool)):
+        with pytest.raises(ValueError, match="at most 69 rows, in blocks of 3 x 3"):
+            find_pattern(wrong, "cpu")
