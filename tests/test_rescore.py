@@ -1,0 +1,78 @@
+"""Kept agents are scored anew as they were recorded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch", reason="needs the extra train")
+
+from agents import score_pid, score_random
+from agents.pid_agent import Design
+from piavatar_envs.envs.config import load_config, parse_assignments
+from piavatar_envs.tasks import load_task
+from scripts import rescore
+
+RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
+
+
+def test_every_kept_agent_has_a_job():
+    jobs = rescore.find_jobs(RESULTS, "cuda")
+    kept = [*RESULTS.glob("ppo/*"), *RESULTS.glob("pid/*"), *RESULTS.glob("random/*")]
+    assert {job.folder for job in jobs} == set(kept) and len(jobs) == len(kept) > 40
+    assert all("cuda" in job.command for job in jobs)
+
+
+@pytest.mark.parametrize("folder", sorted(RESULTS.glob("pid/*")), ids=lambda path: path.name)
+def test_the_arguments_of_a_pid_agent_are_its_settings(folder):
+    recorded = json.loads((folder / "results.json").read_text())["config"]
+    env_id, *rest = rescore.pid_arguments(folder)
+    settings = [word for word in rest if "=" in word]
+    config = load_config(load_task(env_id).Config, {"control": "torque"}, parse_assignments(settings))
+    resolved = config.model_dump(mode="json")
+    assert [name for name, _ in rescore.differences(recorded["env"], resolved)] == []
+    said = dict(zip(rest[len(settings) :: 2], rest[len(settings) + 1 :: 2], strict=True))
+    changed = {
+        f"--design.{name.replace('_', '-')}": str(value)
+        for name, value in recorded["design"].items()
+        if value != json.loads(json.dumps(getattr(Design(), name)))
+    }
+    assert said == changed
+
+
+def test_scoring_again_comes_to_the_same(tmp_path, device):
+    """Two agents of a small body; nothing but the date is new, and there is a table of both."""
+    pid, stream = tmp_path / "pid" / "pid_Stand", tmp_path / "random" / "Stand"
+    small = ("PIAvatar/Stand-v0", "fidelity=tiny", "episode_seconds=0.2", "drive.firm_bones=false")
+    episodes = ("--evaluation.episodes", "3", "--evaluation.first-seed", "7", "--device", device)
+    score_pid.main([*small, *episodes, "--design.hip-share", "0.25", "--out", str(pid)])
+    score_random.main([str(pid), "--seeds", "2", *episodes, "--out", str(stream)])
+    before = [json.loads((folder / "results.json").read_text()) for folder in (pid, stream)]
+    for folder in (pid, stream):
+        report = json.loads((folder / "results.json").read_text())
+        report["date"] = "long ago"
+        (folder / "results.json").write_text(json.dumps(report))
+    assert rescore.main(tmp_path, device, 2) == 0
+    after = [json.loads((folder / "results.json").read_text()) for folder in (pid, stream)]
+    assert all(report["date"] != "long ago" for report in after)
+    for old, new in zip(before, after, strict=True):
+        assert new["results"] == old["results"] and new["config"] == old["config"]
+    table = json.loads((tmp_path / rescore.TABLE).read_text())
+    assert {row["agent"] for row in table["results"]} >= {"PID", "random"}
+
+
+def test_a_job_that_fails_is_told_and_leaves_the_table(tmp_path, device, capsys):
+    folder = tmp_path / "ppo" / "stand_0"
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text("env_id: PIAvatar/Stand-v0\n")
+    assert rescore.main(tmp_path, device) == 1
+    words = capsys.readouterr().err
+    assert "must hold config.yaml and policy.pt" in words and "1 of 1 failed" in words
+    assert not (tmp_path / rescore.TABLE).exists()
+
+
+def test_nothing_to_score_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="has 0 agents and jobs=1; both must be >= 1"):
+        rescore.main(tmp_path)
