@@ -45,8 +45,8 @@ class Picture:
             self._skins[key] = Skin(flesh.asset, shaped, points.rest[row], points.skin_joints, points.skin_weights)
         return self._skins[key]
 
-    def frame(self, env: int) -> np.ndarray:
-        """The scene of environment ``env``, ``(height, width, 3)`` uint8."""
+    def frame(self, env: int, steps: int) -> np.ndarray:
+        """The scene of environment ``env``, ``(height, width, 3)`` uint8, so many steps after the last picture."""
         from piavatar_envs.render import Sphere
 
         state = self.batch.simulation.state
@@ -56,7 +56,8 @@ class Picture:
         markers = [Sphere(*marker) if isinstance(marker, tuple) else marker for marker in markers]
         roots = [avatar.tracked.position.numpy()[env, 0] for avatar in self.batch.simulation.avatars]
         follow = np.mean(roots, axis=0) if self.batch.task.camera_follows else None
-        return self.renderer.render(bodies, markers + self._colliders(env), follow=follow)
+        elapsed = steps * self.batch.config.physics.control_dt
+        return self.renderer.render(bodies, markers + self._colliders(env), follow=follow, elapsed=elapsed)
 
     def _avatars(self, env: int, x: np.ndarray, F: np.ndarray) -> list:
         from scipy.spatial.transform import Rotation
@@ -141,7 +142,7 @@ class Pictures:
             # another episode: the camera jumps instead of gliding
             self._opened[env].cut()
         self._seen[env] = now
-        return self._opened[env].frame(own)
+        return self._opened[env].frame(own, max(0, now[2] - before[2]))
 
     def close(self) -> None:
         """Close what was opened."""

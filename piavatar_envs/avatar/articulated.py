@@ -115,7 +115,8 @@ class ArticulatedBody:
                 ``(num_points,)`` bool; none if not given.
 
         Raises:
-            ValueError: a stiffness, damping or rate is negative or not finite, or the shape is another one.
+            ValueError: a stiffness, damping or rate is negative or not finite, or the shape of one, or of ``firm``, is
+                another one.
         """
         n, device = model.num_envs, model.device
         rates = np.zeros((1, points.num_points)) if attachment is None else attachment
@@ -125,6 +126,8 @@ class ArticulatedBody:
                 raise ValueError(f"{name} has shape {value.shape}, expected (1 or {n}, {size})")
             if not (np.isfinite(value).all() and (value >= 0.0).all()):
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
+        if firm is not None and firm.shape != (points.num_points,):
+            raise ValueError(f"firm has shape {firm.shape}, expected ({points.num_points},): one a particle")
         self.body, self._parts = divide(points, body, device)
         self.model, self.threads = model, warp_threads(device)
         self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))

@@ -55,7 +55,11 @@ class Renderer:
         self._backend: Backend | None = _open(backend, self.width, self.height)
 
     def render(
-        self, bodies: Sequence[Body], markers: Sequence[Marker] = (), follow: np.ndarray | None = None
+        self,
+        bodies: Sequence[Body],
+        markers: Sequence[Marker] = (),
+        follow: np.ndarray | None = None,
+        elapsed: float = 1.0 / 30.0,
     ) -> np.ndarray:
         """Draw one picture.
 
@@ -63,6 +67,7 @@ class Renderer:
             bodies: meshes in world coordinates.
             markers: spheres, arrows, boxes, capsules and rings.
             follow: the point the camera follows [m], shape ``(3,)``, for example the root; the origin if None.
+            elapsed: time since the last picture [s], in which the camera has glided.
 
         Returns:
             The picture, shape ``(height, width, 3)`` uint8; the caller's own.
@@ -73,7 +78,7 @@ class Renderer:
         """
         if self._backend is None:
             raise RuntimeError("this Renderer is closed; make a new one")
-        center = self._follow(follow)
+        center = self._follow(follow, elapsed)
         topology, vertices, colors = self._gather(bodies, markers)
         offset = np.array([*center, 0.0])
         shot = Shot(offset + self.camera.position, offset + self.camera.target, self.camera.field_of_view, center)
@@ -105,13 +110,13 @@ class Renderer:
     ) -> None:
         self.close()
 
-    def _follow(self, point: np.ndarray | None) -> np.ndarray:
+    def _follow(self, point: np.ndarray | None, elapsed: float) -> np.ndarray:
         wanted = np.zeros(2) if point is None else np.asarray(point, dtype=np.float64)[:2]
         if not np.isfinite(wanted).all():
             wanted = np.zeros(2) if self._center is None else self._center
         if self._center is None:
             self._center = wanted
-        self._center = self._center + self.camera.follow * (wanted - self._center)
+        self._center = self._center + self.camera.share_after(elapsed) * (wanted - self._center)
         return self._center
 
     def _gather(self, bodies: Sequence[Body], markers: Sequence[Marker]) -> tuple[Topology, np.ndarray, np.ndarray]:

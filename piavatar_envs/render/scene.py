@@ -157,7 +157,7 @@ class Camera:
         position: the eye [m], relative to the ground point below what it follows.
         target: the point looked at [m], relative to the same point.
         field_of_view: vertical angle [deg].
-        follow: share of the distance to the followed point made up in each frame: 0 stays put, 1 sticks to it.
+        follow: share of the distance to the followed point made up in each 1/30 s: 0 stays put, 1 sticks to it.
     """
 
     position: tuple[float, float, float] = (1.75, -3.75, 1.62)
@@ -165,11 +165,15 @@ class Camera:
     field_of_view: float = 29.0
     follow: float = 0.15
 
+    def share_after(self, seconds: float) -> float:
+        """Share of the distance to the followed point made up in a time [s]."""
+        return 1.0 - (1.0 - self.follow) ** (30.0 * seconds)
+
     def __post_init__(self) -> None:
         if not 1.0 <= self.field_of_view <= 120.0:
             raise ValueError(f"field_of_view={self.field_of_view} deg is outside [1, 120]")
         if not 0.0 <= self.follow <= 1.0:
-            raise ValueError(f"follow={self.follow} is outside [0, 1]: it is a share of the way in each frame")
+            raise ValueError(f"follow={self.follow} is outside [0, 1]: it is a share of the way in 1/30 s")
 
 
 def _revolve(profile: np.ndarray) -> np.ndarray:

@@ -283,6 +283,12 @@ def test_bad_gains_are_refused(make_rig, name, bad):
         ArticulatedBody(rig.points, rig.drive.body, rig.model, **{**gains, name: np.ones(3)})
 
 
+def test_firm_particles_are_those_of_the_body(make_rig):
+    rig = make_rig(cells=16)
+    with pytest.raises(ValueError, match=r"firm has shape \(3,\), expected \(\d+,\)"):
+        ArticulatedBody(rig.points, rig.drive.body, rig.model, GAINS, GAINS, firm=np.ones(3, bool))
+
+
 def test_a_held_pelvis_bears_the_weight(make_rig):
     """Springs of the pelvis carry a body at rest: with stiff joints it sinks by ``m g / K``, and stays."""
     rig = make_rig(cells=16, gravity=9.81)

@@ -99,6 +99,21 @@ def test_the_camera_follows(body):
         assert abs(int(bounds(green(renderer.render([body], follow=np.zeros(3))))[0]) - int(bounds(here)[0])) <= 1
 
 
+def test_the_camera_glides_by_time_not_by_pictures(body):
+    """After a fifth of a second it is where it is, in one picture or in six; and where no time goes by it stays."""
+
+    def left_of(times: list[float]) -> int:
+        with Renderer(SIZE, SIZE, camera=Camera(follow=0.2), backend="software") as renderer:
+            renderer.render([body], follow=np.zeros(3))
+            for elapsed in times:
+                picture = renderer.render([shifted(body, (0.4, 0, 0))], follow=np.array([0.4, 0, 1]), elapsed=elapsed)
+        return bounds(green(picture))[0]
+
+    assert left_of([0.2]) == left_of([1.0 / 30.0] * 6) == left_of([0.1, 0.0, 0.1]) != left_of([0.0])
+    assert Camera(follow=0.2).share_after(1.0 / 30.0) == pytest.approx(0.2)
+    assert Camera(follow=1.0).share_after(0.01) == 1.0 and Camera(follow=0.0).share_after(9.0) == 0.0
+
+
 def test_pictures_repeat(renderer, body):
     markers = [Sphere((0.4, -0.4, 1.2), 0.06), Arrow((0, -1, 1), (0, 0.5, 0)), Box((0.6, 0, 0.2), (0.1, 0.1, 0.2))]
     first = renderer.render([body], markers)
