@@ -125,7 +125,7 @@ class Pictures:
         """
         self._place, self._config = place, config
         self._opened: dict[int, Picture] = {}
-        self._seen: dict[int, tuple[int, int, int]] = {}
+        self._seen: dict[int, tuple[int, ...]] = {}
 
     def frame(self, env: int) -> np.ndarray:
         """The scene of environment ``env``, ``(height, width, 3)`` uint8.
@@ -136,13 +136,14 @@ class Pictures:
         batch, own = self._place(env)
         if env not in self._opened:
             self._opened[env] = Picture(batch, self._config)
-        now = tuple(int(array.numpy()[own]) for array in (batch.seed, batch.episode, batch.step_count))
+        counters = (batch.seed, batch.episode, batch.step_count)
+        now = (batch.restarts, *(int(array.numpy()[own]) for array in counters))
         before = self._seen.get(env, now)
-        if now[:2] != before[:2] or now[2] < before[2]:
-            # another episode: the camera jumps instead of gliding
+        if now[:3] != before[:3] or now[3] < before[3]:
+            # another episode, or the same one from another moment on: the camera jumps instead of gliding
             self._opened[env].cut()
         self._seen[env] = now
-        return self._opened[env].frame(own, max(0, now[2] - before[2]))
+        return self._opened[env].frame(own, max(0, now[3] - before[3]))
 
     def close(self) -> None:
         """Close what was opened."""

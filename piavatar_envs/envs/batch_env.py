@@ -37,6 +37,7 @@ class BatchEnv:
             reward is zero.
         truncated: ``(num_envs,)`` bool, the clock has run out for those still alive.
         failure: ``(num_envs,)`` int32, bits ``FAILURE_*``.
+        restarts: how often episodes have begun by :meth:`reset`, or a state has been set: time has jumped then.
     """
 
     def __init__(self, task: Task, num_envs: int = 1, device: str = "cpu", seed: int = 0) -> None:
@@ -80,6 +81,7 @@ class BatchEnv:
             return wp.zeros(shape, dtype=dtype, device=device)
 
         agents = (n, self.num_agents)
+        self.restarts = 0
         self.mask, self._seeded, self._new_seed = zeros(n, wp.bool), zeros(n, wp.bool), zeros(n, int)
         self._begins = zeros(1, int)  # whether any episode does
         self.seed = wp.array(_as_int32(seed + np.arange(n)), dtype=int, device=device)
@@ -186,6 +188,7 @@ class BatchEnv:
             self._new_seed.assign(_as_int32(values))
             self._seeded.assign(mask & given)
         self.mask.assign(mask)
+        self.restarts += 1
         self._begins.fill_(1)  # whoever asks for observations here gets those of all environments, as they are now
         return self._begin()
 
@@ -270,6 +273,7 @@ class BatchEnv:
         for avatar in self.simulation.shapes.of_host:
             self.simulation.shapes.adopt(avatar, state[f"shape.{avatar}"])
         self.simulation.shapes.fall_behind()
+        self.restarts += 1
         self.observe_program.run()
 
 

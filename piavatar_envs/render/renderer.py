@@ -51,6 +51,7 @@ class Renderer:
         self.width, self.height = int(width), int(height)
         self.camera = camera or Camera()
         self._center: np.ndarray | None = None
+        self._wanted = np.zeros(2)  # what it followed in the last picture [m]
         self._topology: Topology | None = None
         self._backend: Backend | None = _open(backend, self.width, self.height)
 
@@ -115,8 +116,9 @@ class Renderer:
         if not np.isfinite(wanted).all():
             wanted = np.zeros(2) if self._center is None else self._center
         if self._center is None:
-            self._center = wanted
-        self._center = self._center + self.camera.share_after(elapsed) * (wanted - self._center)
+            self._center = self._wanted = wanted
+        self._center = self.camera.glide(self._center, self._wanted, wanted, elapsed)
+        self._wanted = wanted
         return self._center
 
     def _gather(self, bodies: Sequence[Body], markers: Sequence[Marker]) -> tuple[Topology, np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -165,9 +166,24 @@ class Camera:
     field_of_view: float = 29.0
     follow: float = 0.15
 
-    def share_after(self, seconds: float) -> float:
-        """Share of the distance to the followed point made up in a time [s]."""
-        return 1.0 - (1.0 - self.follow) ** (30.0 * seconds)
+    def glide(self, center: np.ndarray, before: np.ndarray, now: np.ndarray, seconds: float) -> np.ndarray:
+        """Where it is after a time [s] in which the point that it follows has gone straight from one place to another.
+
+        The solution of ``dc/dt = k (p - c)``: however often it is asked for on the way, it comes to the same.
+
+        Args:
+            center: where it was [m].
+            before: where the point was [m].
+            now: where it is [m].
+            seconds: the time, not negative.
+        """
+        if self.follow == 0.0 or seconds == 0.0:
+            return center
+        if self.follow == 1.0:
+            return now
+        lag = -30.0 * seconds * math.log(1.0 - self.follow)  # k times the time
+        share = 1.0 - math.exp(-lag)
+        return center + share * (before - center) + (1.0 - share / lag) * (now - before)
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.field_of_view <= 120.0:

@@ -132,6 +132,49 @@ def test_pictures(device, env_id):
     env.close()
 
 
+def test_the_camera_is_where_time_has_brought_it(device):
+    """Whatever was shown on the way; and it jumps where an episode, or the same one, begins again."""
+    pytest.importorskip("pyvista")
+
+    def make():
+        size = {"width": 64, "height": 48}
+        return gymnasium.make(
+            "PIAvatar/PushBox-v0", device=device, fidelity="tiny", render_mode="rgb_array", **size
+        ).unwrapped
+
+    def centre(env) -> np.ndarray:
+        return env._episode._pictures._opened[0].renderer._center
+
+    def go(env, aside: float, every: int) -> None:
+        action = np.zeros(env.action_space.shape, np.float32)
+        action[env.action_names.index("root.x")] = aside
+        for step in range(12):
+            env.step(action)
+            if (step + 1) % every == 0:
+                env.render()
+
+    often, seldom = make(), make()
+    for env, every in ((often, 1), (seldom, 12)):
+        env.reset(seed=0)
+        env.render()
+        go(env, 1.0, every)
+    right = centre(often).copy()
+    assert abs(right[0]) > 0.03 and centre(seldom) == pytest.approx(right, abs=0.1 * abs(right[0]))
+    before = often.render()
+    assert np.array_equal(before, often.render()) and np.array_equal(centre(often), right)
+    state = often.get_state()
+    often.reset(seed=0)
+    often.render()
+    assert abs(centre(often)[0]) < 0.1 * abs(right[0]), "the same episode from its beginning"
+    go(often, -1.0, 12)
+    often.set_state(state)
+    often.render()
+    pelvis = often.batch.simulation.avatar.tracked.position.numpy()[0, 0, :2]
+    assert centre(often) == pytest.approx(pelvis, abs=1e-6), "a moment that was kept"
+    often.close()
+    seldom.close()
+
+
 def test_no_picture_without_a_render_mode(make_env, env_id):
     env = make_env(env_id)
     env.reset(seed=0)

@@ -100,18 +100,25 @@ def test_the_camera_follows(body):
 
 
 def test_the_camera_glides_by_time_not_by_pictures(body):
-    """After a fifth of a second it is where it is, in one picture or in six; and where no time goes by it stays."""
+    """Behind somebody who walks it is where it is, in one picture or in six; and where no time goes by it stays."""
 
     def left_of(times: list[float]) -> int:
         with Renderer(SIZE, SIZE, camera=Camera(follow=0.2), backend="software") as renderer:
             renderer.render([body], follow=np.zeros(3))
+            gone = 0.0
             for elapsed in times:
-                picture = renderer.render([shifted(body, (0.4, 0, 0))], follow=np.array([0.4, 0, 1]), elapsed=elapsed)
+                gone += 2.0 * elapsed
+                at = np.array([gone, 0.0, 1.0])
+                picture = renderer.render([shifted(body, (gone, 0.0, 0.0))], follow=at, elapsed=elapsed)
         return bounds(green(picture))[0]
 
-    assert left_of([0.2]) == left_of([1.0 / 30.0] * 6) == left_of([0.1, 0.0, 0.1]) != left_of([0.0])
-    assert Camera(follow=0.2).share_after(1.0 / 30.0) == pytest.approx(0.2)
-    assert Camera(follow=1.0).share_after(0.01) == 1.0 and Camera(follow=0.0).share_after(9.0) == 0.0
+    assert left_of([0.2]) == left_of([1.0 / 30.0] * 6) == left_of([0.1, 0.0, 0.1]) != left_of([0.1])
+    camera, still, begin, end = Camera(follow=0.2), np.ones(2), np.array([1.0, 0.0]), np.array([1.6, -0.3])
+    assert camera.glide(still, begin, begin, 1.0 / 30.0) == pytest.approx(still + 0.2 * (begin - still))
+    # far behind a point of constant speed it lags by speed / k
+    assert camera.glide(still, begin - 100.0, begin, 100.0) == pytest.approx(begin + 1.0 / (30.0 * np.log(0.8)))
+    assert (Camera(follow=1.0).glide(still, begin, end, 0.01) == end).all()
+    assert (Camera(follow=0.0).glide(still, begin, end, 9.0) == still).all()
 
 
 def test_pictures_repeat(renderer, body):
