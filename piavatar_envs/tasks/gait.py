@@ -11,16 +11,21 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
 import warp as wp
 from pydantic import BaseModel, Field
 
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import joint_index
-from piavatar_envs.envs.config import FROZEN
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.envs.config import FROZEN, ConfigError, DriveConfig
 from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.mpm.types import Sensors, row
 from piavatar_envs.tasks.rewards import tolerance
+from piavatar_envs.tasks.upright import left_foot_share
 
 if TYPE_CHECKING:
+    from piavatar_envs.avatar.body import BodyPoints
     from piavatar_envs.envs.batch_env import BatchEnv
     from piavatar_envs.mpm.program import Program
 
@@ -29,21 +34,30 @@ wp.set_module_options({"enable_backward": False})
 GAIT_TERM = ObservationTerm(
     "gait_phase", 2, "-", "-", "sine and cosine of the gait's clock: while the sine is positive the left foot bears"
 )
-GAIT_DOC = (
-    "(0 by default) while the left foot's share of what the ground bears is within 0.2 of the clock's: all of it in "
-    "the first half of every `gait.stride_seconds`, none in the second, a tenth each to go over; beyond it a Gaussian "
-    "that has fallen to a tenth after another 0.4; nothing while neither foot bears"
-)
-
+#: Beyond the first a left foot's share of the load is off the clock's, and another second off a tenth is left [-].
+_BOUND, _MARGIN = 0.2, 0.4
 #: Share of a stride in which the load goes from one foot to the other: adults have 0.1, twice a stride (Perry &
 #: Burnfield, "Gait Analysis", 2010).
 _HANDOVER = 0.1
+GAIT_DOC = (
+    f"(0 by default) while the left foot's share of what the ground bears is within {_BOUND} of the clock's: all of it "
+    f"in the first half of every `gait.stride_seconds`, none in the second, {_HANDOVER} of a stride each to go over; "
+    f"beyond it a Gaussian that has fallen to a tenth after another {_MARGIN}; nothing while neither foot bears"
+)
+
 _STEEPNESS = wp.constant(0.5 / math.sin(math.pi * _HANDOVER))
 _LEFT_SHOULDER, _RIGHT_SHOULDER = (wp.constant(joint_index(f"{side}_shoulder")) for side in ("left", "right"))
 _LEFT_ELBOW, _RIGHT_ELBOW = (wp.constant(joint_index(f"{side}_elbow")) for side in ("left", "right"))
-#: From the rest pose, in which arms are lowered by some 45 degrees, to arms that hang, and how far elbows are bent then
-#: [rad].
-_HANGING, _BENT = wp.constant(0.6), wp.constant(0.3)
+#: From the rest pose, in which arms are lowered by some 45 degrees and elbows bent by as much, to arms that hang [rad].
+_LOWERED, _STRETCHED = wp.constant(0.6), wp.constant(0.5)
+#: A foot is off the ground whose sole is this much higher than in the rest pose [m].
+_CLEAR = wp.constant(0.03)
+#: Particles of a foot no higher than this above its lowest are its sole [m].
+_SOLE = 0.03
+#: Of a body that nothing bears, in place of a share.
+NOTHING = wp.constant(-1.0)
+#: Control steps that a stride has at least: with fewer the clock shows no order of the feet.
+_LEAST_STEPS = 6.0
 
 
 class GaitConfig(BaseModel):
@@ -67,14 +81,51 @@ class Gait:
     worth: float  # reward
     stride: float  # [control steps]
     arm_swing: float  # [rad]
+    soles: wp.array2d(dtype=int)  # (2, n) particles of the left and of the right one; some may be there twice
 
 
-def gait_rule(config: GaitConfig, control_dt: float) -> Gait:
-    """Kernel argument."""
+def gait_rule(config: GaitConfig, control_dt: float, points: BodyPoints, device: str) -> Gait:
+    """Kernel argument.
+
+    Args:
+        config: settings.
+        control_dt: a control step [s].
+        points: of the body.
+        device: where its soles are looked at.
+    """
     rule = Gait()
     rule.worth = config.worth
     rule.stride, rule.arm_swing = config.stride_seconds / control_dt, config.arm_swing
+    soles = [_sole(points, side) for side in ("left", "right")]
+    most = max(map(len, soles))
+    rule.soles = wp.array(np.stack([np.resize(sole, most) for sole in soles]), dtype=int, device=device)
     return rule
+
+
+def check_gait(config: GaitConfig, drive: DriveConfig, control_dt: float) -> None:
+    """Refuse a gait that cannot be.
+
+    Raises:
+        ConfigError: the pose is commanded, or a stride has hardly any steps.
+    """
+    if config.worth > 0.0 and drive.control == "pose":
+        raise ConfigError(
+            f"gait.worth={config.worth} is for joints that are moved by their own strength; use "
+            'drive.control="pd" or "torque", or gait.worth=0'
+        )
+    if config.worth > 0.0 and config.stride_seconds < (_LEAST_STEPS - 0.01) * control_dt:
+        raise ConfigError(
+            f"gait.stride_seconds={config.stride_seconds} is less than {_LEAST_STEPS:.0f} control steps of "
+            f"{control_dt:.3g} s; use at least {_LEAST_STEPS * control_dt:.3g}, or a shorter physics.control_dt"
+        )
+
+
+def _sole(points: BodyPoints, side: str) -> np.ndarray:
+    """Lowest particles of a foot."""
+    bones = [joint_index(f"{side}_ankle"), joint_index(f"{side}_foot")]
+    share = np.where(np.isin(points.skin_joints, bones), points.skin_weights, 0.0).sum(1)
+    foot, height = np.flatnonzero(share > 0.5), points.rest[0][:, 2]
+    return foot[height[foot] < height[foot].min() + _SOLE].astype(np.int32)
 
 
 @wp.func
@@ -85,20 +136,60 @@ def phase_of(gait: Gait, steps: float):
 
 
 @wp.func
-def left_share(phase: float):
+def due_share(phase: float):
     """What the left foot shall bear of the body, from 0 to 1."""
     return wp.clamp(0.5 + _STEEPNESS * wp.sin(phase), 0.0, 1.0)
 
 
 @wp.func
-def turn_taken(gait: Gait, step: int, share: float, impulse: float):
-    """What it is worth, from 0 to 1, that the left foot has that ``share`` of the ground's upward ``impulse`` [N s].
+def turn_taken(gait: Gait, step: int, left: float):
+    """What it is worth, from 0 to 1, that the left foot bears such a share, or :data:`NOTHING`.
 
     Of the step that the counter counts next, by the clock in its middle.
     """
-    if impulse <= 0.0:
+    if left == NOTHING:
         return 0.0
-    return tolerance(wp.abs(share - left_share(phase_of(gait, float(step) + 0.5))), 0.2, 0.4)
+    return tolerance(wp.abs(left - due_share(phase_of(gait, float(step) + 0.5))), _BOUND, _MARGIN)
+
+
+@wp.func
+def lift_of(gait: Gait, body: Body, x: wp.array2d(dtype=wp.vec3), e: int, foot: int):
+    """How much higher than in the rest pose the lowest of a sole is [m]."""
+    r = row(e, body.rest.shape[0])
+    lift = float(1.0e6)
+    for n in range(gait.soles.shape[1]):
+        p = gait.soles[foot, n]
+        lift = wp.min(lift, x[e, body.first + p][2] - body.rest[r, p][2])
+    return lift
+
+
+@wp.kernel
+def weigh_feet(
+    gait: Gait,
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    sensors: Sensors,
+    x: wp.array2d(dtype=wp.vec3),
+    # out
+    left: wp.array(dtype=float),
+):
+    """Share of the left foot in what the ground bears, or :data:`NOTHING`.
+
+    Levers between the ankles know nothing of how long soles are: on the toes of a foot behind, they give some of the
+    load to the one ahead. If that is in the air it has none.
+    """
+    e = wp.tid()
+    if sensors.boundary_impulse[e, 0][2] <= 0.0:
+        left[e] = NOTHING
+        return
+    left_off = lift_of(gait, body, x, e, 0) > _CLEAR
+    right_off = lift_of(gait, body, x, e, 1) > _CLEAR
+    if left_off == right_off:
+        left[e] = left_foot_share(position, sensors, e, 0)
+    elif left_off:
+        left[e] = 0.0
+    else:
+        left[e] = 1.0
 
 
 @wp.func
@@ -109,14 +200,15 @@ def arm_pose(gait: Gait, phase: float, b: int):
         side = 1.0
     if b == _RIGHT_SHOULDER:
         side = -1.0
-    bent = float(0.0)
+    if side != 0.0:
+        # the left arm is behind when the left foot is in front
+        ahead = -side * gait.arm_swing * wp.cos(phase)
+        return quat_exp(wp.vec3(-ahead, 0.0, 0.0)) * quat_exp(wp.vec3(0.0, side * _LOWERED, 0.0))
     if b == _LEFT_ELBOW:
-        bent = _BENT
+        return quat_exp(wp.vec3(_STRETCHED, 0.0, 0.0))
     if b == _RIGHT_ELBOW:
-        bent = _BENT
-    # the left arm is behind when the left foot is in front
-    ahead = bent - side * gait.arm_swing * wp.cos(phase)
-    return quat_exp(wp.vec3(-ahead, 0.0, 0.0)) * quat_exp(wp.vec3(0.0, side * _HANGING, 0.0))
+        return quat_exp(wp.vec3(_STRETCHED, 0.0, 0.0))
+    return wp.quat_identity()
 
 
 @wp.kernel

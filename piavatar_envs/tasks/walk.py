@@ -11,10 +11,9 @@ from pydantic import Field
 
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.config import ConfigError, DriveConfig, EnvConfig
+from piavatar_envs.envs.config import DriveConfig, EnvConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
-from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.fall import FallConfig, is_down
 from piavatar_envs.tasks.gait import (
@@ -22,11 +21,13 @@ from piavatar_envs.tasks.gait import (
     GAIT_TERM,
     Gait,
     GaitConfig,
+    check_gait,
     gait_rule,
     hang_arms,
     record_observe_gait,
     swing_arms,
     turn_taken,
+    weigh_feet,
 )
 from piavatar_envs.tasks.ground import Grounding, forward_of
 from piavatar_envs.tasks.place import PlaceRule, home
@@ -38,7 +39,6 @@ from piavatar_envs.tasks.upright import (
     UPRIGHT_TERMS,
     Upright,
     UprightConfig,
-    left_foot_share,
     posture_of,
     record_observe_upright,
     tilt_of,
@@ -104,7 +104,7 @@ def judge_walk(
     velocity: wp.array2d(dtype=wp.vec3),
     step_count: wp.array(dtype=int),
     action: wp.array3d(dtype=float),
-    sensors: Sensors,
+    left_load: wp.array(dtype=float),
     # out
     terms: wp.array3d(dtype=float),
     metrics: wp.array3d(dtype=float),
@@ -122,8 +122,7 @@ def judge_walk(
     off_way = wp.acos(wp.clamp(wp.dot(wp.normalize(facing), ahead), -1.0, 1.0))
     gone = way_gone(way, body, e, position[e, 0])
     mean_speed = gone[0] / (way.control_dt * float(step_count[e] + 1))
-    share = left_foot_share(position, sensors, e, 0)
-    in_turn = turn_taken(way.gait, step_count[e], share, sensors.boundary_impulse[e, 0][2])
+    in_turn = turn_taken(way.gait, step_count[e], left_load[e])
     hips_straight = tolerance(tilt_of(rotation[e, 0]), 0.1, rule.tilt_margin)
     fast = now.high * tolerance(wp.abs(speed - way.speed), 0.1 * way.speed, way.speed)
     terms[e, 0, 0] = (0.7 - way.gait.worth) * fast
@@ -176,12 +175,13 @@ class WalkTask(Task):
 straight ahead at `target_speed`, where it faces at first; nothing holds it but what its joints can do. Faster is no
 better than slower. The way is as long as one comes in an episode at 1.5 times the target; it ends at `lane` to either
 side. How it gets ahead is its own affair, and hopping on both feet does, unless `gait.worth` is set, for `control="pd"`
-or `"torque"`: then feet shall bear the body in turn, by a clock that the avatar sees (`gait_phase`), and the pose that
-targets are counted from has arms that hang and swing with the clock against the legs. Where arms do not act they do
-just that."""
+or `"torque"`: then feet shall bear the body in turn, by a clock that begins with the episode. The avatar sees it at the
+end of its observation, in two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. At
+action 0 arms are not in the rest pose then: they hang, and swing with the clock against the legs. Where they do not act
+they do just that."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "speed": "0.7, or 0.7 - `gait.worth`, while the pelvis moves ahead at `target_speed` give or take a tenth; "
-        "beyond it a Gaussian that has fallen to 0.07 after another `target_speed`; all times `height` / 0.1",
+        "beyond it a Gaussian that has fallen to a tenth after another `target_speed`; all times `height` / 0.1",
         "gait": f"`gait.worth` {GAIT_DOC}; all times what `speed` is of its greatest, and less where the pelvis tilts, "
         "as `upright` is where the chest does",
         "heading": "0.1 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.01 "
@@ -216,11 +216,7 @@ just that."""
         #: whether there is a clock
         self.clocked = config.gait.worth > 0.0
         self.targets_about_reference = self.clocked
-        if self.clocked and config.drive.control == "pose":
-            raise ConfigError(
-                f"gait.worth={config.gait.worth} is for joints that are moved by their own strength; use "
-                'drive.control="pd" or "torque", or gait.worth=0'
-            )
+        check_gait(config.gait, config.drive, config.physics.control_dt)
 
     def terms(self) -> tuple[ObservationTerm, ...]:
         return (*self.observation_terms, GAIT_TERM) if self.clocked else self.observation_terms
@@ -246,7 +242,9 @@ just that."""
         way.start, way.speed, way.lane, way.length = start, config.target_speed, config.lane, self._length()
         way.heading_margin, way.control_dt = config.heading_margin, config.physics.control_dt
         way.least, way.upright = config.fall.least, upright_rule(config.upright, config.control_cost)
-        way.gait = gait_rule(config.gait, config.physics.control_dt)
+        points = env.simulation.flesh[0].points
+        way.gait = gait_rule(config.gait, config.physics.control_dt, points, env.device)
+        self.left_load = wp.zeros(env.num_envs, dtype=float, device=env.device)
         self.way = way
 
     def record_reset(self, env, program) -> None:
@@ -266,13 +264,16 @@ just that."""
 
     def record_outcome(self, env, program) -> None:
         avatar = env.simulation.avatar
-        t = avatar.tracked
+        t, sim = avatar.tracked, env.simulation
+        if self.clocked:
+            inputs = [self.way.gait, avatar.body, t.position, sim.sensors, sim.state.x]
+            program.launch(weigh_feet, env.num_envs, inputs, [self.left_load])
         program.launch(
             judge_walk,
             env.num_envs,
             [
                 self.way, avatar.body, t.rotation, t.position, t.velocity, env.step_count, env.action,
-                env.simulation.sensors,
+                self.left_load,
             ],
             [env.terms, env.metrics, env.success, env.terminated],
         )  # fmt: skip

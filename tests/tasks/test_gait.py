@@ -9,11 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from agents.mirror import Mirror
 from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import ConfigError, load_config
 from piavatar_envs.tasks import load_task
 
 WALK = "PIAvatar/Walk-v0"
 SHOULDERS = [joint_index("left_shoulder"), joint_index("right_shoulder")]
+ELBOWS = [joint_index("left_elbow"), joint_index("right_elbow")]
 WRISTS = [joint_index("left_wrist"), joint_index("right_wrist")]
 
 
@@ -29,8 +31,8 @@ def tolerance(value: float, bound: float, margin: float) -> float:
     return 10.0 ** -((max(value - bound, 0.0) / margin) ** 2)
 
 
-def left_share(time: float, stride: float) -> float:
-    """A trapezoid: all in the first half of a stride, none in the second, a tenth of it to go over."""
+def due(time: float, stride: float) -> float:
+    """All in the first half of a stride, none in the second, a tenth of it to go over: a sine that is cut off."""
     return float(np.clip(0.5 + 0.5 * np.sin(2.0 * np.pi * time / stride) / np.sin(0.1 * np.pi), 0.0, 1.0))
 
 
@@ -49,7 +51,7 @@ def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride):
         phase = 2.0 * np.pi * (step + 1) * dt / stride
         assert seen(env, observation, "gait_phase") == pytest.approx([np.sin(phase), np.cos(phase)], abs=1e-4)
         left, right = seen(env, observation, "foot_impulses")
-        off = abs(left / (left + right) - left_share((step + 0.5) * dt, stride)) if left + right > 0.0 else np.inf
+        off = abs(left / (left + right) - due((step + 0.5) * dt, stride)) if left + right > 0.0 else np.inf
         pelvis = Rotation.from_quat(tracked.rotation.numpy()[0, 0].astype(float)).apply([0.0, 0.0, 1.0])
         worth = tolerance(off, 0.2, 0.4) * tolerance(np.arccos(min(pelvis[2], 1.0)), 0.1, 0.6)
         terms = info["reward_terms"]
@@ -104,6 +106,76 @@ def test_a_commanded_body_has_no_gait():
         task(load_config(task.Config, {"control": "pose"}, {"gait.worth": 0.2}))
 
 
+def test_a_foot_in_the_air_bears_nothing(make_env):
+    """On the toes of the left foot, the right one ahead and high: levers between the ankles give it a third."""
+    settings = {"gait.worth": 0.7, "gait.stride_seconds": 5.0, "fidelity": "coarse"}
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, **settings)
+    env.reset(seed=0)
+    action = still(env)
+    lifted = {"right_hip.y": -0.6, "right_hip.x": -0.25, "right_knee.x": 0.12, "left_hip.x": 0.2, "left_ankle.x": 0.5}
+    for step in range(45):
+        for name, value in lifted.items():
+            action[env.action_names.index(name)] = value * min(1.0, step / 20.0)
+        observation, *_, info = env.step(action)
+    at, gait = env.batch.simulation.state.x.numpy()[0], env.batch.task.way.gait
+    lowest = [at[sole, 2].min() for sole in gait.soles.numpy()]
+    assert lowest[0] < 0.02 and lowest[1] > 0.05
+    left, right = seen(env, observation, "foot_impulses")
+    assert right > 0.15 * (left + right) and env.batch.task.left_load.numpy()[0] == 1.0
+    terms = info["reward_terms"]  # a quarter of the stride: the left foot's turn
+    assert terms["gait"] > 0.9 * 0.7 * tolerance(1.0 - info["speed"], 0.1, 1.0) * tolerance(
+        np.radians(info["tilt_deg"]), 0.1, 0.6
+    ) and terms["speed"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("control", ["pd", "torque"])
+def test_every_environment_has_a_clock_of_its_own(control, device):
+    """Goals of held arms by each one's own clock, which a partial reset sets back."""
+    legs = ["left_hip", "right_hip", "left_knee", "right_knee"]
+    settings = {"control": control, "fidelity": "tiny", "joints": legs, "root_assist": 1.0, "gait.worth": 0.2}
+    task = load_task(WALK)
+    batch = BatchEnv(task(load_config(task.Config, settings)), 3, device)
+    batch.reset(seeds=[0, 1, 2])
+    dt, clocks = batch.config.physics.control_dt, np.zeros(3)
+    for step in range(14):
+        if step in (4, 9):
+            mask = np.array([step == 4, False, True])
+            batch.reset(env_mask=mask)
+            clocks[mask] = 0
+        batch.step()
+        clocks += 1
+        goal = batch.simulation.avatar.state.goal_rotation.numpy()
+        for env in range(3):
+            ahead = 0.3 * np.cos(2.0 * np.pi * clocks[env] * dt) * np.array([-1.0, 1.0])
+            for b, side, swing in zip(SHOULDERS, (1.0, -1.0), ahead, strict=True):
+                expected = Rotation.from_rotvec([-swing, 0, 0]) * Rotation.from_rotvec([0, 0.6 * side, 0])
+                off = expected.inv() * Rotation.from_quat(goal[env, b].astype(float))
+                assert off.magnitude() < 1e-3
+            for b in ELBOWS:
+                assert goal[env, b] == pytest.approx(Rotation.from_rotvec([0.5, 0, 0]).as_quat(), abs=1e-5)
+
+
+def test_arms_hang(make_env):
+    """At mid-swing forearms are nearer to the vertical than in the rest pose, and ahead of it."""
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, **{"gait.worth": 0.3, "fidelity": "coarse"})
+    env.reset(seed=0)
+    for _ in range(30 + 8):  # from a quarter of a stride on
+        env.step(still(env))
+    at, rest = env.batch.simulation.avatar.tracked.position.numpy()[0], env.batch.simulation.flesh[0].points.joints[0]
+    for elbow, wrist, shoulder in zip(ELBOWS, WRISTS, SHOULDERS, strict=True):
+        arm, forearm, before = at[elbow] - at[shoulder], at[wrist] - at[elbow], rest[wrist] - rest[elbow]
+        assert arm[2] < -0.9 * np.linalg.norm(arm)
+        assert before[2] > -0.7 * np.linalg.norm(before) and forearm[2] < -0.85 * np.linalg.norm(forearm)
+        assert forearm[1] < 0.0
+
+
+@pytest.mark.parametrize(("stride", "dt"), [(0.2, 0.2), (0.5, 0.1), (0.19, 1.0 / 30.0)])
+def test_a_stride_of_hardly_any_steps_is_refused(stride, dt):
+    task = load_task(WALK)
+    with pytest.raises(ConfigError, match=r"stride_seconds"):
+        task(load_config(task.Config, {}, {"gait.worth": 0.2, "gait.stride_seconds": stride, "physics.control_dt": dt}))
+
+
 def test_the_mirror_is_half_a_stride_on(make_env):
     """The same moment of the other side: who is paid for the left foot's load is, mirrored, for the right one's."""
     env = make_env(WALK, **{"gait.worth": 0.3})
@@ -114,4 +186,3 @@ def test_the_mirror_is_half_a_stride_on(make_env):
     changed = mirror.observations(torch.tensor([*clock, 3.0, 1.0])).numpy()
     later = 2.0 * np.pi * (time + 0.5)
     assert changed == pytest.approx([np.sin(later), np.cos(later), 1.0, 3.0], abs=1e-6)
-    assert left_share(time, 1.0) == pytest.approx(1.0 - left_share(time + 0.5, 1.0))
