@@ -103,7 +103,8 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
     try:
         actor.load_state_dict(torch.load(path, map_location=device, weights_only=True))
     except (pickle.UnpicklingError, EOFError, RuntimeError, AttributeError, TypeError) as error:
-        raise ConfigError(f"{path} holds no policy of its config.yaml: {first_line(error)}") from None
+        size = f"that sees {len(seen)} numbers and gives {action_size}"
+        raise ConfigError(f"{path} holds no policy of its config.yaml {size}: {first_line(error)}") from None
     return mean_agent(actor.eval(), seen, device)
 
 

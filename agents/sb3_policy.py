@@ -44,7 +44,8 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
         with zipfile.ZipFile(path) as content, content.open(PARAMETERS) as file:
             policy.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
     except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError, TypeError) as error:
-        raise ConfigError(f"{path} holds no policy of its config.yaml: {first_line(error)}") from None
+        size = f"that sees {len(components(layout, config.observe))} numbers and gives {action_size}"
+        raise ConfigError(f"{path} holds no policy of its config.yaml {size}: {first_line(error)}") from None
     return policy_agent(policy.eval())
 
 
