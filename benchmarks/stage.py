@@ -243,7 +243,7 @@ def perform(act: Act, fidelity: str = "coarse", device: str = "cpu", steps: int 
     stage = Stage(act, fidelity, device)
     count = steps or round(act.seconds / stage.dt)
     moments = {round(moment / stage.dt) for moment in act.view.moments} if size else set()
-    picture, frames, seen = None, [], []
+    picture, frames, seen, shown = None, [], [], 0
     for step in range(count + 1):
         if step:
             stage.step()
@@ -252,7 +252,8 @@ def perform(act: Act, fidelity: str = "coarse", device: str = "cpu", steps: int 
             from piavatar_envs.api.picture import Picture
 
             picture = picture or Picture(stage, RenderConfig(width=size, height=size, color=act.view.color))
-            frames.append(picture.frame(0))
+            frames.append(picture.frame(0, stage.dt * (step - shown)))
+            shown = step
     if picture:
         picture.close()
     columns = {name: np.array([entry[name] for entry in seen]) for name in seen[0]}

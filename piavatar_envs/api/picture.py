@@ -45,8 +45,8 @@ class Picture:
             self._skins[key] = Skin(flesh.asset, shaped, points.rest[row], points.skin_joints, points.skin_weights)
         return self._skins[key]
 
-    def frame(self, env: int, steps: int) -> np.ndarray:
-        """The scene of environment ``env``, ``(height, width, 3)`` uint8, so many steps after the last picture."""
+    def frame(self, env: int, elapsed: float) -> np.ndarray:
+        """The scene of environment ``env``, ``(height, width, 3)`` uint8, a time [s] after the last picture."""
         from piavatar_envs.render import Sphere
 
         state = self.batch.simulation.state
@@ -56,7 +56,6 @@ class Picture:
         markers = [Sphere(*marker) if isinstance(marker, tuple) else marker for marker in markers]
         roots = [avatar.tracked.position.numpy()[env, 0] for avatar in self.batch.simulation.avatars]
         follow = np.mean(roots, axis=0) if self.batch.task.camera_follows else None
-        elapsed = steps * self.batch.config.physics.control_dt
         return self.renderer.render(bodies, markers + self._colliders(env), follow=follow, elapsed=elapsed)
 
     def _avatars(self, env: int, x: np.ndarray, F: np.ndarray) -> list:
@@ -143,7 +142,7 @@ class Pictures:
             # another episode, or the same one from another moment on: the camera jumps instead of gliding
             self._opened[env].cut()
         self._seen[env] = now
-        return self._opened[env].frame(own, max(0, now[3] - before[3]))
+        return self._opened[env].frame(own, max(0, now[3] - before[3]) * batch.config.physics.control_dt)
 
     def close(self) -> None:
         """Close what was opened."""
