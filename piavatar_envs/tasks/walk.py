@@ -50,6 +50,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: Mean speed over the target's that no walker shall exceed: the domain ends there.
 FASTEST = 1.5
+#: Mean speed over the target's that is asked for.
+_PACE = wp.constant(0.9)
 #: Components of what is observed of the way.
 _WAY_SIZE = 4
 
@@ -66,6 +68,9 @@ class WalkConfig(EnvConfig):
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     target_speed: float = Field(1.0, gt=0.0, le=5.0, description="how fast to go [m/s]")
     lane: float = Field(1.0, gt=0.0, le=2.0, description="distance aside of the way at which the episode ends [m]")
+    most_behind: float | None = Field(
+        None, gt=0.0, description="distance behind the pace at which the episode ends; None: there is no pace [m]"
+    )
     heading_margin: float = Field(0.8, gt=0.0, description="angle off the way at which the reward is 0.1 [rad]")
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
@@ -78,6 +83,7 @@ class Way:
     start: PlaceRule  # where it begins: only its place is used
     speed: float  # [m/s]
     lane: float  # [m]
+    most_behind: float  # [m]
     length: float  # [m]
     heading_margin: float  # [rad]
     control_dt: float  # [s]
@@ -121,12 +127,13 @@ def judge_walk(
     facing[2] = 0.0
     off_way = wp.acos(wp.clamp(wp.dot(wp.normalize(facing), ahead), -1.0, 1.0))
     gone = way_gone(way, body, e, position[e, 0])
-    mean_speed = gone[0] / (way.control_dt * float(step_count[e] + 1))
+    time = way.control_dt * float(step_count[e] + 1)
+    mean_speed = gone[0] / time
     in_turn = turn_taken(way.gait, step_count[e], left_load[e])
     hips_straight = tolerance(tilt_of(rotation[e, 0]), 0.1, rule.tilt_margin)
     fast = now.high * tolerance(wp.abs(speed - way.speed), 0.1 * way.speed, way.speed)
     terms[e, 0, 0] = (0.7 - way.gait.worth) * fast
-    terms[e, 0, 1] = way.gait.worth * fast * in_turn * hips_straight
+    terms[e, 0, 1] = way.gait.worth * now.high * in_turn * hips_straight
     terms[e, 0, 2] = 0.1 * now.high * tolerance(off_way, 0.1, way.heading_margin)
     terms[e, 0, 3] = 0.1 * now.high
     terms[e, 0, 4] = 0.1 * now.straight
@@ -136,9 +143,10 @@ def judge_walk(
     metrics[e, 0, 4] = mean_speed
     metrics[e, 0, 5] = gone[0]
     standing = now.head >= rule.stand_head
-    success[e, 0] = standing and mean_speed >= 0.9 * way.speed and gone[0] >= way.speed
+    success[e, 0] = standing and mean_speed >= _PACE * way.speed and gone[0] >= way.speed
     fallen = is_down(wp.vec2(now.head, now.pelvis), way.least)
-    terminated[e, 0] = fallen or wp.abs(gone[1]) > way.lane or wp.abs(gone[0]) > way.length
+    behind = _PACE * way.speed * time - gone[0] > way.most_behind
+    terminated[e, 0] = fallen or behind or wp.abs(gone[1]) > way.lane or wp.abs(gone[0]) > way.length
 
 
 @wp.kernel
@@ -182,8 +190,8 @@ they do just that."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "speed": "0.7, or 0.7 - `gait.worth`, while the pelvis moves ahead at `target_speed` give or take a tenth; "
         "beyond it a Gaussian that has fallen to a tenth after another `target_speed`; all times `height` / 0.1",
-        "gait": f"`gait.worth` {GAIT_DOC}; all times what `speed` is of its greatest, and less where the pelvis tilts, "
-        "as `upright` is where the chest does",
+        "gait": f"`gait.worth` {GAIT_DOC}; all times `height` / 0.1, and less where the pelvis tilts, as "
+        "`upright` is where the chest does",
         "heading": "0.1 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.01 "
         "after another `heading_margin`; all times `height` / 0.1",
         "height": "0.1 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that "
@@ -202,7 +210,10 @@ they do just that."""
         "`mean_speed` is at least 0.9 `target_speed`, over at least as many metres as the target goes in a second, and "
         "the head is no lower than `upright.stand_head` of its height in the rest pose"
     )
-    termination_doc = f"{FALL_DOC};\n- the pelvis is more than `lane` aside of the way, or beyond its end"
+    termination_doc = (
+        f"{FALL_DOC};\n- the pelvis is more than `lane` aside of the way, or beyond its end;\n- the pelvis is "
+        "more than `most_behind` behind a pace of 0.9 `target_speed`, if there is one"
+    )
     picture_seconds = 0.3
     picture_actions: ClassVar[Mapping[str, float]] = {
         "left_hip.x": 0.4, "left_knee.x": 0.1, "right_hip.x": -0.22, "right_knee.x": 0.15, "left_shoulder.x": -0.2,
@@ -240,6 +251,7 @@ they do just that."""
         self.reference_rotation = wp.zeros((env.num_envs, NUM_JOINTS), dtype=wp.quat, device=env.device)
         start.place = wp.vec3(*self._place())
         way.start, way.speed, way.lane, way.length = start, config.target_speed, config.lane, self._length()
+        way.most_behind = np.inf if config.most_behind is None else config.most_behind
         way.heading_margin, way.control_dt = config.heading_margin, config.physics.control_dt
         way.least, way.upright = config.fall.least, upright_rule(config.upright, config.control_cost)
         points = env.simulation.flesh[0].points

@@ -288,6 +288,22 @@ def test_who_leaves_the_way_is_out(make_env):
     assert 7 < steps < 14
 
 
+@pytest.mark.parametrize("most_behind", [0.2, None])
+def test_who_falls_behind_the_pace_is_out(make_env, most_behind):
+    """Of a body that stands: by 0.9 of the target's speed it is 0.2 m behind after 0.22 s, and not out without."""
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, most_behind=most_behind)
+    env.reset(seed=0)
+    ends = []
+    for step in range(12):
+        _, _, terminated, _, info = env.step(still(env))
+        behind = 0.9 * (step + 1) * env.config.physics.control_dt - info["distance"]
+        assert terminated == (most_behind is not None and behind > most_behind)
+        ends.append(terminated)
+        if terminated:
+            break
+    assert len(ends) == (12 if most_behind is None else 7)
+
+
 @pytest.mark.parametrize("name", ["ball_mass", "throw_speed", "throw_distance"])
 def test_falling_ranges_are_refused(name):
     with pytest.raises(ConfigError, match=rf"{name}=\[3.0, 2.0\]"):
