@@ -115,8 +115,10 @@ def check_actions(action: np.ndarray, shape: tuple[int, ...], names: Sequence[st
     """The action as float32, refused before anything changes.
 
     Raises:
-        ValueError: a wrong shape, or a component that is not finite; its index and name are given.
+        ValueError: complex numbers, a wrong shape, or a component that is not finite; its index and name are given.
     """
+    if np.iscomplexobj(action):
+        raise ValueError("action is complex; actions must be real, in [-1, 1]")
     action = np.asarray(action, dtype=np.float32)
     if action.shape != shape:
         raise ValueError(f"action has shape {action.shape}, expected {shape}")

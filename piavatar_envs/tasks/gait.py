@@ -36,13 +36,18 @@ GAIT_TERM = ObservationTerm(
 )
 #: Beyond the first a left foot's share of the load is off the clock's, and another second off a tenth is left [-].
 _BOUND, _MARGIN = 0.2, 0.4
+#: The same of how far it is ahead [m].
+_SHORT, _SHORT_MARGIN = 0.1, 0.3
 #: Share of a stride in which the load goes from one foot to the other: adults have 0.1, twice a stride (Perry &
 #: Burnfield, "Gait Analysis", 2010).
 _HANDOVER = 0.1
 GAIT_DOC = (
     f"(0 by default) while the left foot's share of what the ground bears is within {_BOUND} of the clock's: all of it "
     f"in the first half of every `gait.stride_seconds`, none in the second, {_HANDOVER} of a stride each to go over; "
-    f"beyond it a Gaussian that has fallen to a tenth after another {_MARGIN}; nothing while neither foot bears"
+    f"beyond it a Gaussian that has fallen to a tenth after another {_MARGIN}; nothing while neither foot bears. Half "
+    f"of it only while the left ankle is as far ahead of the right one as the clock says, by steps that make "
+    f"`target_speed`, give or take {_SHORT} m; beyond it a Gaussian that has fallen to a tenth after another "
+    f"{_SHORT_MARGIN} m"
 )
 
 _STEEPNESS = wp.constant(0.5 / math.sin(math.pi * _HANDOVER))
@@ -80,15 +85,17 @@ class Gait:
 
     worth: float  # reward
     stride: float  # [control steps]
+    step_length: float  # [m]
     arm_swing: float  # [rad]
     soles: wp.array2d(dtype=int)  # (2, n) particles of the left and of the right one; some may be there twice
 
 
-def gait_rule(config: GaitConfig, control_dt: float, points: BodyPoints, device: str) -> Gait:
+def gait_rule(config: GaitConfig, speed: float, control_dt: float, points: BodyPoints, device: str) -> Gait:
     """Kernel argument.
 
     Args:
         config: settings.
+        speed: to go at [m/s].
         control_dt: a control step [s].
         points: of the body.
         device: where its soles are looked at.
@@ -96,6 +103,7 @@ def gait_rule(config: GaitConfig, control_dt: float, points: BodyPoints, device:
     rule = Gait()
     rule.worth = config.worth
     rule.stride, rule.arm_swing = config.stride_seconds / control_dt, config.arm_swing
+    rule.step_length = 0.5 * speed * config.stride_seconds
     soles = [_sole(points, side) for side in ("left", "right")]
     most = max(map(len, soles))
     rule.soles = wp.array(np.stack([np.resize(sole, most) for sole in soles]), dtype=int, device=device)
@@ -150,6 +158,16 @@ def turn_taken(gait: Gait, step: int, left: float):
     if left == NOTHING:
         return 0.0
     return tolerance(wp.abs(left - due_share(phase_of(gait, float(step) + 0.5))), _BOUND, _MARGIN)
+
+
+@wp.func
+def stepped(gait: Gait, step: int, lead: float):
+    """What it is worth, from 0 to 1, that the left ankle is so far ahead of the right one [m].
+
+    In the middle of the step that the counter counts next. A foot comes down a step's length in front of the other.
+    """
+    due = gait.step_length * wp.cos(phase_of(gait, float(step) + 1.0))
+    return tolerance(wp.abs(lead - due), _SHORT, _SHORT_MARGIN)
 
 
 @wp.func

@@ -252,6 +252,12 @@ def left_foot_share(position: wp.array2d(dtype=wp.vec3), sensors: Sensors, e: in
     return foot_share(position[e, _LEFT], position[e, _RIGHT], sensors.boundary_impulse[e, agent], moment)
 
 
+@wp.func
+def lead_of_left_foot(position: wp.array2d(dtype=wp.vec3), e: int, ahead: wp.vec3):
+    """How far ahead of the right ankle the left one is [m]."""
+    return wp.dot(position[e, _LEFT] - position[e, _RIGHT], ahead)
+
+
 @wp.kernel
 def observe_upright(
     agent: int,

@@ -25,6 +25,7 @@ from piavatar_envs.tasks.gait import (
     gait_rule,
     hang_arms,
     record_observe_gait,
+    stepped,
     swing_arms,
     turn_taken,
     weigh_feet,
@@ -39,6 +40,7 @@ from piavatar_envs.tasks.upright import (
     UPRIGHT_TERMS,
     Upright,
     UprightConfig,
+    lead_of_left_foot,
     posture_of,
     record_observe_upright,
     tilt_of,
@@ -130,10 +132,12 @@ def judge_walk(
     time = way.control_dt * float(step_count[e] + 1)
     mean_speed = gone[0] / time
     in_turn = turn_taken(way.gait, step_count[e], left_load[e])
+    lead = lead_of_left_foot(position, e, ahead)
+    stride = in_turn * (0.5 + 0.5 * stepped(way.gait, step_count[e], lead))
     hips_straight = tolerance(tilt_of(rotation[e, 0]), 0.1, rule.tilt_margin)
     fast = now.high * tolerance(wp.abs(speed - way.speed), 0.1 * way.speed, way.speed)
     terms[e, 0, 0] = (0.7 - way.gait.worth) * fast
-    terms[e, 0, 1] = way.gait.worth * now.high * in_turn * hips_straight
+    terms[e, 0, 1] = way.gait.worth * now.high * stride * hips_straight
     terms[e, 0, 2] = 0.1 * now.high * tolerance(off_way, 0.1, way.heading_margin)
     terms[e, 0, 3] = 0.1 * now.high
     terms[e, 0, 4] = 0.1 * now.straight
@@ -190,8 +194,8 @@ they do just that."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "speed": "0.7, or 0.7 - `gait.worth`, while the pelvis moves ahead at `target_speed` give or take a tenth; "
         "beyond it a Gaussian that has fallen to a tenth after another `target_speed`; all times `height` / 0.1",
-        "gait": f"`gait.worth` {GAIT_DOC}; all times `height` / 0.1, and less where the pelvis tilts, as "
-        "`upright` is where the chest does",
+        "gait": f"`gait.worth` {GAIT_DOC}; all times `height` / 0.1, and less where the pelvis tilts, as `upright` is "
+        "where the chest does",
         "heading": "0.1 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.01 "
         "after another `heading_margin`; all times `height` / 0.1",
         "height": "0.1 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that "
@@ -255,7 +259,7 @@ they do just that."""
         way.heading_margin, way.control_dt = config.heading_margin, config.physics.control_dt
         way.least, way.upright = config.fall.least, upright_rule(config.upright, config.control_cost)
         points = env.simulation.flesh[0].points
-        way.gait = gait_rule(config.gait, config.physics.control_dt, points, env.device)
+        way.gait = gait_rule(config.gait, config.target_speed, config.physics.control_dt, points, env.device)
         self.left_load = wp.zeros(env.num_envs, dtype=float, device=env.device)
         self.way = way
 
