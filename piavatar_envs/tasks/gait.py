@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.config import FROZEN, ConfigError, DriveConfig
+from piavatar_envs.envs.config import FROZEN, ConfigError
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.mpm.types import Sensors, row
 from piavatar_envs.tasks.rewards import tolerance
@@ -42,8 +42,8 @@ _SHORT, _SHORT_MARGIN = 0.1, 0.3
 #: Burnfield, "Gait Analysis", 2010).
 _HANDOVER = 0.1
 GAIT_DOC = (
-    f"(0 by default) while the left foot's share of what the ground bears is within {_BOUND} of the clock's: all of it "
-    f"in the first half of every `gait.stride_seconds`, none in the second, {_HANDOVER} of a stride each to go over; "
+    f"while the left foot's share of what the ground bears is within {_BOUND} of the clock's: all of it in the first "
+    f"half of every `gait.stride_seconds`, none in the second, {_HANDOVER} of a stride each to go over; "
     f"beyond it a Gaussian that has fallen to a tenth after another {_MARGIN}; nothing while neither foot bears. Half "
     f"of it only while the left ankle is as far ahead of the right one as the clock says, by steps that make "
     f"`target_speed`, give or take {_SHORT} m; beyond it a Gaussian that has fallen to a tenth after another "
@@ -71,7 +71,7 @@ class GaitConfig(BaseModel):
     model_config = FROZEN
 
     worth: float = Field(
-        0.0, ge=0.0, le=0.7, description="reward for feet that bear in turn, out of that of speed; 0 for no clock [-]"
+        0.35, ge=0.0, le=0.7, description="reward for feet that bear in turn, out of that of speed; 0 for no clock [-]"
     )
     stride_seconds: float = Field(1.0, ge=0.2, le=5.0, description="time of two steps, one of each foot [s]")
     arm_swing: float = Field(
@@ -110,17 +110,12 @@ def gait_rule(config: GaitConfig, speed: float, control_dt: float, points: BodyP
     return rule
 
 
-def check_gait(config: GaitConfig, drive: DriveConfig, control_dt: float) -> None:
+def check_gait(config: GaitConfig, control_dt: float) -> None:
     """Refuse a gait that cannot be.
 
     Raises:
-        ConfigError: the pose is commanded, or a stride has hardly any steps.
+        ConfigError: a stride has hardly any steps.
     """
-    if config.worth > 0.0 and drive.control == "pose":
-        raise ConfigError(
-            f"gait.worth={config.worth} is for joints that are moved by their own strength; use "
-            'drive.control="pd" or "torque", or gait.worth=0'
-        )
     if config.worth > 0.0 and config.stride_seconds < (_LEAST_STEPS - 0.01) * control_dt:
         raise ConfigError(
             f"gait.stride_seconds={config.stride_seconds} is less than {_LEAST_STEPS:.0f} control steps of "

@@ -71,7 +71,7 @@ class WalkConfig(EnvConfig):
     target_speed: float = Field(1.0, gt=0.0, le=5.0, description="how fast to go [m/s]")
     lane: float = Field(1.0, gt=0.0, le=2.0, description="distance aside of the way at which the episode ends [m]")
     most_behind: float | None = Field(
-        None, gt=0.0, description="distance behind the pace at which the episode ends; None: there is no pace [m]"
+        1.5, gt=0.0, description="distance behind the pace at which the episode ends; None: there is no pace [m]"
     )
     heading_margin: float = Field(0.8, gt=0.0, description="angle off the way at which the reward is 0.1 [rad]")
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
@@ -185,14 +185,16 @@ class WalkTask(Task):
 
     summary = """The avatar stands on the ground with its joints a little bent at random (`pose_noise`) and shall walk
 straight ahead at `target_speed`, where it faces at first; nothing holds it but what its joints can do. Faster is no
-better than slower. The way is as long as one comes in an episode at 1.5 times the target; it ends at `lane` to either
-side. How it gets ahead is its own affair, and hopping on both feet does, unless `gait.worth` is set, for `control="pd"`
-or `"torque"`: then feet shall bear the body in turn, by a clock that begins with the episode. The avatar sees it at the
-end of its observation, in two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. At
-action 0 arms are not in the rest pose then: they hang, and swing with the clock against the legs. Where they do not act
-they do just that."""
+better than slower, and who falls behind a pace of 0.9 of the target, by `most_behind`, is out. The way is as long as
+one comes in an episode at 1.5 times the target; it ends at `lane` to either side.
+
+Feet shall bear the body in turn and pass each other, by a clock that begins with the episode. The avatar sees it at the
+end of its observation in two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. Under
+`control="pd"` and `"torque"` arms hang at action 0, in place of the rest pose, and swing with the clock against the
+legs; where they do not act they do just that. With `gait.worth=0` there is no clock, and how it gets ahead is its own
+affair: hopping on both feet does."""
     reward_docs: ClassVar[Mapping[str, str]] = {
-        "speed": "0.7, or 0.7 - `gait.worth`, while the pelvis moves ahead at `target_speed` give or take a tenth; "
+        "speed": "0.7 - `gait.worth` while the pelvis moves ahead at `target_speed` give or take a tenth; "
         "beyond it a Gaussian that has fallen to a tenth after another `target_speed`; all times `height` / 0.1",
         "gait": f"`gait.worth` {GAIT_DOC}; all times `height` / 0.1, and less where the pelvis tilts, as `upright` is "
         "where the chest does",
@@ -230,8 +232,8 @@ they do just that."""
         super().__init__(config)
         #: whether there is a clock
         self.clocked = config.gait.worth > 0.0
-        self.targets_about_reference = self.clocked
-        check_gait(config.gait, config.drive, config.physics.control_dt)
+        self.targets_about_reference = self.clocked and config.drive.control != "pose"
+        check_gait(config.gait, config.physics.control_dt)
 
     def terms(self) -> tuple[ObservationTerm, ...]:
         return (*self.observation_terms, GAIT_TERM) if self.clocked else self.observation_terms
@@ -265,13 +267,13 @@ they do just that."""
 
     def record_reset(self, env, program) -> None:
         record_standing(env, program, self.config.pose_noise)
-        if self.clocked:
+        if self.targets_about_reference:
             command = env.simulation.avatar.state.command_rotation
             program.launch(hang_arms, command.shape, [env.mask, self.way.gait], [command])
         self.grounding.record_reset(env, program)
 
     def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
-        if not self.clocked:
+        if not self.targets_about_reference:
             return super().record_references(env, program)
         state, reference = env.simulation.avatar.state, self.reference_rotation
         inputs = [self.way.gait, env.step_count, state.command_rotation]

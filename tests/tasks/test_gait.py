@@ -102,7 +102,7 @@ def test_arms_hang_and_swing_against_the_legs(make_env, swing):
 
 
 def test_without_a_gait_there_is_no_clock_and_arms_are_at_rest(make_env):
-    env = make_env(WALK, root_assist=1.0, pose_noise=0.0)
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, **{"gait.worth": 0.0})
     assert "gait_phase" not in env.observation_layout
     env.reset(seed=0)
     for _ in range(15):
@@ -111,10 +111,17 @@ def test_without_a_gait_there_is_no_clock_and_arms_are_at_rest(make_env):
     assert (Rotation.from_quat(local.astype(float)).magnitude() < 0.1).all()
 
 
-def test_a_commanded_body_has_no_gait():
-    task = load_task(WALK)
-    with pytest.raises(ConfigError, match=r"gait\.worth=0\.2 is for joints .* drive\.control=\"pd\""):
-        task(load_config(task.Config, {"control": "pose"}, {"gait.worth": 0.2}))
+def test_arms_of_a_commanded_body_do_not_swing_by_themselves(make_env):
+    """It is paid by the clock as others are, and stays in the pose that it is in."""
+    env = make_env(WALK, control="pose", pose_noise=0.0)
+    env.reset(seed=0)
+    paid = [env.step(still(env))[4]["reward_terms"]["gait"] for _ in range(30)]
+    local = env.batch.simulation.avatar.tracked.local.numpy()[0, SHOULDERS]
+    assert (Rotation.from_quat(local.astype(float)).magnitude() < 0.1).all()
+    for step, gait in enumerate(paid):  # side by side, and the load on both: what remains of that at any time
+        shared = tolerance(abs(0.5 - due((step + 0.5) / 30.0, 1.0)), 0.2, 0.4)
+        passing = tolerance(abs(0.5 * np.cos(2.0 * np.pi * (step + 1) / 30.0)), 0.1, 0.3)
+        assert gait == pytest.approx(0.35 * shared * (0.5 + 0.5 * passing), abs=5e-3)
 
 
 def test_a_foot_in_the_air_bears_nothing(make_env):
