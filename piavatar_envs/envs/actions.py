@@ -118,7 +118,7 @@ def check_actions(action: np.ndarray, shape: tuple[int, ...], names: Sequence[st
         ValueError: complex numbers, a wrong shape, or a component that is not finite; its index and name are given.
     """
     if np.iscomplexobj(action):
-        raise ValueError("action is complex; actions must be real, in [-1, 1]")
+        raise ValueError("action is of complex numbers; actions must be real, in [-1, 1]: give action.real")
     action = np.asarray(action, dtype=np.float32)
     if action.shape != shape:
         raise ValueError(f"action has shape {action.shape}, expected {shape}")

@@ -3,7 +3,8 @@
 A clock makes a gait out of what gets ahead: without one, hopping on both feet does as well (Siekmann, Godse, Fern &
 Hurst, "Sim-to-Real Learning of All Common Bipedal Gaits via Periodic Reward Composition", ICRA 2021). At phase 0 the
 left foot has just come down in front; it bears while the right one swings, and from half a stride on the right one
-bears. In the mirror the clock is half a stride on.
+bears. Meanwhile the other foot passes it, and comes down a step's length in front: what a body that leads with one foot
+and draws the other up to it never does. In the mirror the clock is half a stride on.
 """
 
 from __future__ import annotations
@@ -36,18 +37,20 @@ GAIT_TERM = ObservationTerm(
 )
 #: Beyond the first a left foot's share of the load is off the clock's, and another second off a tenth is left [-].
 _BOUND, _MARGIN = 0.2, 0.4
-#: The same of how far it is ahead [m].
-_SHORT, _SHORT_MARGIN = 0.1, 0.3
+#: The same of how far it is ahead, in lengths of a step [-].
+_SHORT, _SHORT_MARGIN = 0.2, 0.6
+#: Ankles of an adult come no farther apart [m].
+_REACH = 1.2
 #: Share of a stride in which the load goes from one foot to the other: adults have 0.1, twice a stride (Perry &
 #: Burnfield, "Gait Analysis", 2010).
 _HANDOVER = 0.1
 GAIT_DOC = (
     f"while the left foot's share of what the ground bears is within {_BOUND} of the clock's: all of it in the first "
-    f"half of every `gait.stride_seconds`, none in the second, {_HANDOVER} of a stride each to go over; "
-    f"beyond it a Gaussian that has fallen to a tenth after another {_MARGIN}; nothing while neither foot bears. Half "
-    f"of it only while the left ankle is as far ahead of the right one as the clock says, by steps that make "
-    f"`target_speed`, give or take {_SHORT} m; beyond it a Gaussian that has fallen to a tenth after another "
-    f"{_SHORT_MARGIN} m"
+    f"half of every `gait.stride_seconds`, none in the second, {_HANDOVER} of a stride each to go over; beyond it a "
+    f"Gaussian that has fallen to a tenth after another {_MARGIN}; nothing while neither foot bears. Half of that is "
+    "for the load alone, half times what is 1 while the left ankle is ahead of the right one by the cosine of the "
+    f"clock's phase times a step's length, `target_speed * gait.stride_seconds / 2`, give or take {_SHORT} of it; "
+    f"beyond it a Gaussian that has fallen to a tenth after another {_SHORT_MARGIN}"
 )
 
 _STEEPNESS = wp.constant(0.5 / math.sin(math.pi * _HANDOVER))
@@ -71,11 +74,11 @@ class GaitConfig(BaseModel):
     model_config = FROZEN
 
     worth: float = Field(
-        0.35, ge=0.0, le=0.7, description="reward for feet that bear in turn, out of that of speed; 0 for no clock [-]"
+        0.35, ge=0.0, le=0.7, description="reward for feet in turn, out of that of speed; 0: no clock [-]"
     )
     stride_seconds: float = Field(1.0, ge=0.2, le=5.0, description="time of two steps, one of each foot [s]")
     arm_swing: float = Field(
-        0.3, ge=0.0, le=0.6, description="how far shoulders that do not act swing to the front and to the back [rad]"
+        0.3, ge=0.0, le=0.6, description="how far shoulders swing to the front and to the back [rad]"
     )
 
 
@@ -103,23 +106,35 @@ def gait_rule(config: GaitConfig, speed: float, control_dt: float, points: BodyP
     rule = Gait()
     rule.worth = config.worth
     rule.stride, rule.arm_swing = config.stride_seconds / control_dt, config.arm_swing
-    rule.step_length = 0.5 * speed * config.stride_seconds
+    rule.step_length = step_length(config, speed)
     soles = [_sole(points, side) for side in ("left", "right")]
     most = max(map(len, soles))
     rule.soles = wp.array(np.stack([np.resize(sole, most) for sole in soles]), dtype=int, device=device)
     return rule
 
 
-def check_gait(config: GaitConfig, control_dt: float) -> None:
+def step_length(config: GaitConfig, speed: float) -> float:
+    """Of a foot, at a ``speed`` [m/s], in front of the other one [m]."""
+    return 0.5 * speed * config.stride_seconds
+
+
+def check_gait(config: GaitConfig, speed: float, control_dt: float) -> None:
     """Refuse a gait that cannot be.
 
     Raises:
-        ConfigError: a stride has hardly any steps.
+        ConfigError: a stride has hardly any control steps, or steps would be longer than legs.
     """
+    if config.worth > 0.0 and step_length(config, speed) > _REACH:
+        raise ConfigError(
+            f"target_speed={speed} and gait.stride_seconds={config.stride_seconds} make steps of "
+            f"{step_length(config, speed):.3g} m, and legs reach {_REACH} m; use a stride of at most "
+            f"{2.0 * _REACH / speed:.3g} s, a lower speed, or gait.worth=0 for no gait"
+        )
     if config.worth > 0.0 and config.stride_seconds < (_LEAST_STEPS - 0.01) * control_dt:
         raise ConfigError(
             f"gait.stride_seconds={config.stride_seconds} is less than {_LEAST_STEPS:.0f} control steps of "
-            f"{control_dt:.3g} s; use at least {_LEAST_STEPS * control_dt:.3g}, or a shorter physics.control_dt"
+            f"{control_dt:.3g} s; use at least {_LEAST_STEPS * control_dt:.3g}, a shorter physics.control_dt, or "
+            "gait.worth=0 for no gait"
         )
 
 
@@ -159,10 +174,11 @@ def turn_taken(gait: Gait, step: int, left: float):
 def stepped(gait: Gait, step: int, lead: float):
     """What it is worth, from 0 to 1, that the left ankle is so far ahead of the right one [m].
 
-    In the middle of the step that the counter counts next. A foot comes down a step's length in front of the other.
+    At the end of the control step that the counter counts next. At phase 0 the left foot is down in front by the length
+    of a step, half a stride later the right one.
     """
     due = gait.step_length * wp.cos(phase_of(gait, float(step) + 1.0))
-    return tolerance(wp.abs(lead - due), _SHORT, _SHORT_MARGIN)
+    return tolerance(wp.abs(lead - due), _SHORT * gait.step_length, _SHORT_MARGIN * gait.step_length)
 
 
 @wp.func

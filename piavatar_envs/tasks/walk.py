@@ -52,7 +52,7 @@ wp.set_module_options({"enable_backward": False})
 
 #: Mean speed over the target's that no walker shall exceed: the domain ends there.
 FASTEST = 1.5
-#: Mean speed over the target's that is asked for.
+#: Mean speed over the target's that is asked for: the pace, and what succeeds.
 _PACE = wp.constant(0.9)
 #: Components of what is observed of the way.
 _WAY_SIZE = 4
@@ -186,13 +186,14 @@ class WalkTask(Task):
     summary = """The avatar stands on the ground with its joints a little bent at random (`pose_noise`) and shall walk
 straight ahead at `target_speed`, where it faces at first; nothing holds it but what its joints can do. Faster is no
 better than slower, and who falls behind a pace of 0.9 of the target, by `most_behind`, is out. The way is as long as
-one comes in an episode at 1.5 times the target; it ends at `lane` to either side.
+one comes in an episode at 1.5 times the target; it ends at `lane` to either side. (With `control="pose"` nothing moves
+the pelvis: that is for poses, not for walking.)
 
-Feet shall bear the body in turn and pass each other, by a clock that begins with the episode. The avatar sees it at the
-end of its observation in two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. Under
-`control="pd"` and `"torque"` arms hang at action 0, in place of the rest pose, and swing with the clock against the
-legs; where they do not act they do just that. With `gait.worth=0` there is no clock, and how it gets ahead is its own
-affair: hopping on both feet does."""
+Feet shall bear the body in turn and pass each other, by a clock that begins with the episode. The avatar sees it in
+two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. With it arms hang, and swing
+against the legs: those that do not act, and under `control="pd"` the pose that is asked for at action 0 (upper arms 34
+degrees lower than at rest, elbows stretched by 29, though actions reach but 20). With `gait.worth=0` there is no
+clock, and how it gets ahead is its own affair: hopping on both feet does."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "speed": "0.7 - `gait.worth` while the pelvis moves ahead at `target_speed` give or take a tenth; "
         "beyond it a Gaussian that has fallen to a tenth after another `target_speed`; all times `height` / 0.1",
@@ -213,12 +214,12 @@ affair: hopping on both feet does."""
         "distance": "that the pelvis has come ahead [m]",
     }
     success_doc = (
-        "`mean_speed` is at least 0.9 `target_speed`, over at least as many metres as the target goes in a second, and "
-        "the head is no lower than `upright.stand_head` of its height in the rest pose"
+        f"`mean_speed` is at least {_PACE} `target_speed`, over at least as many metres as the target goes in a "
+        "second, and the head is no lower than `upright.stand_head` of its height in the rest pose"
     )
     termination_doc = (
         f"{FALL_DOC};\n- the pelvis is more than `lane` aside of the way, or beyond its end;\n- the pelvis is "
-        "more than `most_behind` behind a pace of 0.9 `target_speed`, if there is one"
+        f"more than `most_behind` behind a pace of {_PACE} `target_speed`, unless that is None"
     )
     picture_seconds = 0.3
     picture_actions: ClassVar[Mapping[str, float]] = {
@@ -233,7 +234,7 @@ affair: hopping on both feet does."""
         #: whether there is a clock
         self.clocked = config.gait.worth > 0.0
         self.targets_about_reference = self.clocked and config.drive.control != "pose"
-        check_gait(config.gait, config.physics.control_dt)
+        check_gait(config.gait, config.target_speed, config.physics.control_dt)
 
     def terms(self) -> tuple[ObservationTerm, ...]:
         return (*self.observation_terms, GAIT_TERM) if self.clocked else self.observation_terms

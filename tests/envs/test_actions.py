@@ -54,7 +54,7 @@ def bad_actions(size: int) -> dict[str, tuple[object, str]]:
         "a number": (0.5, rf"shape \(\), expected \({size},\)"),
         "not a number": (at(7, np.nan), r"action\[7\] \({7}\) is nan.*finite"),
         "infinite": (at(size - 1, np.inf), rf"action\[{size - 1}\] \({{{size - 1}}}\) is inf.*finite"),
-        "complex": (np.zeros(size) * 1j, "action is complex; actions must be real"),
+        "complex": (np.zeros(size) * 1j, "action is of complex numbers; actions must be real.*action.real"),
         "minus infinity": (at(0, -np.inf), r"action\[0\] \({0}\) is -inf.*finite"),
     }
 

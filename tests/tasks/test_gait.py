@@ -37,12 +37,19 @@ def due(time: float, stride: float) -> float:
     return float(np.clip(0.5 + 0.5 * np.sin(2.0 * np.pi * time / stride) / np.sin(0.1 * np.pi), 0.0, 1.0))
 
 
-@pytest.mark.parametrize("stride", [1.0, 0.7])
-def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride):
+def stepped(lead: float, time: float, stride: float, length: float) -> float:
+    """A foot comes down a step's length in front, in turn: what it is worth that the left one is ahead by so much."""
+    return tolerance(abs(lead - length * np.cos(2.0 * np.pi * time / stride)) / length, 0.2, 0.6)
+
+
+@pytest.mark.parametrize(("stride", "speed", "yaw"), [(1.0, 1.0, 0.0), (0.7, 1.6, 2.0)])
+def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride, speed, yaw):
     """A body that leans on one foot and then on the other: the reward is that of its load, its step and of the time."""
-    env = make_env(WALK, root_assist=0.3, pose_noise=0.0, **{"gait.worth": 0.3, "gait.stride_seconds": stride})
+    settings = {"gait.worth": 0.3, "gait.stride_seconds": stride, "scene.avatars": [{"yaw": yaw}]}
+    env = make_env(WALK, root_assist=0.3, pose_noise=0.0, target_speed=speed, **settings)
     observation, _ = env.reset(seed=0)
     assert seen(env, observation, "gait_phase") == pytest.approx([0.0, 1.0])
+    ahead = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     paid, dt, sim = [], env.config.physics.control_dt, env.batch.simulation
     tracked, rest, soles = sim.avatar.tracked, sim.flesh[0].points.rest[0], env.batch.task.way.gait.soles.numpy()
     for step in range(60):
@@ -61,9 +68,10 @@ def test_the_clock_is_seen_and_feet_are_paid_by_it(make_env, stride):
             share = float(lifts[1] > 0.03)
         off = abs(share - due((step + 0.5) * dt, stride))
         pelvis = Rotation.from_quat(tracked.rotation.numpy()[0, 0].astype(float)).apply([0.0, 0.0, 1.0])
-        lead = -float(np.diff(tracked.position.numpy()[0, ANKLES[::-1], 1])[0])
-        short = abs(lead - 0.5 * stride * np.cos(phase))
-        in_turn = tolerance(off, 0.2, 0.4) * (0.5 + 0.5 * tolerance(short, 0.1, 0.3))
+        ankles = tracked.position.numpy()[0, ANKLES]
+        lead = float((ankles[0] - ankles[1]) @ ahead)
+        passing = stepped(lead, (step + 1) * dt, stride, 0.5 * speed * stride)
+        in_turn = tolerance(off, 0.2, 0.4) * (0.5 + 0.5 * passing)
         worth = in_turn * tolerance(np.arccos(min(pelvis[2], 1.0)), 0.1, 0.6)
         terms = info["reward_terms"]
         assert terms["gait"] / 0.3 == pytest.approx(terms["height"] / 0.1 * worth, abs=2e-3)
@@ -120,14 +128,14 @@ def test_arms_of_a_commanded_body_do_not_swing_by_themselves(make_env):
     assert (Rotation.from_quat(local.astype(float)).magnitude() < 0.1).all()
     for step, gait in enumerate(paid):  # side by side, and the load on both: what remains of that at any time
         shared = tolerance(abs(0.5 - due((step + 0.5) / 30.0, 1.0)), 0.2, 0.4)
-        passing = tolerance(abs(0.5 * np.cos(2.0 * np.pi * (step + 1) / 30.0)), 0.1, 0.3)
+        passing = stepped(0.0, (step + 1) / 30.0, 1.0, 0.5)
         assert gait == pytest.approx(0.35 * shared * (0.5 + 0.5 * passing), abs=5e-3)
 
 
 def test_a_foot_in_the_air_bears_nothing(make_env):
     """On the toes of the left foot, the right one ahead and high: levers between the ankles give it a third."""
     settings = {"gait.worth": 0.7, "gait.stride_seconds": 5.0, "fidelity": "coarse"}
-    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, **settings)
+    env = make_env(WALK, root_assist=1.0, pose_noise=0.0, target_speed=0.2, **settings)
     env.reset(seed=0)
     action = still(env)
     lifted = {"right_hip.y": -0.6, "right_hip.x": -0.25, "right_knee.x": 0.12, "left_hip.x": 0.2, "left_ankle.x": 0.5}
@@ -142,7 +150,11 @@ def test_a_foot_in_the_air_bears_nothing(make_env):
     assert right > 0.15 * (left + right) and env.batch.task.left_load.numpy()[0] == 1.0
     terms = info["reward_terms"]  # a quarter of the stride: the left foot's turn
     straight = tolerance(np.radians(info["tilt_deg"]), 0.1, 0.6)
-    assert 0.9 * 0.35 * straight < terms["gait"] < 0.7 * straight and terms["speed"] == pytest.approx(0.0, abs=1e-6)
+    ankles = env.batch.simulation.avatar.tracked.position.numpy()[0, ANKLES, 1]
+    passing = stepped(float(ankles[1] - ankles[0]), 45.0 / 30.0, 5.0, 0.5)
+    assert terms["gait"] > 0.9 * 0.7 * straight * (0.5 + 0.5 * passing) and terms["speed"] == pytest.approx(
+        0.0, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("control", ["pd", "torque"])
@@ -191,6 +203,20 @@ def test_a_stride_of_hardly_any_steps_is_refused(stride, dt):
     task = load_task(WALK)
     with pytest.raises(ConfigError, match=r"stride_seconds"):
         task(load_config(task.Config, {}, {"gait.worth": 0.2, "gait.stride_seconds": stride, "physics.control_dt": dt}))
+
+
+@pytest.mark.parametrize(("speed", "stride", "refused"), [(1.2, 2.0, False), (1.3, 2.0, True), (5.0, 0.4, False)])
+def test_steps_that_no_leg_makes_are_refused(speed, stride, refused):
+    """Of up to 1.2 m; without a gait nobody asks for any."""
+    task = load_task(WALK)
+    settings = {"target_speed": speed, "gait.stride_seconds": stride}
+    if refused:
+        with pytest.raises(
+            ConfigError, match=r"steps of 1\.3 m, and legs reach 1\.2 m; use a stride of at most 1\.85 s"
+        ):
+            task(load_config(task.Config, {}, settings))
+        settings["gait.worth"] = 0.0
+    task(load_config(task.Config, {}, settings))
 
 
 def test_the_mirror_is_half_a_stride_on(make_env):
