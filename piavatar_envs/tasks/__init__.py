@@ -14,6 +14,7 @@ _NOT_TASKS = {
     "clip",
     "disturb",
     "fall",
+    "ease",
     "gait",
     "gate",
     "goal",

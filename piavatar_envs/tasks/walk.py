@@ -15,6 +15,7 @@ from piavatar_envs.envs.config import DriveConfig, EnvConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.tasks.base import Task
+from piavatar_envs.tasks.ease import EASE_DOC, ease_rule, record_ease
 from piavatar_envs.tasks.fall import FallConfig, is_down
 from piavatar_envs.tasks.gait import (
     GAIT_DOC,
@@ -75,6 +76,9 @@ class WalkConfig(EnvConfig):
     )
     heading_margin: float = Field(0.8, gt=0.0, description="angle off the way at which the reward is 0.1 [rad]")
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    ease_cost: float = Field(
+        0.0, ge=0.0, description="weight of how far joints are bent beyond what people do [1/rad^2]"
+    )
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 
@@ -180,7 +184,7 @@ class WalkTask(Task):
         ObservationTerm("way_direction", 3, "-", "root", "where to go: a unit vector"),
         ObservationTerm("way_offset", 1, "m", "world", "distance of the pelvis from the way, to the left"),
     )
-    reward_terms = ("speed", "gait", "heading", "height", "upright", "control")
+    reward_terms = ("speed", "gait", "heading", "height", "upright", "control", "ease")
     metrics = ("head_height", "pelvis_height", "tilt_deg", "speed", "mean_speed", "distance")
 
     summary = """The avatar stands on the ground with its joints a little bent at random (`pose_noise`) and shall walk
@@ -206,6 +210,7 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
         "upright": "0.1 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.01 after "
         "another `upright.tilt_margin`",
         "control": "`-control_cost` times the mean of the squared action components",
+        "ease": EASE_DOC,
     }
     metric_docs: ClassVar[Mapping[str, str]] = {
         **METRIC_DOCS,
@@ -264,7 +269,7 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
         points = env.simulation.flesh[0].points
         way.gait = gait_rule(config.gait, config.target_speed, config.physics.control_dt, points, env.device)
         self.left_load = wp.zeros(env.num_envs, dtype=float, device=env.device)
-        self.way = way
+        self.way, self.ease = way, ease_rule(config.ease_cost, env.device)
 
     def record_reset(self, env, program) -> None:
         record_standing(env, program, self.config.pose_noise)
@@ -296,6 +301,7 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
             ],
             [env.terms, env.metrics, env.success, env.terminated],
         )  # fmt: skip
+        record_ease(env, program, self.ease, self.reward_terms.index("ease"))
 
     def record_observe(self, env, program, agent: int, start: int) -> None:
         avatar = env.simulation.avatars[agent]
