@@ -150,6 +150,12 @@ def first_line(error: Exception) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
+def no_policy(path: Path, seen: int, action_size: int, error: Exception) -> ConfigError:
+    """What to raise for a file without a policy that sees ``seen`` numbers and gives ``action_size``."""
+    size = f"that sees {seen} numbers and gives {action_size}"
+    return ConfigError(f"{path} holds no policy of its config.yaml {size}: {first_line(error)}")
+
+
 def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Leaves of nested dictionaries by dotted name; one without any is as if it were not there."""
     found: dict[str, Any] = {}

@@ -14,11 +14,11 @@ from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
 from agents.batches import BatchTraining
-from agents.checkpoint import first_line
+from agents.checkpoint import no_policy
 from agents.evaluate import Agent
 from agents.help import HelpSettings
 from agents.workers import components
-from piavatar_envs.envs.config import FROZEN, ConfigError, FrozenDict
+from piavatar_envs.envs.config import FROZEN, FrozenDict
 from piavatar_envs.envs.observations import ObservationLayout
 
 
@@ -103,8 +103,7 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
     try:
         actor.load_state_dict(torch.load(path, map_location=device, weights_only=True))
     except (pickle.UnpicklingError, EOFError, RuntimeError, AttributeError, TypeError) as error:
-        size = f"that sees {len(seen)} numbers and gives {action_size}"
-        raise ConfigError(f"{path} holds no policy of its config.yaml {size}: {first_line(error)}") from None
+        raise no_policy(path, len(seen), action_size, error) from None
     return mean_agent(actor.eval(), seen, device)
 
 

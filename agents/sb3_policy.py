@@ -13,11 +13,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.sac.policies import SACPolicy
 
 from agents import ppo
-from agents.checkpoint import first_line
+from agents.checkpoint import no_policy
 from agents.config import TrainingConfig
 from agents.evaluate import Agent, policy_agent
 from agents.workers import components
-from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.envs.observations import ObservationLayout
 
 #: The policy's parameters within ``policy.zip``.
@@ -44,8 +43,7 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
         with zipfile.ZipFile(path) as content, content.open(PARAMETERS) as file:
             policy.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
     except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError, TypeError) as error:
-        size = f"that sees {len(components(layout, config.observe))} numbers and gives {action_size}"
-        raise ConfigError(f"{path} holds no policy of its config.yaml {size}: {first_line(error)}") from None
+        raise no_policy(path, len(components(layout, config.observe)), action_size, error) from None
     return policy_agent(policy.eval())
 
 

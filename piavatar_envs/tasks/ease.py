@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.joint_torques import beyond
 from piavatar_envs.avatar.limits import Bounds
-from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import joint_index
 
 if TYPE_CHECKING:
@@ -70,9 +70,7 @@ def judge_ease(ease: Ease, term: int, local: wp.array2d(dtype=wp.quat), terms: w
     count = ease.joint.shape[0]
     total = float(0.0)
     for n in range(count):
-        bent = quat_log(local[e, ease.joint[n]])
-        beyond = bent - wp.min(wp.max(bent, ease.lower[n]), ease.upper[n])
-        total += wp.length_sq(beyond)
+        total += wp.length_sq(beyond(local[e, ease.joint[n]], ease.lower[n], ease.upper[n]))
     terms[e, 0, term] = -ease.cost * total / float(3 * count)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 from pydantic import BaseModel, Field
 
+from piavatar_envs.avatar.asset import dense_weights
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
@@ -124,13 +125,15 @@ def check_gait(config: GaitConfig, speed: float, control_dt: float) -> None:
     Raises:
         ConfigError: a stride has hardly any control steps, or steps would be longer than legs.
     """
-    if config.worth > 0.0 and step_length(config, speed) > _REACH:
+    if config.worth == 0.0:
+        return
+    if step_length(config, speed) > _REACH:
         raise ConfigError(
             f"target_speed={speed} and gait.stride_seconds={config.stride_seconds} make steps of "
             f"{step_length(config, speed):.3g} m, and legs reach {_REACH} m; use a stride of at most "
             f"{2.0 * _REACH / speed:.3g} s, a lower speed, or gait.worth=0 for no gait"
         )
-    if config.worth > 0.0 and config.stride_seconds < (_LEAST_STEPS - 0.01) * control_dt:
+    if config.stride_seconds < (_LEAST_STEPS - 0.01) * control_dt:
         raise ConfigError(
             f"gait.stride_seconds={config.stride_seconds} is less than {_LEAST_STEPS:.0f} control steps of "
             f"{control_dt:.3g} s; use at least {_LEAST_STEPS * control_dt:.3g}, a shorter physics.control_dt, or "
@@ -141,7 +144,7 @@ def check_gait(config: GaitConfig, speed: float, control_dt: float) -> None:
 def _sole(points: BodyPoints, side: str) -> np.ndarray:
     """Lowest particles of a foot."""
     bones = [joint_index(f"{side}_ankle"), joint_index(f"{side}_foot")]
-    share = np.where(np.isin(points.skin_joints, bones), points.skin_weights, 0.0).sum(1)
+    share = dense_weights(points.skin_joints, points.skin_weights)[:, bones].sum(1)
     foot, height = np.flatnonzero(share > 0.5), points.rest[0][:, 2]
     return foot[height[foot] < height[foot].min() + _SOLE].astype(np.int32)
 

@@ -301,7 +301,8 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
             ],
             [env.terms, env.metrics, env.success, env.terminated],
         )  # fmt: skip
-        record_ease(env, program, self.ease, self.reward_terms.index("ease"))
+        if self.config.ease_cost > 0.0:
+            record_ease(env, program, self.ease, self.reward_terms.index("ease"))
 
     def record_observe(self, env, program, agent: int, start: int) -> None:
         avatar = env.simulation.avatars[agent]
