@@ -51,6 +51,12 @@ class RslPPOSettings(BaseModel):
     largest_gradient: float = Field(1.0, gt=0.0, description="norm to which gradients are clipped [-]")
     action_std: float = Field(0.6, gt=0.0, description="standard deviation of the first actions [-]")
     normalize_observation: bool = Field(False, description="whether networks see observations by running statistics")
+    observation_noise: float = Field(
+        0.0,
+        ge=0.0,
+        description="standard deviation of noise on what networks see while they learn, in the terms' own units; what "
+        "hardly moves then, such as a joint that is held, is not taken for exact",
+    )
     mirrored: bool = Field(False, description="whether it also learns from every step as it is in a mirror")
     hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of both networks")
 

@@ -35,7 +35,7 @@ from piavatar_envs.tasks.base import Task
 
 
 class ScaledPPO(PPO):
-    """rsl_rl's PPO, which learns from scaled rewards, and in smaller and smaller updates.
+    """rsl_rl's PPO, which learns from scaled rewards and noisy observations, and in smaller and smaller updates.
 
     What is logged are the environment's own rewards.
 
@@ -43,17 +43,21 @@ class ScaledPPO(PPO):
         updates: how many there have been; to be set where a training goes on.
     """
 
-    def __init__(self, *args: Any, reward_scale: float, kl_targets: Sequence[float], **settings: Any) -> None:
+    def __init__(
+        self, *args: Any, reward_scale: float, observation_noise: float, kl_targets: Sequence[float], **settings: Any
+    ) -> None:
         """As rsl_rl's.
 
         Args:
             args: of the base.
             reward_scale: the factor.
+            observation_noise: standard deviation of what is added to every component.
             kl_targets: of the first update and all that follow, in place of ``desired_kl``; none for a fixed one.
             settings: of the base.
         """
         super().__init__(*args, **settings)
         self.reward_scale, self.kl_targets, self.updates = reward_scale, kl_targets, 0
+        self.observation_noise = observation_noise
 
     def update(self) -> dict[str, float]:
         """Learn from a rollout."""
@@ -67,6 +71,12 @@ class ScaledPPO(PPO):
     ) -> None:
         """Record a step."""
         super().process_env_step(obs, self.reward_scale * rewards, dones, extras)
+
+    def act(self, obs: TensorDict) -> torch.Tensor:
+        """Draw actions, and record what they are drawn for."""
+        if self.observation_noise > 0.0:
+            obs = obs.apply(lambda seen: seen + self.observation_noise * torch.randn_like(seen))
+        return super().act(obs)
 
 
 class CurveWriter(LogWriter):
@@ -190,6 +200,7 @@ def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
         "algorithm": {
             "class_name": ScaledPPO,
             "reward_scale": ppo.reward_scale,
+            "observation_noise": ppo.observation_noise,
             "kl_targets": kl_targets(config),
             "num_learning_epochs": ppo.epochs,
             "num_mini_batches": ppo.minibatches,

@@ -196,8 +196,8 @@ the pelvis: that is for poses, not for walking.)
 Feet shall bear the body in turn and pass each other, by a clock that begins with the episode. The avatar sees it in
 two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. With it arms hang, and swing
 against the legs: those that do not act, and under `control="pd"` the pose that is asked for at action 0 (upper arms 34
-degrees lower than at rest, elbows stretched by 29, though actions reach but 20). With `gait.worth=0` there is no
-clock, and how it gets ahead is its own affair: hopping on both feet does."""
+degrees lower than at rest, elbows stretched by 20). With `gait.worth=0` there is no clock, and how it gets ahead is its
+own affair: hopping on both feet does."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "speed": "0.7 - `gait.worth` while the pelvis moves ahead at `target_speed` give or take a tenth; "
         "beyond it a Gaussian that has fallen to a tenth after another `target_speed`; all times `height` / 0.1",
