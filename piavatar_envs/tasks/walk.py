@@ -77,7 +77,7 @@ class WalkConfig(EnvConfig):
     heading_margin: float = Field(0.8, gt=0.0, description="angle off the way at which the reward is 0.1 [rad]")
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
     ease_cost: float = Field(
-        0.0, ge=0.0, description="weight of how far joints are bent beyond what people do [1/rad^2]"
+        5.0, ge=0.0, description="weight of how far joints are bent beyond what people do [1/rad^2]"
     )
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
