@@ -58,7 +58,7 @@ _STEEPNESS = wp.constant(0.5 / math.sin(math.pi * _HANDOVER))
 _LEFT_SHOULDER, _RIGHT_SHOULDER = (wp.constant(joint_index(f"{side}_shoulder")) for side in ("left", "right"))
 _LEFT_ELBOW, _RIGHT_ELBOW = (wp.constant(joint_index(f"{side}_elbow")) for side in ("left", "right"))
 #: From the rest pose, in which arms are lowered by some 45 degrees and elbows bent by as much, to arms that hang [rad].
-_LOWERED, _STRETCHED = wp.constant(0.6), wp.constant(math.radians(20.0))
+_LOWERED, _STRETCHED = wp.constant(0.6), wp.constant(0.5)
 #: A foot is off the ground whose sole is this much higher than in the rest pose [m].
 _CLEAR = wp.constant(0.03)
 #: Particles of a foot no higher than this above its lowest are its sole [m].

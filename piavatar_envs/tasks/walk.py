@@ -77,7 +77,7 @@ class WalkConfig(EnvConfig):
     heading_margin: float = Field(0.8, gt=0.0, description="angle off the way at which the reward is 0.1 [rad]")
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
     ease_cost: float = Field(
-        5.0, ge=0.0, description="weight of how far joints are bent beyond what people do [1/rad^2]"
+        0.0, ge=0.0, description="weight of how far joints are bent beyond what people do [1/rad^2]"
     )
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
@@ -196,8 +196,8 @@ the pelvis: that is for poses, not for walking.)
 Feet shall bear the body in turn and pass each other, by a clock that begins with the episode. The avatar sees it in
 two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. With it arms hang, and swing
 against the legs: those that do not act, and under `control="pd"` the pose that is asked for at action 0 (upper arms 34
-degrees lower than at rest, elbows stretched by 20). With `gait.worth=0` there is no clock, and how it gets ahead is its
-own affair: hopping on both feet does."""
+degrees lower than at rest, elbows stretched by 29, though actions reach but 20). With `gait.worth=0` there is no
+clock, and how it gets ahead is its own affair: hopping on both feet does."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "speed": "0.7 - `gait.worth` while the pelvis moves ahead at `target_speed` give or take a tenth; "
         "beyond it a Gaussian that has fallen to a tenth after another `target_speed`; all times `height` / 0.1",

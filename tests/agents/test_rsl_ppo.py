@@ -91,6 +91,28 @@ def test_updates_aim_at_smaller_and_smaller_divergences(tmp_path, monkeypatch, c
         rsl_ppo.main([*run, "ppo.desired_kl=null", "--out", str(tmp_path / "none")])
 
 
+def test_networks_learn_from_noisy_observations_and_play_on_exact_ones(tmp_path, monkeypatch, capsys):
+    exact, seen = [], []
+    act, record = rsl_ppo.PPO.act, rsl_ppo.PPO.process_env_step
+    monkeypatch.setattr(rsl_ppo.PPO, "act", lambda self, obs: seen.append(obs["policy"].clone()) or act(self, obs))
+    monkeypatch.setattr(
+        rsl_ppo.PPO,
+        "process_env_step",
+        lambda self, obs, *of_step: exact.append(obs["policy"].clone()) or record(self, obs, *of_step),
+    )
+
+    def noise(std: float) -> torch.Tensor:
+        exact.clear(), seen.clear()
+        out = tmp_path / str(std)
+        rsl_ppo.main([str(CONFIGS[0]), *TINY, "help=null", f"ppo.observation_noise={std}", "--out", str(out)])
+        return torch.stack(seen[1:]) - torch.stack(exact[:-1])  # 23 steps of two environments
+
+    assert (noise(0.0) == 0.0).all()
+    added = noise(0.25)
+    assert added.numel() > 5000 and abs(added.mean()) < 0.02
+    assert added.std().item() == pytest.approx(0.25, rel=0.05)
+
+
 def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path, capsys):
     """With a rate that adapts and observations that are normalised, whose statistics must go on, too."""
     path = next(path for path in CONFIGS if path.stem == "kick_ball_rsl")

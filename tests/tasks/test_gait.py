@@ -181,7 +181,7 @@ def test_every_environment_has_a_clock_of_its_own(control, device):
                 off = expected.inv() * Rotation.from_quat(goal[env, b].astype(float))
                 assert off.magnitude() < 1e-3
             for b in ELBOWS:
-                assert goal[env, b] == pytest.approx(Rotation.from_rotvec([np.radians(20.0), 0, 0]).as_quat(), abs=1e-5)
+                assert goal[env, b] == pytest.approx(Rotation.from_rotvec([0.5, 0, 0]).as_quat(), abs=1e-5)
 
 
 def test_arms_hang(make_env):
