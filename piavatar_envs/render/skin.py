@@ -14,9 +14,11 @@ from scipy.spatial import cKDTree
 
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 
-NUM_NEIGHBOURS = 8
+#: Particles that move a vertex. With few, what neighbours differ by crumples the skin where it is finer than they are:
+#: toes on the ground, between bones that are put into their places and flesh that is not.
+NUM_NEIGHBOURS = 24
 #: Particles looked at for each vertex, in turn: more only where too few of the nearest share the vertex's bones.
-_CANDIDATES = (32, 256)
+_CANDIDATES = (64, 256)
 #: A particle with less than this share of the best candidate's overlap moves with other bones: leave it out.
 _MIN_RELATIVE_OVERLAP = 0.05
 

@@ -80,6 +80,16 @@ def test_the_skin_follows_a_smooth_displacement(subject):
     assert np.abs(error).max() < 0.2 * 2.0 * 0.035
 
 
+def test_what_neighbours_differ_by_does_not_crumple_the_skin(subject):
+    """Particles that are off by 5 mm each, a seventh of their spacing, stretch hardly any edge of the mesh by much."""
+    noise = 0.005 * np.random.default_rng(0).normal(size=(subject.skin.num_particles, 3))
+    moved = subject.skin.interpolate(noise)
+    faces, vertices = subject.asset.faces, subject.body.vertices
+    a, b = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
+    stretch = np.linalg.norm(moved[a] - moved[b], axis=1) / np.linalg.norm(vertices[a] - vertices[b], axis=1)
+    assert np.median(stretch) < 0.05 and np.percentile(stretch, 99) < 0.25
+
+
 def test_bad_particles_are_refused(subject):
     particles = subject.particles
     with pytest.raises(ValueError, match="one row a particle"):
