@@ -7,7 +7,7 @@ balls are thrown is said in ``turns.py`` and ``pushes.py``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import warp as wp
@@ -19,11 +19,8 @@ from piavatar_envs.envs.draws import STREAM_BALL, generator
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.envs.config import PhysicsConfig
     from piavatar_envs.mpm.program import Program
-    from piavatar_envs.tasks.dodge import DodgeConfig
-    from piavatar_envs.tasks.push_recovery import PushRecoveryConfig
-
-    ThrowConfig = DodgeConfig | PushRecoveryConfig
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,6 +34,20 @@ MAX_SPIN = wp.constant(6.0)
 CLEARANCE = wp.constant(0.4)
 #: Of the balls' masses the first draw in their stream, one a ball; the draws around them are the schedule's.
 MASSES = wp.constant(1)
+
+
+class ThrowConfig(Protocol):
+    """What the configuration of a task that throws balls has. Ranges are a lower and an upper bound."""
+
+    physics: PhysicsConfig
+    num_balls: int
+    ball_radius: float  # [m]
+    ball_mass: tuple[float, float]  # [kg]
+    throw_interval: float  # time between two throws [s]
+    throw_speed: tuple[float, float]  # [m/s]
+    throw_distance: tuple[float, float]  # of the origins from the avatar's place [m]
+    throw_angle: float  # greatest azimuth of the origins from the front [rad]
+    aim_spread: float  # greatest error of the aim along each axis [m]
 
 
 @wp.struct
