@@ -5,18 +5,44 @@ Nothing heavy is imported and no GPU is touched until an environment is made.
 
 from __future__ import annotations
 
-from gymnasium.envs.registration import register
+from typing import TYPE_CHECKING
 
-from piavatar_envs.tasks import task_modules
+from gymnasium.envs.registration import register, registry
+
+from piavatar_envs.tasks import add_task, task_modules
+
+if TYPE_CHECKING:
+    from piavatar_envs.tasks.base import Task
 
 __version__ = "0.1.0"
 
-for _env_id in task_modules():
+
+def _register(env_id: str) -> None:
     register(
-        id=_env_id,
+        id=env_id,
         entry_point="piavatar_envs.api.gymnasium:AvatarEnv",
         vector_entry_point="piavatar_envs.api.vector:AvatarVectorEnv",
         # the time limit lives inside, so that a saved state holds it
         max_episode_steps=None,
-        kwargs={"task": _env_id},
+        kwargs={"task": env_id},
     )
+
+
+def register_task(env_id: str, task: type[Task] | str) -> None:
+    """Make a task of your own an environment for ``gym.make``, ``gym.make_vec`` and all views; see docs/tasks.md.
+
+    Args:
+        env_id: a namespace of your own, a name and a version: ``"Mine/Hop-v0"``. Registering it again replaces it.
+        task: a subclass of :class:`piavatar_envs.tasks.base.Task`, or ``"module:Class"``, imported when it is made.
+
+    Raises:
+        TypeError: the task is neither.
+        ValueError: an id without namespace or version, or one of this package.
+    """
+    add_task(env_id, task)
+    registry.pop(env_id, None)  # without Gymnasium's warning: a notebook's cell is often run twice
+    _register(env_id)
+
+
+for _env_id in task_modules():
+    _register(_env_id)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -43,14 +44,63 @@ def task_modules() -> dict[str, str]:
     return {f"{NAMESPACE}/{''.join(part.capitalize() for part in name.split('_'))}-v0": name for name in names}
 
 
-def load_task(env_id: str) -> type[Task]:
-    """The task class of an id, with or without the namespace.
+#: Tasks from elsewhere by id: classes, or where they are, see :func:`add_task`.
+_added: dict[str, type[Task] | str] = {}
+
+
+def add_task(env_id: str, task: type[Task] | str) -> None:
+    """Let :func:`load_task` find a task that is not of this package.
+
+    Args:
+        env_id: a namespace of your own, a name and a version: ``"Mine/Hop-v0"``. A task that has it already gives way.
+        task: its class, or ``"module:Class"`` to be imported when it is first asked for.
 
     Raises:
+        TypeError: the task is neither.
+        ValueError: an id without namespace or version, or one of this package.
+    """
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", env_id):
+        raise ValueError(f"{env_id!r} must be a namespace, a name and a version, such as 'Mine/Hop-v0'")
+    if env_id.startswith(f"{NAMESPACE}/"):
+        raise ValueError(f"{env_id!r} is in the namespace of this package; use one of your own: 'Mine/Hop-v0'")
+    if not (_is_task(task) or (isinstance(task, str) and ":" in task)):
+        raise TypeError(f"{env_id}: {task!r} is neither a subclass of Task nor 'module:Class'")
+    _added[env_id] = task
+
+
+def _is_task(task: object) -> bool:
+    if not isinstance(task, type):
+        return False
+    from piavatar_envs.tasks.base import Task  # whoever has a subclass has imported it
+
+    return issubclass(task, Task)
+
+
+def load_task(task: str | type[Task]) -> type[Task]:
+    """The class of a task.
+
+    Args:
+        task: its id, for the tasks of this package with or without the namespace; ``"module:id"`` imports the module
+            first, which registers it; or the class itself.
+
+    Raises:
+        ImportError: the module of its id cannot be imported.
         ValueError: there is no such task.
     """
+    if _is_task(task):
+        return task
+    module, _, env_id = str(task).rpartition(":")
+    if module:
+        importlib.import_module(module)
     modules = task_modules()
     full = env_id if "/" in env_id else f"{NAMESPACE}/{env_id}"
-    if full not in modules:
-        raise ValueError(f"unknown task {env_id!r}; there are {', '.join(modules)}")
-    return importlib.import_module(f"{__name__}.{modules[full]}").TASK
+    if full in modules:
+        return importlib.import_module(f"{__name__}.{modules[full]}").TASK
+    if full not in _added:
+        raise ValueError(f"unknown task {task!r}; there are {', '.join([*modules, *_added])}")
+    added = _added[full]
+    if isinstance(added, str):
+        place, _, name = added.partition(":")
+        added = getattr(importlib.import_module(place), name)
+        add_task(full, added)
+    return added

@@ -1,0 +1,94 @@
+"""Tasks from outside the package: registered, found by every view, and refused with the reason."""
+
+from __future__ import annotations
+
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import piavatar_envs
+from piavatar_envs.api.gymnasium import AvatarEnv
+from piavatar_envs.tasks import load_task, reach
+
+MODULE = """
+import piavatar_envs
+from piavatar_envs.tasks.reach import ReachConfig, ReachTask
+
+
+class NearConfig(ReachConfig):
+    radius: float = 0.2
+
+
+class NearTask(ReachTask):
+    Config = NearConfig
+
+
+piavatar_envs.register_task("{namespace}/Near-v0", "{module}:NearTask")
+"""
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch):
+    """A module of somebody else's with a task; nothing of it is left afterwards."""
+    monkeypatch.syspath_prepend(tmp_path)
+    name = "somebodys_tasks"
+    (tmp_path / f"{name}.py").write_text(MODULE.format(module=name, namespace="Somebody"))
+    yield name
+    sys.modules.pop(name, None)
+    gym.registry.pop("Somebody/Near-v0", None)
+    piavatar_envs.tasks._added.pop("Somebody/Near-v0", None)
+
+
+def test_it_is_an_environment_like_all_others(module, device):
+    env = gym.make(f"{module}:Somebody/Near-v0", fidelity="tiny", device=device)  # Gymnasium imports the module
+    assert env.unwrapped.config.radius == 0.2 and env.spec.max_episode_steps is None
+    one, _ = env.reset(seed=3)
+    many = gym.make_vec("Somebody/Near-v0", num_envs=2, fidelity="tiny", device=device)
+    observations, _ = many.reset(seed=3)
+    assert np.array_equal(observations[0], one) and not np.array_equal(observations[1], one)
+    same = AvatarEnv(load_task("Somebody/Near-v0"), fidelity="tiny", device=device)
+    assert np.array_equal(same.reset(seed=3)[0], one)
+    for made in (env, many, same):
+        made.close()
+
+
+def test_its_module_is_imported_when_its_id_names_it(module):
+    assert module not in sys.modules
+    task = load_task(f"{module}:Somebody/Near-v0")
+    assert task is sys.modules[module].NearTask and load_task("Somebody/Near-v0") is task
+    assert load_task(task) is task and load_task("Reach-v0") is reach.ReachTask
+
+
+def test_registering_again_replaces_without_a_warning(module, recwarn):
+    load_task(f"{module}:Somebody/Near-v0")
+    piavatar_envs.register_task("Somebody/Near-v0", reach.ReachTask)
+    assert load_task("Somebody/Near-v0") is reach.ReachTask and not recwarn.list
+
+
+@pytest.mark.parametrize(
+    "own_id, task, error, reason",
+    [
+        ("Near-v0", reach.ReachTask, ValueError, "must be a namespace, a name and a version"),
+        ("Somebody/Near", reach.ReachTask, ValueError, "must be a namespace, a name and a version"),
+        ("PIAvatar/Reach-v0", reach.ReachTask, ValueError, "namespace of this package; use one of your own"),
+        ("Somebody/Near-v0", reach.ReachConfig, TypeError, "neither a subclass of Task nor 'module:Class'"),
+        ("Somebody/Near-v0", "NearTask", TypeError, "neither a subclass of Task nor 'module:Class'"),
+    ],
+)
+def test_what_is_refused_is_not_registered(own_id, task, error, reason):
+    before = dict(gym.registry)
+    with pytest.raises(error, match=reason):
+        piavatar_envs.register_task(own_id, task)
+    assert dict(gym.registry) == before
+    if own_id != "PIAvatar/Reach-v0":
+        with pytest.raises(ValueError, match="unknown task"):
+            load_task(own_id)
+
+
+def test_tasks_that_are_not_there():
+    with pytest.raises(ValueError, match=r"unknown task 'Hop-v0'; there are PIAvatar/Dodge-v0"):
+        load_task("Hop-v0")
+    with pytest.raises(ImportError):
+        load_task("no_such_module:Somebody/Near-v0")
