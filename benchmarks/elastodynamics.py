@@ -164,6 +164,7 @@ def _draw_errors(rows: Sequence[dict[str, Any]], axes: Any) -> None:
     axes.set(xlabel="cells through the body; in the radius of a ball", ylabel="relative error")
     axes.set_xticks([2, 3, 4, 6, 8, 12], ["2", "3", "4", "6", "8", "12"])
     axes.minorticks_off()
+    axes.set_ylim(2e-5, 1.0)  # room for the legend
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, loc="lower left")
 

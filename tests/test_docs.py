@@ -1,0 +1,91 @@
+"""README and guides: their links lead somewhere, and their Python does what they say."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from piavatar_envs.envs.config import ConfigError
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = {
+    page.relative_to(ROOT).as_posix(): page for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+}
+#: What takes minutes or a GPU, and what stands in its place here.
+SMALLER = {
+    "for _ in range(150):": "for _ in range(3):",
+    "total_timesteps=50_000, progress_bar=True": "total_timesteps=16",
+    ".learn(100_000)": ".learn(16)",
+    "num_envs=1024": "num_envs=2",
+    "num_envs=2048": "num_envs=2",
+    "num_envs=4096": "num_envs=2",
+    "num_envs=16": "num_envs=2",
+    '"shape.pool": 64': '"shape.pool": 2',
+    "num_agents=3": "num_agents=2, fidelity='tiny', episode_seconds=0.5",
+    'OnPolicyRunner(env, train_cfg, log_dir="runs/reach", device="cuda").learn(300)': "assert env.num_envs == 2",
+    'device="cuda"': "device=DEVICE",
+}
+
+
+def blocks(page: Path) -> list[str]:
+    """The Python of a page."""
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
+
+
+def test_links_lead_somewhere():
+    found = 0
+    for name, page in PAGES.items():
+        for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            if not target.startswith(("http:", "https:", "#")):
+                found += 1
+                assert (page.parent / target.partition("#")[0]).exists(), f"{name} links to {target}"
+    assert found > 40
+
+
+def test_every_guide_is_linked_from_the_readme():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert [name for name in PAGES if name != "README.md" and f"({name})" not in readme] == []
+
+
+def test_what_is_made_smaller_is_there():
+    code = "\n".join(block for page in PAGES.values() for block in blocks(page))
+    assert [text for text in SMALLER if text not in code] == []
+
+
+@pytest.mark.parametrize("name", [name for name, page in PAGES.items() if blocks(page)])
+def test_python_runs(name, device, monkeypatch, tmp_path):
+    """From top to bottom, as a reader would type it; the small print is in ``SMALLER``.
+
+    A block that a page calls a file ("Save this as") is one.
+    """
+    sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra train")
+    for needed in ("skrl", "rsl_rl", "pettingzoo"):
+        pytest.importorskip(needed, reason="needs the extras skrl, rsl and multi")
+    if "deepmimic:" in "".join(blocks(PAGES[name])):
+        pytest.importorskip("pybullet", reason="needs the extra motions")
+    monkeypatch.setattr(sb3, "PPO", partial(sb3.PPO, n_steps=8, batch_size=8))
+    monkeypatch.syspath_prepend(tmp_path)
+    saved = re.findall(r"[Ss]ave this as\s`([\w.]+)`", PAGES[name].read_text(encoding="utf-8"))
+    code = blocks(PAGES[name])
+    for file, block in zip(saved, code, strict=False):
+        (tmp_path / file).write_text(block, encoding="utf-8")
+    space = {"DEVICE": device, "__name__": name}
+    for block in code[len(saved) :]:
+        if block.startswith(">>>"):
+            check_refusals(block, space)
+            continue
+        for text, small in SMALLER.items():
+            block = block.replace(text, small)
+        exec(compile(block, name, "exec"), space)
+
+
+def check_refusals(block: str, space: dict) -> None:
+    """What is typed after ``>>>`` is refused in the words that follow."""
+    lines = block.splitlines()
+    for typed, said in zip(lines[::2], lines[1::2], strict=True):
+        with pytest.raises(ConfigError) as refused:
+            exec(typed.removeprefix(">>> "), space)
+        assert said == f"ConfigError: {refused.value}"
