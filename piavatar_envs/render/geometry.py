@@ -8,6 +8,9 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse
 
+#: Farther than this from the origin nothing is drawn [m].
+_FAR = 50.0
+
 
 class Topology:
     """Connectivity of several meshes laid one after the other. Built when what is shown changes, not every frame."""
@@ -84,6 +87,12 @@ class Topology:
 def topology_key(faces: Sequence[np.ndarray], counts: Sequence[int]) -> tuple:
     """Equal for meshes that share a :class:`Topology`: the very same face arrays with as many vertices."""
     return tuple((id(part), int(count)) for part, count in zip(faces, counts, strict=True))
+
+
+def drawable(vertices: np.ndarray) -> np.ndarray:
+    """Vertices that a graphics library can take, float32: a simulation that blew up is still worth a picture."""
+    vertices = np.asarray(vertices, dtype=np.float32)
+    return np.clip(np.nan_to_num(vertices, nan=0.0, posinf=_FAR, neginf=-_FAR), -_FAR, _FAR)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

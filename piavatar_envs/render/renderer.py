@@ -10,13 +10,13 @@ import numpy as np
 from piavatar_envs.render import coloring, shading, vtk_backend
 from piavatar_envs.render.backend import Backend, Shot
 from piavatar_envs.render.display import opengl_available
-from piavatar_envs.render.geometry import Topology, topology_key
+from piavatar_envs.render.follow import Follower
+from piavatar_envs.render.geometry import Topology, drawable, topology_key
 from piavatar_envs.render.overlay import draw_scale
 from piavatar_envs.render.scene import Body, Camera, Marker
 from piavatar_envs.render.shadow import ground_shadow
 
 BACKENDS = ("auto", "pyvista", "software")
-_FAR = 50.0
 
 
 class Renderer:
@@ -50,8 +50,7 @@ class Renderer:
                 raise ValueError(f"{name}={value} px is outside [16, 8192]")
         self.width, self.height = int(width), int(height)
         self.camera = camera or Camera()
-        self._center: np.ndarray | None = None
-        self._wanted = np.zeros(2)  # what it followed in the last picture [m]
+        self._follower = Follower(self.camera)
         self._topology: Topology | None = None
         self._backend: Backend | None = _open(backend, self.width, self.height)
 
@@ -79,7 +78,7 @@ class Renderer:
         """
         if self._backend is None:
             raise RuntimeError("this Renderer is closed; make a new one")
-        center = self._follow(follow, elapsed)
+        center = self._follower.move(follow, elapsed)
         topology, vertices, colors = self._gather(bodies, markers)
         offset = np.array([*center, 0.0])
         shot = Shot(offset + self.camera.position, offset + self.camera.target, self.camera.field_of_view, center)
@@ -95,7 +94,7 @@ class Renderer:
 
     def reset_camera(self) -> None:
         """Let the next picture's camera start at what it follows, without a glide from where it was."""
-        self._center = None
+        self._follower.cut()
 
     def close(self) -> None:
         """Free the window; closing twice is fine."""
@@ -111,16 +110,6 @@ class Renderer:
     ) -> None:
         self.close()
 
-    def _follow(self, point: np.ndarray | None, elapsed: float) -> np.ndarray:
-        wanted = np.zeros(2) if point is None else np.asarray(point, dtype=np.float64)[:2]
-        if not np.isfinite(wanted).all():
-            wanted = np.zeros(2) if self._center is None else self._center
-        if self._center is None:
-            self._center = self._wanted = wanted
-        self._center = self.camera.glide(self._center, self._wanted, wanted, elapsed)
-        self._wanted = wanted
-        return self._center
-
     def _gather(self, bodies: Sequence[Body], markers: Sequence[Marker]) -> tuple[Topology, np.ndarray, np.ndarray]:
         """Everything shown as one mesh: its triangles, vertices ``(V, 3)`` [m] and own colours ``(V, 3)``."""
         if not bodies and not markers:
@@ -134,9 +123,7 @@ class Renderer:
         faces, counts = [mesh[1] for mesh in meshes], [len(mesh[0]) for mesh in meshes]
         if self._topology is None or self._topology.key != topology_key(faces, counts):
             self._topology = Topology(faces, counts)
-        vertices = np.concatenate([np.asarray(mesh[0], dtype=np.float32) for mesh in meshes])
-        # A simulation that blew up is still worth a picture.
-        vertices = np.clip(np.nan_to_num(vertices, nan=0.0, posinf=_FAR, neginf=-_FAR), -_FAR, _FAR)
+        vertices = drawable(np.concatenate([np.asarray(mesh[0], dtype=np.float32) for mesh in meshes]))
         return self._topology, vertices, np.concatenate(colors)
 
 

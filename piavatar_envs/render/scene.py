@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -148,6 +149,21 @@ class Ring:
 
 
 Marker = Sphere | Arrow | Box | Capsule | Ring
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """All that there is to see at one moment, in world coordinates.
+
+    Attributes:
+        bodies: avatars and soft props, always in the same order.
+        markers: what the task shows, and rigid obstacles.
+        follow: the point that the camera follows [m], shape ``(3,)``, or None where it stays.
+    """
+
+    bodies: Sequence[Body]
+    markers: Sequence[Marker]
+    follow: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,7 @@ def test_the_camera_is_where_time_has_brought_it(device):
         ).unwrapped
 
     def centre(env) -> np.ndarray:
-        return env._episode._pictures._opened[0].renderer._center
+        return env._episode._pictures._opened[0].renderer._follower.center
 
     def go(env, aside: float, every: int) -> None:
         action = np.zeros(env.action_space.shape, np.float32)
