@@ -26,6 +26,7 @@ EXTRAS = {
     "multi": ("pettingzoo",),
     "skrl": ("skrl", "torch"),
     "rsl": ("rsl_rl", "tensordict", "torch"),
+    "live": ("viser",),
     "bench": ("mujoco",),
     "dev": ("pytest", "xdist", "build"),
 }

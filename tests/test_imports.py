@@ -99,7 +99,17 @@ def run_python(code: str) -> str:
 
 def test_importing_the_package_is_light_and_touches_no_device():
     """A forked worker inherits a CUDA context it cannot use, so an import must make none: Warp stays asleep."""
-    heavy = ("torch", "pyvista", "vtk", "matplotlib", "stable_baselines3", "pettingzoo", "imageio", "pybullet_data")
+    heavy = (
+        "torch",
+        "pyvista",
+        "vtk",
+        "matplotlib",
+        "stable_baselines3",
+        "pettingzoo",
+        "imageio",
+        "pybullet_data",
+        "viser",
+    )
     code = f"""
 import sys
 import piavatar_envs, gymnasium
@@ -118,6 +128,6 @@ import gymnasium, piavatar_envs
 env = gymnasium.make("PIAvatar/Reach-v0", device="cpu", fidelity="tiny")
 env.reset(seed=0)
 env.step(env.action_space.sample())
-print([name for name in ("pyvista", "vtk", "matplotlib", "torch", "imageio") if name in sys.modules])
+print([name for name in ("pyvista", "vtk", "matplotlib", "torch", "imageio", "viser") if name in sys.modules])
 """
     assert run_python(code).strip().endswith("[]")

@@ -1,0 +1,173 @@
+"""Scenes in a web browser, as they happen: a server on this machine (viser, extra ``live``)."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from collections.abc import Iterator
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from piavatar_envs.render import ground
+from piavatar_envs.render.bands import bands_of
+from piavatar_envs.render.coloring import strain_table
+from piavatar_envs.render.follow import Follower
+from piavatar_envs.render.geometry import drawable
+from piavatar_envs.render.scene import Camera, Color, Scene
+from piavatar_envs.render.shading import KEY
+
+if TYPE_CHECKING:
+    import viser
+
+HOST = "127.0.0.1"
+PORT = 8080
+#: Ports that are tried, one after the other.
+_TRIES = 1000
+#: All that moves hangs from it, and it moves against what the camera follows: cameras are left to those who hold them.
+_WORLD = "/world"
+_GROUND_SIZE = 40.0
+#: A warm sun, a cool sky and what the ground gives back, as in the pictures; bytes.
+_KEY_LIGHT, _SKY_LIGHT, _GROUND_LIGHT = (255, 243, 226), (216, 228, 250), (206, 186, 170)
+
+
+def import_viser() -> ModuleType:
+    """The library.
+
+    Raises:
+        ImportError: it is not installed; says how to.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise ImportError('the live view needs viser, which is not installed; pip install "piavatar-envs[live]"') from (
+            error
+        )
+    return viser
+
+
+class LiveView:
+    """Shows scenes to every browser that looks at :attr:`url`.
+
+    Attributes:
+        server: the library's, for panels.
+        url: where to look.
+    """
+
+    def __init__(self, camera: Camera | None = None, port: int = PORT) -> None:
+        """Start the server, and say where it is.
+
+        Args:
+            camera: where a browser looks from at first; as a picture's, by default.
+            port: of this machine, or the next one that is free.
+
+        Raises:
+            ImportError: viser is not installed.
+            ValueError: a port outside [1, 64536].
+        """
+        if not 1 <= port <= 65536 - _TRIES:
+            raise ValueError(f"port={port} is outside [1, {65536 - _TRIES}]")
+        library = import_viser()
+        self._follower = Follower(camera or Camera())
+        self._nodes: dict[str, viser.MeshHandle] = {}
+        with _silence():
+            self.server: viser.ViserServer = library.ViserServer(HOST, port, "piavatar-envs", verbose=False)
+        self.url = f"http://{HOST}:{self.server.get_port()}"
+        self._set_up(self._follower.camera)
+        self._closed = False
+        print(f"live view: {self.url}", flush=True)
+
+    def _set_up(self, camera: Camera) -> None:
+        """Camera, light and ground, by the numbers of the pictures."""
+        scene, first = self.server.scene, self.server.initial_camera
+        first.position, first.look_at, first.fov = camera.position, camera.target, math.radians(camera.field_of_view)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        top, bottom = np.array(ground.BACKGROUND_TOP), np.array(ground.BACKGROUND_BOTTOM)
+        share = np.linspace(0.0, 1.0, 256)[:, None, None]
+        sky = np.rint(255.0 * (top + share * (bottom - top))).astype(np.uint8)
+        scene.set_background_image(np.repeat(sky, 16, axis=1), format="png")
+        scene.configure_environment_map(None)
+        scene.configure_default_lights(False)
+        scene.add_light_directional(
+            "/light/key", color=_KEY_LIGHT, intensity=2.5, cast_shadow=True, position=tuple(10.0 * KEY)
+        )
+        scene.add_light_hemisphere(
+            "/light/sky", sky_color=_SKY_LIGHT, ground_color=_GROUND_LIGHT, intensity=1.5, position=(0.0, 0.0, 1.0)
+        )
+        self._world = scene.add_frame(_WORLD, show_axes=False)
+        self._ground = scene.add_grid(
+            "/ground", _GROUND_SIZE, _GROUND_SIZE, cell_size=ground.SQUARE, section_size=2.0 * ground.SQUARE,
+            cell_color=_bytes(ground.LINE), section_color=_bytes(ground.LINE), plane_color=_bytes(ground.LIGHT_SQUARE),
+            plane_opacity=1.0, shadow_opacity=0.3, fade_distance=2.0 * ground.FADE_END, fade_from="origin",
+            position=(0.0, 0.0, ground.HEIGHT),
+        )  # fmt: skip
+        scale = np.repeat(strain_table()[None], 12, axis=0)
+        self._scale = self.server.gui.add_image(np.rint(255.0 * scale).astype(np.uint8), visible=False, format="png")
+
+    def show(self, scene: Scene, elapsed: float | None) -> None:
+        """Show a scene. Meshes that were there are moved, not made anew.
+
+        Args:
+            scene: all that is to be seen.
+            elapsed: simulated time since the last one [s], in which the camera glides after what it follows; None where
+                it jumps there.
+        """
+        if elapsed is None:
+            self._follower.cut()
+        center = self._follower.move(scene.follow, elapsed or 0.0)
+        shown = dict(_meshes(scene))
+        with self.server.atomic():
+            self._world.position = (*-center, 0.0)
+            # a ground that repeats may stay below the camera for ever
+            self._ground.position = (*-np.mod(center, 2.0 * ground.SQUARE), ground.HEIGHT)
+            for name in self._nodes.keys() - shown.keys():
+                self._nodes.pop(name).remove()
+            for name, (vertices, faces, color) in shown.items():
+                self._place(name, drawable(vertices), faces, _bytes(color))
+        strained = [body for body in scene.bodies if body.scalars is not None]
+        if strained:
+            self._scale.label = f"{strained[0].scalar_label}, 0 to {strained[0].scalar_max:g}"
+        self._scale.visible = bool(strained)
+
+    def _place(self, name: str, vertices: np.ndarray, faces: np.ndarray, color: tuple[int, int, int]) -> None:
+        """Put a mesh where it is; only what has changed is sent."""
+        node = self._nodes.get(name)
+        if node is None:
+            self._nodes[name] = self.server.scene.add_mesh_simple(name, vertices, faces, color=color)
+            return
+        node.vertices, node.faces, node.color = vertices, faces, color
+
+    def close(self) -> None:
+        """Stop the server; closing twice is fine."""
+        if not self._closed:
+            self._closed = True
+            with _silence():
+                self.server.stop()
+
+
+def _meshes(scene: Scene) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, Color]]]:
+    """Name, vertices, triangles and colour of everything in a scene; the same thing has the same name every time."""
+    for index, body in enumerate(scene.bodies):
+        name = f"{_WORLD}/body_{index}"
+        if body.scalars is None:
+            yield name, (body.vertices, body.faces, body.color)
+            continue
+        for band in bands_of(body):
+            yield f"{name}_band_{band.number}", (band.vertices, band.faces, band.color)
+    for index, marker in enumerate(scene.markers):
+        vertices, faces = marker.mesh()
+        yield f"{_WORLD}/{type(marker).__name__.lower()}_{index}", (vertices, faces, marker.color)
+
+
+def _bytes(color: Color) -> tuple[int, int, int]:
+    red, green, blue = (round(255.0 * value) for value in color)
+    return red, green, blue
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[Any]:
+    """Nothing is printed within it: the library tells of itself, whether asked to or not."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield

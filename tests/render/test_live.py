@@ -1,0 +1,162 @@
+"""The live view: what the server holds is what the scene says. No browser is opened."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+
+from piavatar_envs.render import Arrow, Body, Camera, Scene, Sphere
+from piavatar_envs.render.bands import NUM_BANDS, bands_of
+from piavatar_envs.render.coloring import color_by
+from piavatar_envs.render.live import LiveView
+
+GREEN = (0.0, 1.0, 0.0)
+
+
+def test_a_missing_viser_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ImportError, match=r'pip install "piavatar-envs\[live\]"'):
+        LiveView()
+
+
+def test_importing_loads_no_server():
+    code = "import sys, piavatar_envs.render.live, piavatar_envs.render.panel; print('viser' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "False"
+
+
+@pytest.fixture
+def body(subject) -> Body:
+    return Body(subject.body.vertices, subject.asset.faces, color=GREEN)
+
+
+@pytest.fixture
+def view():
+    pytest.importorskip("viser", reason='needs pip install "piavatar-envs[live]"')
+    view = LiveView(Camera(follow=1.0), port=8200)
+    yield view
+    view.close()
+
+
+def handle(view: LiveView, name: str):
+    return view.server.scene.get_handle_by_name(f"/world/{name}")
+
+
+def names(view: LiveView) -> set[str]:
+    return {name.removeprefix("/world/") for name in view._nodes}
+
+
+def test_everything_in_the_scene_is_shown(view, body):
+    markers = [Sphere((0.4, -0.4, 1.2), 0.06), Arrow((0, -1, 1), (0, 0.5, 0))]
+    view.show(Scene([body], markers), None)
+    assert names(view) == {"body_0", "sphere_0", "arrow_1"}
+    shown = handle(view, "body_0")
+    np.testing.assert_array_equal(shown.vertices, np.asarray(body.vertices, np.float32))
+    np.testing.assert_array_equal(shown.faces, body.faces)
+    assert shown.color == (0, 255, 0) and not shown.flat_shading
+    for name, marker in (("sphere_0", markers[0]), ("arrow_1", markers[1])):
+        np.testing.assert_allclose(handle(view, name).vertices, marker.mesh()[0], atol=1e-6)
+
+
+def test_what_moves_is_moved_and_not_made_anew(view, body):
+    view.show(Scene([body], [Sphere((0, 0, 1), 0.1)]), None)
+    before = handle(view, "body_0")
+    moved = Body(body.vertices + np.float32(0.25), body.faces, color=(1.0, 0.0, 0.0))
+    view.show(Scene([moved], []), 0.1)
+    assert handle(view, "body_0") is before and before.color == (255, 0, 0)
+    np.testing.assert_array_equal(before.vertices, np.asarray(moved.vertices, np.float32))
+    assert handle(view, "sphere_0") is None, "what has gone is gone"
+
+
+def test_the_world_moves_below_the_camera_and_not_the_camera(view, body):
+    """A user's camera is never written to; what is followed stays where it looks."""
+    view.show(Scene([body], [], follow=np.array([3.3, -7.2, 0.9])), None)
+    np.testing.assert_allclose(view.server.scene.get_handle_by_name("/world").position, [-3.3, 7.2, 0.0])
+    np.testing.assert_array_equal(handle(view, "body_0").vertices, np.asarray(body.vertices, np.float32))
+    # the ground repeats every metre: it moves with the world, and stays below the camera
+    ground = np.array(view.server.scene.get_handle_by_name("/ground").position)
+    assert np.abs(ground[:2]).max() <= 1.0
+    np.testing.assert_allclose((ground[:2] + [3.3, -7.2]) % 1.0 % 1.0, 0.0, atol=1e-9)
+    view.show(Scene([body], []), None)
+    np.testing.assert_allclose(view.server.scene.get_handle_by_name("/world").position, 0.0)
+
+
+def test_the_camera_glides_as_that_of_pictures(body):
+    pytest.importorskip("viser")
+    camera = Camera(follow=0.2)
+    view = LiveView(camera, port=8200)
+    view.show(Scene([body], [], follow=np.zeros(3)), None)
+    view.show(Scene([body], [], follow=np.array([1.0, 0.0, 0.9])), 0.2)
+    expected = camera.glide(np.zeros(2), np.zeros(2), np.array([1.0, 0.0]), 0.2)
+    np.testing.assert_allclose(-np.array(view.server.scene.get_handle_by_name("/world").position)[:2], expected)
+    view.close()
+
+
+def test_strain_is_shown_in_bands_that_are_the_body(view, body):
+    height = np.asarray(body.vertices, float)[:, 2]
+    strained = Body(body.vertices, body.faces, scalars=0.2 * height - 0.01, scalar_max=0.3)  # beyond both ends, too
+    bands = bands_of(strained)
+    assert len(bands) == NUM_BANDS
+    assert sum(len(band.faces) for band in bands) == len(body.faces)
+    corners = np.sort(np.concatenate([band.vertices[band.faces].reshape(-1, 9) for band in bands]), axis=0)
+    np.testing.assert_array_equal(corners, np.sort(body.vertices[body.faces].reshape(-1, 9), axis=0))
+    for band in bands[1:-1]:
+        middle = 0.2 * band.vertices[band.faces][..., 2].mean(axis=1) - 0.01
+        assert (np.abs(middle * NUM_BANDS / 0.3 - band.number - 0.5) < 0.5 + 1e-4).all()
+        np.testing.assert_allclose(band.color, color_by([(band.number + 0.5) * 0.3 / NUM_BANDS], 0.3)[0], atol=0.03)
+    view.show(Scene([strained], []), None)
+    assert names(view) == {f"body_0_band_{number}" for number in range(NUM_BANDS)} and view._scale.visible
+    view.show(Scene([body], []), None)
+    assert names(view) == {"body_0"} and not view._scale.visible
+
+
+def test_broken_strain_has_the_last_colour(body):
+    broken = Body(body.vertices, body.faces, scalars=np.full(len(body.vertices), np.nan))
+    assert [band.number for band in bands_of(broken)] == [NUM_BANDS - 1]
+
+
+def test_a_body_that_blew_up_is_shown(view, body):
+    vertices = np.array(body.vertices)
+    vertices[::50] = np.nan
+    vertices[7] = np.inf
+    view.show(Scene([Body(vertices, body.faces)], [], follow=np.full(3, np.nan)), None)
+    assert np.isfinite(handle(view, "body_0").vertices).all()
+    assert np.isfinite(view.server.scene.get_handle_by_name("/world").position).all()
+
+
+def port_of(view: LiveView) -> int:
+    return int(view.url.rpartition(":")[2])
+
+
+def test_where_a_port_is_busy_the_next_one_serves(view, capsys):
+    second = LiveView(port=port_of(view))
+    assert port_of(second) > port_of(view)
+    assert capsys.readouterr().out == f"live view: {second.url}\n", "the address is told once, and nothing else"
+    for url in (view.url, second.url):
+        with urllib.request.urlopen(url, timeout=5.0) as answer:
+            assert answer.status == 200 and b"<html" in answer.read()
+    second.close()
+
+
+def test_closing_frees_the_port(capsys, monkeypatch):
+    pytest.importorskip("viser")
+    view, stops = LiveView(port=8200), []
+    stop = view.server.stop
+    monkeypatch.setattr(view.server, "stop", lambda: (stop(), stops.append(1)))
+    capsys.readouterr()
+    view.close()
+    view.close()
+    assert capsys.readouterr().out == "" and len(stops) == 1
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port_of(view)), timeout=5.0)
+
+
+@pytest.mark.parametrize("port", [0, -1, 65000])
+def test_a_port_that_cannot_be_is_refused(port):
+    with pytest.raises(ValueError, match=rf"port={port} is outside \[1, 64536\]"):
+        LiveView(port=port)
