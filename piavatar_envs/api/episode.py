@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -20,10 +20,15 @@ from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import EnvConfig
 from piavatar_envs.tasks.base import Task
 
+if TYPE_CHECKING:
+    from piavatar_envs.api.live import Live
+
 #: How settings may be given.
 Settings = EnvConfig | Mapping[str, Any] | str | Path | None
 
-RENDER_MODES = ("rgb_array",)
+#: Of one environment, and of a batch of them: there is one live view, and it shows one.
+RENDER_MODES = ("rgb_array", "human")
+BATCH_RENDER_MODES = ("rgb_array",)
 
 
 class Episode:
@@ -41,10 +46,16 @@ class Episode:
 
         Raises:
             ConfigError: a scene that cannot be.
+            ImportError: ``render_mode="human"`` without the extra ``live``.
             ValueError: an unknown render mode or device.
         """
         self.config, self.render_mode = task.config, check_render_mode(render_mode)
         self.batch = BatchEnv(task, 1, device)
+        self._live: Live | None = None
+        if render_mode == "human":
+            from piavatar_envs.api.live import Live  # nothing of the renderer without a picture
+
+            self._live = Live(self.batch, self.config.render.color)
         self.action_names: tuple[str, ...] = tuple(self.batch.action_spec.names())
         self.ready = False
         self._arrays = NumpyArrays()
@@ -81,6 +92,8 @@ class Episode:
             seed = int(rng.integers(2**32))
         self.batch.reset(seeds=None if seed is None else [seed])
         self.ready = True
+        if self._live:
+            self._live.begin()
 
     def check_ready(self, call: str) -> None:
         """Refuse ``call`` before the first reset.
@@ -100,9 +113,11 @@ class Episode:
         return check_actions(action, (self.batch.action_spec.size,), self.action_names)
 
     def advance(self, actions: np.ndarray) -> None:
-        """One control step under checked ``actions`` ``(agents, action_size)``."""
+        """One control step under checked ``actions`` ``(agents, action_size)``; in real time, if somebody watches."""
         self.batch.action.assign(actions[None])
         self.batch.step()
+        if self._live:
+            self._live.step()
 
     def observation(self, agent: int) -> Any:
         """What an agent sees, as copies: a flat vector, or a dictionary with ``obs_mode="dict"``."""
@@ -139,6 +154,8 @@ class Episode:
     def render(self) -> np.ndarray | None:
         """The scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``, else None.
 
+        With ``"human"`` there is nothing to do: resets and steps update the live view.
+
         Raises:
             ImportError: the extra ``render`` is not installed.
             gymnasium.error.ResetNeeded: before the first reset.
@@ -147,11 +164,13 @@ class Episode:
             gym.logger.warn('render() needs an environment made with render_mode="rgb_array"')
             return None
         self.check_ready("render")
-        return self._pictures.frame(0)
+        return None if self._live else self._pictures.frame(0)
 
     def close(self) -> None:
-        """Free the renderer's window."""
+        """Free the renderer's window, and stop the live view; closing twice is fine."""
         self._pictures.close()
+        if self._live:
+            self._live.close()
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go on from what ``batch.get_state()`` returned.
@@ -161,16 +180,34 @@ class Episode:
         """
         self.batch.set_state(state)
         self.ready = True
+        if self._live:
+            self._live.begin()
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
-    """The mode itself.
+    """The mode itself, of one environment.
 
     Raises:
         ValueError: an unknown one.
     """
     if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode={render_mode!r} is not known; use None or {', '.join(RENDER_MODES)}")
+        raise ValueError(f"render_mode={render_mode!r} is not known; use None, {' or '.join(RENDER_MODES)}")
+    return render_mode
+
+
+def check_batch_render_mode(render_mode: str | None) -> str | None:
+    """The mode itself, of a batch of environments.
+
+    Raises:
+        ValueError: an unknown one, or the live view.
+    """
+    if render_mode == "human":
+        raise ValueError(
+            "render_mode='human' is a live view of one environment, and this is a batch; use rgb_array here, or "
+            "watch one: gym.make(id, render_mode='human') or python -m piavatar_envs watch ID"
+        )
+    if render_mode is not None and render_mode not in BATCH_RENDER_MODES:
+        raise ValueError(f"render_mode={render_mode!r} is not known; use None or {', '.join(BATCH_RENDER_MODES)}")
     return render_mode
 
 

@@ -38,13 +38,14 @@ class AvatarEnv(EpisodeView, gym.Env):
 
         Args:
             task: id of the task, with or without the namespace.
-            render_mode: None or ``"rgb_array"``.
+            render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ImportError: ``render_mode="human"`` without the extra ``live``.
             ValueError: an unknown task, render mode or device.
         """
         task_class = load_task(task)

@@ -49,7 +49,7 @@ class AvatarParallelEnv(EpisodeView, ParallelEnv):
 
         Args:
             task_class: the task.
-            render_mode: None or ``"rgb_array"``.
+            render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
             max_cycles: control steps until truncation; wins over ``episode_seconds``.
@@ -57,6 +57,7 @@ class AvatarParallelEnv(EpisodeView, ParallelEnv):
 
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
+            ImportError: ``render_mode="human"`` without the extra ``live``.
             ValueError: an unknown render mode or device, or no time at all.
         """
         self.config = load_config(task_class.Config, config, overrides)

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from piavatar_envs.api.arrays import Array
 from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.api.episode import RENDER_MODES, Settings, check_render_mode
+from piavatar_envs.api.episode import BATCH_RENDER_MODES, Settings, check_batch_render_mode
 from piavatar_envs.api.infos import outcome, standing, vector_format
 from piavatar_envs.api.picture import Pictures
 from piavatar_envs.api.view import BatchedView
@@ -43,7 +43,7 @@ class AvatarVectorEnv(BatchedView, VectorEnv):
     """
 
     metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": list(RENDER_MODES),
+        "render_modes": list(BATCH_RENDER_MODES),
         "render_fps": 30,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
@@ -78,7 +78,7 @@ class AvatarVectorEnv(BatchedView, VectorEnv):
             ImportError: ``array_api="torch"`` and torch is not installed.
             ValueError: an unknown task, render mode, device, kind of arrays or autoreset mode, or no environments.
         """
-        self.render_mode, self.autoreset_mode = check_render_mode(render_mode), _autoreset_mode(autoreset_mode)
+        self.render_mode, self.autoreset_mode = check_batch_render_mode(render_mode), _autoreset_mode(autoreset_mode)
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
         self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, array_api, num_threads)

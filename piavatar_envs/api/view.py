@@ -25,6 +25,8 @@ class EpisodeView:
     def render(self) -> np.ndarray | None:
         """The scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``, else None.
 
+        With ``"human"`` there is nothing to do: resets and steps update the live view.
+
         Raises:
             ImportError: the extra ``render`` is not installed.
             gymnasium.error.ResetNeeded: before the first reset.
@@ -32,7 +34,7 @@ class EpisodeView:
         return self._episode.render()
 
     def close(self) -> None:
-        """Free the renderer's window."""
+        """Free the renderer's window, and stop the live view; closing twice is fine."""
         self._episode.close()
 
     def assist_root(self, share: float) -> None:

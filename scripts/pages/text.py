@@ -236,7 +236,8 @@ def _arguments(entry: Entry, facts: Facts) -> str:
     shared = [replace(s, settings=tuple(row for row in s.settings if not row.own)) for s in sections]
     maker, more = ("parallel_env", "`max_cycles` (steps until truncation), ") if entry.multi else ("gym.make", "")
     text = (
-        f'{code(maker)} takes `render_mode` (`None` or `"rgb_array"`), `device` (of Warp: `"cpu"` or `"cuda:0"`), '
+        f'{code(maker)} takes `render_mode` (`None`, `"rgb_array"`, or `"human"`: live in a web browser), `device` (of '
+        'Warp: `"cpu"` or `"cuda:0"`), '
         f"{more}`config` (a mapping or a YAML file, where `None` is `null`) and, by keyword, every setting below: its "
         'last name will do, as in `tone=0.3`; the whole one can be given as `**{"drive.tone": 0.3}`. The unit `-` is '
         "that of a pure number."

@@ -40,8 +40,8 @@ def test_bad_settings_are_refused_in_one_line_with_what_is_allowed(device, env_i
 
 
 def test_unknown_render_mode_is_refused(device, env_id):
-    with pytest.raises(ValueError, match=r"render_mode='human' is not known; use None or rgb_array"):
-        AvatarEnv(env_id, render_mode="human", device=device, fidelity="tiny")
+    with pytest.raises(ValueError, match=r"render_mode='ansi' is not known; use None, rgb_array or human"):
+        AvatarEnv(env_id, render_mode="ansi", device=device, fidelity="tiny")
 
 
 def test_a_yaml_file_and_keywords_configure(tmp_path, device, env_id):

@@ -178,7 +178,7 @@ def test_spaces_belong_to_the_agents(make_world, module_name):
 def test_metadata(make_world, module_name):
     metadata = make_world(module_name).metadata
     assert metadata["name"] == module_name.rpartition(".")[2] == str(make_world(module_name))
-    assert metadata["render_modes"] == ["rgb_array"] and metadata["is_parallelizable"]
+    assert metadata["render_modes"] == ["rgb_array", "human"] and metadata["is_parallelizable"]
     assert metadata["render_fps"] == 30 and make_world(module_name, control_dt=0.02).metadata["render_fps"] == 50
 
 
@@ -317,7 +317,7 @@ def test_nothing_goes_before_the_first_reset_or_after_the_end(worlds, module_nam
     ("settings", "told"),
     [
         ({"max_cycles": 0}, "max_cycles=0 must be at least 1"),
-        ({"render_mode": "human"}, "render_mode='human' is not known; use None or rgb_array"),
+        ({"render_mode": "ansi"}, "render_mode='ansi' is not known; use None, rgb_array or human"),
         ({"bogus": 1}, "bogus is no setting of"),
         ({"device": "tpu"}, "device='tpu'"),
         ({"scene": {"avatars": [{"yaw": 0.0}] * 9}}, "scene.avatars has 9 entries"),
@@ -385,6 +385,28 @@ def test_pictures(worlds, module_name, device, play):
     assert all(frame.shape == (48, 64, 3) and frame.dtype == np.uint8 for frame in frames)
     assert min(np.ptp(frame) for frame in frames) > 50
     assert not np.array_equal(frames[0], frames[1]) and not np.array_equal(frames[2], frames[-1])
+
+
+def test_pettingzoos_render_test(worlds, module_name, device):
+    """Of both modes: pictures are arrays, the live view returns nothing."""
+    pytest.importorskip("pyvista")
+    pytest.importorskip("viser")
+    settings = {"render.width": 64, "render.height": 48}
+    official.render_test(functools.partial(fresh(worlds, module_name, device).env, **settings))
+
+
+def test_a_world_is_watched(worlds, module_name, device, play):
+    pytest.importorskip("viser")
+    world = fresh(worlds, module_name, device).parallel_env(render_mode="human")
+    world.reset(seed=0)
+    view = world._episode._live.view
+    bodies = [f"/world/body_{index}" for index in range(len(world.possible_agents))]
+    before = [view._nodes[name].vertices.copy() for name in bodies]
+    play(world, 2, np.random.default_rng(0))
+    assert world.render() is None
+    assert not any(np.array_equal(view._nodes[n].vertices, b) for n, b in zip(bodies, before, strict=True))
+    world.close()
+    assert view._closed
 
 
 def test_no_picture_without_a_render_mode(make_world, module_name):
