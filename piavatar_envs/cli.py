@@ -1,4 +1,4 @@
-"""The command line: ``python -m piavatar_envs list | doctor | play``.
+"""The command line: ``python -m piavatar_envs list | doctor | play | watch``.
 
 Only what ``--help`` needs is imported here; each command imports its own work, so that help comes at once.
 """
@@ -13,7 +13,13 @@ from typing import Annotated, Literal
 
 import tyro
 
+EnvId = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="an id or a module: see list")]
+AgentName = Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the actions come from")]
+Seed = Annotated[int, tyro.conf.arg(help="of the first reset and of the random actions")]
 Device = Annotated[str, tyro.conf.arg(help="where to simulate: cpu, cuda, cuda:1, ...")]
+Overrides = Annotated[
+    tuple[str, ...], tyro.conf.arg(aliases=["-c"], help="settings, e.g. -c fidelity=tiny drive.tone=0")
+]
 
 
 def list_command() -> None:
@@ -46,18 +52,16 @@ def doctor_command(
 
 
 def play_command(
-    env_id: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="an id or a module: see list")],
-    agent: Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the actions come from")] = "random",
+    env_id: EnvId,
+    agent: AgentName = "random",
     video: Annotated[Path | None, tyro.conf.arg(help="write an .mp4 or .gif (needs the extra render)")] = None,
     steps: Annotated[
         int | None, tyro.conf.arg(help="steps to play, over as many episodes; default one episode")
     ] = None,
-    seed: Annotated[int, tyro.conf.arg(help="of the first reset and of the random actions")] = 0,
+    seed: Seed = 0,
     device: Device = "cpu",
     color: Annotated[Literal["skin", "strain"], tyro.conf.arg(help="colour of the body in the video")] = "skin",
-    config: Annotated[
-        tuple[str, ...], tyro.conf.arg(aliases=["-c"], help="settings, e.g. -c fidelity=tiny drive.tone=0")
-    ] = (),
+    config: Overrides = (),
 ) -> None:
     """Play an environment and print its return and metrics; to a video, if asked.
 
@@ -74,11 +78,47 @@ def play_command(
     from piavatar_envs import doctor, play
     from piavatar_envs.envs.config import parse_assignments
 
-    if env_id not in registered_ids():
-        raise ValueError(f"no environment {env_id!r}; there are {', '.join(registered_ids()) or 'none'}")
+    check_id(env_id)
     overrides = parse_assignments(config)
     doctor.quiet_warp()
     play.show(play.play(env_id, agent, video, steps, seed, device, color, overrides), video)
+
+
+def watch_command(
+    env_id: EnvId,
+    agent: AgentName = "random",
+    seed: Seed = 0,
+    device: Device = "cpu",
+    port: Annotated[int, tyro.conf.arg(help="of this machine, or the next one that is free")] = 8080,
+    config: Overrides = (),
+) -> None:
+    """Play an environment for ever, live in a web browser, until Ctrl-C (needs the extra live).
+
+    Args:
+        env_id: the environment, e.g. PIAvatar/Reach-v0.
+        agent: random or zero actions.
+        seed: seed of the run.
+        device: where to simulate.
+        port: of the view.
+        config: overrides of the environment's configuration.
+    """
+    from piavatar_envs import doctor, watch
+    from piavatar_envs.envs.config import parse_assignments
+
+    check_id(env_id)
+    overrides = parse_assignments(config)
+    doctor.quiet_warp()
+    watch.watch(env_id, agent, seed, device, port, overrides)
+
+
+def check_id(env_id: str) -> None:
+    """Refuse what is not in the list.
+
+    Raises:
+        ValueError: there is no such environment.
+    """
+    if env_id not in registered_ids():
+        raise ValueError(f"no environment {env_id!r}; there are {', '.join(registered_ids()) or 'none'}")
 
 
 def registered_ids() -> list[str]:
@@ -109,7 +149,7 @@ def describe(env_id: str) -> str:
 
 def main(args: list[str] | None = None) -> None:
     """Run a command; what a user got wrong ends in one line and exit status 2."""
-    commands = {"list": list_command, "doctor": doctor_command, "play": play_command}
+    commands = {"list": list_command, "doctor": doctor_command, "play": play_command, "watch": watch_command}
     try:
         tyro.extras.subcommand_cli_from_dict(
             commands, prog="piavatar-envs", description="Soft human avatars behind reset/step.", args=args

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -16,6 +16,9 @@ from tqdm import tqdm
 import piavatar_envs  # noqa: F401 - registers the ids
 from piavatar_envs.multi import multi_modules
 from piavatar_envs.render.video import SUFFIXES, write_video
+
+if TYPE_CHECKING:
+    from piavatar_envs.api.pettingzoo import AvatarParallelEnv
 
 
 @dataclass
@@ -60,8 +63,7 @@ def play(
     Raises:
         ValueError: an unknown module, agent or suffix, a number of steps below 1, a setting out of range.
     """
-    if agent not in ("random", "zero"):
-        raise ValueError(f"no agent {agent!r}; there are random and zero")
+    check_agent(agent)
     if steps is not None and steps < 1:
         raise ValueError(f"steps={steps} must be >= 1")
     if video is not None and video.suffix not in SUFFIXES:  # before the kernels are compiled, not after the rollout
@@ -69,7 +71,7 @@ def play(
     settings = {"device": device, **(overrides or {})}
     if video is not None:
         settings = {"render_mode": "rgb_array", "color": color, **settings}
-    env = gymnasium.make(env_id, **settings) if "/" in env_id else Together(env_id, settings)
+    env = make(env_id, settings)
     rollout = Rollout()
     try:
         frames = _frames(env, agent, steps, seed, rollout)
@@ -80,6 +82,26 @@ def play(
     finally:
         env.close()
     return rollout
+
+
+def check_agent(agent: str) -> None:
+    """Refuse what is no agent of this file.
+
+    Raises:
+        ValueError: it is neither random nor zero.
+    """
+    if agent not in ("random", "zero"):
+        raise ValueError(f"no agent {agent!r}; there are random and zero")
+
+
+def make(env_id: str, settings: Mapping[str, Any]) -> gymnasium.Env | Together:
+    """The environment of a registered id, or of a module of several agents.
+
+    Raises:
+        ImportError: an extra is not installed.
+        ValueError: an unknown module, a setting out of range.
+    """
+    return gymnasium.make(env_id, **settings) if "/" in env_id else Together(env_id, settings)
 
 
 class Together:
@@ -100,9 +122,14 @@ class Together:
         first = self.env.action_space(self.env.possible_agents[0])
         self.action_space = gymnasium.vector.utils.batch_space(first, len(self.env.possible_agents))
 
-    def reset(self, seed: int | None = None) -> None:
-        """Begin an episode."""
-        self.env.reset(seed=seed)
+    @property
+    def unwrapped(self) -> AvatarParallelEnv:
+        """The world itself."""
+        return self.env
+
+    def reset(self, seed: int | None = None) -> tuple[None, dict[str, Any]]:
+        """Begin an episode; ``info`` is by agent."""
+        return None, self.env.reset(seed=seed)[1]
 
     def step(self, actions: np.ndarray) -> tuple[None, float, bool, bool, dict[str, Any]]:
         """Advance those who are still in; ``info`` is by agent."""

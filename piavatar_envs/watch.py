@@ -1,0 +1,143 @@
+"""An environment played for ever in a web browser, of one agent or several, under the hands of who watches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from piavatar_envs.api.live import Live
+from piavatar_envs.play import Together, check_agent, make, numbers
+from piavatar_envs.render.live import PORT, import_viser
+from piavatar_envs.render.panel import Panel
+
+#: From an observation (None where there are several agents) to an action.
+Act = Callable[[Any], np.ndarray]
+#: Time between two looks at the panel while nothing moves, and between two tables [s].
+_REST, _TELL_EVERY = 0.05, 0.2
+
+
+def watch(
+    env_id: str,
+    agent: str = "random",
+    seed: int = 0,
+    device: str = "cpu",
+    port: int = PORT,
+    overrides: Mapping[str, Any] | None = None,
+) -> None:
+    """Play ``env_id`` in a web browser until Ctrl-C.
+
+    Args:
+        env_id: a registered id, or the name of a module of several agents such as ``sumo_v0``.
+        agent: "random" (uniform in the action space) or "zero".
+        seed: of the first reset and of the random actions; later episodes go on from it.
+        device: a Warp device.
+        port: of this machine, or the next one that is free.
+        overrides: settings of the environment's configuration.
+
+    Raises:
+        ImportError: the extra ``live`` is not installed.
+        ValueError: an unknown module or agent, a port or a setting out of range.
+    """
+    check_agent(agent)
+    import_viser()  # before the kernels are compiled, not after
+    with suppress(KeyboardInterrupt):
+        env = make(env_id, {"device": device, **(overrides or {})})
+        env.action_space.seed(seed)
+        still = np.zeros(env.action_space.shape, env.action_space.dtype)
+        watch_env(env, lambda _observation: env.action_space.sample() if agent == "random" else still, seed, port)
+
+
+def watch_env(
+    env: gymnasium.Env | Together,
+    act: Act,
+    seed: int = 0,
+    port: int = PORT,
+    begin: Callable[[], None] = lambda: None,
+) -> None:
+    """Let somebody play in a web browser for ever; closes the environment when an exception ends it.
+
+    Args:
+        env: made without a render mode.
+        act: who plays.
+        seed: of the first reset.
+        port: of this machine, or the next one that is free.
+        begin: called before every episode.
+
+    Raises:
+        ImportError: the extra ``live`` is not installed.
+        KeyboardInterrupt: Ctrl-C.
+        ValueError: a port out of range.
+    """
+    try:
+        inner = env.unwrapped
+        live = Live(inner.batch, inner.config.render.color, port)
+        try:
+            show = Show(env, act, begin, live)
+            show.begin(seed)
+            while True:
+                show.turn()
+        finally:
+            live.close()
+    finally:
+        env.close()
+
+
+class Show:
+    """A play without end, a turn at a time.
+
+    Attributes:
+        panel: what the visitors ask for.
+    """
+
+    def __init__(self, env: gymnasium.Env | Together, act: Act, begin: Callable[[], None], live: Live) -> None:
+        """Open the view and its panel; :meth:`begin` comes next."""
+        self.panel = Panel(live.view.server, live.color)
+        self._env, self._act, self._begin, self._live = env, act, begin, live
+        self._name = env.name if isinstance(env, Together) else env.spec.id
+        self._dt = env.unwrapped.config.physics.control_dt
+        self._over = False
+
+    def begin(self, seed: int | None = None) -> None:
+        """Begin an episode: of ``seed``, or the next one."""
+        self._begin()
+        self._observation, _ = self._env.reset(seed=seed)
+        self._over, self._steps, self._return, self._info = False, 0, 0.0, {}
+        self._live.begin()
+        self._tell()
+
+    def turn(self) -> None:
+        """A step, a new episode or, where neither is wanted, a rest."""
+        panel, live = self.panel, self._live
+        if panel.take_episode():
+            self.begin()
+        if panel.color != live.color:
+            live.color = panel.color
+            live.show()
+        if not panel.take_step():
+            live.pace.rest(_REST)
+            return
+        if self._over:
+            self.begin()
+        action = self._act(self._observation)
+        self._observation, reward, terminated, truncated, self._info = self._env.step(action)
+        self._steps += 1
+        self._return += float(reward)
+        self._over = terminated or truncated
+        live.step(panel.speed)
+        if self._over or not panel.playing or live.pace.clock() - self._told_at >= _TELL_EVERY:
+            self._tell()
+
+    def _tell(self) -> None:
+        """Fill the table; not every step, because a browser takes longer to set it than to draw the scene."""
+        self._told_at = self._live.pace.clock()
+        terms = {
+            name.replace("reward_terms.", ""): f"{value:+.3f}"
+            for name, value in numbers(self._info).items()
+            if "reward_terms." in name
+        }
+        about = {"step": str(self._steps), "time": f"{self._steps * self._dt:.2f} s", "return": f"{self._return:.2f}"}
+        self.panel.tell(self._name, about | terms)

@@ -1,0 +1,151 @@
+"""``watch``: it plays for ever, does what the panel asks for, and ends quietly."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from piavatar_envs import cli, watch
+from piavatar_envs.api.live import Live, Pace
+from piavatar_envs.play import make
+from tests.api.test_live import FakeTime
+
+pytest.importorskip("viser", reason='needs pip install "piavatar-envs[live]"')
+
+
+@pytest.fixture
+def open_show(device):
+    """A maker of shows whose time only passes as they let it: ``show, env, time = open_show(env_id)``."""
+    opened = []
+
+    def start(env_id: str, **settings):
+        env, time = make(env_id, {"device": device, "fidelity": "tiny", **settings}), FakeTime()
+        live = Live(env.unwrapped.batch, port=8300, pace=Pace(time.clock, time.sleep))
+        begun = []
+        still = np.zeros(env.action_space.shape, np.float32)
+        show = watch.Show(env, lambda _observation: still, lambda: begun.append(1), live)
+        opened.append((live, env))
+        show.begin(seed=4)
+        return show, env, time, begun
+
+    yield start
+    for live, env in opened:
+        live.close()
+        env.close()
+
+
+def table(show) -> str:
+    return show.panel._text.content
+
+
+def steps_done(env) -> int:
+    return int(env.unwrapped.batch.step_count.numpy()[0])
+
+
+def test_it_plays_one_episode_after_the_other(open_show):
+    show, env, time, begun = open_show("PIAvatar/Reach-v0", episode_seconds=0.2)
+    for turn in range(1, 16):
+        show.turn()
+        if turn in (6, 12):  # the last step of an episode is told, however short it was
+            assert "| step | 6 |" in table(show) and "| time | 0.20 s |" in table(show)
+    assert len(begun) == 3 and steps_done(env) == 3
+    assert time.now - 100.0 == pytest.approx(0.5)
+
+
+def test_the_panel_pauses_steps_and_begins_anew(open_show):
+    show, env, _, begun = open_show("PIAvatar/Reach-v0")
+    show.turn()
+    show.panel.play(False)
+    for _ in range(3):
+        show.turn()
+    assert steps_done(env) == 1 and show.panel._play.label == "Play"
+    show.panel.ask_for_step()
+    for _ in range(3):
+        show.turn()
+    assert steps_done(env) == 2 and "| step | 2 |" in table(show)
+    show.panel.ask_for_episode()
+    show.turn()
+    assert steps_done(env) == 0 and len(begun) == 2 and "| step | 0 |" in table(show)
+    show.panel.play(True)
+    show.turn()
+    assert steps_done(env) == 1 and show.panel._play.label == "Pause"
+
+
+def test_the_panel_sets_the_speed(open_show):
+    show, _, time, _ = open_show("PIAvatar/Reach-v0")
+    show.panel.speed = 0.5
+    show.turn()
+    assert time.now - 100.0 == pytest.approx(2.0 / 30.0)
+    show.panel.speed = 4.0
+    show.turn()
+    assert time.now - 100.0 == pytest.approx(2.25 / 30.0)
+
+
+def test_the_panel_changes_the_colour_also_while_it_stands_still(open_show):
+    show, env, _, _ = open_show("PIAvatar/Reach-v0")
+    show.panel.play(False)
+    show.panel.color = "strain"
+    show.turn()
+    view = show._live.view
+    assert any("band" in name for name in view._nodes) and "/world/body_0" not in view._nodes
+    assert steps_done(env) == 0
+
+
+def test_the_panel_tells_of_the_reward(open_show):
+    show, *_ = open_show("PIAvatar/Reach-v0")
+    show.panel.ask_for_step()
+    show.turn()
+    told = table(show)
+    assert "PIAvatar/Reach-v0" in told and f"| return | {show._return:.2f} |" in told
+    for name, value in show._info["reward_terms"].items():
+        assert f"| {name} | {value:+.3f} |" in told
+
+
+def test_worlds_of_several_agents_are_watched_too(open_show):
+    pytest.importorskip("pettingzoo")
+    show, *_ = open_show("sumo_v0")
+    show.panel.ask_for_step()
+    show.turn()
+    assert "| agent_0.control |" in table(show) and "| agent_1.control |" in table(show)
+    assert {"/world/body_0", "/world/body_1"} <= set(show._live.view._nodes)
+
+
+@pytest.mark.parametrize(
+    ("args", "told"),
+    [
+        (["watch", "PIAvatar/Nothing-v9"], "no environment 'PIAvatar/Nothing-v9'; there are "),
+        (["watch", "PIAvatar/Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 is outside [1, 64536]"),
+    ],
+)
+def test_mistakes_end_in_one_line(capsys, device, args, told):
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*args, "--device", device] if "Reach" in args[1] else args)
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and told in error and "Traceback" not in error
+
+
+def test_a_missing_viser_ends_in_one_line(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["watch", "PIAvatar/Reach-v0"])
+    assert stop.value.code == 2 and 'pip install "piavatar-envs[live]"' in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
+def test_ctrl_c_ends_it_quietly(device):
+    line = [sys.executable, "-m", "piavatar_envs", "watch", "PIAvatar/Reach-v0", "--device", device, "--port", "8400"]
+    run = subprocess.Popen(
+        [*line, "-c", "fidelity=tiny"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    try:
+        assert "live view: http://127.0.0.1:" in run.stdout.readline()
+        run.send_signal(signal.SIGINT)
+        _, error = run.communicate(timeout=60)
+    finally:
+        run.kill()
+    assert run.returncode == 0 and "Traceback" not in error, error
