@@ -1,13 +1,15 @@
 """Let what a training has left play again: ``python -m agents.play runs/stand_rsl --film stand.gif``.
 
 Takes the folder of a run with one agent, by ``agents.rsl_ppo`` (policy.pt) or ``agents.train`` (policy.zip), builds the
-environment of its config.yaml, and plays the episodes of its evaluation. Nothing in the files is unpickled.
+environment of its config.yaml, and plays the episodes of its evaluation; with ``--live`` it plays in a web browser
+instead, until Ctrl-C. Nothing in the files is unpickled.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from rich.console import Console
 from agents.batches import in_every_seat, play
 from agents.command import read_options
 from agents.config import EvaluationSettings, load_training
-from agents.evaluate import Agent
+from agents.evaluate import Agent, begin_round
 from agents.film import check_every, film
 from agents.report import show_table, versions, write_results
 from agents.workers import EnvFactory
@@ -113,6 +115,34 @@ class Options:
     film_episodes: int = 1
     #: control steps between two of its pictures
     film_every: int = 1
+    #: play one episode after the other in a web browser until Ctrl-C, instead of evaluating (needs the extra live)
+    live: bool = False
+    #: port of that view on this machine, or the next one that is free
+    port: int = 8080
+
+
+def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
+    """Let somebody watch the agent in a web browser until Ctrl-C.
+
+    Args:
+        run: what the training has left.
+        env: settings of the environment, resolved.
+        options: of the command line.
+
+    Raises:
+        ConfigError: the files do not fit each other.
+        ImportError: the extra ``live`` is not installed.
+        ValueError: an unknown device, or a port out of range.
+    """
+    from piavatar_envs.render.live import import_viser
+    from piavatar_envs.watch import watch_env
+
+    import_viser()  # before the kernels are compiled, not after
+    first = run.evaluation.first_seed if options.first_seed is None else options.first_seed
+    with suppress(KeyboardInterrupt):
+        made = EnvFactory(run.env_id, env, options.device)()
+        agent = run.make_agent(made.unwrapped.observation_layout, made.action_space.shape[0])
+        watch_env(made, lambda seen: agent(seen[None, None])[0, 0], first, options.port, lambda: begin_round(agent, 1))
 
 
 def main(args: list[str] | None = None) -> None:
@@ -125,12 +155,15 @@ def main(args: list[str] | None = None) -> None:
         task_class = load_task(run.env_id)
         settings = {name.removeprefix("env."): value for name, value in parse_assignments(options.settings).items()}
         config = load_config(task_class.Config, run.env, settings | {"obs_mode": "flat"})
+        if options.live:
+            watch_run(run, config.model_dump(mode="json"), options)
+            return
         episodes = run.evaluation.episodes if options.episodes is None else options.episodes
         if episodes < 2:
             raise ConfigError(f"episodes={episodes} must be >= 2: of one there is no interval")
         batch = BatchedEpisodes(task_class(config), episodes, options.device)
         agent = run.make_agent(batch.layout, batch.action_size)
-    except (ConfigError, ValueError) as error:
+    except (ConfigError, ValueError, ImportError) as error:
         sys.exit(f"error: {error}")
     first = run.evaluation.first_seed if options.first_seed is None else options.first_seed
     evaluation = play("trained", agent, batch, first)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import sys
 import zipfile
 
 import numpy as np
@@ -14,7 +15,9 @@ pytest.importorskip("stable_baselines3", reason="needs the extra train")
 
 from agents import play, scores, train  # noqa: E402
 from agents.play import open_run  # noqa: E402
-from piavatar_envs.envs.config import ConfigError  # noqa: E402
+from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
+from piavatar_envs.envs.config import ConfigError, load_config  # noqa: E402
+from piavatar_envs.tasks import load_task  # noqa: E402
 
 QUICK = ("env.fidelity=tiny", "env.episode_seconds=0.2", "evaluation.episodes=3")
 SB3 = {
@@ -59,6 +62,38 @@ def test_settings_win_and_a_film_is_written(device, tmp_path, capsys):
 
     with Image.open(film) as pictures:
         assert pictures.n_frames == 3 and pictures.size == (64, 64)
+
+
+@pytest.mark.parametrize("kind", ["rsl", "ppo"])
+def test_it_plays_live_as_it_does_in_an_evaluation(kind, device, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("viser", reason="needs the extra live")
+    run_of(kind, tmp_path / "run", device)
+    totals = []
+
+    def watch_env(env, act, seed, port, begin):
+        begin()
+        observation, _ = env.reset(seed=seed)
+        over, total = False, 0.0
+        while not over:
+            observation, reward, terminated, truncated, _ = env.step(act(observation))
+            total, over = total + reward, terminated or truncated
+        totals.append((seed, port, total))
+        raise KeyboardInterrupt  # ends it as Ctrl-C does: quietly
+
+    monkeypatch.setattr("piavatar_envs.watch.watch_env", watch_env)
+    play.main([str(tmp_path / "run"), "--live", "--port", "8500", "--first-seed", "7", "--device", device])
+    run = open_run(tmp_path / "run")
+    task = load_task(run.env_id)
+    batch = BatchedEpisodes(task(load_config(task.Config, run.env)), 1, device)
+    (episode,) = play.play("trained", run.make_agent(batch.layout, batch.action_size), batch, 7).episodes
+    assert totals == [(7, 8500, pytest.approx(episode.total, rel=1e-4))]
+
+
+def test_without_viser_it_does_not_play_live(device, tmp_path, monkeypatch):
+    run_of("ppo", tmp_path / "run", device)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(SystemExit, match=r'error: .*pip install "piavatar-envs\[live\]"'):
+        play.main([str(tmp_path / "run"), "--live", "--device", device])
 
 
 def test_folders_without_a_run_are_refused(device, tmp_path, capsys):
