@@ -16,11 +16,14 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+#: What Gymnasium calls for every id.
+ENTRY_POINT = "piavatar_envs.api.gymnasium:AvatarEnv"
+
 
 def _register(env_id: str) -> None:
     register(
         id=env_id,
-        entry_point="piavatar_envs.api.gymnasium:AvatarEnv",
+        entry_point=ENTRY_POINT,
         vector_entry_point="piavatar_envs.api.vector:AvatarVectorEnv",
         # the time limit lives inside, so that a saved state holds it
         max_episode_steps=None,

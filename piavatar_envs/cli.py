@@ -6,6 +6,7 @@ Only what ``--help`` needs is imported here; each command imports its own work, 
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import sys
 from pathlib import Path
@@ -112,23 +113,30 @@ def watch_command(
 
 
 def check_id(env_id: str) -> None:
-    """Refuse what is not in the list.
+    """Refuse what is not in the list. Of a task of somebody's own, ``module:id``, the module is imported first.
 
     Raises:
+        ImportError: there is no such module.
         ValueError: there is no such environment.
     """
-    if env_id not in registered_ids():
+    module, _, own_id = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    if own_id not in registered_ids():
         raise ValueError(f"no environment {env_id!r}; there are {', '.join(registered_ids()) or 'none'}")
 
 
 def registered_ids() -> list[str]:
-    """The ids of this suite in Gymnasium's registry, sorted, then the modules of several agents."""
+    """The ids in Gymnasium's registry, with those of tasks of one's own, sorted; then the modules of several agents."""
     import gymnasium
 
-    from piavatar_envs.multi import multi_modules  # importing the package registers the ids
+    from piavatar_envs import ENTRY_POINT  # importing the package registers the ids
+    from piavatar_envs.multi import multi_modules
+    from piavatar_envs.tasks import NAMESPACE
 
-    ids = sorted(env_id for env_id, spec in gymnasium.registry.items() if spec.namespace == "PIAvatar")
-    return ids + [path.rpartition(".")[2] for path in multi_modules()]
+    found = gymnasium.registry.items()
+    ids = [name for name, spec in found if spec.namespace == NAMESPACE or spec.entry_point == ENTRY_POINT]
+    return sorted(ids) + [path.rpartition(".")[2] for path in multi_modules()]
 
 
 def describe(env_id: str) -> str:

@@ -11,6 +11,7 @@ from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
 from piavatar_envs.api.view import EpisodeView
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks.base import Task
 
 
 class AvatarEnv(EpisodeView, gym.Env):
@@ -28,7 +29,7 @@ class AvatarEnv(EpisodeView, gym.Env):
 
     def __init__(
         self,
-        task: str = "Reach-v0",
+        task: str | type[Task] = "Reach-v0",
         render_mode: str | None = None,
         device: str = "cpu",
         config: Settings = None,
@@ -37,7 +38,7 @@ class AvatarEnv(EpisodeView, gym.Env):
         """Build the environment.
 
         Args:
-            task: id of the task, with or without the namespace.
+            task: id of the task, this suite's with or without the namespace, or its class.
             render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.

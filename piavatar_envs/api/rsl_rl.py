@@ -18,6 +18,7 @@ from piavatar_envs.api.same_step import means, step_and_reset
 from piavatar_envs.api.view import BatchedView
 from piavatar_envs.envs.config import ConfigError, load_config
 from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks.base import Task
 
 try:
     import torch
@@ -46,7 +47,7 @@ class AvatarRslEnv(BatchedView, VecEnv):
 
     def __init__(
         self,
-        task: str = "Reach-v0",
+        task: str | type[Task] = "Reach-v0",
         num_envs: int = 1,
         device: str = "cpu",
         config: Settings = None,
@@ -58,7 +59,7 @@ class AvatarRslEnv(BatchedView, VecEnv):
         """Build the environments, and begin their first episodes.
 
         Args:
-            task: id of the task, with or without the namespace.
+            task: id of the task, this suite's with or without the namespace, or its class.
             num_envs: number of environments.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.

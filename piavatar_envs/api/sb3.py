@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from piavatar_envs.api.vector import AvatarVectorEnv
+from piavatar_envs.tasks.base import Task
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -34,7 +35,7 @@ class SB3VecEnv(VecEnv):
 
     def __init__(
         self,
-        task: str = "Reach-v0",
+        task: str | type[Task] = "Reach-v0",
         num_envs: int = 1,
         render_mode: str | None = None,
         device: str = "cpu",
@@ -46,7 +47,7 @@ class SB3VecEnv(VecEnv):
         """Build the environments.
 
         Args:
-            task: id of the task, with or without the namespace.
+            task: id of the task, this suite's with or without the namespace, or its class.
             num_envs: number of environments.
             render_mode: None or ``"rgb_array"``.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``; what leaves are NumPy arrays either way.

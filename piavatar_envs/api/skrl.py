@@ -48,7 +48,7 @@ class AvatarSkrlEnv(BatchedView):
 
     def __init__(
         self,
-        task: str = "Reach-v0",
+        task: str | type[Task] = "Reach-v0",
         num_envs: int = 1,
         device: str = "cpu",
         config: Settings = None,
@@ -58,7 +58,7 @@ class AvatarSkrlEnv(BatchedView):
         """Build the environments.
 
         Args:
-            task: id of the task, with or without the namespace.
+            task: id of the task, this suite's with or without the namespace, or its class.
             num_envs: number of environments.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.

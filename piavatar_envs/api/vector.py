@@ -18,6 +18,7 @@ from piavatar_envs.api.picture import Pictures
 from piavatar_envs.api.view import BatchedView
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks.base import Task
 
 
 class AvatarVectorEnv(BatchedView, VectorEnv):
@@ -50,7 +51,7 @@ class AvatarVectorEnv(BatchedView, VectorEnv):
 
     def __init__(
         self,
-        task: str = "Reach-v0",
+        task: str | type[Task] = "Reach-v0",
         num_envs: int = 1,
         render_mode: str | None = None,
         device: str = "cpu",
@@ -63,7 +64,7 @@ class AvatarVectorEnv(BatchedView, VectorEnv):
         """Build the environments.
 
         Args:
-            task: id of the task, with or without the namespace.
+            task: id of the task, this suite's with or without the namespace, or its class.
             num_envs: number of environments.
             render_mode: None or ``"rgb_array"``.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.

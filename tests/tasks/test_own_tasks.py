@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import piavatar_envs
+from piavatar_envs import cli
 from piavatar_envs.api.gymnasium import AvatarEnv
 from piavatar_envs.tasks import load_task, reach
 
@@ -59,6 +60,14 @@ def test_its_module_is_imported_when_its_id_names_it(module):
     task = load_task(f"{module}:Somebody/Near-v0")
     assert task is sys.modules[module].NearTask and load_task("Somebody/Near-v0") is task
     assert load_task(task) is task and load_task("Reach-v0") is reach.ReachTask
+
+
+def test_the_command_line_knows_it(module, capsys):
+    cli.main(["play", f"{module}:Somebody/Near-v0", "--steps", "1", "-c", "fidelity=tiny"])
+    assert "reward_terms.reach" in capsys.readouterr().out and "Somebody/Near-v0" in cli.registered_ids()
+    with pytest.raises(SystemExit):
+        cli.main(["play", "no_such_module:Somebody/Near-v0"])
+    assert capsys.readouterr().err == "error: No module named 'no_such_module'\n"
 
 
 def test_registering_again_replaces_without_a_warning(module, recwarn):
