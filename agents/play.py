@@ -150,6 +150,8 @@ def main(args: list[str] | None = None) -> None:
     options = read_options(Options, "play", args)
     quiet_warp()
     try:
+        if options.live and (options.out or options.film or options.episodes is not None):
+            raise ConfigError("--live plays until Ctrl-C and evaluates nothing; leave out --out, --film and --episodes")
         check_every(options.film_every)
         run = open_run(options.run, options.device)
         task_class = load_task(run.env_id)

@@ -151,10 +151,10 @@ def _draw_errors(rows: Sequence[dict[str, Any]], axes: Any) -> None:
     for name, label, color in (
         ("bar", "frequency of a bar", "#1b7f79"),
         ("cantilever", "sag of a cantilever", "#d1495b"),
-        ("bar on wall", "contact time, bar on wall", "#472b62"),
-        ("bar on bar", "contact time, bar on bar", "#8d6a9f"),
-        ("ball on plane", "contact time, ball on plane", "#f2a65a"),
-        ("ball on ball", "contact time, ball on ball", "#c9b037"),
+        ("bar on wall", "time to turn, bar on wall", "#472b62"),
+        ("bar on bar", "time to turn, bar on bar", "#8d6a9f"),
+        ("ball on plane", "time to turn, ball on plane", "#f2a65a"),
+        ("ball on ball", "time to turn, ball on ball", "#c9b037"),
     ):
         found = [row for row in rows if row["case"] == name and row.get("material", "neo_hookean") == "neo_hookean"]
         errors = [np.abs(row.get("time_error_range", row.get("error"))).max() for row in found]

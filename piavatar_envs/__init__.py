@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from gymnasium.envs.registration import register, registry
 
-from piavatar_envs.tasks import add_task, task_modules
+from piavatar_envs.tasks import add_task, place_of, task_modules
 
 if TYPE_CHECKING:
     from piavatar_envs.tasks.base import Task
@@ -20,14 +20,14 @@ __version__ = "0.1.0"
 ENTRY_POINT = "piavatar_envs.api.gymnasium:AvatarEnv"
 
 
-def _register(env_id: str) -> None:
+def _register(env_id: str, task: str) -> None:
     register(
         id=env_id,
         entry_point=ENTRY_POINT,
         vector_entry_point="piavatar_envs.api.vector:AvatarVectorEnv",
         # the time limit lives inside, so that a saved state holds it
         max_episode_steps=None,
-        kwargs={"task": env_id},
+        kwargs={"task": task},
     )
 
 
@@ -44,8 +44,9 @@ def register_task(env_id: str, task: type[Task] | str) -> None:
     """
     add_task(env_id, task)
     registry.pop(env_id, None)  # without Gymnasium's warning: a notebook's cell is often run twice
-    _register(env_id)
+    # by what a process that has not run this can import
+    _register(env_id, place_of(env_id, task))
 
 
 for _env_id in task_modules():
-    _register(_env_id)
+    _register(_env_id, _env_id)

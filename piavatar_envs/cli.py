@@ -14,6 +14,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from piavatar_envs.tasks import NAMESPACE
+
 EnvId = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="an id or a module: see list")]
 AgentName = Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the actions come from")]
 Seed = Annotated[int, tyro.conf.arg(help="of the first reset and of the random actions")]
@@ -123,7 +125,10 @@ def check_id(env_id: str) -> None:
     if module:
         importlib.import_module(module)
     if own_id not in registered_ids():
-        raise ValueError(f"no environment {env_id!r}; there are {', '.join(registered_ids()) or 'none'}")
+        raise ValueError(
+            f"no environment {env_id!r}; there are {', '.join(registered_ids()) or 'none'}; a task of your own is "
+            "named with the module that registers it, such as my_tasks:Mine/HandsUp-v0"
+        )
 
 
 def registered_ids() -> list[str]:
@@ -132,7 +137,6 @@ def registered_ids() -> list[str]:
 
     from piavatar_envs import ENTRY_POINT  # importing the package registers the ids
     from piavatar_envs.multi import multi_modules
-    from piavatar_envs.tasks import NAMESPACE
 
     found = gymnasium.registry.items()
     ids = [name for name, spec in found if spec.namespace == NAMESPACE or spec.entry_point == ENTRY_POINT]
@@ -144,7 +148,10 @@ def describe(env_id: str) -> str:
 
     ``PIAvatar/TrackMotion-v0`` is described by ``tasks/track_motion.py``, ``sumo_v0`` by ``multi/sumo_v0.py``.
     """
-    if "/" in env_id:
+    namespace, _, _ = env_id.rpartition("/")
+    if namespace not in ("", NAMESPACE):
+        return ""  # of somebody else's
+    if namespace:
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", env_id.partition("/")[2].partition("-v")[0]).lower()
         path = Path(__file__).parent / "tasks" / f"{name}.py"
     else:

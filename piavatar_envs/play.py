@@ -68,7 +68,7 @@ def play(
         raise ValueError(f"steps={steps} must be >= 1")
     if video is not None and video.suffix not in SUFFIXES:  # before the kernels are compiled, not after the rollout
         raise ValueError(f"video {video} ends in {video.suffix!r}; use {' or '.join(SUFFIXES)}")
-    settings = {"device": device, **(overrides or {})}
+    settings = settings_of(device, overrides)
     if video is not None:
         settings = {"render_mode": "rgb_array", "color": color, **settings}
     env = make(env_id, settings)
@@ -92,6 +92,17 @@ def check_agent(agent: str) -> None:
     """
     if agent not in ("random", "zero"):
         raise ValueError(f"no agent {agent!r}; there are random and zero")
+
+
+def settings_of(device: str, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What an environment is made with.
+
+    Raises:
+        ValueError: the overrides ask for a way to show it, which is not theirs to say.
+    """
+    if "render_mode" in (overrides or {}):
+        raise ValueError("render_mode is no setting here; use play --video FILE for a film, or watch for the live view")
+    return {"device": device, **(overrides or {})}
 
 
 def make(env_id: str, settings: Mapping[str, Any]) -> gymnasium.Env | Together:

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from piavatar_envs.api.live import Live
-from piavatar_envs.play import Together, check_agent, make, numbers
+from piavatar_envs.play import Together, check_agent, make, numbers, settings_of
 from piavatar_envs.render.live import PORT, import_viser
 from piavatar_envs.render.panel import Panel
 
@@ -43,9 +43,10 @@ def watch(
         ValueError: an unknown module or agent, a port or a setting out of range.
     """
     check_agent(agent)
+    settings = settings_of(device, overrides)
     import_viser()  # before the kernels are compiled, not after
     with suppress(KeyboardInterrupt):
-        env = make(env_id, {"device": device, **(overrides or {})})
+        env = make(env_id, settings)
         env.action_space.seed(seed)
         still = np.zeros(env.action_space.shape, env.action_space.dtype)
         watch_env(env, lambda _observation: env.action_space.sample() if agent == "random" else still, seed, port)
@@ -118,6 +119,7 @@ class Show:
             live.color = panel.color
             live.show()
         if not panel.take_step():
+            live.catch_up()
             live.pace.rest(_REST)
             return
         if self._over:

@@ -25,7 +25,7 @@ SMALLER = {
     "num_envs=16": "num_envs=2",
     '"shape.pool": 64': '"shape.pool": 2',
     "num_agents=3": "num_agents=2, fidelity='tiny', episode_seconds=0.5",
-    'OnPolicyRunner(env, train_cfg, log_dir="runs/reach", device="cuda").learn(300)': "assert env.num_envs == 2",
+    ".learn(300)": ".learn(1)",
     'device="cuda"': "device=DEVICE",
 }
 

@@ -85,6 +85,18 @@ def test_the_panel_sets_the_speed(open_show):
     assert time.now - 100.0 == pytest.approx(2.25 / 30.0)
 
 
+def test_who_pauses_sees_the_last_step(open_show):
+    """At high speed a screen is not sent every step; the last one is, when it stands still."""
+    show, _, _, _ = open_show("PIAvatar/Reach-v0")
+    show.panel.speed = 4.0
+    for _ in range(2):
+        show.turn()
+    assert show._live._behind
+    show.panel.play(False)
+    show.turn()
+    assert not show._live._behind and show._live._progress.since_last() == 0.0
+
+
 def test_the_panel_changes_the_colour_also_while_it_stands_still(open_show):
     show, env, _, _ = open_show("PIAvatar/Reach-v0")
     show.panel.play(False)
@@ -119,6 +131,8 @@ def test_worlds_of_several_agents_are_watched_too(open_show):
     [
         (["watch", "PIAvatar/Nothing-v9"], "no environment 'PIAvatar/Nothing-v9'; there are "),
         (["watch", "PIAvatar/Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 is outside [1, 64536]"),
+        (["watch", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is no setting here; use play --video"),
+        (["play", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is no setting here; use play --video"),
     ],
 )
 def test_mistakes_end_in_one_line(capsys, device, args, told):

@@ -51,7 +51,7 @@ class AvatarEnv(EpisodeView, gym.Env):
         """
         task_class = load_task(task)
         settings = load_config(task_class.Config, config, overrides)
-        self._episode = Episode(task_class(settings), render_mode, device)
+        self._episode = Episode(task_class(settings).alone(), render_mode, device)
         self.batch, self.config = self._episode.batch, settings
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self._episode.frame_rate}

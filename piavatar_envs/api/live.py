@@ -83,7 +83,7 @@ class Live:
         self._batch, self._port, self._env = batch, port, env
         self._progress, self._scenery = Progress(batch, env), Scenery(batch)
         self._view: LiveView | None = None
-        self._shown = 0.0
+        self._shown, self._behind = 0.0, False
 
     @property
     def view(self) -> LiveView:
@@ -111,17 +111,26 @@ class Live:
         Args:
             speed: simulated over real time, at most.
         """
-        if self.pace.clock() - self._shown >= _LEAST_INTERVAL:
+        self._behind = True
+        if self._view is not None and self.pace.clock() - self._shown >= _LEAST_INTERVAL:
             self.show()
         self.pace.wait(self._batch.config.physics.control_dt / speed)
 
+    def catch_up(self) -> None:
+        """Show the last step, if it came too soon after the one before to be shown."""
+        if self._behind and self._view is not None:
+            self.show()
+
     def show(self) -> None:
         """Show how things are."""
-        self._shown = self.pace.clock()
+        self._shown, self._behind = self.pace.clock(), False
         self.view.show(self._scenery.scene(self._env, self.color), self._progress.since_last())
 
     def close(self) -> None:
-        """Stop the server, if it was started; closing twice is fine."""
+        """Stop the server, if it was started; closing twice is fine.
+
+        What begins anew opens it again, a step does not.
+        """
         if self._view is not None:
             self._view.close()
             self._view = None

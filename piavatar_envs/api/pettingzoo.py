@@ -11,6 +11,7 @@ import numpy as np
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
 from piavatar_envs.api.view import EpisodeView
 from piavatar_envs.envs.config import load_config, replace
+from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
 try:
@@ -38,7 +39,7 @@ class AvatarParallelEnv(EpisodeView, ParallelEnv):
 
     def __init__(
         self,
-        task_class: type[Task],
+        task: str | type[Task],
         render_mode: str | None = None,
         device: str = "cpu",
         config: Settings = None,
@@ -48,7 +49,7 @@ class AvatarParallelEnv(EpisodeView, ParallelEnv):
         """Build the environment.
 
         Args:
-            task_class: the task.
+            task: its class, or for tasks of one's own the id.
             render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
@@ -58,8 +59,9 @@ class AvatarParallelEnv(EpisodeView, ParallelEnv):
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
             ImportError: ``render_mode="human"`` without the extra ``live``.
-            ValueError: an unknown render mode or device, or no time at all.
+            ValueError: an unknown task, render mode or device, or no time at all.
         """
+        task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
         if max_cycles is not None:
             if max_cycles < 1:

@@ -76,7 +76,7 @@ class AvatarRslEnv(BatchedView, VecEnv):
         """
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
-        self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, "torch", num_threads)
+        self.episodes = BatchedEpisodes(task_class(self.config).alone(), num_envs, device, "torch", num_threads)
         self.num_envs, self.num_actions = num_envs, self.episodes.action_size
         self.device = self.episodes.api.device
         self.max_episode_length = self.episodes.groups[0].max_steps

@@ -72,7 +72,7 @@ class AvatarSkrlEnv(BatchedView):
         """
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
-        self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, "torch", num_threads)
+        self.episodes = BatchedEpisodes(task_class(self.config).alone(), num_envs, device, "torch", num_threads)
         self.num_envs, self.device = num_envs, self.episodes.api.device
         self.single_observation_space = gym.spaces.Dict({"policy": self.episodes.observation_space()})
         self.single_action_space = self.episodes.action_space()
@@ -161,7 +161,7 @@ class AvatarSkrlMultiEnv(BatchedView):
 
     def __init__(
         self,
-        task_class: type[Task],
+        task: str | type[Task],
         num_envs: int = 1,
         device: str = "cpu",
         config: Settings = None,
@@ -171,7 +171,7 @@ class AvatarSkrlMultiEnv(BatchedView):
         """Build the worlds.
 
         Args:
-            task_class: the task, such as ``piavatar_envs.multi.high_five_v0.TASK``.
+            task: its class, such as ``piavatar_envs.multi.high_five_v0.TASK``, or for tasks of one's own the id.
             num_envs: number of worlds.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
@@ -181,8 +181,9 @@ class AvatarSkrlMultiEnv(BatchedView):
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
             ImportError: torch is not installed.
-            ValueError: an unknown device, or no worlds.
+            ValueError: an unknown task or device, or no worlds.
         """
+        task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
         self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, "torch", num_threads)
         self.num_envs, self.device = num_envs, self.episodes.api.device

@@ -82,7 +82,7 @@ class AvatarVectorEnv(BatchedView, VectorEnv):
         self.render_mode, self.autoreset_mode = check_batch_render_mode(render_mode), _autoreset_mode(autoreset_mode)
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
-        self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, array_api, num_threads)
+        self.episodes = BatchedEpisodes(task_class(self.config).alone(), num_envs, device, array_api, num_threads)
         self.num_envs = num_envs
         self.metadata = {
             **self.metadata,

@@ -37,7 +37,7 @@ def bands_of(body: Body) -> list[Band]:
     middles = (np.arange(NUM_BANDS) + 0.5) / NUM_BANDS
     colors = color_by(middles, 1.0)
     share = np.nan_to_num(np.asarray(body.scalars)[body.faces].mean(axis=1) / body.scalar_max, nan=1.0, posinf=1.0)
-    band = np.clip((share * NUM_BANDS).astype(np.int64), 0, NUM_BANDS - 1)
+    band = np.clip(share * NUM_BANDS, 0.0, NUM_BANDS - 1.0).astype(np.int64)
     found = []
     for number in np.unique(band):
         own = body.faces[band == number]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import io
 import math
+import sys
 from collections.abc import Iterator
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
@@ -74,6 +76,9 @@ class LiveView:
         self._nodes: dict[str, viser.MeshHandle] = {}
         with _silence():
             self.server: viser.ViserServer = library.ViserServer(HOST, port, "piavatar-envs", verbose=False)
+        # any page that a browser of this machine has open may send what the hidden button would: no tunnel is opened
+        self.server.request_share_url = lambda *_arguments, **_more: None
+        atexit.register(self.close)  # or the library tells of it itself
         self.url = f"http://{HOST}:{self.server.get_port()}"
         self._set_up(self._follower.camera)
         self._closed = False
@@ -143,6 +148,7 @@ class LiveView:
         """Stop the server; closing twice is fine."""
         if not self._closed:
             self._closed = True
+            atexit.unregister(self.close)
             with _silence():
                 self.server.stop()
 
@@ -166,8 +172,23 @@ def _bytes(color: Color) -> tuple[int, int, int]:
     return red, green, blue
 
 
+class _Muted(io.TextIOBase):
+    """A standard output that does not let the library tell of itself, from whatever thread; all else passes."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write, or do not."""
+        return len(text) if "viser" in text else self._stream.write(text)
+
+    def flush(self) -> None:
+        """Flush what was written."""
+        self._stream.flush()
+
+
 @contextlib.contextmanager
-def _silence() -> Iterator[Any]:
-    """Nothing is printed within it: the library tells of itself, whether asked to or not."""
-    with contextlib.redirect_stdout(io.StringIO()):
+def _silence() -> Iterator[None]:
+    """The library is quiet within it: it tells of itself, whether asked to or not."""
+    with contextlib.redirect_stdout(_Muted(sys.stdout)):
         yield

@@ -59,7 +59,7 @@ def add_task(env_id: str, task: type[Task] | str) -> None:
         TypeError: the task is neither.
         ValueError: an id without namespace or version, or one of this package.
     """
-    if not re.fullmatch(r"[\w.-]+/[\w.-]+-v\d+", env_id):
+    if not re.fullmatch(r"[\w-]+/[\w.-]+-v\d+", env_id):
         raise ValueError(f"{env_id!r} must be a namespace, a name and a version, such as 'Mine/Hop-v0'")
     if env_id.startswith(f"{NAMESPACE}/"):
         raise ValueError(f"{env_id!r} is in the namespace of this package; use one of your own: 'Mine/Hop-v0'")
@@ -68,12 +68,12 @@ def add_task(env_id: str, task: type[Task] | str) -> None:
     _added[env_id] = task
 
 
-def _is_task(task: object) -> bool:
-    if not isinstance(task, type):
-        return False
-    from piavatar_envs.tasks.base import Task  # whoever has a subclass has imported it
-
-    return issubclass(task, Task)
+def place_of(env_id: str, task: type[Task] | str) -> str:
+    """What another process can :func:`load_task` by: ``"module:Class"``, or the id of a class that no import gives."""
+    if isinstance(task, str):
+        return task
+    importable = task.__module__ != "__main__" and task.__qualname__.isidentifier()
+    return f"{task.__module__}:{task.__name__}" if importable else env_id
 
 
 def load_task(task: str | type[Task]) -> type[Task]:
@@ -81,26 +81,40 @@ def load_task(task: str | type[Task]) -> type[Task]:
 
     Args:
         task: its id, for the tasks of this package with or without the namespace; ``"module:id"`` imports the module
-            first, which registers it; or the class itself.
+            first, which registers it; ``"module:Class"``; or the class itself.
 
     Raises:
-        ImportError: the module of its id cannot be imported.
+        ImportError: the module cannot be imported.
         ValueError: there is no such task.
     """
     if _is_task(task):
         return task
-    module, _, env_id = str(task).rpartition(":")
-    if module:
-        importlib.import_module(module)
+    module, _, name = str(task).rpartition(":")
+    found = importlib.import_module(module) if module else None
+    if module and "/" not in name:
+        task_class = getattr(found, name, None)
+        if not _is_task(task_class):
+            raise ValueError(f"{module} has no task {name!r}: it must be a subclass of piavatar_envs.tasks.base.Task")
+        return task_class
     modules = task_modules()
-    full = env_id if "/" in env_id else f"{NAMESPACE}/{env_id}"
+    full = name if "/" in name else f"{NAMESPACE}/{name}"
     if full in modules:
         return importlib.import_module(f"{__name__}.{modules[full]}").TASK
     if full not in _added:
-        raise ValueError(f"unknown task {task!r}; there are {', '.join([*modules, *_added])}")
-    added = _added[full]
-    if isinstance(added, str):
-        place, _, name = added.partition(":")
-        added = getattr(importlib.import_module(place), name)
-        add_task(full, added)
-    return added
+        raise ValueError(f"unknown task {task!r}; there are {', '.join([*modules, *_added])}{_remedy(module, full)}")
+    return load_task(_added[full])
+
+
+def _remedy(module: str, env_id: str) -> str:
+    """What else there is to say of an id that nobody knows."""
+    if module or env_id.startswith(f"{NAMESPACE}/"):
+        return ""
+    return f"; a task of your own is named with the module that registers it, such as my_tasks:{env_id}"
+
+
+def _is_task(task: object) -> bool:
+    if not isinstance(task, type):
+        return False
+    from piavatar_envs.tasks.base import Task  # whoever has a subclass has imported it
+
+    return issubclass(task, Task)

@@ -104,6 +104,20 @@ class Task:
         """Names of the agents, one an avatar."""
         return tuple(f"agent_{index}" for index in range(len(self.scene.avatars)))
 
+    def alone(self) -> Task:
+        """The task itself, if it has one agent.
+
+        Raises:
+            ValueError: it has several.
+        """
+        if len(self.agent_names) != 1:
+            name, count = type(self).__name__, len(self.agent_names)
+            raise ValueError(
+                f"{name} has {count} agents, and this is an environment of one; use "
+                f"piavatar_envs.api.pettingzoo.AvatarParallelEnv({name})"
+            )
+        return self
+
     def terms(self) -> tuple[ObservationTerm, ...]:
         """What the task adds to the observation."""
         return self.observation_terms
@@ -148,8 +162,11 @@ class Task:
 
         Props and colliders start where the scene says, unless this writes other places into
         ``env.simulation.props.spawn`` (and ``.density``) or ``env.simulation.collider_spawn``.
+
+        Raises:
+            NotImplementedError: a task that does not define it.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must define record_reset(env, program)")
 
     def record_references(self, env: BatchEnv, program: Program) -> list[tuple[wp.array, wp.array]]:
         """Append what comes before the physics; return the pose that actions are added to, of every avatar.
@@ -160,8 +177,12 @@ class Task:
         return [(state.command_rotation, state.command_root) for state in states]
 
     def record_outcome(self, env: BatchEnv, program: Program) -> None:
-        """Append, after the physics: write reward and cost terms, metrics, success and termination of every agent."""
-        raise NotImplementedError
+        """Append, after the physics: write reward and cost terms, metrics, success and termination of every agent.
+
+        Raises:
+            NotImplementedError: a task that does not define it.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must define record_outcome(env, program)")
 
     def record_observe(self, env: BatchEnv, program: Program, agent: int, start: int) -> None:
         """Append: write the task's observation terms from component ``start``. Must not change any state."""

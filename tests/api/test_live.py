@@ -147,6 +147,8 @@ def test_closing_stops_the_server(make_human):
     env.close()
     env.close()
     assert view._closed
+    env.step(np.zeros(env.action_space.shape, np.float32))
+    assert env.unwrapped._episode._live._view is None, "only what begins anew opens it again"
 
 
 def test_nothing_is_opened_before_the_first_reset(make_human):

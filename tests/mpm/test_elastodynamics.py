@@ -56,7 +56,7 @@ def test_a_bar_bounces_as_saint_venant_says(device, mirrored):
 
 @pytest.mark.parametrize("mirrored", [False, True], ids=["plane", "ball"])
 def test_a_ball_bounces_as_hertz_says(device, mirrored):
-    """The contact is a quarter of a grid spacing deep here: what can be hoped for is its size."""
+    """The contact is a quarter of a grid spacing deep here: what can be hoped for is its size, not Poisson's ratio."""
     row = impacts.ball_impact(6, mirrored, shifts=(0.5,), device=device)
     assert abs(row["time_error"]) < 0.25 and abs(row["force_error"]) < 0.25
     assert 0.8 < row["speed_after"] < 1.0 and row["energy_left"] < 1.0

@@ -120,6 +120,13 @@ def test_broken_strain_has_the_last_colour(body):
     assert [band.number for band in bands_of(broken)] == [NUM_BANDS - 1]
 
 
+def test_strain_beyond_all_bounds_has_the_last_colour_too(body):
+    scalars = np.zeros(len(body.vertices))
+    scalars[body.faces[0]] = 1e30
+    torn = {band.number: len(band.faces) for band in bands_of(Body(body.vertices, body.faces, scalars=scalars))}
+    assert set(torn) == {0, NUM_BANDS - 1} and torn[NUM_BANDS - 1] >= 1
+
+
 def test_a_body_that_blew_up_is_shown(view, body):
     vertices = np.array(body.vertices)
     vertices[::50] = np.nan
@@ -154,6 +161,28 @@ def test_closing_frees_the_port(capsys, monkeypatch):
     assert capsys.readouterr().out == "" and len(stops) == 1
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port_of(view)), timeout=5.0)
+
+
+def test_no_page_of_the_browser_can_publish_it(view, monkeypatch):
+    """The library would open a tunnel to the internet for whoever sends the message of its button."""
+    from viser import _messages
+
+    handlers = view.server._websock_server._incoming_handlers[_messages.ShareUrlRequest]
+    asked = []
+    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *_a, **_m: asked.append(1), raising=False)
+    for handler in handlers:
+        handler(0, _messages.ShareUrlRequest())
+    view.server._thread_executor.submit(int).result(timeout=5.0)
+    assert asked == [] and view.server.request_share_url() is None
+
+
+def test_what_others_print_is_not_swallowed(capsys):
+    from piavatar_envs.render.live import _silence
+
+    with _silence():
+        print("(viser) Server stopped")
+        print("mine")
+    assert capsys.readouterr().out.split() == ["mine"]
 
 
 @pytest.mark.parametrize("port", [0, -1, 65000])

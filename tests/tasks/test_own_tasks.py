@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 import sys
 
 import gymnasium as gym
@@ -11,7 +13,9 @@ import pytest
 import piavatar_envs
 from piavatar_envs import cli
 from piavatar_envs.api.gymnasium import AvatarEnv
+from piavatar_envs.api.vector import AvatarVectorEnv
 from piavatar_envs.tasks import load_task, reach
+from piavatar_envs.tasks.base import Task
 
 MODULE = """
 import piavatar_envs
@@ -62,9 +66,37 @@ def test_its_module_is_imported_when_its_id_names_it(module):
     assert load_task(task) is task and load_task("Reach-v0") is reach.ReachTask
 
 
+def test_processes_that_have_not_imported_it_find_it(module, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    context = {"context": "spawn", "shared_memory": False}
+    make = dict(fidelity="tiny", vectorization_mode="async", vector_kwargs=context)
+    envs = gym.make_vec(f"{module}:Somebody/Near-v0", num_envs=2, **make)
+    observations, _ = envs.reset(seed=3)
+    envs.close()
+    one = AvatarEnv(f"{module}:NearTask", fidelity="tiny").reset(seed=3)[0]
+    assert np.array_equal(observations[0], one)
+
+
+def test_several_agents_are_for_the_view_of_several():
+    pytest.importorskip("pettingzoo", reason="needs the extra multi")
+    duel = importlib.import_module("piavatar_envs.multi.sumo_v0").TASK
+    for view in (AvatarEnv, AvatarVectorEnv):
+        with pytest.raises(ValueError, match=r"SumoTask has 2 agents, .*AvatarParallelEnv\(SumoTask\)"):
+            view(duel, fidelity="tiny")
+
+
+def test_a_task_without_hooks_says_which():
+    class Empty(Task):
+        """Nothing is defined."""
+
+    with pytest.raises(NotImplementedError, match=r"Empty must define record_reset\(env, program\)"):
+        AvatarEnv(Empty, fidelity="tiny")
+
+
 def test_the_command_line_knows_it(module, capsys):
     cli.main(["play", f"{module}:Somebody/Near-v0", "--steps", "1", "-c", "fidelity=tiny"])
     assert "reward_terms.reach" in capsys.readouterr().out and "Somebody/Near-v0" in cli.registered_ids()
+    assert cli.describe("Somebody/Reach-v0") == "" != cli.describe("PIAvatar/Reach-v0")
     with pytest.raises(SystemExit):
         cli.main(["play", "no_such_module:Somebody/Near-v0"])
     assert capsys.readouterr().err == "error: No module named 'no_such_module'\n"
@@ -81,6 +113,7 @@ def test_registering_again_replaces_without_a_warning(module, recwarn):
     [
         ("Near-v0", reach.ReachTask, ValueError, "must be a namespace, a name and a version"),
         ("Somebody/Near", reach.ReachTask, ValueError, "must be a namespace, a name and a version"),
+        ("some.body/Near-v0", reach.ReachTask, ValueError, "must be a namespace, a name and a version"),
         ("PIAvatar/Reach-v0", reach.ReachTask, ValueError, "namespace of this package; use one of your own"),
         ("Somebody/Near-v0", reach.ReachConfig, TypeError, "neither a subclass of Task nor 'module:Class'"),
         ("Somebody/Near-v0", "NearTask", TypeError, "neither a subclass of Task nor 'module:Class'"),
@@ -96,8 +129,13 @@ def test_what_is_refused_is_not_registered(own_id, task, error, reason):
             load_task(own_id)
 
 
-def test_tasks_that_are_not_there():
+def test_tasks_that_are_not_there(module):
     with pytest.raises(ValueError, match=r"unknown task 'Hop-v0'; there are PIAvatar/Dodge-v0"):
         load_task("Hop-v0")
+    with pytest.raises(ValueError, match=r"the module that registers it, such as my_tasks:Somebody/Hop-v0"):
+        load_task("Somebody/Hop-v0")
+    for name in ("Nothing", "NearConfig"):
+        with pytest.raises(ValueError, match=f"{module} has no task '{name}': it must be a subclass of"):
+            load_task(f"{module}:{name}")
     with pytest.raises(ImportError):
         load_task("no_such_module:Somebody/Near-v0")
