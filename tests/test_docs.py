@@ -66,6 +66,7 @@ def test_python_runs(name, device, monkeypatch, tmp_path):
         pytest.importorskip(needed, reason="needs the extras skrl, rsl and multi")
     if "deepmimic:" in "".join(blocks(PAGES[name])):
         pytest.importorskip("pybullet", reason="needs the extra motions")
+    monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sb3, "PPO", partial(sb3.PPO, n_steps=8, batch_size=8))
     monkeypatch.syspath_prepend(tmp_path)
     saved = re.findall(r"[Ss]ave this as\s`([\w.]+)`", PAGES[name].read_text(encoding="utf-8"))
