@@ -15,7 +15,7 @@ from piavatar_envs.avatar.posing import pose_body
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
 from piavatar_envs.envs.actions import ActionSpec
-from piavatar_envs.envs.config import EnvConfig
+from piavatar_envs.envs.config import ConfigError, EnvConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_rotation, write_vector
 from piavatar_envs.envs.parameters import Drawn
@@ -153,7 +153,10 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         asset = load_body()
         body = asset.shape(asset.parameters(**config.shape.parameters))
         self.pelvis_height = float(body.joints[0, 2])
-        motion = load_motion(config.motion, asset, body)
+        try:
+            motion = load_motion(config.motion, asset, body)
+        except (ValueError, FileNotFoundError) as error:
+            raise ConfigError(f"motion: {error}") from None
         steps = max(1, round(config.episode_seconds / dt))
         period = max(1, round(motion.duration / dt))
         self.interval = max(1, round(config.impulse_interval / dt))

@@ -123,7 +123,7 @@ def test_kick_throws_the_right_foot_forward() -> None:
 
 @pytest.mark.parametrize("name", ["waltz", "deepmimic:"])
 def test_unknown_names_are_refused(name: str) -> None:
-    with pytest.raises((KeyError, ImportError), match=r"unknown motion|DeepMimic"):
+    with pytest.raises((ValueError, ImportError), match=r"unknown motion|DeepMimic"):
         load_motion(name)
 
 

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.motion import deepmimic, load_motion
 from piavatar_envs.avatar.motion.library import list_embedded
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, forward_kinematics, joint_index
+from piavatar_envs.envs.config import ConfigError
 
 TRACK = "PIAvatar/TrackMotion-v0"
 
@@ -112,9 +113,9 @@ def test_an_amass_file_is_followed_by_its_path(make_env, tmp_path):
 @pytest.mark.parametrize(
     ("motion", "error", "told"),
     [
-        ("moonwalk", KeyError, "moonwalk.*arm_wave.*squat.*AMASS"),
-        ("/no/such/clip.npz", FileNotFoundError, "/no/such/clip.npz"),
-        ("deepmimic:moonwalk", (KeyError, ImportError), "moonwalk|motions"),
+        ("moonwalk", ConfigError, "motion: unknown motion 'moonwalk'.*arm_wave.*squat.*AMASS"),
+        ("/no/such/clip.npz", ConfigError, "motion: .*/no/such/clip.npz"),
+        ("deepmimic:moonwalk", (ConfigError, ImportError), "moonwalk|motions"),
     ],
 )
 def test_unknown_motions_are_refused(make_env, motion, error, told):

@@ -68,7 +68,7 @@ def load_installed(name: str, rest_joints: np.ndarray) -> Motion:
 
     Raises:
         ImportError: ``pybullet`` is not installed.
-        KeyError: there is no such clip.
+        ValueError: there is no such clip.
     """
     folder = clip_folder()
     if folder is None:
@@ -77,7 +77,7 @@ def load_installed(name: str, rest_joints: np.ndarray) -> Motion:
             "pip install 'piavatar-envs[motions]' (wheels exist for Python 3.10 and 3.11)"
         )
     if name not in list_clips():
-        raise KeyError(f"no DeepMimic clip {name!r}; installed are {', '.join(list_clips())}")
+        raise ValueError(f"no DeepMimic clip {name!r}; installed are {', '.join(list_clips())}")
     return load_file(folder / f"{_PREFIX}{name}{_SUFFIX}", rest_joints)
 
 

@@ -42,9 +42,8 @@ def load_motion(name_or_path: str | Path, asset: AvatarAsset | None = None, body
         body: one of its shapes; without it the mean shape. Legs of another length scale the root's path.
 
     Raises:
-        KeyError: the name is unknown.
         ImportError: a DeepMimic clip without the extra ``motions``.
-        ValueError: a file that is not a motion.
+        ValueError: the name is unknown, or a file is not a motion.
         FileNotFoundError: there is no such file.
     """
     asset = load_body() if asset is None else asset
@@ -58,7 +57,7 @@ def load_motion(name_or_path: str | Path, asset: AvatarAsset | None = None, body
     elif isinstance(name_or_path, Path) or Path(name).suffix or "/" in name:
         motion = amass.load_file(name, joints)
     else:
-        raise KeyError(
+        raise ValueError(
             f"unknown motion {name!r}; known are {', '.join(list_motions())}, or the path of an AMASS .npz file"
         )
     return motion.on_ground(asset, body)
