@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
+from benchmarks.matter import push_particles
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.envs.simulation import GRID_PER_HEIGHT
@@ -17,13 +18,10 @@ from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.fields import Fields
-from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.props import geometry
-
-wp.set_module_options({"enable_backward": False})
 
 #: Half the edge of a block [m].
 BLOCK = (0.2, 0.2, 0.1)
@@ -70,14 +68,6 @@ def body(resolution: str, shift: Sequence[float] = (0.0, 0.0, 0.0), yaw: float =
     c, s = np.cos(yaw), np.sin(yaw)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return Thing(particles.rest_positions @ turn.T + np.asarray(shift), particles.volumes, **how)
-
-
-@wp.kernel
-def damp(keep: float, u: wp.array2d(dtype=wp.vec3), C: wp.array3d(dtype=float)):
-    """Take a share of all physical motion away."""
-    e, p = wp.tid()
-    u[e, p] = keep * u[e, p]
-    store_matrix(C, e, p, keep * matrix_at(C, e, p))
 
 
 @dataclass
@@ -187,12 +177,14 @@ def collide(
     state.x.assign(x[None].astype(np.float32))
     state.u.assign(by_particle("velocity").reshape(1, -1, 3))
     world = Collision(things, model, state, scratch, owner, dx)
+    keep = wp.array([np.exp(-50.0 * model.step.dt)], dtype=float, device=device)
+    kick = wp.zeros(len(x), dtype=wp.vec3, device=device)
     for name in ("free", "damped"):
         program = world.programs[name] = Program(device)
         record_begin(program, model, state, scratch)
         for index in range(model.num_substeps):
             record_substep(program, model, state, scratch, index)
             if name == "damped":
-                program.launch(damp, state.x.shape, [float(np.exp(-50.0 * model.step.dt)), state.u, state.C])
+                program.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
         record_end(program, model, state, scratch)
     return world

@@ -10,11 +10,11 @@ import importlib
 import re
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-from piavatar_envs.tasks import NAMESPACE
+from piavatar_envs.tasks import NAMESPACE, how_to_name
 
 EnvId = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="an id or a module: see list")]
 AgentName = Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the actions come from")]
@@ -78,12 +78,9 @@ def play_command(
         color: skin or strain.
         config: overrides of the environment's configuration.
     """
-    from piavatar_envs import doctor, play
-    from piavatar_envs.envs.config import parse_assignments
+    from piavatar_envs import play
 
-    check_id(env_id)
-    overrides = parse_assignments(config)
-    doctor.quiet_warp()
+    overrides = prepare(env_id, config)
     play.show(play.play(env_id, agent, video, steps, seed, device, color, overrides), video)
 
 
@@ -105,13 +102,25 @@ def watch_command(
         port: of the view.
         config: overrides of the environment's configuration.
     """
-    from piavatar_envs import doctor, watch
+    from piavatar_envs import watch
+
+    watch.watch(env_id, agent, seed, device, port, prepare(env_id, config))
+
+
+def prepare(env_id: str, config: tuple[str, ...]) -> dict[str, Any]:
+    """What is the same before anything is played: the id is known, Warp is quiet; returns the settings.
+
+    Raises:
+        ImportError: there is no such module.
+        ValueError: there is no such environment, or what should be a setting is none.
+    """
+    from piavatar_envs import doctor
     from piavatar_envs.envs.config import parse_assignments
 
     check_id(env_id)
     overrides = parse_assignments(config)
     doctor.quiet_warp()
-    watch.watch(env_id, agent, seed, device, port, overrides)
+    return overrides
 
 
 def check_id(env_id: str) -> None:
@@ -126,8 +135,8 @@ def check_id(env_id: str) -> None:
         importlib.import_module(module)
     if own_id not in registered_ids():
         raise ValueError(
-            f"no environment {env_id!r}; there are {', '.join(registered_ids()) or 'none'}; a task of your own is "
-            "named with the module that registers it, such as my_tasks:Mine/HandsUp-v0"
+            f"no environment {env_id!r}; there are {', '.join(registered_ids()) or 'none'}; "
+            f"{how_to_name('Mine/HandsUp-v0')}"
         )
 
 

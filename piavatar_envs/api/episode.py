@@ -184,14 +184,15 @@ class Episode:
             self._live.begin()
 
 
-def check_render_mode(render_mode: str | None) -> str | None:
+def check_render_mode(render_mode: str | None, modes: tuple[str, ...] = RENDER_MODES) -> str | None:
     """The mode itself, of one environment.
 
     Raises:
         ValueError: an unknown one.
     """
-    if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode={render_mode!r} is not known; use None, {' or '.join(RENDER_MODES)}")
+    if render_mode is not None and render_mode not in modes:
+        known = f"{', '.join(['None', *modes[:-1]])} or {modes[-1]}"
+        raise ValueError(f"render_mode={render_mode!r} is not known; use {known}")
     return render_mode
 
 
@@ -206,9 +207,7 @@ def check_batch_render_mode(render_mode: str | None) -> str | None:
             "render_mode='human' is a live view of one environment, and this is a batch; use rgb_array here, or "
             "watch one: gym.make(id, render_mode='human') or python -m piavatar_envs watch ID"
         )
-    if render_mode is not None and render_mode not in BATCH_RENDER_MODES:
-        raise ValueError(f"render_mode={render_mode!r} is not known; use None or {', '.join(BATCH_RENDER_MODES)}")
-    return render_mode
+    return check_render_mode(render_mode, BATCH_RENDER_MODES)
 
 
 def _of_host(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -29,9 +29,8 @@ class Scenery:
         """All that is to be seen of environment ``env`` now, the bodies in their colours or by their strain."""
         from piavatar_envs.render import Scene, Sphere
 
-        state, task = self.batch.simulation.state, self.batch.task
-        x, F = state.x.numpy()[env], matrices_of(state.F)[env]
-        bodies = self._avatars(env, x, F, color) + self._props(env, x)
+        task, x = self.batch.task, self.batch.simulation.state.x.numpy()[env]
+        bodies = self._avatars(env, x, color) + self._props(env, x)
         markers = [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
         roots = [avatar.tracked.position.numpy()[env, 0] for avatar in self.batch.simulation.avatars]
         follow = np.mean(roots, axis=0) if task.camera_follows else None
@@ -49,7 +48,7 @@ class Scenery:
             self._skins[key] = Skin(flesh.asset, shaped, points.rest[row], points.skin_joints, points.skin_weights)
         return self._skins[key]
 
-    def _avatars(self, env: int, x: np.ndarray, F: np.ndarray, color: str) -> list[Body]:
+    def _avatars(self, env: int, x: np.ndarray, color: str) -> list[Body]:
         from scipy.spatial.transform import Rotation
 
         from piavatar_envs.render import PALETTE, Body, strain_magnitude
@@ -63,6 +62,7 @@ class Scenery:
             vertices = skin.deform(rotations, avatar.tracked.position.numpy()[env], x[own])
             scalars = None
             if color == "strain":
+                F = matrices_of(self.batch.simulation.state.F.numpy()[env])
                 scalars = skin.interpolate(strain_magnitude(F[own]))
             bodies.append(Body(vertices, flesh.asset.faces, color=PALETTE[index % len(PALETTE)], scalars=scalars))
         return bodies
@@ -84,7 +84,7 @@ class Scenery:
         """The scene's boxes, spheres and capsules; planes are not drawn."""
         from scipy.spatial.transform import Rotation
 
-        from piavatar_envs.render import Box, Capsule, Sphere
+        from piavatar_envs.render import PROP, Box, Capsule, Sphere
 
         boundaries, shapes = self.batch.simulation.model.boundaries, []
         for index, collider in enumerate(self.batch.simulation.subjects.colliders):
@@ -93,7 +93,7 @@ class Scenery:
             if collider.kind == "box":
                 shapes.append(Box(at, np.array(collider.size), rotation=turn))
             elif collider.kind == "sphere":
-                shapes.append(Sphere(at, collider.size[0], color=(0.55, 0.60, 0.66)))
+                shapes.append(Sphere(at, collider.size[0], color=PROP))
             elif collider.kind == "capsule":
                 shapes.append(Capsule(at, *collider.size, rotation=turn))
         return shapes

@@ -101,15 +101,14 @@ def load_task(task: str | type[Task]) -> type[Task]:
     if full in modules:
         return importlib.import_module(f"{__name__}.{modules[full]}").TASK
     if full not in _added:
-        raise ValueError(f"unknown task {task!r}; there are {', '.join([*modules, *_added])}{_remedy(module, full)}")
+        known = f"unknown task {task!r}; there are {', '.join([*modules, *_added])}"
+        raise ValueError(known if module or full.startswith(f"{NAMESPACE}/") else f"{known}; {how_to_name(full)}")
     return load_task(_added[full])
 
 
-def _remedy(module: str, env_id: str) -> str:
-    """What else there is to say of an id that nobody knows."""
-    if module or env_id.startswith(f"{NAMESPACE}/"):
-        return ""
-    return f"; a task of your own is named with the module that registers it, such as my_tasks:{env_id}"
+def how_to_name(env_id: str) -> str:
+    """What to say to whoever names a task of their own, such as ``env_id``, that nobody has registered."""
+    return f"a task of your own is named with the module that registers it, such as my_tasks:{env_id}"
 
 
 def _is_task(task: object) -> bool:
