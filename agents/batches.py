@@ -15,6 +15,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import tyro
 from pydantic import AfterValidator, BaseModel, Field
+from tqdm import tqdm
 
 from agents import seeds
 from agents.checkpoint import Checkpoint
@@ -39,6 +40,8 @@ from piavatar_envs.tasks.base import Task
 
 #: Metrics of tasks that evaluations sum up.
 TOLD = ("distance", "strongest_push")
+#: Seconds between two signs of life where nobody looks on, as in a log.
+_LOG_SECONDS = 30.0
 
 
 class BatchTraining(BaseModel):
@@ -105,22 +108,32 @@ def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Ev
     success = np.zeros((batch.num_envs, batch.num_agents), bool)
     playing = np.ones(batch.num_envs, bool)
     begin_round(agent, batch.num_envs)
-    while playing.any():
-        acted = batch.alive()
-        batch.step(agent(batch.observation()))
-        # that of an agent that is out is what it was in its last step
-        success = np.where(acted, batch.read(lambda group: group.success), success)
-        metrics = batch.read(lambda group: group.metrics)
-        rewards, failures = batch.reward(), batch.read(lambda group: group.failure)
-        over = batch.read(lambda group: group.terminated).all(axis=1)
-        for env in np.flatnonzero(playing):
-            info: dict[str, Any] = {"success": success[env].all(), "failure": failure_name(int(failures[env]))}
-            info |= {name: float(metrics[env, acted[env], place].mean()) for name, place in told.items()}
-            if batch.num_agents > 1:
-                info |= {"rewards": rewards[env].astype(np.float64), "successes": success[env].copy()}
-            episodes[env].book(float(rewards[env].mean()), info, bool(over[env]))
-        playing &= ~batch.find_ended()
+    with _progress(name, batch.num_envs) as bar:
+        while playing.any():
+            acted = batch.alive()
+            batch.step(agent(batch.observation()))
+            # that of an agent that is out is what it was in its last step
+            success = np.where(acted, batch.read(lambda group: group.success), success)
+            metrics = batch.read(lambda group: group.metrics)
+            rewards, failures = batch.reward(), batch.read(lambda group: group.failure)
+            over = batch.read(lambda group: group.terminated).all(axis=1)
+            for env in np.flatnonzero(playing):
+                info: dict[str, Any] = {"success": success[env].all(), "failure": failure_name(int(failures[env]))}
+                info |= {name: float(metrics[env, acted[env], place].mean()) for name, place in told.items()}
+                if batch.num_agents > 1:
+                    info |= {"rewards": rewards[env].astype(np.float64), "successes": success[env].copy()}
+                episodes[env].book(float(rewards[env].mean()), info, bool(over[env]))
+            ended = playing & batch.find_ended()
+            playing &= ~ended
+            bar.set_postfix(longest=max(episode.steps for episode in episodes), refresh=False)
+            bar.update(int(ended.sum()))
     return Evaluation(name, episodes)
+
+
+def _progress(name: str, episodes: int) -> tqdm:
+    """A bar of the episodes that have ended, on stderr; all go on at once, so it also has the steps of the longest."""
+    seconds = 0.1 if sys.stderr.isatty() else _LOG_SECONDS
+    return tqdm(total=episodes, desc=f"evaluate {name}", unit="episode", mininterval=seconds, dynamic_ncols=True)
 
 
 def play_beside_baselines(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> list[Evaluation]:

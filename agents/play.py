@@ -1,8 +1,8 @@
 """Let what a training has left play again: ``python -m agents.play runs/stand_rsl --film stand.gif``.
 
 Takes the folder of a run with one agent, by ``agents.rsl_ppo`` (policy.pt) or ``agents.train`` (policy.zip), builds the
-environment of its config.yaml, and plays the episodes of its evaluation; with ``--live`` it plays in a web browser
-instead, until Ctrl-C. Nothing in the files is unpickled.
+environment of its config.yaml, and plays the episodes of its evaluation. Asked for a film alone it plays no others;
+with ``--live`` it plays in a web browser instead, until Ctrl-C. Nothing in the files is unpickled.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Options:
     run: tyro.conf.Positional[Path]
     #: settings of the environment that win over the run's: fidelity=tiny, or as for the training env.fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
-    #: episodes to play, by default as many as the training's evaluation has
+    #: episodes to score, by default as many as the training's evaluation has, or none where only a film is asked for
     episodes: int | None = None
     #: seed of the first episode, by default that of the training's evaluation
     first_seed: int | None = None
@@ -145,10 +145,36 @@ def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
         watch_env(made, lambda seen: agent(seen[None, None])[0, 0], first, options.port, lambda: begin_round(agent, 1))
 
 
+def score_run(agent: Agent, batch: BatchedEpisodes, first: int, options: Options, env: dict[str, Any]) -> None:
+    """Play an episode in every environment of a batch, show the figures, and write them if the command line says so.
+
+    Args:
+        agent: what the training has left.
+        batch: of NumPy arrays.
+        first: seed of the first episode.
+        options: of the command line.
+        env: settings of the environment, resolved.
+    """
+    evaluation = play("trained", agent, batch, first)
+    show_table([evaluation], Console(highlight=False, soft_wrap=True))
+    if options.out:
+        about = versions("play", options.device) | {"run": options.run.resolve().name, "env": env}
+        write_results(options.out, about, [evaluation], {"num_envs": batch.num_envs})
+
+
+def film_run(run: Run, agent: Agent, seconds: float, first: int, options: Options, env: dict[str, Any]) -> None:
+    """Film episodes, one after the other; arguments as :func:`score_run`, ``seconds`` is a control step's time."""
+    make = EnvFactory(run.env_id, env, options.device)
+    alone = {options.run.name: lambda observation: agent(observation[:, None])[:, 0]}
+    film(options.film, make, alone, range(first, first + options.film_episodes), 1.0 / seconds, options.film_every)
+    print(f"wrote {options.film}")
+
+
 def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = read_options(Options, "play", args)
     quiet_warp()
+    scores = options.film is None or options.out is not None or options.episodes is not None
     try:
         if options.live and (options.out or options.film or options.episodes is not None):
             raise ConfigError("--live plays until Ctrl-C and evaluates nothing; leave out --out, --film and --episodes")
@@ -157,33 +183,24 @@ def main(args: list[str] | None = None) -> None:
         task_class = load_task(run.env_id)
         settings = {name.removeprefix("env."): value for name, value in parse_assignments(options.settings).items()}
         config = load_config(task_class.Config, run.env, settings | {"obs_mode": "flat"})
+        env = config.model_dump(mode="json")
         if options.live:
-            watch_run(run, config.model_dump(mode="json"), options)
+            watch_run(run, env, options)
             return
         episodes = run.evaluation.episodes if options.episodes is None else options.episodes
         if episodes < 2:
-            raise ConfigError(f"episodes={episodes} must be >= 2: of one there is no interval")
-        batch = BatchedEpisodes(task_class(config), episodes, options.device)
+            advice = "of one there is no interval; a film alone needs no --episodes"
+            raise ConfigError(f"episodes={episodes} must be >= 2: {advice}")
+        batch = BatchedEpisodes(task_class(config), episodes if scores else 1, options.device)
         agent = run.make_agent(batch.layout, batch.action_size)
     except (ConfigError, ValueError, ImportError) as error:
         sys.exit(f"error: {error}")
     first = run.evaluation.first_seed if options.first_seed is None else options.first_seed
-    evaluation = play("trained", agent, batch, first)
+    if scores:
+        score_run(agent, batch, first, options, env)
     batch.close()
-    console = Console(highlight=False, soft_wrap=True)
-    show_table([evaluation], console)
-    if options.out:
-        about = versions("play", options.device) | {
-            "run": options.run.resolve().name,
-            "env": config.model_dump(mode="json"),
-        }
-        write_results(options.out, about, [evaluation], {"num_envs": episodes})
     if options.film:
-        make = EnvFactory(run.env_id, config.model_dump(mode="json"), options.device)
-        alone = {options.run.name: lambda observation: agent(observation[:, None])[:, 0]}
-        seeds = range(first, first + options.film_episodes)
-        film(options.film, make, alone, seeds, 1.0 / config.physics.control_dt, options.film_every)
-        console.print(f"wrote {options.film}")
+        film_run(run, agent, config.physics.control_dt, first, options, env)
 
 
 if __name__ == "__main__":

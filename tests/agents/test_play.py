@@ -56,12 +56,16 @@ def test_settings_win_and_a_film_is_written(device, tmp_path, capsys):
     run_of("ppo", tmp_path / "run", device)
     film = tmp_path / "film.gif"
     small = ("env.render.width=64", "render.height=64")
-    line = [str(tmp_path / "run"), "episode_seconds=0.1", "--episodes", "2", *small, "--film", str(film)]
+    line = [str(tmp_path / "run"), "episode_seconds=0.1", *small, "--film", str(film)]
+    capsys.readouterr()
     play.main([*line, "--device", device])
+    assert "trained" not in capsys.readouterr().out, "a film alone plays no other episodes"
     from PIL import Image
 
     with Image.open(film) as pictures:
         assert pictures.n_frames == 3 and pictures.size == (64, 64)
+    play.main([*line, "--episodes", "2", "--device", device])
+    assert "trained" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", ["rsl", "ppo"])
@@ -106,7 +110,7 @@ def test_folders_without_a_run_are_refused(device, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--episodes", "1"), r"episodes=1 must be >= 2"),
+        (("--episodes", "1"), r"episodes=1 must be >= 2: .*a film alone needs no --episodes"),
         (("--episodes", "0"), r"episodes=0 must be >= 2"),
         (("--film-every", "0"), r"film_every=0 must be >= 1"),
         (("joints=[tail]",), r"'tail' is not a joint"),
