@@ -177,7 +177,8 @@ def scatter_turn(
     return stays
 
 
-@wp.kernel(launch_bounds=(THREADS, 6))
+# with fewer registers than a quarter of a multiprocessor's, additions wait for those of the ones before
+@wp.kernel(launch_bounds=(THREADS, 4))
 def runs_to_grid(
     grid: Grid,
     step: Step,
