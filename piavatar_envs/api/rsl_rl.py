@@ -108,18 +108,21 @@ class AvatarRslEnv(BatchedView, VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Control steps since every episode began, ``(num_envs,)`` int64.
+        """How far every episode is towards its time limit, in control steps, ``(num_envs,)`` int64.
 
-        Setting it sets the clocks, as runners do to spread the ends of the first episodes (``init_at_random_ep_len``).
+        Setting it brings the limits nearer, as runners do to spread the ends of the first episodes
+        (``init_at_random_ep_len``). The world's own clock, by which clips and gaits go on, stays.
         """
-        return self.episodes.read(lambda group: group.step_count).long()
+        count, ahead = (self.episodes.read(lambda group, n=n: getattr(group, n)) for n in ("step_count", "head_start"))
+        return (count + ahead).long()
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps: torch.Tensor) -> None:
         if tuple(steps.shape) != (self.num_envs,):
             raise ValueError(f"episode_length_buf has shape {tuple(steps.shape)}, expected {(self.num_envs,)}")
         clocks = steps.to(self.device).clamp(0, self.max_episode_length - 1)
-        self.episodes.api.write(clocks, [group.step_count for group in self.episodes.groups])
+        ahead = clocks - self.episodes.read(lambda group: group.step_count)
+        self.episodes.api.write(ahead, [group.head_start for group in self.episodes.groups])
 
     def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
         """Begin an episode in every environment; returns the observations and empty extras.

@@ -87,6 +87,7 @@ class BatchEnv:
         self.seed = wp.array(_as_int32(seed + np.arange(n)), dtype=int, device=device)
         self.episode = wp.full(n, -1, dtype=int, device=device)
         self.step_count, self.truncated = zeros(n, int), zeros(n, wp.bool)
+        self.head_start = zeros(n, int)  # control steps that the time limit is ahead of the world's clock
         self.action = zeros((*agents, self.action_spec.size), float)
         self.observation = zeros((*agents, self.layout.size), float)
         self.reward, self.cost = zeros(agents, float), zeros(agents, float)
@@ -104,8 +105,8 @@ class BatchEnv:
         self.count_program.launch(count_episodes, n, [self.mask, self._new_seed], counters)
 
         program = self.reset_program
-        flags = [self.step_count, self.terminated, self.truncated, self.success, self.alive, self._begins]
-        program.launch(begin_episode, agents, [self.mask], flags)
+        clocks, flags = [self.step_count, self.head_start], [self.terminated, self.truncated, self.success, self.alive]
+        program.launch(begin_episode, agents, [self.mask], [*clocks, *flags, self._begins])
         sim.record_draws(program, self.mask, self.seed, self.episode)
         self.task.record_reset(self, program)
         sim.record_reset(program, self.mask)
@@ -131,7 +132,8 @@ class BatchEnv:
                 [agent, self.num_agents, self.failure, avatar.state.let_go, self.terms, self.cost_terms],
                 [self.reward, self.cost, self.terminated, self.alive],
             )
-        program.launch(end_step, n, [self.max_steps, self.terminated], [self.step_count, self.truncated])
+        ends = [self.max_steps, self.terminated, self.head_start]
+        program.launch(end_step, n, ends, [self.step_count, self.truncated])
         self._record_observation(program)
 
     def _record_actions(self, program: Program, agent: int, avatar: AvatarDrive, reference: tuple) -> None:
@@ -235,10 +237,8 @@ class BatchEnv:
 
     def arrays(self) -> dict[str, wp.array]:
         """Every array a checkpoint holds, by name."""
-        own = {
-            name: getattr(self, name)
-            for name in ("step_count", "seed", "episode", "terminated", "truncated", "success", "alive")
-        }
+        clocks, flags = ("step_count", "head_start"), ("terminated", "truncated", "success", "alive")
+        own = {name: getattr(self, name) for name in (*clocks, "seed", "episode", *flags)}
         return (
             self.simulation.arrays()
             | {f"env.{name}": array for name, array in (own | self.observer.arrays()).items()}

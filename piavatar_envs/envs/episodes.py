@@ -51,6 +51,7 @@ def begin_episode(
     mask: wp.array(dtype=wp.bool),
     # out
     step_count: wp.array(dtype=int),
+    head_start: wp.array(dtype=int),
     terminated: wp.array2d(dtype=wp.bool),
     truncated: wp.array(dtype=wp.bool),
     success: wp.array2d(dtype=wp.bool),
@@ -62,6 +63,7 @@ def begin_episode(
     begins[0] = 0
     if mask[e]:
         step_count[e] = 0
+        head_start[e] = 0
         truncated[e] = False
         terminated[e, agent] = False
         success[e, agent] = False
@@ -114,6 +116,7 @@ def end_agent(
 def end_step(
     max_steps: int,
     terminated: wp.array2d(dtype=wp.bool),
+    head_start: wp.array(dtype=int),
     # in and out
     step_count: wp.array(dtype=int),
     # out
@@ -126,4 +129,4 @@ def end_step(
     for agent in range(terminated.shape[1]):
         if not terminated[e, agent]:
             left += 1
-    truncated[e] = step_count[e] >= max_steps and left > 0
+    truncated[e] = step_count[e] + head_start[e] >= max_steps and left > 0

@@ -134,7 +134,7 @@ class Parameters:
             (env.num_envs, self.term.size),
             [
                 self.values, self._columns[agent], agent, env.layout[PARAMETERS].slice.start, env.step_count,
-                env.max_steps,
+                env.head_start, env.max_steps,
             ],
             [env.observation],
         )  # fmt: skip
@@ -215,6 +215,7 @@ def observe_parameters(
     agent: int,
     start: int,
     step_count: wp.array(dtype=int),
+    head_start: wp.array(dtype=int),
     max_steps: int,
     # out
     observation: wp.array3d(dtype=float),
@@ -224,5 +225,5 @@ def observe_parameters(
     if n < columns.shape[0]:
         observation[e, agent, start + n] = values[e, columns[n]]
     else:
-        time = float(step_count[e]) / float(max_steps)
+        time = float(step_count[e] + head_start[e]) / float(max_steps)
         observation[e, agent, start + n] = 2.0 * wp.min(time, 1.0) - 1.0

@@ -119,6 +119,29 @@ def test_clocks_can_be_set_and_end_the_episodes(env):
         env.episode_length_buf = torch.zeros(3)
 
 
+def test_clocks_that_are_set_leave_the_world_alone(device):
+    """Walk ends episodes that are behind a pace, and has its gait by the clock: only the time limit comes nearer."""
+    walk = {"fidelity": "tiny", "control": "torque", "observe_parameters": True, "seed": 3}
+    env, other = (AvatarRslEnv("PIAvatar/Walk-v0", 4, device, **walk) for _ in range(2))
+    lengths = torch.tensor([0, 120, 298, 299], device=env.device)
+    env.episode_length_buf = lengths
+    assert env.episode_length_buf.tolist() == lengths.tolist()
+    still = torch.zeros(4, env.num_actions, device=env.device)
+    clock = env.observation_layout["parameters"].slice.stop - 1
+    for step in (1, 2):
+        (seen, reward, done, extras), (alone, own, _, _) = env.step(still), other.step(still)
+        begun = torch.tensor([False, False, step == 2, step == 1])
+        assert done.bool().tolist() == extras["time_outs"].tolist() == begun.tolist()
+        assert torch.equal(reward[:3], own[:3]), "nobody is judged by another clock"
+        same = alone["policy"].clone()
+        same[:, clock] = seen["policy"][:, clock]
+        assert torch.equal(seen["policy"][:2], same[:2])
+        assert seen["policy"][1, clock].item() == pytest.approx(2.0 * (120 + step) / 300 - 1.0, abs=1e-6)
+    assert env.episode_length_buf.tolist() == [2, 122, 0, 1]
+    env.close()
+    other.close()
+
+
 def test_groups_hold_their_terms_in_order(env, device):
     groups = {"actor": ["target_velocity", "target_position"], "critic": ["root_height"]}
     grouped = AvatarRslEnv(REACH, 2, device, groups=groups, seed=7, **SETTINGS)
