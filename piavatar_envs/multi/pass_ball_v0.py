@@ -49,6 +49,9 @@ class PassBallConfig(EnvConfig):
     serve_speed: tuple[float, float] = Field((1.0, 1.6), description="range of the ball's speed at the start [m/s]")
     serve_angle: float = Field(0.15, ge=0.0, le=0.5, description="greatest angle off the way to the first passer [rad]")
     reach: float = Field(0.4, gt=0.1, le=1.0, description="distance from a pelvis at which the ball has arrived [m]")
+    sent: float = Field(
+        0.5, ge=0.0, le=2.0, description="how far a pass must go from where the passer touched the ball last [m]"
+    )
     dead_speed: float = Field(0.1, gt=0.0, description="horizontal speed below which a ball out of reach is dead [m/s]")
     goal_passes: int = Field(2, ge=1, description="passes that count as a success [-]")
     progress_weight: float = Field(1.0, ge=0.0, description="reward for a metre of the ball's way to its goal [1/m]")
@@ -75,8 +78,9 @@ class PassBallTask(Task):
     summary = """`num_agents` avatars stand around a circle, `spacing` apart and facing its middle. From there a soft
 ball of 0.4 to 2 kg (`ball_mass`) rolls towards one of them, the first passer, who shall kick or push it on to the next,
 counterclockwise from above, whose turn it then is. A pass is complete when the ball, after the passer has touched it,
-comes within `reach` of the next one's pelvis or touches them. Legs and root act; a root goes no farther than `roam`
-from its place, so that the ball must be sent, not carried. All are paid alike, but for the cost of their actions."""
+comes within `reach` of the next one's pelvis or touches them, and is at least `sent` from where the passer touched it
+last: it must be sent, not carried, and not held by feet that meet around it. Legs and root act; a root goes no farther
+than `roam` from its place. All are paid alike, but for the cost of their actions."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "progress": "`progress_weight` times the metres that the ball has come nearer, horizontally, to whoever shall "
         "have it: the passer until they have touched it, then the next",
@@ -120,6 +124,7 @@ from its place, so that the ball must be sent, not carried. All are paid alike, 
             ObservationTerm("place", 3, "m", "root", "one's place, from the pelvis, horizontally"),
             ObservationTerm("ball_mass", 1, "-", "-", "decimal logarithm of the ball's mass in kg"),
             ObservationTerm("touched", 1, "-", "-", "1 if the passer has touched the ball in this turn"),
+            ObservationTerm("way", 1, "m", "-", "how far the ball has come from there, horizontally; 0 before"),
             ObservationTerm("turn", agents, "-", "-", "1 for the passer, counted on from oneself"),
             ObservationTerm("ball_from_left_foot", 3, "m", "root", "the ball from the left foot's ball"),
             ObservationTerm("ball_from_right_foot", 3, "m", "root", "the ball from the right foot's ball"),
@@ -149,11 +154,12 @@ from its place, so that the ball must be sent, not carried. All are paid alike, 
         serve.light, serve.heavy = (float(np.log(mass / volume)) for mass in config.ball_mass)
         rule.subject, rule.ball_volume = env.simulation.subjects.names.index(BALL), volume
         rule.reach, rule.fetch, rule.rim = config.reach, config.reach + config.roam, self.rim
-        rule.dead_speed, rule.goal_passes = config.dead_speed, config.goal_passes
+        rule.sent, rule.dead_speed, rule.goal_passes = config.sent, config.dead_speed, config.goal_passes
         rule.progress_weight, rule.pass_bonus = config.progress_weight, config.pass_bonus
         rule.control_cost = config.control_cost
         for name in ("passer", "touched", "passes"):
             setattr(play, name, wp.zeros(n, dtype=int, device=device))
+        play.left = wp.zeros(n, dtype=wp.vec3, device=device)
         play.gap = wp.zeros(n, dtype=float, device=device)
         play.contact, play.touches = (wp.zeros((n, env.num_agents), dtype=int, device=device) for _ in range(2))
         self.serve, self.rule, self.play, self.referee = serve, rule, play, Referee(env, self.config.fall)
@@ -162,7 +168,7 @@ from its place, so that the ball must be sent, not carried. All are paid alike, 
         self.reference_root = [wp.zeros(n, dtype=wp.vec3, device=device) for _ in places]
 
     def arrays(self) -> dict[str, wp.array]:
-        names = ("passer", "touched", "passes", "gap", "contact", "touches")
+        names = ("passer", "touched", "passes", "left", "gap", "contact", "touches")
         return {name: getattr(self.play, name) for name in names}
 
     def record_reset(self, env, program) -> None:

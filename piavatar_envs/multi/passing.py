@@ -36,6 +36,7 @@ class PassRule:
     subject: int  # the ball among the subjects of the world
     ball_volume: float  # [m^3]
     reach: float  # distance from a pelvis at which the ball has arrived [m]
+    sent: float  # how far it must have come from where the passer touched it last [m]
     fetch: float  # and at which a slow ball can still be fetched [m]
     rim: float  # distance from the origin at which the ball is out [m]
     dead_speed: float  # [m/s]
@@ -52,6 +53,7 @@ class Play:
     passer: wp.array(dtype=int)  # (num_envs,) whose turn it is
     touched: wp.array(dtype=int)  # (num_envs,) whether they have touched the ball in this turn
     passes: wp.array(dtype=int)  # (num_envs,) completed
+    left: wp.array(dtype=wp.vec3)  # (num_envs,) where the ball was when they touched it last [m], if they have
     gap: wp.array(dtype=float)  # (num_envs,) from the ball to where it shall go [m]; negative: not yet known
     contact: wp.array2d(dtype=int)  # (num_envs, num_agents) whether one touched the ball in the last step
     touches: wp.array2d(dtype=int)  # (num_envs, num_agents) so far
@@ -92,6 +94,7 @@ def serve_ball(
     play.passer[e] = first
     play.touched[e] = 0
     play.passes[e] = 0
+    play.left[e] = wp.vec3()
     play.gap[e] = -1.0
     for agent in range(agents):
         play.contact[e, agent] = 0
@@ -121,6 +124,12 @@ def flat_distance(a: wp.vec3, b: wp.vec3):
 def goes_to(play: Play, e: int, agents: int):
     """Who shall have the ball next: the passer until they have touched it, then the one after them."""
     return (play.passer[e] + play.touched[e]) % agents
+
+
+@wp.func
+def way_come(play: Play, e: int, ball: wp.vec3):
+    """How far the ball has come from where the passer touched it last [m]; 0 before they have."""
+    return wp.where(play.touched[e] == 1, flat_distance(ball, play.left[e]), 0.0)
 
 
 @wp.func
@@ -160,12 +169,15 @@ def judge(
     receiver = (passer + 1) % agents
     if play.contact[e, passer] == 1:
         play.touched[e] = 1
+        play.left[e] = ball[e]
     arrived = flat_distance(ball[e], pelvis[e, receiver]) <= rule.reach or play.contact[e, receiver] == 1
-    passed = play.touched[e] == 1 and arrived
+    # feet that meet around a ball, and tap or hold it, send it nowhere
+    passed = play.touched[e] == 1 and arrived and way_come(play, e, ball[e]) >= rule.sent
     if passed:
         play.passes[e] += 1
         play.passer[e] = receiver
         play.touched[e] = play.contact[e, receiver]
+        play.left[e] = ball[e]
     play.gap[e] = flat_distance(ball[e], pelvis[e, goes_to(play, e, agents)])
     nearest = float(1.0e6)
     for agent in range(agents):
@@ -212,6 +224,7 @@ def observe_game(
     # a tenth and ten times the mass differ as much: what a kick does to them does, too
     observation[e, agent, start + 9] = wp.log10(density[e] * rule.ball_volume)
     observation[e, agent, start + 10] = float(play.touched[e])
+    observation[e, agent, start + 11] = way_come(play, e, ball[e])
     for n in range(agents):
         turn = play.passer[e] == (agent + n) % agents
-        observation[e, agent, start + 11 + n] = wp.where(turn, 1.0, 0.0)
+        observation[e, agent, start + 12 + n] = wp.where(turn, 1.0, 0.0)

@@ -52,7 +52,7 @@ class Scorer:
         way = ball_of(batch, env)[1]
         places = [avatar.position for avatar in batch.task.scene.avatars]
         self.passer = int(np.argmax([np.dot(way[:2], place) for place in places]))
-        self.touched, self.passes, self.gap = False, 0, None
+        self.touched, self.passes, self.left, self.gap = False, 0, None, None
         self.agents = len(places)
         self.contact, self.touches = np.zeros(self.agents, bool), np.zeros(self.agents, int)
 
@@ -67,11 +67,14 @@ class Scorer:
         self.touches += contact & ~self.contact
         self.contact = contact
         progress = 0.0 if self.gap is None else self.gap - flat(ball, at[self.goal()])
-        self.touched |= bool(contact[self.passer])
+        if contact[self.passer]:
+            self.touched, self.left = True, ball
         after = (self.passer + 1) % self.agents
-        passed = self.touched and (flat(ball, at[after]) <= self.config.reach or bool(contact[after]))
+        arrived = flat(ball, at[after]) <= self.config.reach or bool(contact[after])
+        passed = self.touched and arrived and flat(ball, self.left) >= self.config.sent
         if passed:
-            self.passes, self.passer, self.touched = self.passes + 1, after, bool(contact[after])
+            self.passes, self.passer, self.touched, self.left = self.passes + 1, after, bool(contact[after]), ball
+        self.way = flat(ball, self.left) if self.touched else 0.0
         self.gap = flat(ball, at[self.goal()])
         return {"progress": progress, "passed": passed}
 
@@ -105,6 +108,7 @@ def test_a_ball_that_is_kicked_on_arrives_and_all_is_booked(circle):
                 seen = circle.layout.split(circle.observation.numpy()[env, agent])
                 assert np.argmax(seen["turn"]) == (scorer.passer - agent) % 3 and seen["turn"].sum() == 1.0
                 assert seen["touched"] == scorer.touched
+                assert seen["way"] == pytest.approx(scorer.way, abs=1e-3)
         over |= circle.terminated.numpy().any(1)
     assert sum(scorer.passes >= 1 for scorer in scorers) >= 3, "the script must get it across"
     assert sum(scorer.touches.sum() for scorer in scorers) >= 4
@@ -172,6 +176,12 @@ KICKED = ((0.0, 0.8), (0,), (0, 1, 0, 1, 0))
         ("near the next", [KICKED, ((-0.5, 0.4), (), (0, 1, 0, 1, 0)), ((-0.8, 0.1), (), (1, 0, 1, 1, 0))]),
         ("a touch by the next, far from the pelvis", [KICKED, ((-0.4, 0.3), (1,), (1, 1, 1, 1, 1))]),
         ("the third does not count", [KICKED, ((0.9, 0.1), (2,), (0, 1, 0, 1, 0))]),
+        ("a tap to the next foot is none", [KICKED, ((-0.2, 0.6), (1,), (0, 1, 0, 1, 1))]),
+        ("nor a ball that both hold, wherever they take it", [KICKED, ((-0.8, 0.1), (0, 1), (0, 1, 0, 1, 1))]),
+        (
+            "what was tapped may go on",
+            [KICKED, ((-0.2, 0.6), (1,), (0, 1, 0, 1, 1)), ((-0.8, 0.1), (), (1, 0, 1, 1, 1))],
+        ),
         ("a touch that lasts is one", [KICKED] * 3),
     ],
 )
@@ -183,8 +193,9 @@ def test_whose_turn_it_is(device, story, steps):
 
     rule, play, sensors = passing.PassRule(), passing.Play(), Sensors()
     rule.subject, rule.reach, rule.fetch, rule.rim, rule.goal_passes = 3, 0.3, 9.0, 9.0, 1
-    rule.progress_weight, rule.pass_bonus = 1.0, 5.0
+    rule.sent, rule.progress_weight, rule.pass_bonus = 0.5, 1.0, 5.0
     play.passer, play.touched, play.passes, play.gap = *(array(1, int) for _ in range(3)), array(1)
+    play.left = array(1, wp.vec3)
     play.gap.fill_(-1.0)
     play.contact, play.touches = array((1, 3), int), array((1, 3), int)
     sensors.pair_impulse, sensors.boundary_impulse = array((1, 16), wp.vec3), array((1, 4), wp.vec3)
