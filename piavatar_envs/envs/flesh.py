@@ -35,7 +35,7 @@ def drive_settings(d: DriveConfig) -> DriveSettings:
         alpha=d.alpha,
         shape_preservation=d.shape_preservation,
         root=d.root,
-        free_motion=d.free_motion,
+        free_motion=d.root == "free" if d.free_motion is None else d.free_motion,
         max_force=d.max_force_weight,
         max_torque=d.max_torque_weight,
         max_tilt=d.let_go_tilt,
@@ -138,16 +138,19 @@ class Flesh:
         """How its joints are driven; None where its pose is.
 
         Raises:
-            ConfigError: torques with a scheme of one velocity.
+            ConfigError: torques, or a root that is held, with a scheme of one velocity.
         """
         d = self.drive
+        held = d.control != "pose" or d.root == "wrench"
+        if held and self.physics.decoupling in ("paper", "none"):
+            what = "root='wrench'" if d.control == "pose" else f"control={d.control!r}"
+            remedy = "split or no_stress" + (", or drive.root=free" if d.control == "pose" else "")
+            raise ConfigError(
+                f"drive.{what} needs two velocities: physics.decoupling={self.physics.decoupling!r} has one; use "
+                f"{remedy}"
+            )
         if d.control == "pose":
             return None
-        if self.physics.decoupling in ("paper", "none"):
-            raise ConfigError(
-                f"drive.control={d.control!r} needs two velocities: physics.decoupling={self.physics.decoupling!r} has "
-                "one; use split or no_stress"
-            )
         sampled = self.sampled
         distance = bone_distance(sampled.rest_positions, sampled.bone)
         firm = firmness(sampled.skin_joints, sampled.skin_weights)

@@ -71,7 +71,8 @@ class PhysicsConfig(BaseModel):
     decoupling: Literal["split", "paper", "none", "no_stress"] = Field(
         "split",
         description="how commanded motion is kept out of the strain: split (two velocities, the default), paper (its "
-        "deformation-gradient decoupling), none (velocity injected, strain and all), no_stress (no elasticity)",
+        "deformation-gradient decoupling), none (velocity injected, strain and all), no_stress (no elasticity); paper "
+        "and none have one velocity, in which no root can be held: they need root=free",
     )
     gravity: float = Field(9.81, ge=0.0, le=100.0, description="gravitational acceleration, along -z [m/s^2]")
     friction: float = Field(0.8, ge=0.0, le=10.0, description="Coulomb coefficient of the ground; walls are smooth [-]")
@@ -124,8 +125,10 @@ class DriveConfig(BaseModel):
     root: Literal["wrench", "free"] = Field(
         "wrench", description="wrench (a bounded force and torque hold the commanded root) or free (nothing does)"
     )
-    free_motion: bool = Field(
-        False, description="take the rigid part out of commanded motion, so that it carries no unreacted momentum"
+    free_motion: bool | None = Field(
+        None,
+        description="take the rigid part out of commanded motion, so that it carries no unreacted momentum; null where "
+        "nothing holds the root",
     )
     max_force_weight: float = Field(2.0, ge=0.0, description="largest root force, in body weights [m g]")
     max_torque_weight: float = Field(0.7, ge=0.0, description="largest root torque, in metres of body weight [m * m g]")

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 #: Settings under which the state holds more or other things.
-SETTINGS = [{}, {"shape.randomize": True}, {"control": "pose", "drive.tone": 0.2, "decoupling": "paper"}]
+SETTINGS = [
+    {},
+    {"shape.randomize": True},
+    {"control": "pose", "drive.tone": 0.2, "root": "free", "decoupling": "paper"},
+]
 
 
 def run_on(env, steps: int, seed: int) -> list:

@@ -238,7 +238,7 @@ def momenta(batch) -> np.ndarray:
 
 def test_a_floating_body_keeps_its_momentum(make_batch):
     """Shape, tone and commanded motion give back what they take: by bone masses that are those of the particles."""
-    batch = make_batch(REACH, 3, **FREE, free_motion=True, **VARIED, **{"shape.randomize": True, "scene.ground": False})
+    batch = make_batch(REACH, 3, **FREE, **VARIED, **{"shape.randomize": True, "scene.ground": False})
     batch.reset(seeds=[1, 2, 3])
     state = batch.get_state()
     state["particles.u"] += np.float32([0.3, -0.2, 0.1])
