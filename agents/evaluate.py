@@ -21,7 +21,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
-from agents.intervals import share_interval, share_interval_over_seeds
+from agents.intervals import NORMAL, mean_over_seeds, share_interval, share_interval_over_seeds, wilson
 from benchmarks.runner import Estimate, mean_and_interval
 
 Agent = Callable[[np.ndarray], np.ndarray]
@@ -134,28 +134,30 @@ def by_push(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
     for episode in episodes:
         classes.setdefault(int(episode.push // PUSH_CLASS), []).append(not episode.terminated)
     return [
-        _push_row((PUSH_CLASS * place, PUSH_CLASS * (place + 1)), lasted) for place, lasted in sorted(classes.items())
+        _push_row((PUSH_CLASS * place, PUSH_CLASS * (place + 1)), lasted, 1)
+        for place, lasted in sorted(classes.items())
     ]
 
 
-def _push_row(bounds: tuple[float, float], lasted: Sequence[bool]) -> dict[str, Any]:
+def _push_row(bounds: tuple[float, float], lasted: Sequence[bool], seeds: int) -> dict[str, Any]:
+    share = float(np.mean(lasted))
     return {
         "impulse_n_s": list(bounds),
         "episodes": len(lasted),
-        "lasted": float(np.mean(lasted)),
-        "lasted_interval": share_interval(lasted),
+        "lasted": share,
+        "lasted_interval": wilson(share, len(lasted) / seeds, NORMAL),
     }
 
 
 def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """One row for trainings of several seeds, with intervals over the seeds.
+    """One row for trainings of several seeds, with intervals for other seeds and other episodes.
 
-    Returns and lengths have Student's interval of the seeds' means, which is robust to what such distributions are like
-    (Colas, Sigaud & Oudeyer, "How many random seeds?", arXiv 1806.08295), success that of
-    :func:`share_interval_over_seeds`.
+    Returns and lengths have that of :func:`mean_over_seeds`, success that of :func:`share_interval_over_seeds`.
+    (Student's intervals are robust to what such distributions are like: Colas, Sigaud & Oudeyer, "How many random
+    seeds?", arXiv 1806.08295.)
 
     Args:
-        rows: of the same agent, as :meth:`Evaluation.row` gives them, one a seed.
+        rows: of the same agent in the same episodes, as :meth:`Evaluation.row` gives them, one a seed.
 
     Raises:
         ValueError: no rows, or of different agents or numbers of episodes.
@@ -166,25 +168,26 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     (case, episodes), *_ = about
     summed: dict[str, Any] = {"case": case, "seeds": len(rows), "episodes": episodes}
     for mean, interval in (("return_mean", "return_interval"), ("mean_steps", "steps_interval")):
-        estimate = mean_and_interval([row[mean] for row in rows])
+        halves = [(row[interval][1] - row[interval][0]) / 2.0 for row in rows]
+        estimate = mean_over_seeds([row[mean] for row in rows], halves, episodes)
         finite = np.isfinite(estimate.half_width)
         summed |= {mean: estimate.mean, interval: [estimate.low, estimate.high] if finite else None}
     for name in ("success_once", "success_at_end"):
         shares = [row[name] for row in rows]
         summed |= {name: float(np.mean(shares)), f"{name}_interval": share_interval_over_seeds(shares, episodes)}
     if "by_push" in rows[0]:
-        summed["by_push"] = _pooled([push for row in rows for push in row["by_push"]])
+        summed["by_push"] = _pooled([push for row in rows for push in row["by_push"]], len(rows))
     return summed | {"failures": sum(row["failures"] for row in rows)}
 
 
-def _pooled(pushes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Classes of pushes of several trainings; their episodes count as if one training had played them all."""
+def _pooled(pushes: Sequence[Mapping[str, Any]], seeds: int) -> list[dict[str, Any]]:
+    """Classes of pushes of several trainings, whose episodes are the same: intervals are of one training's."""
     classes: dict[tuple[float, float], list[bool]] = {}
     for push in pushes:
         lasted = round(push["lasted"] * push["episodes"])
         own = [True] * lasted + [False] * (push["episodes"] - lasted)
         classes.setdefault(tuple(push["impulse_n_s"]), []).extend(own)
-    return [_push_row(bounds, lasted) for bounds, lasted in sorted(classes.items())]
+    return [_push_row(bounds, lasted, seeds) for bounds, lasted in sorted(classes.items())]
 
 
 def evaluate(
@@ -192,7 +195,8 @@ def evaluate(
 ) -> Evaluation:
     """Let an agent play episodes ``first_seed``, ``first_seed + 1``, ... to their ends.
 
-    The outcome does not depend on the number of workers: every episode has a seed of its own.
+    Every episode has a seed of its own, so what an agent does that draws nothing does not depend on the number of
+    workers. (Random actions come from one stream for all.)
 
     Args:
         name: the agent's, for tables.

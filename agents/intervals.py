@@ -1,4 +1,4 @@
-"""95 % intervals of shares: of episodes, and of trainings of several seeds."""
+"""95 % intervals: of shares of episodes, and of what trainings of several seeds have on average."""
 
 from __future__ import annotations
 
@@ -7,10 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
+from benchmarks.runner import Estimate
+
+#: Quantile of the normal distribution for 95 %.
+NORMAL = float(stats.norm.ppf(0.975))
+
 
 def share_interval(outcomes: Sequence[bool]) -> list[float]:
     """Wilson's 95 % interval of the share of episodes with an outcome: not empty where all or none had it."""
-    return wilson(float(np.mean(outcomes)), len(outcomes), float(stats.norm.ppf(0.975)))
+    return wilson(float(np.mean(outcomes)), len(outcomes), NORMAL)
 
 
 def wilson(share: float, size: float, quantile: float) -> list[float]:
@@ -31,20 +36,56 @@ def wilson(share: float, size: float, quantile: float) -> list[float]:
     return [max(0.0, float(centre - half)), min(1.0, float(centre + half))]
 
 
-def share_interval_over_seeds(shares: Sequence[float], episodes: int) -> list[float]:
-    """The 95 % interval of a share that trainings of several seeds have on average.
+def mean_over_seeds(means: Sequence[float], halves: Sequence[float], episodes: int) -> Estimate:
+    """The mean of seeds that have played the same episodes, with its 95 % interval for other seeds and episodes.
 
-    Episodes of one training are alike, so all of them together are worth fewer: as many as would scatter as much as the
-    seeds' own shares do (Wilson's interval with the effective sample size; Franco, Little, Louis & Slud, "Comparative
-    study of confidence intervals for proportions in complex sample surveys", J. Survey Stat. Methodol. 7, 2019). The
-    quantile is Student's, of one degree of freedom less than there are seeds.
+    The scatter of the seeds' means says nothing of the episodes, for these are easy or hard for all seeds alike. So the
+    mean's variance is that of the seeds' means over their number, and that of one seed's mean over episodes, as if all
+    scatter within a seed came of the episodes: at worst too large.
+
+    Args:
+        means: of every seed.
+        halves: half the 95 % interval of each over its episodes.
+        episodes: of every seed.
+    """
+    seeds = len(means)
+    if seeds < 2 or episodes < 2:
+        return Estimate(float(np.mean(means)), np.inf)
+    of_seeds = float(np.var(means, ddof=1)) / seeds
+    of_episodes = float(np.mean(np.square(halves))) / float(stats.t.ppf(0.975, episodes - 1)) ** 2
+    variance, quantile = _scatter(of_seeds, of_episodes, seeds, episodes)
+    return Estimate(float(np.mean(means)), quantile * float(np.sqrt(variance)))
+
+
+def share_interval_over_seeds(shares: Sequence[float], episodes: int) -> list[float]:
+    """The 95 % interval of a share that trainings of several seeds have on average, all in the same episodes.
+
+    It is Wilson's, of as many episodes as would scatter as much as :func:`mean_over_seeds` finds: of those of one seed,
+    at most (the effective sample size; Franco, Little, Louis & Slud, "Comparative study of confidence intervals for
+    proportions in complex sample surveys", J. Survey Stat. Methodol. 7, 2019).
 
     Args:
         shares: of every seed.
         episodes: of every seed.
     """
     seeds, mean = len(shares), float(np.mean(shares))
-    size, alone = float(seeds * episodes), mean * (1.0 - mean)
-    if seeds > 1 and alone > 0.0:
-        size = min(size, alone / max(float(np.var(shares, ddof=1)) / seeds, 1e-12))
-    return wilson(mean, size, float(stats.t.ppf(0.975, seeds - 1)) if seeds > 1 else np.inf)
+    if seeds < 2 or episodes < 2:
+        return wilson(mean, float(episodes), np.inf)
+    within = float(np.mean([share * (1.0 - share) for share in shares]))
+    variance, quantile = _scatter(float(np.var(shares, ddof=1)) / seeds, within / episodes, seeds, episodes)
+    alone = mean * (1.0 - mean)
+    return wilson(mean, alone / variance if alone > 0.0 else float(episodes), quantile)
+
+
+def _scatter(of_seeds: float, of_episodes: float, seeds: int, episodes: int) -> tuple[float, float]:
+    """The variance of a mean over seeds and episodes, and Student's quantile for it.
+
+    Of two, whose interval is wider: of seeds and episodes together (degrees of freedom by Satterthwaite, "An
+    approximate distribution of estimates of variance components", Biometrics 2, 1946), or of the few seeds alone.
+    """
+    alone, together = float(stats.t.ppf(0.975, seeds - 1)), of_seeds + of_episodes
+    if together == 0.0:  # nothing has scattered
+        return 0.0, alone
+    freedom = together**2 / (of_seeds**2 / (seeds - 1) + of_episodes**2 / (episodes - 1))
+    quantile = float(stats.t.ppf(0.975, freedom))
+    return (together, quantile) if quantile**2 * together > alone**2 * of_seeds else (of_seeds, alone)

@@ -260,8 +260,8 @@ def main(args: list[str] | None = None) -> None:
     devices = sorted({one["device"]["name"] for one in measured} | set(kept["devices"]))
     commits = sorted({str(one["commit"])[:12] for one in measured} | set(kept["commits"]))
     about = (
-        f"{', '.join(devices)}; commits {', '.join(commits)}. Brackets are 95 % intervals: over seeds where there are "
-        "several, else over episodes; each seed has played so many episodes."
+        f"{', '.join(devices)}; commits {', '.join(commits)}. Brackets are 95 % intervals: over seeds and episodes "
+        "where there are several seeds, else over episodes; all seeds have played the same, so many each."
     )
     text = markdown(rows, about)
     if options.out is not None:

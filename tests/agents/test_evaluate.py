@@ -17,8 +17,9 @@ from agents.evaluate import (
     separated,
     zero_agent,
 )
-from agents.intervals import share_interval, share_interval_over_seeds, wilson
+from agents.intervals import mean_over_seeds, share_interval, share_interval_over_seeds, wilson
 from agents.matches import seated
+from benchmarks.runner import mean_and_interval
 
 
 def ones(observation):
@@ -100,50 +101,80 @@ def test_wilsons_interval_is_scipys_and_is_not_empty_at_the_ends():
         np.testing.assert_allclose(found, [expected.low, expected.high], atol=1e-12)
 
 
-def rows(returns, once, episodes=40, case="trained"):
+def rows(returns, once, episodes=40, case="trained", half=0.5):
+    """Rows of seeds, whose mean returns are known to ``half`` from their episodes."""
     return [
         {
-            "case": case, "episodes": episodes, "return_mean": value, "mean_steps": 10.0 * value, "success_once": share,
-            "success_at_end": share / 2.0, "failures": 1,
+            "case": case, "episodes": episodes, "return_mean": value, "mean_steps": 10.0 * value,
+            "return_interval": [value - half, value + half],
+            "steps_interval": [10.0 * (value - half), 10.0 * (value + half)],
+            "success_once": share, "success_at_end": share / 2.0, "failures": 1,
         }
         for value, share in zip(returns, once, strict=True)
     ]  # fmt: skip
 
 
-def test_over_seeds_the_seeds_are_the_sample():
+def test_over_seeds_seeds_and_episodes_are_samples():
     values, shares = [3.0, 5.0, 10.0, 2.0, 4.0], [0.95, 0.95, 0.975, 0.925, 0.95]
-    row = over_seeds(rows(values, shares))
+    row = over_seeds(rows(values, shares, half=0.0))
     assert (row["case"], row["seeds"], row["episodes"], row["failures"]) == ("trained", 5, 40, 5)
+    assert row["success_once"] == pytest.approx(0.95) and row["success_at_end"] == pytest.approx(0.475)
+    # where episodes are all alike, seeds are the sample
     interval = stats.t.interval(0.95, 4, np.mean(values), stats.sem(values))
     np.testing.assert_allclose(row["return_interval"], interval)
     np.testing.assert_allclose(row["steps_interval"], 10.0 * np.array(interval))
-    assert row["success_once"] == pytest.approx(0.95) and row["success_at_end"] == pytest.approx(0.475)
-    # seeds that scatter as little as episodes do are worth all their episodes, by Student's quantile
-    expected = wilson(0.95, 200.0, stats.t.ppf(0.975, 4))
-    np.testing.assert_allclose(row["success_once_interval"], expected)
-    # seeds that scatter more are worth fewer: p (1 - p) / n is to be the variance of their mean, 0.0025 / 5
-    apart = over_seeds(rows(values, [1.0, 0.9, 0.95, 1.0, 0.9]))["success_once_interval"]
-    np.testing.assert_allclose(apart, wilson(0.95, 0.95 * 0.05 / 0.0005, stats.t.ppf(0.975, 4)))
+    # where seeds are all alike, five of them know no more than one does: they have played the same episodes
+    alike = over_seeds(rows([4.0] * 5, [0.95] * 5))
+    np.testing.assert_allclose(alike["return_interval"], [3.5, 4.5])
+    np.testing.assert_allclose(alike["success_once_interval"], wilson(0.95, 40.0, stats.t.ppf(0.975, 39)))
+    both = over_seeds(rows(values, shares, half=3.0))["return_interval"]
+    assert both[0] < interval[0] and both[1] > interval[1]
+    # two more numbers that hardly scatter do not make five seeds more than five
+    np.testing.assert_allclose(over_seeds(rows(values, shares))["return_interval"], interval)
+    # of endless episodes seeds alone scatter: p (1 - p) / n is to be the variance of their mean, 0.0025 / 5
+    apart = over_seeds(rows(values, [1.0, 0.9, 0.95, 1.0, 0.9], episodes=10**9))["success_once_interval"]
+    np.testing.assert_allclose(apart, wilson(0.95, 0.95 * 0.05 / 0.0005, stats.t.ppf(0.975, 4)), rtol=1e-6)
     assert over_seeds(rows([1.0], [0.5]))["success_once_interval"] == [0.0, 1.0]  # one seed says nothing
     assert over_seeds(rows([1.0], [0.5]))["return_interval"] is None
     all_won = over_seeds(rows(values, [1.0] * 5))["success_once_interval"]
-    assert all_won[1] == pytest.approx(1.0) and 0.9 < all_won[0] < 1.0
+    np.testing.assert_allclose(all_won, wilson(1.0, 40.0, stats.t.ppf(0.975, 4)))
     with pytest.raises(ValueError, match="rows of one agent"):
         over_seeds(rows([1.0], [0.5]) + rows([1.0], [0.5], case="zero"))
 
 
+def coverage(intervals, truth) -> float:
+    """Share of intervals that hold the truth."""
+    return float(np.mean([low <= truth <= high for low, high in intervals]))
+
+
 def test_the_interval_of_shares_covers_what_it_says_also_where_seeds_differ():
-    """95 of 100 times, with shares of seeds from a beta distribution; all episodes in one sample would not."""
+    """95 of 100 times and more, with shares of seeds from a beta distribution; all episodes in one sample would not."""
     rng = np.random.default_rng(0)
     seeds, episodes, trials, a, b = 5, 40, 1500, 8.0, 2.0
     shares = rng.binomial(episodes, rng.beta(a, b, (trials, seeds))) / episodes
     truth = a / (a + b)
+    assert coverage([share_interval_over_seeds(row, episodes) for row in shares], truth) > 0.93
+    assert coverage([wilson(row.mean(), seeds * episodes, 1.96) for row in shares], truth) < 0.8
 
-    def coverage(intervals):
-        return np.mean([low <= truth <= high for low, high in intervals])
 
-    assert 0.93 < coverage([share_interval_over_seeds(row, episodes) for row in shares]) < 0.985
-    assert coverage([wilson(row.mean(), seeds * episodes, 1.96) for row in shares]) < 0.8
+@pytest.mark.parametrize("of_episodes", [0.0, 0.5, 1.0])
+def test_intervals_cover_what_they_say_where_all_seeds_play_the_same_episodes(of_episodes):
+    """Of scatter that episodes, seeds, and both together bring; seeds alone would not cover it."""
+    rng = np.random.default_rng(1)
+    seeds, episodes, trials = 5, 64, 1500
+    easy = np.sqrt(of_episodes) * rng.standard_normal((trials, 1, episodes))
+    good = 0.05 * rng.standard_normal((trials, seeds, 1))
+    values = 3.0 + good + easy + np.sqrt(1.0 - of_episodes) * rng.standard_normal((trials, seeds, episodes))
+    one = stats.t.ppf(0.975, episodes - 1) * stats.sem(values, axis=2)
+    means = values.mean(2)
+    found = [mean_over_seeds(*row, episodes) for row in zip(means, one, strict=True)]
+    assert coverage([(estimate.low, estimate.high) for estimate in found], 3.0) > 0.93
+    shares = (values > 2.5).mean(2)
+    truth = float(stats.norm.cdf(0.5 / np.sqrt(1.0 + 0.05**2)))
+    assert coverage([share_interval_over_seeds(row, episodes) for row in shares], truth) > 0.93
+    if of_episodes == 1.0:
+        of_seeds_alone = [mean_and_interval(row) for row in means]
+        assert coverage([(estimate.low, estimate.high) for estimate in of_seeds_alone], 3.0) < 0.7
 
 
 def test_separated_asks_for_whole_intervals():
@@ -177,4 +208,5 @@ def test_pushes_fall_into_classes_and_pool_over_seeds():
     pooled = over_seeds([one, one])["by_push"]
     assert [row["episodes"] for row in pooled] == [4, 2, 6]
     assert [row["lasted"] for row in pooled] == pytest.approx([1.0, 0.0, 1.0 / 3.0])
-    assert pooled[2]["lasted_interval"] == share_interval([True, False, False] * 2)
+    # both have played the same episodes, so they know no more than one
+    assert pooled[2]["lasted_interval"] == pytest.approx(share_interval([True, False, False]))
