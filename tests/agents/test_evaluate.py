@@ -37,6 +37,20 @@ def test_every_seed_is_played_once_to_its_end(countdown, workers):
     np.testing.assert_allclose(result.returns, [n + seed for n, seed in zip(lengths, range(11, 17), strict=True)])
 
 
+@pytest.mark.parametrize("by_time", [False, True])
+def test_an_episode_whose_time_is_over_has_not_ended_before_it(countdown, by_time):
+    """Else all that stand to the end would count as fallen."""
+
+    class Timed(countdown):
+        def step(self, action):
+            observation, reward, terminated, truncated, info = super().step(action)
+            over = terminated or truncated
+            return observation, reward, over and not by_time, over and by_time, info
+
+    result = evaluate("ones", ones, DummyVecEnv([Timed] * 2), episodes=3, first_seed=11, progress=False)
+    assert [episode.terminated for episode in result.episodes] == [not by_time] * 3
+
+
 class Remembering:
     """Pays attention to when episodes begin: its first action of each is 1, the others are 0."""
 

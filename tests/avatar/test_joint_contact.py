@@ -126,7 +126,7 @@ def test_muscles_give_no_more_than_they_have(make_rig, limit):
 
 
 def test_a_joint_is_stopped_at_the_end_of_its_range(make_rig):
-    """A torque of 10 N m turns an elbow out of its range by what its stop gives, and no further."""
+    """A torque of 10 N m turns an elbow out of its range by what its stop gives, no further; it does not rebound."""
     elbows = [joint_index("left_elbow"), joint_index("right_elbow")]
     held = Held(make_rig(cells=16), elbows, 0.0, 0.5)
     lower, upper, stop = -EVERYWHERE.copy(), EVERYWHERE.copy(), np.zeros(NUM_JOINTS)
@@ -140,6 +140,15 @@ def test_a_joint_is_stopped_at_the_end_of_its_range(make_rig):
     for _ in range(40):
         held.program.run()
     np.testing.assert_allclose(held.local()[:, 0], 0.3 + 10.0 / 200.0, atol=0.01)
+    # let go, it creeps back into its range: what stops it damps it, too, by 0.03 s of its stiffness
+    held.body.state.torque.zero_()
+    held.program.run()
+    beyond = [held.local()[:, 0] - 0.3]
+    for _ in range(3):
+        held.program.run()
+        beyond.append(held.local()[:, 0] - 0.3)
+    remains = np.exp(-held.model.control_dt / 0.03)
+    np.testing.assert_allclose(np.array(beyond[1:]) / beyond[:-1], remains, rtol=0.25)
 
 
 def test_flesh_is_held_the_faster_the_deeper_it_lies():

@@ -271,22 +271,25 @@ def test_standing_still_is_worth_less_than_half_of_walking(make_env):
     assert np.mean(rewards) < 0.5
 
 
-def test_who_leaves_the_way_is_out(make_env):
-    env = make_env(WALK, lane=0.3, gravity=0.0, pose_noise=0.0)
+@pytest.mark.parametrize("drift", [(1.0, 0.0), (-1.0, 0.0), (0.0, -4.0)], ids=["left", "right", "the end"])
+def test_who_leaves_the_way_is_out(make_env, drift):
+    """To either side of the lane, or beyond its end: one and a half times as far as its speed goes in an episode."""
+    env = make_env(WALK, lane=0.3, gravity=0.0, pose_noise=0.0, episode_seconds=0.6)
     env.reset(seed=0)
     state = env.batch.simulation.state
     joints = env.batch.simulation.avatar.joints.state
     velocity = joints.velocity.numpy()
-    velocity[0, 0] = 1.0
+    velocity[0, :2] = drift
     joints.velocity.assign(velocity)
-    state.vk.assign(state.vk.numpy() + np.float32([1.0, 0.0, 0.0]))
+    state.vk.assign(state.vk.numpy() + np.float32([*drift, 0.0]))
     steps = 0
     terminated = False
-    while not terminated and steps < 20:
-        observation, _, terminated, _, _ = env.step(still(env))
-        assert terminated == (seen(env, observation, "way_offset")[0] > np.float32(0.3))
+    while not terminated and steps < 18:
+        observation, _, terminated, _, info = env.step(still(env))
+        aside = abs(seen(env, observation, "way_offset")[0])
+        assert terminated == (aside > np.float32(0.3) or info["distance"] > 0.9)
         steps += 1
-    assert 7 < steps < 14
+    assert 5 < steps < 14
 
 
 @pytest.mark.parametrize("most_behind", [0.2, None])
