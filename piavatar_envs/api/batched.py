@@ -14,6 +14,7 @@ from gymnasium.utils import seeding
 
 from piavatar_envs.api import spaces
 from piavatar_envs.api.arrays import Array, find_array_api
+from piavatar_envs.api.copies import check_state
 from piavatar_envs.avatar.joint_drive import checked_assist
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.simulation import check_device
@@ -232,17 +233,19 @@ class BatchedEpisodes:
         """Restore what :meth:`get_state` returned, under any number of threads.
 
         Raises:
-            ValueError: the state is of another environment, or of another number; nothing has changed then.
+            ValueError: the state is of another environment, of another number or not finite; nothing has changed then.
         """
-        for name, value in state.items():
-            if np.shape(value)[:1] != (self.num_envs,):
-                raise ValueError(f"state[{name!r}] has shape {np.shape(value)}, but num_envs={self.num_envs}")
+        check_state(state, self.num_envs)
+        self.adopt(state, ready=True)
+
+    def adopt(self, state: dict[str, np.ndarray], ready: bool) -> None:
+        """Be a copy of others, given their state and whether they are ready."""
         parts = {name: np.split(np.asarray(value), self._splits) for name, value in state.items()}
         self.api.begin()
         for index, group in enumerate(self.groups):
             group.set_state({name: part[index] for name, part in parts.items()})
         self.api.end()
-        self.ready = True
+        self.ready = ready
 
     def assist_root(self, share: float | np.ndarray) -> None:
         """Help the pelvis from now on; see :meth:`BatchEnv.assist_root`.

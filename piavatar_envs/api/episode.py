@@ -13,6 +13,7 @@ from gymnasium.utils import seeding
 
 from piavatar_envs.api import spaces
 from piavatar_envs.api.arrays import NumpyArrays
+from piavatar_envs.api.copies import check_state
 from piavatar_envs.api.infos import failure_names, outcome, standing
 from piavatar_envs.api.picture import Pictures
 from piavatar_envs.envs.actions import check_actions
@@ -172,16 +173,25 @@ class Episode:
         if self._live:
             self._live.close()
 
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that the future depends on, on the host."""
+        return self.batch.get_state()
+
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on from what ``batch.get_state()`` returned.
+        """Go on from what :meth:`get_state` returned.
 
         Raises:
-            ValueError: the state is of another environment; nothing has changed then.
+            ValueError: the state is of another environment or not finite; nothing has changed then.
         """
-        self.batch.set_state(state)
-        self.ready = True
+        check_state(state, 1)
+        self.adopt(state, ready=True)
         if self._live:
             self._live.begin()
+
+    def adopt(self, state: dict[str, np.ndarray], ready: bool) -> None:
+        """Be a copy of another, given its state and whether it is ready. Nobody watches before the next reset."""
+        self.batch.set_state(state)
+        self.ready = ready
 
 
 def check_render_mode(render_mode: str | None, modes: tuple[str, ...] = RENDER_MODES) -> str | None:

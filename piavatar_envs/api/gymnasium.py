@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
+from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
 from piavatar_envs.api.view import EpisodeView
 from piavatar_envs.envs.config import load_config
@@ -14,7 +16,7 @@ from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
 
-class AvatarEnv(EpisodeView, gym.Env):
+class AvatarEnv(Copied, EpisodeView, gym.Env):
     """One soft avatar and a task.
 
     Observations are a flat float32 vector, or a dictionary with ``obs_mode="dict"``; ``observation_layout`` says what
@@ -51,6 +53,8 @@ class AvatarEnv(EpisodeView, gym.Env):
         """
         task_class = load_task(task)
         settings = load_config(task_class.Config, config, overrides)
+        made = {"task": task_class, "render_mode": render_mode, "device": device, "config": settings}
+        self._build = partial(AvatarEnv.__init__, **made)
         self._episode = Episode(task_class(settings).alone(), render_mode, device)
         self.batch, self.config = self._episode.batch, settings
         self.render_mode = render_mode
@@ -92,7 +96,7 @@ class AvatarEnv(EpisodeView, gym.Env):
         """Restore what :meth:`get_state` returned; returns the observation.
 
         Raises:
-            ValueError: the state is of another environment; nothing has changed then.
+            ValueError: the state is of another environment or not finite; nothing has changed then.
         """
         self._episode.restore(state)
         return self._episode.observation(0)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
 from piavatar_envs.api.view import EpisodeView
 from piavatar_envs.envs.config import load_config, replace
@@ -20,7 +22,7 @@ except ImportError as error:
     raise ImportError("several agents need PettingZoo; install it with: pip install 'piavatar-envs[multi]'") from error
 
 
-class AvatarParallelEnv(EpisodeView, ParallelEnv):
+class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
     """Several soft avatars and a task; each avatar is an agent.
 
     Observations and actions are as those of :class:`~piavatar_envs.api.gymnasium.AvatarEnv`, by agent, and so is
@@ -67,6 +69,8 @@ class AvatarParallelEnv(EpisodeView, ParallelEnv):
             if max_cycles < 1:
                 raise ValueError(f"max_cycles={max_cycles} must be at least 1, or None for episode_seconds")
             self.config = replace(self.config, episode_seconds=max_cycles * self.config.physics.control_dt)
+        made = {"task": task_class, "render_mode": render_mode, "device": device, "config": self.config}
+        self._build = partial(AvatarParallelEnv.__init__, **made)
         self._episode = Episode(task_class(self.config), render_mode, device)
         self.batch, self.render_mode = self._episode.batch, render_mode
         self.metadata: dict[str, Any] = {
@@ -173,7 +177,7 @@ class AvatarParallelEnv(EpisodeView, ParallelEnv):
         """Restore what :meth:`get_state` returned, and who plays; returns the observations of these.
 
         Raises:
-            ValueError: the state is of another environment; nothing has changed then.
+            ValueError: the state is of another environment or not finite; nothing has changed then.
         """
         self._episode.restore(state)
         self.agents = self._playing()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from piavatar_envs.api.arrays import Array
 from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import BATCH_RENDER_MODES, Settings, check_batch_render_mode
 from piavatar_envs.api.infos import outcome, standing, vector_format
 from piavatar_envs.api.picture import Pictures
@@ -21,7 +23,7 @@ from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
 
-class AvatarVectorEnv(BatchedView, VectorEnv):
+class AvatarVectorEnv(Copied, BatchedView, VectorEnv):
     """Many worlds of one soft avatar and a task, stepped at once.
 
     Environment ``i`` is the single environment of seed ``seed + i``, bit for bit. Its ``info`` is the single
@@ -82,6 +84,9 @@ class AvatarVectorEnv(BatchedView, VectorEnv):
         self.render_mode, self.autoreset_mode = check_batch_render_mode(render_mode), _autoreset_mode(autoreset_mode)
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
+        made = {"num_envs": num_envs, "render_mode": render_mode, "device": device, "array_api": array_api}
+        made |= {"autoreset_mode": self.autoreset_mode, "num_threads": num_threads, "config": self.config}
+        self._build = partial(AvatarVectorEnv.__init__, task=task_class, **made)
         self.episodes = BatchedEpisodes(task_class(self.config).alone(), num_envs, device, array_api, num_threads)
         self.num_envs = num_envs
         self.metadata = {
@@ -252,7 +257,7 @@ class AvatarVectorEnv(BatchedView, VectorEnv):
         """Restore what :meth:`get_state` returned; returns the observations.
 
         Raises:
-            ValueError: the state is of other environments; nothing has changed then.
+            ValueError: the state is of other environments or not finite; nothing has changed then.
         """
         self.episodes.set_state(state)
         return self._observation()

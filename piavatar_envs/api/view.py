@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,6 +16,11 @@ class EpisodeView:
     """Passes on to the only environment what has nothing to do with how it is shown."""
 
     _episode: Episode
+    _built: ClassVar[tuple[str, ...]] = ("_episode", "batch")
+
+    @property
+    def _host(self) -> Episode:
+        return self._episode
 
     @property
     def observation_layout(self) -> ObservationLayout:
@@ -49,7 +54,7 @@ class EpisodeView:
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Everything that the future depends on; ``set_state()`` restores it, bit for bit."""
-        return self._episode.batch.get_state()
+        return self._episode.get_state()
 
 
 class BatchedView:
@@ -60,6 +65,12 @@ class BatchedView:
     """
 
     episodes: BatchedEpisodes
+    # a copy of what was closed is open: it has threads of its own
+    _built: ClassVar[tuple[str, ...]] = ("episodes", "_pictures", "closed")
+
+    @property
+    def _host(self) -> BatchedEpisodes:
+        return self.episodes
 
     @property
     def observation_layout(self) -> ObservationLayout:

@@ -130,6 +130,8 @@ def spoil(state, how):
         state["tracked_0.rotation"] = state["tracked_0.rotation"].astype(str)
     elif how == "nothing":
         state = {}
+    elif how == "infinity":
+        state["drive_0.motion"].flat[0] = np.inf
     return state
 
 
@@ -143,6 +145,7 @@ def spoil(state, how):
         ("double precision", "particles.u.*float64.*float32"),
         ("text", "tracked_0.rotation"),
         ("nothing", "missing"),
+        ("infinity", r"drive_0.motion.*\[0, .*inf.*finite"),
     ],
 )
 def test_malformed_states_are_refused_and_change_nothing(make_env, env_id, how, told):
@@ -157,6 +160,17 @@ def test_malformed_states_are_refused_and_change_nothing(make_env, env_id, how, 
     after = env.get_state()
     assert all(before[name].tobytes() == after[name].tobytes() for name in before)
     assert np.array_equal(env.batch.observation.numpy(), observed)
+
+
+@pytest.mark.parametrize(("state", "told"), [(None, "is a NoneType"), ([1, 2], "is a list")])
+def test_what_is_no_state_is_refused(make_env, state, told):
+    env = make_env("PIAvatar/Reach-v0")
+    env.reset(seed=3)
+    before = env.get_state()
+    with pytest.raises(ValueError, match=f"{told}.*get_state"):
+        env.set_state(state)
+    after = env.get_state()
+    assert all(before[name].tobytes() == after[name].tobytes() for name in before)
 
 
 def test_states_of_another_environment_are_refused(make_env, env_id):

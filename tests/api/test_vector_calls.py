@@ -368,7 +368,7 @@ def test_threads_never_capture_at_once(device):
     fresh.close()
 
 
-@pytest.mark.parametrize("how", ["fewer", "missing", "unknown", "double", "particles"])
+@pytest.mark.parametrize("how", ["fewer", "missing", "unknown", "double", "particles", "nan", "none"])
 def test_a_state_of_others_is_refused_and_changes_nothing(make_vec, how):
     vector = make_vec("PIAvatar/KickBall-v0", 3)
     vector.reset(seed=1)
@@ -383,6 +383,10 @@ def test_a_state_of_others_is_refused_and_changes_nothing(make_vec, how):
         bad["particles.u"] = bad["particles.u"].astype(np.float64)
     elif how == "particles":
         bad["particles.x"] = bad["particles.x"][:, 1:]
+    elif how == "nan":
+        bad["task.best"] = np.full_like(bad["task.best"], np.nan)
+    elif how == "none":
+        bad = None
     with pytest.raises(ValueError, match="state"):
         vector.set_state(bad)
     assert bytes_of(vector.get_state()) == before

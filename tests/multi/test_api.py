@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import functools
+import pickle
 import subprocess
 import sys
 import types
@@ -162,6 +164,47 @@ def test_state_is_what_all_see(make_world, play, module_name):
     before = world.state()
     play(world, 2)
     assert not np.array_equal(before, world.state()) and np.isfinite(before).all()
+
+
+def test_a_copy_goes_on_as_the_original(make_world, play, same, module_name):
+    """By both ways, over the end of the episode; also where an agent has left, and where nobody plays any more."""
+    world = make_world(module_name, max_cycles=6)
+    assert copy.deepcopy(world).agents == world.agents
+    for steps in (2, 4, 6):
+        world.reset(seed=3)
+        play(world, steps, np.random.default_rng(0))
+        if steps == 4:
+            state = world.get_state()
+            state["env.alive"][0, 0], state["env.terminated"][0, 0] = False, True
+            world.set_state(state)
+        copies = copy.deepcopy(world), pickle.loads(pickle.dumps(world))
+        runs = []
+        for env in (world, *copies):
+            rng = np.random.default_rng(1)
+            runs.append([env.agents, play(env, 9, rng), env.agents, env.reset(), env.agents, play(env, 9, rng)])
+        assert same(runs[0], runs[1]) and same(runs[0], runs[2])
+
+
+def test_a_copy_of_what_was_never_reset_needs_one(worlds, module_name, device):
+    world = fresh(worlds, module_name, device).parallel_env()
+    for other in (copy.deepcopy(world), pickle.loads(pickle.dumps(world))):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            other.step({})
+        assert other.reset(seed=1) and other.agents == other.possible_agents
+
+
+def test_the_aec_view_is_copied(worlds, module_name, device, same):
+    env = fresh(worlds, module_name, device).env(max_cycles=4)
+    env.reset(seed=1)
+    env.step(np.zeros(env.action_space(env.agent_selection).shape, np.float32))
+    runs = []
+    for view in (copy.deepcopy(env), pickle.loads(pickle.dumps(env)), env):
+        runs.append([])
+        for agent in view.agent_iter():
+            runs[-1].append((agent, *view.last()))
+            ended = view.terminations[agent] or view.truncations[agent]
+            view.step(None if ended else np.full(view.action_space(agent).shape, 0.5, np.float32))
+    assert same(runs[0], runs[2]) and same(runs[1], runs[2])
 
 
 def test_spaces_belong_to_the_agents(make_world, module_name):
