@@ -205,3 +205,12 @@ class RenderConfig(BaseModel):
     width: int = Field(480, ge=16, le=7680, description="width of a frame [pixel]")
     height: int = Field(480, ge=16, le=4320, description="height of a frame [pixel]")
     color: Literal["skin", "strain"] = Field("skin", description="colour of the body: its skin, or its deformation")
+    camera_position: tuple[float, float, float] | None = Field(
+        None, description="where the camera is, from the ground below what it follows; null: where the task has it [m]"
+    )
+    camera_target: tuple[float, float, float] | None = Field(
+        None, description="where it looks, from the same point; null: where the task has it [m]"
+    )
+    camera_follows: bool | None = Field(
+        None, description="whether it follows the avatars, or stays about the origin; null: as the task has it"
+    )

@@ -27,6 +27,13 @@ class Shot:
     field_of_view: float
     center: np.ndarray
 
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """What is up in the picture: z, or y where the camera looks straight down or up."""
+        way = np.asarray(self.target, np.float64) - self.eye
+        steep = np.hypot(way[0], way[1]) < 1e-3 * abs(way[2])
+        return (0.0, 1.0, 0.0) if steep else (0.0, 0.0, 1.0)
+
 
 class Backend(Protocol):
     """Turns lit vertices into pictures of one size."""

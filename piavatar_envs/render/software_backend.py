@@ -55,7 +55,7 @@ class SoftwareBackend:
 def _view(shot: Shot, size: tuple[int, ...]) -> View:
     forward = np.asarray(shot.target, dtype=np.float64) - shot.eye
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = np.cross(forward, shot.up)
     right /= np.linalg.norm(right)
     view = View()
     view.eye, view.forward, view.right = wp.vec3(*shot.eye), wp.vec3(*forward), wp.vec3(*right)

@@ -62,7 +62,7 @@ class VtkBackend:
         self._set_ground(shot.center)
         self._set_shadow(shadow)
         camera = self._plotter.camera
-        camera.position, camera.focal_point, camera.up = tuple(shot.eye), tuple(shot.target), (0.0, 0.0, 1.0)
+        camera.position, camera.focal_point, camera.up = tuple(shot.eye), tuple(shot.target), shot.up
         camera.view_angle = shot.field_of_view
         camera.clipping_range = (0.05, 60.0)
         self._plotter.render()

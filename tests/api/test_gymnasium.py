@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from piavatar_envs.api.gymnasium import AvatarEnv
+from piavatar_envs.envs.config import ConfigError
 
 
 def refusal(env_id: str, settings: dict) -> str:
@@ -129,6 +130,35 @@ def test_pictures(device, env_id):
     assert all(frame.shape == (48, 64, 3) and frame.dtype == np.uint8 and np.ptp(frame) > 50 for frame in frames)
     assert not np.array_equal(*frames)
     env.close()
+    env.close()
+
+
+def test_the_camera_can_be_moved(device):
+    """To the side, where the body is narrower than from the front, or straight above, where it is smaller still."""
+    pytest.importorskip("pyvista")
+    aside = {"camera_position": (4.0, 0.0, 0.9), "camera_target": (0.0, 0.0, 0.9)}
+    above = {"camera_position": (0.0, 0.0, 5.0), "camera_target": (0.0, 0.0, 0.0)}
+    front = {"camera_position": (0.0, -4.0, 0.9), "camera_target": (0.0, 0.0, 0.9), "camera_follows": False}
+    shown = {}
+    for name, camera in (("front", front), ("aside", aside), ("above", above), ("task", {})):
+        made = {"fidelity": "tiny", "render_mode": "rgb_array", "width": 96, "height": 96, "control": "torque"}
+        env = gymnasium.make("PIAvatar/Stand-v0", device=device, **made, **camera)
+        env.reset(seed=0)
+        frame = env.render().astype(int)
+        skin = frame[..., 0] - frame[..., 2] > 30  # redder than ground and sky
+        shown[name] = np.ptp(np.argwhere(skin), axis=0) / 96.0 if skin.any() else np.zeros(2)
+        assert (
+            env.unwrapped._episode._pictures._opened[0].renderer._follower.center == 0.0
+        ).all() or camera is not front
+        env.close()
+    assert shown["front"][0] > 0.6 and shown["front"][1] > 1.5 * shown["aside"][1] > 0.1
+    assert 0.05 < shown["above"][0] < 0.3 and shown["task"][0] > 0.5
+    env = gymnasium.make(
+        "PIAvatar/Stand-v0", device=device, **made, camera_position=(0.0, 0.0, 1.0), camera_target=(0, 0, 1)
+    )
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=r"camera_position=\[0.0, 0.0, 1.0\] is where it looks"):
+        env.render()
     env.close()
 
 
