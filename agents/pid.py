@@ -33,6 +33,8 @@ from scipy.spatial.transform import Rotation
 
 #: From torques if nothing moved and what springs and dampers add to the inertia to the torques that are given.
 Ahead = Callable[[np.ndarray, np.ndarray], np.ndarray]
+#: What motors give of the torques that they are asked for.
+Given = Callable[[np.ndarray], np.ndarray]
 
 #: A number for all, or an array that broadcasts against ``(n, joints, 3)`` or ``(n, dof)``.
 PerJoint = float | np.ndarray
@@ -128,6 +130,7 @@ class PID:
         feedforward: np.ndarray | float = 0.0,
         factor: np.ndarray | float = 1.0,
         ahead: Ahead | None = None,
+        given: Given | None = None,
     ) -> np.ndarray:
         """Torques for the next ``dt`` [N m].
 
@@ -139,6 +142,8 @@ class PID:
             factor: on the gains [-], from a schedule.
             ahead: how the body answers springs and dampers within the step; None where every degree of freedom answers
                 alone, by the inertia of the gains, or none does.
+            given: what a motor gives of the torques that it is asked for, where its limits are others than those of the
+                gains; integrals give way to what it leaves.
 
         Raises:
             ValueError: an error or a rate of another shape than the controller's.
@@ -148,6 +153,7 @@ class PID:
                 raise ValueError(f"{name} has shape {np.shape(value)}, expected {self.integral.shape}")
         raw = self._proportional(error, target_rate - rate, factor, ahead) + self.integral + feedforward
         limited = np.clip(raw, -self._limit, self._limit)
+        limited = limited if given is None else given(limited)
         self.integral += self.dt * factor * self._ki * error + self._give_way * (limited - raw)
         return limited
 
@@ -202,6 +208,7 @@ class PosePID:
         feedforward: np.ndarray | float = 0.0,
         factor: np.ndarray | float = 1.0,
         ahead: Ahead | None = None,
+        given: Given | None = None,
     ) -> np.ndarray:
         """Torques of all joints for the next step [N m], ``(n, joints, 3)``.
 
@@ -213,12 +220,13 @@ class PosePID:
             feedforward: torque on top, within the limit [N m].
             factor: on the gains [-], from a schedule, ``(n, joints, 1)`` or a number.
             ahead: how the body answers, see :meth:`PID.step`.
+            given: what muscles give, likewise.
         """
         target = np.broadcast_to(target, rotation.shape)
         error = difference(rotation, target)
         closing = target_rate if np.ndim(target_rate) == 0 else turned(error, np.broadcast_to(target_rate, error.shape))
         rate = self._found_rate(rotation) if rate is None else rate
-        return self.pid.step(error, rate, closing, feedforward, factor, ahead)
+        return self.pid.step(error, rate, closing, feedforward, factor, ahead, given)
 
     def _found_rate(self, rotation: np.ndarray) -> np.ndarray:
         """Rates from two rotations, through a filter of first order; zero in a first step."""

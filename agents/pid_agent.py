@@ -181,9 +181,19 @@ class PIDAgent:
             feedforward=-in_bones(now, moments)[:, 1:],
             factor=self._stiff * self._schedule(self._leg_loads),
             ahead=lambda still, added: answered(matrix, still, added),
+            given=lambda asked: self.given(local, asked),
         )
         self._time += self.dt
         return self.actions(np.einsum("nbij,nbj->nbi", local, torque))
+
+    def given(self, local: np.ndarray, asked: np.ndarray) -> np.ndarray:
+        """What muscles give of the torques ``(n, 21, 3)`` that bones, turned by ``local`` from parents, ask for [N m].
+
+        Their limits are along the parents' axes, and seldom the same in both directions: a neck has nearly twice as
+        much one way as the other.
+        """
+        along = np.clip(np.einsum("nbij,nbj->nbi", local, asked), self.lower[1:], self.upper[1:])
+        return np.einsum("nbij,nbi->nbj", local, along)
 
     def actions(self, torque: np.ndarray) -> np.ndarray:
         """Shares of the greatest torques that give ``torque`` ``(n, 21, 3)``, in the parents' axes [N m]."""

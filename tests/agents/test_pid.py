@@ -93,6 +93,14 @@ def test_an_integral_that_is_of_no_effect_gives_way():
     for _ in range(5000):
         assert held.step(np.array([[1.0]]), np.zeros((1, 1)))[0, 0] == limit
     assert kp + held.integral[0, 0] - limit == pytest.approx(np.sqrt(kd / ki) * ki, rel=0.02)
+    # and where a motor gives less in one direction, at what it gives
+    weak = PID(Gains(10.0, kd, ki, limit), 2e-3, (1, 1))
+    for sign, most in ((1.0, 4.0), (-1.0, limit)):
+        for _ in range(5000):
+            torque = weak.step(np.array([[sign]]), np.zeros((1, 1)), given=lambda asked: np.minimum(asked, 4.0))
+        assert torque[0, 0] == sign * most
+        left = 10.0 + sign * weak.integral[0, 0] - most
+        assert left == pytest.approx(np.sqrt(kd / ki) * ki, rel=0.02)
 
 
 def test_output_limits_hold_for_every_axis():

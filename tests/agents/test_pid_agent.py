@@ -150,6 +150,29 @@ def test_bodies_know_nothing_of_each_other_and_rounds_begin_anew(standing):
     np.testing.assert_array_equal(many(seen[0]), first)
 
 
+def test_it_knows_what_muscles_give_of_what_it_asks_for(standing):
+    """In any posture, also in the weak direction of joints whose muscles are not the same in both."""
+    agent, rng = PIDAgent(standing), np.random.default_rng(0)
+    agent.begin(2)
+    local = Rotation.random(2 * (NUM_JOINTS - 1), random_state=1).as_matrix().reshape(2, NUM_JOINTS - 1, 3, 3)
+    asked = rng.uniform(-400.0, 400.0, (2, NUM_JOINTS - 1, 3))
+    given = np.einsum("nbij,nbj->nbi", local, agent.given(local, asked))
+    shares = agent.actions(np.einsum("nbij,nbj->nbi", local, asked)).reshape(2, -1, 3)
+    lower, upper = agent.lower[agent.acting], agent.upper[agent.acting]
+    np.testing.assert_allclose(
+        given[:, [joint - 1 for joint in agent.acting]], shares * np.where(shares > 0, upper, -lower)
+    )
+    neck = JOINT_NAMES.index("neck")
+    assert -agent.lower[neck, 0] > 1.5 * agent.upper[neck, 0], "else nothing is tested"
+    held, error = agent.pid.pid, np.zeros((2, NUM_JOINTS - 1, 3))
+    error[:, neck - 1, 0] = 0.3
+    straight = np.broadcast_to(np.eye(3), local.shape)
+    for _ in range(3000):  # a neck that something holds back: the integral does not grow beyond what there is
+        torque = held.step(error, np.zeros_like(error), given=lambda asked: agent.given(straight, asked))
+    assert torque[0, neck - 1, 0] == pytest.approx(agent.upper[neck, 0])
+    assert held.integral[0, neck - 1, 0] < 0.5 * agent.upper[neck, 0]
+
+
 def test_only_joints_above_the_legs_have_an_integral(standing):
     agent = PIDAgent(standing)
     agent.begin(1)

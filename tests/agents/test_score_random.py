@@ -11,7 +11,7 @@ pytest.importorskip("torch", reason="needs the extra train")
 
 from agents import score_pid, score_random, scores
 from agents.batches import in_every_seat, play
-from agents.evaluate import random_agent
+from agents.evaluate import over_seeds, random_agent
 from agents.seeds import first_seed
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.envs.config import load_config
@@ -38,12 +38,12 @@ def test_every_seed_is_a_stream_of_its_own_in_the_same_episodes(run, device, tmp
     task = load_task("Stand-v0")
     batch = BatchedEpisodes(task(load_config(task.Config, env)), 2, device)
     agents = [random_agent(batch.action_size, first_seed(seed)) for seed in range(3)]
-    means = [play("random", in_every_seat(agent), batch, 1_000_000).returns.mean() for agent in agents]
+    rows = [play("random", in_every_seat(agent), batch, 1_000_000).row() for agent in agents]
     batch.close()
+    means = [seed["return_mean"] for seed in rows]
     assert np.ptp(means) > 0.0
     assert row["return_mean"] == pytest.approx(np.mean(means))
-    half = 4.303 * np.std(means, ddof=1) / np.sqrt(3.0)  # Student's t of two degrees of freedom
-    assert row["return_interval"] == pytest.approx([np.mean(means) - half, np.mean(means) + half], rel=1e-3)
+    assert row["return_interval"] == pytest.approx(over_seeds(rows)["return_interval"])
     pid = json.loads((run / "results.json").read_text())
     table = {found["agent"]: found["seeds"] for found in scores.scores({"pid": pid, "random": report})}
     assert table == {"random": 3, "zero": None, "PID": None}
