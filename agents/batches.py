@@ -14,12 +14,12 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import tyro
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field, field_validator
 from tqdm import tqdm
 
 from agents import seeds
 from agents.checkpoint import Checkpoint
-from agents.command import read_options
+from agents.command import meant_for, read_options
 from agents.config import EvaluationSettings, load_resolved
 from agents.curve import Curve
 from agents.evaluate import Agent, Episode, Evaluation, baselines, begin_round
@@ -35,7 +35,9 @@ from piavatar_envs.envs.config import (
     load_config,
     parse_assignments,
 )
+from piavatar_envs.envs.simulation import check_device
 from piavatar_envs.mpm.types import failure_name
+from piavatar_envs.tasks import listed_name
 from piavatar_envs.tasks.base import Task
 
 #: Metrics of tasks that evaluations sum up.
@@ -61,6 +63,8 @@ class BatchTraining(BaseModel):
     seed: int = Field(0, ge=0, lt=seeds.MOST_RUNS, description="of the networks, the actions and the training episodes")
     checkpoint_every: int = Field(10, ge=1, description="iterations between two checkpoints")
     evaluation: EvaluationSettings = Field(default_factory=EvaluationSettings, description="how agents are compared")
+
+    _list_env_id = field_validator("env_id")(listed_name)
 
     @property
     def first_seed(self) -> int:
@@ -214,6 +218,10 @@ def run(
     quiet_warp()
     try:
         config = load_batched(cls, find_task, options.config, parse_assignments(options.settings))
+        check_device(options.device)
+    except ValueError as error:
+        sys.exit(f"error: {error}{meant_for(options.config, name)}")
+    try:
         task = new_task(config, find_task)
         folder = options.out or Path("runs") / options.config.stem
         folder.mkdir(parents=True, exist_ok=True)

@@ -2,13 +2,47 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import tyro
+import yaml
+from pydantic import BaseModel
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
+
+from piavatar_envs.envs.config import ConfigError, load_config
 
 Options = TypeVar("Options")
+
+#: Which script a configuration is for: by the folder that it is in, and by settings that together no other one's has.
+_FOLDERS = {"rsl_rl": "rsl_ppo", "sb3": "train", "skrl": "skrl_mappo"}
+_SETTINGS = {"rsl_ppo": {"iterations", "ppo"}, "train": {"total_steps"}, "skrl_mappo": {"mappo"}}
+
+_registry = ConstructorRegistry()
+
+
+@_registry.struct_rule
+def _models(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """Pydantic models; what they refuse is said in one line, where tyro would show pydantic's own words."""
+    if not (isinstance(info.type, type) and issubclass(info.type, BaseModel)):
+        return None
+    default = info.default if isinstance(info.default, info.type) else info.type()
+
+    def instantiate(**settings: Any) -> BaseModel:
+        try:
+            return load_config(info.type, settings)
+        except ConfigError as error:
+            sys.exit(f"error: {error}")
+
+    instantiate.__doc__ = info.type.__doc__
+    fields = [
+        StructFieldSpec(name, field.annotation, getattr(default, name), field.description)
+        for name, field in info.type.model_fields.items()
+    ]
+    return StructConstructorSpec(instantiate, tuple(fields))
 
 
 def read_options(cls: type[Options], script: str, args: Sequence[str] | None = None) -> Options:
@@ -20,8 +54,26 @@ def read_options(cls: type[Options], script: str, args: Sequence[str] | None = N
         args: command line, by default the process's own.
     """
     program = f"python -m agents.{script}"
-    options, unread = tyro.cli(cls, prog=program, args=args, return_unknown_args=True)
-    if any(word.startswith("-") for word in unread):
-        return tyro.cli(cls, prog=program, args=args)  # says which options there are not, and exits
+    with _registry:
+        options, unread = tyro.cli(cls, prog=program, args=args, return_unknown_args=True)
+        if any(word.startswith("-") for word in unread):
+            return tyro.cli(cls, prog=program, args=args)  # says which options there are not, and exits
     # tyro takes settings that stand together, and hands back those beyond an option
     return replace(options, settings=(*options.settings, *unread))
+
+
+def meant_for(path: Path, script: str) -> str:
+    """What to add to the error about a configuration: where it plainly is another script's, which one's.
+
+    Args:
+        path: of the file.
+        script: that has refused it, without ``agents.``.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        return ""  # the error says so
+    names = {str(key).partition(".")[0] for key in content} if isinstance(content, dict) else set()
+    others = [other for other, telling in _SETTINGS.items() if telling <= names]
+    other = _FOLDERS.get(path.resolve().parent.name, others[0] if len(others) == 1 else script)
+    return "" if other == script else f" (this is a file for python -m agents.{other})"

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from agents.ppo import PPOSettings
 from agents.sac import SACSettings
@@ -17,7 +17,7 @@ from agents.seeds import FIRST_TRAINED, MOST_RUNS
 from agents.selfplay import SelfPlaySettings
 from piavatar_envs.envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
 from piavatar_envs.multi import multi_modules
-from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks import instead_of, listed_name, load_task
 
 Resolved = TypeVar("Resolved", bound=BaseModel)
 _MULTI_ID = re.compile(r"\w+_v\d+")
@@ -74,6 +74,8 @@ class TrainingConfig(BaseModel):
     )
     evaluation: EvaluationSettings = Field(default_factory=EvaluationSettings, description="how agents are compared")
 
+    _list_env_id = field_validator("env_id")(listed_name)
+
     @property
     def is_multi(self) -> bool:
         """Whether the environment is a world of several agents."""
@@ -88,7 +90,7 @@ def multi_module(env_id: str) -> ModuleType:
     """
     modules = {name.rpartition(".")[2]: name for name in multi_modules()}
     if env_id not in modules:
-        raise ValueError(f"unknown world {env_id!r}; there are {', '.join(modules)}")
+        raise ValueError(f"unknown world {env_id!r}; {instead_of(env_id, modules)}")
     try:
         return importlib.import_module(modules[env_id])
     except ImportError as error:

@@ -28,6 +28,7 @@ from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.render.video import check_suffix
 from piavatar_envs.tasks import load_task
 
 
@@ -57,8 +58,10 @@ def open_run(folder: Path, device: str = "cpu") -> Run:
         device: torch's, where a policy of rsl_rl computes.
 
     Raises:
-        ConfigError: the folder holds no such run, or the files do not fit each other.
+        ConfigError: there is no such folder, it holds no such run, or the files do not fit each other.
     """
+    if not folder.is_dir():
+        raise ConfigError(f"no folder {folder}; give the one that a training has left, as in runs/")
     settings, kinds = folder / "config.yaml", {"policy.pt": _open_rsl, "policy.zip": _open_sb3}
     found = [name for name in kinds if (folder / name).is_file()]
     if not settings.is_file() or not found:
@@ -179,6 +182,8 @@ def main(args: list[str] | None = None) -> None:
         if options.live and (options.out or options.film or options.episodes is not None):
             raise ConfigError("--live plays until Ctrl-C and evaluates nothing; leave out --out, --film and --episodes")
         check_every(options.film_every)
+        if options.film:
+            check_suffix(options.film)
         run = open_run(options.run, options.device)
         task_class = load_task(run.env_id)
         settings = {name.removeprefix("env."): value for name, value in parse_assignments(options.settings).items()}

@@ -22,7 +22,8 @@ from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.config import ConfigError, dump_yaml, load_config, parse_assignments
-from piavatar_envs.tasks import load_task
+from piavatar_envs.render.video import check_suffix
+from piavatar_envs.tasks import listed_name, load_task
 
 
 @dataclass(frozen=True)
@@ -52,25 +53,28 @@ def main(args: list[str] | None = None) -> None:
     options = read_options(Options, "score_pid", args)
     quiet_warp()
     episodes, first = options.evaluation.episodes, options.evaluation.first_seed
+    env_id = listed_name(options.env_id)
     try:
         check_every(options.film_every)
-        task_class = load_task(options.env_id)
+        if options.film:
+            check_suffix(options.film)
+        task_class = load_task(env_id)
         config = load_config(task_class.Config, {"control": "torque"}, parse_assignments(options.settings))
         batch = BatchedEpisodes(task_class(config), episodes, options.device)
-        agent = make_pid_agent(options.env_id, config.model_dump(mode="json"), options.design)
+        agent = make_pid_agent(env_id, config.model_dump(mode="json"), options.design)
     except (ConfigError, ValueError) as error:
         sys.exit(f"error: {error}")
     results = play_beside_baselines("PID", in_every_seat(agent), batch, first)
     batch.close()
-    name = options.env_id.rpartition("/")[2].removesuffix("-v0")
+    name = env_id.rpartition("/")[2].removesuffix("-v0")
     folder = options.out or Path("runs") / f"pid_{name}"
     folder.mkdir(parents=True, exist_ok=True)
-    settings = {"env_id": options.env_id, "env": config.model_dump(mode="json"), "design": asdict(options.design)}
+    settings = {"env_id": env_id, "env": config.model_dump(mode="json"), "design": asdict(options.design)}
     (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
     about = versions("score_pid", options.device) | {"seed": 0, "config": settings}
     conclude(folder, about, results, {}, "config.yaml, results.json")
     if options.film:
-        make = EnvFactory(options.env_id, config.model_dump(mode="json"), options.device)
+        make = EnvFactory(env_id, config.model_dump(mode="json"), options.device)
         film(options.film, make, {"PID": agent}, [first], 1.0 / config.physics.control_dt, options.film_every)
         print(f"wrote {options.film}")
 

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents import matches, selfplay
 from agents.checkpoint import Checkpoint
-from agents.command import read_options
+from agents.command import meant_for, read_options
 from agents.config import TrainingConfig, load_training
 from agents.curve import Curve
 from agents.evaluate import Evaluation, baselines, evaluate, policy_agent
@@ -27,7 +27,9 @@ from agents.learning import begin, learn
 from agents.parallel import AgentVecEnv
 from agents.report import conclude, draw_curve, versions
 from agents.workers import EnvFacts, components, factory, prepare, start_vector, start_workers
+from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.config import ConfigError, dump_yaml, parse_assignments
+from piavatar_envs.envs.simulation import check_device
 
 Results = Sequence[Evaluation] | Sequence[matches.Match]
 
@@ -111,8 +113,13 @@ class Options:
 def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = read_options(Options, "train", args)
+    quiet_warp()
     try:
         config = load_training(options.config, parse_assignments(options.settings))
+        check_device(options.device)
+    except ValueError as error:
+        sys.exit(f"error: {error}{meant_for(options.config, 'train')}")
+    try:
         folder = options.out or Path("runs") / options.config.stem
         folder.mkdir(parents=True, exist_ok=True)
         checkpoint = Checkpoint(folder, "train", config, options.device, options.resume)

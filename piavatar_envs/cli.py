@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from piavatar_envs.tasks import NAMESPACE, how_to_name
+from piavatar_envs.tasks import NAMESPACE, instead_of, listed_name
 
 EnvId = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ID", help="an id or a module: see list")]
 AgentName = Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the actions come from")]
@@ -124,20 +124,17 @@ def prepare(env_id: str, config: tuple[str, ...]) -> dict[str, Any]:
 
 
 def check_id(env_id: str) -> None:
-    """Refuse what is not in the list. Of a task of somebody's own, ``module:id``, the module is imported first.
+    """Refuse what is not in the list, in either spelling; of a task of one's own, ``module:id``, import the module.
 
     Raises:
         ImportError: there is no such module.
         ValueError: there is no such environment.
     """
-    module, _, own_id = env_id.rpartition(":")
+    module, _, own_id = listed_name(env_id).rpartition(":")
     if module:
         importlib.import_module(module)
     if own_id not in registered_ids():
-        raise ValueError(
-            f"no environment {env_id!r}; there are {', '.join(registered_ids()) or 'none'}; "
-            f"{how_to_name('Mine/HandsUp-v0')}"
-        )
+        raise ValueError(f"no environment {env_id!r}; {instead_of(env_id, registered_ids())}")
 
 
 def registered_ids() -> list[str]:

@@ -15,7 +15,8 @@ from tqdm import tqdm
 
 import piavatar_envs  # noqa: F401 - registers the ids
 from piavatar_envs.multi import multi_modules
-from piavatar_envs.render.video import SUFFIXES, write_video
+from piavatar_envs.render.video import check_suffix, write_video
+from piavatar_envs.tasks import instead_of, listed_name, task_modules
 
 if TYPE_CHECKING:
     from piavatar_envs.api.pettingzoo import AvatarParallelEnv
@@ -51,7 +52,7 @@ def play(
     """Play ``env_id`` for some steps, beginning a new episode whenever one ends; without ``steps``, one episode.
 
     Args:
-        env_id: a registered id, or the name of a module of several agents such as ``sumo_v0``.
+        env_id: a registered id, or a module of several agents such as ``sumo_v0``, with or without what it stands in.
         agent: "random" (uniform in the action space) or "zero".
         video: the .mp4 or .gif to write, or None.
         steps: number of steps.
@@ -61,13 +62,14 @@ def play(
         overrides: settings of the environment's configuration.
 
     Raises:
-        ValueError: an unknown module, agent or suffix, a number of steps below 1, a setting out of range.
+        ValueError: an unknown module, agent or suffix, a seed below 0, a number of steps below 1, a setting out of
+            range.
     """
-    check_agent(agent)
+    check_agent(agent, seed)
     if steps is not None and steps < 1:
         raise ValueError(f"steps={steps} must be >= 1")
-    if video is not None and video.suffix not in SUFFIXES:  # before the kernels are compiled, not after the rollout
-        raise ValueError(f"video {video} ends in {video.suffix!r}; use {' or '.join(SUFFIXES)}")
+    if video is not None:
+        check_suffix(video)  # before the kernels are compiled, not after the rollout
     settings = settings_of(device, overrides)
     if video is not None:
         settings = {"render_mode": "rgb_array", "color": color, **settings}
@@ -84,14 +86,16 @@ def play(
     return rollout
 
 
-def check_agent(agent: str) -> None:
-    """Refuse what is no agent of this file.
+def check_agent(agent: str, seed: int) -> None:
+    """Refuse what is no agent of this file, and what seeds none.
 
     Raises:
-        ValueError: it is neither random nor zero.
+        ValueError: it is neither random nor zero, or the seed is below 0.
     """
     if agent not in ("random", "zero"):
         raise ValueError(f"no agent {agent!r}; there are random and zero")
+    if seed < 0:
+        raise ValueError(f"seed={seed} must be >= 0")
 
 
 def settings_of(device: str, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -112,7 +116,8 @@ def make(env_id: str, settings: Mapping[str, Any]) -> gymnasium.Env | Together:
         ImportError: an extra is not installed.
         ValueError: an unknown module, a setting out of range.
     """
-    return gymnasium.make(env_id, **settings) if "/" in env_id else Together(env_id, settings)
+    name = listed_name(env_id)
+    return gymnasium.make(name, **settings) if "/" in name else Together(name, settings)
 
 
 class Together:
@@ -127,7 +132,7 @@ class Together:
         """
         modules = {path.rpartition(".")[2]: path for path in multi_modules()}
         if name not in modules:
-            raise ValueError(f"unknown module {name!r}; there are {', '.join(modules)}")
+            raise ValueError(f"unknown module {name!r}; {instead_of(name, [*modules, *task_modules()])}")
         self.env = importlib.import_module(modules[name]).parallel_env(**settings)
         self.name, self.metadata, self.render_mode = name, self.env.metadata, self.env.render_mode
         first = self.env.action_space(self.env.possible_agents[0])

@@ -31,7 +31,7 @@ def watch(
     """Play ``env_id`` in a web browser until Ctrl-C.
 
     Args:
-        env_id: a registered id, or the name of a module of several agents such as ``sumo_v0``.
+        env_id: a registered id, or a module of several agents such as ``sumo_v0``, with or without what it stands in.
         agent: "random" (uniform in the action space) or "zero".
         seed: of the first reset and of the random actions; later episodes go on from it.
         device: a Warp device.
@@ -40,9 +40,9 @@ def watch(
 
     Raises:
         ImportError: the extra ``live`` is not installed.
-        ValueError: an unknown module or agent, a port or a setting out of range.
+        ValueError: an unknown module or agent, a seed, a port or a setting out of range.
     """
-    check_agent(agent)
+    check_agent(agent, seed)
     settings = settings_of(device, overrides)
     import_viser()  # before the kernels are compiled, not after
     with suppress(KeyboardInterrupt):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from piavatar_envs import cli, doctor, play
+from piavatar_envs.tasks import listed_name
 
 PROBE = "PIAvatar/HouseProbe-v0"
 
@@ -139,7 +140,11 @@ def test_video_has_a_frame_for_each_state(probe, tmp_path, suffix):
     [
         (["play", "PIAvatar/Nothing-v9"], "no environment 'PIAvatar/Nothing-v9'; there are "),
         (["play", PROBE, "--video", "clip.avi"], "video clip.avi ends in '.avi'; use .mp4 or .gif"),
+        (["play", "PIAvatar/Raech-v0"], "no environment 'PIAvatar/Raech-v0'; did you mean PIAvatar/Reach-v0?\n"),
+        (["play", "piavatar_envs.multi.sumo_v9"], "; did you mean sumo_v0?\n"),
+        (["play", "Mine/Walk-v0"], "such as my_tasks:Mine/Walk-v0; did you mean PIAvatar/Walk-v0?\n"),
         (["play", PROBE, "--steps", "0"], "steps=0 must be >= 1"),
+        (["play", PROBE, "--seed", "-1"], "error: seed=-1 must be >= 0\n"),
         (["play", PROBE, "--config", "tone"], "'tone' is not an override"),
     ],
 )
@@ -148,6 +153,23 @@ def test_mistakes_end_in_one_line(probe, capsys, args, told):
         cli.main(args)
     error = capsys.readouterr().err
     assert stop.value.code == 2 and told in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize(
+    ("spelling", "listed"),
+    [
+        ("HouseProbe-v0", "HouseProbe-v0"),  # not of this package
+        ("Reach-v0", "PIAvatar/Reach-v0"),
+        ("PIAvatar/PushBox-v0", "PIAvatar/PushBox-v0"),
+        ("piavatar_envs.multi.sumo_v0", "sumo_v0"),
+        ("sumo_v0", "sumo_v0"),
+        ("mine:Mine/Reach-v0", "mine:Mine/Reach-v0"),
+    ],
+)
+def test_names_are_also_known_without_what_they_stand_in(spelling, listed):
+    assert listed_name(spelling) == listed
+    if "Probe" not in spelling and ":" not in spelling:
+        cli.check_id(spelling)
 
 
 def test_play_prints_the_return(probe, capsys):
@@ -171,9 +193,14 @@ def test_real_video_is_coloured_by_strain(device, tmp_path):
     assert frames.shape == (3, 96, 96, 3) and frames.std() > 5.0
 
 
-def test_modules_of_several_agents_are_played_too(tmp_path):
-    rollout = play.play("sumo_v0", agent="zero", steps=3, overrides={"fidelity": "tiny"})
+@pytest.mark.parametrize("name", ["sumo_v0", "piavatar_envs.multi.sumo_v0"])
+def test_modules_of_several_agents_are_played_too(name):
+    rollout = play.play(name, agent="zero", steps=3, overrides={"fidelity": "tiny"})
     assert rollout.steps == 3 and len(rollout.returns) == 1 and not rollout.failures
     assert {"agent_0.success", "agent_1.reward_terms.control"} <= set(rollout.metrics)
     with pytest.raises(ValueError, match=r"unknown module 'sumo_v9'.*sumo_v0"):
         play.play("sumo_v9", steps=1)
+
+
+def test_a_task_is_played_without_its_namespace(device):
+    assert play.play("Reach-v0", steps=1, device=device, overrides={"fidelity": "tiny"}).steps == 1

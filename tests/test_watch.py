@@ -130,6 +130,8 @@ def test_worlds_of_several_agents_are_watched_too(open_show):
     ("args", "told"),
     [
         (["watch", "PIAvatar/Nothing-v9"], "no environment 'PIAvatar/Nothing-v9'; there are "),
+        (["watch", "PIAvatar/Reach-v0", "--seed", "-1"], "error: seed=-1 must be >= 0\n"),
+        (["watch", "Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 is outside [1, 64536]"),
         (["watch", "PIAvatar/Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 is outside [1, 64536]"),
         (["watch", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is no setting here; use play --video"),
         (["play", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is no setting here; use play --video"),

@@ -9,6 +9,17 @@ import numpy as np
 
 SUFFIXES = (".mp4", ".gif")
 _GIF_COLORS, _GIF_SAMPLES = 128, 12
+_GIF_FASTEST = 50.0  # frames per second; viewers slow down what is quicker
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse a file that is no video by its name, before there is anything to film.
+
+    Raises:
+        ValueError: an unknown suffix.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"video {path} ends in {path.suffix!r}; use {' or '.join(SUFFIXES)}")
 
 
 def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> Path:
@@ -20,7 +31,8 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> P
     Args:
         path: the file; its suffix, ``.mp4`` or ``.gif``, says how. Missing folders are made.
         frames: pictures of one size, shape ``(H, W, 3)`` uint8.
-        fps: frames per second; a GIF rounds the time of a frame to whole hundredths of a second.
+        fps: frames per second, in a GIF 50 at most. A GIF counts hundredths of a second: its frames take turns to be
+            longer and shorter, so that each begins within 10 ms of its time.
 
     Returns:
         The path.
@@ -31,8 +43,7 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> P
             picture or differs in size.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"cannot write {path.name!r}: the suffix {path.suffix!r} is not one of {', '.join(SUFFIXES)}")
+    check_suffix(path)
     if not fps > 0.0:
         raise ValueError(f"fps={fps} must be positive")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,9 +103,15 @@ def _write_gif(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
         strip = Image.fromarray(np.concatenate([np.asarray(image)[::2, ::2] for image in chosen]))
         palette = strip.quantize(_GIF_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
         images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-        duration = 10 * max(2, round(100.0 / fps))  # [ms]; viewers slow down what is quicker than 20 ms
-        images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=False)
+        durations = _gif_durations(len(images), fps)
+        images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=False)
     return len(images)
+
+
+def _gif_durations(count: int, fps: float) -> list[int]:
+    """How long each frame is shown [ms], in whole hundredths of a second that do not drift from ``fps``."""
+    begins = np.rint(np.arange(count + 1) * 100.0 / min(fps, _GIF_FASTEST))
+    return (10 * np.diff(begins)).astype(int).tolist()
 
 
 def _checked(frame: np.ndarray, shape: tuple[int, ...] | None, count: int) -> np.ndarray:

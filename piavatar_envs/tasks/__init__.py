@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import pkgutil
 import re
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -36,6 +38,8 @@ _NOT_TASKS = {
     "upright",
 }
 NAMESPACE = "PIAvatar"
+#: What the module of a world of several agents may be named with.
+_MULTI = "piavatar_envs.multi."
 
 
 def task_modules() -> dict[str, str]:
@@ -76,6 +80,15 @@ def place_of(env_id: str, task: type[Task] | str) -> str:
     return f"{task.__module__}:{task.__name__}" if importable else env_id
 
 
+def listed_name(name: str) -> str:
+    """An environment's name as ``piavatar_envs list`` has it: ``Reach-v0`` gets its namespace, a module loses its.
+
+    Any other name is given back as it is.
+    """
+    full = f"{NAMESPACE}/{name}"
+    return full if full in task_modules() else name.removeprefix(_MULTI)
+
+
 def load_task(task: str | type[Task]) -> type[Task]:
     """The class of a task.
 
@@ -101,14 +114,34 @@ def load_task(task: str | type[Task]) -> type[Task]:
     if full in modules:
         return importlib.import_module(f"{__name__}.{modules[full]}").TASK
     if full not in _added:
-        known = f"unknown task {task!r}; there are {', '.join([*modules, *_added])}"
-        raise ValueError(known if module or full.startswith(f"{NAMESPACE}/") else f"{known}; {how_to_name(full)}")
+        raise ValueError(f"unknown task {task!r}; {instead_of(task, [*modules, *_added])}")
     return load_task(_added[full])
 
 
 def how_to_name(env_id: str) -> str:
     """What to say to whoever names a task of their own, such as ``env_id``, that nobody has registered."""
     return f"a task of your own is named with the module that registers it, such as my_tasks:{env_id}"
+
+
+def instead_of(name: str, known: Iterable[str]) -> str:
+    """What to say to whoever asks for an environment that there is not: which one is close to it, or all there are.
+
+    Args:
+        name: what was asked for; with a namespace that is not this package's, it may be a task of one's own.
+        known: what there is.
+    """
+    own = "/" in name and ":" not in name and not name.startswith(f"{NAMESPACE}/")
+    how = [how_to_name(name)] if own else []
+    by_stem = {_stem(one): one for one in known}
+    close = difflib.get_close_matches(_stem(name), by_stem, n=1, cutoff=0.65)
+    if close:
+        return "; ".join([*how, f"did you mean {by_stem[close[0]]}?"])
+    return "; ".join([f"there are {', '.join(by_stem.values()) or 'none'}", *how])
+
+
+def _stem(name: str) -> str:
+    """A name without what all names have: ``PIAvatar/PushBox-v0`` and ``push_box_v0`` are both ``pushbox``."""
+    return re.sub(r"[-_]v\d+$", "", re.split(r"[/:.]", name)[-1]).replace("_", "").lower()
 
 
 def _is_task(task: object) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from agents.batches import BatchTraining, in_every_seat, load_batched, play
+from agents.batches import BatchTraining, in_every_seat, load_batched, play, run
 from agents.evaluate import Episode, zero_agent
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.envs.config import ConfigError, load_config
@@ -80,6 +80,18 @@ def test_the_command_line_wins_over_the_file(tmp_path):
     config = load_batched(Training, load_task, path, {"env.tone": 0.25, "iterations": 3})
     assert config.iterations == 3 and config.env["drive"]["tone"] == 0.25
     assert config.env["physics"]["density"] == 1000.0, "defaults are said, too"
+
+
+def test_a_device_that_is_not_there_is_refused_before_anything_is_written(tmp_path):
+    (tmp_path / "run.yaml").write_text("env_id: Reach-v0\n")
+    line = [str(tmp_path / "run.yaml"), "--device", "cuda:99", "--out", str(tmp_path / "run")]
+    with pytest.raises(SystemExit, match=r"^error: device='cuda:99' is not available .*; use one of cpu"):
+        run("rsl_ppo", Training, load_task, pytest.fail, line)
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_environment_is_known_without_its_namespace():
+    assert load_batched(Training, load_task, {"env_id": "Stand-v0"}).env_id == "PIAvatar/Stand-v0"
 
 
 def test_falls_and_pushes_are_told(device):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from agents import batches, demo, play, score_pid, train
-from agents.command import read_options
+from agents.command import meant_for, read_options
 
 #: Scripts that take settings, and what they want first.
 SCRIPTS = {play: ["run"], train: ["run.yaml"], batches: ["run.yaml"], score_pid: ["PIAvatar/Stand-v0"], demo: []}
@@ -42,6 +42,33 @@ def test_options_that_there_are_not_are_refused(script, first, line, capsys):
         read_options(script.Options, "x", [*first, *line])
     said = capsys.readouterr()
     assert ended.value.code == 2 and "Unrecognized options" in said.out + said.err
+
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+#: What scripts call files that are theirs; those that lie in no library's folder are agents.train's.
+OWNERS = {"rsl_rl": "rsl_ppo", "skrl": "skrl_mappo", "sb3": "train", "configs": "train"}
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: path.stem)
+def test_files_of_other_scripts_are_known_wherever_they_lie(path, tmp_path):
+    owner = OWNERS[path.parent.name]
+    copy = tmp_path / "config.yaml"
+    copy.write_bytes(path.read_bytes())
+    for script in ("rsl_ppo", "skrl_mappo", "train"):
+        told = "" if script == owner else f" (this is a file for python -m agents.{owner})"
+        assert meant_for(path, script) == meant_for(copy, script) == told
+
+
+@pytest.mark.parametrize("text", [None, "", "seed: 3", "[1, 2]", "a: [", "\xff"], ids=repr)
+def test_files_that_may_be_anybodys_are_nobodys(text, tmp_path):
+    if text is not None:
+        (tmp_path / "config.yaml").write_text(text, encoding="latin-1")
+    assert meant_for(tmp_path / "config.yaml", "train") == ""
+
+
+def test_a_file_of_another_script_is_refused_with_that_ones_name():
+    with pytest.raises(SystemExit, match=r"no setting of TrainingConfig.* \(this is a file for .* agents\.rsl_ppo\)$"):
+        train.main([str(CONFIGS / "rsl_rl" / "stand_rsl.yaml")])
 
 
 def test_what_is_no_setting_is_refused(tmp_path):

@@ -45,6 +45,14 @@ def test_errors_are_one_line_with_key_value_and_limit(settings, words):
     assert all(word in message for word in words), message
 
 
+@pytest.mark.parametrize(
+    ("spelling", "listed"), [("Reach-v0", "PIAvatar/Reach-v0"), ("piavatar_envs.multi.sumo_v0", "sumo_v0")]
+)
+def test_environments_are_known_without_what_they_stand_in(spelling, listed):
+    config = load_training({"env_id": spelling, "env": {"fidelity": "tiny"}})
+    assert config.env_id == listed and config.is_multi == (listed == "sumo_v0")
+
+
 def test_environment_settings_of_the_command_line_win_over_the_file():
     config = load_training({"env": {"fidelity": "tiny", "tone": 0.5}}, {"env.tone": 0.25, "seed": 3})
     assert env_config(config).drive.tone == 0.25

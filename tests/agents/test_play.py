@@ -105,6 +105,8 @@ def test_folders_without_a_run_are_refused(device, tmp_path, capsys):
         open_run(tmp_path)
     with pytest.raises(SystemExit, match=r"must hold config\.yaml"):
         play.main([str(tmp_path)])
+    with pytest.raises(SystemExit, match=r"^error: no folder .*nowhere; give the one that a training has left"):
+        play.main([str(tmp_path / "nowhere")])
 
 
 @pytest.mark.parametrize(
@@ -113,6 +115,7 @@ def test_folders_without_a_run_are_refused(device, tmp_path, capsys):
         (("--episodes", "1"), r"episodes=1 must be >= 2: .*a film alone needs no --episodes"),
         (("--episodes", "0"), r"episodes=0 must be >= 2"),
         (("--film-every", "0"), r"film_every=0 must be >= 1"),
+        (("--film", "x.avi"), r"video x\.avi ends in '\.avi'; use \.mp4 or \.gif"),
         (("joints=[tail]",), r"'tail' is not a joint"),
     ],
 )

@@ -45,3 +45,18 @@ def test_bodies_that_no_torques_move_are_refused():
         score_pid.main([*SHORT, "drive.control=pose"])
     with pytest.raises(SystemExit, match=r"error: .*Fly-v0"):
         score_pid.main(["PIAvatar/Fly-v0"])
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--evaluation.episodes", "1"), "error: episodes=1 must be >= 2"),
+        (("--film", "x.avi"), "error: video x.avi ends in '.avi'; use .mp4 or .gif"),
+        (("--device", "cuda:99"), "error: device='cuda:99' is not available"),
+    ],
+)
+def test_mistakes_end_in_one_line_and_leave_nothing(options, told, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        score_pid.main([*SHORT, *options, "--out", str(tmp_path / "out")])
+    assert str(stop.value).startswith(told) and "\n" not in str(stop.value)
+    assert "Value error" not in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -49,6 +49,12 @@ def test_the_saved_policy_is_the_trained_one_and_needs_no_wrapper(tiny, workers,
     env.close()
 
 
+def test_a_device_that_is_not_there_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(SystemExit, match=r"^error: device='cuda:99' is not available .*; use one of cpu"):
+        train.main(["configs/reach_ppo.yaml", "--device", "cuda:99", "--out", str(tmp_path / "run")])
+    assert not (tmp_path / "run").exists()
+
+
 def test_training_repeats_and_depends_on_its_seed(tiny, workers, facts, tmp_path):
     weights = []
     for seed in (0, 0, 1):

@@ -10,6 +10,7 @@ import pytest
 from piavatar_envs.render import label, side_by_side, write_video
 
 pytest.importorskip("imageio_ffmpeg", reason="needs the extra render")
+Image = pytest.importorskip("PIL.Image", reason="needs the extra render")
 
 
 def moving_square(count: int, height: int = 64, width: int = 96):
@@ -51,6 +52,20 @@ def test_mp4_frames_are_not_hoarded(tmp_path):
     assert len(alive) == 30 and most <= 4
 
 
+@pytest.mark.parametrize("fps", [10.0, 24.0, 30.0, 47.3, 50.0])
+def test_a_gif_keeps_time(tmp_path, fps):
+    path = write_video(tmp_path / "clip.gif", moving_square(31), fps)
+    with Image.open(path) as gif:
+        ends = np.cumsum([gif.seek(index) or gif.info["duration"] for index in range(gif.n_frames)])
+    assert len(ends) == 31
+    np.testing.assert_allclose(ends, 1000.0 / fps * np.arange(1, 32), atol=10.0)
+
+
+def test_no_frame_of_a_gif_is_quicker_than_viewers_take(tmp_path):
+    with Image.open(write_video(tmp_path / "clip.gif", moving_square(9), fps=60)) as gif:
+        assert {gif.seek(index) or gif.info["duration"] for index in range(gif.n_frames)} == {20}
+
+
 def test_a_still_gif_is_small(tmp_path):
     still = [next(moving_square(1, 240, 240))] * 40
     assert write_video(tmp_path / "still.gif", still, fps=20).stat().st_size < 20_000
@@ -59,7 +74,7 @@ def test_a_still_gif_is_small(tmp_path):
 @pytest.mark.parametrize(
     ("name", "frames", "fps", "message"),
     [
-        ("clip.avi", moving_square(1), 30, r"'\.avi' is not one of \.mp4, \.gif"),
+        ("clip.avi", moving_square(1), 30, r"clip\.avi ends in '\.avi'; use \.mp4 or \.gif"),
         ("clip.mp4", [], 30, "at least one"),
         ("clip.gif", [], 30, "at least one"),
         ("clip.mp4", moving_square(1), 0, "fps=0"),
