@@ -15,14 +15,13 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import tyro
 from pydantic import AfterValidator, BaseModel, Field, field_validator
-from tqdm import tqdm
 
 from agents import seeds
 from agents.checkpoint import Checkpoint
 from agents.command import meant_for, read_options
 from agents.config import EvaluationSettings, load_resolved
 from agents.curve import Curve
-from agents.evaluate import Agent, Episode, Evaluation, baselines, begin_round
+from agents.evaluate import Agent, Episode, Evaluation, baselines, begin_round, episode_bar
 from agents.report import conclude, draw_curve, versions
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
@@ -112,7 +111,8 @@ def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Ev
     success = np.zeros((batch.num_envs, batch.num_agents), bool)
     playing = np.ones(batch.num_envs, bool)
     begin_round(agent, batch.num_envs)
-    with _progress(name, batch.num_envs) as bar:
+    seconds = 0.1 if sys.stderr.isatty() else _LOG_SECONDS
+    with episode_bar(name, batch.num_envs, mininterval=seconds, dynamic_ncols=True) as bar:
         while playing.any():
             acted = batch.alive()
             batch.step(agent(batch.observation()))
@@ -129,15 +129,10 @@ def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Ev
                 episodes[env].book(float(rewards[env].mean()), info, bool(over[env]))
             ended = playing & batch.find_ended()
             playing &= ~ended
+            # all go on at once, and often end at once
             bar.set_postfix(longest=max(episode.steps for episode in episodes), refresh=False)
             bar.update(int(ended.sum()))
     return Evaluation(name, episodes)
-
-
-def _progress(name: str, episodes: int) -> tqdm:
-    """A bar of the episodes that have ended, on stderr; all go on at once, so it also has the steps of the longest."""
-    seconds = 0.1 if sys.stderr.isatty() else _LOG_SECONDS
-    return tqdm(total=episodes, desc=f"evaluate {name}", unit="episode", mininterval=seconds, dynamic_ncols=True)
 
 
 def play_beside_baselines(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> list[Evaluation]:

@@ -207,13 +207,18 @@ def evaluate(
         progress: whether to show a bar.
     """
     played: list[Episode] = []
-    with tqdm(total=episodes, desc=f"evaluate {name}", unit="episode", disable=None if progress else True) as bar:
+    with episode_bar(name, episodes, disable=None if progress else True) as bar:
         for first in range(first_seed, first_seed + episodes, venv.num_envs):
             # where the last round has environments to spare, they play, too, and do not count
             counted = min(venv.num_envs, first_seed + episodes - first)
             played += _play_round(agent, venv, first)[:counted]
             bar.update(counted)
     return Evaluation(name, played)
+
+
+def episode_bar(name: str, episodes: int, **how: Any) -> tqdm:
+    """A bar of an agent's episodes that have ended, on stderr; ``how`` as tqdm has it."""
+    return tqdm(total=episodes, desc=f"evaluate {name}", unit="episode", **how)
 
 
 def _play_round(agent: Agent, venv: VecEnv, first_seed: int) -> list[Episode]:

@@ -15,6 +15,7 @@ from agents.evaluate import Agent, begin_round
 from agents.workers import EnvFactory, start_workers
 from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.render import label, side_by_side, write_video
+from piavatar_envs.render.video import check_suffix
 
 
 def film(
@@ -43,14 +44,17 @@ def film(
         halves.close()
 
 
-def check_every(every: int) -> None:
-    """Refuse a video without pictures, before there is anything to film.
+def check_film(path: Path | None, every: int) -> None:
+    """Refuse a video without pictures, or that is none by its name, before there is anything to film.
 
     Raises:
         ConfigError: ``every`` is less than 1.
+        ValueError: an unknown suffix.
     """
     if every < 1:
         raise ConfigError(f"film_every={every} must be >= 1")
+    if path is not None:
+        check_suffix(path)
 
 
 def _frames(halves: VecEnv, agents: dict[str, Agent], seeds: Sequence[int], every: int) -> Iterator[np.ndarray]:

@@ -21,14 +21,13 @@ from agents.batches import in_every_seat, play
 from agents.command import read_options
 from agents.config import EvaluationSettings, load_training
 from agents.evaluate import Agent, begin_round
-from agents.film import check_every, film
+from agents.film import check_film, film
 from agents.report import show_table, versions, write_results
 from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.envs.observations import ObservationLayout
-from piavatar_envs.render.video import check_suffix
 from piavatar_envs.tasks import load_task
 
 
@@ -181,9 +180,7 @@ def main(args: list[str] | None = None) -> None:
     try:
         if options.live and (options.out or options.film or options.episodes is not None):
             raise ConfigError("--live plays until Ctrl-C and evaluates nothing; leave out --out, --film and --episodes")
-        check_every(options.film_every)
-        if options.film:
-            check_suffix(options.film)
+        check_film(options.film, options.film_every)
         run = open_run(options.run, options.device)
         task_class = load_task(run.env_id)
         settings = {name.removeprefix("env."): value for name, value in parse_assignments(options.settings).items()}

@@ -15,14 +15,13 @@ import tyro
 from agents.batches import in_every_seat, play_beside_baselines
 from agents.command import read_options
 from agents.config import EvaluationSettings
-from agents.film import check_every, film
+from agents.film import check_film, film
 from agents.pid_agent import Design, make_pid_agent
 from agents.report import conclude, versions
 from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.config import ConfigError, dump_yaml, load_config, parse_assignments
-from piavatar_envs.render.video import check_suffix
 from piavatar_envs.tasks import listed_name, load_task
 
 
@@ -55,9 +54,7 @@ def main(args: list[str] | None = None) -> None:
     episodes, first = options.evaluation.episodes, options.evaluation.first_seed
     env_id = listed_name(options.env_id)
     try:
-        check_every(options.film_every)
-        if options.film:
-            check_suffix(options.film)
+        check_film(options.film, options.film_every)
         task_class = load_task(env_id)
         config = load_config(task_class.Config, {"control": "torque"}, parse_assignments(options.settings))
         batch = BatchedEpisodes(task_class(config), episodes, options.device)

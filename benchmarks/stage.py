@@ -114,7 +114,6 @@ class Act:
 class _Backdrop:
     """What a picture asks a task for."""
 
-    config: EnvConfig
     camera_position: tuple[float, float, float]
     camera_target: tuple[float, float, float]
     camera_follows: bool = False
@@ -141,7 +140,7 @@ class Stage:
             scene=act.scene,
         )
         self.simulation = Simulation(config, 1, device, act.domain)
-        self.task = _Backdrop(config, act.view.eye, act.view.target)
+        self.task = _Backdrop(act.view.eye, act.view.target)
         self.dt, self.steps_done = config.physics.control_dt, 0
         self._reset, self._step = Program(self.simulation.device), Program(self.simulation.device)
         everyone = wp.array([True], dtype=wp.bool, device=self.simulation.device)

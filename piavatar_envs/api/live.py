@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
-from piavatar_envs.api.scenery import Progress, Scenery, camera_of
+from piavatar_envs.api.scenery import Progress, Scenery
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.render.live import PORT, import_viser
 
@@ -93,9 +93,11 @@ class Live:
             ValueError: a port that cannot be.
         """
         if self._view is None:
+            from piavatar_envs.render import Camera
             from piavatar_envs.render.live import LiveView
 
-            self._view = LiveView(camera_of(self._batch.task), self._port)
+            task = self._batch.task
+            self._view = LiveView(Camera(task.camera_position, task.camera_target), self._port)
         return self._view
 
     def begin(self) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from piavatar_envs.api.scenery import Progress, Scenery, camera_of
+from piavatar_envs.api.scenery import Progress, Scenery
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import RenderConfig
 
@@ -20,10 +20,10 @@ class Picture:
         Raises:
             ImportError: the extra ``render`` is not installed.
         """
-        from piavatar_envs.render import Renderer
+        from piavatar_envs.render import Camera, Renderer
 
-        self.config = config
-        self.renderer = Renderer(config.width, config.height, camera_of(batch.task))
+        self.config, task = config, batch.task
+        self.renderer = Renderer(config.width, config.height, Camera(task.camera_position, task.camera_target))
         self._scenery = Scenery(batch)
 
     def cut(self) -> None:

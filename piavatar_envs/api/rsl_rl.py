@@ -113,8 +113,8 @@ class AvatarRslEnv(BatchedView, VecEnv):
         Setting it brings the limits nearer, as runners do to spread the ends of the first episodes
         (``init_at_random_ep_len``). The world's own clock, by which clips and gaits go on, stays.
         """
-        count, ahead = (self.episodes.read(lambda group, n=n: getattr(group, n)) for n in ("step_count", "head_start"))
-        return (count + ahead).long()
+        ahead = self.episodes.read(lambda group: group.head_start)
+        return (self.episodes.read(lambda group: group.step_count) + ahead).long()
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps: torch.Tensor) -> None:

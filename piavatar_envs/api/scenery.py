@@ -7,29 +7,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.envs.flesh import Flesh
 from piavatar_envs.mpm.matrices import matrices_of
-from piavatar_envs.tasks.base import Task
 
 if TYPE_CHECKING:
-    from piavatar_envs.render import Body, Camera, Marker, Scene, Skin
-
-
-def camera_of(task: Task) -> Camera:
-    """The task's camera, where the settings of its pictures have no other.
-
-    Raises:
-        ConfigError: it would look at where it is.
-    """
-    from piavatar_envs.render import Camera
-
-    config = task.config.render
-    position = task.camera_position if config.camera_position is None else config.camera_position
-    target = task.camera_target if config.camera_target is None else config.camera_target
-    if np.allclose(position, target):
-        raise ConfigError(f"render.camera_position={list(position)} is where it looks; move it or render.camera_target")
-    return Camera(position, target)
+    from piavatar_envs.render import Body, Marker, Scene, Skin
 
 
 class Scenery:
@@ -51,8 +33,7 @@ class Scenery:
         bodies = self._avatars(env, x, color) + self._props(env, x)
         markers = [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
         roots = [avatar.tracked.position.numpy()[env, 0] for avatar in self.batch.simulation.avatars]
-        follows = task.config.render.camera_follows
-        follow = np.mean(roots, axis=0) if (task.camera_follows if follows is None else follows) else None
+        follow = np.mean(roots, axis=0) if task.camera_follows else None
         return Scene(bodies, markers + self._colliders(env), follow)
 
     def _skin(self, env: int, avatar: int, flesh: Flesh) -> Skin:

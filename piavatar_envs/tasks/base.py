@@ -68,9 +68,9 @@ class Task:
     observes_others: ClassVar[bool] = False
     targets_about_reference: ClassVar[bool] = False
 
-    camera_position: ClassVar[tuple[float, float, float]] = (1.75, -3.75, 1.62)
-    camera_target: ClassVar[tuple[float, float, float]] = (0.0, -0.04, 0.86)
-    camera_follows: ClassVar[bool] = True
+    camera_position: tuple[float, float, float] = (1.75, -3.75, 1.62)
+    camera_target: tuple[float, float, float] = (0.0, -0.04, 0.86)
+    camera_follows: bool = True
 
     summary: ClassVar[str] = ""
     reward_docs: ClassVar[Mapping[str, str]] = {}
@@ -87,6 +87,21 @@ class Task:
         self.config = config
         self.joints = select_joints(config.joints)
         self.scene = self.build_scene()
+        self._move_camera()
+
+    def _move_camera(self) -> None:
+        """To where the settings of pictures have it, if they do.
+
+        Raises:
+            ConfigError: it would look at where it is.
+        """
+        for name in ("camera_position", "camera_target", "camera_follows"):
+            chosen = getattr(self.config.render, name)
+            if chosen is not None:
+                setattr(self, name, chosen)
+        if np.allclose(self.camera_position, self.camera_target):
+            place = list(self.camera_position)
+            raise ConfigError(f"render.camera_position={place} is where it looks; move it or render.camera_target")
 
     def build_scene(self) -> SceneConfig:
         """What is in the world: the configured scene and what the task adds to it.
