@@ -4,9 +4,9 @@ They are those of a box around the particles' stencils, in bricks of 2 x 2 x 2 n
 where it is on the grid. A group whose box has too many bricks goes in turns: each takes the particles that are near the
 first of those that are left, and a box around that one. Whose turn comes when depends on the particles' places only.
 
-Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; of every brick its record, and which nodes have
-got mass; four sums of every node, one brick after the other. A brick has a word in each of the 32 banks, as in
-:mod:`piavatar_envs.mpm.shared_grid`.
+Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; of every brick its record, which nodes have got
+mass, and where it is in its block; four sums of every node, one brick after the other. A brick has a word in each of
+the 32 banks, as in :mod:`piavatar_envs.mpm.shared_grid`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import warp as wp
 from piavatar_envs.mpm.runs import KINEMATIC, PLACE
 from piavatar_envs.mpm.shared_grid import BRICK_WORDS
 from piavatar_envs.mpm.shared_memory import native
-from piavatar_envs.mpm.types import Blocks, Grid, vec8i
+from piavatar_envs.mpm.types import Blocks, Grid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,12 +32,13 @@ MASS_UNIT, MOMENTUM_UNIT = (wp.constant(n) for n in (6, 7))
 LOWEST, HIGHEST = (wp.constant(n) for n in (8, 12))
 RECORDS = wp.constant(16)
 MASSIVE = wp.constant(int(RECORDS) + int(CAPACITY))
-NODES = wp.constant(-(-(int(MASSIVE) + int(CAPACITY)) // 32) * 32)
+WITHIN = wp.constant(int(MASSIVE) + int(CAPACITY))
+NODES = wp.constant(-(-(int(WITHIN) + int(CAPACITY)) // 32) * 32)
 #: Words of a room.
 WORDS = wp.constant(int(NODES) + int(BRICK_WORDS) * int(CAPACITY))
 #: Units of the most that a particle has.
 UNITS = wp.constant(float(2**25))
-#: What a brick's record has besides it, if there is matter of another field in its block.
+#: What a brick has besides its place in its block, if there is matter of another field there.
 SHARED = wp.constant(1 << 30)
 
 #: The least power of two that is not below the positive number in a word.
@@ -55,7 +56,7 @@ for (int c = 0; c < 3; ++c) {
 def in_group(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
     names = "CAPACITY REACH MORE LEFT FIRST HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT LOWEST HIGHEST RECORDS"
-    names += " MASSIVE NODES BRICK_WORDS SHARED"
+    names += " MASSIVE WITHIN NODES BRICK_WORDS SHARED"
     values = {name: globals()[name] for name in names.split()} | {"KINEMATIC": KINEMATIC, "PLACE": PLACE}
     known = ", ".join(f"{name} = {int(value)}" for name, value in values.items())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
@@ -146,16 +147,13 @@ def has_turn(grid: Grid, takes: bool, base: wp.vec3i) -> bool:
 const int along_y = BRICK_WORDS * size[2], along_x = along_y * size[1];
 const int first = NODES + ((base[0] >> 1) - lowest[0]) * along_x + ((base[1] >> 1) - lowest[1]) * along_y
     + ((base[2] >> 1) - lowest[2]) * BRICK_WORDS;
-wp::vec_t<8, wp::int32> bricks;
-for (int n = 0; n < 8; ++n)
-    bricks[n] = first + (n & 4 ? along_x : 0) + (n & 2 ? along_y : 0) + (n & 1 ? BRICK_WORDS : 0);
-return bricks;
+return wp::vec_t<3, wp::int32>(first, along_x, along_y);
 """,
-        "return wp::vec_t<8, wp::int32>();",
+        "return wp::vec_t<3, wp::int32>();",
     )
 )
-def bricks_around(base: wp.vec3i) -> vec8i:
-    """Words at which the bricks of a stencil begin, that of its lowest node and its upper neighbors; z varies first."""
+def bricks_around(base: wp.vec3i) -> wp.vec3i:
+    """Word at which the brick of a stencil's lowest node begins, and how far on its neighbors along x and y do."""
     ...
 
 
@@ -165,7 +163,8 @@ def bricks_around(base: wp.vec3i) -> vec8i:
         + """
 const int bricks = size[0] * size[1] * size[2];
 for (int n = threadIdx.x; n < bricks; n += blockDim.x) {
-    const int line = n / size[2], plane = line / size[1];
+    // halves are so far from any border that a quotient need not be exact, and a whole number's takes longer
+    const int line = (int)(((float)n + 0.5f) / (float)size[2]), plane = (int)(((float)line + 0.5f) / (float)size[1]);
     const int i = lowest[0] + plane, j = lowest[1] + line - plane * size[1], l = lowest[2] + n - line * size[2];
     const int block = ((i >> 1) * grid.blocks[1] + (j >> 1)) * grid.blocks[2] + (l >> 1);
     int within = ((i & 1) << 5) + ((j & 1) << 3) + ((l & 1) << 1);
@@ -177,7 +176,7 @@ for (int n = threadIdx.x; n < bricks; n += blockDim.x) {
     room[RECORDS + n] = *slot;
 #endif
     if (num_fields > 1 && wp::index(blocks.fields, e, block) != 1 << field) within |= SHARED;
-    room[MASSIVE + n] = within;
+    room[WITHIN + n] = within;
 }
 """
     )
@@ -195,12 +194,13 @@ def fetch_slots(grid: Grid, blocks: Blocks, num_fields: int, e: int, field: int)
 asm volatile("cp.async.wait_all;" ::: "memory");
 #endif
 const int bricks = size[0] * size[1] * size[2];
-for (int n = threadIdx.x; n < bricks; n += blockDim.x) room[RECORDS + n] = 64 * room[RECORDS + n] + room[MASSIVE + n];
+for (int n = threadIdx.x; n < bricks; n += blockDim.x)
+    room[RECORDS + n] = 128 * room[RECORDS + n] + (room[WITHIN + n] & ~SHARED);
 """
     )
 )
 def note_records():
-    """Find the record of every brick's first node, and whether its block is shared.
+    """Find the record of every brick's first node, of its momentum.
 
     The slots are those that the same threads have fetched.
     """
@@ -211,13 +211,16 @@ def note_records():
     in_group(
         """
 int all = 0;
-for (int n = 0; n < 8; ++n) all |= room[RECORDS + (bricks[n] - NODES) / BRICK_WORDS];
+for (int n = 0; n < 8; ++n) {
+    const int at = box[0] + (n & 4 ? box[1] : 0) + (n & 2 ? box[2] : 0) + (n & 1 ? BRICK_WORDS : 0);
+    all |= room[WITHIN + (at - NODES) / BRICK_WORDS];
+}
 return (all & SHARED) != 0;
 """,
         "return false;",
     )
 )
-def is_shared(bricks: vec8i) -> bool:
+def is_shared(box: wp.vec3i) -> bool:
     """Whether a block of a particle's stencil has matter of another field."""
     ...
 

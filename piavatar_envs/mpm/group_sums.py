@@ -25,41 +25,53 @@ const int bricks = size[0] * size[1] * size[2];
 const bool is_place = kind == PLACE, of_mass = c == 0 || is_place;
 const int word = kind == 0 ? c : c + 3 & 3;  // a vector begins where the mass was, if there is none
 const int within = (lane & 16) + (lane >> 1 & 4) + (lane >> 2 & 1) + (kind == KINEMATIC ? 64 : 0);
-const int apart = is_place ? 1 : 2;  // the halves of records lie apart
+const unsigned mass_of_node = 1u << (lane & 28);
 // the group's units are not smaller than those of the sums: shifted, they are exact
 float unit = power_of_two(room[of_mass ? HEAVIEST : kind == KINEMATIC ? DRIVEN : FASTEST]);
 unit *= is_place && c > 0 ? 0x1p-24f : 0x1p-25f;
 const int shift = __float_as_int(unit) - room[of_mass ? MASS_UNIT : MOMENTUM_UNIT] >> 23;
-const int most_counted = shift > 48 ? 0 : shift < 18 ? 0x7fffffff : 1 << (48 - shift);
-bool too_much = false;
 auto put = [&](auto add) {{
-    int* at = room + NODES + BRICK_WORDS * warp + lane;
-    for (int place = warp; place < bricks; place += warps, at += BRICK_WORDS * warps) {{
-        int sum = *at;
-        const int record = apart * ((room[RECORDS + place] & ~SHARED) & ~63) + (room[RECORDS + place] & 63) + within;
-        *at = 0;
-        const unsigned massive = kind == 0 ? __ballot_sync(ALL, sum != 0) : room[MASSIVE + place];
-        if (kind == 0 && lane == 0) room[MASSIVE + place] = massive;
-        if (!(massive >> (lane & 28) & 1u)) sum = 0;  // who adds no mass adds nothing
-        if (sum != 0) add(record, sum);
+    int* from = room + NODES + BRICK_WORDS * warp + lane;
+    for (int n = RECORDS + warp; n < RECORDS + bricks; n += warps, from += BRICK_WORDS * warps) {{
+        const int sum = *from, record = room[n] + within;
+        *from = 0;
+        unsigned massive = __ballot_sync(ALL, sum != 0);
+        if (kind != 0) massive = room[n + CAPACITY];
+        else if (lane == 0) room[n + CAPACITY] = massive;
+        if (sum != 0 && (massive & mass_of_node)) add(record, sum);  // who adds no mass adds nothing
     }}
 }};
-if (sums.is_fixed != 0) {{
+// memory takes the four numbers of a node at a time
+auto red = [](size_t to, int record, long long added) {{
+    size_t node;
+    asm("mad.wide.s32 %0, %1, %2, %3;" : "=l"(node) : "r"(record), "r"(32), "l"(to));
+    asm volatile("red.global.add.u64 [%0], %1;" :: "l"(node), "l"(added) : "memory");
+}};
+auto record_of_place = [](int record) {{ return (record >> 1 & ~63) + (record & 63); }};  // of no halves
+bool too_much = false;
+// sums have 31 bits, so most of them cannot be too large
+if (sums.is_fixed != 0 && !is_place && __all_sync(ALL, shift < 18)) {{
+    const size_t to = __cvta_generic_to_global(&wp::index(sums.fixed, e, 0)) + 8 * word;
+    const int factor = 1 << shift;
+    put([&](int record, int sum) {{
+        long long added;
+        asm("mul.wide.s32 %0, %1, %2;" : "=l"(added) : "r"(sum), "r"(factor));
+        red(to, record, added);
+    }});
+}} else if (sums.is_fixed != 0) {{
     void* const records = is_place ? (void*)&wp::index(sums.offset_fixed, e, 0) : &wp::index(sums.fixed, e, 0);
     const size_t to = __cvta_generic_to_global(records) + 8 * word;
-    put([&](int record, int sum) {{  // memory takes the four numbers of a node at a time
-        size_t node;
-        asm("mad.wide.s32 %0, %1, %2, %3;" : "=l"(node) : "r"(record), "r"(32), "l"(to));
-        const long long added = (long long)sum << shift;
-        if (abs(sum) <= most_counted)
-            asm volatile("red.global.add.u64 [%0], %1;" :: "l"(node), "l"(added) : "memory");
-        else
-            too_much = true;
+    const int most_counted = shift > 48 ? 0 : shift < 18 ? 0x7fffffff : 1 << (48 - shift);
+    put([&](int record, int sum) {{
+        if (abs(sum) <= most_counted) red(to, is_place ? record_of_place(record) : record, (long long)sum << shift);
+        else too_much = true;
     }});
 }} else {{
     float* const to = (float*)(is_place ? &wp::index(sums.offset, e, 0) : &wp::index(sums.value, e, 0)) + word;
     if (is_place && c > 0) unit *= grid.dx;
-    put([&](int record, int sum) {{ atomicAdd(to + 4 * (size_t)record, sum * unit); }});
+    put([&](int record, int sum) {{
+        atomicAdd(to + 4 * (size_t)(is_place ? record_of_place(record) : record), sum * unit);
+    }});
 }}
 if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 """)

@@ -39,8 +39,17 @@ from piavatar_envs.mpm.group_plan import THREADS, share_of
 from piavatar_envs.mpm.group_sums import put_down
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattered
-from piavatar_envs.mpm.shared_add import add_to_bricks
-from piavatar_envs.mpm.shared_memory import clear_words, meet, number, or_word, set_number, thread_of_block, word
+from piavatar_envs.mpm.shared_add import add_to_box
+from piavatar_envs.mpm.shared_memory import (
+    block_of_launch,
+    clear_words,
+    meet,
+    number,
+    or_word,
+    set_number,
+    thread_of_block,
+    word,
+)
 from piavatar_envs.mpm.stencil import spline
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.transfer import Scattered, near_boundary, scatters
@@ -55,7 +64,6 @@ from piavatar_envs.mpm.types import (
     Step,
     Sums,
     row,
-    vec8i,
 )
 
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls: a
@@ -92,23 +100,25 @@ def prepare_kind(
 ):
     """What a particle has of a ``kind``, and whether it ``adds`` that; the group's units are raised to it.
 
-    All threads come here.
+    All threads come here, and meet after they have found what they have of momentum, before which a turn has begun.
     """
     active = adds
     momentum = float(0.0)
     s = Scattered()
     if adds:
         s = scattered(grid, step, particles, moving, e, p, kind)
-        if kind != PLACE:  # whose numbers are no momenta, and as sound as the masses were
+    if kind == MOMENTUM:
+        meet()  # not before memory has been asked for what particles have
+    if kind != PLACE:  # whose numbers are no momenta, and as sound as the masses were
+        if adds:
             momentum = bounded(s, number(MOMENTUM_UNIT), failure, e)
             active = momentum >= 0.0
-    if kind != PLACE:
         raise_most(active, kind, s.at_base[0], momentum)
     return s, active
 
 
 @wp.func
-def add_up(kind: int, bricks: vec8i, s: Scattered):
+def add_up(kind: int, box: wp.vec3i, s: Scattered):
     """Add what a particle has of a ``kind`` to the group's nodes."""
     per_scalar = per_unit_of(HEAVIEST)
     per_vector = 0.5 * per_scalar  # of places, up to 1.5 masses
@@ -117,7 +127,7 @@ def add_up(kind: int, bricks: vec8i, s: Scattered):
     wx = spline(s.f[0])
     wy = spline(s.f[1])
     wz = spline(s.f[2])
-    add_to_bricks(bricks, thread_of_block(), s, wx, wy, wz, per_scalar, per_vector)
+    add_to_box(box, thread_of_block(), s, wx, wy, wz, per_scalar, per_vector)
 
 
 @wp.func
@@ -143,7 +153,7 @@ def scatter_turn(
     ours = bool(left)
     stays = bool(False)
     tells = bool(near)
-    bricks = vec8i()
+    box = wp.vec3i()
     kind = int(MOMENTUM)
     while kind <= PLACE:
         wanted = ours and (kind == MOMENTUM or tells or (driven and kind == KINEMATIC))
@@ -155,30 +165,27 @@ def scatter_turn(
             ours = has_turn(grid, adds, s.base)
             stays = adds and not ours
             adds = ours
-            bricks = bricks_around(s.base)
+            box = bricks_around(s.base)
             fetch_slots(grid, blocks, num_fields, e, at[2])
-            if num_fields > 1:
-                note_records()
-                meet()
-                tells = tells or (ours and is_shared(bricks))
+        if adds:
+            add_up(kind, box, s)
+        if kind == MOMENTUM:
+            note_records()  # nobody needs them before
+        meet()
+        if kind == MOMENTUM:
+            tells = tells or (num_fields > 1 and ours and is_shared(box))
             if ours and tells:
                 or_word(MORE, (1 << KINEMATIC) + (1 << PLACE))
-        if adds:
-            add_up(kind, bricks, s)
-        if kind == MOMENTUM and num_fields == 1:  # nobody needs them before
-            note_records()
-        meet()
         put_down(grid, sums, failure, e, kind)
         kind += 1
+        meet()
         if word(MORE) == 0:
             kind = PLACE + 1
-        else:
-            meet()
     return stays
 
 
-# with fewer registers than a quarter of a multiprocessor's, additions wait for those of the ones before
-@wp.kernel(launch_bounds=(THREADS, 4))
+# with fewer registers, some of what additions need must be kept elsewhere
+@wp.kernel(launch_bounds=(THREADS, 5))
 def runs_to_grid(
     grid: Grid,
     step: Step,
@@ -187,17 +194,16 @@ def runs_to_grid(
     contact: Contact,
     moving: Moving,
     blocks: Blocks,
-    share: int,
     # in and out
     failure: wp.array(dtype=int),
     sums: Sums,
 ):
     """The same sums as :func:`piavatar_envs.mpm.transfer.particles_to_grid`.
 
-    A CUDA block of as many threads takes a ``share`` of particles, one of the groups of an environment; all of its
-    threads come to what they do together.
+    A CUDA block takes one of the groups of an environment, a thread a particle; all of its threads come to what they do
+    together.
     """
-    group = environment_of(wp.tid() // share, particles.groups.shape[0] - 1)
+    group = environment_of(block_of_launch(), particles.groups.shape[0] - 1)
     e = group[0]
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
     begins = particles.groups[group[1]]
@@ -210,7 +216,6 @@ def runs_to_grid(
         x = moving.x[e, p]
         left = scatters(blocks, moving, e, p, failure)
         near = near_boundary(grid, boundaries, e, x)
-    meet()
     at = wp.vec3i(e, p, begins[1])
     goes_on = bool(True)
     while goes_on:
@@ -219,11 +224,10 @@ def runs_to_grid(
         if goes_on:
             meet()
             begin_turn(driven)
-            meet()
 
 
 def record_runs(program: Program, inputs: list[Any], particles: Particles, failure: wp.array, sums: Sums) -> None:
     """Append :func:`runs_to_grid` for all environments: no CUDA block has two of them."""
     share, groups = share_of(particles.field.shape[0]), particles.groups.shape[0] - 1
     threads = failure.shape[0] * groups * share
-    program.launch(runs_to_grid, threads, [*inputs, share], [failure, sums], block_dim=share)
+    program.launch(runs_to_grid, threads, inputs, [failure, sums], block_dim=share)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import warp as wp
 
 from piavatar_envs.mpm.shared_grid import BRICK_WORDS, brick_native, line_in_bricks
@@ -14,8 +16,7 @@ wp.set_module_options({"enable_backward": False})
 # Threads that add to the same bank wait for each other. So each has an order of its own, as the bits of its particle's
 # number say: two of them that of the four words of a node; one that of the nodes along each axis, first the lower or
 # the upper one of a brick, then the other, and last what is left
-@wp.func_native(
-    brick_native("""
+_ADD = """
 const int px = s.base[0] & 1, py = s.base[1] & 1, pz = s.base[2] & 1;
 const int turn = p & 3, turn_x = (p >> 2 ^ px) & 1, turn_y = (p >> 3 ^ py) & 1, turn_z = (p >> 4 ^ pz) & 1;
 // a word at the lowest node, and how it changes along the axes; a mass does not
@@ -34,42 +35,72 @@ auto take_turn = [&](float& a, float& b, float& c, float& d) {  // word c ^ turn
 take_turn(q[0], q[1], q[2], q[3]);
 for (int d = 0; d < 3; ++d) take_turn(along[0][d], along[1][d], along[2][d], along[3][d]);
 float weight_z[3], at_z[3];
-int word_z[3];
+int place_z[3];
 bool upper_z[3];
 for (int n = 0; n < 3; ++n) {
     const int l = n < 2 ? n ^ turn_z : 2;
     weight_z[n] = l == 0 ? wz[0] : l == 1 ? wz[1] : wz[2];
-    at_z[n] = (float)l, word_z[n] = ((pz + l) & 1) * ALONG_Z + turn, upper_z[n] = pz + l > 1;
+    at_z[n] = (float)l, place_z[n] = UNIT * (((pz + l) & 1) * ALONG_Z + turn), upper_z[n] = pz + l > 1;
 }
-#pragma unroll 1
+BEFORE
+#pragma unroll UNROLLED
 for (int n = 0; n < 3; ++n) {
     const int i = n < 2 ? n ^ turn_x : 2;
     const float wi = i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2];
     const bool far = px + i > 1;
-    const int b00 = far ? bricks[4] : bricks[0], b01 = far ? bricks[5] : bricks[1];
-    const int b10 = far ? bricks[6] : bricks[2], b11 = far ? bricks[7] : bricks[3];
-    const int plane = ((px + i) & 1) * ALONG_X;
+    PLANE
+    const int plane = UNIT * ((px + i) & 1) * ALONG_X;
     const float at_x = i == 0 ? 0.0f : 1.0f;  // the last plane from the one before it
     for (int c = 0; c < 4; ++c) q[c] += i == 2 ? along[c][0] : 0.0f;
-#pragma unroll 1
+#pragma unroll UNROLLED
     for (int m = 0; m < 3; ++m) {
         const int j = m < 2 ? m ^ turn_y : 2;
         const bool upper = py + j > 1;
-        const int line = plane + ((py + j) & 1) * ALONG_Y;
-        const int first = upper ? b10 : b00, last = upper ? b11 : b01;
+        const int line = plane + UNIT * ((py + j) & 1) * ALONG_Y;
+        LINE
         const float w = wi * (j == 0 ? wy[0] : j == 1 ? wy[1] : wy[2]);
         float at[4];
         for (int c = 0; c < 4; ++c) at[c] = q[c] + at_x * along[c][0] + (float)j * along[c][1];
 #pragma unroll
         for (int l = 0; l < 3; ++l) {
-            const int node = line + (upper_z[l] ? last : first) + word_z[l];  // a multiple of four, and the turn
+            const int node = NODE;  // a multiple of four words, and the turn
             const float wl = w * weight_z[l];
-            for (int c = 0; c < 4; ++c)
-                atomicAdd(room + (node ^ c), __float2int_rn(wl * (at[c] + at_z[l] * along[c][2])));
+            for (int c = 0; c < 4; ++c) {
+                int* const word = reinterpret_cast<int*>(reinterpret_cast<char*>(room) + 4 / UNIT * (node ^ UNIT * c));
+                atomicAdd(word, __float2int_rn(wl * (at[c] + at_z[l] * along[c][2])));
+            }
         }
     }
 }
-""")
+"""
+
+
+def adding(unit: int, before: str, plane: str, line: str, node: str, unrolled: int) -> str:
+    """The snippet that adds a particle to nodes in bricks, from its pieces.
+
+    Args:
+        unit: what places are counted in, 1 for words, 4 for bytes.
+        before: what is to be known before all planes of the stencil.
+        plane: what is to be known of one that lies ``far``, in the upper bricks along x, or not.
+        line: what is to be known of one of its lines, in the ``upper`` bricks along y or not.
+        node: the place of the first word of node ``l`` of the line.
+        unrolled: planes, and lines of a plane, that the compiler writes down.
+    """
+    pieces = {"BEFORE": before, "PLANE": plane, "LINE": line, "NODE": node, "UNROLLED": str(unrolled)}
+    snippet = re.sub("BEFORE|PLANE|LINE|NODE|UNROLLED", lambda name: pieces[name.group()], _ADD)
+    return brick_native(f"constexpr int UNIT = {unit};\n{snippet}")
+
+
+@wp.func_native(
+    adding(
+        unit=1,
+        before="",
+        plane="""const int b00 = far ? bricks[4] : bricks[0], b01 = far ? bricks[5] : bricks[1];
+    const int b10 = far ? bricks[6] : bricks[2], b11 = far ? bricks[7] : bricks[3];""",
+        line="const int first = upper ? b10 : b00, last = upper ? b11 : b01;",
+        node="line + (upper_z[l] ? last : first) + place_z[l]",
+        unrolled=1,
+    )
 )
 def add_to_bricks(
     bricks: vec8i,
@@ -82,6 +113,33 @@ def add_to_bricks(
     per_momentum: float,
 ):
     """Add mass and physical momentum of particle ``p`` to its 27 nodes, in bricks that begin at those words."""
+    ...
+
+
+@wp.func_native(
+    adding(
+        unit=4,
+        before="for (int n = 0; n < 3; ++n) place_z[n] += upper_z[n] ? UNIT * BRICK : 0;",
+        plane="const int first = UNIT * (box[0] + (far ? box[1] : 0));",
+        line="const int first_of_line = first + line + UNIT * (upper ? box[2] : 0);",
+        node="first_of_line + place_z[l]",
+        unrolled=3,
+    )
+)
+def add_to_box(
+    box: wp.vec3i,
+    p: int,
+    s: Scattered,
+    wx: wp.vec3,
+    wy: wp.vec3,
+    wz: wp.vec3,
+    per_mass: float,
+    per_momentum: float,
+):
+    """:func:`add_to_bricks`, in bricks that lie in a row.
+
+    ``box`` has the word at which the first brick begins, and how far on the next ones along x and along y do.
+    """
     ...
 
 

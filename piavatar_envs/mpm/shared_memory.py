@@ -38,6 +38,12 @@ def thread_of_block() -> int:
     ...
 
 
+@wp.func_native(native("return blockIdx.x;", "return 0;"))
+def block_of_launch() -> int:
+    """Place of a CUDA block among those of a launch."""
+    ...
+
+
 @wp.func_native(native("return blockDim.x;", "return 1;"))
 def threads_of_block() -> int:
     """Threads of a CUDA block."""
