@@ -92,7 +92,7 @@ def bounded(s: Scattered, unit: float, failure: wp.array(dtype=int), e: int):
     return wp.max(bounds)
 
 
-@wp.kernel(launch_bounds=(128, 5))
+@wp.kernel(launch_bounds=(128, 6))
 def grid_to_particles(
     grid: Grid,
     step: Step,
