@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,8 +15,8 @@ from agents.sac import SACSettings
 from agents.seeds import FIRST_TRAINED, MOST_RUNS
 from agents.selfplay import SelfPlaySettings
 from piavatar_envs.envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
-from piavatar_envs.multi import multi_modules
-from piavatar_envs.tasks import instead_of, listed_name, load_task
+from piavatar_envs.multi import load_world
+from piavatar_envs.tasks import listed_name, load_task
 
 Resolved = TypeVar("Resolved", bound=BaseModel)
 _MULTI_ID = re.compile(r"\w+_v\d+")
@@ -88,11 +87,8 @@ def multi_module(env_id: str) -> ModuleType:
     Raises:
         ValueError: there is no such module, or PettingZoo is not installed.
     """
-    modules = {name.rpartition(".")[2]: name for name in multi_modules()}
-    if env_id not in modules:
-        raise ValueError(f"unknown world {env_id!r}; {instead_of(env_id, modules)}")
     try:
-        return importlib.import_module(modules[env_id])
+        return load_world(env_id)
     except ImportError as error:
         raise ValueError(f"{env_id} is not importable: {error}") from error
 

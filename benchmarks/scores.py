@@ -21,7 +21,7 @@ from agents.parallel import AgentVecEnv
 from agents.train import train
 from agents.workers import factory, prepare, start_workers
 from benchmarks import runner
-from piavatar_envs.multi import multi_modules
+from piavatar_envs.multi import listed_worlds
 from piavatar_envs.tasks import task_modules
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,7 +51,7 @@ class Options(runner.Options):
 
 def every_environment() -> list[str]:
     """Registered ids, then modules of several agents."""
-    return [*task_modules(), *(path.rpartition(".")[2] for path in multi_modules())]
+    return [*task_modules(), *listed_worlds()]
 
 
 def training_config(env_id: str, options: Options) -> TrainingConfig:

@@ -142,11 +142,11 @@ def registered_ids() -> list[str]:
     import gymnasium
 
     from piavatar_envs import ENTRY_POINT  # importing the package registers the ids
-    from piavatar_envs.multi import multi_modules
+    from piavatar_envs.multi import listed_worlds
 
     found = gymnasium.registry.items()
     ids = [name for name, spec in found if spec.namespace == NAMESPACE or spec.entry_point == ENTRY_POINT]
-    return sorted(ids) + [path.rpartition(".")[2] for path in multi_modules()]
+    return [*sorted(ids), *listed_worlds()]
 
 
 def describe(env_id: str) -> str:

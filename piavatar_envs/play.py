@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -14,9 +13,9 @@ import numpy as np
 from tqdm import tqdm
 
 import piavatar_envs  # noqa: F401 - registers the ids
-from piavatar_envs.multi import multi_modules
+from piavatar_envs.multi import load_world
 from piavatar_envs.render.video import check_suffix, write_video
-from piavatar_envs.tasks import instead_of, listed_name, task_modules
+from piavatar_envs.tasks import listed_name, task_modules
 
 if TYPE_CHECKING:
     from piavatar_envs.api.pettingzoo import AvatarParallelEnv
@@ -130,10 +129,7 @@ class Together:
             ValueError: there is no such module.
             ImportError: PettingZoo is not installed.
         """
-        modules = {path.rpartition(".")[2]: path for path in multi_modules()}
-        if name not in modules:
-            raise ValueError(f"unknown module {name!r}; {instead_of(name, [*modules, *task_modules()])}")
-        self.env = importlib.import_module(modules[name]).parallel_env(**settings)
+        self.env = load_world(name, task_modules()).parallel_env(**settings)
         self.name, self.metadata, self.render_mode = name, self.env.metadata, self.env.render_mode
         first = self.env.action_space(self.env.possible_agents[0])
         self.action_space = gymnasium.vector.utils.batch_space(first, len(self.env.possible_agents))

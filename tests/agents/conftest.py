@@ -57,4 +57,4 @@ def tiny() -> TrainingConfig:
 def games(monkeypatch) -> None:
     """Let the toy worlds in ``games/`` be those that a configuration may name."""
     names = tuple(f"tests.agents.games.{name}_v0" for name in ("auction", "ledger", "rendezvous"))
-    monkeypatch.setattr("agents.config.multi_modules", lambda: names)
+    monkeypatch.setattr("piavatar_envs.multi.multi_modules", lambda: names)

@@ -15,7 +15,7 @@ import numpy as np
 import pettingzoo.test as official
 import pytest
 
-from piavatar_envs.multi import multi_modules
+from piavatar_envs.multi import listed_worlds, load_world, multi_modules
 
 #: PettingZoo's complaints that are wanted: these observations have no honest limits.
 UNBOUNDED = r"Agent's (minimum|maximum) observation space value is -?infinity.*"
@@ -45,6 +45,12 @@ def fresh(worlds, module_name, device):
 def test_worlds_are_found():
     assert {"piavatar_envs.multi.sumo_v0", "piavatar_envs.multi.boxing_v0"} <= set(multi_modules())
     assert "piavatar_envs.multi.versus" not in multi_modules()
+    assert list(listed_worlds().values()) == list(multi_modules())
+    assert load_world("sumo_v0").__name__ == listed_worlds()["sumo_v0"] == "piavatar_envs.multi.sumo_v0"
+    with pytest.raises(ValueError, match=r"unknown world 'sumo_v9'; did you mean sumo_v0\?"):
+        load_world("sumo_v9")
+    with pytest.raises(ValueError, match=r"did you mean PIAvatar/Reach-v0\?"):
+        load_world("raech", ["PIAvatar/Reach-v0"])
 
 
 def test_listing_the_worlds_is_light():
