@@ -44,15 +44,16 @@ def film(
         halves.close()
 
 
-def check_film(path: Path | None, every: int) -> None:
+def check_film(path: Path | None, every: int, episodes: int = 1) -> None:
     """Refuse a video without pictures, or that is none by its name, before there is anything to film.
 
     Raises:
-        ConfigError: ``every`` is less than 1.
+        ConfigError: ``every`` or ``episodes`` is less than 1.
         ValueError: an unknown suffix.
     """
-    if every < 1:
-        raise ConfigError(f"film_every={every} must be >= 1")
+    for name, value in (("film_every", every), ("film_episodes", episodes)):
+        if value < 1:
+            raise ConfigError(f"{name}={value} must be >= 1")
     if path is not None:
         check_suffix(path)
 

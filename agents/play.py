@@ -27,6 +27,7 @@ from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.config import ConfigError, load_config, parse_assignments
+from piavatar_envs.envs.draws import check_seeds
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task
 
@@ -123,6 +124,28 @@ class Options:
     port: int = 8080
 
 
+def check_options(options: Options) -> None:
+    """Refuse what can be seen to be wrong without the run.
+
+    Raises:
+        ConfigError: options that do not go together, no episodes, or no pictures.
+        ValueError: a seed that there is not, or what is no video by its name.
+    """
+    if options.live and (options.out or options.film or options.episodes is not None):
+        raise ConfigError("--live plays until Ctrl-C and evaluates nothing; leave out --out, --film and --episodes")
+    if options.episodes is not None and options.episodes < 2:
+        advice = "of one there is no interval; a film alone needs no --episodes"
+        raise ConfigError(f"episodes={options.episodes} must be >= 2: {advice}")
+    check_film(options.film, options.film_every, options.film_episodes)
+    if options.first_seed is not None:
+        check_seeds(options.first_seed, name="first_seed")
+
+
+def first_seed(run: Run, options: Options) -> int:
+    """Seed of the first episode."""
+    return run.evaluation.first_seed if options.first_seed is None else options.first_seed
+
+
 def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
     """Let somebody watch the agent in a web browser until Ctrl-C.
 
@@ -136,11 +159,12 @@ def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
         ImportError: the extra ``live`` is not installed.
         ValueError: an unknown device, or a port out of range.
     """
-    from piavatar_envs.render.live import import_viser
+    from piavatar_envs.render.live import check_port, import_viser
     from piavatar_envs.watch import watch_env
 
+    check_port(options.port)
     import_viser()  # before the kernels are compiled, not after
-    first = run.evaluation.first_seed if options.first_seed is None else options.first_seed
+    first = first_seed(run, options)
     with suppress(KeyboardInterrupt):
         made = EnvFactory(run.env_id, env, options.device)()
         agent = run.make_agent(made.unwrapped.observation_layout, made.action_space.shape[0])
@@ -178,9 +202,7 @@ def main(args: list[str] | None = None) -> None:
     quiet_warp()
     scores = options.film is None or options.out is not None or options.episodes is not None
     try:
-        if options.live and (options.out or options.film or options.episodes is not None):
-            raise ConfigError("--live plays until Ctrl-C and evaluates nothing; leave out --out, --film and --episodes")
-        check_film(options.film, options.film_every)
+        check_options(options)
         run = open_run(options.run, options.device)
         task_class = load_task(run.env_id)
         settings = {name.removeprefix("env."): value for name, value in parse_assignments(options.settings).items()}
@@ -189,15 +211,13 @@ def main(args: list[str] | None = None) -> None:
         if options.live:
             watch_run(run, env, options)
             return
-        episodes = run.evaluation.episodes if options.episodes is None else options.episodes
-        if episodes < 2:
-            advice = "of one there is no interval; a film alone needs no --episodes"
-            raise ConfigError(f"episodes={episodes} must be >= 2: {advice}")
-        batch = BatchedEpisodes(task_class(config), episodes if scores else 1, options.device)
+        episodes = (options.episodes or run.evaluation.episodes) if scores else 1
+        first = first_seed(run, options)
+        check_seeds(first, max(episodes, options.film_episodes), "first_seed")
+        batch = BatchedEpisodes(task_class(config), episodes, options.device)
         agent = run.make_agent(batch.layout, batch.action_size)
     except (ConfigError, ValueError, ImportError) as error:
         sys.exit(f"error: {error}")
-    first = run.evaluation.first_seed if options.first_seed is None else options.first_seed
     if scores:
         score_run(agent, batch, first, options, env)
     batch.close()

@@ -55,14 +55,19 @@ def score(batch: BatchedEpisodes, first_seed: int, count: int) -> dict[str, Any]
         batch: plays an episode in each of its environments.
         first_seed: of the episodes, the same for all streams.
         count: of streams; the seed of each is the one with which a training of that place would begin.
+    """
+    streams = [random_agent(batch.action_size, seeds.first_seed(stream)) for stream in range(count)]
+    return over_seeds([play("random", in_every_seat(stream), batch, first_seed).row() for stream in streams])
+
+
+def check_streams(count: int) -> None:
+    """Refuse numbers of streams before they have anything to play.
 
     Raises:
         ConfigError: a count that has no interval, or is larger than that of the seeds that trainings can have.
     """
     if not 2 <= count <= seeds.MOST_RUNS:
         raise ConfigError(f"seeds={count} must be >= 2 and <= {seeds.MOST_RUNS}: of one there is no interval")
-    streams = [random_agent(batch.action_size, seeds.first_seed(stream)) for stream in range(count)]
-    return over_seeds([play("random", in_every_seat(stream), batch, first_seed).row() for stream in streams])
 
 
 def main(args: list[str] | None = None) -> None:
@@ -70,6 +75,7 @@ def main(args: list[str] | None = None) -> None:
     options = read_options(Options, "score_random", args)
     quiet_warp()
     try:
+        check_streams(options.seeds)
         env_id, env = environment_of(options.run)
         task_class = load_task(env_id)
         config = load_config(task_class.Config, dict(env), parse_assignments(options.settings))

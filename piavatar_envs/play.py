@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 import piavatar_envs  # noqa: F401 - registers the ids
+from piavatar_envs.envs.draws import check_seeds
 from piavatar_envs.multi import load_world
 from piavatar_envs.render.video import check_suffix, write_video
 from piavatar_envs.tasks import listed_name, task_modules
@@ -61,8 +62,7 @@ def play(
         overrides: settings of the environment's configuration.
 
     Raises:
-        ValueError: an unknown module, agent or suffix, a seed below 0, a number of steps below 1, a setting out of
-            range.
+        ValueError: an unknown module, agent or suffix, a number of steps below 1, a seed or a setting out of range.
     """
     check_agent(agent, seed)
     if steps is not None and steps < 1:
@@ -89,12 +89,11 @@ def check_agent(agent: str, seed: int) -> None:
     """Refuse what is no agent of this file, and what seeds none.
 
     Raises:
-        ValueError: it is neither random nor zero, or the seed is below 0.
+        ValueError: it is neither random nor zero, or the seed is outside [0, 2^32).
     """
     if agent not in ("random", "zero"):
         raise ValueError(f"no agent {agent!r}; there are random and zero")
-    if seed < 0:
-        raise ValueError(f"seed={seed} must be >= 0")
+    check_seeds(seed)
 
 
 def settings_of(device: str, overrides: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from piavatar_envs.api.live import Live
 from piavatar_envs.play import Together, check_agent, make, numbers, settings_of
-from piavatar_envs.render.live import PORT, import_viser
+from piavatar_envs.render.live import PORT, check_port, import_viser
 from piavatar_envs.render.panel import Panel
 
 #: From an observation (None where there are several agents) to an action.
@@ -43,6 +43,7 @@ def watch(
         ValueError: an unknown module or agent, a seed, a port or a setting out of range.
     """
     check_agent(agent, seed)
+    check_port(port)
     settings = settings_of(device, overrides)
     import_viser()  # before the kernels are compiled, not after
     with suppress(KeyboardInterrupt):

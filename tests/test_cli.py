@@ -144,7 +144,7 @@ def test_video_has_a_frame_for_each_state(probe, tmp_path, suffix):
         (["play", "piavatar_envs.multi.sumo_v9"], "; did you mean sumo_v0?\n"),
         (["play", "Mine/Walk-v0"], "such as my_tasks:Mine/Walk-v0; did you mean PIAvatar/Walk-v0?\n"),
         (["play", PROBE, "--steps", "0"], "steps=0 must be >= 1"),
-        (["play", PROBE, "--seed", "-1"], "error: seed=-1 must be >= 0\n"),
+        (["play", PROBE, "--seed", "-1"], "error: seed=-1 must be >= 0 and <= 4294967295\n"),
         (["play", PROBE, "--config", "tone"], "'tone' is not an override"),
     ],
 )

@@ -130,7 +130,7 @@ def test_worlds_of_several_agents_are_watched_too(open_show):
     ("args", "told"),
     [
         (["watch", "PIAvatar/Nothing-v9"], "no environment 'PIAvatar/Nothing-v9'; there are "),
-        (["watch", "PIAvatar/Reach-v0", "--seed", "-1"], "error: seed=-1 must be >= 0\n"),
+        (["watch", "PIAvatar/Reach-v0", "--seed", "-1"], "error: seed=-1 must be >= 0 and <= 4294967295\n"),
         (["watch", "Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 is outside [1, 64536]"),
         (["watch", "PIAvatar/Reach-v0", "--port", "0", "-c", "fidelity=tiny"], "port=0 is outside [1, 64536]"),
         (["watch", "PIAvatar/Reach-v0", "-c", "render_mode=human"], "render_mode is no setting here; use play --video"),
@@ -142,6 +142,12 @@ def test_mistakes_end_in_one_line(capsys, device, args, told):
         cli.main([*args, "--device", device] if "Reach" in args[1] else args)
     error = capsys.readouterr().err
     assert stop.value.code == 2 and told in error and "Traceback" not in error
+
+
+def test_a_port_is_refused_before_anything_is_built(monkeypatch):
+    monkeypatch.setattr(watch, "make", None)
+    with pytest.raises(ValueError, match="port=0 is outside"):
+        watch.watch("Reach-v0", port=0)
 
 
 def test_a_missing_viser_ends_in_one_line(monkeypatch, capsys):

@@ -17,6 +17,7 @@ from piavatar_envs.api.arrays import Array, find_array_api
 from piavatar_envs.api.copies import check_state
 from piavatar_envs.avatar.joint_drive import checked_assist
 from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.draws import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.simulation import check_device
 from piavatar_envs.tasks.base import Task
 
@@ -128,7 +129,7 @@ class BatchedEpisodes:
         if len(seeds) != n:
             raise ValueError(f"there are {len(seeds)} seeds for num_envs={n} environments")
         if not self.ready:
-            drawn = seeding.np_random(None)[0].integers(2**32, size=n)
+            drawn = seeding.np_random(None)[0].integers(NUM_SEEDS, size=n)
             seeds = [int(own) if seed is None else seed for seed, own in zip(seeds, drawn, strict=True)]
         return seeds
 
@@ -284,6 +285,5 @@ def _checked_seed(seed: Any) -> int:
     """
     seed = int(seed) if isinstance(seed, np.integer) else seed
     seeding.np_random(seed)
-    if seed >= 2**32:
-        raise ValueError(f"seed={seed} must be in [0, 2^32)")
+    check_seeds(seed)
     return seed

@@ -19,6 +19,7 @@ from piavatar_envs.api.picture import Pictures
 from piavatar_envs.envs.actions import check_actions
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import EnvConfig
+from piavatar_envs.envs.draws import NUM_SEEDS
 from piavatar_envs.tasks.base import Task
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ class Episode:
         """
         rng, _ = seeding.np_random(seed)
         if seed is None and not self.ready:
-            seed = int(rng.integers(2**32))
+            seed = int(rng.integers(NUM_SEEDS))
         self.batch.reset(seeds=None if seed is None else [seed])
         self.ready = True
         if self._live:

@@ -11,6 +11,7 @@ from piavatar_envs.avatar.drive import AvatarDrive
 from piavatar_envs.avatar.joint_drive import checked_assist
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.envs.actions import apply_actions, refuse_nonfinite
+from piavatar_envs.envs.draws import NUM_SEEDS
 from piavatar_envs.envs.episodes import begin_episode, count_episodes, end_agent, end_step, find_ended, retire
 from piavatar_envs.envs.joint_actions import apply_targets, apply_torques, follow_reference
 from piavatar_envs.envs.observer import Observer
@@ -185,7 +186,7 @@ class BatchEnv:
         if seeds is not None:
             given = np.array([seed is not None for seed in seeds])
             values = np.array([0 if seed is None else seed for seed in seeds], np.int64)
-            if values.shape != (n,) or (values < 0).any() or (values >= 2**32).any():
+            if values.shape != (n,) or (values < 0).any() or (values >= NUM_SEEDS).any():
                 raise ValueError(f"seeds={seeds} must have shape ({n},) and be in [0, 2^32)")
             self._new_seed.assign(_as_int32(values))
             self._seeded.assign(mask & given)

@@ -16,6 +16,24 @@ STREAM_DISTURBANCE = wp.constant(2)
 STREAM_BALL = wp.constant(3)
 STREAM_PARAMETERS = wp.constant(4)
 
+#: Seeds of environments count from 0 and end before this, because kernels hold them in 32 bits.
+NUM_SEEDS = 2**32
+
+
+def check_seeds(first: int, count: int = 1, name: str = "seed") -> None:
+    """Refuse seeds that environments cannot have.
+
+    Args:
+        first: of ``count`` seeds one after the other.
+        count: how many.
+        name: by which the first one was given.
+
+    Raises:
+        ValueError: one is outside [0, 2^32).
+    """
+    if not 0 <= first <= NUM_SEEDS - count:
+        raise ValueError(f"{name}={first} must be >= 0 and <= {NUM_SEEDS - count}")
+
 
 @wp.func
 def generator(seed: int, episode: int, stream: int, index: int):

@@ -50,6 +50,16 @@ def import_viser() -> ModuleType:
     return viser
 
 
+def check_port(port: int) -> None:
+    """Refuse a port from which on there are not enough to try.
+
+    Raises:
+        ValueError: it is outside [1, 64536].
+    """
+    if not 1 <= port <= 65536 - _TRIES:
+        raise ValueError(f"port={port} is outside [1, {65536 - _TRIES}]")
+
+
 class LiveView:
     """Shows scenes to every browser that looks at :attr:`url`.
 
@@ -69,8 +79,7 @@ class LiveView:
             ImportError: viser is not installed.
             ValueError: a port outside [1, 64536].
         """
-        if not 1 <= port <= 65536 - _TRIES:
-            raise ValueError(f"port={port} is outside [1, {65536 - _TRIES}]")
+        check_port(port)
         library = import_viser()
         self._follower = Follower(camera or Camera())
         self._nodes: dict[str, viser.MeshHandle] = {}

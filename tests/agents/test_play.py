@@ -115,12 +115,18 @@ def test_folders_without_a_run_are_refused(device, tmp_path, capsys):
         (("--episodes", "1"), r"episodes=1 must be >= 2: .*a film alone needs no --episodes"),
         (("--episodes", "0"), r"episodes=0 must be >= 2"),
         (("--film-every", "0"), r"film_every=0 must be >= 1"),
+        (("--film-episodes", "0"), r"film_episodes=0 must be >= 1"),
+        (("--first-seed", "-1"), r"first_seed=-1 must be >= 0 and <= 4294967295"),
+        (("--live", "--port", "0"), r"port=0 is outside \[1, 64536\]"),
+        (("--first-seed", "4294967295", "--episodes", "2"), r"first_seed=4294967295 must be >= 0 and <= 4294967294"),
         (("--film", "x.avi"), r"video x\.avi ends in '\.avi'; use \.mp4 or \.gif"),
         (("joints=[tail]",), r"'tail' is not a joint"),
     ],
 )
-def test_what_cannot_be_played_is_refused(options, words, device, tmp_path, capsys):
+def test_what_cannot_be_played_is_refused(options, words, device, tmp_path, capsys, monkeypatch):
     run_of("ppo", tmp_path / "run", device)
+    for builder in ("BatchedEpisodes", "EnvFactory"):
+        monkeypatch.setattr(play, builder, None)  # nothing is built
     with pytest.raises(SystemExit, match=f"error: .*{words}"):
         play.main([str(tmp_path / "run"), *options, "--device", device])
 

@@ -49,11 +49,12 @@ def test_every_seed_is_a_stream_of_its_own_in_the_same_episodes(run, device, tmp
     assert table == {"random": 3, "zero": None, "PID": None}
 
 
-def test_what_is_no_run_and_one_seed_are_refused(run, tmp_path):
+def test_what_is_no_run_and_one_seed_are_refused(run, tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=r"error: .*No such file"):
         score_random.main([str(tmp_path)])
     (tmp_path / "results.json").write_text("{}")
     with pytest.raises(SystemExit, match=r"has no config.env_id and config.env"):
         score_random.main([str(tmp_path)])
+    monkeypatch.setattr(score_random, "BatchedEpisodes", None)  # nothing is built
     with pytest.raises(SystemExit, match="seeds=1 must be >= 2"):
         score_random.main([str(run), "--seeds", "1"])
