@@ -36,7 +36,8 @@ class Copied:
 
     Attributes:
         _host: what holds the environments.
-        _build: the constructor, with all arguments but the view; importable, so that another process can call it.
+        _build: the constructor, or as much of it as makes ``_built``, with all arguments but the view; importable, so
+            that another process can call it.
         _built: names of the attributes that a copy has of its own.
     """
 

@@ -10,13 +10,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import Settings
 from piavatar_envs.api.same_step import means, step_and_reset
 from piavatar_envs.api.view import BatchedView
-from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
@@ -28,7 +30,7 @@ except ImportError as error:
     raise ImportError("this view needs rsl_rl; install it with: pip install 'piavatar-envs[rsl]'") from error
 
 
-class AvatarRslEnv(BatchedView, VecEnv):
+class AvatarRslEnv(Copied, BatchedView, VecEnv):
     """One avatar in each environment, for rsl_rl's runners.
 
     There is an episode from the start: runners never reset. An environment that ends is reset in the same step; what
@@ -76,13 +78,20 @@ class AvatarRslEnv(BatchedView, VecEnv):
         """
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
-        self.episodes = BatchedEpisodes(task_class(self.config).alone(), num_envs, device, "torch", num_threads)
+        # a copy begins no episodes
+        made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
+        self._build = partial(AvatarRslEnv._make, task=task_class, **made)
+        self._build(self)
         self.num_envs, self.num_actions = num_envs, self.episodes.action_size
         self.device = self.episodes.api.device
         self.max_episode_length = self.episodes.groups[0].max_steps
         self.cfg = self.config.model_dump(mode="json")
         self.groups = self._checked_groups(groups)
         self.reset(seed)
+
+    def _make(self, task: type[Task], num_envs: int, device: str, num_threads: int | None, config: EnvConfig) -> None:
+        """Build the environments."""
+        self.episodes = BatchedEpisodes(task(config).alone(), num_envs, device, "torch", num_threads)
 
     def _checked_groups(self, groups: Mapping[str, Sequence[str]] | None) -> dict[str, tuple[str, ...]]:
         layout = self.episodes.layout

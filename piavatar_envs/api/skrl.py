@@ -15,6 +15,7 @@ Several, for MAPPO and IPPO::
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -22,6 +23,7 @@ import gymnasium as gym
 from piavatar_envs.api import spaces
 from piavatar_envs.api.arrays import Array
 from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import Settings
 from piavatar_envs.api.same_step import Transition, means, step_and_reset
 from piavatar_envs.api.view import BatchedView
@@ -30,7 +32,7 @@ from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
 
-class AvatarSkrlEnv(BatchedView):
+class AvatarSkrlEnv(Copied, BatchedView):
     """One avatar in each environment, as skrl's wrapper ``"isaaclab-single-agent"`` wants it.
 
     An environment that ends is reset in the same step: the observation returned is the first of its next episode, and
@@ -72,6 +74,8 @@ class AvatarSkrlEnv(BatchedView):
         """
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
+        made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
+        self._build = partial(AvatarSkrlEnv.__init__, task=task_class, **made)
         self.episodes = BatchedEpisodes(task_class(self.config).alone(), num_envs, device, "torch", num_threads)
         self.num_envs, self.device = num_envs, self.episodes.api.device
         self.single_observation_space = gym.spaces.Dict({"policy": self.episodes.observation_space()})
@@ -133,7 +137,7 @@ class AvatarSkrlEnv(BatchedView):
         self.episodes.close()
 
 
-class AvatarSkrlMultiEnv(BatchedView):
+class AvatarSkrlMultiEnv(Copied, BatchedView):
     """Several avatars in each environment, dictionaries by agent, as skrl's ``"isaaclab-multi-agent"`` wants them.
 
     All agents are always there, because the batch is: an agent that is out keeps its rows while the others of its world
@@ -185,6 +189,8 @@ class AvatarSkrlMultiEnv(BatchedView):
         """
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
+        made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
+        self._build = partial(AvatarSkrlMultiEnv.__init__, task=task_class, **made)
         self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, "torch", num_threads)
         self.num_envs, self.device = num_envs, self.episodes.api.device
         self.possible_agents = list(self.episodes.task.agent_names)

@@ -192,6 +192,87 @@ def test_vectors_of_tensors_go_on(make_vec, arrays_in, equal):
             assert type(a) is type(b) and equal(a.cpu(), b.cpu())
 
 
+def skrl_view(device):
+    from piavatar_envs.api.skrl import AvatarSkrlEnv
+
+    env = AvatarSkrlEnv("KickBall-v0", 2, device, fidelity="tiny", num_threads=2, obs_mode="dict", **SHORT)
+    env.reset(seed=5)
+    return env
+
+
+def skrl_view_of_several(device):
+    pytest.importorskip("pettingzoo")
+    from piavatar_envs.api.skrl import AvatarSkrlMultiEnv
+    from piavatar_envs.multi import sumo_v0
+
+    env = AvatarSkrlMultiEnv(sumo_v0.TASK, 2, device, fidelity="tiny", **SHORT)
+    env.reset(seed=5)
+    return env
+
+
+def rsl_view(device):
+    for needed in ("rsl_rl", "tensordict"):
+        pytest.importorskip(needed)
+    import torch
+
+    from piavatar_envs.api.rsl_rl import AvatarRslEnv
+
+    groups = {"actor": ["target_position"], "critic": ["root_height"]}
+    env = AvatarRslEnv("Reach-v0", 2, device, groups=groups, seed=5, fidelity="tiny", num_threads=1, **SHORT)
+    env.episode_length_buf = torch.tensor([0, 3], device=env.device)
+    return env
+
+
+def plain(answer):
+    """An answer with dictionaries in the place of what a library makes of them."""
+    if hasattr(answer, "items"):
+        return {name: plain(value) for name, value in answer.items()}
+    return [plain(part) for part in answer] if isinstance(answer, (tuple, list)) else answer
+
+
+def play_learners(view, steps: int = 9, seed: int = 1) -> list:
+    """What a view for learners returns on the way over the ends of its episodes."""
+    import torch
+
+    episodes, rng = view.episodes, np.random.default_rng(seed)
+    answers = []
+    for _ in range(steps):
+        actions = rng.uniform(-1.0, 1.0, (episodes.num_agents, view.num_envs, episodes.action_size))
+        rows = [torch.tensor(row, dtype=torch.float32, device=view.device) for row in actions]
+        named = dict(zip(getattr(view, "agents", ()), rows, strict=False))
+        answers.append(plain(view.step(named or rows[0])))
+    return answers
+
+
+@pytest.mark.parametrize("make", [skrl_view, skrl_view_of_several, rsl_view])
+def test_views_for_learners_go_on(device, make, arrays_in, equal):
+    pytest.importorskip("torch")
+    view = make(device)
+    play_learners(view, 2, seed=0)
+    view.note = {"of": "the user"}
+    copies = copies_of(view)
+    expected = list(arrays_in(play_learners(view)))
+    assert len(expected) > 50
+    for other in copies.values():
+        assert other.config == view.config and len(other.episodes.groups) == len(view.episodes.groups)
+        assert getattr(other, "groups", None) == getattr(view, "groups", None)
+        assert other.note == view.note and other.note is not view.note
+        found = list(arrays_in(play_learners(other)))
+        assert all(equal(a.cpu(), b.cpu()) for a, b in zip(found, expected, strict=True))
+        other.close()
+    view.close()
+
+
+def test_a_copy_for_rsl_rl_begins_no_episode(device, monkeypatch):
+    """A view of one's own may not be able to reset before the copy has what it keeps."""
+    view = rsl_view(device)
+    monkeypatch.setattr(type(view), "reset", None)
+    other = copy.deepcopy(view)
+    assert other.episode_length_buf.tolist() == view.episode_length_buf.tolist() == [0, 3]
+    for made in (view, other):
+        made.close()
+
+
 def test_a_copy_of_what_was_closed_is_open(device):
     vector = AvatarVectorEnv("Reach-v0", 2, device=device, fidelity="tiny", num_threads=2)
     vector.reset(seed=0)
