@@ -69,6 +69,23 @@ def vector_format(values: Mapping[str, Any], api: ArrayApi, num_envs: int, mask:
     return put(values)
 
 
+def single_infos(infos: Mapping[str, Any], num_envs: int) -> list[dict[str, Any]]:
+    """What :func:`vector_format` gave as one dictionary an environment, with what its masks say it has."""
+    rows: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+    for name, mask in infos.items():
+        if not name.startswith("_") or name[1:] not in infos:
+            continue
+        values = infos[name[1:]]
+        if isinstance(values, dict):
+            values = single_infos(values, num_envs)
+        elif values.ndim == 1:
+            values = values.tolist()
+        for env, held in enumerate(mask.tolist()):
+            if held:
+                rows[env][name[1:]] = values[env]
+    return rows
+
+
 def failure_names(bits: Array) -> Array:
     """Names of failures, None for none; tensors stay as they are: the host would have to wait for them."""
     if not isinstance(bits, np.ndarray):

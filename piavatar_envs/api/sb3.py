@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from piavatar_envs.api.infos import single_infos
 from piavatar_envs.api.vector import AvatarVectorEnv
 from piavatar_envs.tasks.base import Task
 
@@ -85,7 +86,7 @@ class SB3VecEnv(VecEnv):
         if any(self._options):
             raise ValueError(f"unknown reset options {sorted(set().union(*self._options))}; there are none")
         observation, infos = self.vector.reset(seed=self._seeds)
-        self.reset_infos = _rows(infos, self.num_envs)
+        self.reset_infos = single_infos(infos, self.num_envs)
         self._reset_seeds()
         return observation
 
@@ -107,10 +108,10 @@ class SB3VecEnv(VecEnv):
         ended = terminated | truncated
         final, last = infos.pop("final_info", {}), infos.pop("final_obs", None)
         told = self._step_infos or ended.any()
-        now = _rows(infos, self.num_envs) if told else []
+        now = single_infos(infos, self.num_envs) if told else []
         rows = [row | {"TimeLimit.truncated": False} if self._step_infos else {} for row in now]
         rows = rows or [{} for _ in range(self.num_envs)]
-        for env, info in enumerate(_rows(final, self.num_envs)):
+        for env, info in enumerate(single_infos(final, self.num_envs)):
             if ended[env]:
                 self.reset_infos[env] = now[env]
                 rows[env] = info | {
@@ -144,21 +145,20 @@ class SB3VecEnv(VecEnv):
         Raises:
             AttributeError: there is none of this name.
         """
-        value = getattr(self.vector, _SINGLE.get(attr_name, attr_name))
-        return [value for _ in self._get_indices(indices)]
+        return self.vector.attr_of_some(list(self._get_indices(indices)), attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set an attribute of the vector, which all environments share.
+        """Set an attribute of one's own, which all environments share and nothing of this package reads.
 
         Raises:
-            ValueError: ``indices`` are not all of them.
+            ValueError: ``indices`` are not all of them, a setting, or what the environments are made with.
         """
         if set(self._get_indices(indices)) != set(range(self.num_envs)):
             raise ValueError(f"set_attr({attr_name!r}): environments of a batch share their attributes; leave indices")
-        setattr(self.vector, attr_name, value)
+        self.vector.set_attr(attr_name, [value] * self.num_envs)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any) -> list:
-        """Call what a single environment would have, for some environments: ``reset``, ``render`` and ``get_state``.
+        """Call what a single environment would have, for some environments; see :meth:`AvatarVectorEnv.call`.
 
         ``env_method("reset", seed=7, indices=2)`` begins an episode in one environment and returns a list of its
         observation and info, as :meth:`AvatarEnv.reset` does; the others go on.
@@ -166,55 +166,10 @@ class SB3VecEnv(VecEnv):
         Raises:
             AttributeError: the environments of a batch have no such method of their own.
         """
-        wanted = list(self._get_indices(indices))
-        if method_name == "reset":
-            return self._reset_some(wanted, *method_args, **method_kwargs)
-        if method_name == "render":
-            frames = self.get_images()
-            return [frames[env] for env in wanted]
-        if method_name == "get_state":
-            state = self.vector.get_state()
-            return [{name: value[env : env + 1] for name, value in state.items()} for env in wanted]
-        raise AttributeError(
-            f"env_method({method_name!r}): environments of a batch are stepped and reset together; they have 'reset', "
-            "'render' and 'get_state', everything else is the vector's: use .vector"
-        )
-
-    def _reset_some(
-        self, envs: Sequence[int], *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> list[tuple[Any, dict[str, Any]]]:
-        """Begin episodes in some environments, each of the same seed or the next one of its own."""
-        if not self.vector.episodes.ready:
-            self.reset()
-        mask = np.zeros(self.num_envs, bool)
-        mask[envs] = True
-        seeds = [seed if held else None for held in mask]
-        observation, infos = self.vector.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
-        rows = _rows(infos, self.num_envs)
-        named = isinstance(observation, dict)
-        own = [{k: v[env] for k, v in observation.items()} if named else observation[env] for env in envs]
-        return [(seen, rows[env]) for seen, env in zip(own, envs, strict=True)]
+        if method_name == "reset" and not self.vector.episodes.ready:
+            self.reset()  # those that are not meant, by their seeds
+        return self.vector.call_some(list(self._get_indices(indices)), method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
         """Whether environments are wrapped: environments of a batch never are."""
         return [False for _ in self._get_indices(indices)]
-
-
-#: Attributes of a single environment that the vector has under another name.
-_SINGLE = {"action_space": "single_action_space", "observation_space": "single_observation_space"}
-
-
-def _rows(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
-    """Infos in vector format as one dictionary an environment, with what its masks say it has."""
-    rows: list[dict[str, Any]] = [{} for _ in range(num_envs)]
-    for name, mask in infos.items():
-        if not name.startswith("_") or name[1:] not in infos:
-            continue
-        values = infos[name[1:]]
-        if isinstance(values, dict):
-            values = _rows(values, num_envs)
-        elif values.ndim == 1:
-            values = values.tolist()
-        for env in np.flatnonzero(mask):
-            rows[env][name[1:]] = values[env]
-    return rows

@@ -14,6 +14,7 @@ from gymnasium.vector.utils import batch_space
 from piavatar_envs.api.arrays import Array
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.api.copies import Copied
+from piavatar_envs.api.each import Each
 from piavatar_envs.api.episode import BATCH_RENDER_MODES, Settings, check_batch_render_mode
 from piavatar_envs.api.infos import outcome, standing, vector_format
 from piavatar_envs.api.picture import Pictures
@@ -23,7 +24,7 @@ from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
 
-class AvatarVectorEnv(Copied, BatchedView, VectorEnv):
+class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
     """Many worlds of one soft avatar and a task, stepped at once.
 
     Environment ``i`` is the single environment of seed ``seed + i``, bit for bit. Its ``info`` is the single
@@ -100,6 +101,7 @@ class AvatarVectorEnv(Copied, BatchedView, VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._pictures = Pictures(self.episodes.group_of, self.config.render)
+        self._own = frozenset(vars(self))
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
