@@ -115,7 +115,7 @@ class PropSet:
             place_prop,
             (self.model.num_envs, prop.count),
             [mask, prop, index, spawn.position, spawn.rotation, spawn.velocity, spawn.spin],
-            [state.x, state.u, state.C, state.F, state.vk],
+            [state.x, state.u, state.C, state.F, state.kinematic],
         )
 
     def record_tracking(self, program: Program, state: State) -> None:

@@ -10,7 +10,7 @@ import warp as wp
 from piavatar_envs.avatar.kabsch import kabsch_rotation
 from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of
 from piavatar_envs.mpm.matrices import store_matrix
-from piavatar_envs.mpm.types import Particles, row
+from piavatar_envs.mpm.types import Kinematic, Particles, row
 
 wp.set_module_options({"enable_backward": False})
 
@@ -75,7 +75,7 @@ def place_prop(
     u: wp.array2d(dtype=wp.vec3),
     C: wp.array3d(dtype=float),
     F: wp.array3d(dtype=float),
-    vk: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
 ):
     """Particles of prop ``index`` in the masked environments into rigid motion, unstrained; over ``(E, count)``.
 
@@ -90,7 +90,8 @@ def place_prop(
     u[e, q] = velocity[e, index] + wp.cross(spin[e, index], arm)
     store_matrix(C, e, q, wp.skew(spin[e, index]))
     store_matrix(F, e, q, wp.identity(n=3, dtype=float))
-    vk[e, q] = wp.vec3(0.0)
+    driven.vk[e, q] = wp.vec3(0.0)
+    driven.spin[e, q] = wp.vec3(0.0)
 
 
 @wp.kernel

@@ -59,6 +59,22 @@ def test_faults_end_the_episode_and_are_named(make_env, env_id, equal, fault):
     assert_next_episode_is_normal(env, expected, equal)
 
 
+@pytest.mark.parametrize("name", ["particles.vk", "particles.spin"])
+def test_what_drives_props_does_not_outlast_a_reset(make_env, equal, name):
+    """Nothing drives a prop: only a state brings numbers there, and only a reset can take them away."""
+    env = make_env("PIAvatar/KickBall-v0")
+    expected = [(env.reset(seed=1)[0], 0.0), *(row[:2] for row in steps(env, 5))]
+    state = env.batch.get_state()
+    state[name][:] = np.nan
+    env.batch.set_state(state)
+    assert steps(env, 1)[0][4]["failure"] is not None
+    env.reset()
+    after = env.get_state()
+    assert np.isfinite(after[name]).all()
+    env.set_state(after)
+    assert_next_episode_is_normal(env, expected, equal)
+
+
 @pytest.mark.parametrize("stiffness", [1e4, 1e8])
 def test_absurd_stiffness_at_a_forced_time_step(make_env, env_id, equal, stiffness):
     """The builder refuses such a step (see test_gymnasium); a body that stiffens afterwards blows up."""

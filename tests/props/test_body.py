@@ -8,7 +8,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.mpm.matrices import matrices_of
-from piavatar_envs.mpm.types import Particles, group
+from piavatar_envs.mpm.types import Kinematic, Particles, group
 from piavatar_envs.props import geometry
 from piavatar_envs.props.body import Prop, PropMatter, PropState, place_prop, scale_density, track_prop
 
@@ -38,7 +38,7 @@ class Scene:
         self.mass = mass
         self.particles = group(Particles, mass=wp.array(mass, dtype=float, device=device))
         shape = (NUM_ENVS, self.total)
-        self.x, self.u, self.vk = (self.poisoned(shape, wp.vec3) for _ in range(3))
+        self.x, self.u, self.vk, self.turning = (self.poisoned(shape, wp.vec3) for _ in range(4))
         self.C, self.F = (self.poisoned((NUM_ENVS, 9, self.total), float) for _ in range(2))
         self.failure = wp.zeros(NUM_ENVS, dtype=int, device=device)
         self.spawn, self.state = (PropState.allocate(NUM_ENVS, NUM_PROPS, device) for _ in range(2))
@@ -70,7 +70,7 @@ class Scene:
             place_prop,
             (NUM_ENVS, self.count),
             [self.array(mask, wp.bool), self.prop, INDEX, spawn.position, spawn.rotation, spawn.velocity, spawn.spin],
-            [self.x, self.u, self.C, self.F, self.vk],
+            [self.x, self.u, self.C, self.F, group(Kinematic, vk=self.vk, spin=self.turning)],
             device=self.device,
         )
         turns = rotation.as_matrix().reshape(NUM_ENVS, NUM_PROPS, 3, 3)
@@ -103,20 +103,21 @@ def test_placed_particles_move_rigidly(device):
     scene = Scene(device)
     R, position, velocity, spin = scene.place(np.random.default_rng(0))
     arm = np.einsum("eij,pj->epi", R, scene.rest)
-    x, u, C, F, vk = (scene.read(name)[:, scene.own].astype(float) for name in ("x", "u", "C", "F", "vk"))
+    names = ("x", "u", "C", "F", "vk", "turning")
+    x, u, C, F, vk, turning = (scene.read(name)[:, scene.own].astype(float) for name in names)
     assert np.abs(x - (position[:, None] + arm)).max() < 2e-6
     assert np.abs(u - (velocity[:, None] + np.cross(spin[:, None], arm))).max() < 1e-5
     # the affine matrix carries the same motion on to the next point
     step = np.array([0.01, -0.02, 0.03])
     assert np.abs(C @ step - np.cross(spin, step)[:, None]).max() < 1e-6
     assert np.array_equal(F, np.broadcast_to(np.eye(3), F.shape))
-    assert not vk.any()
+    assert not vk.any() and not turning.any()
 
 
 def test_placing_touches_only_the_prop_and_the_masked_environments(device):
     scene = Scene(device)
     scene.place(np.random.default_rng(1), mask=(True, False, True, False))
-    for name in ("x", "u", "C", "F", "vk"):
+    for name in ("x", "u", "C", "F", "vk", "turning"):
         values = scene.read(name)
         foreign = np.concatenate([values[:, :BEFORE], values[:, scene.own.stop :]], axis=1)
         assert np.all(foreign == np.float32(POISON)), name
