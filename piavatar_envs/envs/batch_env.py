@@ -15,6 +15,7 @@ from piavatar_envs.envs.draws import NUM_SEEDS
 from piavatar_envs.envs.episodes import begin_episode, count_episodes, end_agent, end_step, find_ended, retire
 from piavatar_envs.envs.joint_actions import apply_targets, apply_torques, follow_reference
 from piavatar_envs.envs.observer import Observer
+from piavatar_envs.envs.props import check_places
 from piavatar_envs.envs.simulation import Simulation
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.tasks.base import Task
@@ -45,6 +46,7 @@ class BatchEnv:
         """Build everything; call :meth:`reset` before :meth:`step`.
 
         Raises:
+            ConfigError: the task would place a prop outside the domain.
             ValueError: a bad device, batch or time step; see :class:`Simulation`.
         """
         if num_envs < 1:
@@ -53,6 +55,8 @@ class BatchEnv:
         self.simulation = Simulation(
             task.config, num_envs, device, task.domain(), task.scene, avatar_names=task.agent_names
         )
+        placed = self.simulation.props.points, task.prop_places()
+        check_places(self.simulation.domain, self.simulation.dx, task.scene.props, *placed)
         self.device, self.num_agents = self.simulation.device, len(self.simulation.avatars)
         self.control = task.config.drive.control
         self.action_spec = task.action_spec().under(self.control)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
 import numpy as np
 import warp as wp
+from scipy.spatial.transform import Rotation
 
-from piavatar_envs.envs.config import PropConfig
+from piavatar_envs.envs.config import ConfigError, PropConfig
+from piavatar_envs.envs.domain import Domain
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.materials import lame_parameters
 from piavatar_envs.mpm.program import Program
@@ -17,6 +19,9 @@ from piavatar_envs.props.body import Prop, PropMatter, PropState, place_prop, sc
 from piavatar_envs.props.geometry import PropPoints
 
 wp.set_module_options({"enable_backward": False})
+
+#: How far a prop may reach out of the domain when it begins [grid spacings]: the grid holds it, and walls push it back.
+OVERLAP = 0.5
 
 
 class PropSet:
@@ -137,6 +142,50 @@ class PropSet:
         found["props.density"] = self.density
         found["contact.density"] = self.model.contact.density
         return found | {f"matter.{name}": getattr(self.model.particles, name) for name in ("mass", "mu", "lam")}
+
+
+def check_places(
+    domain: Domain,
+    dx: float,
+    configs: Sequence[PropConfig],
+    points: Sequence[PropPoints],
+    places: Mapping[str, Sequence[Sequence[float]]],
+) -> None:
+    """Refuse props that would begin outside the domain, where their first step is their last.
+
+    Args:
+        domain: where particles may go.
+        dx: grid spacing [m].
+        configs: of the props, turned as they begin.
+        points: their particles.
+        places: of their centres of mass [m], by name.
+
+    Raises:
+        ConfigError: a prop would reach out of the domain; or a name is no prop's.
+    """
+    solids = {config.name: (config, solid.rest) for config, solid in zip(configs, points, strict=True)}
+    box = np.array([domain.lower, domain.upper])
+    for name, centres in places.items():
+        if name not in solids:
+            raise ConfigError(f"there is no prop {name!r} to be placed; there are {', '.join(solids) or 'none'}")
+        config, rest = solids[name]
+        turned = Rotation.from_quat(np.roll(config.rotation, -1)).apply(rest)
+        reach = np.array([turned.min(0), turned.max(0)])
+        for centre in centres:
+            inside = (centre + reach[0] >= box[0] - OVERLAP * dx) & (centre + reach[1] <= box[1] + OVERLAP * dx)
+            if not inside.all():
+                _refuse_place(name, centre, int(np.argmin(inside)), box, box - reach)
+
+
+def _refuse_place(name: str, centre: Sequence[float], axis: int, box: np.ndarray, room: np.ndarray) -> None:
+    """Say that a prop at ``centre`` reaches out of ``box`` along ``axis``; ``room`` is for its centre [m]."""
+    along, at = "xyz"[axis], [round(float(value), 3) for value in centre]
+    low, high = room[:, axis]
+    remedy = f"place it with {along} in [{low:.3g}, {high:.3g}] m" if low <= high else "make it smaller"
+    raise ConfigError(
+        f"prop {name!r} would begin at {at} m and reach out of the domain, which ends at "
+        f"{along}={box[0, axis]:.3g} and {box[1, axis]:.3g} m; {remedy}"
+    )
 
 
 @wp.kernel

@@ -16,7 +16,7 @@ from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.flesh import Flesh, drive_settings
-from piavatar_envs.envs.props import PropSet
+from piavatar_envs.envs.props import PropSet, check_places
 from piavatar_envs.envs.randomize import Randomization, fastest_wave
 from piavatar_envs.envs.shapes import Shapes
 from piavatar_envs.envs.subjects import assemble, prop_matter, prop_points
@@ -25,6 +25,7 @@ from piavatar_envs.mpm.build import build_model, choose_num_substeps, make_grid
 from piavatar_envs.mpm.impulses import clear_masked_sensors
 from piavatar_envs.mpm.memory import allocate, estimate_slots
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.props.geometry import PropPoints
 
 #: Grid spacings in a standing mean body, by fidelity; "fine" is the paper's scale, about 1 cm.
 GRID_PER_HEIGHT: dict[str, float] = {
@@ -39,6 +40,7 @@ class Simulation:
     """Avatars and props in each of ``num_envs`` worlds.
 
     Attributes:
+        domain: where particles may go.
         model: constants of the continuum.
         state: particles; scratch: grid; sensors: contact of the last control step.
         flesh: matter of every avatar (NumPy); avatars: their drives.
@@ -90,13 +92,13 @@ class Simulation:
         rows = num_envs if own_rows else 1
         joints = [flesh.joint_settings() for flesh in self.flesh]
         domain = domain or Domain().around([a.position for a in avatars])
-        domain, walls = self._room(domain, bool(solids), any(joints))
+        self.domain, walls = self._room(domain, solids, any(joints))
         self.subjects = assemble(self.scene, physics, names, self.flesh, matter, walls, rows)
         rest = np.concatenate([*(flesh.points.rest[0] for flesh in self.flesh), *(points.rest for points in solids)])
         wave = fastest_wave(config.randomize, [flesh.matter() for flesh in self.flesh])
         self.model = build_model(
             self.subjects.matter,
-            make_grid(domain.lower, domain.upper, self.dx),
+            make_grid(self.domain.lower, self.domain.upper, self.dx),
             num_envs=num_envs,
             device=self.device,
             control_dt=physics.control_dt,
@@ -130,10 +132,17 @@ class Simulation:
         """The first avatar's drive."""
         return self.avatars[0]
 
-    def _room(self, domain: Domain, solid: bool, driven: bool) -> tuple[Domain, tuple[Collider, ...]]:
-        """The domain, wider where joints are driven by torques, and the walls around it; ``solid``: there are props."""
-        walled = self.scene.walls and (solid or len(self.flesh) > 1 or domain.fenced)
+    def _room(self, domain: Domain, solids: Sequence[PropPoints], driven: bool) -> tuple[Domain, tuple[Collider, ...]]:
+        """The domain, wider where joints are driven by torques, and the walls around it.
+
+        Raises:
+            ConfigError: a prop would begin outside.
+        """
+        walled = self.scene.walls and (bool(solids) or len(self.flesh) > 1 or domain.fenced)
         domain = domain.for_falls(walled) if driven else domain
+        check_places(
+            domain, self.dx, self.scene.props, solids, {prop.name: [prop.position] for prop in self.scene.props}
+        )
         return domain, domain.walls() if walled else ()
 
     def _substeps(self, wave: float) -> int | None:

@@ -141,6 +141,14 @@ class Task:
         """Names of the props that agents see."""
         return tuple(prop.name for prop in self.scene.props)
 
+    def prop_places(self) -> Mapping[str, Sequence[Sequence[float]]]:
+        """Where episodes may put props, of those that :meth:`record_reset` places, by name.
+
+        Corners of what holds the middles [m], each x, y, z. What would begin outside the domain is refused when the
+        environment is built; where the scene has its props is looked at anyway.
+        """
+        return {}
+
     def drawn(self) -> tuple[Parameter, ...]:
         """Numbers that the task draws for each episode and that ``observe_parameters`` shows.
 

@@ -87,6 +87,18 @@ def gate_domain(config: GateConfig, scene: SceneConfig, top: float) -> Domain:
     return body.including((-aside, y - way, 0.0), (aside, 0.0, top + BEHIND))
 
 
+def ball_places(config: GateConfig, *heights: float, drift: float = 0.0) -> Mapping[str, Sequence[Sequence[float]]]:
+    """Corners of where the ball may begin, for :meth:`Task.prop_places`.
+
+    Args:
+        config: the task's settings.
+        heights: the least and the greatest, or all there is [m].
+        drift: how much farther aside than its jitter it may begin [m].
+    """
+    (x, y), aside = config.ball_place, config.ball_jitter + drift
+    return {BALL: [(x + i * aside, y + j * aside, z) for i in (-1, 1) for j in (-1, 1) for z in heights]}
+
+
 def drawn_goal(config: GateConfig) -> tuple[Parameter, ...]:
     """What episodes draw of ball and gate."""
     side = math.sin(config.target_angle)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import warp as wp
@@ -24,6 +24,7 @@ from piavatar_envs.tasks.goal import (
     TERMINATION_DOC,
     Goal,
     ball_config,
+    ball_places,
     drawn_goal,
     gate_domain,
 )
@@ -77,6 +78,12 @@ class Fall:
     gravity: float  # downward [m/s^2]
 
 
+@wp.func
+def falling_time(height: float, gravity: float):
+    """Time [s] to fall a height [m] from rest; at most a second, for want of gravity."""
+    return wp.min(wp.sqrt(2.0 * wp.max(height, 0.0) / wp.max(gravity, 0.1)), 1.0)
+
+
 @wp.kernel
 def throw_ball(
     mask: wp.array(dtype=wp.bool),
@@ -98,8 +105,7 @@ def throw_ball(
     offset = wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
     drift = fall.speed * wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
     height = wp.randf(random, fall.low, fall.high)
-    # at most a second, for want of gravity
-    time = wp.min(wp.sqrt(2.0 * wp.max(height - ball.place[2], 0.0) / wp.max(fall.gravity, 0.1)), 1.0)
+    time = falling_time(height - ball.place[2], fall.gravity)
     start = ball.place + ball.jitter * offset - time * drift
     start[2] = height
     position[e, ball.prop] = start
@@ -182,6 +188,11 @@ that all of them but the control cost add up to at most 1, half of it for the go
         scene, config = super().build_scene(), self.config
         ball = ball_config(config, (*config.ball_place, config.ball_height[1]))
         return replace(scene, props=[ball, *scene.props])
+
+    def prop_places(self) -> Mapping[str, Sequence[Sequence[float]]]:
+        config = self.config
+        time = falling_time(config.ball_height[1] - TOUCH_HEIGHT, config.physics.gravity)
+        return ball_places(config, *config.ball_height, drift=config.ball_speed * time)
 
     def drawn(self) -> tuple[Parameter, ...]:
         return drawn_goal(self.config)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import warp as wp
@@ -23,6 +23,7 @@ from piavatar_envs.tasks.goal import (
     TERMINATION_DOC,
     Goal,
     ball_config,
+    ball_places,
     drawn_goal,
     gate_domain,
 )
@@ -156,6 +157,9 @@ that all of them but the control cost add up to at most 1, half of it for the go
         scene = super().build_scene()
         ball = ball_config(self.config, (*self.config.ball_place, self.config.ball_radius))
         return replace(scene, props=[ball, *scene.props])
+
+    def prop_places(self) -> Mapping[str, Sequence[Sequence[float]]]:
+        return ball_places(self.config, self.config.ball_radius)
 
     def drawn(self) -> tuple[Parameter, ...]:
         return drawn_goal(self.config)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -135,6 +135,10 @@ of the root, too, which is never more than 0.1 m and 0.3 rad ahead of it."""
             friction=config.box_friction,
         )
         return replace(scene, props=[box, *scene.props])
+
+    def prop_places(self) -> Mapping[str, Sequence[Sequence[float]]]:
+        height = self.config.box_half_size[2]
+        return {NAME: [(*self._ahead(distance), height) for distance in self.config.box_distance]}
 
     def _ahead(self, distance: float, angle: float = 0.0) -> tuple[float, float]:
         """What is ``distance`` [m] before the avatar's place, ``angle`` [rad] from straight ahead."""

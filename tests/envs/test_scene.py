@@ -99,6 +99,69 @@ def test_limbs_are_fields_of_their_own(device):
     assert trunk.tolist() == [0] * 5 + [5] * 5 + [10]
 
 
+def test_props_begin_inside_the_domain(device):
+    """One that reaches less than half a grid spacing out is pushed back; the message says where it is inside."""
+    for place, told in {
+        (3.0, -1.0, 1.0): r"prop 'ball' would begin at \[3.0, -1.0, 1.0\] m and .* ends at x=-1.6 and 1.6 m; place it "
+        r"with x in \[-1.52, 1.52\] m",
+        (0.0, -1.65, 1.0): "ends at y=-1.6 and 1.6 m",
+        (0.0, -1.0, 2.65): "ends at z=-0.3 and 2.6 m",
+    }.items():
+        with pytest.raises(ConfigError, match=told):
+            world(device, props=[{**BALL, "position": place}])
+    edge = Domain().upper[1] - 0.08 + 0.4 * world(device).dx
+    world(device, props=[{**BALL, "position": (0.0, edge, 1.0)}])
+    plank = {"name": "plank", "shape": "box", "size": [0.9, 0.1, 0.1], "position": [0.9, -1.0, 1.0]}
+    with pytest.raises(ConfigError, match=r"'plank' .* x=-1.6 and 1.6"):
+        world(device, props=[plank])
+    world(device, props=[{**plank, "rotation": [1.0, 0.0, 1.0, 0.0]}])
+    with pytest.raises(ConfigError, match="make it smaller"):
+        world(device, props=[{**plank, "size": [2.0, 0.1, 0.1]}])
+    # what is around moves with the avatars, and is wider under torques
+    world(device, props=[{**BALL, "position": [3.0, -1.0, 1.0]}], avatars=[{"position": [3.0, 0.0]}])
+    torques = {"fidelity": "tiny", "control": "torque", "scene": {"props": [{**BALL, "position": [2.5, -1.0, 1.0]}]}}
+    Simulation(load_config(EnvConfig, None, torques), 1, device)
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "axis"),
+    [
+        ("PIAvatar/KickBall-v0", {"ball_place": (0.0, 1.1), "ball_jitter": 0.2}, "y"),
+        ("PIAvatar/Header-v0", {"ball_height": (6.0, 6.5), "ball_speed": 2.0}, "x"),
+    ],
+)
+def test_places_that_episodes_draw_are_inside_the_domain(make_batch, task, settings, axis):
+    with pytest.raises(ConfigError, match=f"would begin at .* reach out of the domain, which ends at {axis}=.* m;"):
+        make_batch(task, **settings)
+
+
+@pytest.mark.parametrize("task", ["PIAvatar/KickBall-v0", "PIAvatar/Header-v0", "PIAvatar/PushBox-v0"])
+def test_episodes_draw_the_places_that_are_looked_at(make_batch, task):
+    batch = make_batch(task, 32)
+    ((name, places),) = batch.task.prop_places().items()
+    drawn = []
+    for episode in range(8):
+        batch.reset(seeds=range(32) if episode == 0 else None)
+        drawn.append(batch.simulation.props.spawn.position.numpy()[:, batch.simulation.props.index(name)])
+    drawn, places = np.concatenate(drawn), np.array(places)
+    low, high = places.min(0), places.max(0)
+    assert (drawn >= low - 1e-6).all() and (drawn <= high + 1e-6).all()
+    # no wider than they need be: what is drawn comes near the limits, but where several draws would have to agree
+    assert (np.ptp(drawn, axis=0) >= 0.6 * (high - low)).all()
+
+
+def test_a_place_of_no_prop_is_refused(device):
+    from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.tasks.kick_ball import KickBallTask
+
+    class Lost(KickBallTask):
+        def prop_places(self):
+            return {"bal": [(0.0, 0.0, 0.2)]}
+
+    with pytest.raises(ConfigError, match="there is no prop 'bal' to be placed; there are ball"):
+        BatchEnv(Lost(load_config(Lost.Config, None, {"fidelity": "tiny"})), 1, device)
+
+
 def test_props_have_their_mass_and_the_fleshs_wave_speed(device):
     props = [BALL, {"name": "brick", "shape": "box", "size": [0.2, 0.2, 0.2], "density": 300.0, "young_modulus": 2e4}]
     simulation = world(device, num_envs=2, props=props)
