@@ -5,15 +5,17 @@ Nothing heavy is imported and no GPU is touched until an environment is made.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register, registry
 
 from piavatar_envs.tasks import add_task, place_of, task_modules
 
 if TYPE_CHECKING:
+    from piavatar_envs.api.check import check_task
     from piavatar_envs.tasks.base import Task
 
+__all__ = ["check_task", "register_task"]
 __version__ = "0.1.0"
 
 #: What Gymnasium calls for every id.
@@ -46,6 +48,15 @@ def register_task(env_id: str, task: type[Task] | str) -> None:
     registry.pop(env_id, None)  # without Gymnasium's warning: a notebook's cell is often run twice
     # by what a process that has not run this can import
     _register(env_id, place_of(env_id, task))
+
+
+def __getattr__(name: str) -> Any:
+    """``check_task``, whose imports are heavy, when it is first asked for."""
+    if name != "check_task":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from piavatar_envs.api.check import check_task
+
+    return check_task
 
 
 for _env_id in task_modules():
