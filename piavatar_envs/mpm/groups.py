@@ -185,7 +185,7 @@ def scatter_turn(
 
 
 # with fewer registers, some of what additions need must be kept elsewhere
-@wp.kernel(launch_bounds=(THREADS, 5))
+@wp.kernel(launch_bounds=(THREADS, 6))
 def runs_to_grid(
     grid: Grid,
     step: Step,
