@@ -9,13 +9,14 @@ import pytest
 import warp as wp
 
 from piavatar_envs.mpm import group_plan
-from piavatar_envs.mpm.build import choose_scatter
+from piavatar_envs.mpm.build import MaterialPoints, choose_scatter
 from piavatar_envs.mpm.memory import estimate_slots
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.runs import MOST_COUNTED
 from piavatar_envs.mpm.shared_room import parts_of, suits_shared
 from piavatar_envs.mpm.solver import record_marks, record_scatter
 from piavatar_envs.mpm.sums import units
-from piavatar_envs.mpm.types import SCATTERS
+from piavatar_envs.mpm.types import FAILURE_CFL, SCATTERS
 
 ARRAYS = ("x", "u", "C", "F")
 CUBES = [
@@ -129,6 +130,35 @@ def test_particles_far_apart(simulate, scatter):
     for key, sums in found.items():
         by_hand = expected.get(key, np.zeros((64, 7)))
         np.testing.assert_allclose(sums[:, :4], by_hand[:, :4], atol=2e-7, err_msg=str(key))  # of 0.016 kg
+
+
+@pytest.mark.parametrize("scatter", ["runs", "singles"], indirect=True)
+def test_who_adds_no_mass_adds_nothing(simulate, scatter):
+    """Light particles are fast: their momentum counts, their mass is less than a unit.
+
+    A node with momentum and no mass would be skipped, and keep it for who comes there later.
+    """
+    rng = np.random.default_rng(8)
+    light = np.arange(8) > 3
+    rest = rng.uniform(-0.02, 0.02, (8, 3)) + np.where(light, 0.15, -0.15)[:, None] * [1.0, 0.0, 0.0]
+    points = MaterialPoints.uniform(np.where(light, 1e-10, 1.0) * 0.025**3)
+    sim = simulate(rest=rest, points=points, scatter=scatter).set(u=np.where(light, 1e4, 0.0)[:, None])
+    assert len(sim.model.particles.groups) == 2  # of all, and where it ends
+    sums = np.concatenate(list(node_sums(sim).values()))
+    assert sim.failures == [0] and 27 <= np.count_nonzero(sums[:, 0]) <= 64
+    assert not sums[:, 1:].any()
+
+
+@pytest.mark.parametrize(("share", "failure"), [(0.1, 0), (0.95, FAILURE_CFL)])
+def test_sums_too_large_for_their_words_fail(simulate, device, share, failure):
+    """Particles that may be added up, but are too much together: a node has those of eight."""
+    if device == "cpu":
+        pytest.skip("a CPU adds floating-point numbers")
+    sim = simulate(scatter="runs")
+    unit, mass = sim.scratch.sums.momentum_unit.numpy()[0, 0], sim.model.particles.mass.numpy()[0, 0]
+    sim.set(u=(share * float(MOST_COUNTED) * float(unit) / float(mass), 0.0, 0.0))
+    node_sums(sim)
+    assert sim.failures == [failure]
 
 
 @pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "plain"], indirect=True)
