@@ -36,8 +36,8 @@ auto put = [&](auto add) {{
         const int sum = *from, record = room[n] + within;
         *from = 0;
         unsigned massive = __ballot_sync(ALL, sum != 0);
-        if (kind != 0) massive = room[n + CAPACITY];
-        else if (lane == 0) room[n + CAPACITY] = massive;
+        if (kind != 0) massive = room[n - RECORDS + MASSIVE];
+        else if (lane == 0) room[n - RECORDS + MASSIVE] = massive;
         if (sum != 0 && (massive & mass_of_node)) add(record, sum);  // who adds no mass adds nothing
     }}
 }};
@@ -47,7 +47,8 @@ auto red = [](size_t to, int record, long long added) {{
     asm("mad.wide.s32 %0, %1, %2, %3;" : "=l"(node) : "r"(record), "r"(32), "l"(to));
     asm volatile("red.global.add.u64 [%0], %1;" :: "l"(node), "l"(added) : "memory");
 }};
-auto record_of_place = [](int record) {{ return (record >> 1 & ~63) + (record & 63); }};  // of no halves
+// what places have of records has no halves
+auto own = [&](int record) {{ return is_place ? (record >> 1 & ~63) + (record & 63) : record; }};
 bool too_much = false;
 // sums have 31 bits, so most of them cannot be too large
 if (sums.is_fixed != 0 && !is_place && __all_sync(ALL, shift < 18)) {{
@@ -63,15 +64,13 @@ if (sums.is_fixed != 0 && !is_place && __all_sync(ALL, shift < 18)) {{
     const size_t to = __cvta_generic_to_global(records) + 8 * word;
     const int most_counted = shift > 48 ? 0 : shift < 18 ? 0x7fffffff : 1 << (48 - shift);
     put([&](int record, int sum) {{
-        if (abs(sum) <= most_counted) red(to, is_place ? record_of_place(record) : record, (long long)sum << shift);
+        if (abs(sum) <= most_counted) red(to, own(record), (long long)sum << shift);
         else too_much = true;
     }});
 }} else {{
     float* const to = (float*)(is_place ? &wp::index(sums.offset, e, 0) : &wp::index(sums.value, e, 0)) + word;
     if (is_place && c > 0) unit *= grid.dx;
-    put([&](int record, int sum) {{
-        atomicAdd(to + 4 * (size_t)(is_place ? record_of_place(record) : record), sum * unit);
-    }});
+    put([&](int record, int sum) {{ atomicAdd(to + 4 * (size_t)own(record), sum * unit); }});
 }}
 if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 """)

@@ -184,7 +184,7 @@ def scatter_turn(
     return stays
 
 
-# with fewer registers, some of what additions need must be kept elsewhere
+# that leaves a thread 80 registers, all but a few of those that it asks for
 @wp.kernel(launch_bounds=(THREADS, 6))
 def runs_to_grid(
     grid: Grid,

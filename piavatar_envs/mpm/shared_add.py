@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import warp as wp
 
 from piavatar_envs.mpm.shared_grid import BRICK_WORDS, brick_native, line_in_bricks
@@ -17,6 +15,7 @@ wp.set_module_options({"enable_backward": False})
 # number say: two of them that of the four words of a node; one that of the nodes along each axis, first the lower or
 # the upper one of a brick, then the other, and last what is left
 _ADD = """
+constexpr int UNIT = %(unit)d;
 const int px = s.base[0] & 1, py = s.base[1] & 1, pz = s.base[2] & 1;
 const int turn = p & 3, turn_x = (p >> 2 ^ px) & 1, turn_y = (p >> 3 ^ py) & 1, turn_z = (p >> 4 ^ pz) & 1;
 // a word at the lowest node, and how it changes along the axes; a mass does not
@@ -42,28 +41,28 @@ for (int n = 0; n < 3; ++n) {
     weight_z[n] = l == 0 ? wz[0] : l == 1 ? wz[1] : wz[2];
     at_z[n] = (float)l, place_z[n] = UNIT * (((pz + l) & 1) * ALONG_Z + turn), upper_z[n] = pz + l > 1;
 }
-BEFORE
-#pragma unroll UNROLLED
+%(before)s
+#pragma unroll %(unrolled)d
 for (int n = 0; n < 3; ++n) {
     const int i = n < 2 ? n ^ turn_x : 2;
     const float wi = i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2];
     const bool far = px + i > 1;
-    PLANE
+    %(plane)s
     const int plane = UNIT * ((px + i) & 1) * ALONG_X;
     const float at_x = i == 0 ? 0.0f : 1.0f;  // the last plane from the one before it
     for (int c = 0; c < 4; ++c) q[c] += i == 2 ? along[c][0] : 0.0f;
-#pragma unroll UNROLLED
+#pragma unroll %(unrolled)d
     for (int m = 0; m < 3; ++m) {
         const int j = m < 2 ? m ^ turn_y : 2;
         const bool upper = py + j > 1;
         const int line = plane + UNIT * ((py + j) & 1) * ALONG_Y;
-        LINE
+        %(line)s
         const float w = wi * (j == 0 ? wy[0] : j == 1 ? wy[1] : wy[2]);
         float at[4];
         for (int c = 0; c < 4; ++c) at[c] = q[c] + at_x * along[c][0] + (float)j * along[c][1];
 #pragma unroll
         for (int l = 0; l < 3; ++l) {
-            const int node = NODE;  // a multiple of four words, and the turn
+            const int node = %(node)s;  // a multiple of four words, and the turn
             const float wl = w * weight_z[l];
             for (int c = 0; c < 4; ++c) {
                 int* const word = reinterpret_cast<int*>(reinterpret_cast<char*>(room) + 4 / UNIT * (node ^ UNIT * c));
@@ -86,9 +85,8 @@ def adding(unit: int, before: str, plane: str, line: str, node: str, unrolled: i
         node: the place of the first word of node ``l`` of the line.
         unrolled: planes, and lines of a plane, that the compiler writes down.
     """
-    pieces = {"BEFORE": before, "PLANE": plane, "LINE": line, "NODE": node, "UNROLLED": str(unrolled)}
-    snippet = re.sub("BEFORE|PLANE|LINE|NODE|UNROLLED", lambda name: pieces[name.group()], _ADD)
-    return brick_native(f"constexpr int UNIT = {unit};\n{snippet}")
+    pieces = {"unit": unit, "before": before, "plane": plane, "line": line, "node": node, "unrolled": unrolled}
+    return brick_native(_ADD % pieces)
 
 
 @wp.func_native(
