@@ -29,11 +29,21 @@ I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 def cayley(turn: wp.vec3):
     """Rotation ``(I - W/2)^-1 (I + W/2)`` with ``W = skew(turn)`` [rad]; orthogonal to round-off for any ``turn``.
 
-    With ``a = turn / 2`` it has the closed form ``I + 2 (A + A A) / (1 + a.a)``, ``A = skew(a)``.
+    With ``a = turn / 2`` it has the closed form ``I + 2 (A + A A) / (1 + a.a)``, ``A = skew(a)``, where
+    ``A A = a a^T - a.a I``: written down, it takes a third of the operations.
     """
     a = 0.5 * turn
-    A = wp.skew(a)
-    return I3 + (2.0 / (1.0 + wp.dot(a, a))) * (A + A * A)
+    square = wp.dot(a, a)
+    share = 2.0 / (1.0 + square)
+    b = share * a
+    rest = 1.0 - share * square
+    # fmt: off
+    return wp.mat33(
+        rest + b[0] * a[0], b[0] * a[1] - b[2], b[0] * a[2] + b[1],
+        b[0] * a[1] + b[2], rest + b[1] * a[1], b[1] * a[2] - b[0],
+        b[0] * a[2] - b[1], b[1] * a[2] + b[0], rest + b[2] * a[2],
+    )
+    # fmt: on
 
 
 @wp.func
