@@ -18,6 +18,8 @@ BLOCK = 128
 #: Particles of a thread, at most, in passes that wait for memory: it asks for what the next one has before it goes on
 #: with one. On an H200 of 1, 3 and 6 the last was best.
 ROUNDS = 6
+#: Threads that would share the chunks of a bone, from which on each bone has a warp.
+MANY_THREADS = 8
 #: Threads that a multiprocessor can have.
 RESIDENT = 2048
 
@@ -28,8 +30,12 @@ def warp_threads(device: str) -> int:
 
 
 def chunk_threads(device: str, chunks: int) -> int:
-    """Threads that add up the ``chunks`` of a bone, about two each."""
-    return min(warp_threads(device), 1 << max(0, (chunks - 1) // 2).bit_length())
+    """Threads of a warp that add up the ``chunks`` of a bone, about two each; 0 if each bone has a warp of its own.
+
+    A warp that goes from bone to bone waits for memory every time.
+    """
+    threads = min(warp_threads(device), 1 << max(0, (chunks - 1) // 2).bit_length())
+    return threads if threads < MANY_THREADS else 0
 
 
 def particle_rounds(device: str, particles: int) -> int:
@@ -99,6 +105,18 @@ def place_in_block(e: int, block: int) -> wp.vec3i:
 
     On a CPU the launch is over ``(num_envs, 1)``, ``e`` as Warp says.
     """
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return wp::vec_t<4, wp::int32>((int)blockIdx.x, (int)(threadIdx.x >> 5), (int)(threadIdx.x & 31), 32);
+#else
+return wp::vec_t<4, wp::int32>(e, 0, 0, 1);
+#endif
+""")
+def place_in_warps(e: int) -> wp.vec4i:
+    """Environment, warp, lane and number of lanes, where a CUDA block has an environment; on a CPU ``e``, 0, 0, 1."""
     ...
 
 

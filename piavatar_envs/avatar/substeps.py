@@ -111,13 +111,18 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         program.launch(drive_stages.drive_body, n, inputs, outputs)
         return
     chunks, own = (n, drive.num_chunks, drive.threads), [drive.chunk_threads, state.failure, drive.threads]
+    each_bone, of_bone = (n, NUM_JOINTS, drive.threads), [drive.body, state.failure, drive.threads]
     inputs = [drive.body, drive.model.particles, state.x, state.u, bench.tracked, state.failure, drive.threads]
     program.launch(bone_sums.sum_moments, chunks, inputs, [s.moments], block_dim=BLOCK)
+    if drive.chunk_threads == 0:
+        program.launch(drive_stages.fit_bones, each_bone, of_bone, [bench], block_dim=drive.threads)
     rounds = particle_rounds(drive.model.device, n * drive.num_points)
     shared = particle_threads(drive.model.device, drive.num_points, rounds)
     bones = (n, drive.threads)
-    inputs = [*who, drive.body_mass, step, *own]
-    program.launch(drive_stages.prepare_body, bones, inputs, [bench, g.held], block_dim=drive.threads)
+    warps = drive_stages.warps_of_body(drive.model.device, n)
+    inputs = [*who, drive.body_mass, step, drive.chunk_threads, state.failure, warps]
+    threads = warps * drive.threads
+    program.launch(drive_stages.prepare_body, (n, threads), inputs, [bench, g.held], block_dim=threads)
     program.launch(
         flesh.drive_particles,
         (n, shared),
@@ -129,6 +134,8 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         _record_free_motion(drive, program, state, bench)
     inputs = [drive.body, drive.model.particles, state.x, s.bone_center, s.pull, s.lean, state.failure, drive.threads]
     program.launch(bone_sums.sum_corrections, chunks, inputs, [s.corrections], block_dim=BLOCK)
+    if drive.chunk_threads == 0:
+        program.launch(drive_stages.add_to_bones, each_bone, of_bone, [bench], block_dim=drive.threads)
     program.launch(drive_stages.settle_body, bones, [*who, *own], [bench], block_dim=drive.threads)
     program.launch(
         flesh.apply_corrections,

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar import drive, lanes, substeps
+from piavatar_envs.avatar import drive, drive_stages, lanes, substeps
 from piavatar_envs.mpm.types import FAILURE_NONFINITE
 
 
@@ -136,6 +136,38 @@ def test_threads_that_have_several_particles_drive_as_one_each_does(device, make
     found = several.everything()
     for name, value in one.everything().items():
         np.testing.assert_array_equal(found[name], value, err_msg=name)
+
+
+def stepped(make_rig, wild_pose) -> dict:
+    """Two bodies that have been driven for two control steps."""
+    rng = np.random.default_rng(9)
+    rig = make_rig(num_envs=2, gravity=9.81, floor=True)
+    rig.command(np.stack([wild_pose(rng, 0.1) for _ in range(2)]))
+    rig.step(2)
+    return rig.everything()
+
+
+def test_one_warp_prepares_a_body_as_three_do(device, make_rig, wild_pose, monkeypatch):
+    """Three do on a GPU where bodies are few; an environment does the same in any batch."""
+    if not wp.get_device(device).is_cuda:
+        pytest.skip("on a CPU one thread prepares a body")
+    three = stepped(make_rig, wild_pose)
+    monkeypatch.setattr(drive_stages, "BODIES_PREPARED", 0)
+    assert drive_stages.warps_of_body(device, 2) == 1
+    for name, value in stepped(make_rig, wild_pose).items():
+        np.testing.assert_array_equal(three[name], value, err_msg=name)
+
+
+def test_bones_with_a_warp_each_move_as_those_that_share_one(device, make_rig, wild_pose, monkeypatch):
+    """Bones of large bodies have so many chunks that each has a warp; their sums are the same but for round-off."""
+    if not wp.get_device(device).is_cuda:
+        pytest.skip("on a CPU one thread has all bones")
+    shared = stepped(make_rig, wild_pose)
+    monkeypatch.setattr(lanes, "MANY_THREADS", 0)
+    assert lanes.chunk_threads(device, 1) == 0
+    apart = stepped(make_rig, wild_pose)
+    for name, value in shared.items():
+        np.testing.assert_allclose(apart[name], value, rtol=1e-4, atol=1e-4, err_msg=name)
 
 
 @pytest.mark.parametrize("root", ["wrench", "free"])
