@@ -19,9 +19,11 @@ from piavatar_envs.mpm.stencil import (
     stencil_inside,
 )
 from piavatar_envs.mpm.types import (
+    BESIDE,
     FAILURE_BLOCKS,
     FAILURE_NONFINITE,
     FAILURE_OUT_OF_GRID,
+    TELLS,
     Blocks,
     Grid,
     Particles,
@@ -79,6 +81,29 @@ def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
             for k in range(2):
                 mask = mask | blocks.fields[e, block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)]
     return mask
+
+
+# A GPU finds out anew: to write it down and read it takes as long
+@wp.func_native(f"""
+#if !defined(__CUDA_ARCH__)
+wp::index(blocks.around, e, p) = tells ? {int(TELLS)} | (beside ? {int(BESIDE)} : 0) : 0;
+#endif
+""")
+def note_around(blocks: Blocks, e: int, p: int, tells: bool, beside: bool):
+    """Note whether particle ``p`` tells its nodes where it is, and whether that is because another field is beside."""
+    ...
+
+
+@wp.func_native(f"""
+#if !defined(__CUDA_ARCH__)
+return wp::index(blocks.around, e, p);
+#else
+return {int(TELLS) | int(BESIDE)};
+#endif
+""")
+def noted_around(blocks: Blocks, e: int, p: int) -> int:
+    """Bits ``TELLS`` and ``BESIDE`` of particle ``p``; what may be, where nobody notes what is."""
+    ...
 
 
 @wp.func

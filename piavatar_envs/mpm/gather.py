@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import mark_blocks
+from piavatar_envs.mpm.blocks import mark_blocks, noted_around
 from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.records import TO_KINEMATIC, first_of_halves, read_half_from
 from piavatar_envs.mpm.stencil import base_node, grid_position, in_same_brick, spline, stencil_inside
+from piavatar_envs.mpm.stencil_lines import gather_lines, slabs_of_stencil
 from piavatar_envs.mpm.stencil_records import HALVES, ends_of_line, line_of_records, slab_records
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
@@ -18,6 +19,7 @@ from piavatar_envs.mpm.types import (
     NO_STRESS,
     PAPER,
     SPLIT,
+    TELLS,
     Blocks,
     Boundaries,
     Grid,
@@ -241,6 +243,43 @@ def gather(
     )  # fmt: skip
 
 
+@wp.func
+def gather_by_lines(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    blocks: Blocks,
+    moved: Moving,
+    failure: wp.array(dtype=int),
+    e: int,
+    p: int,
+):
+    """:func:`gather` for a CPU, whose scatter has noted what is around a particle."""
+    x = moved.x[e, p]
+    xg = grid_position(grid, x)
+    base = base_node(xg)
+    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
+    wx = spline(f[0])
+    wy = spline(f[1])
+    wz = spline(f[2])
+    field = particles.field[p]
+    nodes = first_of_halves(node_velocity, e)
+    slab0, slab1, slab2 = slabs_of_stencil(grid, blocks, e, field, base, HALVES)
+    sums = gather_lines(nodes, base, slab0, slab1, slab2, wx, wy, wz)
+    physical = Gradients(sums[0], sums[1], sums[2], sums[3])
+    kinematic = Gradients()
+    asked = bool(False)
+    if step.decoupling == PAPER or (noted_around(blocks, e, p) & TELLS) != 0:
+        asked = asks_kinematic(grid, step, boundaries, e, x)
+    if asked:
+        kinematic = gather_kinematic(grid, blocks, nodes, e, field, base, wx, wy, wz)
+    return finish_gather(
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, base, f
+    )  # fmt: skip
+
+
 @wp.kernel
 def grid_to_particles(
     grid: Grid,
@@ -253,11 +292,11 @@ def grid_to_particles(
     moved: Moving,
     failure: wp.array(dtype=int),
 ):
-    """Move every particle with the grid, see :func:`gather`."""
+    """Move every particle with the grid, see :func:`gather_by_lines`."""
     e, p = wp.tid()
     if blocks.frozen[e] != 0:
         return
-    s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+    s = gather_by_lines(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
     if s.fault == 0:
         moved.x[e, p] = s.x
         moved.u[e, p] = s.u

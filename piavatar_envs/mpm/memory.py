@@ -159,6 +159,7 @@ def allocate_blocks(model: Model) -> Blocks:
         num_shared=_zeros(model, n, int),
         swept=_zeros(model, n, int),
         frozen=_zeros(model, n, int),
+        around=_zeros(model, (n, model.num_particles) if wp.get_device(model.device).is_cpu else (1, 1), wp.uint8),
     )
 
 

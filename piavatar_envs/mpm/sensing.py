@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import fields_around, first_record, has_field, record_of
+from piavatar_envs.mpm.blocks import fields_around, first_record, has_field, noted_around, record_of
 from piavatar_envs.mpm.impulses import add_impulse, part_entry, read_change
 from piavatar_envs.mpm.records import mass_of
 from piavatar_envs.mpm.stencil import (
@@ -17,7 +17,7 @@ from piavatar_envs.mpm.stencil import (
 )
 from piavatar_envs.mpm.stencil_records import VECTORS, line_of_records, slab_records
 from piavatar_envs.mpm.sweep import THREADS
-from piavatar_envs.mpm.types import Blocks, Contact, Grid, Particles, Sensors, row
+from piavatar_envs.mpm.types import BESIDE, Blocks, Contact, Grid, Particles, Sensors, row
 from piavatar_envs.mpm.warp_blocks import fields_may_meet
 
 # unrolled, the stencil takes so many registers that a GPU has few threads at once
@@ -139,7 +139,7 @@ def sense_contact(
     """
     e, p = wp.tid()
     xg = grid_position(grid, x[e, p])
-    if failure[e] == 0:
+    if failure[e] == 0 and (noted_around(blocks, e, p) & BESIDE) != 0:
         sense_particle(grid, particles, blocks, sensors, e, p, xg)
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import fields_around, record_of
+from piavatar_envs.mpm.blocks import fields_around, note_around
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.matrices import matrix_at
-from piavatar_envs.mpm.records import TO_KINEMATIC
 from piavatar_envs.mpm.stencil import base_node, grid_position, spline
-from piavatar_envs.mpm.stencil_records import HALVES, line_of_records, slab_records
+from piavatar_envs.mpm.stencil_lines import scatter_lines, scatter_places, slabs_of_stencil
+from piavatar_envs.mpm.stencil_records import HALVES, VECTORS
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
     FAILURE_NONFINITE,
@@ -135,6 +135,12 @@ def near_boundary(grid: Grid, boundaries: Boundaries, e: int, x: wp.vec3):
 
 
 @wp.func
+def is_beside(grid: Grid, particles: Particles, contact: Contact, blocks: Blocks, e: int, p: int, base: wp.vec3i):
+    """Whether another field is in a block of a particle's stencil."""
+    return contact.num_fields > 1 and fields_around(grid, blocks, base, e) != (1 << particles.field[p])
+
+
+@wp.func
 def tells_place(
     grid: Grid,
     particles: Particles,
@@ -147,24 +153,9 @@ def tells_place(
     base: wp.vec3i,
 ):
     """Whether nodes must know where this particle is and how it is driven: another field or a boundary is near."""
-    if contact.num_fields > 1 and fields_around(grid, blocks, base, e) != (1 << particles.field[p]):
+    if is_beside(grid, particles, contact, blocks, e, p, base):
         return True
     return near_boundary(grid, boundaries, e, x)
-
-
-@wp.func
-def scatter_offsets(grid: Grid, blocks: Blocks, sums: Sums, e: int, field: int, seam: float, s: Scattered):
-    """Tell the nodes where a particle is."""
-    wx = spline(s.f[0])
-    wy = spline(s.f[1])
-    wz = spline(s.f[2])
-    for i in range(3):
-        for j in range(3):
-            for l in range(3):
-                r = record_of(grid, blocks, e, field, s.base[0] + i, s.base[1] + j, s.base[2] + l)
-                d = grid.dx * (wp.vec3(float(i), float(j), float(l)) - s.f)
-                m = wx[i] * wy[j] * wz[l] * s.at_base[0]
-                wp.atomic_add(sums.offset, e, r, wp.vec4(m * d[0], m * d[1], m * d[2], m * seam))
 
 
 @wp.kernel
@@ -189,37 +180,18 @@ def particles_to_grid(
         return
     x = moving.x[e, p]
     base = base_node(grid_position(grid, x))
-    tells = tells_place(grid, particles, boundaries, contact, blocks, e, p, x, base)
+    beside = is_beside(grid, particles, contact, blocks, e, p, base)
+    tells = beside or near_boundary(grid, boundaries, e, x)
+    note_around(blocks, e, p, tells, beside)
     s = prepare(grid, step, particles, moving, e, p, tells)
-    A = s.A
-    along_x = wp.vec4(0.0, A[0, 0], A[1, 0], A[2, 0])
-    along_y = wp.vec4(0.0, A[0, 1], A[1, 1], A[2, 1])
-    along_z = wp.vec4(0.0, A[0, 2], A[1, 2], A[2, 2])
-    driven = tells or step.decoupling == PAPER
-    kinematic = wp.vec4(s.at_base[4], s.at_base[5], s.at_base[6], 0.0)
+    field = particles.field[p]
+    slab0, slab1, slab2 = slabs_of_stencil(grid, blocks, e, field, base, HALVES)
     wx = spline(s.f[0])
     wy = spline(s.f[1])
     wz = spline(s.f[2])
-    field = particles.field[p]
-    at_i = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
-    slab = wp.vec4i()
-    for i in range(3):
-        at_j = wx[i] * at_i
-        if i == 0 or ((base[0] + i) & 3) == 0:
-            slab = slab_records(grid, blocks, e, field, base, i, HALVES)
-        for j in range(3):
-            line = wy[j] * at_j
-            step_z = (wx[i] * wy[j]) * along_z
-            at = line_of_records(slab, base, i, j)
-            wp.atomic_add(sums.value, e, at[0], wz[0] * line)
-            wp.atomic_add(sums.value, e, at[1], wz[1] * (line + step_z))
-            wp.atomic_add(sums.value, e, at[2], wz[2] * (line + 2.0 * step_z))
-            if driven:
-                k = (wx[i] * wy[j]) * kinematic
-                wp.atomic_add(sums.value, e, at[0] + TO_KINEMATIC, wz[0] * k)
-                wp.atomic_add(sums.value, e, at[1] + TO_KINEMATIC, wz[1] * k)
-                wp.atomic_add(sums.value, e, at[2] + TO_KINEMATIC, wz[2] * k)
-            at_j += wx[i] * along_y
-        at_i += along_x
+    driven = tells or step.decoupling == PAPER
+    scatter_lines(sums, e, base, slab0, slab1, slab2, wx, wy, wz, s.at_base, s.A, driven)
     if tells:
-        scatter_offsets(grid, blocks, sums, e, field, particles.seam[p], s)
+        slab0, slab1, slab2 = slabs_of_stencil(grid, blocks, e, field, base, VECTORS)
+        m = s.at_base[0]
+        scatter_places(sums, e, base, slab0, slab1, slab2, wx, wy, wz, s.f, m, particles.seam[p], grid.dx)

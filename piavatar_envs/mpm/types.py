@@ -55,6 +55,8 @@ SCATTERS: dict[str, bool] = {
     "singles_float": False,
     "shared": False,
 }
+#: What is around a particle: perhaps a boundary or another field, so that it tells its nodes where it is; the latter.
+TELLS, BESIDE = wp.constant(1), wp.constant(2)
 SPLIT = wp.constant(0)
 PAPER = wp.constant(1)
 NO_STRESS = wp.constant(3)
@@ -164,6 +166,8 @@ class Blocks:
     num_shared: wp.array(dtype=int)  # (num_envs,) how many, also such as found no slot for it
     swept: wp.array(dtype=int)  # (num_envs,) slots whose records the last grid pass has written
     frozen: wp.array(dtype=int)  # (num_envs,) not 0: had failed when this was last looked at, see :func:`freeze`
+    # (num_envs, num_particles) TELLS and BESIDE, as the scatter has found them in this substep; of a CPU
+    around: wp.array2d(dtype=wp.uint8)
 
 
 @wp.struct
