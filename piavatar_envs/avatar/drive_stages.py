@@ -13,9 +13,10 @@ import warp as wp
 from piavatar_envs.avatar.bone_sums import add_chunks, chunk_corrections, chunk_moments, chunk_motion
 from piavatar_envs.avatar.flesh import apply_correction, blend_corrections, drive_particle
 from piavatar_envs.avatar.free_motion import free_motion, is_free
+from piavatar_envs.avatar.kinematics import pose_bones
 from piavatar_envs.avatar.lanes import meet_threads, place_in_warps
 from piavatar_envs.avatar.loads import vector_at
-from piavatar_envs.avatar.posing import carry_anchor, carry_bone, pose_bones, write_record
+from piavatar_envs.avatar.posing import carry_anchor, carry_bone, write_record
 from piavatar_envs.avatar.rigid_fit import fit_bone, fit_whole
 from piavatar_envs.avatar.root import hold_root, lay_command
 from piavatar_envs.avatar.types import Bench, Body, Drive, Held

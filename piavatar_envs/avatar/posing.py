@@ -11,7 +11,6 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import LEAN, PLACE, SPIN, STEP, TURN, VELOCITY, store_record
-from piavatar_envs.avatar.lanes import meet_threads
 from piavatar_envs.avatar.rotation import finite_turn, quat_exp, quat_log, rigid_matrix, turn_about_z
 from piavatar_envs.avatar.types import (
     DRIVE_REFERENCE,
@@ -67,111 +66,6 @@ def begin_control(
             root_increment[e] = wp.quat_rotate(turn, goal_root[e] - command_root[e])
     carry_rotation[e, b] = wp.quat(0.0, 0.0, 0.0, 1.0)
     carry_translation[e, b] = wp.vec3(0.0)
-
-
-@wp.func
-def bone_offset(body: Body, e: int, b: int, root: wp.vec3):
-    """Where the joint of a bone is from its parent's in the frame of that; the pelvis', in the world [m]."""
-    parent = body.parent[b]
-    r = row(e, body.rest_joint.shape[0])
-    if parent < 0:
-        return root
-    return body.rest_joint[r, b] - body.rest_joint[r, parent]
-
-
-@wp.func
-def pose_bone(
-    body: Body,
-    e: int,
-    b: int,
-    root: wp.vec3,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-):
-    """Forward kinematics of one bone, whose ``rotation`` is local so far; its parent must have been posed."""
-    parent = body.parent[b]
-    offset = bone_offset(body, e, b, root)
-    if parent < 0:
-        position[e, b] = offset
-    else:
-        rotation[e, b] = wp.normalize(rotation[e, parent] * rotation[e, b])
-        position[e, b] = position[e, parent] + wp.quat_rotate(rotation[e, parent], offset)
-
-
-# In every round a bone takes the motion of its ancestor, who is twice as far as in the round before.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-int up = parent;
-for (int reach = 1; reach < levels; reach *= 2) {
-    const int from = up < 0 ? 0 : up;
-    wp::transform before;
-#pragma unroll
-    for (int k = 0; k < 7; ++k) before[k] = __shfl_sync(0xffffffffu, placed[k], from);
-    const int next = __shfl_sync(0xffffffffu, up, from);
-    if (up >= 0) placed = wp::mul(before, placed);
-    up = up < 0 ? -1 : next;
-}
-#endif
-return placed;
-""")
-def after_ancestors(placed: wp.transform, parent: int, levels: int) -> wp.transform:
-    """Motion of a bone in the world, of the lanes of a warp: their own from the parent's, one after the other."""
-    ...
-
-
-@wp.func
-def pose_bones(
-    body: Body,
-    fraction: float,
-    base_rotation: wp.array2d(dtype=wp.quat),
-    base_root: wp.array(dtype=wp.vec3),
-    increment: wp.array2d(dtype=wp.vec3),
-    root_increment: wp.array(dtype=wp.vec3),
-    e: int,
-    thread: int,
-    threads: int,
-    # out
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-):
-    """Pose at ``fraction`` of the control step: base local rotations turned along arcs, then forward kinematics.
-
-    A thread that is alone poses the bones in their order, parents first. Each lane of a warp has a bone.
-    """
-    root = base_root[e] + fraction * root_increment[e]
-    bones = body.parent.shape[0]
-    if threads == 1:
-        for b in range(bones):
-            rotation[e, b] = base_rotation[e, b] * quat_exp(fraction * increment[e, b])
-            pose_bone(body, e, b, root, rotation, position)
-    else:
-        own = wp.min(thread, bones - 1)
-        local = base_rotation[e, own] * quat_exp(fraction * increment[e, own])
-        placed = after_ancestors(wp.transform(bone_offset(body, e, own, root), local), body.parent[own], body.levels)
-        if thread < bones:
-            rotation[e, own] = wp.normalize(wp.transform_get_rotation(placed))
-            position[e, own] = wp.transform_get_translation(placed)
-        meet_threads(threads)
-
-
-@wp.kernel
-def pose_body(
-    body: Body,
-    fraction: float,
-    base_rotation: wp.array2d(dtype=wp.quat),
-    base_root: wp.array(dtype=wp.vec3),
-    increment: wp.array2d(dtype=wp.vec3),
-    root_increment: wp.array(dtype=wp.vec3),
-    threads: int,
-    # out
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-):
-    """:func:`pose_bones` of every environment, over ``(num_envs, threads)``."""
-    e, thread = wp.tid()
-    pose_bones(
-        body, fraction, base_rotation, base_root, increment, root_increment, e, thread, threads, rotation, position
-    )  # fmt: skip
 
 
 @wp.func

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from piavatar_envs.avatar import bone_sums, drive_stages, flesh, posing
+from piavatar_envs.avatar import bone_sums, drive_stages, flesh, kinematics, posing
 from piavatar_envs.avatar.injection import inject_velocity
 from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
@@ -98,7 +98,7 @@ class Groups:
 def record_pose(drive: AvatarDrive, program: Program, fraction: float, rotation, root, increment, out: Pose) -> None:
     """Append: the pose at ``fraction`` of a control step that starts from local ``rotation`` and ``root``."""
     inputs = [drive.body, fraction, rotation, root, increment, drive.scratch.root_increment, drive.threads]
-    program.launch(posing.pose_body, (drive.model.num_envs, drive.threads), inputs, [out.rotation, out.position])
+    program.launch(kinematics.pose_body, (drive.model.num_envs, drive.threads), inputs, [out.rotation, out.position])
 
 
 def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) -> None:

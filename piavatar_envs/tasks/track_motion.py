@@ -10,8 +10,8 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.kinematics import pose_body
 from piavatar_envs.avatar.motion import load_motion
-from piavatar_envs.avatar.posing import pose_body
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
 from piavatar_envs.envs.actions import ActionSpec

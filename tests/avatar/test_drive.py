@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar import posing
+from piavatar_envs.avatar import kinematics
 from piavatar_envs.avatar.skeleton import forward_kinematics, joint_index
 from piavatar_envs.mpm.program import Program
 
@@ -33,7 +33,9 @@ def test_kernels_pose_the_body_like_numpy(make_rig, wild_pose, fraction):
     position = wp.zeros((2, 22), dtype=wp.vec3, device=rig.model.device)
     program = Program(rig.model.device)
     threads = rig.drive.threads
-    program.launch(posing.pose_body, (2, threads), [rig.drive.body, fraction, *inputs, threads], [rotation, position])
+    program.launch(
+        kinematics.pose_body, (2, threads), [rig.drive.body, fraction, *inputs, threads], [rotation, position]
+    )
     program.run()
     for env in range(2):
         local = (Rotation.from_rotvec(base[env]) * Rotation.from_rotvec(fraction * turn[env])).as_matrix()
