@@ -61,10 +61,9 @@ class BatchedEpisodes:
             ImportError: torch is asked for and not installed.
             ValueError: no environments or threads, an unknown device or kind of arrays.
         """
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs} must be at least 1")
-        if num_threads is not None and num_threads < 1:
-            raise ValueError(f"num_threads={num_threads} must be at least 1, or None for one a core")
+        check_count("num_envs", num_envs)
+        if num_threads is not None:
+            check_count("num_threads", num_threads, ", or None for one a core")
         device = check_device(device)
         self.api = find_array_api(array_api, device)
         threads = min(num_threads or available_cores(), num_envs) if wp.get_device(device).is_cpu else 1
@@ -124,8 +123,14 @@ class BatchedEpisodes:
 
     def _checked_seeds(self, seeds: int | Sequence[int | None] | None) -> list[int | None]:
         n = self.num_envs
-        seeds = [seeds + env for env in range(n)] if np.isscalar(seeds) else seeds
-        seeds = [None] * n if seeds is None else [None if seed is None else _checked_seed(seed) for seed in seeds]
+        if seeds is None:
+            seeds = [None] * n
+        elif isinstance(seeds, (str, bytes)) or not np.iterable(seeds):
+            first = _checked_seed(seeds)
+            check_seeds(first, n)
+            seeds = [first + env for env in range(n)]
+        else:
+            seeds = [None if seed is None else _checked_seed(seed) for seed in seeds]
         if len(seeds) != n:
             raise ValueError(f"there are {len(seeds)} seeds for num_envs={n} environments")
         if not self.ready:
@@ -264,9 +269,10 @@ class BatchedEpisodes:
         return self.groups[group], env - ([0, *self._splits][group])
 
     def close(self) -> None:
-        """End the threads; closing twice is fine."""
+        """End the threads; closing twice is fine. Who goes on has one thread."""
         if self._pool is not None:
             self._pool.shutdown()
+            self._pool = None
 
 
 def available_cores() -> int:
@@ -274,6 +280,16 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def check_count(name: str, count: Any, otherwise: str = "") -> None:
+    """Refuse what is not a number of things.
+
+    Raises:
+        ValueError: it is not a whole number, or less than 1.
+    """
+    if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+        raise ValueError(f"{name}={count!r} must be a whole number, at least 1{otherwise}")
 
 
 def _checked_seed(seed: Any) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from piavatar_envs.api.batched import check_count
 from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
 from piavatar_envs.api.view import EpisodeView
@@ -66,8 +67,7 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
         if max_cycles is not None:
-            if max_cycles < 1:
-                raise ValueError(f"max_cycles={max_cycles} must be at least 1, or None for episode_seconds")
+            check_count("max_cycles", max_cycles, ", or None for episode_seconds")
             self.config = replace(self.config, episode_seconds=max_cycles * self.config.physics.control_dt)
         made = {"task": task_class, "render_mode": render_mode, "device": device, "config": self.config}
         self._build = partial(AvatarParallelEnv.__init__, **made)

@@ -9,7 +9,15 @@ from pydantic import AfterValidator, BaseModel, Field
 from piavatar_envs.envs.sections import FROZEN, FrozenDict
 
 Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+
+
+def _not_zero(rotation: tuple[float, ...]) -> tuple[float, ...]:
+    if not any(rotation):
+        raise ValueError(f"{list(rotation)} must be a quaternion wxyz, not zero")
+    return rotation
+
+
+Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_not_zero)]
 Settings = Annotated[dict[str, Any], AfterValidator(FrozenDict)]
 MaterialName = Literal["neo_hookean", "fixed_corotated"]
 

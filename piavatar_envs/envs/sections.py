@@ -7,6 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from piavatar_envs.mpm.build import CFL_STABLE
+
 #: Shared by every model. Strict, because a number in quotes is a mistake; ``.inf`` and ``.nan`` are never a setting.
 FROZEN = ConfigDict(
     frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
@@ -55,7 +57,10 @@ class PhysicsConfig(BaseModel):
         None, ge=1, le=10_000, description="substeps a control step; null chooses them from the CFL limit"
     )
     cfl: float = Field(
-        0.5, gt=0.0, le=1.0, description="largest c dt / dx a substep may have, c the P-wave speed (stable to 0.84) [-]"
+        0.5,
+        gt=0.0,
+        le=CFL_STABLE,
+        description="largest c dt / dx a substep may have, c the P-wave speed; beyond 0.84 it is not stable [-]",
     )
     material: Literal["neo_hookean", "fixed_corotated"] = Field(
         "neo_hookean", description="elastic energy of the flesh"

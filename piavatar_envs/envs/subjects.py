@@ -149,7 +149,11 @@ def _frictions(scene: SceneConfig, physics: PhysicsConfig, names: Sequence[str],
         # two surfaces rub as much as the smoother of them
         row = names.index(prop.name)
         table[row, len(names) :] = np.minimum(table[row, len(names) :], prop.friction)
+    told: set[frozenset[str]] = set()
     for pair in scene.pair_friction:
+        if {pair.a, pair.b} in told:
+            raise ConfigError(f"scene.pair_friction: {pair.a!r} and {pair.b!r} come twice; leave one of them out")
+        told.add(frozenset((pair.a, pair.b)))
         for name in (pair.a, pair.b):
             if name not in everything:
                 raise ConfigError(f"scene.pair_friction: there is no {name!r}; there are {', '.join(everything)}")

@@ -146,6 +146,9 @@ def test_every_id_has_it(device):
     ("settings", "told"),
     [
         ({"num_envs": 0}, ["num_envs=0"]),
+        ({"num_envs": 1.5}, ["num_envs=1.5", "whole number"]),
+        ({"num_envs": True}, ["num_envs=True", "whole number"]),
+        ({"cfl": 1.0}, ["cfl=1.0 must be <= 0.84"]),
         ({"array_api": "jax"}, ["array_api='jax'", "numpy", "torch"]),
         ({"autoreset_mode": "never"}, ["autoreset_mode='never'", "'NextStep'", "'SameStep'", "'Disabled'"]),
         ({"num_threads": 0}, ["num_threads=0"]),
@@ -158,6 +161,26 @@ def test_bad_settings_are_refused(device, settings, told):
     with pytest.raises(ValueError) as caught:
         AvatarVectorEnv("Reach-v0", **{"device": device, "fidelity": "tiny", **settings})
     assert all(part in str(caught.value) for part in told), caught.value
+
+
+@pytest.mark.parametrize("seed", ["3", np.array(3), 1.5, -1, [1, "2"]])
+def test_what_is_no_seed_is_refused(make_vec, seed):
+    vector = make_vec("PIAvatar/Reach-v0", 2)
+    with pytest.raises(gymnasium.error.Error, match="Seed must be"):
+        vector.reset(seed=seed)
+    with pytest.raises(ValueError, match="seed=4294967295 must be >= 0 and <= 4294967294"):
+        vector.reset(seed=2**32 - 1)  # of the second environment it would be 2^32
+
+
+def test_a_closed_vector_goes_on(device, equal):
+    """As closed single environments do: what is closed are windows and threads."""
+    vector = AvatarVectorEnv("Reach-v0", 2, device=device, fidelity="tiny", num_threads=2)
+    action = actions_of(vector, 1)[0]
+    vector.reset(seed=0)
+    before = [vector.step(action)[0] for _ in range(3)]
+    vector.close()
+    vector.reset(seed=0)
+    assert all(equal(vector.step(action)[0], one) for one in before)
 
 
 def test_a_yaml_file_configures(tmp_path, device):

@@ -199,6 +199,9 @@ def test_friction_of_pairs(device):
     assert not on_solids[:, 2:].any()  # the walls around the domain are smooth
 
 
+RUBS = {"a": "ball", "b": "agent_0", "friction": 0.1}
+
+
 @pytest.mark.parametrize(
     ("scene", "told"),
     [
@@ -208,7 +211,9 @@ def test_friction_of_pairs(device):
         ({"props": [BALL | {"shape": "mesh", "size": [1.0]}]}, "prop ball: .*needs a file"),
         ({"props": [BALL | {"mass": -1.0}]}, "mass=-1.0 must be > 0"),
         ({"props": [{"shape": "sphere"}]}, "name is missing"),
-        ({"pair_friction": [{"a": "ball", "b": "agent_0", "friction": 0.1}]}, "there is no 'ball'"),
+        ({"props": [BALL], "pair_friction": [RUBS, RUBS | {"a": "agent_0", "b": "ball"}]}, "'ball' come twice"),
+        ({"props": [BALL | {"rotation": [0, 0, 0, 0]}]}, "must be a quaternion wxyz, not zero"),
+        ({"pair_friction": [RUBS]}, "there is no 'ball'"),
         ({"avatars": [{"drive": {"tone": 2.0}}]}, "tone=2.0 must be <= 1"),
         ({"avatars": [{"drive": {"tune": 0.2}}]}, "tune is no setting of DriveConfig"),
         ({"avatars": [{"physics": {"fidelity": "fine"}}]}, "fidelity cannot differ between avatars"),

@@ -365,7 +365,8 @@ def test_nothing_goes_before_the_first_reset_or_after_the_end(worlds, module_nam
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"max_cycles": 0}, "max_cycles=0 must be at least 1"),
+        ({"max_cycles": 0}, "max_cycles=0 must be a whole number, at least 1"),
+        ({"max_cycles": 1.5}, "max_cycles=1.5 must be a whole number, at least 1"),
         ({"render_mode": "ansi"}, "render_mode='ansi' is not known; use None, rgb_array or human"),
         ({"bogus": 1}, "bogus is no setting of"),
         ({"device": "tpu"}, "device='tpu'"),
