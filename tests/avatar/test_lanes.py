@@ -111,10 +111,10 @@ def test_a_warp_stores_its_sum(device):
     np.testing.assert_allclose(out12.numpy(), expected[..., :12], atol=1e-5)
 
 
-@pytest.mark.parametrize(("chunks", "threads"), [(0, 1), (1, 1), (2, 1), (3, 2), (5, 4), (64, 32), (5000, 32)])
+@pytest.mark.parametrize(("chunks", "threads"), [(0, 1), (1, 1), (2, 1), (3, 2), (5, 4), (8, 4), (9, 0), (5000, 0)])
 def test_a_thread_adds_about_two_chunks(device, chunks, threads):
-    """But no more threads share a bone than a warp has."""
-    assert chunk_threads(device, chunks) == min(threads, warp_threads(device))
+    """Where a bone has many, it has a warp of its own; on a CPU one thread adds them up."""
+    assert chunk_threads(device, chunks) == (threads if warp_threads(device) > 1 else 1)
 
 
 def test_particles_blend_the_records_of_their_bones(device):
