@@ -153,7 +153,7 @@ def gather_physical(
     wy: wp.vec3,
     wz: wp.vec3,
 ):
-    """Sums over a stencil of the nodes' physical velocity."""
+    """Sums over a stencil of the nodes' physical velocity, on a GPU; on a CPU they are :func:`gather_lines`."""
     g = Gradients()
     slab = wp.vec4i()
     planes = int(3)  # not a constant: a GPU has too few registers for the loads of all three at once
@@ -222,7 +222,7 @@ def gather(
 ):
     """Particle ``p`` from the nodes: velocities and gradients, and with them position and deformation.
 
-    The blocks that it comes to are marked for the next substep.
+    The blocks that it comes to are marked for the next substep. For a GPU; see :func:`gather_by_lines`.
     """
     x = moved.x[e, p]
     xg = grid_position(grid, x)
