@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from piavatar_envs.mpm.build import CFL_STABLE
+from piavatar_envs.mpm.cfl import CFL_STABLE
 
 #: Shared by every model. Strict, because a number in quotes is a mistake; ``.inf`` and ``.nan`` are never a setting.
 FROZEN = ConfigDict(

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.mpm.boundaries import Collider, make_boundaries
+from piavatar_envs.mpm.cfl import CFL_STABLE
 from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.group_plan import begin_groups
 from piavatar_envs.mpm.materials import lame_parameters, material_index
@@ -25,8 +26,6 @@ from piavatar_envs.mpm.types import (
     Step,
 )
 
-#: Largest stable ``c dt / dx`` that was measured (0.84 to 1.04, less near incompressibility).
-CFL_STABLE = 0.84
 #: Particles for every slot up to which a large body's are added to the nodes one by one: a skin has some three
 #: particles a slot, of which a body at rest fills three of five, and an interior more than thirty.
 SPARSE = 8
