@@ -16,7 +16,7 @@ from piavatar_envs.api import spaces
 from piavatar_envs.api.arrays import Array, find_array_api
 from piavatar_envs.api.copies import check_state
 from piavatar_envs.avatar.joint_drive import checked_assist
-from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.batch_env import BatchEnv, check_count
 from piavatar_envs.envs.draws import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.simulation import check_device
 from piavatar_envs.tasks.base import Task
@@ -280,16 +280,6 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def check_count(name: str, count: Any, otherwise: str = "") -> None:
-    """Refuse what is not a number of things.
-
-    Raises:
-        ValueError: it is not a whole number, or less than 1.
-    """
-    if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
-        raise ValueError(f"{name}={count!r} must be a whole number, at least 1{otherwise}")
 
 
 def _checked_seed(seed: Any) -> int:

@@ -9,10 +9,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from piavatar_envs.api.batched import check_count
 from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
 from piavatar_envs.api.view import EpisodeView
+from piavatar_envs.envs.batch_env import check_count
 from piavatar_envs.envs.config import load_config, replace
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -19,6 +20,16 @@ from piavatar_envs.envs.props import check_places
 from piavatar_envs.envs.simulation import Simulation
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.tasks.base import Task
+
+
+def check_count(name: str, count: Any, otherwise: str = "") -> None:
+    """Refuse what is not a number of things.
+
+    Raises:
+        ValueError: it is not a whole number, or less than 1.
+    """
+    if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+        raise ValueError(f"{name}={count!r} must be a whole number, at least 1{otherwise}")
 
 
 class BatchEnv:
@@ -49,8 +60,7 @@ class BatchEnv:
             ConfigError: the task would place a prop outside the domain.
             ValueError: a bad device, batch or time step; see :class:`Simulation`.
         """
-        if num_envs < 1:
-            raise ValueError(f"num_envs={num_envs} must be at least 1")
+        check_count("num_envs", num_envs)
         self.task, self.config, self.num_envs = task, task.config, num_envs
         self.simulation = Simulation(
             task.config, num_envs, device, task.domain(), task.scene, avatar_names=task.agent_names
