@@ -7,19 +7,18 @@ import warp as wp
 from piavatar_envs.avatar.blending import blend_images, blend_places
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import blended_motion, motion_apart
+from piavatar_envs.avatar.lanes import lane_of_warp, warp_of_block
 from piavatar_envs.avatar.loads import int_at, number_at, vector_at
 from piavatar_envs.avatar.part_sums import (
     PART_BLOCK,
     WORDS,
     Parts,
     bring_particle,
-    lane_of_warp,
     place_in_parts,
     room_of_particles,
     store_second,
     sum_both,
     sum_one,
-    warp_of_block,
 )
 from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.types import Body, vec12

@@ -14,7 +14,7 @@ from piavatar_envs.avatar.bone_sums import add_chunks, chunk_corrections, chunk_
 from piavatar_envs.avatar.flesh import apply_correction, blend_corrections, drive_particle
 from piavatar_envs.avatar.free_motion import free_motion, is_free
 from piavatar_envs.avatar.kinematics import pose_bones
-from piavatar_envs.avatar.lanes import meet_threads, place_in_warps
+from piavatar_envs.avatar.lanes import meet_threads, place_in_block, warp_of_block
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.posing import carry_anchor, carry_bone, write_record
 from piavatar_envs.avatar.rigid_fit import fit_bone, fit_whole
@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: Threads of a warp, which does the bones of a body, and bodies of a multiprocessor: they wait for memory and for one
 #: step after the other, so the more of them, the better.
-WARP, BODIES_AT_ONCE = 32, 32
+WARP, BODIES_AT_ONCE = wp.constant(32), 32
 #: Warps that prepare a body, where there are so few that a multiprocessor has as many at once.
 PREPARING, BODIES_PREPARED = 3, 10
 
@@ -191,7 +191,7 @@ def add_to_bones(body: Body, failure: wp.array(dtype=int), threads: int, w: Benc
         add_chunks(body, w.corrections, e, b, thread, threads, w.bone_corrections)
 
 
-@wp.kernel(launch_bounds=(WARP * PREPARING, BODIES_PREPARED))
+@wp.kernel(launch_bounds=(int(WARP) * PREPARING, BODIES_PREPARED))
 def prepare_body(
     body: Body,
     drive: Drive,
@@ -199,22 +199,23 @@ def prepare_body(
     step: int,
     sharing: int,
     failure: wp.array(dtype=int),
-    warps: int,
     # in and out
     w: Bench,
     held: Held,
 ):
-    """From the chunks' moments to the bones' records and the root wrench; a CUDA block of so many ``warps`` has a body.
+    """From the chunks' moments to the bones' records and the root wrench; a CUDA block has a body.
 
-    Over ``(num_envs, threads)``. What one warp needs not wait for in another is done at the same time; it is the
-    same whether there are as many as ``PREPARING``, where bodies are few, or one.
+    Over ``(num_envs, threads)``, see :func:`warps_of_body`. What one warp needs not wait for in another is done at the
+    same time; it is the same whether there are as many as ``PREPARING``, where bodies are few, or one.
     """
     i, _ = wp.tid()
-    own = place_in_warps(i)
-    e = own[0]
-    warp = own[1]
-    thread = own[2]
-    threads = own[3]
+    at = place_in_block(i, WARP)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
+    own = warp_of_block()
+    warp = own[0]
+    warps = own[1]
     if failure[e] != 0:
         return
     if warp == 0:
@@ -246,7 +247,7 @@ def settle_motion(
         settle_removed(body, drive, w, held, e, thread, threads)
 
 
-@wp.kernel(launch_bounds=(WARP, BODIES_AT_ONCE))
+@wp.kernel(launch_bounds=(int(WARP), BODIES_AT_ONCE))
 def settle_body(
     body: Body,
     drive: Drive,

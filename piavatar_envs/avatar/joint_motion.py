@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import blend_changes, blend_images, motion_at
-from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, threads_of_environment
+from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, over_ancestors, threads_of_environment
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.rotation import quat_exp
@@ -46,32 +46,16 @@ def joint_alone(position: wp.array2d(dtype=wp.vec3), q: wp.array2d(dtype=float),
     return vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
 
 
-# In every round a bone takes what its ancestor has found, who is twice as far as in the round before.
-_ADD_ANCESTORS = """
-#if defined(__CUDA_ARCH__)
-int up = parent;
-for (int reach = 1; reach < levels; reach *= 2) {
-    const int from = up < 0 ? 0 : up;
-#pragma unroll
-    for (int k = 0; k < %d; ++k) {
-        const float more = __shfl_sync(0xffffffffu, value[k], from);
-        value[k] += up < 0 ? 0.0f : more;
-    }
-    const int next = __shfl_sync(0xffffffffu, up, from);
-    up = up < 0 ? -1 : next;
-}
-#endif
-return value;
-"""
+_ADD = "value[k] += up < 0 ? 0.0f : more;"
 
 
-@wp.func_native(_ADD_ANCESTORS % 6)
+@wp.func_native(over_ancestors(6, _ADD))
 def add_ancestors6(value: vec8, parent: int, levels: int) -> vec8:
     """Sum of what the lanes of a warp have, of a bone each, over all from the root to a lane's own; six numbers."""
     ...
 
 
-@wp.func_native(_ADD_ANCESTORS % 3)
+@wp.func_native(over_ancestors(3, _ADD))
 def add_ancestors3(value: wp.vec3, parent: int, levels: int) -> wp.vec3:
     """:func:`add_ancestors6` of a vector."""
     ...

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.lanes import meet_threads
+from piavatar_envs.avatar.lanes import meet_threads, over_ancestors
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.types import row
@@ -44,23 +44,8 @@ def pose_bone(
         position[e, b] = position[e, parent] + wp.quat_rotate(rotation[e, parent], offset)
 
 
-# In every round a bone takes the motion of its ancestor, who is twice as far as in the round before.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-int up = parent;
-for (int reach = 1; reach < levels; reach *= 2) {
-    const int from = up < 0 ? 0 : up;
-    wp::transform before;
-#pragma unroll
-    for (int k = 0; k < 7; ++k) before[k] = __shfl_sync(0xffffffffu, placed[k], from);
-    const int next = __shfl_sync(0xffffffffu, up, from);
-    if (up >= 0) placed = wp::mul(before, placed);
-    up = up < 0 ? -1 : next;
-}
-#endif
-return placed;
-""")
-def after_ancestors(placed: wp.transform, parent: int, levels: int) -> wp.transform:
+@wp.func_native(over_ancestors(7, "before[k] = more;", "if (up >= 0) value = wp::mul(before, value);"))
+def after_ancestors(value: wp.transform, parent: int, levels: int) -> wp.transform:
     """Motion of a bone in the world, of the lanes of a warp: their own from the parent's, one after the other."""
     ...
 

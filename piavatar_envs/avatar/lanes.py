@@ -110,14 +110,58 @@ def place_in_block(e: int, block: int) -> wp.vec3i:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-return wp::vec_t<4, wp::int32>((int)blockIdx.x, (int)(threadIdx.x >> 5), (int)(threadIdx.x & 31), 32);
+return wp::vec_t<2, wp::int32>((int)(threadIdx.x >> 5), (int)(blockDim.x >> 5));
 #else
-return wp::vec_t<4, wp::int32>(e, 0, 0, 1);
+return wp::vec_t<2, wp::int32>(0, 1);
 #endif
 """)
-def place_in_warps(e: int) -> wp.vec4i:
-    """Environment, warp, lane and number of lanes, where a CUDA block has an environment; on a CPU ``e``, 0, 0, 1."""
+def warp_of_block() -> wp.vec2i:
+    """Which warp of its CUDA block a thread is in, and of how many; on a CPU of one."""
     ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return wp::vec_t<2, wp::int32>((int)(threadIdx.x & 31), 32);
+#else
+return wp::vec_t<2, wp::int32>(0, 1);
+#endif
+""")
+def lane_of_warp() -> wp.vec2i:
+    """Which thread of its warp a thread is, and of how many; on a CPU of one."""
+    ...
+
+
+# In every round a bone takes what its ancestor has found, who is twice as far as in the round before.
+_OVER_ANCESTORS = """
+#if defined(__CUDA_ARCH__)
+int up = parent;
+for (int reach = 1; reach < levels; reach *= 2) {
+    const int from = up < 0 ? 0 : up;
+    auto before = value;
+#pragma unroll
+    for (int k = 0; k < %(count)d; ++k) {
+        const float more = __shfl_sync(0xffffffffu, value[k], from);
+        %(each)s
+    }
+    %(then)s
+    const int next = __shfl_sync(0xffffffffu, up, from);
+    up = up < 0 ? -1 : next;
+}
+#endif
+return value;
+"""
+
+
+def over_ancestors(count: int, each: str, then: str = "") -> str:
+    """A snippet for what the lanes of a warp have, a bone each, in ``value``, gathered from the root to the own bone.
+
+    Args:
+        count: numbers of a value.
+        each: what is done with number ``k`` of the ancestor ``up``, ``more``; below 0 there is none.
+        then: what is done after all of them, with what ``each`` may have kept in ``before``, of the value's own kind.
+    """
+    return _OVER_ANCESTORS % {"count": count, "each": each, "then": then}
 
 
 _SUM = """

@@ -79,30 +79,6 @@ def place_in_parts(e: int, part: int, thread: int, num_envs: int) -> wp.vec3i:
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return wp::vec_t<2, wp::int32>((int)(threadIdx.x >> 5), (int)(blockDim.x >> 5));
-#else
-return wp::vec_t<2, wp::int32>(0, 1);
-#endif
-""")
-def warp_of_block() -> wp.vec2i:
-    """Which warp of its CUDA block a thread is in, and of how many; on a CPU of one."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return wp::vec_t<2, wp::int32>((int)(threadIdx.x & 31), 32);
-#else
-return wp::vec_t<2, wp::int32>(0, 1);
-#endif
-""")
-def lane_of_warp() -> wp.vec2i:
-    """Which thread of its warp a thread is, and of how many; on a CPU of one."""
-    ...
-
-
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
 __shared__ float __align__(16) particles[{int(WORDS) * PART}];

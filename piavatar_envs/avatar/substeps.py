@@ -119,9 +119,8 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
     rounds = particle_rounds(drive.model.device, n * drive.num_points)
     shared = particle_threads(drive.model.device, drive.num_points, rounds)
     bones = (n, drive.threads)
-    warps = drive_stages.warps_of_body(drive.model.device, n)
-    inputs = [*who, drive.body_mass, step, drive.chunk_threads, state.failure, warps]
-    threads = warps * drive.threads
+    threads = drive_stages.warps_of_body(drive.model.device, n) * drive.threads
+    inputs = [*who, drive.body_mass, step, drive.chunk_threads, state.failure]
     program.launch(drive_stages.prepare_body, (n, threads), inputs, [bench, g.held], block_dim=threads)
     program.launch(
         flesh.drive_particles,
