@@ -10,7 +10,7 @@ from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.records import TO_KINEMATIC, first_of_halves, read_half_from
 from piavatar_envs.mpm.stencil import base_node, grid_position, in_same_brick, spline, stencil_inside
-from piavatar_envs.mpm.stencil_lines import gather_lines, slabs_of_stencil
+from piavatar_envs.mpm.stencil_lines import gather_lines, lines_of
 from piavatar_envs.mpm.stencil_records import HALVES, ends_of_line, line_of_records, slab_records
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
@@ -261,20 +261,17 @@ def gather_by_lines(
     xg = grid_position(grid, x)
     base = base_node(xg)
     f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
-    wx = spline(f[0])
-    wy = spline(f[1])
-    wz = spline(f[2])
     field = particles.field[p]
     nodes = first_of_halves(node_velocity, e)
-    slab0, slab1, slab2 = slabs_of_stencil(grid, blocks, e, field, base, HALVES)
-    sums = gather_lines(nodes, base, slab0, slab1, slab2, wx, wy, wz)
+    lines = lines_of(grid, blocks, e, field, base, f, HALVES)
+    sums = gather_lines(nodes, lines)
     physical = Gradients(sums[0], sums[1], sums[2], sums[3])
     kinematic = Gradients()
     asked = bool(False)
     if step.decoupling == PAPER or (noted_around(blocks, e, p) & TELLS) != 0:
         asked = asks_kinematic(grid, step, boundaries, e, x)
     if asked:
-        kinematic = gather_kinematic(grid, blocks, nodes, e, field, base, wx, wy, wz)
+        kinematic = gather_kinematic(grid, blocks, nodes, e, field, base, lines.wx, lines.wy, lines.wz)
     return finish_gather(
         grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, base, f
     )  # fmt: skip

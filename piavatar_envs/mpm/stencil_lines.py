@@ -9,6 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.records import TO_KINEMATIC
+from piavatar_envs.mpm.stencil import spline
 from piavatar_envs.mpm.stencil_records import slab_records
 from piavatar_envs.mpm.types import Blocks, Grid, Sums, vec8
 
@@ -24,10 +25,11 @@ auto vector = [](float a, float b, float c, float d) { return four{a, b, c, d}; 
 typedef wp::vec_t<4, wp::float32> four;
 auto vector = [](float a, float b, float c, float d) { return four(a, b, c, d); };
 #endif
-const int bx = base[0] & 3, by = base[1] & 3, bz = base[2] & 3;
+const int bx = lines.base[0] & 3, by = lines.base[1] & 3, bz = lines.base[2] & 3;
+const wp::vec3 wx = lines.wx, wy = lines.wy, wz = lines.wz;
 // calls what is to be done with the places of the three nodes of line j of plane i
 auto with_line = [&](int i, int j, auto visit) {
-    const wp::vec_t<4, wp::int32>& slab = i == 0 ? slab0 : i == 1 ? slab1 : slab2;
+    const wp::vec_t<4, wp::int32>& slab = i == 0 ? lines.slab0 : i == 1 ? lines.slab1 : lines.slab2;
     const bool upper = by + j > 3;
     const int within = 16 * ((bx + i) & 3) + 4 * ((by + j) & 3) + bz;
     const int first = slab[upper ? 2 : 0] + within, last = slab[upper ? 3 : 1] + within;
@@ -36,18 +38,36 @@ auto with_line = [&](int i, int j, auto visit) {
 """
 
 
+@wp.struct
+class Lines:
+    """The nine lines of a stencil: where their nodes are in an array, and what they weigh."""
+
+    base: wp.vec3i  # lowest node
+    slab0: wp.vec4i  # places of the three planes, see :func:`piavatar_envs.mpm.stencil_records.slab_records`
+    slab1: wp.vec4i
+    slab2: wp.vec4i
+    wx: wp.vec3
+    wy: wp.vec3
+    wz: wp.vec3
+
+
 @wp.func
-def slabs_of_stencil(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i, of_block: int):
-    """:func:`piavatar_envs.mpm.stencil_records.slab_records` of the three planes of a stencil."""
-    first = slab_records(grid, blocks, e, f, base, 0, of_block)
-    second = first
-    third = first
+def lines_of(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i, f: wp.vec3, of_block: int):
+    """Lines of the stencil at ``base``, a particle ``f`` from there, in an array of ``of_block`` entries a block."""
+    s = Lines()
+    s.base = base
+    s.slab0 = slab_records(grid, blocks, e, field, base, 0, of_block)
+    s.slab1 = s.slab0
+    s.slab2 = s.slab0
     if ((base[0] + 1) & 3) == 0:
-        second = slab_records(grid, blocks, e, f, base, 1, of_block)
-        third = second
+        s.slab1 = slab_records(grid, blocks, e, field, base, 1, of_block)
+        s.slab2 = s.slab1
     elif ((base[0] + 2) & 3) == 0:
-        third = slab_records(grid, blocks, e, f, base, 2, of_block)
-    return first, second, third
+        s.slab2 = slab_records(grid, blocks, e, field, base, 2, of_block)
+    s.wx = spline(f[0])
+    s.wy = spline(f[1])
+    s.wz = spline(f[2])
+    return s
 
 
 @wp.func_native(
@@ -80,18 +100,9 @@ return sums;
 )
 def gather_lines(
     nodes: wp.uint64,
-    base: wp.vec3i,
-    slab0: wp.vec4i,
-    slab1: wp.vec4i,
-    slab2: wp.vec4i,
-    wx: wp.vec3,
-    wy: wp.vec3,
-    wz: wp.vec3,
+    lines: Lines,
 ) -> wp.mat44:
-    """Weighted sum of the halves of records in ``nodes``, and those times the nodes' places along x, y and z.
-
-    ``slab0`` and so on are :func:`slabs_of_stencil` of ``HALVES``.
-    """
+    """Weighted sum of the halves of records in ``nodes``, and those times the nodes' places along x, y and z."""
     ...
 
 
@@ -145,13 +156,7 @@ for (int i = 0; i < 3; ++i) {{
 def scatter_lines(
     sums: Sums,
     e: int,
-    base: wp.vec3i,
-    slab0: wp.vec4i,
-    slab1: wp.vec4i,
-    slab2: wp.vec4i,
-    wx: wp.vec3,
-    wy: wp.vec3,
-    wz: wp.vec3,
+    lines: Lines,
     at_base: vec8,
     A: wp.mat33,
     driven: bool,
@@ -182,17 +187,11 @@ for (int i = 0; i < 3; ++i)
 def scatter_places(
     sums: Sums,
     e: int,
-    base: wp.vec3i,
-    slab0: wp.vec4i,
-    slab1: wp.vec4i,
-    slab2: wp.vec4i,
-    wx: wp.vec3,
-    wy: wp.vec3,
-    wz: wp.vec3,
+    lines: Lines,
     f: wp.vec3,
     mass: float,
     seam: float,
     dx: float,
 ):
-    """Tell the nodes where a particle is, ``f`` from ``base`` [dx]; ``slab0`` and so on are of ``VECTORS``."""
+    """Tell the nodes where a particle is, ``f`` from ``base`` [dx]; ``lines`` are of ``VECTORS``."""
     ...

@@ -12,8 +12,8 @@ from piavatar_envs.mpm.blocks import fields_around, note_around
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.matrices import matrix_at
-from piavatar_envs.mpm.stencil import base_node, grid_position, spline
-from piavatar_envs.mpm.stencil_lines import scatter_lines, scatter_places, slabs_of_stencil
+from piavatar_envs.mpm.stencil import base_node, grid_position
+from piavatar_envs.mpm.stencil_lines import lines_of, scatter_lines, scatter_places
 from piavatar_envs.mpm.stencil_records import HALVES, VECTORS
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
@@ -185,13 +185,8 @@ def particles_to_grid(
     note_around(blocks, e, p, tells, beside)
     s = prepare(grid, step, particles, moving, e, p, tells)
     field = particles.field[p]
-    slab0, slab1, slab2 = slabs_of_stencil(grid, blocks, e, field, base, HALVES)
-    wx = spline(s.f[0])
-    wy = spline(s.f[1])
-    wz = spline(s.f[2])
     driven = tells or step.decoupling == PAPER
-    scatter_lines(sums, e, base, slab0, slab1, slab2, wx, wy, wz, s.at_base, s.A, driven)
+    scatter_lines(sums, e, lines_of(grid, blocks, e, field, base, s.f, HALVES), s.at_base, s.A, driven)
     if tells:
-        slab0, slab1, slab2 = slabs_of_stencil(grid, blocks, e, field, base, VECTORS)
-        m = s.at_base[0]
-        scatter_places(sums, e, base, slab0, slab1, slab2, wx, wy, wz, s.f, m, particles.seam[p], grid.dx)
+        lines = lines_of(grid, blocks, e, field, base, s.f, VECTORS)
+        scatter_places(sums, e, lines, s.f, s.at_base[0], particles.seam[p], grid.dx)
