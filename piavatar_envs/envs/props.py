@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from itertools import permutations
 
 import numpy as np
 import warp as wp
@@ -175,6 +176,27 @@ def check_places(
             inside = (centre + reach[0] >= box[0] - OVERLAP * dx) & (centre + reach[1] <= box[1] + OVERLAP * dx)
             if not inside.all():
                 _refuse_place(name, centre, int(np.argmin(inside)), box, box - reach)
+
+
+def check_apart(dx: float, configs: Sequence[PropConfig], points: Sequence[PropPoints]) -> None:
+    """Refuse props of which one would begin with its middle in another: they would fly apart.
+
+    Args:
+        dx: grid spacing [m].
+        configs: of the props.
+        points: their particles.
+
+    Raises:
+        ConfigError: there are such.
+    """
+    turned = [Rotation.from_quat(np.roll(c.rotation, -1)).apply(p.rest) for c, p in zip(configs, points, strict=True)]
+    for (one, _), (other, rest) in permutations(zip(configs, turned, strict=True), 2):
+        middle = np.subtract(one.position, other.position)
+        if one.name != other.name and np.linalg.norm(rest - middle, axis=1).min() < dx:  # names are checked elsewhere
+            at = [round(float(value), 3) for value in one.position]
+            raise ConfigError(
+                f"prop {one.name!r} would begin at {at} m, inside of {other.name!r}; place them side by side"
+            )
 
 
 def _refuse_place(name: str, centre: Sequence[float], axis: int, box: np.ndarray, room: np.ndarray) -> None:

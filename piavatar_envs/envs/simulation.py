@@ -16,7 +16,7 @@ from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.flesh import Flesh, drive_settings
-from piavatar_envs.envs.props import PropSet, check_places
+from piavatar_envs.envs.props import PropSet, check_apart, check_places
 from piavatar_envs.envs.randomize import Randomization, fastest_wave
 from piavatar_envs.envs.shapes import Shapes
 from piavatar_envs.envs.subjects import assemble, prop_matter, prop_points
@@ -136,8 +136,11 @@ class Simulation:
         """The domain, wider where joints are driven by torques, and the walls around it.
 
         Raises:
-            ConfigError: a prop would begin outside.
+            ConfigError: a prop would begin outside, or one of those that are configured in another.
         """
+        own = {prop.name for prop in self.config.scene.props}  # a task places its own at every reset
+        given = [(prop, rest) for prop, rest in zip(self.scene.props, solids, strict=True) if prop.name in own]
+        check_apart(self.dx, [prop for prop, _ in given], [rest for _, rest in given])
         walled = self.scene.walls and (bool(solids) or len(self.flesh) > 1 or domain.fenced)
         domain = domain.for_falls(walled) if driven else domain
         check_places(

@@ -149,19 +149,35 @@ def _frictions(scene: SceneConfig, physics: PhysicsConfig, names: Sequence[str],
         # two surfaces rub as much as the smoother of them
         row = names.index(prop.name)
         table[row, len(names) :] = np.minimum(table[row, len(names) :], prop.friction)
-    told: set[frozenset[str]] = set()
+    _check_pairs(scene, names, everything)
     for pair in scene.pair_friction:
-        if {pair.a, pair.b} in told:
-            raise ConfigError(f"scene.pair_friction: {pair.a!r} and {pair.b!r} come twice; leave one of them out")
-        told.add(frozenset((pair.a, pair.b)))
-        for name in (pair.a, pair.b):
-            if name not in everything:
-                raise ConfigError(f"scene.pair_friction: there is no {name!r}; there are {', '.join(everything)}")
         a, b = everything.index(pair.a), everything.index(pair.b)
         for row, column in ((a, b), (b, a)):
             if row < len(names):
                 table[row, column] = pair.friction
     return table
+
+
+def _check_pairs(scene: SceneConfig, names: Sequence[str], everything: Sequence[str]) -> None:
+    """Refuse pairs of what is not there, of two that cannot touch, and such as come twice.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    told: set[frozenset[str]] = set()
+    for pair in scene.pair_friction:
+        for name in (pair.a, pair.b):
+            if name not in everything:
+                raise ConfigError(f"scene.pair_friction: there is no {name!r}; there are {', '.join(everything)}")
+        if frozenset((pair.a, pair.b)) in told:
+            raise ConfigError(f"scene.pair_friction: {pair.a!r} and {pair.b!r} come twice; leave one of them out")
+        told.add(frozenset((pair.a, pair.b)))
+        is_prop = pair.a in (prop.name for prop in scene.props)
+        if pair.a == pair.b and (is_prop or not scene.self_contact):
+            remedy = "leave it out" if is_prop else "leave it out, or set scene.self_contact=true"
+            raise ConfigError(f"scene.pair_friction: {pair.a!r} does not touch itself; {remedy}")
+        if pair.a not in names and pair.b not in names:
+            raise ConfigError(f"scene.pair_friction: {pair.a!r} and {pair.b!r} are solids, they never touch")
 
 
 def _colliders(scene: SceneConfig, frictions: np.ndarray) -> tuple[Collider, ...]:

@@ -163,7 +163,8 @@ def test_a_place_of_no_prop_is_refused(device):
 
 
 def test_props_have_their_mass_and_the_fleshs_wave_speed(device):
-    props = [BALL, {"name": "brick", "shape": "box", "size": [0.2, 0.2, 0.2], "density": 300.0, "young_modulus": 2e4}]
+    brick = {"name": "brick", "shape": "box", "size": [0.2, 0.2, 0.2], "density": 300.0, "young_modulus": 2e4}
+    props = [BALL, brick | {"position": [0.0, 1.0, 1.0]}]
     simulation = world(device, num_envs=2, props=props)
     assert simulation.props.mass[0] == pytest.approx(0.5, rel=1e-6)
     particles, first = simulation.model.particles, simulation.subjects.first
@@ -199,6 +200,7 @@ def test_friction_of_pairs(device):
     assert not on_solids[:, 2:].any()  # the walls around the domain are smooth
 
 
+POST = {"name": "post", "kind": "capsule", "size": [0.1, 0.4], "position": [0.0, 1.0, 0.5]}
 RUBS = {"a": "ball", "b": "agent_0", "friction": 0.1}
 
 
@@ -212,6 +214,11 @@ RUBS = {"a": "ball", "b": "agent_0", "friction": 0.1}
         ({"props": [BALL | {"mass": -1.0}]}, "mass=-1.0 must be > 0"),
         ({"props": [{"shape": "sphere"}]}, "name is missing"),
         ({"props": [BALL], "pair_friction": [RUBS, RUBS | {"a": "agent_0", "b": "ball"}]}, "'ball' come twice"),
+        ({"props": [BALL], "pair_friction": [RUBS | {"b": "ball"}]}, "'ball' does not touch itself; leave it out$"),
+        ({"pair_friction": [RUBS | {"a": "agent_0"}]}, "'agent_0' does not touch itself; .*self_contact=true"),
+        ({"colliders": [POST], "pair_friction": [RUBS | {"a": "ground", "b": "post"}]}, "solids, they never touch"),
+        ({"props": [BALL, BALL | {"name": "twin"}]}, "'ball' would begin at .* inside of 'twin'"),
+        ({"props": [BALL, {"name": "crate", "shape": "box", "size": [0.4, 0.3, 0.3]}]}, "begin at .* side by side"),
         ({"props": [BALL | {"rotation": [0, 0, 0, 0]}]}, "must be a quaternion wxyz, not zero"),
         ({"pair_friction": [RUBS]}, "there is no 'ball'"),
         ({"avatars": [{"drive": {"tone": 2.0}}]}, "tone=2.0 must be <= 1"),
