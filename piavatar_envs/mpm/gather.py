@@ -9,7 +9,7 @@ from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_a
 from piavatar_envs.mpm.decouple import advance_deformation
 from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.records import TO_KINEMATIC, first_of_halves, read_half_from
-from piavatar_envs.mpm.stencil import base_node, grid_position, in_same_brick, spline, stencil_inside
+from piavatar_envs.mpm.stencil import Stencil, base_node, grid_position, in_same_brick, stencil_at, stencil_inside
 from piavatar_envs.mpm.stencil_lines import gather_lines, lines_of
 from piavatar_envs.mpm.stencil_records import HALVES, ends_of_line, line_of_records, slab_records
 from piavatar_envs.mpm.types import (
@@ -105,10 +105,9 @@ def finish_gather(
     physical: Gradients,
     kinematic: Gradients,
     asked: bool,
-    base: wp.vec3i,
-    f: wp.vec3,
+    stencil: Stencil,
 ):
-    """Particle ``p``, which is ``f`` from node ``base``, a substep later; the blocks that it comes to are marked.
+    """Particle ``p`` a substep later; the blocks that it comes to are marked.
 
     It is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking exact
     (1e-5 m against 1e-2 m). What the grid did not see of it is projected out of the boundaries. ``kinematic`` has
@@ -118,10 +117,10 @@ def finish_gather(
     advection = wp.vec3(physical.mean[1], physical.mean[2], physical.mean[3])
     s = Gathered()
     s.u = advection
-    s.C = gradient_of(grid, physical, f)
+    s.C = gradient_of(grid, physical, stencil.f)
     grad_vk = wp.mat33()
     if step.decoupling == PAPER:
-        grad_vk = gradient_of(grid, kinematic, f)
+        grad_vk = gradient_of(grid, kinematic, stencil.f)
     elif step.decoupling == SPLIT or step.decoupling == NO_STRESS:
         own = moved.vk[e, p]
         if asked:
@@ -136,7 +135,7 @@ def finish_gather(
         wp.atomic_or(failure, e, s.fault)
     else:
         to = base_node(grid_position(grid, s.x))
-        if not in_same_brick(to, base):
+        if not in_same_brick(to, stencil.base):
             mark_blocks(grid, blocks, to, particles.field[p], e, failure)
     return s
 
@@ -148,12 +147,13 @@ def gather_physical(
     nodes: wp.uint64,
     e: int,
     field: int,
-    base: wp.vec3i,
-    wx: wp.vec3,
-    wy: wp.vec3,
-    wz: wp.vec3,
+    stencil: Stencil,
 ):
     """Sums over a stencil of the nodes' physical velocity, on a GPU; on a CPU they are :func:`gather_lines`."""
+    base = stencil.base
+    wx = stencil.wx
+    wy = stencil.wy
+    wz = stencil.wz
     g = Gradients()
     slab = wp.vec4i()
     planes = int(3)  # not a constant: a GPU has too few registers for the loads of all three at once
@@ -184,19 +184,18 @@ def gather_kinematic(
     nodes: wp.uint64,
     e: int,
     field: int,
-    base: wp.vec3i,
-    wx: wp.vec3,
-    wy: wp.vec3,
-    wz: wp.vec3,
+    stencil: Stencil,
 ):
     """Sums over a stencil of the kinematic velocity; few particles ask for them, so they are as short as can be."""
+    base = stencil.base
+    wz = stencil.wz
     g = Gradients()
     lines = int(9)  # not a constant: Warp would write them all down
     for n in range(lines):
         i = n // 3
         j = n % 3
         at = line_of_records(slab_records(grid, blocks, e, field, base, i, HALVES), base, i, j)
-        w = wx[i] * wy[j]
+        w = stencil.wx[i] * stencil.wy[j]
         for l in range(3):
             k = read_half_from(nodes, at[l], TO_KINEMATIC)
             s = (w * wz[l]) * wp.vec4(0.0, k[0], k[1], k[2])
@@ -225,21 +224,16 @@ def gather(
     The blocks that it comes to are marked for the next substep. For a GPU; see :func:`gather_by_lines`.
     """
     x = moved.x[e, p]
-    xg = grid_position(grid, x)
-    base = base_node(xg)
-    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
-    wx = spline(f[0])
-    wy = spline(f[1])
-    wz = spline(f[2])
+    stencil = stencil_at(grid_position(grid, x))
     field = particles.field[p]
     nodes = first_of_halves(node_velocity, e)
-    physical = gather_physical(grid, blocks, nodes, e, field, base, wx, wy, wz)
+    physical = gather_physical(grid, blocks, nodes, e, field, stencil)
     kinematic = Gradients()
     asked = asks_kinematic(grid, step, boundaries, e, x)
     if asked:
-        kinematic = gather_kinematic(grid, blocks, nodes, e, field, base, wx, wy, wz)
+        kinematic = gather_kinematic(grid, blocks, nodes, e, field, stencil)
     return finish_gather(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, base, f
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, stencil
     )  # fmt: skip
 
 
@@ -258,12 +252,10 @@ def gather_by_lines(
 ):
     """:func:`gather` for a CPU, whose scatter has noted what is around a particle."""
     x = moved.x[e, p]
-    xg = grid_position(grid, x)
-    base = base_node(xg)
-    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
+    stencil = stencil_at(grid_position(grid, x))
     field = particles.field[p]
     nodes = first_of_halves(node_velocity, e)
-    lines = lines_of(grid, blocks, e, field, base, f, HALVES)
+    lines = lines_of(grid, blocks, e, field, stencil, HALVES)
     sums = gather_lines(nodes, lines)
     physical = Gradients(sums[0], sums[1], sums[2], sums[3])
     kinematic = Gradients()
@@ -271,9 +263,9 @@ def gather_by_lines(
     if step.decoupling == PAPER or (noted_around(blocks, e, p) & TELLS) != 0:
         asked = asks_kinematic(grid, step, boundaries, e, x)
     if asked:
-        kinematic = gather_kinematic(grid, blocks, nodes, e, field, base, lines.wx, lines.wy, lines.wz)
+        kinematic = gather_kinematic(grid, blocks, nodes, e, field, stencil)
     return finish_gather(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, base, f
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, stencil
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from piavatar_envs.mpm.stencil import (
     base_node,
     block_index,
     grid_position,
-    spline,
+    stencil_at,
     stencil_inside,
 )
 from piavatar_envs.mpm.stencil_records import VECTORS, line_of_records, slab_records
@@ -83,16 +83,13 @@ def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Se
     """Impulse that contact gives particle ``p`` at grid position ``xg``, on its sensor, by the subject that gave it."""
     sensor = particles.sensor[p]
     own = particles.field[p]
-    base = base_node(xg)
+    stencil = stencil_at(xg)
+    base = stencil.base
     # nearly all particles leave here
     if sensor < 0 or fields_around(grid, blocks, base, e) == (1 << own):
         return
     if not touched_around(grid, blocks, sensors, e, own, base):
         return
-    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
-    wx = spline(f[0])
-    wy = spline(f[1])
-    wz = spline(f[2])
     m = particles.mass[row(e, particles.mass.shape[0]), p]
     taken = wp.vec4()
     slab = wp.vec4i()
@@ -102,14 +99,14 @@ def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Se
             slab = slab_records(grid, blocks, e, own, base, i, VECTORS)
         for j in range(three):
             at = line_of_records(slab, base, i, j)
-            w = m * pick(wx, i) * pick(wy, j)
+            w = m * pick(stencil.wx, i) * pick(stencil.wy, j)
             # all of a line are asked for before the first has answered
             first = change_at(sensors, e, at[0])
             second = change_at(sensors, e, at[1])
             third = change_at(sensors, e, at[2])
-            taken = take_share(sensors, e, sensor, taken, first, w * wz[0])
-            taken = take_share(sensors, e, sensor, taken, second, w * wz[1])
-            taken = take_share(sensors, e, sensor, taken, third, w * wz[2])
+            taken = take_share(sensors, e, sensor, taken, first, w * stencil.wz[0])
+            taken = take_share(sensors, e, sensor, taken, second, w * stencil.wz[1])
+            taken = take_share(sensors, e, sensor, taken, third, w * stencil.wz[2])
     give(sensors, e, sensor, taken)
 
 
@@ -164,15 +161,12 @@ def sense_penetration(
     if failure[e] != 0:
         return
     xg = grid_position(grid, x[e, p])
-    base = base_node(xg)
+    stencil = stencil_at(xg)
+    base = stencil.base
     if not stencil_inside(grid, base):
         return
     own = contact.subject[particles.field[p]]
     around = fields_around(grid, blocks, base, e)
-    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
-    wx = spline(f[0])
-    wy = spline(f[1])
-    wz = spline(f[2])
     fraction = float(0.0)
     for g in range(contact.num_fields):
         if has_field(around, g) and contact.subject[g] != own:
@@ -184,7 +178,8 @@ def sense_penetration(
                             r = record_of(grid, blocks, e, g, base[0] + i, base[1] + j, base[2] + k)
                             # a block that the last gather has marked knows nothing yet
                             if r < BLOCK_NODES * blocks.swept[e]:
-                                m += pick(wx, i) * pick(wy, j) * pick(wz, k) * mass_of(node_velocity, e, r)
+                                w = pick(stencil.wx, i) * pick(stencil.wy, j) * pick(stencil.wz, k)
+                                m += w * mass_of(node_velocity, e, r)
             density = contact.density[row(e, contact.density.shape[0]), g]
             fraction += m * grid.inv_dx * grid.inv_dx * grid.inv_dx / density
     depth = grid.dx * (wp.min(fraction, 1.0) - SURFACE) / SURFACE_SLOPE

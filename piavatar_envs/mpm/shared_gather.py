@@ -13,7 +13,7 @@ from piavatar_envs.mpm.shared_grid import (
     physical_at,
 )
 from piavatar_envs.mpm.shared_memory import has_bit, meet_warp, thread_of_block, threads_of_block
-from piavatar_envs.mpm.stencil import base_node, grid_position, spline
+from piavatar_envs.mpm.stencil import Stencil, grid_position, stencil_at
 from piavatar_envs.mpm.stores import store_particle
 from piavatar_envs.mpm.types import (
     Blocks,
@@ -30,13 +30,15 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
-def kinematic_from_bricks(room: Room, bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3):
+def kinematic_from_bricks(room: Room, bricks: vec8i, stencil: Stencil):
     """Kinematic velocity of a stencil's nodes, in components 1 to 3; few particles ask for it."""
+    base = stencil.base
+    wz = stencil.wz
     mean = wp.vec4()
     lines = int(9)  # not a constant: it is as short as can be
     for n in range(lines):
         at = line_in_bricks(bricks, base, n // 3, n % 3)
-        w = wx[n // 3] * wy[n % 3]
+        w = stencil.wx[n // 3] * stencil.wy[n % 3]
         first = wz[0] * kinematic_at(kinematic_of(room, at[0]))
         second = wz[1] * kinematic_at(kinematic_of(room, at[1]))
         mean += w * (first + second + wz[2] * kinematic_at(kinematic_of(room, at[2])))
@@ -44,8 +46,12 @@ def kinematic_from_bricks(room: Room, bricks: vec8i, base: wp.vec3i, wx: wp.vec3
 
 
 @wp.func
-def physical_from_bricks(bricks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3):
+def physical_from_bricks(bricks: vec8i, stencil: Stencil):
     """Sums over a stencil, see :func:`piavatar_envs.mpm.gather.gather_physical`."""
+    base = stencil.base
+    wx = stencil.wx
+    wy = stencil.wy
+    wz = stencil.wz
     g = Gradients()
     planes = int(3)  # not a constant: too few registers for the loads of all three at once
     for i in range(planes):
@@ -83,22 +89,17 @@ def gather_from_bricks(
 ):
     """Particle ``p`` from the nodes, see :func:`piavatar_envs.mpm.gather.gather`."""
     x = moved.x[e, p]
-    xg = grid_position(grid, x)
-    base = base_node(xg)
-    f = xg - wp.vec3(float(base[0]), float(base[1]), float(base[2]))
-    wx = spline(f[0])
-    wy = spline(f[1])
-    wz = spline(f[2])
-    bricks = bricks_around(grid, blocks, room, e, particles.field[p], base, 0)
+    stencil = stencil_at(grid_position(grid, x))
+    bricks = bricks_around(grid, blocks, room, e, particles.field[p], stencil.base, 0)
     kinematic = Gradients()
     asked = bool(False)
     if has_bit(room.told, p):  # who is that near a boundary tells its place
         asked = asks_kinematic(grid, step, boundaries, e, x)
     if asked:
-        kinematic.mean = kinematic_from_bricks(room, bricks, base, wx, wy, wz)
-    physical = physical_from_bricks(bricks, base, wx, wy, wz)
+        kinematic.mean = kinematic_from_bricks(room, bricks, stencil)
+    physical = physical_from_bricks(bricks, stencil)
     return finish_gather(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, base, f
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, stencil
     )  # fmt: skip
 
 

@@ -63,6 +63,29 @@ def spline(f: float):
     return wp.vec3(0.5 * a * a, 0.75 - b * b, 0.5 * c * c)
 
 
+@wp.struct
+class Stencil:
+    """Where a particle is among the nodes that it touches, and what these weigh along each axis."""
+
+    base: wp.vec3i  # lowest node
+    f: wp.vec3  # position from there, in grid spacings
+    wx: wp.vec3
+    wy: wp.vec3
+    wz: wp.vec3
+
+
+@wp.func
+def stencil_at(xg: wp.vec3):
+    """The stencil around a grid position."""
+    s = Stencil()
+    s.base = base_node(xg)
+    s.f = xg - wp.vec3(float(s.base[0]), float(s.base[1]), float(s.base[2]))
+    s.wx = spline(s.f[0])
+    s.wy = spline(s.f[1])
+    s.wz = spline(s.f[2])
+    return s
+
+
 @wp.func
 def node_in_block(i: int, j: int, k: int):
     """Index of node ``(i, j, k)`` among the 64 of its block."""

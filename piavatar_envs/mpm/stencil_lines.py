@@ -9,7 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.records import TO_KINEMATIC
-from piavatar_envs.mpm.stencil import spline
+from piavatar_envs.mpm.stencil import Stencil
 from piavatar_envs.mpm.stencil_records import slab_records
 from piavatar_envs.mpm.types import Blocks, Grid, Sums, vec8
 
@@ -25,8 +25,8 @@ auto vector = [](float a, float b, float c, float d) { return four{a, b, c, d}; 
 typedef wp::vec_t<4, wp::float32> four;
 auto vector = [](float a, float b, float c, float d) { return four(a, b, c, d); };
 #endif
-const int bx = lines.base[0] & 3, by = lines.base[1] & 3, bz = lines.base[2] & 3;
-const wp::vec3 wx = lines.wx, wy = lines.wy, wz = lines.wz;
+const int bx = lines.of.base[0] & 3, by = lines.of.base[1] & 3, bz = lines.of.base[2] & 3;
+const wp::vec3 wx = lines.of.wx, wy = lines.of.wy, wz = lines.of.wz;
 // calls what is to be done with the places of the three nodes of line j of plane i
 auto with_line = [&](int i, int j, auto visit) {
     const wp::vec_t<4, wp::int32>& slab = i == 0 ? lines.slab0 : i == 1 ? lines.slab1 : lines.slab2;
@@ -42,20 +42,18 @@ auto with_line = [&](int i, int j, auto visit) {
 class Lines:
     """The nine lines of a stencil: where their nodes are in an array, and what they weigh."""
 
-    base: wp.vec3i  # lowest node
+    of: Stencil
     slab0: wp.vec4i  # places of the three planes, see :func:`piavatar_envs.mpm.stencil_records.slab_records`
     slab1: wp.vec4i
     slab2: wp.vec4i
-    wx: wp.vec3
-    wy: wp.vec3
-    wz: wp.vec3
 
 
 @wp.func
-def lines_of(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i, f: wp.vec3, of_block: int):
-    """Lines of the stencil at ``base``, a particle ``f`` from there, in an array of ``of_block`` entries a block."""
+def lines_of(grid: Grid, blocks: Blocks, e: int, field: int, stencil: Stencil, of_block: int):
+    """Lines of a stencil in an array of ``of_block`` entries a block."""
+    base = stencil.base
     s = Lines()
-    s.base = base
+    s.of = stencil
     s.slab0 = slab_records(grid, blocks, e, field, base, 0, of_block)
     s.slab1 = s.slab0
     s.slab2 = s.slab0
@@ -64,9 +62,6 @@ def lines_of(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i, f: 
         s.slab2 = s.slab1
     elif ((base[0] + 2) & 3) == 0:
         s.slab2 = slab_records(grid, blocks, e, field, base, 2, of_block)
-    s.wx = spline(f[0])
-    s.wy = spline(f[1])
-    s.wz = spline(f[2])
     return s
 
 
@@ -170,6 +165,7 @@ def scatter_lines(
     + _ADDING
     + """
 const auto add = adding_to(sums.offset, e);
+const wp::vec3 f = lines.of.f;
 #pragma unroll
 for (int i = 0; i < 3; ++i)
 #pragma unroll
@@ -188,10 +184,9 @@ def scatter_places(
     sums: Sums,
     e: int,
     lines: Lines,
-    f: wp.vec3,
     mass: float,
     seam: float,
     dx: float,
 ):
-    """Tell the nodes where a particle is, ``f`` from ``base`` [dx]; ``lines`` are of ``VECTORS``."""
+    """Tell the nodes where a particle is; ``lines`` are of ``VECTORS``."""
     ...

@@ -12,7 +12,7 @@ from piavatar_envs.mpm.blocks import fields_around, note_around
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.matrices import matrix_at
-from piavatar_envs.mpm.stencil import base_node, grid_position
+from piavatar_envs.mpm.stencil import grid_position, stencil_at
 from piavatar_envs.mpm.stencil_lines import lines_of, scatter_lines, scatter_places
 from piavatar_envs.mpm.stencil_records import HALVES, VECTORS
 from piavatar_envs.mpm.types import (
@@ -53,9 +53,9 @@ class Scattered:
 def placed(grid: Grid, x: wp.vec3):
     """A particle at ``x`` that scatters nothing."""
     s = Scattered()
-    xg = grid_position(grid, x)
-    s.base = base_node(xg)
-    s.f = xg - wp.vec3(float(s.base[0]), float(s.base[1]), float(s.base[2]))
+    stencil = stencil_at(grid_position(grid, x))
+    s.base = stencil.base
+    s.f = stencil.f
     return s
 
 
@@ -179,14 +179,14 @@ def particles_to_grid(
     if not scatters(blocks, moving, e, p, failure):
         return
     x = moving.x[e, p]
-    base = base_node(grid_position(grid, x))
-    beside = is_beside(grid, particles, contact, blocks, e, p, base)
+    stencil = stencil_at(grid_position(grid, x))
+    beside = is_beside(grid, particles, contact, blocks, e, p, stencil.base)
     tells = beside or near_boundary(grid, boundaries, e, x)
     note_around(blocks, e, p, tells, beside)
     s = prepare(grid, step, particles, moving, e, p, tells)
     field = particles.field[p]
     driven = tells or step.decoupling == PAPER
-    scatter_lines(sums, e, lines_of(grid, blocks, e, field, base, s.f, HALVES), s.at_base, s.A, driven)
+    scatter_lines(sums, e, lines_of(grid, blocks, e, field, stencil, HALVES), s.at_base, s.A, driven)
     if tells:
-        lines = lines_of(grid, blocks, e, field, base, s.f, VECTORS)
-        scatter_places(sums, e, lines, s.f, s.at_base[0], particles.seam[p], grid.dx)
+        lines = lines_of(grid, blocks, e, field, stencil, VECTORS)
+        scatter_places(sums, e, lines, s.at_base[0], particles.seam[p], grid.dx)
