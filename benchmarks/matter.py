@@ -84,7 +84,7 @@ class Matter:
     def sums_are_clear(self) -> bool:
         """Whether no node holds anything that a later substep would add to."""
         sums = self.scratch.sums
-        arrays = [sums.fixed, sums.offset, sums.offset_fixed]
+        arrays = [sums.fixed, sums.offset, sums.offset_fixed, sums.told]
         if self.model.scatter != "shared":  # whose sums are written, not added up
             arrays.append(sums.value)
         return not any(array.numpy().any() for array in arrays)

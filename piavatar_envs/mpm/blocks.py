@@ -121,22 +121,6 @@ def fields_beyond(grid: Grid, blocks: Blocks, corner: wp.vec3i, e: int):
 
 
 @wp.func
-def beside_others(grid: Grid, blocks: Blocks, e: int, f: int, corner: wp.vec3i, n: int):
-    """Whether the ``n``-th of the 27 blocks around that at ``corner`` has matter of field ``f`` and of another.
-
-    Where none has, no particle whose stencil comes into the block meets another field.
-    """
-    x = corner[0] // 4 + n // 9 - 1
-    y = corner[1] // 4 + n // 3 % 3 - 1
-    z = corner[2] // 4 + n % 3 - 1
-    low = wp.min(x, wp.min(y, z))
-    if low < 0 or x >= grid.blocks[0] or y >= grid.blocks[1] or z >= grid.blocks[2]:
-        return False
-    mask = blocks.fields[e, (x * grid.blocks[1] + y) * grid.blocks[2] + z]
-    return has_field(mask, f) and mask != (1 << f)
-
-
-@wp.func
 def first_record(grid: Grid, blocks: Blocks, e: int, f: int, block: int):
     """Record of the first node of a block that holds matter of field ``f``."""
     return BLOCK_NODES * blocks.slot[e, f * grid.num_blocks + block]
@@ -155,13 +139,9 @@ def slots_used(blocks: Blocks, e: int):
 
 
 @wp.func
-def held_by(grid: Grid, blocks: Blocks, e: int, slot: int):
-    """Field and block that a slot belongs to; -1 and 0 if it is free."""
-    n = blocks.held[e, wp.min(slot, blocks.held.shape[1] - 1)]  # asked for before it is known whether it counts
-    held = wp.vec2i(-1, 0)
-    if slot < slots_used(blocks, e):
-        held = wp.vec2i(n // grid.num_blocks, n % grid.num_blocks)
-    return held
+def held_by(grid: Grid, held: int):
+    """Field and block that a slot belongs to, from what ``held`` says of it."""
+    return wp.vec2i(held // grid.num_blocks, held % grid.num_blocks)
 
 
 @wp.func

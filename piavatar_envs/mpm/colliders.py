@@ -36,8 +36,6 @@ CONTACT_GATE = wp.constant(0.5)
 NEAR_PARTICLE = wp.constant(3.5)
 #: Blocks of nodes whose middle is closer may be the base of such a particle: NEAR_PARTICLE, and half a diagonal.
 NEAR_BLOCK = wp.constant(7.0)
-#: Slabs of nodes closer than this may hold such a position: NEAR_PARTICLE, a stencil and a slab's half diagonal.
-NEAR_SLAB = wp.constant(8.5)
 #: Slabs of nodes closer than this may hold matter within the gate: CONTACT_GATE, half a stencil's and half a slab's
 #: diagonal.
 GATED_SLAB = wp.constant(5.3)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import beside_others, held_by, slots_used
-from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_BLOCK, NEAR_SLAB, boundary_contact, nearest_boundary
+from piavatar_envs.mpm.blocks import held_by, slots_used
+from piavatar_envs.mpm.colliders import CONTACT_GATE, GATED_SLAB, NEAR_BLOCK, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.normals import MASS_MIN, face_shared
-from piavatar_envs.mpm.records import write_kinematic, write_physical
+from piavatar_envs.mpm.records import write_physical, write_record
+from piavatar_envs.mpm.shared_memory import meet_warp
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
-from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at
-from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, first_node, from_lane, lane_of_thread, lanes_of_warp
+from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, units_of
+from piavatar_envs.mpm.sweep import THREADS, Sweep, lane_of_thread, lanes_of_warp, nodes_of_lane
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import (
     NO_STRESS,
@@ -33,8 +34,6 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 
 #: Nodes of a slab of a block, the unit in which boundaries are looked for.
 SLAB_NODES = wp.constant(16)
-#: One more than the bits of all slabs of a block.
-ALL_SLABS = wp.constant(16)
 
 
 @wp.func
@@ -103,29 +102,6 @@ def block_is_near(grid: Grid, boundaries: Boundaries, e: int, corner: wp.vec3i):
 
 
 @wp.func
-def with_near(grid: Grid, sweep: Sweep, boundaries: Boundaries, e: int, held: wp.vec2i, begin: int):
-    """Field and block of a slot, with the field a bit for each slab that a boundary is near; -1 and 0 stay.
-
-    A slab has 4 x 4 nodes; the bits are right for those of a turn from record ``begin``.
-    """
-    if held[0] < 0:
-        return held
-    corner = block_corner(grid, held[1])
-    first = (begin % BLOCK_NODES) // SLAB_NODES
-    about = held[0] * ALL_SLABS
-    for slab in range(first, first + wp.max(sweep.share // SLAB_NODES, 2)):  # a warp's turn is two slabs
-        if slab_is_near(grid, boundaries, e, corner, slab * SLAB_NODES, NEAR_SLAB):
-            about = about | (1 << slab)
-    return wp.vec2i(about, held[1])
-
-
-@wp.func
-def near_node(about: int, local: int):
-    """Whether a boundary is near the slab of node ``local``, from what :func:`with_near` says."""
-    return ((about >> (local // SLAB_NODES)) & 1) != 0
-
-
-@wp.func
 def place_of(grid: Grid, corner: wp.vec3i, local: int):
     """Position of node ``local`` of the block with the lowest node ``corner`` [m]."""
     node = node_of_block(corner, local)
@@ -133,57 +109,83 @@ def place_of(grid: Grid, corner: wp.vec3i, local: int):
 
 
 @wp.func
-def alone_in(grid: Grid, contact: Contact, blocks: Blocks, sensors: Sensors, e: int, r: int):
-    """Field and block of record ``r`` if the block has no other field, else -1 and 0; nothing has touched it yet."""
-    held = held_by(grid, blocks, e, r // BLOCK_NODES)
-    if held[0] >= 0 and contact.num_fields > 1:
-        sensors.touched[e, r // BLOCK_NODES] = 0
-        if blocks.fields[e, held[1]] != (1 << held[0]):
-            held = wp.vec2i(-1, 0)
-    return held
+def update_free(
+    step: Step, sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l, node_velocity: wp.array2d(dtype=wp.vec4)
+):
+    """Velocity of a node that has been told nothing, from the sum that has ``begun``: it has no kinematic one."""
+    total = total_velocity(step, False, end_sum(sums, e, units, r, begun, False))
+    write_physical(node_velocity, e, r, physical_velocity(False, total))
 
 
 @wp.func
-def told_by_neighbours(grid: Grid, contact: Contact, blocks: Blocks, e: int, f: int, corner: wp.vec3i):
-    """Whether particles next to another field may have left their offsets in the block of field ``f`` at ``corner``."""
-    told = bool(False)
-    if contact.num_fields > 1 and blocks.num_shared[e] > 0:
-        for n in range(lane_of_thread(), 27, lanes_of_warp()):
-            told = told or beside_others(grid, blocks, e, f, corner, n)
-        told = any_lane(told)
-    return told
+def update_told(
+    grid: Grid,
+    step: Step,
+    boundaries: Boundaries,
+    contact: Contact,
+    sums: Sums,
+    e: int,
+    units: wp.vec2,
+    f: int,
+    r: int,
+    corner: wp.vec3i,
+    near: bool,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
+):
+    """Velocities of a node that may have been told where particles are and how they are driven.
+
+    A boundary may be ``near`` the matter there; ``corner`` is the lowest node of its block.
+    """
+    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    total = total_velocity(step, split, end_sum(sums, e, units, r, begin_sum(sums, e, r), True))
+    if near:
+        at = place_of(grid, corner, r % BLOCK_NODES)
+        total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
+    write_record(node_velocity, e, r, physical_velocity(split, total))
+    clear_offset(sums, e, r)
 
 
 @wp.func
-def update_node(
+def update_block(
     grid: Grid,
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
     sums: Sums,
     begun: vec4l,
+    begun_next: vec4l,
     e: int,
-    f: int,
-    r: int,
-    corner: wp.vec3i,
-    is_near: bool,
-    is_told: bool,
+    slot: int,
+    held: wp.vec2i,
+    told: bool,
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """Sums of a node to velocities; kinematic ones where somebody has told them, or the variant asks everybody."""
-    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    driven = is_told or step.decoupling == PAPER
-    total = total_velocity(step, split, end_sum(sums, e, f, r, begun, driven))
-    if is_near:  # most skip all of that work
-        x = place_of(grid, corner, r % BLOCK_NODES)
-        total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, total, sensors)
-    v = physical_velocity(split, total)
-    write_physical(node_velocity, e, r, v)
+    """Sums of a slot's nodes to velocities; it is ``held`` by a field, for a block, and some may have been ``told``.
+
+    The threads of a warp share the nodes; the sums of each one's first two have ``begun``.
+    """
+    driven = told or step.decoupling == PAPER
+    units = units_of(sums, e, held[0])
+    lanes = lanes_of_warp()
+    r = BLOCK_NODES * slot + lane_of_thread()
     if driven:
-        write_kinematic(node_velocity, e, r, v)
-    if is_told:
-        clear_offset(sums, e, r)
+        corner = block_corner(grid, held[1])
+        near = bool(False)
+        for n in range(nodes_of_lane()):
+            local = (r + n * lanes) % BLOCK_NODES
+            if n == 0 or lanes > 1 or local % SLAB_NODES == 0:  # a thread of a CPU goes from node to node
+                near = slab_is_near(grid, boundaries, e, corner, local, GATED_SLAB)
+            update_told(
+                grid, step, boundaries, contact, sums, e, units, held[0], r + n * lanes, corner, near, node_velocity,
+                sensors,
+            )  # fmt: skip
+    else:  # most have nothing else to do
+        update_free(step, sums, e, units, r, begun, node_velocity)
+        update_free(step, sums, e, units, r + lanes, begun_next, node_velocity)
+        for n in range(2, nodes_of_lane()):  # on a CPU
+            update_free(step, sums, e, units, r + n * lanes, begin_sum(sums, e, r + n * lanes), node_velocity)
 
 
 @wp.kernel(launch_bounds=(THREADS, 7))
@@ -192,8 +194,8 @@ def update_grid(
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
-    sweep: Sweep,
     of_shared: Sweep,
+    slots: int,
     failure: wp.array(dtype=int),
     # in and out: sums are read, then cleared
     blocks: Blocks,
@@ -203,58 +205,48 @@ def update_grid(
     node_facing: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """Velocity of every node with mass in blocks of one field.
+    """Velocity of every node with mass in blocks of one field; a warp has every ``slots``-th, on a CPU a thread.
 
     Contact acts on the total velocity ``v = u + vk``; the rest is physical. Where there are several fields, the first
     threads prepare contact, see :func:`piavatar_envs.mpm.normals.face_shared`: they are few, and have the longest to
     wait.
 
     Nodes have offsets and, but for the paper's variant, kinematic momentum only from particles that tell their place,
-    see :func:`piavatar_envs.mpm.transfer.tells_place`. Such a particle is at most ``NEAR_PARTICLE`` from a boundary,
-    and then every node of its stencil is in a slab within ``NEAR_SLAB``; or a block of its stencil has another field
-    besides its own, and then every block of its stencil is that one or one of its neighbours, and told.
+    see :func:`piavatar_envs.mpm.transfer.tells_place`, and who scatters those notes in which slots. Matter within the
+    gate of a boundary is of such particles only, so elsewhere nobody asks for boundaries.
     """
-    at = environment_of(wp.tid(), of_shared.threads + sweep.threads)
+    at = environment_of(wp.tid(), of_shared.threads + slots * lanes_of_warp())
     e = at[0]
     place = at[1]
     if place < of_shared.threads:
         face_shared(grid, contact, of_shared, blocks, sums, e, place, node_velocity, node_facing)
         return
-    thread = place - of_shared.threads
-    lane = lane_of_thread()
+    slot = (place - of_shared.threads) // lanes_of_warp()
     used = slots_used(blocks, e)
-    if thread == 0:
-        blocks.swept[e] = used
-        blocks.frozen[e] = failure[e]  # the scatter has ended
-    end = BLOCK_NODES * used
-    begin = first_node(sweep, thread)
-    # asked for early: who waits for one answer after the other waits for most of the pass
-    next_sum = begin_sum(sums, e, begin + lane)
-    held = alone_in(grid, contact, blocks, sensors, e, begin + lane * sweep.stride)
-    if begin >= end:
-        return
-    known = with_near(grid, sweep, boundaries, e, held, begin)
-    for turn in range(sweep.turns):
-        first = begin + turn * sweep.stride
-        if first >= end:
-            break
-        sum = next_sum
-        if first + sweep.stride < end and turn + 1 < sweep.turns:
-            next_sum = begin_sum(sums, e, first + sweep.stride + lane)
-        about = from_lane(known[0], turn)
-        if about < 0:
-            continue
-        f = about // ALL_SLABS
-        block = from_lane(known[1], turn)
-        corner = wp.vec3i()
-        if contact.num_fields > 1 or about % ALL_SLABS != 0:
-            corner = block_corner(grid, block)
-        told = told_by_neighbours(grid, contact, blocks, e, f, corner)
-        for r in range(first + lane, first + lane + sweep.share):
-            is_near = near_node(about, r % BLOCK_NODES)
-            if r > first + lane:  # on a CPU, where a thread takes a block
-                sum = begin_sum(sums, e, r)
-            update_node(
-                grid, step, boundaries, contact, sums, sum, e, f, r, corner, is_near, is_near or told, node_velocity,
-                sensors,
-            )  # fmt: skip
+    goes_on = bool(True)
+    while goes_on:
+        first = BLOCK_NODES * slot + lane_of_thread()
+        begun = begin_sum(sums, e, first)
+        begun_next = begin_sum(sums, e, first + lanes_of_warp())
+        n = blocks.held[e, slot]
+        told = sums.told[e, slot] != 0
+        meet_warp()  # all is asked for before the first has answered, and read before it is written
+        if place == of_shared.threads:
+            blocks.swept[e] = used
+            blocks.frozen[e] = failure[e]  # the scatter has ended
+        if slot < used:
+            if told:
+                sums.told[e, slot] = 0
+            held = wp.vec2i(0, n)
+            alone = bool(True)
+            if contact.num_fields > 1:
+                held = held_by(grid, n)
+                alone = blocks.fields[e, held[1]] == (1 << held[0])
+                sensors.touched[e, slot] = 0
+            if alone:
+                update_block(
+                    grid, step, boundaries, contact, sums, begun, begun_next, e, slot, held, told, node_velocity,
+                    sensors,
+                )  # fmt: skip
+        slot += slots
+        goes_on = slot < used

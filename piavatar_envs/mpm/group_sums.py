@@ -49,6 +49,9 @@ auto red = [](size_t to, int record, long long added) {{
 }};
 // what places have of records has no halves
 auto own = [&](int record) {{ return is_place ? (record >> 1 & ~63) + (record & 63) : record; }};
+if (is_place)
+    for (int n = threadIdx.x; n < bricks; n += blockDim.x)
+        if (room[MASSIVE + n]) wp::index(sums.told, e, room[RECORDS + n] >> 7) = 1;
 bool too_much = false;
 // sums have 31 bits, so most of them cannot be too large
 if (sums.is_fixed != 0 && !is_place && __all_sync(ALL, shift < 18)) {{
@@ -78,6 +81,6 @@ if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 def put_down(grid: Grid, sums: Sums, failure: wp.array(dtype=int), e: int, kind: int):
     """Add what the nodes have got of a ``kind`` to the sums outside, and forget it; sums that are too large are not.
 
-    Four threads a node. Masses come first.
+    Four threads a node. Masses come first; slots whose nodes are told places are noted.
     """
     ...

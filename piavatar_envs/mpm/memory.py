@@ -81,7 +81,7 @@ def estimate_bytes(
     """
     sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter])
     node = sums + 32 + (16 + 16 if num_fields > 1 else 0)
-    slots = max_slots * (BLOCK**3 * node + (10 if num_fields > 1 else 4))
+    slots = max_slots * (BLOCK**3 * node + (10 if num_fields > 1 else 4) + (0 if scatter == "shared" else 4))
     particles = 48 * num_particles + 72 * whole_lines(num_particles)  # four vectors and two matrices
     return num_envs * (particles + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
 
@@ -177,6 +177,7 @@ def allocate_sums(model: Model, velocity: wp.array) -> Sums:
         offset_fixed=_zeros(model, integers, vec4l),
         mass_unit=wp.array(mass.astype(np.float32), dtype=float, device=model.device),
         momentum_unit=wp.array(momentum.astype(np.float32), dtype=float, device=model.device),
+        told=_zeros(model, (1, 1) if model.scatter == "shared" else (model.num_envs, model.max_slots), int),
     )
 
 

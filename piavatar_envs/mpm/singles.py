@@ -219,6 +219,8 @@ def singles_to_grid(
             s = scattered(grid, step, particles, moving, e, p, kind)
             if kind == KINEMATIC:
                 adds = bounded(s, units[1], failure, e) >= 0.0
+            else:
+                sums.told[e, record // BLOCK_NODES] = 1
 
 
 def record_singles(program: Program, inputs: list[Any], shape: tuple[int, int], failure: Any, sums: Sums) -> None:

@@ -15,7 +15,7 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
 from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
 from piavatar_envs.mpm.singles import record_singles
-from piavatar_envs.mpm.sweep import THREADS, Sweep, plan_shared_sweep, plan_sweep
+from piavatar_envs.mpm.sweep import THREADS, plan_sweep, slot_threads, slots_at_once
 from piavatar_envs.mpm.transfer import particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
@@ -37,12 +37,11 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
         _record_new_marks(program, model, state, scratch)
     record_scatter(program, model, state, scratch)
     if m.scatter != "shared":
-        (num_envs, threads), sweep = plan_sweep(m)
-        of_shared = plan_shared_sweep(m)[1] if m.contact.num_fields > 1 else Sweep()
+        of_shared, slots = plan_sweep(m), slots_at_once(m)
         program.launch(
             update_grid,
-            num_envs * (of_shared.threads + threads),
-            [m.grid, m.step, m.boundaries, m.contact, sweep, of_shared, s.failure],
+            m.num_envs * (of_shared.threads + slots * slot_threads(m)),
+            [m.grid, m.step, m.boundaries, m.contact, of_shared, slots, s.failure],
             [blocks, sums, scratch.velocity, scratch.facing, scratch.sensors],
             block_dim=THREADS,
         )
@@ -79,11 +78,11 @@ def _senses_apart(model: Model) -> bool:
 def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append the grid pass over the blocks with several fields, and what the contact sensors feel."""
     m, blocks, sums = model, scratch.blocks, scratch.sums
-    threads, sweep = plan_shared_sweep(m)
+    sweep = plan_sweep(m)
     if m.scatter == "shared":  # else the grid pass has done it
         program.launch(
             find_facing,
-            threads,
+            (m.num_envs, sweep.threads),
             [m.grid, m.contact, sweep, blocks],
             [sums, scratch.velocity, scratch.facing],
             block_dim=THREADS,

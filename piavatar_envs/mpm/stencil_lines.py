@@ -9,7 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.records import TO_KINEMATIC
-from piavatar_envs.mpm.stencil import Stencil
+from piavatar_envs.mpm.stencil import BLOCK_NODES, Stencil
 from piavatar_envs.mpm.stencil_records import slab_records
 from piavatar_envs.mpm.types import Blocks, Grid, Sums, vec8
 
@@ -190,3 +190,11 @@ def scatter_places(
 ):
     """Tell the nodes where a particle is; ``lines`` are of ``VECTORS``."""
     ...
+
+
+@wp.func
+def note_told(sums: Sums, e: int, lines: Lines):
+    """Note that nodes in the blocks of a stencil have been told something; ``lines`` are of ``VECTORS``."""
+    for n in range(4):  # what is less by 4 is the last of two along z, see slab_records
+        sums.told[e, (lines.slab0[n] + 4) // BLOCK_NODES] = 1
+        sums.told[e, (lines.slab2[n] + 4) // BLOCK_NODES] = 1

@@ -84,6 +84,14 @@ def counted(n: vec4l):
 
 
 @wp.func
+def units_of(sums: Sums, e: int, f: int):
+    """Units of mass [kg] and of momentum [kg m/s] of field ``f``."""
+    return wp.vec2(
+        sums.mass_unit[row(e, sums.mass_unit.shape[0]), f], sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
+    )
+
+
+@wp.func
 def begin_sum(sums: Sums, e: int, r: int):
     """What :func:`end_sum` begins with, mass and physical momentum in fixed point, to be asked for early.
 
@@ -98,12 +106,12 @@ def begin_sum(sums: Sums, e: int, r: int):
 @wp.func
 def take_sum(sums: Sums, e: int, f: int, r: int):
     """Mass, physical and kinematic momentum of record ``r`` of field ``f``, which is cleared."""
-    return end_sum(sums, e, f, r, begin_sum(sums, e, r), True)
+    return end_sum(sums, e, units_of(sums, e, f), r, begin_sum(sums, e, r), True)
 
 
 @wp.func
-def end_sum(sums: Sums, e: int, f: int, r: int, begun: vec4l, driven: bool):
-    """:func:`take_sum` of what has ``begun``.
+def end_sum(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l, driven: bool):
+    """:func:`take_sum` of what has ``begun``, of a field with these ``units``.
 
     Where it is known that nobody has added kinematic momentum, the record is not ``driven``: that is not read in fixed
     point, nor cleared. (A CPU would lose more by the question than by the answer.)
@@ -115,9 +123,8 @@ def end_sum(sums: Sums, e: int, f: int, r: int, begun: vec4l, driven: bool):
     else:
         a = counted(begun)
         if a[0] > 0.0:  # who adds no mass adds nothing
-            m = sums.mass_unit[row(e, sums.mass_unit.shape[0]), f]
-            p = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
-            s = vec8(m * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
+            p = units[1]
+            s = vec8(units[0] * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
             if driven:
                 b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
                 s = s + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)

@@ -1,21 +1,16 @@
-"""How the threads of a grid pass walk over the nodes of the slots in use.
+"""How the threads of a grid pass share the nodes.
 
-Only the device knows how many slots an environment uses. There is room for twice as many, and a thread that finds
-nothing to do costs a good part of one that does. On a GPU an environment therefore gets fewer threads, which come back
-for more: a warp takes half a block in a turn. What must be known of the blocks of its next turns its threads find out
-beforehand, each for one. On a CPU a thread takes a whole block, and that is that.
+There is room for twice as many slots as an environment uses, and only the device knows how many those are. A warp of a
+GPU has the nodes of a slot, two a thread; on a CPU a thread has all of them. Where there are many, an environment gets
+warps for some, which come back for more, and end where there is nothing to do.
 
-    lane = lane_of_thread()
-    begin = first_node(sweep, thread)
-    if begin >= end:
-        return
-    known = ...  # of the block of node begin + lane * sweep.stride, if that comes before the end
+Blocks with several fields are few, and listed. There a thread has one node::
+
     for turn in range(sweep.turns):
-        first = begin + turn * sweep.stride
+        first = thread * sweep.share + turn * sweep.stride
         if first >= end:
             break
-        of_block = from_lane(known, turn)
-        for r in range(first + lane, first + lane + sweep.share):
+        for n in range(first, first + sweep.share):
             ...
 """
 
@@ -28,12 +23,12 @@ from piavatar_envs.mpm.types import Model
 
 wp.set_module_options({"enable_backward": False})
 
-#: Threads of a CUDA block: two slots.
+#: Threads of a CUDA block: four slots.
 THREADS = 128
 #: Threads of a warp.
 LANES = 32
 #: Slots for which a large GPU has threads at once, and the fewest for which an environment gets them.
-SLOTS_AT_ONCE = 132 * 32
+SLOTS_AT_ONCE = 132 * 28
 FEWEST_SLOTS = 8
 #: The same for blocks that have several fields.
 SHARED_AT_ONCE = 132 * 6
@@ -42,10 +37,10 @@ FEWEST_SHARED = 2
 
 @wp.struct
 class Sweep:
-    """Who takes which nodes."""
+    """Who takes which nodes of blocks that have several fields; nobody where there are none."""
 
     threads: int  # of an environment
-    turns: int  # that a thread may have, no more than there are threads to look ahead for each other
+    turns: int  # that a thread may have
     share: int  # nodes of a thread in a turn
     stride: int  # nodes from one turn to the next
 
@@ -59,18 +54,6 @@ return 0;
 """)
 def lane_of_thread() -> int:
     """Place of a thread in its warp; 0 on a CPU."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-return __shfl_sync(0xffffffffu, value, lane);
-#else
-return value;
-#endif
-""")
-def from_lane(value: int, lane: int) -> int:
-    """What ``value`` is in thread ``lane`` of the warp; all of its threads must come here."""
     ...
 
 
@@ -99,9 +82,9 @@ def lanes_of_warp() -> int:
 
 
 @wp.func
-def first_node(sweep: Sweep, thread: int):
-    """First node that the warp of a thread takes."""
-    return thread * sweep.share - lane_of_thread()
+def nodes_of_lane():
+    """Nodes of a block that each of them has."""
+    return BLOCK_NODES // lanes_of_warp()
 
 
 def most_shared(model: Model) -> int:
@@ -109,27 +92,28 @@ def most_shared(model: Model) -> int:
     return max(1, model.max_slots // 2) if model.contact.num_fields > 1 else 1
 
 
-def plan_shared_sweep(model: Model) -> tuple[tuple[int, int], Sweep]:
-    """:func:`plan_sweep` over the blocks that have several fields, which are listed and few."""
+def plan_sweep(model: Model) -> Sweep:
+    """How the threads of each environment walk over its blocks that have several fields."""
     nodes, blocks = int(BLOCK_NODES), 1
     sweep = Sweep()
+    if model.contact.num_fields == 1:
+        return sweep
     sweep.share = nodes
     if wp.get_device(model.device).is_cuda:
         blocks = min(most_shared(model), max(FEWEST_SHARED, -(-SHARED_AT_ONCE // model.num_envs)))
         sweep.share = 1
     sweep.turns, sweep.stride = -(-most_shared(model) // blocks), nodes * blocks
     sweep.threads = sweep.stride // sweep.share
-    return (model.num_envs, sweep.threads), sweep
+    return sweep
 
 
-def plan_sweep(model: Model) -> tuple[tuple[int, int], Sweep]:
-    """Launch dimensions ``(num_envs, threads)`` of a grid pass, and how its threads walk."""
-    nodes = int(BLOCK_NODES)
-    sweep = Sweep()
-    slots, sweep.share = model.max_slots, nodes
+def slots_at_once(model: Model) -> int:
+    """Slots of an environment that a grid pass begins with; who has one comes back for more."""
     if wp.get_device(model.device).is_cuda:
-        slots = max(FEWEST_SLOTS, -(-SLOTS_AT_ONCE // model.num_envs), -(-model.max_slots // LANES))
-        slots, sweep.share = min(slots, model.max_slots), 1
-    sweep.turns, sweep.stride = -(-model.max_slots // slots), nodes * slots
-    sweep.threads = sweep.stride // sweep.share
-    return (model.num_envs, sweep.threads), sweep
+        return min(model.max_slots, max(FEWEST_SLOTS, -(-SLOTS_AT_ONCE // model.num_envs)))
+    return model.max_slots
+
+
+def slot_threads(model: Model) -> int:
+    """Threads that a slot has in a grid pass."""
+    return LANES if wp.get_device(model.device).is_cuda else 1

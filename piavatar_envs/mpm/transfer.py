@@ -13,7 +13,7 @@ from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.matrices import matrix_at
 from piavatar_envs.mpm.stencil import grid_position, stencil_at
-from piavatar_envs.mpm.stencil_lines import lines_of, scatter_lines, scatter_places
+from piavatar_envs.mpm.stencil_lines import lines_of, note_told, scatter_lines, scatter_places
 from piavatar_envs.mpm.stencil_records import HALVES, VECTORS
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
@@ -190,3 +190,4 @@ def particles_to_grid(
     if tells:
         lines = lines_of(grid, blocks, e, field, stencil, VECTORS)
         scatter_places(sums, e, lines, s.at_base[0], particles.seam[p], grid.dx)
+        note_told(sums, e, lines)

@@ -186,6 +186,7 @@ class Sums:
     offset_fixed: wp.array2d(dtype=vec4l)
     mass_unit: wp.array2d(dtype=float)  # [kg]
     momentum_unit: wp.array2d(dtype=float)  # [kg m/s]
+    told: wp.array2d(dtype=int)  # (num_envs, S) not 0: nodes of this slot were told where particles are and go
 
 
 @wp.struct

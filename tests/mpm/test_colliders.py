@@ -14,7 +14,6 @@ from piavatar_envs.mpm.colliders import (
     GATED_SLAB,
     NEAR_BLOCK,
     NEAR_PARTICLE,
-    NEAR_SLAB,
     boundary_contact,
     move_colliders,
     nearest_boundary,
@@ -411,6 +410,5 @@ def test_nothing_beyond_the_limits_is_asked_about_boundaries():
     slab = furthest((0.0, 1.5, 1.5), (0.0, 0.0, 0.0), (0.0, 3.0, 3.0))
     stencil = furthest((0.0, 0.0, 0.0), (-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
     assert CONTACT_GATE + stencil + slab < GATED_SLAB < CONTACT_GATE + stencil + slab + 0.1
-    assert NEAR_PARTICLE + stencil + slab < NEAR_SLAB < NEAR_PARTICLE + stencil + slab + 0.3
     block = furthest((2.5, 2.5, 2.5), (0.5, 0.5, 0.5), (4.5, 4.5, 4.5))
     assert NEAR_PARTICLE + block < NEAR_BLOCK < NEAR_PARTICLE + block + 0.1

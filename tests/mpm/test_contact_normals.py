@@ -14,7 +14,7 @@ from piavatar_envs.mpm.records import mass_of
 from piavatar_envs.mpm.solver import record_marks, record_scatter
 from piavatar_envs.mpm.stencil import block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import offset_at
-from piavatar_envs.mpm.sweep import THREADS, plan_shared_sweep
+from piavatar_envs.mpm.sweep import THREADS, plan_sweep
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums
 
 DX = 0.05
@@ -40,7 +40,9 @@ def look_at_nodes(
 ):
     """The nodes of the blocks that both fields share, where the first of them has its slot."""
     slot, local = wp.tid()
-    held = held_by(grid, blocks, 0, slot)
+    if slot >= blocks.count[0]:
+        return
+    held = held_by(grid, blocks.held[0, slot])
     if held[0] != 0 or (blocks.fields[0, held[1]] & 3) != 3:
         return
     node = node_of_block(block_corner(grid, held[1]), local)
@@ -71,10 +73,14 @@ class Look:
         program = Program(model.device)
         record_marks(program, model, state, scratch)
         record_scatter(program, model, state, scratch)
-        threads, sweep = plan_shared_sweep(model)
+        sweep = plan_sweep(model)
         found = [scratch.sums, scratch.velocity, scratch.facing]
         program.launch(
-            find_facing, threads, [model.grid, model.contact, sweep, scratch.blocks], found, block_dim=THREADS
+            find_facing,
+            (1, sweep.threads),
+            [model.grid, model.contact, sweep, scratch.blocks],
+            found,
+            block_dim=THREADS,
         )
         count = 64 * model.max_slots
 

@@ -120,6 +120,26 @@ def test_sums_are_those_of_the_equations(collide, scatter):
 
 
 @pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "shared"], indirect=True)
+def test_slots_whose_nodes_are_told_something_are_noted(meet, scatter):
+    """The grid pass asks no others for offsets and kinematic momentum; it leaves nothing of what it has read."""
+    bar = {"box": ((-0.8, -0.1, -0.1), (0.0, 0.1, 0.1)), "velocity": (0.2, 0.1, 0.0)}  # from a wall to a cube
+    wall = [((1.0, 0.0, 0.0), -0.81, 0.5)]
+    sim = meet([bar, CUBES[1]], friction=0.3, planes=wall, num_envs=2, scatter=scatter)
+    sim.set(vk=np.random.default_rng(5).normal(0.0, 0.3, sim.state.vk.numpy().shape))
+    node_sums(sim)
+    model, sums = sim.model, sim.scratch.sums
+    shape = (model.num_envs, model.max_slots, -1)
+    own, places = (sums.fixed, sums.offset_fixed) if sums.is_fixed else (sums.value, sums.offset)
+    driven = own.numpy().reshape(model.num_envs, -1, 2, 64, 4)[:, :, 1].reshape(shape).any(2)
+    told = sums.told.numpy() != 0
+    assert told[places.numpy().reshape(shape).any(2) | driven].all()
+    used = sim.scratch.blocks.count.numpy().sum()
+    assert 0 < np.count_nonzero(told) < 0.9 * used
+    sim.run(3)
+    assert sim.sums_are_clear
+
+
+@pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "shared"], indirect=True)
 def test_particles_far_apart(simulate, scatter):
     """They touch more bricks of nodes than a group has room for, and go in turns."""
     rng = np.random.default_rng(6)

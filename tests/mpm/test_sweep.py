@@ -10,7 +10,7 @@ import warp as wp
 
 from piavatar_envs.mpm import sweep
 from piavatar_envs.mpm.records import mass_of, read_record, write_physical, write_record
-from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at
+from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, units_of
 from piavatar_envs.mpm.types import Grid, Sums, group, vec4l, vec8
 
 RECORDS = 64
@@ -19,19 +19,15 @@ SLOTS = 3
 
 @pytest.mark.parametrize("cuda", [False, True])
 @pytest.mark.parametrize("num_envs", [1, 3, 64, 4096])
-@pytest.mark.parametrize("slots", [1, 7, 8, 208, 4010, 17784, 200000])
-def test_every_node_has_one_thread(monkeypatch, cuda, num_envs, slots):
-    """Warps see whole turns of 32 nodes, and no more turns than they have threads to look ahead."""
+@pytest.mark.parametrize("slots", [1, 7, 208, 17784, 200000])
+def test_slots_have_threads(monkeypatch, cuda, num_envs, slots):
+    """Few environments have a warp for every slot at once; of many, each goes on with every so-many-th."""
     monkeypatch.setattr(sweep.wp, "get_device", lambda name: SimpleNamespace(is_cuda=cuda))
-    (envs, threads), plan = sweep.plan_sweep(SimpleNamespace(device="any", num_envs=num_envs, max_slots=slots))
-    warp = sweep.LANES if cuda else 1
-    assert envs == num_envs and threads % warp == 0 and plan.stride % 64 == 0
-    assert plan.turns <= warp and threads <= 64 * slots
-    thread = np.arange(threads)
-    first = thread * plan.share - thread % warp  # of the warp, see first_node
-    nodes = first[:, None] + plan.stride * np.arange(plan.turns) + (thread % warp)[:, None]
-    nodes = (nodes[..., None] + np.arange(plan.share)).ravel()
-    assert np.array_equal(np.sort(nodes[nodes < 64 * slots]), np.arange(64 * slots))
+    model = SimpleNamespace(device="any", num_envs=num_envs, max_slots=slots)
+    at_once = sweep.slots_at_once(model)
+    assert min(slots, sweep.FEWEST_SLOTS) <= at_once <= slots
+    assert sweep.slot_threads(model) == (32 if cuda else 1)
+    assert at_once == slots or num_envs * at_once >= sweep.SLOTS_AT_ONCE
 
 
 @pytest.mark.parametrize("cuda", [False, True])
@@ -40,9 +36,9 @@ def test_every_node_has_one_thread(monkeypatch, cuda, num_envs, slots):
 def test_every_node_of_shared_blocks_has_one_thread(monkeypatch, cuda, num_envs, slots):
     monkeypatch.setattr(sweep.wp, "get_device", lambda name: SimpleNamespace(is_cuda=cuda))
     model = SimpleNamespace(device="any", num_envs=num_envs, max_slots=slots, contact=SimpleNamespace(num_fields=2))
-    (envs, threads), plan = sweep.plan_shared_sweep(model)
-    assert envs == num_envs and threads % (64 if cuda else 1) == 0
-    nodes = plan.share * np.arange(threads)[:, None] + plan.stride * np.arange(plan.turns)
+    plan = sweep.plan_sweep(model)
+    assert plan.threads % (64 if cuda else 1) == 0
+    nodes = plan.share * np.arange(plan.threads)[:, None] + plan.stride * np.arange(plan.turns)
     nodes = (nodes[..., None] + np.arange(plan.share)).ravel()
     most = 64 * sweep.most_shared(model)
     assert most >= 64 * (slots // 2) and np.array_equal(np.sort(nodes[nodes < most]), np.arange(most))
@@ -58,7 +54,7 @@ def take_all(
 ):
     """Records of field 1 in environment 1."""
     r = wp.tid()
-    taken[r] = end_sum(sums, 1, 1, r, begin_sum(sums, 1, r), driven[r])
+    taken[r] = end_sum(sums, 1, units_of(sums, 1, 1), r, begin_sum(sums, 1, r), driven[r])
     offset[r] = offset_at(grid, sums, 1, 1, r)
     if r % 2 == 0:
         clear_offset(sums, 1, r)
