@@ -75,24 +75,25 @@ class Limbs:
         self.body.state.position.assign(positions[None].astype(np.float32))
         self.body.target.root.assign(positions[None, 0].astype(np.float32))
         self.aim(rotations)
-        self._run("record_mass")
-        self.program = self.record(options.refresh)
+        self.body.mass.refresh = options.refresh
+        self._build_mass()
+        self.program = self.record()
 
-    def _run(self, part: str) -> None:
+    def _build_mass(self) -> None:
         program = Program(self.rig.model.device)
-        getattr(self.body, part)(program, self.rig.state)
+        self.body.record_mass(program, self.rig.state)
         program.run()
 
-    def record(self, refresh: int | None) -> Program:
-        """A control step, with a mass matrix every ``refresh`` substeps; without joints where that is None."""
+    def record(self, joints: bool = True) -> Program:
+        """A control step, with ``joints`` or the Material Point Method alone."""
         rig, program = self.rig, Program(self.rig.model.device)
         record_begin(program, rig.model, rig.state, rig.scratch)
         for step in range(rig.model.num_substeps):
-            if refresh is not None:
-                self.body.record_substep(program, rig.state, refresh=step % refresh == 0)
+            if joints:
+                self.body.record_substep(program, rig.state, step)
             record_substep(program, rig.model, rig.state, rig.scratch, step)
         record_end(program, rig.model, rig.state, rig.scratch)
-        if refresh is not None:
+        if joints:
             self.body.record_end(program, rig.state)
         return program
 

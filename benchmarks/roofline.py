@@ -168,7 +168,6 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
         "apply_corrections": particles * 4 * 12,
         "sum_moments": particles * 2 * 12,  # x, u
         "attach_flesh": particles * 4 * 12,  # x, u, vk in; u out
-        "sum_displacement": particles * 12,
         "sum_corrections": particles * 3 * 12,  # x, pull, lean
     }
     return formulas.get(kernel)

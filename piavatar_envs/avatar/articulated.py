@@ -24,7 +24,8 @@ Muscles have limits. The pelvis may be held by springs from outside.
 The first line moves velocity from one share to the other and changes no particle's, whatever the mass matrix. Torques
 between bones must change neither momentum nor angular momentum. With the mass matrix of this moment they would not; it
 may be a few substeps old, so what rigid motion ``J d`` has too much comes off, found from the bones' moments as they
-are. When the mass matrix is built anew the pose is fitted to the particles, too (``dq = M^-1 J^T m (x - LBS)``).
+are. At the end of a substep that had a new one the pose is fitted to the particles, too (``dq = M^-1 J^T m (x - LBS)``,
+with what they were off their places at its beginning).
 
 Flesh may be held to the bones by a pull, implicit and critically damped, ``u' = (u + dt w^2 d)/(1 + dt w)^2`` with
 ``d`` from the particle to its skinned place; the joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, with
@@ -54,17 +55,17 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.attachment import attach_flesh, put_in_place, sum_displacement
+from piavatar_envs.avatar.attachment import attach_flesh, put_in_place
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.bone_sums import sum_moments
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_mass import JointMass, grid_inertia
-from piavatar_envs.avatar.joint_motion import hand_back, take_over
-from piavatar_envs.avatar.joint_stages import MASS_BLOCK, Support, act, begin_substep, build_mass, fit_pose
+from piavatar_envs.avatar.joint_motion import take_over
+from piavatar_envs.avatar.joint_stages import MASS_BLOCK, Support, act, begin_substep, build_mass
 from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
-from piavatar_envs.avatar.part_sums import PART_BLOCK, divide
+from piavatar_envs.avatar.part_sums import ALL_WORDS, PART_BLOCK, divide
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
 from piavatar_envs.mpm.program import Program
@@ -84,7 +85,7 @@ class ArticulatedBody:
         springs: of the pelvis and of all joints.
         strength: limits of what springs and torques of the joints do; none until :meth:`set_strength`.
         tissue: what resists in the joints; nothing until :meth:`set_tissue`.
-        attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s], or None.
+        attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s].
         firm: particles that are put into their places on the bones, by index in the body.
         mass: the mass matrix.
         impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` is what held the pelvis.
@@ -110,7 +111,7 @@ class ArticulatedBody:
             stiffness: of the springs, as :class:`Springs` has it, shape ``(1 or num_envs, 23)``.
             damping: likewise.
             attachment: rates of the pulls that hold flesh to bones, shape ``(1 or num_envs, num_points)`` [1/s];
-                without them flesh is held by its own stiffness only.
+                without them, or where they are 0, flesh is held by its own stiffness only.
             firm: which particles are put into their places on the bones after every control step, shape
                 ``(num_points,)`` bool; none if not given.
 
@@ -132,7 +133,7 @@ class ArticulatedBody:
         self.model, self.threads = model, warp_threads(device)
         self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))
         self.springs = group(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
-        self.attachment = None if attachment is None else self._upload(attachment)
+        self.attachment = self._upload(rates)
         chosen = np.flatnonzero(np.zeros(points.num_points) if firm is None else firm)
         self.firm = wp.array(chosen.astype(np.int32), dtype=int, device=device)
 
@@ -154,7 +155,7 @@ class ArticulatedBody:
         self.target.rotation.fill_(wp.quat_identity())
         self.mass = JointMass(points, body, model)
         self._inertia = grid_inertia(points, model.grid.dx)
-        self._scratch = zeros(points.num_points if self.threads == 1 else 0, vec12)
+        self._scratch = zeros(ALL_WORDS * points.num_points if self.threads == 1 else 0, float)
         self.impulse = zeros((n, NUM_DOF), float)
         self.support = group(Support, force=zeros(n, wp.vec3), torque=zeros(n, wp.vec3))
         self._bench = self._allocate()
@@ -185,6 +186,7 @@ class ArticulatedBody:
             stop=zeros(float, n, NUM_JOINTS),
             moments=zeros(vec16, n, chunks),
             other_moments=zeros(vec12, n, chunks),
+            ways=zeros(vec12, n, chunks),
             bones=zeros(vec16, n, NUM_JOINTS),
             linear=zeros(wp.vec3, 2 * n, NUM_JOINTS),
             angular=zeros(wp.vec3, 2 * n, NUM_JOINTS),
@@ -194,8 +196,8 @@ class ArticulatedBody:
             impulse=self.impulse,
             left=zeros(float, n, NUM_DOF),
             place=zeros(wp.mat44, n, NUM_JOINTS),
-            lacking=zeros(vec8, n, NUM_JOINTS),
             moving=zeros(vec8, n, NUM_JOINTS),
+            steps=zeros(vec12, n, NUM_JOINTS),
             slip=self.state.slip,
             pelvis=zeros(wp.vec3, n),
         )
@@ -216,34 +218,12 @@ class ArticulatedBody:
         own = self._bench.diagonals[: self.model.num_envs]
         own.assign(np.broadcast_to(besides.astype(np.float32), own.shape))
 
+    def record_pose(self, program: Program, state: State) -> None:
+        """Append: places and motion of the bones as the joints are now, if something else than a substep moved them."""
+        self._record_stage(program, begin_substep, [self.body], state)
+
     def record_mass(self, program: Program, state: State) -> None:
-        """Append: build the mass matrix where particles and joints are, and what follows from it."""
-        self.mass.record_sums(program, state, self.state.position)
-        threads = int(MASS_BLOCK) if self.threads > 1 else 1
-        inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure]
-        program.launch(build_mass, (self.model.num_envs, threads), inputs, [self._bench], block_dim=threads)
-
-    def _record_fit(self, program: Program, state: State) -> None:
-        """Append: fit the pose to the particles, by a share. No velocity changes."""
-        self._record_parts(program, sum_displacement, [self.body, self._parts], [state.x, state.failure])
-        self._record_stage(program, fit_pose, [self.body, FIT_SHARE], state)
-
-    def _record_parts(
-        self, program: Program, kernel: wp.Kernel, body: list, inputs: list, outputs: Sequence[wp.array] = ()
-    ) -> None:
-        """Append a pass over particles that sums what it finds: a CUDA block a part of the body."""
-        block = PART_BLOCK if self.threads > 1 else 1
-        dim = (self.model.num_envs, self._parts.start.shape[0] - 1, block)
-        inputs = [*body, self.model.particles.mass, *inputs, self._scratch]
-        program.launch(kernel, dim, inputs, [*outputs, self._bench], block_dim=PART_BLOCK)
-
-    def _record_stage(self, program: Program, stage: wp.Kernel, inputs: list, state: State, *more: Support) -> None:
-        """Append what a warp does for an environment."""
-        inputs, outputs = [*inputs, state.failure], [*more, self._bench]
-        program.launch(stage, (self.model.num_envs, self.threads), inputs, outputs, block_dim=self.threads)
-
-    def _record_moments(self, program: Program, state: State) -> None:
-        """Append: moments of the chunks of the physical velocity."""
+        """Append: build the mass matrix where particles and joints are, if no substep does."""
         w = self._bench
         program.launch(
             sum_moments,
@@ -252,36 +232,48 @@ class ArticulatedBody:
             [w.moments],
             block_dim=BLOCK,
         )
+        self._record_mass(program, state)
 
-    def record_substep(self, program: Program, state: State, refresh: bool) -> None:
+    def _record_mass(self, program: Program, state: State) -> None:
+        """Append: build the mass matrix from the bones' moments, and what follows from it."""
+        self.mass.record_sums(program, state, self.state.position)
+        threads = int(MASS_BLOCK) if self.threads > 1 else 1
+        inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure]
+        program.launch(build_mass, (self.model.num_envs, threads), inputs, [self._bench], block_dim=threads)
+
+    def _record_stage(self, program: Program, stage: wp.Kernel, inputs: list, state: State, *more: Support) -> None:
+        """Append what a warp does for an environment."""
+        inputs, outputs = [*inputs, state.failure], [*more, self._bench]
+        program.launch(stage, (self.model.num_envs, self.threads), inputs, outputs, block_dim=self.threads)
+
+    def record_substep(self, program: Program, state: State, step: int) -> None:
         """Append what the joints do before an MPM substep: take over, act, and move the pose on.
 
         Args:
             program: records.
             state: of the particles.
-            refresh: build the mass matrix anew, and fit the pose to the particles; to be done in the first substep of a
-                program and every few milliseconds.
+            step: which substep of its control step it is. The first one finds joints wherever they are; all others go
+                on from the one before.
         """
-        model, w, points = self.model, self._bench, self._points
-        position, dt = self.state.position, model.step.dt
-        if refresh:
-            self.record_mass(program, state)
-            self._record_fit(program, state)
-        else:
-            self._record_stage(program, begin_substep, [self.body], state)
-        # hand back; flesh may be pulled to the bones, too: what it leaves and what it takes is summed in the same pass
-        velocities = 1 if self.attachment is None else 2
-        if self.attachment is not None:
-            inputs = [state.x, self.attachment, state.failure]
-            self._record_parts(program, attach_flesh, [self.body, self._parts, dt], inputs, [state.u, state.vk])
-        else:
-            inputs = [self.body, state.x, position, w.place, w.moving, state.failure]
-            program.launch(hand_back, points, inputs, [state.u, state.vk], block_dim=BLOCK)
-            self._record_moments(program, state)
-        inputs = [self.body, dt, 1.0 / model.control_dt, velocities, self.target, self.springs, self.tissue]
-        self._record_stage(program, act, [*inputs, self.strength], state, self.support)
-        inputs = [self.body, dt, state.x, w.pelvis, w.lacking, w.moving, state.failure]
-        program.launch(take_over, points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
+        model, w, fit = self.model, self._bench, self.mass.is_due(step)
+        if step == 0:
+            self.record_pose(program, state)
+        self._record_pull(program, state, fit)
+        if fit:
+            self._record_mass(program, state)
+        inputs = [self.body, model.step.dt, 1.0 / model.control_dt, FIT_SHARE if fit else 0.0]
+        inputs += [self.target, self.springs, self.tissue, self.strength]
+        self._record_stage(program, act, inputs, state, self.support)
+        inputs = [self.body, model.step.dt, state.x, w.pelvis, w.steps, state.failure]
+        program.launch(take_over, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
+
+    def _record_pull(self, program: Program, state: State, fit: bool) -> None:
+        """Append the pass over particles that pulls them to the bones, and sums what joints are to take over."""
+        block = PART_BLOCK if self.threads > 1 else 1
+        dim = (self.model.num_envs, self._parts.start.shape[0] - 1, block)
+        inputs = [self.body, self._parts, self.model.step.dt, int(fit), self.model.particles.mass]
+        inputs += [state.x, self.attachment, state.failure, self._scratch]
+        program.launch(attach_flesh, dim, inputs, [state.u, state.vk, self._bench], block_dim=PART_BLOCK)
 
     def record_end(self, program: Program, state: State) -> None:
         """Append what ends a control step: firm particles are put into their places on the bones as they are now.
@@ -291,6 +283,5 @@ class ArticulatedBody:
         if self.firm.size == 0:
             return
         model, w = self.model, self._bench
-        self._record_stage(program, begin_substep, [self.body], state)
         inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, state.u, state.vk, state.failure]
         program.launch(put_in_place, (model.num_envs, self.firm.size), inputs, [state.x, state.C, self.state.slip])

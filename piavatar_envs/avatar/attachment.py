@@ -11,17 +11,16 @@ from piavatar_envs.avatar.lanes import lane_of_warp, warp_of_block
 from piavatar_envs.avatar.loads import int_at, number_at, vector_at
 from piavatar_envs.avatar.part_sums import (
     PART_BLOCK,
-    WORDS,
     Parts,
     bring_particle,
     place_in_parts,
     room_of_particles,
     store_second,
     sum_both,
-    sum_one,
+    sum_way,
 )
 from piavatar_envs.avatar.pulls import implicit_velocity
-from piavatar_envs.avatar.types import Body, vec12
+from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.colliders import signed_distance
 from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.shared_memory import meet, threads_of_block
@@ -39,67 +38,17 @@ def pulled_rest(body: Body, e: int, p: int, w: JointBench):
     return rest
 
 
-@wp.func
-def pulled_place(body: Body, e: int, p: int, w: JointBench):
-    """Where a particle is pulled to on the bones [m]."""
-    return blend_places(w.place, e, body.joint, body.weight, p, pulled_rest(body, e, p, w))
-
-
-@wp.kernel(launch_bounds=(PART_BLOCK, 5))
-def sum_displacement(
-    body: Body,
-    parts: Parts,
-    mass: wp.array2d(dtype=float),
-    x: wp.array2d(dtype=wp.vec3),
-    failure: wp.array(dtype=int),
-    scratch: wp.array(dtype=vec12),
-    # in and out
-    w: JointBench,
-):
-    """Of the particles from where the pose has them, see :func:`pulled_place`: its two momenta, of every chunk.
-
-    Over ``(num_envs, parts, PART_BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
-    """
-    i, j, k = wp.tid()
-    at = place_in_parts(i, j, k, x.shape[0])
-    e = at[0]
-    if failure[e] != 0:
-        return
-    thread = at[2]
-    threads = threads_of_block()
-    room = room_of_particles(scratch)
-    first = at[1] * parts.size
-    last = wp.min(first + parts.size, body.count)
-    r = row(e, mass.shape[0])
-    for p in range(first + thread, last, threads):
-        n = body.first + p
-        place = vector_at(x, e, n)
-        none = wp.vec3()
-        bring_particle(
-            room, WORDS * (p - first), number_at(mass, r, n), place, place - pulled_place(body, e, p, w), none
-        )
-    meet()
-    warp = warp_of_block()
-    lane = lane_of_warp()
-    n = int_at(parts.start, at[1]) + warp[0]
-    end = int_at(parts.start, at[1] + 1)
-    while n < end:
-        c = int_at(parts.chunk, n)
-        origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c))
-        sum_one(body, parts, room, origin, e, c, lane[0], lane[1], w.other_moments)
-        n += warp[1]
-
-
 @wp.kernel(launch_bounds=(PART_BLOCK, 4))
 def attach_flesh(
     body: Body,
     parts: Parts,
     dt: float,
+    fit: int,
     mass: wp.array2d(dtype=float),
     x: wp.array2d(dtype=wp.vec3),
     rate: wp.array2d(dtype=float),
     failure: wp.array(dtype=int),
-    scratch: wp.array(dtype=vec12),
+    scratch: wp.array(dtype=float),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     vk: wp.array2d(dtype=wp.vec3),
@@ -107,9 +56,12 @@ def attach_flesh(
 ):
     """Hand back, and pull every particle to its place on the bones, implicit in time and critically damped.
 
-    What a new pose has changed of ``J qdot`` goes to the physical velocity, and ``vk`` keeps a part, as
-    :func:`piavatar_envs.avatar.joint_motion.hand_back` has them. ``rate`` is the pull's [1/s]. Of what it has taken of
-    the velocity, and of what it leaves, the bones get the moments. Launched as :func:`sum_displacement`.
+    What a new pose has changed of ``J qdot`` goes to the physical velocity; what the bones move a particle by besides,
+    :func:`piavatar_envs.avatar.joint_motion.motion_apart`, stays in ``vk``, as it is now. ``rate`` is the pull's [1/s];
+    one of 0 leaves a velocity exactly as it is. Of what the pull has taken of the velocity, and of what it leaves, the
+    bones get the moments, and if ``fit`` is not 0 also of the way to the particles' places.
+
+    Over ``(num_envs, parts, PART_BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
     """
     i, j, k = wp.tid()
     at = place_in_parts(i, j, k, x.shape[0])
@@ -139,7 +91,8 @@ def attach_flesh(
         way = wp.vec3(now[6], now[7], now[8]) + pelvis - place
         vk[e, body.first + p] = apart
         after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
-        bring_particle(room, WORDS * (p - first), number_at(mass, r, body.first + p), place, before - after, after)
+        m = number_at(mass, r, body.first + p)
+        bring_particle(room, parts.size, p - first, m, place, before - after, after, way)
         p += threads
     meet()
     store_second(room, last - first, thread, threads, e, body.first + first, u)
@@ -151,6 +104,8 @@ def attach_flesh(
         c = int_at(parts.chunk, n)
         origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c))
         sum_both(body, parts, room, origin, e, c, lane[0], lane[1], w.moments, w.other_moments)
+        if fit != 0:
+            sum_way(body, parts, room, origin, e, c, lane[0], lane[1], w.ways)
         n += warp[1]
 
 

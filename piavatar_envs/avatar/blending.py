@@ -127,36 +127,46 @@ def store_record(record: wp.array2d(dtype=vec44), e: int, b: int, value: vec44):
     ...
 
 
-@wp.func_native(
-    _INFLUENCES
-    + """
-wp::vec_t<8, wp::float32> sum;
-const auto* const own = &wp::index(change, e, 0);
+def _blend(length: int, numbers: int) -> str:
+    """A snippet that blends the first ``numbers`` of bones' records of a ``length``, on a GPU four at a time."""
+    return f"""{_INFLUENCES}
+wp::vec_t<{length}, wp::float32> sum;
+const auto* const own = &wp::index(record, e, 0);
 #pragma unroll
-for (int n = 0; n < 4; ++n) {
+for (int n = 0; n < 4; ++n) {{
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
     const auto& bone = own[bones[n]];
 #if defined(__CUDA_ARCH__)
-    const float4* const from = reinterpret_cast<const float4*>(&bone);
-    const float4 a = from[0], b = from[1];
-    sum[0] += w * a.x;
-    sum[1] += w * a.y;
-    sum[2] += w * a.z;
-    sum[3] += w * a.w;
-    sum[4] += w * b.x;
-    sum[5] += w * b.y;
+#pragma unroll
+    for (int c = 0; c < {numbers}; c += 4) {{
+        const float4 four = reinterpret_cast<const float4*>(&bone)[c / 4];
+        const float part[4] = {{four.x, four.y, four.z, four.w}};
+#pragma unroll
+        for (int k = 0; k < 4; ++k)
+            if (c + k < {numbers}) sum[c + k] += w * part[k];
+    }}
 #else
-    for (int c = 0; c < 8; ++c) sum[c] += w * bone[c];
+    for (int c = 0; c < {numbers}; ++c) sum[c] += w * bone[c];
 #endif
-}
+}}
 return sum;
 """
-)
+
+
+@wp.func_native(_blend(8, 6))
 def blend_changes(
-    change: wp.array2d(dtype=vec8), e: int, joint: wp.array(dtype=wp.vec4i), weight: wp.array(dtype=wp.vec4), p: int
+    record: wp.array2d(dtype=vec8), e: int, joint: wp.array(dtype=wp.vec4i), weight: wp.array(dtype=wp.vec4), p: int
 ) -> vec8:
-    """``sum_n weight_n change[e, joint_n]`` of particle ``p``."""
+    """``sum_n weight_n record[e, joint_n]`` of particle ``p``: a rigid motion of each bone."""
+    ...
+
+
+@wp.func_native(_blend(12, 12))
+def blend_steps(
+    record: wp.array2d(dtype=vec12), e: int, joint: wp.array(dtype=wp.vec4i), weight: wp.array(dtype=wp.vec4), p: int
+) -> vec12:
+    """:func:`blend_changes` of twelve numbers: two rigid motions of each bone."""
     ...
 
 

@@ -34,6 +34,7 @@ class JointBench:
     # what particles have
     moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)
     other_moments: wp.array2d(dtype=vec12)
+    ways: wp.array2d(dtype=vec12)  # (num_envs, chunks) momenta of the ways to the particles' places, as velocities
     bones: wp.array2d(dtype=vec16)  # (num_envs, bones)
     linear: wp.array2d(dtype=wp.vec3)  # (2 num_envs, bones)
     angular: wp.array2d(dtype=wp.vec3)
@@ -45,8 +46,9 @@ class JointBench:
     left: wp.array2d(dtype=float)  # (num_envs, 69) diagonal without muscles that have reached their limits
     # what particles get
     place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to where bones are
-    lacking: wp.array2d(dtype=vec8)  # (num_envs, bones) what the physical velocity lacks of the whole one
     moving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion of the joints
+    # (num_envs, bones) what the physical velocity lacks of the whole one, and the joints' motion half-way
+    steps: wp.array2d(dtype=vec12)
     slip: wp.array2d(dtype=wp.vec3)  # (num_envs, P) as in JointState
     pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) where its joint begins the substep [m]
 
@@ -151,37 +153,35 @@ def enter_room(w: JointBench, e: int):
     w.momentum = see_numbers(w.momentum, room, _SHARES, _ROWS)
     w.shares = see_numbers(w.shares, room, _SHARES, _ROWS)
     w.moving = see_motions(w.moving, room, _MOVING, 0)
-    w.lacking = see_motions(w.lacking, room, _MOVING, 0)
     w.pose.rotation = see_turns(w.pose.rotation, room, _ROTATION, 0)
     w.pose.position = see_vectors(w.pose.position, room, _POSITION, 0)
     return w
 
 
-_KEEP = """
-#if defined(__CUDA_ARCH__)
-const auto keep = [&](const auto& rows, const auto& into, int words) {
-    const float* const from = reinterpret_cast<const float*>(rows.data);
-    float* const to = reinterpret_cast<float*>(&wp::index(into, e, 0));
-    for (int n = threadIdx.x & 31; n < words; n += 32) to[n] = from[n];
-};
-%s
-__syncwarp();
-#endif
-"""
-
-
-@wp.func_native(_KEEP % f"keep(near.lacking, w.lacking, {8 * NUM_JOINTS});")
-def keep_lacking(w: JointBench, e: int, near: JointBench):
-    """Write what the physical velocity lacks from the room, where the next motion comes."""
+@wp.func_native(f"""
+const float* const from = reinterpret_cast<const float*>(&wp::index(motion, e, 0));
+float* const to = reinterpret_cast<float*>(&wp::index(steps, e, 0)) + first;
+for (int n = thread; n < {6 * NUM_JOINTS}; n += threads) to[12 * (n / 6) + n % 6] = from[8 * (n / 6) + n % 6];
+""")
+def keep_motion(
+    motion: wp.array2d(dtype=vec8), e: int, first: int, thread: int, threads: int, steps: wp.array2d(dtype=vec12)
+):
+    """Write the motion of all bones to their records, from number ``first`` on."""
     ...
 
 
-@wp.func_native(
-    _KEEP
-    % f"""keep(near.moving, w.moving, {8 * NUM_JOINTS});
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+const auto keep = [&](const auto& rows, const auto& into, int words) {{
+    const float* const from = reinterpret_cast<const float*>(rows.data);
+    float* const to = reinterpret_cast<float*>(&wp::index(into, e, 0));
+    for (int n = threadIdx.x & 31; n < words; n += 32) to[n] = from[n];
+}};
+keep(near.moving, w.moving, {8 * NUM_JOINTS});
 keep(near.pose.rotation, w.pose.rotation, {4 * NUM_JOINTS});
-keep(near.pose.position, w.pose.position, {3 * NUM_JOINTS});"""
-)
+keep(near.pose.position, w.pose.position, {3 * NUM_JOINTS});
+#endif
+""")
 def leave_room(w: JointBench, e: int, near: JointBench):
-    """Write motion and pose from the room."""
+    """Write motion and pose from the room, as all threads have left them."""
     ...

@@ -31,11 +31,6 @@ if TYPE_CHECKING:
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
-#: Age that a mass matrix may reach [s]: a little older, and fast limbs are unstable.
-LONGEST_REFRESH = 0.005
-#: Substeps that a mass matrix may be used in. What the joints take over by an old one is wrong by more than itself in
-#: directions in which a turned limb is much heavier than it was, and that grows from substep to substep.
-MOST_USES = 2
 #: Longest substep with joints under torques [s].
 LONGEST_SUBSTEP = 0.004
 #: Of the assisting spring that turns the pelvis upright [N m/rad].
@@ -185,9 +180,8 @@ class JointDrive:
         """
         n, model, muscles = drive.model.num_envs, drive.model, settings.muscles
         self.drive = drive
-        attachment = settings.attachment[None] if settings.attachment.any() else None
         rows = np.zeros((n, 1 + NUM_JOINTS))
-        self.body = ArticulatedBody(points, drive.body, model, rows, rows, attachment, settings.firm)
+        self.body = ArticulatedBody(points, drive.body, model, rows, rows, settings.attachment[None], settings.firm)
         self.body.set_strength(muscles.lower, muscles.upper, n)
         ranges = muscles.range_lower, muscles.range_upper
         locked = [joint_index(name) for name in LOCKED_JOINTS]
@@ -205,7 +199,6 @@ class JointDrive:
         span = float(joints[joint_index("head"), 2] - joints[joint_index("left_foot"), 2])
         self._per_size = float(np.ptp(rest[:, 2])) / span / (REFERENCE_MASS * REFERENCE_HEIGHT)
         self.first: tuple[wp.array, wp.array] | None = None
-        self.refresh = min(MOST_USES, max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6)))
 
     @property
     def state(self):
@@ -256,7 +249,7 @@ class JointDrive:
 
     def record_substep(self, program: Program, state: State, step: int) -> None:
         """Append what the joints do before substep ``step`` of a control step."""
-        self.body.record_substep(program, state, refresh=step % self.refresh == 0)
+        self.body.record_substep(program, state, step)
 
     def record_end(self, program: Program, state: State) -> None:
         """Append what ends a control step: particles of bones are in their places."""

@@ -15,6 +15,11 @@ from piavatar_envs.avatar.types import Body, vec12, vec16
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import Model, State
 
+#: Age that a mass matrix may reach [s]: a little older, and fast limbs are unstable.
+LONGEST_REFRESH = 0.005
+#: Substeps that a mass matrix may be used in. What the joints take over by an old one is wrong by more than itself in
+#: directions in which a turned limb is much heavier than it was, and that grows from substep to substep.
+MOST_USES = 2
 #: What joints whose limbs are thinner than a cell know of the inertia that flesh has on the grid. Without it 20 of 48
 #: ``tiny`` bodies that lie on the floor fail within 200 control steps of random torques, with it 1 of 96. Ankles have
 #: less: at 0.5 two of five walkers fell in every fifth episode, at 0.25 in 2 of 100 at most. Without, feet jerk.
@@ -49,6 +54,7 @@ class JointMass:
         matrix: the mass matrix, ``(num_envs, 69, 69)``.
         pattern: where its factors have entries.
         records: on a CPU, where the matrix is composed, one body after the other.
+        refresh: substeps that a matrix is used in.
     """
 
     def __init__(self, points: BodyPoints, body: Body, model: Model) -> None:
@@ -59,6 +65,11 @@ class JointMass:
         self.pattern = find_pattern(filled_entries(self.pairs), device)
         self.sums = wp.zeros((n, len(self.pairs.entry_start) - 1), dtype=vec12, device=device)
         self.records = wp.zeros(NUM_JOINTS * NUM_JOINTS, dtype=vec16, device=device)
+        self.refresh = min(MOST_USES, max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6)))
+
+    def is_due(self, step: int) -> bool:
+        """Whether substep ``step`` of a control step has a matrix of its own."""
+        return step % self.refresh == 0
 
     def make_factors(self, systems: int) -> wp.array:
         """Room for so many Cholesky factors."""

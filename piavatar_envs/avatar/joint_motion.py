@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_changes, blend_images, motion_at
+from piavatar_envs.avatar.blending import blend_steps
 from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, over_ancestors, threads_of_environment
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.mass_matrix import BONES
@@ -93,25 +93,23 @@ def spread_motion(
 
 
 @wp.func
-def skinned_motion(body: Body, field: wp.array2d(dtype=vec8), e: int, p: int, arm: wp.vec3):
-    """``J q`` at a particle, ``arm`` from the pelvis joint."""
-    return motion_at(blend_changes(field, e, body.joint, body.weight, p), arm)
-
-
-@wp.func
 def motion_apart(b: vec12):
-    """What bones move a particle by besides the blend of their motions at its place; of :func:`blend_images` [m/s].
+    """What bones move a particle by besides the blend of their motions at its place [m/s].
 
-    Linear blend skinning has a particle where its bones have it in the mean. In a bent joint they have it at places
-    that are centimetres apart, and each turns its own: the mean of that is not what their mean motion does to the mean
-    place. Without it particles would leave their places with every turn. Rigid motion has nothing of it.
+    Of :func:`piavatar_envs.avatar.blending.blend_images`. Linear blend skinning has a particle where its bones have it
+    in the mean. In a bent joint they have it at places that are centimetres apart, and each turns its own: the mean of
+    that is not what their mean motion does to the mean place. Without it particles would leave their places with every
+    turn. Rigid motion has nothing of it.
     """
     return wp.vec3(b[9], b[10], b[11]) - wp.cross(wp.vec3(b[3], b[4], b[5]), wp.vec3(b[6], b[7], b[8]))
 
 
 @wp.func
 def blended_motion(b: vec12, arm: wp.vec3):
-    """The blend of the bones' motions, ``arm`` from where their velocity is; of :func:`blend_images` [m/s]."""
+    """The blend of the bones' first motions, ``arm`` from where their velocity is [m/s].
+
+    Of :func:`piavatar_envs.avatar.blending.blend_images`, or of :func:`piavatar_envs.avatar.blending.blend_steps`.
+    """
     return wp.vec3(b[0], b[1], b[2]) + wp.cross(wp.vec3(b[3], b[4], b[5]), arm)
 
 
@@ -121,8 +119,7 @@ def take_over(
     dt: float,
     x: wp.array2d(dtype=wp.vec3),
     pelvis: wp.array(dtype=wp.vec3),
-    lacking: wp.array2d(dtype=vec8),
-    moving: wp.array2d(dtype=vec8),
+    steps: wp.array2d(dtype=vec12),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
@@ -132,9 +129,9 @@ def take_over(
 
     Particle and bones are half a step on there. Moved by ``J qdot`` of its beginning, a straight way, what turns by
     ``theta`` in a substep would be ``theta^2 / 2`` further from its axis, of which no stress knows: limbs would swell
-    within seconds. The whole velocity is the physical one and what that is ``lacking``, a motion about where the
-    ``pelvis`` joint begins [m]; what the bones are ``moving`` with is one about where it is half-way.
-    To that comes what ``vk`` has kept, see :func:`hand_back`.
+    within seconds. The whole velocity is the physical one and what that lacks, the first of the bones' motions in
+    ``steps``, about where the ``pelvis`` joint begins [m]; the second is that of the joints, about where it is
+    half-way. To that comes what ``vk`` has kept, see :func:`piavatar_envs.avatar.attachment.attach_flesh`.
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -144,7 +141,7 @@ def take_over(
         return
     p = own[1]
     center = pelvis[e]
-    root = moving[e, 0]
+    root = steps[e, 0]
     last = body.count - 1
     n = body.first + wp.min(p, last)
     following = vector_at(x, e, n)
@@ -158,46 +155,12 @@ def take_over(
         following = vector_at(x, e, n)
         following_u = vector_at(u, e, n)
         following_apart = vector_at(driven.vk, e, n)
-        whole = before + skinned_motion(body, lacking, e, p, arm)
-        now = blend_changes(moving, e, body.joint, body.weight, p)
-        spin = wp.vec3(now[3], now[4], now[5])
-        vk = motion_at(now, arm)
-        vk += wp.cross(0.5 * dt * spin, vk - wp.vec3(root[0], root[1], root[2]))
+        s = blend_steps(steps, e, body.joint, body.weight, p)
+        whole = before + blended_motion(s, arm)
+        spin = wp.vec3(s[9], s[10], s[11])
+        vk = wp.vec3(s[6], s[7], s[8]) + wp.cross(spin, arm)
+        vk += wp.cross(0.5 * dt * spin, vk - wp.vec3(root[6], root[7], root[8]))
         store_velocities(u, driven, e, body.first + p, whole - vk, vk + apart, spin, True)
-        p += threads
-
-
-@wp.kernel
-def hand_back(
-    body: Body,
-    x: wp.array2d(dtype=wp.vec3),
-    position: wp.array2d(dtype=wp.vec3),
-    place: wp.array2d(dtype=wp.mat44),
-    moving: wp.array2d(dtype=vec8),
-    failure: wp.array(dtype=int),
-    # in and out
-    u: wp.array2d(dtype=wp.vec3),
-    vk: wp.array2d(dtype=wp.vec3),
-):
-    """What a new pose has changed of ``J qdot`` goes to the physical velocity; :func:`take_over` writes the new one.
-
-    What the bones move a particle by besides, :func:`motion_apart`, stays in ``vk``, as it is now.
-    """
-    i, _ = wp.tid()
-    threads = threads_of_environment(x.shape[0])
-    own = first_particle(i, threads)
-    e = own[0]
-    if failure[e] != 0:
-        return
-    p = own[1]
-    while p < body.count:
-        center = position[e, 0]
-        rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-        now = blend_images(place, moving, e, body.joint, body.weight, p, rest, center)
-        apart = motion_apart(now)
-        v = blended_motion(now, x[e, body.first + p] - center) + apart
-        u[e, body.first + p] = u[e, body.first + p] + vk[e, body.first + p] - v
-        vk[e, body.first + p] = apart
         p += threads
 
 

@@ -23,7 +23,7 @@ from piavatar_envs.avatar.cholesky import (
 from piavatar_envs.avatar.joint_bench import (
     JointBench,
     enter_room,
-    keep_lacking,
+    keep_motion,
     leave_room,
     room_of_warp,
     row_in_room,
@@ -41,8 +41,9 @@ from piavatar_envs.avatar.joint_torques import (
     limit_torque,
 )
 from piavatar_envs.avatar.lanes import meet_threads, place_in_block, sum_threads
-from piavatar_envs.avatar.mass_matrix import BONES, compose_mass, room_of_records
+from piavatar_envs.avatar.mass_matrix import BONES, compose_mass
 from piavatar_envs.avatar.mass_pairs import Pairs
+from piavatar_envs.avatar.mass_records import room_of_records
 from piavatar_envs.avatar.rotation import rigid_matrix
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.avatar.warp_cholesky import ROOM
@@ -82,19 +83,29 @@ def begin(body: Body, e: int, thread: int, threads: int, w: JointBench):
 
 
 @wp.func
-def find_shares(
-    body: Body, velocities: int, own: int, into: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench
-):
-    """The shares ``dq = M^-1 J^T m v`` that the joints can take of one or two velocities, from the bones' momenta.
+def find_shares(body: Body, own: int, into: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench):
+    """The shares ``dq = M^-1 J^T m v`` that the joints can take of two velocities, from the bones' momenta.
 
-    One alone has momenta in row ``own``, and is share ``into``; of two the second has momenta and share in that row.
+    Momenta and share of the first are in row ``own``, of the second in row ``into``.
     """
-    pass_down(body, w.pose.position, e, velocities, own, into, thread, threads, w.linear, w.angular, w.momentum)
+    pass_down(body, w.pose.position, e, 2, own, into, thread, threads, w.linear, w.angular, w.momentum)
     fetch_factor(w.factors, e, threads, room)
-    if velocities > 1:
-        solve_both(w.pattern, w.factors, e, w.momentum, own, into, thread, threads, room, w.shares)
-    else:
-        solve(w.pattern, w.factors, e, w.momentum, own, into, thread, threads, room, w.shares)
+    solve_both(w.pattern, w.factors, e, w.momentum, own, into, thread, threads, room, w.shares)
+
+
+@wp.func
+def fit_pose(body: Body, share: float, own: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench):
+    """Fit the pose to the particles by a ``share`` of ``dq = M^-1 J^T m way``, the way from them to their places.
+
+    The ways are those of the beginning of the substep, as are the momenta, about the joints as they were then: on the
+    way from there to here particles have gone on with the joints, and so the momenta are about these as they are now.
+    """
+    gather_other(body, w.ways, e, own, thread, threads, w.linear, w.angular)
+    pass_down(body, w.pose.position, e, 1, own, own, thread, threads, w.linear, w.angular, w.momentum)
+    fetch_factor(w.factors, e, threads, room)
+    solve(w.pattern, w.factors, e, w.momentum, own, own, thread, threads, room, w.shares)
+    spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
+    move_joints(body, -share, w.moving, e, thread, threads, w.pose.rotation, w.pose.position)
 
 
 @wp.func
@@ -158,7 +169,10 @@ def build_mass(
     # in and out
     w: JointBench,
 ):
-    """The mass matrix, its factors and where the bones are, over ``(num_envs, MASS_BLOCK)``; a CUDA block has one."""
+    """The mass matrix where the bones' moments are, and its factors.
+
+    Over ``(num_envs, MASS_BLOCK)``; a CUDA block has one.
+    """
     i, _ = wp.tid()
     at = place_in_block(i, MASS_BLOCK)
     e = at[0]
@@ -169,9 +183,8 @@ def build_mass(
     n = failure.shape[0]
     for k in range(thread, PARTS, threads):
         implicit_diagonal(body, dt, w.pose, springs, tissue, e, k, n + e, w.stop, w.diagonals)
-    place_bones(body, e, thread, threads, w)
     records = room_of_records(w.records, 0)
-    compose_mass(body, pairs, w.pair_sums, w.pose.position, records, e, thread, threads, w.matrix)
+    compose_mass(body, pairs, w.pair_sums, w.moments, w.pose.position, records, e, thread, threads, w.matrix)
     lanes = wp.min(threads, WARP)
     warp = thread // lanes
     for which in range(warp, 2, threads // lanes):
@@ -185,39 +198,13 @@ def build_mass(
 
 
 @wp.kernel
-def fit_pose(
-    body: Body,
-    share: float,
-    failure: wp.array(dtype=int),
-    # in and out
-    w: JointBench,
-):
-    """Fit the pose to the particles, by a ``share``; over ``(num_envs, WARP)``, a CUDA block each."""
-    i, _ = wp.tid()
-    at = place_in_block(i, WARP)
-    e = at[0]
-    thread = at[1]
-    threads = at[2]
-    if failure[e] != 0:
-        return
-    own = row_in_room(e, 0)
-    near = enter_room(w, e)
-    gather_other(body, w.other_moments, e, own, thread, threads, near.linear, near.angular)
-    find_shares(body, 1, own, own, e, thread, threads, room_of_warp(), near)
-    spread_motion(body, near.pose.position, near.shares, own, e, thread, threads, near.moving)
-    move_joints(body, share, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
-    begin(body, e, thread, threads, near)
-    leave_room(w, e, near)
-
-
-@wp.kernel
 def begin_substep(
     body: Body,
     failure: wp.array(dtype=int),
     # in and out
     w: JointBench,
 ):
-    """:func:`begin` where the pose has not been fitted; launched likewise."""
+    """:func:`begin` where something else has moved the joints; over ``(num_envs, WARP)``, a CUDA block each."""
     i, _ = wp.tid()
     at = place_in_block(i, WARP)
     e = at[0]
@@ -232,7 +219,7 @@ def act(
     body: Body,
     dt: float,
     per_time: float,
-    velocities: int,
+    share: float,
     target: Target,
     springs: Springs,
     tissue: Tissue,
@@ -242,9 +229,10 @@ def act(
     support: Support,
     w: JointBench,
 ):
-    """Take over what joints can of ``velocities``, of a pull before the last one; let them turn; move the pose on.
+    """Take over what joints can of two velocities, that of the pull first; let them turn; move the pose on.
 
-    ``per_time`` is the share of an impulse in the support [1/s]. Launched as :func:`fit_pose`.
+    Then the pose is fitted by a ``share``, if that is not 0, and the next substep begins with bones where they are
+    now. ``per_time`` is the share of an impulse in the support [1/s]. Launched as :func:`begin_substep`.
     """
     i, _ = wp.tid()
     at = place_in_block(i, WARP)
@@ -259,22 +247,24 @@ def act(
     taken = row_in_room(n + e, 1)
     near = enter_room(w, e)
     gather_bones(body, w.moments, e, own, thread, threads, near.bones, near.linear, near.angular)
-    if velocities > 1:
-        gather_other(body, w.other_moments, e, taken, thread, threads, near.linear, near.angular)
-    find_shares(body, velocities, own, taken, e, thread, threads, room, near)
-    if velocities > 1:
-        pull_bones(body, own, e, thread, threads, near)
+    gather_other(body, w.other_moments, e, taken, thread, threads, near.linear, near.angular)
+    find_shares(body, own, taken, e, thread, threads, room, near)
+    pull_bones(body, own, e, thread, threads, near)
     add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)
     turn_joints(body, dt, target, springs, tissue, strength, n + e, own, e, thread, threads, room, near)
     go_on(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
-    spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.lacking)
-    keep_lacking(w, e, near)
-    spread_motion(body, near.pose.position, w.velocity, e, e, thread, threads, near.moving)
+    spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.moving)
+    keep_motion(near.moving, e, 0, thread, threads, w.steps)
     if thread == 0:
         w.pelvis[e] = near.pose.position[e, 0]
         support.force[e] = support.force[e] + per_time * part_of(w.impulse, e, 0)
         support.torque[e] = support.torque[e] + per_time * part_of(w.impulse, e, 3)
-    move_joints(body, 0.5 * dt, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
     spread_motion(body, near.pose.position, w.velocity, e, e, thread, threads, near.moving)
     move_joints(body, 0.5 * dt, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
+    spread_motion(body, near.pose.position, w.velocity, e, e, thread, threads, near.moving)
+    keep_motion(near.moving, e, 6, thread, threads, w.steps)
+    move_joints(body, 0.5 * dt, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
+    if share > 0.0:
+        fit_pose(body, share, own, e, thread, threads, room, near)
+    begin(body, e, thread, threads, near)
     leave_room(w, e, near)

@@ -14,7 +14,8 @@ Nothing of the size of ``J`` is stored. A particle has four bones at most, so fe
 common; their moments are summed over fixed lists (no atomics), then from bone to bone up the tree, once for each of the
 two joints (the composite bodies of Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6, but for bodies that
 share matter). Moments are always about the joints at hand: about a common point, a hand's inertia would be the small
-difference of large numbers.
+difference of large numbers. Of what a bone moves alone nothing is summed: its moments are those of all that it moves,
+which are there for other reasons, less those of its pairs.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.lanes import add_rows12, highest_bit
+from piavatar_envs.avatar.lanes import add_rows12, add_rows16, highest_bit
 from piavatar_envs.avatar.mass_pairs import Pairs
+from piavatar_envs.avatar.mass_records import lift, moved, read_pair, second_moment, transposed, two_sided, write_pair
 from piavatar_envs.avatar.rigid_fit import symmetric
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
@@ -42,7 +44,7 @@ I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 
 def filled_entries(pairs: Pairs) -> np.ndarray:
     """Where the mass matrix need not be zero, shape ``(69, 69)`` bool: where two joints carry what moves with both."""
-    shared = pairs.of.numpy().reshape(NUM_JOINTS, NUM_JOINTS) >= 0
+    shared = (pairs.of.numpy().reshape(NUM_JOINTS, NUM_JOINTS) >= 0) | np.eye(NUM_JOINTS, dtype=bool)
     for columns in (False, True):
         for bone in range(NUM_JOINTS - 1, 0, -1):  # children come after their parents
             view = shared.T if columns else shared
@@ -51,84 +53,6 @@ def filled_entries(pairs: Pairs) -> np.ndarray:
     filled = np.ones((NUM_DOF, NUM_DOF), bool)
     filled[3:, 3:] = joints
     return filled
-
-
-@wp.func
-def two_sided(m: float, first: wp.vec3, second: wp.mat33):
-    """Moments of two joints as one record: ``sum m``, ``sum m a`` and, by rows, ``sum m b a^T``."""
-    # fmt: off
-    return vec16(
-        m, first[0], first[1], first[2],
-        second[0, 0], second[0, 1], second[0, 2],
-        second[1, 0], second[1, 1], second[1, 2],
-        second[2, 0], second[2, 1], second[2, 2],
-        0.0, 0.0, 0.0,
-    )
-    # fmt: on
-
-
-@wp.func
-def second_moment(s: vec16):
-    """``sum m b a^T`` of a record."""
-    return wp.mat33(s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11], s[12])
-
-
-@wp.func
-def moved(s: vec16, alpha: wp.vec3, beta: wp.vec3):
-    """The record of a joint with itself, seen from two others: ``a + alpha`` and ``b + beta``."""
-    m = s[0]
-    first = wp.vec3(s[1], s[2], s[3])
-    both = second_moment(s) + wp.outer(first, alpha) + wp.outer(beta, first) + m * wp.outer(beta, alpha)
-    return two_sided(m, first + m * alpha, both)
-
-
-# Records of the pairs of bones lie in shared memory on a GPU, word by word, rows an odd number of words apart: threads
-# read from different banks, whether theirs are the pairs of one bone or those of all with one.
-_ROW, _WORDS = NUM_JOINTS + 1 - NUM_JOINTS % 2, 13
-_WORD = _ROW * NUM_JOINTS
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-__shared__ float __align__(16) words[{_WORDS * _WORD}];
-return reinterpret_cast<wp::uint64>(words + at);
-#else
-return reinterpret_cast<wp::uint64>(scratch.data);
-#endif
-""")
-def room_of_records(scratch: wp.array(dtype=vec16), at: int) -> wp.uint64:
-    """Where an environment's records are: from word ``at`` of a CUDA block's shared memory; on a CPU in ``scratch``."""
-    ...
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-const float* const from = reinterpret_cast<const float*>(records) + {_ROW} * c + d;
-wp::vec_t<16, wp::float32> value;
-#pragma unroll
-for (int k = 0; k < {_WORDS}; ++k) value[k] = from[{_WORD} * k];
-return value;
-#else
-return reinterpret_cast<const wp::vec_t<16, wp::float32>*>(records)[{NUM_JOINTS} * c + d];
-#endif
-""")
-def read_pair(records: wp.uint64, c: int, d: int) -> vec16:
-    """The record of bones ``c`` and ``d``."""
-    ...
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-float* const to = reinterpret_cast<float*>(records) + {_ROW} * c + d;
-#pragma unroll
-for (int k = 0; k < {_WORDS}; ++k) to[{_WORD} * k] = value[k];
-#else
-reinterpret_cast<wp::vec_t<16, wp::float32>*>(records)[{NUM_JOINTS} * c + d] = value;
-#endif
-""")
-def write_pair(records: wp.uint64, c: int, d: int, value: vec16):
-    """Write what :func:`read_pair` reads."""
-    ...
 
 
 @wp.func
@@ -142,30 +66,39 @@ def place_pair(
     records: wp.uint64,
 ):
     """Moments of what two bones both move, about their joints, for either as the first."""
-    c = pairs.first[pair]
+    c = pairs.first[pair]  # about whose joint the sums are
     d = pairs.second[pair]
     s = add_rows12(sums, e, pairs.chunk_start[pair], pairs.chunk_start[pair + 1])
     second = symmetric(wp.vec3(s[4], s[5], s[6]), wp.vec3(s[7], s[8], s[9]))
     own = two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second)
-    origin = position[e, c]  # about which the sums are
-    to_c = origin - position[e, c]
-    to_d = origin - position[e, d]
-    write_pair(records, c, d, moved(own, to_c, to_d))
-    if c != d:
-        write_pair(records, d, c, moved(own, to_d, to_c))
+    here = wp.vec3()
+    to_d = position[e, c] - position[e, d]
+    write_pair(records, c, d, moved(own, here, to_d))
+    write_pair(records, d, c, moved(own, to_d, here))
 
 
 @wp.func
-def lift(s: vec16, step: wp.vec3, away: wp.vec3):
-    """The record with ``a + step``; ``away`` is ``b - a``."""
-    first = wp.vec3(s[1], s[2], s[3])
-    return two_sided(s[0], first + s[0] * step, second_moment(s) + wp.outer(first + s[0] * away, step))
-
-
-@wp.func
-def transposed(s: vec16, away: wp.vec3):
-    """The record with ``a`` and ``b`` exchanged; ``away`` is ``b - a``."""
-    return two_sided(s[0], wp.vec3(s[1], s[2], s[3]) + s[0] * away, wp.transpose(second_moment(s)))
+def place_bone(
+    body: Body,
+    pairs: Pairs,
+    moments: wp.array2d(dtype=vec16),
+    position: wp.array2d(dtype=wp.vec3),
+    e: int,
+    c: int,
+    # in and out
+    records: wp.uint64,
+):
+    """Moments of what a bone moves alone, about its joint: of all that it moves, less what it moves with others."""
+    s = add_rows16(moments, e, body.chunk_start[c], body.chunk_start[c + 1])
+    second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
+    own = two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second)
+    for d in range(BONES):
+        if pairs.of[c * BONES + d] >= 0:
+            shared = read_pair(records, c, d)
+            first = wp.vec3(shared[1], shared[2], shared[3])
+            second = second_moment(shared) + wp.outer(position[e, d] - position[e, c], first)
+            own -= two_sided(shared[0], first, second)
+    write_pair(records, c, c, own)
 
 
 @wp.func
@@ -291,6 +224,7 @@ def compose_mass(
     body: Body,
     pairs: Pairs,
     sums: wp.array2d(dtype=vec12),
+    moments: wp.array2d(dtype=vec16),
     position: wp.array2d(dtype=wp.vec3),
     records: wp.uint64,
     e: int,
@@ -299,7 +233,7 @@ def compose_mass(
     # out
     mass: wp.array3d(dtype=float),
 ):
-    """The mass matrix from the moments of pairs; of ``mass`` only the lower triangle is written.
+    """The mass matrix from the moments of pairs and of bones; of ``mass`` only the lower triangle is written.
 
     Moments of every two bones become those of all that two joints carry: first for one side of the pairs, then for the
     other. The threads of a CUDA block share the bones.
@@ -309,6 +243,9 @@ def compose_mass(
     meet()
     for pair in range(thread, pairs.first.shape[0], threads):
         place_pair(pairs, sums, position, e, pair, records)
+    meet()
+    for b in range(thread, BONES, threads):
+        place_bone(body, pairs, moments, position, e, b, records)
     meet()
     if threads == 1:
         compose_alone(body, position, records, e)

@@ -1,6 +1,7 @@
 """What every two bones of an avatar move both: lists of particles, and their moments.
 
-See :mod:`piavatar_envs.avatar.mass_matrix`.
+What a bone has alone needs no lists: weights of a particle add up to one, so that it is what is left of all that the
+bone moves. See :mod:`piavatar_envs.avatar.mass_matrix`.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 @wp.struct
 class Pairs:
-    """Particles that two bones move, or one: lists in chunks, as those of :class:`piavatar_envs.avatar.types.Body`."""
+    """Particles that two bones move: lists in chunks, as those of :class:`piavatar_envs.avatar.types.Body`."""
 
-    of: wp.array(dtype=int)  # (bones * bones,) pair of two bones; -1 where they have no particle in common
+    # (bones * bones,) pair of two bones; -1 where they have no particle in common, and for a bone with itself
+    of: wp.array(dtype=int)
     first: wp.array(dtype=int)  # (pairs,) one of the bones of a pair, about whose joint its moments are
-    second: wp.array(dtype=int)  # (pairs,) the other one, or the same
+    second: wp.array(dtype=int)  # (pairs,) the other one
     chunk_pair: wp.array(dtype=int)  # (chunks,)
     # pair q owns chunks chunk_start[q] : chunk_start[q + 1], chunk c holds entries entry_start[c] : entry_start[c + 1]
     chunk_start: wp.array(dtype=int)
@@ -34,12 +36,12 @@ class Pairs:
 
 
 def build_pairs(points: BodyPoints, device: str) -> Pairs:
-    """Lists of all pairs of bones that have particles in common, a bone with itself among them."""
+    """Lists of all pairs of two bones that have particles in common."""
     weights = points.skin_weights / points.skin_weights.sum(1, keepdims=True)
     particles: dict[tuple[int, int], list[np.ndarray]] = {}
     products: dict[tuple[int, int], list[np.ndarray]] = {}
     for i in range(4):
-        for j in range(i, 4):
+        for j in range(i + 1, 4):
             product = weights[:, i] * weights[:, j]
             bones = np.sort(points.skin_joints[:, [i, j]], axis=1)
             for a, b in np.unique(bones[product > 0.0], axis=0):

@@ -23,8 +23,11 @@ PART_BLOCK = 256
 #: Particles of a part on a GPU. More have fewer chunks, whose sums cost as much as those of many particles; their CUDA
 #: blocks need more shared memory, so fewer of them fit. It is the same for any number of environments, as sums are.
 PART = 3 * PART_BLOCK
-#: Words of a particle: three times four, so that lanes whose particles follow each other read from different banks.
+#: Words of a particle's record: three times four, so that lanes whose particles follow each other read from different
+#: banks. Behind all records a part has its masses.
 WORDS = wp.constant(12)
+#: Words of a particle in all.
+ALL_WORDS = int(WORDS) + 1
 
 
 @wp.struct
@@ -34,7 +37,7 @@ class Parts:
     size: int
     start: wp.array(dtype=int)  # (parts + 1,) part i has chunks chunk[start[i] : start[i + 1]], the longest first
     chunk: wp.array(dtype=int)
-    entry: wp.array(dtype=wp.vec2i)  # as the body's: where a particle is in its part [words], bits of the weight
+    entry: wp.array(dtype=wp.vec2i)  # as the body's: which particle of its part, bits of the weight
 
 
 def part_size(device: str, count: int) -> int:
@@ -58,7 +61,7 @@ def divide(points: BodyPoints, body: Body, device: str) -> tuple[Body, Parts]:
     borders = np.searchsorted(part[order], np.arange(-(-points.num_points // size) + 1))
     parts.start = wp.array(borders.astype(np.int32), dtype=int, device=device)
     parts.chunk = wp.array(order.astype(np.int32), dtype=int, device=device)
-    entry = np.stack([int(WORDS) * (lists["entry"] % size), lists["entry_weight"].view(np.int32)], axis=1)
+    entry = np.stack([lists["entry"] % size, lists["entry_weight"].view(np.int32)], axis=1)
     parts.entry = wp.array(entry.astype(np.int32), dtype=wp.vec2i, device=device)
     return divided, parts
 
@@ -81,49 +84,57 @@ def place_in_parts(e: int, part: int, thread: int, num_envs: int) -> wp.vec3i:
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-__shared__ float __align__(16) particles[{int(WORDS) * PART}];
+__shared__ float __align__(16) particles[{ALL_WORDS * PART}];
 return reinterpret_cast<wp::uint64>(particles);
 #else
 return reinterpret_cast<wp::uint64>(scratch.data);
 #endif
 """)
-def room_of_particles(scratch: wp.array(dtype=vec12)) -> wp.uint64:
+def room_of_particles(scratch: wp.array(dtype=float)) -> wp.uint64:
     """Where the particles of a part meet: in a CUDA block's shared memory, on a CPU in ``scratch``."""
     ...
 
 
-@wp.func_native("""
-float* const to = reinterpret_cast<float*>(room) + at;
+@wp.func_native(f"""
+float* const to = reinterpret_cast<float*>(room) + {int(WORDS)} * n;
+reinterpret_cast<float*>(room)[{int(WORDS)} * size + n] = m;
 #if defined(__CUDA_ARCH__)
-reinterpret_cast<float4*>(to)[0] = make_float4(x[0], x[1], x[2], m);
-reinterpret_cast<float4*>(to)[1] = make_float4(first[0], first[1], first[2], 0.0f);
-reinterpret_cast<float4*>(to)[2] = make_float4(second[0], second[1], second[2], 0.0f);
+reinterpret_cast<float4*>(to)[0] = make_float4(x[0], x[1], x[2], way[0]);
+reinterpret_cast<float4*>(to)[1] = make_float4(first[0], first[1], first[2], way[1]);
+reinterpret_cast<float4*>(to)[2] = make_float4(second[0], second[1], second[2], way[2]);
 #else
-for (int c = 0; c < 3; ++c) to[c] = x[c], to[4 + c] = first[c], to[8 + c] = second[c];
-to[3] = m;
+for (int c = 0; c < 3; ++c) to[c] = x[c], to[4 + c] = first[c], to[8 + c] = second[c], to[3 + 4 * c] = way[c];
 #endif
 """)
-def bring_particle(room: wp.uint64, at: int, m: float, x: wp.vec3, first: wp.vec3, second: wp.vec3):
-    """Mass, place and two vectors of the particle at word ``at`` of a part."""
+def bring_particle(
+    room: wp.uint64, size: int, n: int, m: float, x: wp.vec3, first: wp.vec3, second: wp.vec3, way: wp.vec3
+):
+    """Mass, place and three vectors of particle ``n`` of a part that has room for ``size``."""
     ...
 
 
-@wp.func_native("""
-const float* const from = reinterpret_cast<const float*>(room) + at;
+@wp.func_native(f"""
+const float* const from = reinterpret_cast<const float*>(room) + {int(WORDS)} * n;
 wp::vec_t<12, wp::float32> value;
 #if defined(__CUDA_ARCH__)
 #pragma unroll
-for (int c = 0; c < 3; ++c) {
+for (int c = 0; c < 3; ++c) {{
     const float4 four = reinterpret_cast<const float4*>(from)[c];
     value[4 * c] = four.x, value[4 * c + 1] = four.y, value[4 * c + 2] = four.z, value[4 * c + 3] = four.w;
-}
+}}
 #else
 for (int c = 0; c < 12; ++c) value[c] = from[c];
 #endif
 return value;
 """)
-def particle_brought(room: wp.uint64, at: int) -> vec12:
-    """What :func:`bring_particle` has brought: place, mass, one vector, nothing, the other one, nothing."""
+def particle_brought(room: wp.uint64, n: int) -> vec12:
+    """What :func:`bring_particle` has brought: place, first and second vector, each with a component of the way."""
+    ...
+
+
+@wp.func_native(f"return reinterpret_cast<const float*>(room)[{int(WORDS)} * size + n];")
+def mass_brought(room: wp.uint64, size: int, n: int) -> float:
+    """The mass that :func:`bring_particle` has brought."""
     ...
 
 
@@ -177,7 +188,7 @@ def sum_both(
     while n < last:
         entry = entry_at(parts.entry, n)
         s = particle_brought(room, entry[0])
-        w = weight_of(entry) * s[3]
+        w = weight_of(entry) * mass_brought(room, parts.size, entry[0])
         d = wp.vec3(s[0], s[1], s[2]) - origin
         total += moments_of(w, d, wp.vec3(s[4], s[5], s[6]))
         momentum = w * wp.vec3(s[8], s[9], s[10])
@@ -188,7 +199,7 @@ def sum_both(
 
 
 @wp.func
-def sum_one(
+def sum_way(
     body: Body,
     parts: Parts,
     room: wp.uint64,
@@ -200,7 +211,10 @@ def sum_one(
     # out
     momenta: wp.array2d(dtype=vec12),
 ):
-    """Momentum and angular momentum of one chunk with the first vector as velocity; otherwise as :func:`sum_both`."""
+    """Momentum and angular momentum of one chunk with the way as velocity; otherwise as :func:`sum_both`.
+
+    A loop of its own: in one with the other sums a thread would need so many registers that fewer threads fit.
+    """
     P = wp.vec3()
     L = wp.vec3()
     n = int_at(body.entry_start, c) + thread
@@ -208,10 +222,9 @@ def sum_one(
     while n < last:
         entry = entry_at(parts.entry, n)
         s = particle_brought(room, entry[0])
-        w = weight_of(entry) * s[3]
-        v = wp.vec3(s[4], s[5], s[6])
-        P += w * v
-        L += wp.cross(w * (wp.vec3(s[0], s[1], s[2]) - origin), v)
+        momentum = (weight_of(entry) * mass_brought(room, parts.size, entry[0])) * wp.vec3(s[3], s[7], s[11])
+        P += momentum
+        L += wp.cross(wp.vec3(s[0], s[1], s[2]) - origin, momentum)
         n += threads
     value = vec12(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     store_sum12(momenta, e, c, value, threads)

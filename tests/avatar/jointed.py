@@ -52,13 +52,25 @@ class Joints:
         self.state.x.assign(
             np.broadcast_to(self.rig.skinned(rotations, root).astype(np.float32), self.state.x.shape + (3,)).copy()
         )
-        self.run("record_mass")
+        self.build_mass()
         return self
 
-    def run(self, part: str, **options) -> None:
+    def build_mass(self) -> None:
+        """Build the mass matrix where pose and particles are."""
         program = Program(self.model.device)
-        getattr(self.body, part)(program, self.state, **options)
+        self.body.record_mass(program, self.state)
         program.run()
+
+    def substep(self, step: int) -> Program:
+        """The first substep of a control step (0), or one without a mass matrix of its own (1).
+
+        Either finds joints wherever they have been put.
+        """
+        program, self.body.mass.refresh = Program(self.model.device), 2
+        if step > 0:
+            self.body.record_pose(program, self.state)
+        self.body.record_substep(program, self.state, step)
+        return program
 
     @property
     def jacobian(self) -> np.ndarray:

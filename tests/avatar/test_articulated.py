@@ -9,7 +9,8 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar import lanes, part_sums
-from piavatar_envs.avatar.articulated import ArticulatedBody
+from piavatar_envs.avatar.articulated import FIT_SHARE, ArticulatedBody
+from piavatar_envs.avatar.joint_mass import LONGEST_REFRESH, MOST_USES
 from piavatar_envs.avatar.joint_torques import UNBOUNDED
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
@@ -30,7 +31,7 @@ def joints(make_rig, wild_pose):
         shape = made.state.x.numpy().shape
         made.state.x.assign(made.state.x.numpy() + rng.normal(0.0, 2e-3, shape).astype(np.float32))
         made.state.u.assign(rng.normal(0.0, 1.0, shape).astype(np.float32))
-        made.run("record_mass")
+        made.build_mass()
         return made
 
     return build
@@ -46,6 +47,18 @@ def test_mass_matrix_is_that_of_the_jacobian(joints, seed):
     assert np.linalg.eigvalsh(made.mass).min() > 0.0
 
 
+def test_a_control_step_has_a_mass_matrix_for_every_two_substeps(joints):
+    """At most; only its first substep looks where joints have been put, and all go over the particles twice."""
+    made = joints()
+    assert made.body.mass.refresh * made.model.step.dt <= LONGEST_REFRESH and made.body.mass.refresh <= MOST_USES
+    made.body.mass.refresh, program = 2, Program(made.model.device)
+    for step in range(5):
+        made.body.record_substep(program, made.state, step)
+    alone = ["attach_flesh", "act", "take_over"]
+    own = ["attach_flesh", "sum_pairs", "build_mass", "act", "take_over"]
+    assert program._names == ["begin_substep", *own, *alone, *own, *alone, *own]
+
+
 def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
     """``(M + I) dq = J^T m v``; they move with ``J dq`` half a step on, and what is left is physical."""
     made = joints()
@@ -54,7 +67,7 @@ def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
     expected = np.linalg.solve(np.einsum("p,pia,pib->ab", m, J, J) + np.diag(made.besides), momentum_of(J, m, before))
     vk = made.halfway(expected) @ expected
     made.body.state.outside.assign(-expected[None].astype(np.float32))  # so that none is expected next
-    made.run("record_substep", refresh=False)
+    made.substep(1).run()
     np.testing.assert_allclose(made.total, before, atol=2e-5)
     got = made.body.state.velocity.numpy()[0]
     assert np.linalg.norm(got - expected) < 2e-3 * np.linalg.norm(expected)
@@ -79,7 +92,7 @@ def test_particles_go_from_skinned_places_to_skinned_places(make_rig, wild_pose,
     made.state.vk.assign(made.skinning(velocity)[None].astype(np.float32))
     home, dt = made.rig.read("x"), made.model.step.dt
     alone = made.halfway(velocity) @ velocity
-    made.run("record_substep", refresh=False)
+    made.substep(1).run()
     got, now = made.body.state.velocity.numpy()[0].astype(float), made.body.state.rotation.numpy()[0].astype(float)
     np.testing.assert_allclose(got, velocity, atol=0.02 * np.abs(velocity).max())
     world = Rotation.from_quat(now).as_matrix()
@@ -100,7 +113,7 @@ def test_torques_change_neither_momentum(joints, wild_pose, stale):
     made.body.target.rotation.assign(Rotation.from_rotvec(wild_pose(rng)).as_quat()[None].astype(np.float32))
     made.body.state.torque.assign(rng.normal(0.0, 1e3, (1, NUM_JOINTS, 3)).astype(np.float32))
     p, L, _ = made.momenta()
-    made.run("record_substep", refresh=False)
+    made.substep(1).run()
     p_after, L_after, size = made.momenta()
     assert size > 2.0 * made.rig.mass.sum() * 0.5
     assert np.linalg.norm(p_after - p) < 3e-6 * size
@@ -121,36 +134,74 @@ def test_torque_turns_a_joint_as_the_inertia_says(joints):
     upper_arm = Rotation.from_quat(made.body.state.rotation.numpy()[0, PARENTS[elbow]])
     right[3 + 3 * elbow : 6 + 3 * elbow] = dt * upper_arm.apply(torque[0, elbow])
     expected = np.linalg.solve(np.einsum("p,pia,pib->ab", m, J, J) + np.diag(locked), right)
-    made.run("record_substep", refresh=False)
+    made.substep(1).run()
     got = made.body.state.velocity.numpy()[0]
     assert np.linalg.norm(got - expected) < 1e-3 * np.linalg.norm(expected)
 
 
-def test_refresh_fits_the_pose_and_keeps_velocities(joints, wild_pose):
+def off_their_places(made, rotvec, rng) -> tuple[np.ndarray, np.ndarray]:
+    """Put particles where another pose near by has them; rotations of that, ``(22, 3, 3)``, and its place [m]."""
+    turned = Rotation.from_rotvec(rotvec) * Rotation.from_rotvec(rng.normal(0.0, 0.02, rotvec.shape))
+    root = made.body.state.position.numpy()[0, 0] + (0.01, -0.02, 0.015)
+    made.state.x.assign(made.rig.skinned(turned.as_matrix(), root)[None].astype(np.float32))
+    return turned.as_matrix(), root
+
+
+def test_the_pose_is_fitted_to_particles_that_rest(joints, wild_pose):
+    """In many substeps, for each takes a share, and a smaller one where the grid's inertia is the larger one."""
+    rng = np.random.default_rng(5)
+    rotvec = wild_pose(rng)
+    made = Joints(joints(0).rig).pose(rotvec)
+    made.state.u.zero_()
+    turned, root = off_their_places(made, rotvec, rng)
+    program = made.substep(0)
+    for _ in range(800):
+        program.run()
+    world, positions = forward_kinematics(turned, root, made.rig.points.joints[0].astype(float))
+    np.testing.assert_allclose(made.body.state.position.numpy()[0], positions, atol=2e-4)
+    off = Rotation.from_quat(made.body.state.rotation.numpy()[0].astype(float)) * Rotation.from_matrix(world).inv()
+    assert off.magnitude().max() < 2e-3
+    for velocity in (made.state.u, made.state.vk, made.body.state.velocity):
+        assert not velocity.numpy().any()
+
+
+def test_a_fit_keeps_velocities(joints, wild_pose):
+    """Nothing drives the joints: what a new pose makes of their velocities is handed back."""
     rng = np.random.default_rng(5)
     rotvec = wild_pose(rng)
     made = Joints(joints(0).rig).pose(rotvec)
     made.state.u.assign(rng.normal(0.0, 1.0, made.state.x.numpy().shape).astype(np.float32))
     made.body.state.velocity.assign(rng.normal(0.0, 1.0, (1, NUM_DOF)).astype(np.float32))
-    made.run("record_mass")
-    turned = Rotation.from_rotvec(rotvec) * Rotation.from_rotvec(rng.normal(0.0, 0.02, rotvec.shape))
-    root = made.body.state.position.numpy()[0, 0] + (0.01, -0.02, 0.015)
-    made.state.x.assign(made.rig.skinned(turned.as_matrix(), root)[None].astype(np.float32))
-    before = made.total
-    program = Program(made.model.device)
-    made.body.record_mass(program, made.state)
-    made.body._record_fit(program, made.state)
-    for _ in range(800):  # a fit takes away a share, and a smaller one where the grid's inertia is the larger one
+    off_their_places(made, rotvec, rng)
+    before, program = made.total, made.substep(0)
+    for _ in range(10):
         program.run()
-    np.testing.assert_allclose(made.total, before, atol=5e-5)
-    world, positions = forward_kinematics(turned.as_matrix(), root, made.rig.points.joints[0].astype(float))
-    np.testing.assert_allclose(made.body.state.position.numpy()[0], positions, atol=2e-4)
-    off = Rotation.from_quat(made.body.state.rotation.numpy()[0].astype(float)) * Rotation.from_matrix(world).inv()
-    assert off.magnitude().max() < 2e-3
-    made.run(
-        "record_substep", refresh=False
-    )  # nothing drives the joints: what the new pose makes of their velocities is handed back
-    np.testing.assert_allclose(made.total, before, atol=5e-5)
+        np.testing.assert_allclose(made.total, before, atol=5e-5)
+
+
+@pytest.mark.parametrize("speed", [0.0, 10.0], ids=["resting", "flying"])
+def test_a_fit_takes_a_share_of_the_displacement(joints, wild_pose, speed):
+    """``(M + I) dq = J^T m (x - LBS)``, wherever the body flies; the next substep has no matrix, and no fit."""
+    rng = np.random.default_rng(6)
+    rotvec, flight = wild_pose(rng), speed * np.array([0.6, 0.0, 0.8])
+    made = Joints(joints(0).rig).pose(rotvec)
+    home, dt = made.rig.read("x"), made.model.step.dt
+    off_their_places(made, rotvec, rng)
+    made.state.u.zero_()
+    made.state.vk.assign(np.broadcast_to(flight, made.state.vk.numpy().shape).astype(np.float32))
+    made.body.state.velocity.assign(np.r_[flight, np.zeros(NUM_DOF - 3)][None].astype(np.float32))
+    J, m, rest = made.jacobian, made.rig.mass, made.rig.points.joints[0].astype(float)
+    M = np.einsum("p,pia,pib->ab", m, J, J) + np.diag(made.besides)
+    dq = np.linalg.solve(M, momentum_of(J, m, made.rig.read("x") - home))
+    local, root = made.moved(dq, FIT_SHARE)
+    for step in range(2):
+        made.substep(step).run()
+        world, positions = forward_kinematics(local, root + (step + 1) * dt * flight, rest)
+        np.testing.assert_allclose(made.body.state.position.numpy()[0], positions, atol=3e-5)
+        off = Rotation.from_quat(made.body.state.rotation.numpy()[0].astype(float)) * Rotation.from_matrix(world).inv()
+        assert off.magnitude().max() < 1e-4
+    turns = np.linalg.norm(FIT_SHARE * carried_by().T @ dq[3:].reshape(NUM_JOINTS, 3), axis=1)
+    assert turns.max() > 4e-3
 
 
 def test_a_mode_swings_at_its_frequency(make_rig):
@@ -164,8 +215,7 @@ def test_a_mode_swings_at_its_frequency(make_rig):
     dt = made.model.step.dt
     made.body.state.velocity.assign(mode[None].astype(np.float32))
     made.state.vk.assign((made.jacobian @ mode)[None].astype(np.float32))
-    program = Program(made.model.device)
-    made.body.record_substep(program, made.state, refresh=True)
+    program = made.substep(0)
     swing, steps = [], round(np.pi / omega / dt)
     for _ in range(steps):
         program.run()
@@ -185,7 +235,7 @@ def test_free_float_keeps_momentum(make_rig, wild_pose):
     program, model = Program(rig.model.device), rig.model
     record_begin(program, model, rig.state, rig.scratch)
     for step in range(model.num_substeps):
-        made.body.record_substep(program, rig.state, refresh=True)
+        made.body.record_substep(program, rig.state, step)
         record_substep(program, model, rig.state, rig.scratch, step)
     record_end(program, model, rig.state, rig.scratch)
     start = rig.totals()
@@ -212,8 +262,7 @@ def test_flesh_comes_back_to_the_bones(make_rig):
     rest = made.rig.read("x")
     bump = 0.02 * np.sin(12.0 * rest) * rng.normal(size=3)
     made.state.x.assign((rest + bump)[None].astype(np.float32))
-    program = Program(made.model.device)
-    made.body.record_substep(program, made.state, refresh=True)
+    program = made.substep(0)
     for _ in range(round(0.4 / dt)):
         program.run()
         made.state.x.assign(made.state.x.numpy() + np.float32(dt) * (made.state.u.numpy() + made.state.vk.numpy()))
@@ -230,8 +279,7 @@ def test_threads_that_have_several_particles_move_as_one_each_does(joints, monke
 
     def moved():
         made = joints(stiffness=300.0, damping=10.0, attachment=attachment)
-        program = Program(made.model.device)
-        made.body.record_substep(program, made.state, refresh=True)
+        program = made.substep(0)
         program.run()
         program.run()
         return made
@@ -254,8 +302,7 @@ def test_a_body_in_many_parts_moves_as_in_one(joints, monkeypatch, attachment):
 
     def moved():
         made = joints(stiffness=300.0, damping=10.0, attachment=attachment)
-        program = Program(made.model.device)
-        made.body.record_substep(program, made.state, refresh=True)
+        program = made.substep(0)
         program.run()
         return made
 
@@ -305,7 +352,7 @@ def test_a_held_pelvis_bears_the_weight(make_rig):
     model, program = rig.model, Program(rig.model.device)
     record_begin(program, model, rig.state, rig.scratch)
     for step in range(model.num_substeps):
-        body.record_substep(program, rig.state, refresh=True)
+        body.record_substep(program, rig.state, step)
         record_substep(program, model, rig.state, rig.scratch, step)
     record_end(program, model, rig.state, rig.scratch)
     for _ in range(30):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_changes, blend_places, blend_records, store_record
+from piavatar_envs.avatar.blending import blend_changes, blend_places, blend_records, blend_steps, store_record
 from piavatar_envs.avatar.lanes import (
     chunk_threads,
     store_sum12,
@@ -64,17 +64,20 @@ def copy_records(source: wp.array2d(dtype=vec44), out: wp.array2d(dtype=vec44)):
 def blend(
     record: wp.array2d(dtype=vec44),
     change: wp.array2d(dtype=vec8),
+    step: wp.array2d(dtype=vec12),
     place: wp.array2d(dtype=wp.mat44),
     joint: wp.array(dtype=wp.vec4i),
     weight: wp.array(dtype=wp.vec4),
     rest: wp.array(dtype=wp.vec3),
     out: wp.array2d(dtype=vec24),
     out_change: wp.array2d(dtype=vec8),
+    out_step: wp.array2d(dtype=vec12),
     out_place: wp.array2d(dtype=wp.vec3),
 ):
     e, p = wp.tid()
     out[e, p] = blend_records(record, e, joint, weight, p, rest[p])
     out_change[e, p] = blend_changes(change, e, joint, weight, p)
+    out_step[e, p] = blend_steps(step, e, joint, weight, p)
     out_place[e, p] = blend_places(place, e, joint, weight, p, rest[p])
 
 
@@ -122,6 +125,7 @@ def test_particles_blend_the_records_of_their_bones(device):
     rng = np.random.default_rng(2)
     record = rng.normal(size=(ROWS, BONES, 44)).astype(np.float32)
     change = rng.normal(size=(ROWS, BONES, 8)).astype(np.float32)
+    steps = rng.normal(size=(ROWS, BONES, 12)).astype(np.float32)
     place = rng.normal(size=(ROWS, BONES, 4, 4)).astype(np.float32)
     joint = rng.integers(0, BONES, size=(POINTS, 4)).astype(np.int32)
     weight = np.sort(rng.random((POINTS, 4)).astype(np.float32))[:, ::-1] * (
@@ -134,12 +138,13 @@ def test_particles_blend_the_records_of_their_bones(device):
 
     out = wp.zeros((ROWS, POINTS), dtype=vec24, device=device)
     out_change = wp.zeros((ROWS, POINTS), dtype=vec8, device=device)
+    out_step = wp.zeros((ROWS, POINTS), dtype=vec12, device=device)
     out_place = wp.zeros((ROWS, POINTS), dtype=wp.vec3, device=device)
     stored = wp.zeros((ROWS, BONES), dtype=vec44, device=device)
     wp.launch(copy_records, (ROWS, BONES), [upload(record, vec44)], [stored], device=device)
     skin = [upload(joint, wp.vec4i), upload(weight.astype(np.float32), wp.vec4), upload(rest, wp.vec3)]
-    inputs = [stored, upload(change, vec8), upload(place, wp.mat44), *skin]
-    wp.launch(blend, (ROWS, POINTS), inputs, [out, out_change, out_place], device=device)
+    inputs = [stored, upload(change, vec8), upload(steps, vec12), upload(place, wp.mat44), *skin]
+    wp.launch(blend, (ROWS, POINTS), inputs, [out, out_change, out_step, out_place], device=device)
     of = record[:, joint].astype(float)  # (ROWS, POINTS, 4, 44)
     rows = of[..., :24].reshape(ROWS, POINTS, 4, 6, 4)
     ends = np.einsum("epnqi,pi->epnq", rows[..., :3], rest.astype(float)) + rows[..., 3]
@@ -149,6 +154,8 @@ def test_particles_blend_the_records_of_their_bones(device):
     np.testing.assert_allclose(out.numpy(), np.einsum("pn,epnc->epc", weight.astype(float), parts), atol=3e-5)
     expected = np.einsum("pn,epnc->epc", weight.astype(float), change[:, joint].astype(float))
     np.testing.assert_allclose(out_change.numpy()[..., :6], expected[..., :6], atol=1e-5)
+    expected = np.einsum("pn,epnc->epc", weight.astype(float), steps[:, joint].astype(float))
+    np.testing.assert_allclose(out_step.numpy(), expected, atol=1e-5)
     of = place[:, joint].astype(float)
     ends = np.einsum("epnij,pj->epni", of[..., :3, :3], rest) + of[..., :3, 3]
     np.testing.assert_allclose(out_place.numpy(), np.einsum("pn,epni->epi", weight.astype(float), ends), atol=1e-5)

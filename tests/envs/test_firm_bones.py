@@ -29,10 +29,11 @@ def swing(batch, steps: int, seed: int = 0) -> np.ndarray:
 
 
 def put_in_place(batch) -> None:
-    """What ends a control step of the joints, alone."""
+    """What ends a control step of the joints, alone, wherever they have been put."""
     simulation = batch.simulation
-    program = Program(simulation.model.device)
-    simulation.avatar.joints.record_end(program, simulation.state)
+    program, joints = Program(simulation.model.device), simulation.avatar.joints
+    joints.body.record_pose(program, simulation.state)
+    joints.record_end(program, simulation.state)
     program.run()
 
 
