@@ -167,7 +167,7 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
         # x, u, pull in; u out
         "apply_corrections": particles * 4 * 12,
         "sum_moments": particles * 2 * 12,  # x, u
-        "attach_flesh": particles * 4 * 12,  # x, u, vk in; u out
+        "attach_flesh": particles * 5 * 12,  # x, u, vk in; u, vk out
         "sum_corrections": particles * 3 * 12,  # x, pull, lean
     }
     return formulas.get(kernel)
