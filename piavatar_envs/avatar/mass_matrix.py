@@ -94,10 +94,7 @@ def place_bone(
     own = two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second)
     for d in range(BONES):
         if pairs.of[c * BONES + d] >= 0:
-            shared = read_pair(records, c, d)
-            first = wp.vec3(shared[1], shared[2], shared[3])
-            second = second_moment(shared) + wp.outer(position[e, d] - position[e, c], first)
-            own -= two_sided(shared[0], first, second)
+            own -= moved(read_pair(records, c, d), wp.vec3(), position[e, d] - position[e, c])
     write_pair(records, c, c, own)
 
 

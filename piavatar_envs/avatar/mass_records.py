@@ -35,7 +35,7 @@ def second_moment(s: vec16):
 
 @wp.func
 def moved(s: vec16, alpha: wp.vec3, beta: wp.vec3):
-    """The record of a joint with itself, seen from two others: ``a + alpha`` and ``b + beta``."""
+    """The record with ``a + alpha`` and ``b + beta``: of a joint with itself, of any two where ``alpha`` is zero."""
     m = s[0]
     first = wp.vec3(s[1], s[2], s[3])
     both = second_moment(s) + wp.outer(first, alpha) + wp.outer(beta, first) + m * wp.outer(beta, alpha)

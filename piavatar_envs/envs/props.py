@@ -170,12 +170,17 @@ def check_places(
         if name not in solids:
             raise ConfigError(f"there is no prop {name!r} to be placed; there are {', '.join(solids) or 'none'}")
         config, rest = solids[name]
-        turned = Rotation.from_quat(np.roll(config.rotation, -1)).apply(rest)
+        turned = _turned(config, rest)
         reach = np.array([turned.min(0), turned.max(0)])
         for centre in centres:
             inside = (centre + reach[0] >= box[0] - OVERLAP * dx) & (centre + reach[1] <= box[1] + OVERLAP * dx)
             if not inside.all():
                 _refuse_place(name, centre, int(np.argmin(inside)), box, box - reach)
+
+
+def _turned(config: PropConfig, rest: np.ndarray) -> np.ndarray:
+    """Particles of a prop about its centre of mass as it begins [m], shape ``(P, 3)``."""
+    return Rotation.from_quat(np.roll(config.rotation, -1)).apply(rest)
 
 
 def check_apart(dx: float, configs: Sequence[PropConfig], points: Sequence[PropPoints]) -> None:
@@ -189,7 +194,7 @@ def check_apart(dx: float, configs: Sequence[PropConfig], points: Sequence[PropP
     Raises:
         ConfigError: there are such.
     """
-    turned = [Rotation.from_quat(np.roll(c.rotation, -1)).apply(p.rest) for c, p in zip(configs, points, strict=True)]
+    turned = [_turned(config, solid.rest) for config, solid in zip(configs, points, strict=True)]
     for (one, _), (other, rest) in permutations(zip(configs, turned, strict=True), 2):
         middle = np.subtract(one.position, other.position)
         if one.name != other.name and np.linalg.norm(rest - middle, axis=1).min() < dx:  # names are checked elsewhere
