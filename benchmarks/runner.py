@@ -37,6 +37,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from piavatar_envs import doctor
+from piavatar_envs.mpm.cores import available_cores
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("numpy", "scipy", "warp-lang", "gymnasium", "stable-baselines3", "torch", "mujoco")
@@ -154,8 +155,7 @@ def device_info(device: str) -> dict[str, Any]:
     if alias not in found:
         raise ValueError(f"no device {device!r} on this machine; there are {', '.join(found)}")
     used = {key: value for key, value in found[alias].items() if key != "free_gib"}
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {**used, "cpu": doctor.cpu_model(), "cpu_cores": cores}
+    return {**used, "cpu": doctor.cpu_model(), "cpu_cores": available_cores()}
 
 
 def git_commit(root: Path = ROOT) -> tuple[str, bool | None]:

@@ -24,10 +24,11 @@ import numpy as np
 import warp as wp
 
 from benchmarks import runner, timing
-from piavatar_envs.api.batched import BatchedEpisodes, available_cores
+from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.api.same_step import step_and_reset
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import load_config
+from piavatar_envs.mpm.cores import available_cores
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task

@@ -15,6 +15,8 @@ from typing import Any
 
 import gymnasium
 
+from piavatar_envs.mpm.cores import available_cores
+
 PACKAGES = ("piavatar-envs", "warp-lang", "numpy", "scipy", "gymnasium", "pydantic", "stable-baselines3", "torch")
 
 #: Modules by extra; an extra is present if all of its modules are.
@@ -122,7 +124,7 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
         package = importlib.import_module(f"piavatar_envs.{room}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
-    wp.force_load(target)
+    wp.force_load(target, max_workers=available_cores())
     for env_id, spec in sorted(gymnasium.registry.items()):
         if environments and spec.namespace == "PIAvatar":
             env = gymnasium.make(env_id, device=device, fidelity="tiny")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -19,6 +18,7 @@ from piavatar_envs.avatar.joint_drive import checked_assist
 from piavatar_envs.envs.batch_env import BatchEnv, check_count
 from piavatar_envs.envs.draws import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.simulation import check_device
+from piavatar_envs.mpm.cores import available_cores
 from piavatar_envs.tasks.base import Task
 
 
@@ -273,13 +273,6 @@ class BatchedEpisodes:
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
-
-
-def available_cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _checked_seed(seed: Any) -> int:

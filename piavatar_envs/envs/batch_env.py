@@ -18,7 +18,7 @@ from piavatar_envs.envs.joint_actions import apply_targets, apply_torques, follo
 from piavatar_envs.envs.observer import Observer
 from piavatar_envs.envs.props import check_places
 from piavatar_envs.envs.simulation import Simulation
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.program import Program, compile_programs
 from piavatar_envs.tasks.base import Task
 
 
@@ -83,6 +83,9 @@ class BatchEnv:
         self.step_program, self.observe_program = Program(self.device), Program(self.device)
         self.count_program, self.ended_program = Program(self.device), Program(self.device)
         self._record()
+        compile_programs(
+            (self.reset_program, self.step_program, self.observe_program, self.count_program, self.ended_program)
+        )
 
     @property
     def failure(self) -> wp.array:

@@ -2,14 +2,40 @@
 
 Nothing is allocated, decided or synchronised when a program runs, so a step costs its kernels and little more. (On a
 CPU the graph saves some 5 us a launch, a tenth of a step at the default resolution.)
+
+Kernels that are not in Warp's cache are compiled before a program runs first. That takes seconds a module, and a world
+has dozens: :func:`compile_programs` gives one to every core.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
+
+from piavatar_envs.mpm.cores import available_cores
+
+#: Modules that are compiled at the same time, at most: each takes some hundred megabytes.
+MOST_AT_ONCE = 16
+
+
+@dataclass(frozen=True)
+class Launch:
+    """A launch that a program will make; as for ``wp.launch``."""
+
+    kernel: wp.Kernel
+    dim: int | Sequence[int]
+    inputs: list[Any]
+    outputs: list[Any]
+    block_dim: int
+
+    def recorded(self, device: wp.Device) -> Callable[[], None]:
+        """What makes the launch; the kernel is compiled if it is not."""
+        arguments = {"inputs": self.inputs, "outputs": self.outputs, "block_dim": self.block_dim}
+        return wp.launch(self.kernel, self.dim, **arguments, device=device, record_cmd=True).launch
 
 
 class Program:
@@ -34,8 +60,8 @@ class Program:
             raise ValueError(f"a condition of shape {condition.shape} and type {condition.dtype}; use (1,) int32")
         self.device = wp.get_device(device)
         self._condition = condition
-        self._launches: list[Callable[[], None]] = []
-        self._names: list[str] = []
+        self._launches: list[Launch] = []
+        self._recorded: list[Callable[[], None]] = []  # of the first of these
         self._graph: Any = None
 
     def launch(
@@ -53,9 +79,7 @@ class Program:
         """
         if self._graph is not None:
             raise RuntimeError(f"cannot append {kernel.key} to a program that has run; build a new one")
-        arguments = {"inputs": list(inputs), "outputs": list(outputs), "block_dim": block_dim}
-        self._launches.append(wp.launch(kernel, dim, **arguments, device=self.device, record_cmd=True).launch)
-        self._names.append(kernel.key)
+        self._launches.append(Launch(kernel, dim, list(inputs), list(outputs), block_dim))
 
     def __len__(self) -> int:
         return len(self._launches)
@@ -71,8 +95,33 @@ class Program:
         """Whether it has run before: graphs are captured then, one at a time."""
         return self._graph is not None
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the kernels that are launched, in order."""
+        return [launch.kernel.key for launch in self._launches]
+
+    @property
+    def launches(self) -> list[tuple[str, Callable[[], None]]]:
+        """Every launch in order, the name of its kernel and what makes it; all are compiled."""
+        self.compile()
+        return list(zip(self.names, self._recorded, strict=True))
+
+    @property
+    def unbound(self) -> list[Launch]:
+        """Launches whose kernels may not have been compiled yet."""
+        return self._launches[len(self._recorded) :]
+
+    def bind(self) -> None:
+        """Bind the arguments of launches that are new."""
+        self._recorded += [launch.recorded(self.device) for launch in self.unbound]
+
+    def compile(self) -> None:
+        """Compile what is launched, as :func:`compile_programs`; the first run does, if nobody has before."""
+        compile_programs([self])
+
     def run_eager(self) -> None:
         """Launch one by one without a graph, to compare with :meth:`run`."""
+        self.compile()
         with wp.ScopedDevice(self.device):
             self._launch_all()
 
@@ -83,10 +132,11 @@ class Program:
         """
         import time
 
-        seconds: dict[str, float] = dict.fromkeys(self._names, 0.0)
+        launches = self.launches
+        seconds: dict[str, float] = dict.fromkeys(self.names, 0.0)
         with wp.ScopedDevice(self.device):
             for _ in range(repeats):
-                for name, launch in zip(self._names, self._launches, strict=True):
+                for name, launch in launches:
                     wp.synchronize_device(self.device)
                     start = time.perf_counter()
                     launch()
@@ -95,6 +145,7 @@ class Program:
         return seconds
 
     def _capture(self) -> None:
+        self.compile()
         with wp.ScopedDevice(self.device), wp.ScopedCapture(self.device) as capture:
             self._launch_all()
         self._graph = capture.graph
@@ -103,13 +154,31 @@ class Program:
         """Launch one after the other, if the condition holds; into a graph, if one is being captured."""
 
         def launch_all() -> None:
-            for launch in self._launches:
+            for launch in self._recorded:
                 launch()
 
         if self._condition is None or not _can_branch(self._condition.device):
             launch_all()
         else:
             wp.capture_if(self._condition, launch_all)
+
+
+def compile_programs(programs: Iterable[Program]) -> None:
+    """Compile what programs launch and is not in Warp's cache, modules side by side, then bind all arguments.
+
+    Raises:
+        Exception: a kernel that does not compile, or a launch with arguments that are not its kernel's, as Warp has it.
+    """
+    programs = list(programs)
+    with ThreadPoolExecutor(min(MOST_AT_ONCE, available_cores())) as pool:
+        modules = {
+            (new.kernel.module, each.device.alias, new.block_dim): None for each in programs for new in each.unbound
+        }
+        loads = [pool.submit(wp.load_module, m, d, block_dim=dim, max_workers=0) for m, d, dim in modules]
+        for load in loads:
+            load.result()
+    for program in programs:
+        program.bind()
 
 
 def _can_branch(device: wp.Device) -> bool:

@@ -78,7 +78,7 @@ class Rig:
 
     def run_part_of_step(self, kernel: str, count: int) -> None:
         """Run a control step up to and with the ``count``-th launch of a kernel."""
-        for launch, name in zip(self.step_program._launches, self.step_program._names, strict=True):
+        for name, launch in self.step_program.launches:
             launch()
             count -= name == kernel
             if count == 0:

@@ -56,7 +56,7 @@ def test_a_control_step_has_a_mass_matrix_for_every_two_substeps(joints):
         made.body.record_substep(program, made.state, step)
     alone = ["attach_flesh", "act", "take_over"]
     own = ["attach_flesh", "sum_pairs", "build_mass", "act", "take_over"]
-    assert program._names == ["begin_substep", *own, *alone, *own, *alone, *own]
+    assert program.names == ["begin_substep", *own, *alone, *own, *alone, *own]
 
 
 def test_joints_take_over_what_they_can_and_change_no_velocity(joints):

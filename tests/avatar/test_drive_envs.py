@@ -185,6 +185,6 @@ def test_one_launch_drives_a_body_as_many_do(make_rig, wild_pose, monkeypatch, r
 
     monkeypatch.setattr(drive, "record_drive", by_passes)
     many = disturbed(make_rig, wild_pose, **options)
-    assert "drive_body" in one.step_program._names and "drive_particles" in many.step_program._names
+    assert "drive_body" in one.step_program.names and "drive_particles" in many.step_program.names
     for name, value in one.everything().items():
         np.testing.assert_array_equal(value, many.everything()[name], err_msg=name)

@@ -8,7 +8,7 @@ import warp as wp
 
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.materials import MATERIALS
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.program import Program, compile_programs
 from piavatar_envs.mpm.solver import record_substep
 from tests.gpu_on_cpu import NAME as GPU_ON_CPU
 
@@ -152,6 +152,35 @@ def test_a_program_with_a_condition_runs_where_it_holds(device):
     condition.assign(np.array([1], np.int32))
     program.run_eager()
     assert runs.numpy().tolist() == [3] * 3 and condition.numpy()[0] == 0
+
+
+def test_programs_are_compiled_together(device, monkeypatch):
+    """A module is loaded once, whoever launches its kernels; what is appended later is compiled with the first run."""
+    loaded, load = [], wp.load_module
+    monkeypatch.setattr(wp, "load_module", lambda m, *args, **kwargs: loaded.append(m) or load(m, *args, **kwargs))
+    runs, condition = wp.zeros(3, dtype=int, device=device), wp.ones(1, dtype=int, device=device)
+    first, second = Program(device), Program(device)
+    for program in (first, second):
+        program.launch(count_runs, 3, [], [runs])
+        program.launch(forget, 1, [], [condition])
+    compile_programs([first, second])
+    assert loaded == [count_runs.module] and not first.unbound and not second.unbound
+    compile_programs([first, second])
+    assert len(loaded) == 1
+    first.launch(count_runs, 3, [], [runs])
+    assert len(first.unbound) == 1
+    first.run()
+    second.run()
+    assert runs.numpy().tolist() == [3] * 3
+
+
+def test_a_launch_with_wrong_arguments_is_refused_before_anything_runs(device):
+    runs, program = wp.zeros(3, dtype=int, device=device), Program(device)
+    program.launch(count_runs, 3, [], [runs])
+    program.launch(count_runs, 3, [runs, 1.0])
+    with pytest.raises(RuntimeError, match="count_runs"):
+        program.run()
+    assert runs.numpy().tolist() == [0] * 3
 
 
 @pytest.mark.parametrize("shape, dtype", [((2,), int), ((1,), float), ((1, 1), int)])
