@@ -85,7 +85,7 @@ def attach_flesh(
         n = body.first + wp.min(p + threads, last - 1)
         following = vector_at(x, e, n)
         following_v = vector_at(u, e, n) + vector_at(vk, e, n)
-        now = blend_images(w.place, w.moving, e, body.joint, body.weight, p, pulled_rest(body, e, p, w), pelvis)
+        now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, e, p, w), pelvis)
         apart = motion_apart(now)
         before = v - blended_motion(now, place - pelvis) - apart
         way = wp.vec3(now[6], now[7], now[8]) + pelvis - place
@@ -145,7 +145,7 @@ def put_in_place(
     p = firm[n]
     q = body.first + p
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-    home = blend_places(place, e, body.joint, body.weight, p, rest)
+    home = blend_places(place, e, body.skin, p, rest)
     at = keep_outside(boundaries, e, home)
     way = at - x[e, q]
     x[e, q] = at
@@ -153,7 +153,7 @@ def put_in_place(
     for i in range(3):
         axis = wp.vec3()
         axis[i] = 1.0
-        turned[i] = wp.dot(blend_places(place, e, body.joint, body.weight, p, rest + axis) - home, way)
+        turned[i] = wp.dot(blend_places(place, e, body.skin, p, rest + axis) - home, way)
     slip[e, p] = slip[e, p] + turned
     spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, u[e, q] + vk[e, q])
     store_matrix(C, e, q, matrix_at(C, e, q) - wp.skew(spin))

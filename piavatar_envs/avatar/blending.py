@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.influences import READ
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.types import Body, vec8, vec12, vec24, vec44
 from piavatar_envs.mpm.types import row
@@ -24,23 +25,9 @@ STEP, VELOCITY, SPIN = wp.constant(33), wp.constant(36), wp.constant(39)
 AT_PLACE, AT_LEAN, AT_STEP = wp.constant(0), wp.constant(3), wp.constant(6)
 AT_VELOCITY, AT_SPIN = wp.constant(18), wp.constant(21)
 
-# What a particle is skinned to, in loads of 16 bytes. The bones of an environment follow each other in memory: to find
-# each by itself would take as long as to blend it.
-_INFLUENCES = """
-#if defined(__CUDA_ARCH__)
-int4 j4 = *reinterpret_cast<const int4*>(&joint.data[p]);
-float4 w4 = *reinterpret_cast<const float4*>(&weight.data[p]);
-const int bones[4] = {j4.x, j4.y, j4.z, j4.w};
-const float weights[4] = {w4.x, w4.y, w4.z, w4.w};
-#else
-const auto& bones = joint.data[p];
-const auto& weights = weight.data[p];
-#endif
-"""
-
 
 @wp.func_native(
-    _INFLUENCES
+    READ
     + """
 wp::vec_t<24, wp::float32> sum;
 const auto add = [&](const wp::float32* bone, wp::float32 w) {
@@ -64,21 +51,22 @@ const auto add = [&](const wp::float32* bone, wp::float32 w) {
 };
 #if defined(__CUDA_ARCH__)
 const auto* const own = &wp::index(record, e, 0);
+float4 w4 = make_float4(weights[0], weights[1], weights[2], weights[3]);
 // one bone at a time: a thread that read all of them at once would need so many registers that few threads fit
 #pragma unroll 1
 for (int n = 0; n < 4; ++n) {
     if (w4.x > 0.0f) {
-        const float4* const from = reinterpret_cast<const float4*>(own + j4.x);
+        const float4* const from = reinterpret_cast<const float4*>(own + (bones & 255u));
         float4 bone[11];
 #pragma unroll
         for (int q = 0; q < 11; ++q) bone[q] = from[q];
         add(reinterpret_cast<const wp::float32*>(bone), w4.x);
     }
-    j4 = make_int4(j4.y, j4.z, j4.w, 0);
+    bones >>= 8;
     w4 = make_float4(w4.y, w4.z, w4.w, 0.0f);
 }
 #else
-for (int n = 0; n < 4 && weights[n] > 0.0f; ++n) add(&wp::index(record, e, bones[n])[0], weights[n]);
+for (int n = 0; n < 4 && weights[n] > 0.0f; ++n) add(&wp::index(record, e, joint(n))[0], weights[n]);
 #endif
 return sum;
 """
@@ -86,8 +74,7 @@ return sum;
 def blend_records(
     record: wp.array2d(dtype=vec44),
     e: int,
-    joint: wp.array(dtype=wp.vec4i),
-    weight: wp.array(dtype=wp.vec4),
+    skin: wp.array(dtype=wp.vec4),
     p: int,
     rest: wp.vec3,
 ) -> vec24:
@@ -129,14 +116,14 @@ def store_record(record: wp.array2d(dtype=vec44), e: int, b: int, value: vec44):
 
 def _blend(length: int, numbers: int) -> str:
     """A snippet that blends the first ``numbers`` of bones' records of a ``length``, on a GPU four at a time."""
-    return f"""{_INFLUENCES}
+    return f"""{READ}
 wp::vec_t<{length}, wp::float32> sum;
 const auto* const own = &wp::index(record, e, 0);
 #pragma unroll
 for (int n = 0; n < 4; ++n) {{
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
-    const auto& bone = own[bones[n]];
+    const auto& bone = own[joint(n)];
 #if defined(__CUDA_ARCH__)
 #pragma unroll
     for (int c = 0; c < {numbers}; c += 4) {{
@@ -155,23 +142,19 @@ return sum;
 
 
 @wp.func_native(_blend(8, 6))
-def blend_changes(
-    record: wp.array2d(dtype=vec8), e: int, joint: wp.array(dtype=wp.vec4i), weight: wp.array(dtype=wp.vec4), p: int
-) -> vec8:
+def blend_changes(record: wp.array2d(dtype=vec8), e: int, skin: wp.array(dtype=wp.vec4), p: int) -> vec8:
     """``sum_n weight_n record[e, joint_n]`` of particle ``p``: a rigid motion of each bone."""
     ...
 
 
 @wp.func_native(_blend(12, 12))
-def blend_steps(
-    record: wp.array2d(dtype=vec12), e: int, joint: wp.array(dtype=wp.vec4i), weight: wp.array(dtype=wp.vec4), p: int
-) -> vec12:
+def blend_steps(record: wp.array2d(dtype=vec12), e: int, skin: wp.array(dtype=wp.vec4), p: int) -> vec12:
     """:func:`blend_changes` of twelve numbers: two rigid motions of each bone."""
     ...
 
 
 @wp.func_native(
-    _INFLUENCES
+    READ
     + """
 wp::vec3 sum;
 const auto* const own = &wp::index(place, e, 0);
@@ -179,7 +162,7 @@ const auto* const own = &wp::index(place, e, 0);
 for (int n = 0; n < 4; ++n) {
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
-    const auto& bone = own[bones[n]];
+    const auto& bone = own[joint(n)];
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
 #if defined(__CUDA_ARCH__)
@@ -197,8 +180,7 @@ return sum;
 def blend_places(
     place: wp.array2d(dtype=wp.mat44),
     e: int,
-    joint: wp.array(dtype=wp.vec4i),
-    weight: wp.array(dtype=wp.vec4),
+    skin: wp.array(dtype=wp.vec4),
     p: int,
     rest: wp.vec3,
 ) -> wp.vec3:
@@ -207,7 +189,7 @@ def blend_places(
 
 
 @wp.func_native(
-    _INFLUENCES
+    READ
     + """
 wp::vec_t<12, wp::float32> sum;
 const auto* const places = &wp::index(place, e, 0);
@@ -216,8 +198,8 @@ const auto* const motions = &wp::index(motion, e, 0);
 for (int n = 0; n < 4; ++n) {
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
-    const auto& bone = places[bones[n]];
-    const auto& own = motions[bones[n]];
+    const auto& bone = places[joint(n)];
+    const auto& own = motions[joint(n)];
     wp::float32 image[3];
 #if defined(__CUDA_ARCH__)
 #pragma unroll
@@ -251,8 +233,7 @@ def blend_images(
     place: wp.array2d(dtype=wp.mat44),
     motion: wp.array2d(dtype=vec8),
     e: int,
-    joint: wp.array(dtype=wp.vec4i),
-    weight: wp.array(dtype=wp.vec4),
+    skin: wp.array(dtype=wp.vec4),
     p: int,
     rest: wp.vec3,
     center: wp.vec3,
@@ -268,7 +249,7 @@ def blend_images(
 def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int):
     """Where linear blend skinning has a particle [m]; ``place`` takes bones from rest to where they are."""
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-    return blend_places(place, e, body.joint, body.weight, p, rest)
+    return blend_places(place, e, body.skin, p, rest)
 
 
 @wp.func

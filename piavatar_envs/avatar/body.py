@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.influences import in_order, pack
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.types import Body
 
@@ -47,21 +48,16 @@ class BodyPoints:
         return self.rest.shape[1]
 
 
-def normal_weights(points: BodyPoints) -> np.ndarray:
-    """Skinning weights that sum to one in single precision, so that fields blended over bones keep momentum."""
-    return points.skin_weights / points.skin_weights.sum(1)[:, None]
-
-
 def bone_lists(points: BodyPoints, part: int) -> dict[str, np.ndarray]:
     """Chunked lists of the particles that each bone moves, as :class:`Body` has them.
 
     The particles of a chunk are in one of the parts that the body has, of ``part`` particles each.
     """
-    skin_weights = normal_weights(points)
+    skin_joints, skin_weights = in_order(points.skin_joints, points.skin_weights)
     chunk_start, chunk_bone, entry_start, entries, weights = [0], [], [0], [], []
     chunk = max(CHUNK, 32 * -(-np.count_nonzero(skin_weights > 0.0) // (32 * MOST_CHUNKS)))
     for bone in range(NUM_JOINTS):
-        point, slot = np.nonzero((points.skin_joints == bone) & (skin_weights > 0.0))
+        point, slot = np.nonzero((skin_joints == bone) & (skin_weights > 0.0))
         borders = np.searchsorted(point, np.arange(0, points.num_points, part))
         for first, last in zip(borders, [*borders[1:], len(point)], strict=True):
             for begin in range(first, last, chunk):
@@ -117,14 +113,14 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     bone_mass, center = bone_masses(points)
 
     def upload(value, dtype):
-        scalar = np.int32 if dtype in (int, wp.vec4i) else np.float32
+        scalar = np.int32 if dtype is int else np.float32
         return wp.array(np.ascontiguousarray(value, scalar), dtype=dtype, device=device)
 
     body = Body()
     body.first, body.count = first, points.num_points
     body.rest = upload(points.rest, wp.vec3)
-    body.joint = upload(points.skin_joints, wp.vec4i)
-    body.weight = upload(normal_weights(points), wp.vec4)
+    joints, weights = in_order(points.skin_joints, points.skin_weights)
+    body.skin = upload(pack(joints, weights), wp.vec4)
     body.inert = upload(points.inert, float)
     body.rest_joint = upload(points.joints, wp.vec3)
     body.rest_center = upload(center, wp.vec3)

@@ -72,7 +72,7 @@ def drive_particle(
     """
     inert = number_at(body.inert, row(e, body.inert.shape[0]), p)
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-    s = blend_records(record, e, body.joint, body.weight, p, rest)
+    s = blend_records(record, e, body.skin, p, rest)
     displacement = at - blended_vector(s, AT_PLACE)
     turn = blended_turn(s)
     k = blended_vector(s, AT_STEP) + turn * displacement
@@ -211,7 +211,7 @@ def apply_correction(
     ``at`` is where the particle is, ``before`` its velocity with the pull. Where the body is ``free``, the rigid part
     of its commanded motion comes off.
     """
-    field = motion_at(blend_changes(change, e, body.joint, body.weight, p), at - center)
+    field = motion_at(blend_changes(change, e, body.skin, p), at - center)
     store_vector(u, e, body.first + p, before + field, True)
     if free:
         v = vector_at(driven.vk, e, body.first + p) - removed.velocity[e]

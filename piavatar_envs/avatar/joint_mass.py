@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.body import BodyPoints, normal_weights
+from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.cholesky import factor_size, find_pattern
+from piavatar_envs.avatar.influences import in_order
 from piavatar_envs.avatar.lanes import warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF, filled_entries
 from piavatar_envs.avatar.mass_pairs import build_pairs, sum_pairs
@@ -41,8 +42,9 @@ def grid_inertia(points: BodyPoints, dx: float) -> np.ndarray:
     joint gives. Heavier joints neither: they take over from flesh that is pulled to bones, too, and something of that
     would be missing (a knee that bears 22 N m would give 1 more).
     """
-    shares = normal_weights(points) * points.mass[0][:, None]
-    mass = np.bincount(points.skin_joints.ravel(), shares.ravel(), minlength=NUM_JOINTS)
+    joints, weights = in_order(points.skin_joints, points.skin_weights)
+    shares = weights * points.mass[0][:, None]
+    mass = np.bincount(joints.ravel(), shares.ravel(), minlength=NUM_JOINTS)
     known = np.array([GRID_SHARES.get(name.split("_")[-1], 0.0) for name in JOINT_NAMES])
     return known * 0.5 * dx**2 * mass
 

@@ -155,7 +155,7 @@ def take_over(
         following = vector_at(x, e, n)
         following_u = vector_at(u, e, n)
         following_apart = vector_at(driven.vk, e, n)
-        s = blend_steps(steps, e, body.joint, body.weight, p)
+        s = blend_steps(steps, e, body.skin, p)
         whole = before + blended_motion(s, arm)
         spin = wp.vec3(s[9], s[10], s[11])
         vk = wp.vec3(s[6], s[7], s[8]) + wp.cross(spin, arm)

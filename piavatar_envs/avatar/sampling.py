@@ -112,7 +112,7 @@ def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rin
     volumes = _volumes(positions, bone, interior, mesh_volume(asset.vertices, asset.faces))
     depth = np.maximum(-distance, 0.0)
     small = len(positions) <= SMALL_BODY
-    order = order_by_bones(skin_joints, skin_weights) if small else order_in_boxes(positions)
+    order = order_by_bones(bone, skin_joints, skin_weights) if small else order_in_boxes(positions)
     links = np.argsort(order).astype(np.int32)[links]
     first = (positions, volumes, skin_joints, skin_weights, bone)
     rest = (anchors, coordinates, shell, depth)
@@ -233,13 +233,15 @@ def order_along_curve(positions: np.ndarray, spacing: float) -> np.ndarray:
     return np.argsort(code, kind="stable")
 
 
-def order_by_bones(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
-    """Order ``(P,)`` in which particles of one bone come first, then those of two, and so on; else it stays.
+def order_by_bones(bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
+    """Order ``(P,)`` in which bones' own particles come first, then those that one bone moves, two, and so on.
 
-    Threads that work together then blend as many bones, and mostly the same: one that blends four makes 31 others wait.
-    Neighbours of large bodies are alike anyway, see :func:`order_in_boxes`.
+    Of as many bones those of the same ones follow each other, as they did. Threads that work together then blend as
+    many bones, and mostly the same: one that blends four makes 31 others wait. Neighbours of large bodies are alike
+    anyway, see :func:`order_in_boxes`.
     """
-    return np.lexsort((skin_joints[:, 0], (skin_weights > 0.0).sum(axis=1)))
+    moves = np.sort(np.where(skin_weights > 0.0, skin_joints, NUM_JOINTS), axis=1)
+    return np.lexsort((*moves.T[::-1], (skin_weights > 0.0).sum(axis=1), bone < 0))
 
 
 def order_in_boxes(positions: np.ndarray) -> np.ndarray:

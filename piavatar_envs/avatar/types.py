@@ -34,8 +34,7 @@ class Body:
     first: int
     count: int
     rest: wp.array2d(dtype=wp.vec3)  # (rows, count) rest positions [m]
-    joint: wp.array(dtype=wp.vec4i)  # (count,) bones that move a particle
-    weight: wp.array(dtype=wp.vec4)  # (count,) skinning weights, descending, sum one
+    skin: wp.array(dtype=wp.vec4)  # (count,) bones that move a particle, see piavatar_envs.avatar.influences
     inert: wp.array2d(dtype=float)  # (rows, count) share of a change of commanded motion that a particle misses
     rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]

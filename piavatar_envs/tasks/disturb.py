@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.influences import bones_of, weights_of
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.envs.draws import STREAM_DISTURBANCE, generator
 from piavatar_envs.mpm.types import row
@@ -72,10 +73,12 @@ def apply_impulse(
     if failure[e] != 0:
         return
     b = struck[e]
+    bones = bones_of(body.skin, p)
+    weights = weights_of(body.skin, p)
     share = float(0.0)
     for n in range(4):
-        if body.joint[p][n] == b:
-            share += body.weight[p][n]
+        if bones[n] == b:
+            share += weights[n]
     if share > 0.0:
         mass = body.bone_mass[row(e, body.bone_mass.shape[0]), b]
         u[e, body.first + p] = u[e, body.first + p] + (share / mass) * impulse[e]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from piavatar_envs.avatar.influences import bones_of, weights_of
 from piavatar_envs.avatar.kinematics import pose_body
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
@@ -80,8 +81,8 @@ def find_lowest(
     if not mask[e]:
         return
     rest = body.rest[row(e, body.rest.shape[0]), p]
-    joint = body.joint[p]
-    weight = body.weight[p]
+    joint = bones_of(body.skin, p)
+    weight = weights_of(body.skin, p)
     height = float(0.0)
     for n in range(4):
         if weight[n] > 0.0:

@@ -83,8 +83,8 @@ def test_a_rigid_velocity_is_recovered_exactly(noisy, device):
     (c, V, W), body = run_fit(noisy)
     np.testing.assert_allclose(body[2], spin, atol=1e-5)
     np.testing.assert_allclose(body[1], velocity, atol=1e-5)
-    # a GPU contracts products and sums: thin bones lose another digit
-    np.testing.assert_allclose(W, np.broadcast_to(spin, W.shape), atol=1e-4 if device == "cpu" else 5e-4)
+    # thin bones lose digits, how many hangs on the order of their particles; a GPU contracts products and sums, too
+    np.testing.assert_allclose(W, np.broadcast_to(spin, W.shape), atol=2e-4 if device == "cpu" else 5e-4)
     np.testing.assert_allclose(V, velocity + np.cross(spin, c - body[0]), atol=1e-5)
 
 

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 from piavatar_envs.avatar.blending import blend_changes, blend_places, blend_records, blend_steps, store_record
+from piavatar_envs.avatar.influences import in_order, pack
 from piavatar_envs.avatar.lanes import (
     chunk_threads,
     store_sum12,
@@ -66,8 +67,7 @@ def blend(
     change: wp.array2d(dtype=vec8),
     step: wp.array2d(dtype=vec12),
     place: wp.array2d(dtype=wp.mat44),
-    joint: wp.array(dtype=wp.vec4i),
-    weight: wp.array(dtype=wp.vec4),
+    skin: wp.array(dtype=wp.vec4),
     rest: wp.array(dtype=wp.vec3),
     out: wp.array2d(dtype=vec24),
     out_change: wp.array2d(dtype=vec8),
@@ -75,10 +75,10 @@ def blend(
     out_place: wp.array2d(dtype=wp.vec3),
 ):
     e, p = wp.tid()
-    out[e, p] = blend_records(record, e, joint, weight, p, rest[p])
-    out_change[e, p] = blend_changes(change, e, joint, weight, p)
-    out_step[e, p] = blend_steps(step, e, joint, weight, p)
-    out_place[e, p] = blend_places(place, e, joint, weight, p, rest[p])
+    out[e, p] = blend_records(record, e, skin, p, rest[p])
+    out_change[e, p] = blend_changes(change, e, skin, p)
+    out_step[e, p] = blend_steps(step, e, skin, p)
+    out_place[e, p] = blend_places(place, e, skin, p, rest[p])
 
 
 @pytest.mark.parametrize("threads", [1, 2, 8, 32])
@@ -128,9 +128,7 @@ def test_particles_blend_the_records_of_their_bones(device):
     steps = rng.normal(size=(ROWS, BONES, 12)).astype(np.float32)
     place = rng.normal(size=(ROWS, BONES, 4, 4)).astype(np.float32)
     joint = rng.integers(0, BONES, size=(POINTS, 4)).astype(np.int32)
-    weight = np.sort(rng.random((POINTS, 4)).astype(np.float32))[:, ::-1] * (
-        np.arange(4) <= rng.integers(0, 4, (POINTS, 1))
-    )
+    joint, weight = in_order(joint, rng.random((POINTS, 4)) * (np.arange(4) <= rng.integers(0, 4, (POINTS, 1))))
     rest = rng.normal(size=(POINTS, 3)).astype(np.float32)
 
     def upload(value, dtype):
@@ -142,7 +140,7 @@ def test_particles_blend_the_records_of_their_bones(device):
     out_place = wp.zeros((ROWS, POINTS), dtype=wp.vec3, device=device)
     stored = wp.zeros((ROWS, BONES), dtype=vec44, device=device)
     wp.launch(copy_records, (ROWS, BONES), [upload(record, vec44)], [stored], device=device)
-    skin = [upload(joint, wp.vec4i), upload(weight.astype(np.float32), wp.vec4), upload(rest, wp.vec3)]
+    skin = [upload(pack(joint, weight), wp.vec4), upload(rest, wp.vec3)]
     inputs = [stored, upload(change, vec8), upload(steps, vec12), upload(place, wp.mat44), *skin]
     wp.launch(blend, (ROWS, POINTS), inputs, [out, out_change, out_step, out_place], device=device)
     of = record[:, joint].astype(float)  # (ROWS, POINTS, 4, 44)
