@@ -147,7 +147,7 @@ class ArticulatedBody:
             velocity=zeros((n, NUM_DOF), float),
             outside=zeros((n, NUM_DOF), float),
             torque=zeros(bones, wp.vec3),
-            slip=zeros((n, points.num_points if chosen.size else 1), wp.vec3),
+            slip=zeros((n, 1 + chosen.max(initial=0)), wp.vec3),
         )
         self.pose = group(Pose, rotation=self.state.rotation, position=self.state.position)
         target = {"rotation": zeros(bones, wp.quat), "root": zeros(n, wp.vec3)}

@@ -57,9 +57,10 @@ def attach_flesh(
     """Hand back, and pull every particle to its place on the bones, implicit in time and critically damped.
 
     What a new pose has changed of ``J qdot`` goes to the physical velocity; what the bones move a particle by besides,
-    :func:`piavatar_envs.avatar.joint_motion.motion_apart`, stays in ``vk``, as it is now. ``rate`` is the pull's [1/s];
-    one of 0 leaves a velocity exactly as it is. Of what the pull has taken of the velocity, and of what it leaves, the
-    bones get the moments, and if ``fit`` is not 0 also of the way to the particles' places.
+    :func:`piavatar_envs.avatar.joint_motion.motion_apart`, stays in ``vk``, as it is now, but where a bone is alone,
+    which has none of it. ``rate`` is the pull's [1/s]; one of 0 leaves a velocity exactly as it is. Of what the pull
+    has taken of the velocity, and of what it leaves, the bones get the moments, and if ``fit`` is not 0 also of the way
+    to the particles' places.
 
     Over ``(num_envs, parts, PART_BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
     """
@@ -86,10 +87,12 @@ def attach_flesh(
         following = vector_at(x, e, n)
         following_v = vector_at(u, e, n) + vector_at(vk, e, n)
         now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, e, p, w), pelvis)
-        apart = motion_apart(now)
+        apart = wp.vec3()
+        if p >= body.alone:
+            apart = motion_apart(now)
+            vk[e, body.first + p] = apart
         before = v - blended_motion(now, place - pelvis) - apart
         way = wp.vec3(now[6], now[7], now[8]) + pelvis - place
-        vk[e, body.first + p] = apart
         after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
         m = number_at(mass, r, body.first + p)
         bring_particle(room, parts.size, p - first, m, place, before - after, after, way)

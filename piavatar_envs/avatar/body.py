@@ -121,6 +121,8 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.rest = upload(points.rest, wp.vec3)
     joints, weights = in_order(points.skin_joints, points.skin_weights)
     body.skin = upload(pack(joints, weights), wp.vec4)
+    several = weights[:, 1] > 0.0
+    body.alone = int(several.argmax()) if several.any() else points.num_points
     body.inert = upload(points.inert, float)
     body.rest_joint = upload(points.joints, wp.vec3)
     body.rest_center = upload(center, wp.vec3)

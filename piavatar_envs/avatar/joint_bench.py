@@ -49,7 +49,7 @@ class JointBench:
     moving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion of the joints
     # (num_envs, bones) what the physical velocity lacks of the whole one, and the joints' motion half-way
     steps: wp.array2d(dtype=vec12)
-    slip: wp.array2d(dtype=wp.vec3)  # (num_envs, P) as in JointState
+    slip: wp.array2d(dtype=wp.vec3)  # as in JointState
     pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) where its joint begins the substep [m]
 
 

@@ -113,6 +113,15 @@ def blended_motion(b: vec12, arm: wp.vec3):
     return wp.vec3(b[0], b[1], b[2]) + wp.cross(wp.vec3(b[3], b[4], b[5]), arm)
 
 
+@wp.func
+def kept_apart(body: Body, vk: wp.array2d(dtype=wp.vec3), e: int, n: int):
+    """What ``vk`` keeps of :func:`motion_apart` for particle ``n`` of the world [m/s]; none where a bone is alone."""
+    apart = wp.vec3()
+    if n >= body.first + body.alone:
+        apart = vector_at(vk, e, n)
+    return apart
+
+
 @wp.kernel(launch_bounds=(BLOCK, 10))
 def take_over(
     body: Body,
@@ -146,7 +155,7 @@ def take_over(
     n = body.first + wp.min(p, last)
     following = vector_at(x, e, n)
     following_u = vector_at(u, e, n)
-    following_apart = vector_at(driven.vk, e, n)
+    following_apart = kept_apart(body, driven.vk, e, n)
     while p < body.count:
         arm = following - center
         before = following_u
@@ -154,7 +163,7 @@ def take_over(
         n = body.first + wp.min(p + threads, last)
         following = vector_at(x, e, n)
         following_u = vector_at(u, e, n)
-        following_apart = vector_at(driven.vk, e, n)
+        following_apart = kept_apart(body, driven.vk, e, n)
         s = blend_steps(steps, e, body.skin, p)
         whole = before + blended_motion(s, arm)
         spin = wp.vec3(s[9], s[10], s[11])

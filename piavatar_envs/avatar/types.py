@@ -35,6 +35,7 @@ class Body:
     count: int
     rest: wp.array2d(dtype=wp.vec3)  # (rows, count) rest positions [m]
     skin: wp.array(dtype=wp.vec4)  # (count,) bones that move a particle, see piavatar_envs.avatar.influences
+    alone: int  # the first so many particles are moved by one bone each
     inert: wp.array2d(dtype=float)  # (rows, count) share of a change of commanded motion that a particle misses
     rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
@@ -213,7 +214,8 @@ class JointState:
     outside: wp.array  # (num_envs, 69) how all but the joints themselves changed it in the last substep
     # (num_envs, bones) torques, of the reference adult, about the rest pose's axes as the parent has turned them [N m]
     torque: wp.array
-    # (num_envs, P) by how much firm particles have been put back, in the frame of the rest pose [m]; or one entry
+    # (num_envs, up to the last firm one) by how much firm particles have been put back, in the frame of the rest pose
+    # [m]; at least one entry
     slip: wp.array
 
 
