@@ -186,7 +186,6 @@ class ArticulatedBody:
             stop=zeros(float, n, NUM_JOINTS),
             moments=zeros(vec16, n, chunks),
             other_moments=zeros(vec12, n, chunks),
-            ways=zeros(vec12, n, chunks),
             bones=zeros(vec16, n, NUM_JOINTS),
             linear=zeros(wp.vec3, 2 * n, NUM_JOINTS),
             angular=zeros(wp.vec3, 2 * n, NUM_JOINTS),
@@ -258,7 +257,7 @@ class ArticulatedBody:
         model, w, fit = self.model, self._bench, self.mass.is_due(step)
         if step == 0:
             self.record_pose(program, state)
-        self._record_pull(program, state, fit)
+        self._record_pull(program, state)
         if fit:
             self._record_mass(program, state)
         inputs = [self.body, model.step.dt, 1.0 / model.control_dt, FIT_SHARE if fit else 0.0]
@@ -267,11 +266,11 @@ class ArticulatedBody:
         inputs = [self.body, model.step.dt, state.x, w.pelvis, w.steps, state.failure]
         program.launch(take_over, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
 
-    def _record_pull(self, program: Program, state: State, fit: bool) -> None:
+    def _record_pull(self, program: Program, state: State) -> None:
         """Append the pass over particles that pulls them to the bones, and sums what joints are to take over."""
         block = PART_BLOCK if self.threads > 1 else 1
         dim = (self.model.num_envs, self._parts.start.shape[0] - 1, block)
-        inputs = [self.body, self._parts, self.model.step.dt, int(fit), self.model.particles.mass]
+        inputs = [self.body, self._parts, self.model.step.dt, self.model.particles.mass]
         inputs += [state.x, self.attachment, state.failure, self._scratch]
         program.launch(attach_flesh, dim, inputs, [state.u, state.vk, self._bench], block_dim=PART_BLOCK)
 

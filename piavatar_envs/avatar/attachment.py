@@ -16,8 +16,7 @@ from piavatar_envs.avatar.part_sums import (
     place_in_parts,
     room_of_particles,
     store_second,
-    sum_both,
-    sum_way,
+    sum_chunk,
 )
 from piavatar_envs.avatar.pulls import implicit_velocity
 from piavatar_envs.avatar.types import Body
@@ -43,7 +42,6 @@ def attach_flesh(
     body: Body,
     parts: Parts,
     dt: float,
-    fit: int,
     mass: wp.array2d(dtype=float),
     x: wp.array2d(dtype=wp.vec3),
     rate: wp.array2d(dtype=float),
@@ -59,8 +57,7 @@ def attach_flesh(
     What a new pose has changed of ``J qdot`` goes to the physical velocity; what the bones move a particle by besides,
     :func:`piavatar_envs.avatar.joint_motion.motion_apart`, stays in ``vk``, as it is now, but where a bone is alone,
     which has none of it. ``rate`` is the pull's [1/s]; one of 0 leaves a velocity exactly as it is. Of what the pull
-    has taken of the velocity, and of what it leaves, the bones get the moments, and if ``fit`` is not 0 also of the way
-    to the particles' places.
+    has taken of the velocity, of what it leaves, and of the way to the particles' places, the bones get the moments.
 
     Over ``(num_envs, parts, PART_BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
     """
@@ -106,9 +103,7 @@ def attach_flesh(
     while n < end:
         c = int_at(parts.chunk, n)
         origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c))
-        sum_both(body, parts, room, origin, e, c, lane[0], lane[1], w.moments, w.other_moments)
-        if fit != 0:
-            sum_way(body, parts, room, origin, e, c, lane[0], lane[1], w.ways)
+        sum_chunk(body, parts, room, origin, e, c, lane[0], lane[1], w.moments, w.other_moments)
         n += warp[1]
 
 

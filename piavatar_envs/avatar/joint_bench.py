@@ -33,8 +33,8 @@ class JointBench:
     stop: wp.array2d(dtype=float)  # (num_envs, bones) stiffness beyond the range [N m/rad]
     # what particles have
     moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)
+    # (num_envs, chunks) momenta of what the pull leaves, and of the ways to the particles' places, as velocities
     other_moments: wp.array2d(dtype=vec12)
-    ways: wp.array2d(dtype=vec12)  # (num_envs, chunks) momenta of the ways to the particles' places, as velocities
     bones: wp.array2d(dtype=vec16)  # (num_envs, bones)
     linear: wp.array2d(dtype=wp.vec3)  # (2 num_envs, bones)
     angular: wp.array2d(dtype=wp.vec3)

@@ -13,6 +13,9 @@ from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
+#: Where the momenta of what the pull leaves begin in :attr:`JointBench.other_moments`, and those of the ways.
+LEFT, WAY = wp.constant(0), wp.constant(6)
+
 
 @wp.func
 def gather_bones(
@@ -42,6 +45,7 @@ def gather_bones(
 def gather_other(
     body: Body,
     moments: wp.array2d(dtype=vec12),
+    first: int,
     e: int,
     row: int,
     thread: int,
@@ -50,11 +54,11 @@ def gather_other(
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
 ):
-    """The two momenta of a velocity, in row ``row``, from :mod:`piavatar_envs.avatar.part_sums`."""
+    """The two momenta of one of the velocities that the sums have, in row ``row``."""
     for b in range(thread, BONES, threads):
         t = add_rows12(moments, e, body.chunk_start[b], body.chunk_start[b + 1])
-        linear[row, b] = wp.vec3(t[0], t[1], t[2])
-        angular[row, b] = wp.vec3(t[3], t[4], t[5])
+        linear[row, b] = wp.vec3(t[first], t[first + 1], t[first + 2])
+        angular[row, b] = wp.vec3(t[first + 3], t[first + 4], t[first + 5])
 
 
 @wp.func

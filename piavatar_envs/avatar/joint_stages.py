@@ -28,7 +28,7 @@ from piavatar_envs.avatar.joint_bench import (
     room_of_warp,
     row_in_room,
 )
-from piavatar_envs.avatar.joint_momentum import balance, gather_bones, gather_other, pass_down
+from piavatar_envs.avatar.joint_momentum import LEFT, WAY, balance, gather_bones, gather_other, pass_down
 from piavatar_envs.avatar.joint_motion import add_change, go_on, move_joints, part_of, spread_motion
 from piavatar_envs.avatar.joint_torques import (
     Springs,
@@ -100,7 +100,7 @@ def fit_pose(body: Body, share: float, own: int, e: int, thread: int, threads: i
     The ways are those of the beginning of the substep, as are the momenta, about the joints as they were then: on the
     way from there to here particles have gone on with the joints, and so the momenta are about these as they are now.
     """
-    gather_other(body, w.ways, e, own, thread, threads, w.linear, w.angular)
+    gather_other(body, w.other_moments, WAY, e, own, thread, threads, w.linear, w.angular)
     pass_down(body, w.pose.position, e, 1, own, own, thread, threads, w.linear, w.angular, w.momentum)
     fetch_factor(w.factors, e, threads, room)
     solve(w.pattern, w.factors, e, w.momentum, own, own, thread, threads, room, w.shares)
@@ -247,7 +247,7 @@ def act(
     taken = row_in_room(n + e, 1)
     near = enter_room(w, e)
     gather_bones(body, w.moments, e, own, thread, threads, near.bones, near.linear, near.angular)
-    gather_other(body, w.other_moments, e, taken, thread, threads, near.linear, near.angular)
+    gather_other(body, w.other_moments, LEFT, e, taken, thread, threads, near.linear, near.angular)
     find_shares(body, own, taken, e, thread, threads, room, near)
     pull_bones(body, own, e, thread, threads, near)
     add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)

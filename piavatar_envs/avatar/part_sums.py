@@ -12,7 +12,6 @@ import warp as wp
 
 from piavatar_envs.avatar.body import BodyPoints, bone_lists
 from piavatar_envs.avatar.bone_sums import moments_of
-from piavatar_envs.avatar.lanes import store_sum12
 from piavatar_envs.avatar.loads import int_at
 from piavatar_envs.avatar.types import Body, vec12, vec16
 
@@ -163,7 +162,7 @@ def weight_of(entry: wp.vec2i) -> float:
 
 
 @wp.func
-def sum_both(
+def sum_chunk(
     body: Body,
     parts: Parts,
     room: wp.uint64,
@@ -178,11 +177,14 @@ def sum_both(
 ):
     """Moments about ``origin`` of one chunk of the part in the room, with the first vector as velocity.
 
-    Of the second one momentum and angular momentum, six of twelve numbers.
+    Of the second one, and of the way, momentum and angular momentum. A loop of its own for the way, which not every
+    substep asks for, would read all particles again.
     """
     total = vec16()
     P = wp.vec3()
     L = wp.vec3()
+    way_P = wp.vec3()
+    way_L = wp.vec3()
     n = int_at(body.entry_start, c) + thread
     last = int_at(body.entry_start, c + 1)
     while n < last:
@@ -194,56 +196,33 @@ def sum_both(
         momentum = w * wp.vec3(s[8], s[9], s[10])
         P += momentum
         L += wp.cross(d, momentum)
+        momentum = w * wp.vec3(s[3], s[7], s[11])
+        way_P += momentum
+        way_L += wp.cross(d, momentum)
         n += threads
-    store_both(moments, other_moments, e, c, total, P, L, threads)
+    # fmt: off
+    other = vec12(
+        P[0], P[1], P[2], L[0], L[1], L[2],
+        way_P[0], way_P[1], way_P[2], way_L[0], way_L[1], way_L[2],
+    )
+    # fmt: on
+    store_both(moments, other_moments, e, c, total, other, threads)
 
 
-@wp.func
-def sum_way(
-    body: Body,
-    parts: Parts,
-    room: wp.uint64,
-    origin: wp.vec3,
-    e: int,
-    c: int,
-    thread: int,
-    threads: int,
-    # out
-    momenta: wp.array2d(dtype=vec12),
-):
-    """Momentum and angular momentum of one chunk with the way as velocity; otherwise as :func:`sum_both`.
-
-    A loop of its own: in one with the other sums a thread would need so many registers that fewer threads fit.
-    """
-    P = wp.vec3()
-    L = wp.vec3()
-    n = int_at(body.entry_start, c) + thread
-    last = int_at(body.entry_start, c + 1)
-    while n < last:
-        entry = entry_at(parts.entry, n)
-        s = particle_brought(room, entry[0])
-        momentum = (weight_of(entry) * mass_brought(room, parts.size, entry[0])) * wp.vec3(s[3], s[7], s[11])
-        P += momentum
-        L += wp.cross(wp.vec3(s[0], s[1], s[2]) - origin, momentum)
-        n += threads
-    value = vec12(P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    store_sum12(momenta, e, c, value, threads)
-
-
-# As piavatar_envs.avatar.lanes has it for sixteen numbers; here are 22, of which a lane stores one.
+# As piavatar_envs.avatar.lanes has it for sixteen numbers; here are 28, of which a lane stores one.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 if (threads == 32) {
-    constexpr int WORDS = 22;
+    constexpr int WORDS = 28;
     const int lane = threadIdx.x & 31;
     float part[WORDS];
 #pragma unroll
-    for (int k = 0; k < WORDS; ++k) part[k] = k < 16 ? value[k] : k < 19 ? P[k - 16] : L[k - 19];
+    for (int k = 0; k < WORDS; ++k) part[k] = k < 16 ? value[k] : other[k - 16];
 #define HALVE(half)                                                                               \\
     _Pragma("unroll") for (int k = 0; k < half; ++k) {                                            \\
         const bool upper = lane & half, pair = k + half < WORDS;                                  \\
-        const float other = part[pair ? k + half : k], away = pair && !upper ? other : part[k];   \\
-        part[k] = (pair && upper ? other : part[k]) + __shfl_xor_sync(0xffffffffu, away, half);   \\
+        const float far = part[pair ? k + half : k], away = pair && !upper ? far : part[k];       \\
+        part[k] = (pair && upper ? far : part[k]) + __shfl_xor_sync(0xffffffffu, away, half);     \\
     }
     HALVE(16) HALVE(8) HALVE(4) HALVE(2) HALVE(1)
 #undef HALVE
@@ -253,7 +232,7 @@ if (threads == 32) {
 }
 #endif
 wp::index(into, e, c) = value;
-for (int k = 0; k < 3; ++k) wp::index(other_into, e, c)[k] = P[k], wp::index(other_into, e, c)[3 + k] = L[k];
+wp::index(other_into, e, c) = other;
 """)
 def store_both(
     into: wp.array2d(dtype=vec16),
@@ -261,9 +240,8 @@ def store_both(
     e: int,
     c: int,
     value: vec16,
-    P: wp.vec3,
-    L: wp.vec3,
+    other: vec12,
     threads: int,
 ):
-    """``into[e, c]`` = the sum of ``value`` over the threads of a warp, and six numbers of ``other_into[e, c]``."""
+    """``into[e, c]`` = the sum of ``value`` over the threads of a warp, and ``other_into[e, c]`` that of ``other``."""
     ...
