@@ -282,5 +282,6 @@ class ArticulatedBody:
         if self.firm.size == 0:
             return
         model, w = self.model, self._bench
-        inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, state.u, state.vk, state.failure]
+        inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, w.pose.position, state.u, state.vk]
+        inputs += [state.failure]
         program.launch(put_in_place, (model.num_envs, self.firm.size), inputs, [state.x, state.C, self.state.slip])

@@ -73,26 +73,22 @@ def attach_flesh(
     last = wp.min(first + parts.size, body.count)
     r = row(e, mass.shape[0])
     p = first + thread
-    pelvis = w.pose.position[e, 0]
-    n = body.first + wp.min(p, last - 1)
-    following = vector_at(x, e, n)
-    following_v = vector_at(u, e, n) + vector_at(vk, e, n)
+    pelvis = vector_at(w.pose.position, e, 0)
     while p < last:
-        place = following
-        v = following_v
-        n = body.first + wp.min(p + threads, last - 1)
-        following = vector_at(x, e, n)
-        following_v = vector_at(u, e, n) + vector_at(vk, e, n)
-        now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, e, p, w), pelvis)
+        n = body.first + p
+        arm = vector_at(x, e, n) - pelvis
+        v = vector_at(u, e, n) + vector_at(vk, e, n)
+        m = number_at(mass, r, n)  # asked for before anything is stored, which it would wait for
+        own_rate = number_at(rate, row(e, rate.shape[0]), p)
+        now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, e, p, w))
         apart = wp.vec3()
         if p >= body.alone:
             apart = motion_apart(now)
-            vk[e, body.first + p] = apart
-        before = v - blended_motion(now, place - pelvis) - apart
-        way = wp.vec3(now[6], now[7], now[8]) + pelvis - place
-        after = implicit_velocity(number_at(rate, row(e, rate.shape[0]), p), dt, way, before)
-        m = number_at(mass, r, body.first + p)
-        bring_particle(room, parts.size, p - first, m, place, before - after, after, way)
+            vk[e, n] = apart
+        before = v - blended_motion(now, arm) - apart
+        way = wp.vec3(now[6], now[7], now[8]) - arm
+        after = implicit_velocity(own_rate, dt, way, before)
+        bring_particle(room, parts.size, p - first, m, arm, before - after, after, way)
         p += threads
     meet()
     store_second(room, last - first, thread, threads, e, body.first + first, u)
@@ -102,7 +98,7 @@ def attach_flesh(
     end = int_at(parts.start, at[1] + 1)
     while n < end:
         c = int_at(parts.chunk, n)
-        origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c))
+        origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c)) - pelvis
         sum_chunk(body, parts, room, origin, e, c, lane[0], lane[1], w.moments, w.other_moments)
         n += warp[1]
 
@@ -123,6 +119,7 @@ def put_in_place(
     boundaries: Boundaries,
     firm: wp.array(dtype=int),
     place: wp.array2d(dtype=wp.mat44),
+    position: wp.array2d(dtype=wp.vec3),
     u: wp.array2d(dtype=wp.vec3),
     vk: wp.array2d(dtype=wp.vec3),
     failure: wp.array(dtype=int),
@@ -144,7 +141,7 @@ def put_in_place(
     q = body.first + p
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     home = blend_places(place, e, body.skin, p, rest)
-    at = keep_outside(boundaries, e, home)
+    at = keep_outside(boundaries, e, position[e, 0] + home)
     way = at - x[e, q]
     x[e, q] = at
     turned = wp.vec3()

@@ -118,12 +118,11 @@ def _blend(length: int, numbers: int) -> str:
     """A snippet that blends the first ``numbers`` of bones' records of a ``length``, on a GPU four at a time."""
     return f"""{READ}
 wp::vec_t<{length}, wp::float32> sum;
-const auto* const own = &wp::index(record, e, 0);
 #pragma unroll
 for (int n = 0; n < 4; ++n) {{
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
-    const auto& bone = own[joint(n)];
+    const auto& bone = record.data[record.shape[1] * e + joint(n)];
 #if defined(__CUDA_ARCH__)
 #pragma unroll
     for (int c = 0; c < {numbers}; c += 4) {{
@@ -157,12 +156,11 @@ def blend_steps(record: wp.array2d(dtype=vec12), e: int, skin: wp.array(dtype=wp
     READ
     + """
 wp::vec3 sum;
-const auto* const own = &wp::index(place, e, 0);
 #pragma unroll
 for (int n = 0; n < 4; ++n) {
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
-    const auto& bone = own[joint(n)];
+    const auto& bone = place.data[place.shape[1] * e + joint(n)];
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
 #if defined(__CUDA_ARCH__)
@@ -192,20 +190,18 @@ def blend_places(
     READ
     + """
 wp::vec_t<12, wp::float32> sum;
-const auto* const places = &wp::index(place, e, 0);
-const auto* const motions = &wp::index(motion, e, 0);
 #pragma unroll
 for (int n = 0; n < 4; ++n) {
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
-    const auto& bone = places[joint(n)];
-    const auto& own = motions[joint(n)];
+    const auto& bone = place.data[place.shape[1] * e + joint(n)];
+    const auto& own = motion.data[motion.shape[1] * e + joint(n)];
     wp::float32 image[3];
 #if defined(__CUDA_ARCH__)
 #pragma unroll
     for (int i = 0; i < 3; ++i) {
         const float4 row = reinterpret_cast<const float4*>(&bone)[i];
-        image[i] = row.x * rest[0] + row.y * rest[1] + row.z * rest[2] + row.w - center[i];
+        image[i] = row.x * rest[0] + row.y * rest[1] + row.z * rest[2] + row.w;
     }
     const float4* const from = reinterpret_cast<const float4*>(&own);
     const float4 a = from[0], b = from[1];
@@ -213,7 +209,7 @@ for (int n = 0; n < 4; ++n) {
 #else
     for (int i = 0; i < 3; ++i) {
         const auto& row = bone.data[i];
-        image[i] = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3] - center[i];
+        image[i] = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3];
     }
     const wp::float32 v[3] = {own[0], own[1], own[2]}, s[3] = {own[3], own[4], own[5]};
 #endif
@@ -236,11 +232,10 @@ def blend_images(
     skin: wp.array(dtype=wp.vec4),
     p: int,
     rest: wp.vec3,
-    center: wp.vec3,
 ) -> vec12:
-    """Of a motion :func:`blend_changes`; :func:`blend_places` less the ``center``; and what the bones' spins do there.
+    """Of a motion :func:`blend_changes`; :func:`blend_places`; and what the bones' spins do there.
 
-    Each bone's spin turns its own place of the particle about the centre.
+    Each bone's spin turns its own place of the particle about what places are seen from.
     """
     ...
 

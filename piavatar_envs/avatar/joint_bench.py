@@ -45,7 +45,7 @@ class JointBench:
     impulse: wp.array2d(dtype=float)
     left: wp.array2d(dtype=float)  # (num_envs, 69) diagonal without muscles that have reached their limits
     # what particles get
-    place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to where bones are
+    place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to where bones are, from the pelvis joint
     moving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion of the joints
     # (num_envs, bones) what the physical velocity lacks of the whole one, and the joints' motion half-way
     steps: wp.array2d(dtype=vec12)

@@ -11,7 +11,7 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import blend_steps
 from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, over_ancestors, threads_of_environment
-from piavatar_envs.avatar.loads import vector_at
+from piavatar_envs.avatar.loads import vector_at, vector_from
 from piavatar_envs.avatar.mass_matrix import BONES
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body, vec8, vec12
@@ -113,15 +113,6 @@ def blended_motion(b: vec12, arm: wp.vec3):
     return wp.vec3(b[0], b[1], b[2]) + wp.cross(wp.vec3(b[3], b[4], b[5]), arm)
 
 
-@wp.func
-def kept_apart(body: Body, vk: wp.array2d(dtype=wp.vec3), e: int, n: int):
-    """What ``vk`` keeps of :func:`motion_apart` for particle ``n`` of the world [m/s]; none where a bone is alone."""
-    apart = wp.vec3()
-    if n >= body.first + body.alone:
-        apart = vector_at(vk, e, n)
-    return apart
-
-
 @wp.kernel(launch_bounds=(BLOCK, 10))
 def take_over(
     body: Body,
@@ -140,7 +131,8 @@ def take_over(
     ``theta`` in a substep would be ``theta^2 / 2`` further from its axis, of which no stress knows: limbs would swell
     within seconds. The whole velocity is the physical one and what that lacks, the first of the bones' motions in
     ``steps``, about where the ``pelvis`` joint begins [m]; the second is that of the joints, about where it is
-    half-way. To that comes what ``vk`` has kept, see :func:`piavatar_envs.avatar.attachment.attach_flesh`.
+    half-way. To that comes what ``vk`` has kept where bones are not alone, see
+    :func:`piavatar_envs.avatar.attachment.attach_flesh`.
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -152,10 +144,11 @@ def take_over(
     center = pelvis[e]
     root = steps[e, 0]
     last = body.count - 1
+    together = body.first + body.alone
     n = body.first + wp.min(p, last)
     following = vector_at(x, e, n)
     following_u = vector_at(u, e, n)
-    following_apart = kept_apart(body, driven.vk, e, n)
+    following_apart = vector_from(driven.vk, together, e, n)
     while p < body.count:
         arm = following - center
         before = following_u
@@ -163,7 +156,7 @@ def take_over(
         n = body.first + wp.min(p + threads, last)
         following = vector_at(x, e, n)
         following_u = vector_at(u, e, n)
-        following_apart = kept_apart(body, driven.vk, e, n)
+        following_apart = vector_from(driven.vk, together, e, n)
         s = blend_steps(steps, e, body.skin, p)
         whole = before + blended_motion(s, arm)
         spin = wp.vec3(s[9], s[10], s[11])

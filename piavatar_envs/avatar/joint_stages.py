@@ -69,10 +69,11 @@ class Support:
 
 @wp.func
 def place_bones(body: Body, e: int, thread: int, threads: int, w: JointBench):
-    """Matrices that take the bones from rest to where they are."""
+    """Matrices that take the bones from rest to where they are, seen from the pelvis joint."""
     r = row(e, body.rest_joint.shape[0])
+    pelvis = w.pose.position[e, 0]
     for b in range(thread, BONES, threads):
-        w.place[e, b] = rigid_matrix(w.pose.rotation[e, b], body.rest_joint[r, b], w.pose.position[e, b])
+        w.place[e, b] = rigid_matrix(w.pose.rotation[e, b], body.rest_joint[r, b], w.pose.position[e, b] - pelvis)
 
 
 @wp.func

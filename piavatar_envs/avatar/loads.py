@@ -1,7 +1,8 @@
 """Reads of arrays whose rows are dense, as all of this package's are: their address is one multiplication.
 
 An array of Warp may have any strides and be indexed from its end, which costs ten instructions an address on a GPU:
-half of what a sum over scattered particles would do.
+half of what a sum over scattered particles would do. Rows of the same length have the same index then, too, where a
+loop over particles would keep an address for each of its arrays, more than it has registers for.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-_ROW = "reinterpret_cast<%s*>(reinterpret_cast<char*>(rows.data) + wp::int64(rows.strides[0]) * e)[p]"
+_ROW = "rows.data[rows.shape[1] * e + p]"
 
 
 @wp.func_native("return values.data[n];")
@@ -25,13 +26,19 @@ def float_at(values: wp.array(dtype=float), n: int) -> float:
     ...
 
 
-@wp.func_native(f"return {_ROW % 'wp::float32'};")
+@wp.func_native(f"return {_ROW};")
 def number_at(rows: wp.array2d(dtype=float), e: int, p: int) -> float:
     """``rows[e, p]``."""
     ...
 
 
-@wp.func_native(f"return {_ROW % 'wp::vec3'};")
+@wp.func_native(f"return {_ROW};")
 def vector_at(rows: wp.array2d(dtype=wp.vec3), e: int, p: int) -> wp.vec3:
     """``rows[e, p]``."""
+    ...
+
+
+@wp.func_native(f"wp::vec3 value;\nif (p >= first) value = {_ROW};\nreturn value;")
+def vector_from(rows: wp.array2d(dtype=wp.vec3), first: int, e: int, p: int) -> wp.vec3:
+    """``rows[e, p]``, or zero before ``first``: a branch of Warp's own would wait for what is asked for."""
     ...
