@@ -21,7 +21,7 @@ from piavatar_envs.avatar.warp_cholesky import (
     eliminate_together,
     factorize_together,
     load_factor,
-    solve_both_together,
+    solve_three_together,
     solve_together,
     store_factor,
 )
@@ -262,32 +262,33 @@ def solve(
     if threads == 1:
         solve_alone(pattern, factor, f, row, x)
     else:
-        solve_together(room, row, row, x)
+        solve_together(room, row, 0, x)
         meet_threads(threads)
 
 
 @wp.func
-def solve_both(
+def solve_in_place(
     pattern: Pattern,
     factor: wp.array2d(dtype=float),
     f: int,
-    right: wp.array2d(dtype=float),
     first: int,
-    second: int,
-    thread: int,
+    step: int,
+    rows: int,
     threads: int,
     room: wp.uint64,
-    # out
+    # in and out
     x: wp.array2d(dtype=float),
 ):
-    """:func:`solve` of rows ``first`` and ``second``, at once in a warp."""
-    copy_row(right, first, first, thread, threads, x)
-    copy_row(right, second, second, thread, threads, x)
+    """:func:`solve` of so many ``rows`` of right-hand sides in ``x``, the ``first`` and others ``step`` rows apart.
+
+    A warp solves three at once, whatever is in those that nobody asks for.
+    """
+    meet_threads(threads)
     if threads == 1:
-        solve_alone(pattern, factor, f, first, x)
-        solve_alone(pattern, factor, f, second, x)
+        for n in range(rows):
+            solve_alone(pattern, factor, f, first + n * step, x)
     else:
-        solve_both_together(room, first, second, x)
+        solve_three_together(room, first, step, x)
         meet_threads(threads)
 
 

@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class JointBench:
-    """What the joints work on in a substep; rows are environments', where there are two of a kind twice as many."""
+    """What the joints work on in a substep; rows are environments', where there are several of a kind times as many."""
 
     pose: Pose
     velocity: wp.array2d(dtype=float)  # (num_envs, 69) as in JointState
@@ -36,10 +36,10 @@ class JointBench:
     # (num_envs, chunks) momenta of what the pull leaves, and of the ways to the particles' places, as velocities
     other_moments: wp.array2d(dtype=vec12)
     bones: wp.array2d(dtype=vec16)  # (num_envs, bones)
-    linear: wp.array2d(dtype=wp.vec3)  # (2 num_envs, bones)
+    linear: wp.array2d(dtype=wp.vec3)  # (3 num_envs, bones)
     angular: wp.array2d(dtype=wp.vec3)
-    momentum: wp.array2d(dtype=float)  # (2 num_envs, 69)
-    shares: wp.array2d(dtype=float)  # (2 num_envs, 69) changes of the velocity: the joints' own, what is taken over
+    # (3 num_envs, 69) momenta, then changes of the velocity: the joints' own, what is taken over; and of the pose
+    shares: wp.array2d(dtype=float)
     # what the joints do
     muscle: wp.array2d(dtype=float)  # (num_envs, 69) impulses
     impulse: wp.array2d(dtype=float)
@@ -53,13 +53,13 @@ class JointBench:
     pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) where its joint begins the substep [m]
 
 
-# Words of shared memory of a warp: the factor's, whose spare ones have the bones' momenta until something is solved
-# with it; two shares (what they are solved from is momenta first), the bones' motion, and the pose.
+# Words of shared memory of a warp: the factor's, whose spare ones and some more have the bones' momenta until something
+# is solved with it; three shares, the bones' motion, and the pose.
 _ROWS, _VECTORS = wp.constant(MOST_ROWS), wp.constant(3 * NUM_JOINTS)
 _LINEAR = wp.constant(SPARE)
-_ANGULAR = wp.constant(int(_LINEAR) + 6 * NUM_JOINTS)
-_SHARES = wp.constant(ROOM)
-_MOVING = wp.constant(int(_SHARES) + 2 * MOST_ROWS)
+_ANGULAR = wp.constant(int(_LINEAR) + 3 * int(_VECTORS))
+_SHARES = wp.constant(max(ROOM, int(_ANGULAR) + 3 * int(_VECTORS)))
+_MOVING = wp.constant(int(_SHARES) + 3 * MOST_ROWS)
 _ROTATION = wp.constant(int(_MOVING) + 8 * NUM_JOINTS)
 _POSITION = wp.constant(int(_ROTATION) + 4 * NUM_JOINTS)
 _WORDS = -(-(int(_POSITION) + 3 * NUM_JOINTS) // 4) * 4
@@ -86,7 +86,7 @@ return row;
 #endif
 """)
 def row_in_room(row: int, there: int) -> int:
-    """Row ``there`` of what has two in a warp's room; on a CPU ``row``."""
+    """Row ``there`` of what has several in a warp's room; on a CPU ``row``."""
     ...
 
 
@@ -143,14 +143,13 @@ def bring_pose(w: JointBench, e: int, room: wp.uint64):
 def enter_room(w: JointBench, e: int):
     """The bench with pose, motion, momenta and shares of an environment in the room of its warp.
 
-    What has two rows has them as :func:`row_in_room` says; all else has one there, whatever the environment. On a CPU
-    it is the bench itself.
+    What has several rows has them as :func:`row_in_room` says; all else has one there, whatever the environment. On a
+    CPU it is the bench itself.
     """
     room = room_of_warp()
     bring_pose(w, e, room)
     w.linear = see_vectors(w.linear, room, _LINEAR, _VECTORS)
     w.angular = see_vectors(w.angular, room, _ANGULAR, _VECTORS)
-    w.momentum = see_numbers(w.momentum, room, _SHARES, _ROWS)
     w.shares = see_numbers(w.shares, room, _SHARES, _ROWS)
     w.moving = see_motions(w.moving, room, _MOVING, 0)
     w.pose.rotation = see_turns(w.pose.rotation, room, _ROTATION, 0)

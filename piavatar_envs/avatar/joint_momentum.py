@@ -85,7 +85,7 @@ def pass_down(
     e: int,
     velocities: int,
     own: int,
-    into: int,
+    step: int,
     thread: int,
     threads: int,
     # in and out
@@ -96,11 +96,10 @@ def pass_down(
 ):
     """``J^T m u`` from the momenta of the bones about their joints: each joint has what all beyond it have.
 
-    Of one velocity, in row ``own``, or of two, the second in row ``into``. A thread that is alone goes from bone to
-    bone, the lanes of a warp from level to level, a bone each.
+    Of so many velocities, the first in row ``own``, others ``step`` rows apart. A thread that is alone goes from bone
+    to bone, the lanes of a warp from level to level, a bone each.
     """
     meet_threads(threads)
-    step = into - own
     if threads == 1:
         for v in range(velocities):
             for back in range(BONES - 1):

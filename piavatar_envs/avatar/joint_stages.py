@@ -3,9 +3,9 @@
 On a GPU an environment has a CUDA block, so that nothing is launched for what one warp does in a few microseconds: four
 warps build the mass matrix, two a factor each; one does all else. On a CPU it is one thread.
 
-There are two of what particles do to the joints, flesh that is pulled and what the joints take over, and two factors of
-the mass matrix, with locked joints alone and with all that is implicit. Both of a kind are in one array: the first of
-all environments, then the second.
+There are three of what particles ask of the joints, for flesh that is pulled, for what the joints take over, and for
+how far flesh is from its places, and two factors of the mass matrix, with locked joints alone and with all that is
+implicit. Those of a kind are in one array: the first of all environments, then the second, then the third.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from piavatar_envs.avatar.cholesky import (
     fetch_factor,
     keep_factor,
     solve,
-    solve_both,
+    solve_in_place,
 )
 from piavatar_envs.avatar.joint_bench import (
     JointBench,
@@ -84,28 +84,26 @@ def begin(body: Body, e: int, thread: int, threads: int, w: JointBench):
 
 
 @wp.func
-def find_shares(body: Body, own: int, into: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench):
-    """The shares ``dq = M^-1 J^T m v`` that the joints can take of two velocities, from the bones' momenta.
+def find_shares(
+    body: Body, own: int, step: int, rows: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench
+):
+    """The shares ``dq = M^-1 J^T m v`` that the joints can take of so many velocities, from the bones' momenta.
 
-    Momenta and share of the first are in row ``own``, of the second in row ``into``.
+    Of the first they are in row ``own``, of others ``step`` rows apart.
     """
-    pass_down(body, w.pose.position, e, 2, own, into, thread, threads, w.linear, w.angular, w.momentum)
+    pass_down(body, w.pose.position, e, rows, own, step, thread, threads, w.linear, w.angular, w.shares)
     fetch_factor(w.factors, e, threads, room)
-    solve_both(w.pattern, w.factors, e, w.momentum, own, into, thread, threads, room, w.shares)
+    solve_in_place(w.pattern, w.factors, e, own, step, rows, threads, room, w.shares)
 
 
 @wp.func
-def fit_pose(body: Body, share: float, own: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench):
+def fit_pose(body: Body, share: float, off: int, e: int, thread: int, threads: int, w: JointBench):
     """Fit the pose to the particles by a ``share`` of ``dq = M^-1 J^T m way``, the way from them to their places.
 
-    The ways are those of the beginning of the substep, as are the momenta, about the joints as they were then: on the
-    way from there to here particles have gone on with the joints, and so the momenta are about these as they are now.
+    It is in row ``off``, of the beginning of the substep: on the way from there to here particles have gone on with the
+    joints.
     """
-    gather_other(body, w.other_moments, WAY, e, own, thread, threads, w.linear, w.angular)
-    pass_down(body, w.pose.position, e, 1, own, own, thread, threads, w.linear, w.angular, w.momentum)
-    fetch_factor(w.factors, e, threads, room)
-    solve(w.pattern, w.factors, e, w.momentum, own, own, thread, threads, room, w.shares)
-    spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
+    spread_motion(body, w.pose.position, w.shares, off, e, thread, threads, w.moving)
     move_joints(body, -share, w.moving, e, thread, threads, w.pose.rotation, w.pose.position)
 
 
@@ -246,10 +244,13 @@ def act(
     n = failure.shape[0]
     own = row_in_room(e, 0)
     taken = row_in_room(n + e, 1)
+    off = row_in_room(2 * n + e, 2)
     near = enter_room(w, e)
     gather_bones(body, w.moments, e, own, thread, threads, near.bones, near.linear, near.angular)
     gather_other(body, w.other_moments, LEFT, e, taken, thread, threads, near.linear, near.angular)
-    find_shares(body, own, taken, e, thread, threads, room, near)
+    gather_other(body, w.other_moments, WAY, e, off, thread, threads, near.linear, near.angular)
+    rows = wp.where(share > 0.0, 3, 2)
+    find_shares(body, own, taken - own, rows, e, thread, threads, room, near)
     pull_bones(body, own, e, thread, threads, near)
     add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)
     turn_joints(body, dt, target, springs, tissue, strength, n + e, own, e, thread, threads, room, near)
@@ -266,6 +267,6 @@ def act(
     keep_motion(near.moving, e, 6, thread, threads, w.steps)
     move_joints(body, 0.5 * dt, near.moving, e, thread, threads, near.pose.rotation, near.pose.position)
     if share > 0.0:
-        fit_pose(body, share, own, e, thread, threads, room, near)
+        fit_pose(body, share, off, e, thread, threads, near)
     begin(body, e, thread, threads, near)
     leave_room(w, e, near)

@@ -180,7 +180,7 @@ def load_factor(factor: wp.array2d(dtype=float), f: int, at: wp.uint64):
     ...
 
 
-# Lanes have the components of one or two vectors in registers, thirty of a part so that those of a joint are together,
+# Lanes have the components of one or more vectors in registers, thirty of a part so that those of a joint are together,
 # and tell each other the three of a joint at once. Both substitutions go by columns of what is left: triangular numbers
 # of 32 rows differ modulo 32, so lanes read from different banks.
 _SOLVE = """
@@ -189,14 +189,13 @@ _SOLVE = """
 constexpr int VECTORS = %(vectors)d, PARTS = %(parts)d, PART = 30;
 const int lane = threadIdx.x & 31, size = x.shape[1];
 float* const over = room + %(factor)d;
-float* const results[2] = {&wp::index(x, first, 0), &wp::index(x, second, 0)};
 float value[VECTORS][PARTS];
 for (int i = lane; i < size; i += 32) over[i] = 1.0f / room[i * (i + 1) / 2 + i];
 #pragma unroll
 for (int q = 0; q < PARTS; ++q)
 #pragma unroll
     for (int v = 0; v < VECTORS; ++v)
-        value[v][q] = lane < PART && PART * q + lane < size ? results[v][PART * q + lane] : 0.0f;
+        value[v][q] = lane < PART && PART * q + lane < size ? wp::index(x, first + v * step, PART * q + lane) : 0.0f;
 __syncwarp();
 #pragma unroll
 for (int part = PARTS - 1; part >= 0; --part)
@@ -246,7 +245,7 @@ for (int part = 0; part < PARTS; ++part)
 for (int q = 0; q < PARTS; ++q)
 #pragma unroll
     for (int v = 0; v < VECTORS; ++v)
-        if (lane < PART && PART * q + lane < size) results[v][PART * q + lane] = value[v][q];
+        if (lane < PART && PART * q + lane < size) wp::index(x, first + v * step, PART * q + lane) = value[v][q];
 __syncwarp();  // over is free
 #endif
 """
@@ -254,12 +253,12 @@ _SIZES = {"at": _AT, "factor": _FACTOR, "parts": -(-MOST_ROWS // 30)}
 
 
 @wp.func_native(_SOLVE % (_SIZES | {"vectors": 1}))
-def solve_together(at: wp.uint64, first: int, second: int, x: wp.array2d(dtype=float)):
+def solve_together(at: wp.uint64, first: int, step: int, x: wp.array2d(dtype=float)):
     """Row ``first`` of what is solved with the factor in a warp's room; it has the right-hand side at first."""
     ...
 
 
-@wp.func_native(_SOLVE % (_SIZES | {"vectors": 2}))
-def solve_both_together(at: wp.uint64, first: int, second: int, x: wp.array2d(dtype=float)):
-    """:func:`solve_together` of two rows."""
+@wp.func_native(_SOLVE % (_SIZES | {"vectors": 3}))
+def solve_three_together(at: wp.uint64, first: int, step: int, x: wp.array2d(dtype=float)):
+    """:func:`solve_together` of three rows, a ``step`` from one to the next."""
     ...
