@@ -71,10 +71,6 @@ from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec1
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import Model, State, group
 
-#: Share of what the pose is off the particles that one fit takes away. Those of a fast, light joint (a head, a hand)
-#: are not where it has them for other reasons, too: to follow them at once throws it about.
-FIT_SHARE = 0.2
-
 
 class ArticulatedBody:
     """Joints of one avatar in every environment, and what moves them.
@@ -259,7 +255,7 @@ class ArticulatedBody:
         self._record_pull(program, state)
         if fit:
             self._record_mass(program, state)
-        inputs = [self.body, model.step.dt, 1.0 / model.control_dt, FIT_SHARE if fit else 0.0]
+        inputs = [self.body, model.step.dt, 1.0 / model.control_dt, 3 if fit else 2]
         inputs += [self.target, self.springs, self.tissue, self.strength]
         self._record_stage(program, act, inputs, state, self.support)
         inputs = [self.body, model.step.dt, state.x, w.pelvis, w.steps, state.failure]

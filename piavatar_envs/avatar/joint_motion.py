@@ -12,7 +12,7 @@ import warp as wp
 from piavatar_envs.avatar.blending import blend_steps
 from piavatar_envs.avatar.lanes import BLOCK, first_particle, meet_threads, over_ancestors, threads_of_environment
 from piavatar_envs.avatar.loads import vector_at, vector_from
-from piavatar_envs.avatar.mass_matrix import BONES
+from piavatar_envs.avatar.mass_matrix import BONES, NUM_DOF
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body, vec8, vec12
 from piavatar_envs.mpm.stores import store_velocities
@@ -231,7 +231,7 @@ def add_change(
 ):
     """What the particles did to the joints: it was not the joints' own doing."""
     meet_threads(threads)
-    for i in range(thread, q.shape[1], threads):
+    for i in range(thread, NUM_DOF, threads):
         q[e, i] = q[e, i] + change[row, i]
         outside[e, i] = outside[e, i] + change[row, i]
 
@@ -255,7 +255,7 @@ def go_on(
     they lack of their whole velocity comes.
     """
     meet_threads(threads)
-    for i in range(thread, q.shape[1], threads):
+    for i in range(thread, NUM_DOF, threads):
         after = q[e, i] + change[own, i] + outside[e, i]
         q[e, i] = after
         taken[row, i] = after - taken[row, i] - outside[e, i]

@@ -23,6 +23,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.joint_motion import part_of, set_part
+from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.rotation import quat_log, short_of_pi
 from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.mpm.types import group, row
@@ -265,5 +266,5 @@ def find_given(
     impulse: wp.array2d(dtype=float),
 ):
     """The impulses that joints and pelvis really get, implicit as they are."""
-    for i in range(thread, impulse.shape[1], threads):
+    for i in range(thread, NUM_DOF, threads):
         impulse[e, i] = impulse[e, i] - left[e, i] * change[row_of_change, i]

@@ -180,6 +180,35 @@ _SUM_MANY = (
 )
 
 
+# Each step halves the numbers that a thread goes on with, as well as the threads that go on with the same: 16 exchanges
+# instead of 80, and each of the numbers ends up with two threads.
+_HALVE = """
+    const int lane = threadIdx.x & 31;
+    float part[16];
+#pragma unroll
+    for (int k = 0; k < 16; ++k) part[k] = k < WORDS ? value[k] : 0.0f;
+#define HALVE(half)                                                                                  \\
+    _Pragma("unroll") for (int k = 0; k < half; ++k) {                                               \\
+        const bool upper = lane & 2 * half;                                                          \\
+        const float away = upper ? part[k] : part[k + half];                                         \\
+        part[k] = (upper ? part[k + half] : part[k]) + __shfl_xor_sync(0xffffffffu, away, 2 * half); \\
+    }
+    HALVE(8) HALVE(4) HALVE(2) HALVE(1)
+    part[0] += __shfl_xor_sync(0xffffffffu, part[0], 1);
+"""
+_SUM_OF_WARP = (
+    "#if defined(__CUDA_ARCH__)\nif (threads == 32) {\n    constexpr int WORDS = 16;"
+    + _HALVE
+    + """
+#pragma unroll
+    for (int k = 0; k < WORDS; ++k) value[k] = __shfl_sync(0xffffffffu, part[0], 2 * k);
+    return value;
+}
+#endif
+"""
+)
+
+
 @wp.func_native(_SUM_ONE)
 def sum_threads(value: float, threads: int) -> float:
     """Sum over ``threads`` threads, told to all of them."""
@@ -192,30 +221,16 @@ def sum_threads12(value: vec12, threads: int) -> vec12:
     ...
 
 
-@wp.func_native(_SUM_MANY % 16)
+@wp.func_native(_SUM_OF_WARP + _SUM_MANY % 16)
 def sum_threads16(value: vec16, threads: int) -> vec16:
     """:func:`sum_threads` of sixteen numbers."""
     ...
 
 
-# Each step halves the numbers that a thread goes on with, as well as the threads that go on with the same: 16 exchanges
-# instead of 80, and each of the numbers ends up with the thread that stores it.
-_STORE_SUM = """
-#if defined(__CUDA_ARCH__)
-if (threads == 32) {
-    constexpr int WORDS = %d;
-    const int lane = threadIdx.x & 31;
-    float part[16];
-#pragma unroll
-    for (int k = 0; k < 16; ++k) part[k] = k < WORDS ? value[k] : 0.0f;
-#define HALVE(half)                                                                                  \
-    _Pragma("unroll") for (int k = 0; k < half; ++k) {                                               \
-        const bool upper = lane & 2 * half;                                                          \
-        const float away = upper ? part[k] : part[k + half];                                         \
-        part[k] = (upper ? part[k + half] : part[k]) + __shfl_xor_sync(0xffffffffu, away, 2 * half); \
-    }
-    HALVE(8) HALVE(4) HALVE(2) HALVE(1)
-    part[0] += __shfl_xor_sync(0xffffffffu, part[0], 1);
+_STORE_SUM = (
+    "#if defined(__CUDA_ARCH__)\nif (threads == 32) {\n    constexpr int WORDS = %d;"
+    + _HALVE
+    + """
     const int word = lane >> 1;
     if ((lane & 1) == 0 && word < WORDS) reinterpret_cast<float*>(&wp::index(into, e, c))[word] = part[0];
     return;
@@ -223,6 +238,7 @@ if (threads == 32) {
 #endif
 wp::index(into, e, c) = value;
 """
+)
 
 
 @wp.func_native(_STORE_SUM % 12)

@@ -9,8 +9,9 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar import lanes, part_sums
-from piavatar_envs.avatar.articulated import FIT_SHARE, ArticulatedBody
+from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.joint_mass import LONGEST_REFRESH, MOST_USES
+from piavatar_envs.avatar.joint_stages import FIT_SHARE
 from piavatar_envs.avatar.joint_torques import UNBOUNDED
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
