@@ -28,8 +28,8 @@ class JointBench:
     pattern: Pattern
     matrix: wp.array3d(dtype=float)  # (num_envs, 69, 69)
     diagonals: wp.array2d(dtype=float)  # (2 num_envs, 69) what factors have besides
-    factors: wp.array2d(dtype=float)  # (2 num_envs, entries)
-    cut: wp.array2d(dtype=float)  # (1, entries) factor where muscles reach their limits; on a CPU
+    # (2 num_envs + 1, entries); the last one, where muscles reach their limits, is a CPU's
+    factors: wp.array2d(dtype=float)
     stop: wp.array2d(dtype=float)  # (num_envs, bones) stiffness beyond the range [N m/rad]
     # what particles have
     moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)

@@ -129,6 +129,30 @@ def pull_bones(body: Body, own: int, e: int, thread: int, threads: int, w: Joint
 
 
 @wp.func
+def limit_joints(
+    body: Body,
+    dt: float,
+    springs: Springs,
+    strength: Strength,
+    driven: int,
+    own: int,
+    e: int,
+    thread: int,
+    threads: int,
+    w: JointBench,
+) -> float:
+    """Let muscles give no more than they have by share ``own``, and tell all threads how many would."""
+    limited = float(0.0)
+    for k in range(thread, PARTS, threads):
+        rest = w.diagonals[driven, 3 * k]
+        limited += limit_torque(
+            body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, e, k, w.impulse, w.left
+        )  # fmt: skip
+    meet_threads(threads)
+    return sum_threads(limited, threads)
+
+
+@wp.func
 def turn_joints(
     body: Body,
     dt: float,
@@ -151,17 +175,15 @@ def turn_joints(
             body, dt, w.pose, target, springs, tissue, w.stop, w.velocity, w.outside, e, k, w.muscle, w.impulse
         )
     fetch_factor(w.factors, driven, threads, room)
-    solve(w.pattern, w.factors, driven, w.impulse, e, own, thread, threads, room, w.shares)
-    limited = float(0.0)
-    for k in range(thread, PARTS, threads):
-        rest = w.diagonals[driven, 3 * k]
-        limited += limit_torque(
-            body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, e, k, w.impulse, w.left
-        )  # fmt: skip
-    meet_threads(threads)
-    if sum_threads(limited, threads) > 0.0:
-        factorize(w.pattern, w.matrix, w.left, e, e, threads, room, 0, w.cut)
-        solve(w.pattern, w.cut, 0, w.impulse, e, own, thread, threads, room, w.shares)
+    factor = int(driven)
+    while factor >= 0:  # once more where muscles reach their limits, by the same piece of the program
+        solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, room, w.shares)
+        if factor != driven:
+            break
+        if limit_joints(body, dt, springs, strength, driven, own, e, thread, threads, w) == 0.0:
+            break
+        factor = w.factors.shape[0] - 1
+        factorize(w.pattern, w.matrix, w.left, e, e, threads, room, factor, w.factors)
     find_given(w.left, w.shares, own, e, thread, threads, w.impulse)
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     support = part_of(w.impulse, e, 0)
@@ -225,7 +247,7 @@ def begin_substep(
         begin(body, e, thread, threads, w)
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(int(WARP), 16))
 def act(
     body: Body,
     dt: float,
