@@ -8,7 +8,7 @@ import warp as wp
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.cholesky import factor_size, find_pattern
 from piavatar_envs.avatar.influences import in_order
-from piavatar_envs.avatar.lanes import warp_threads
+from piavatar_envs.avatar.lanes import BLOCK, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF, filled_entries
 from piavatar_envs.avatar.mass_pairs import build_pairs, sum_pairs
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS
@@ -86,4 +86,5 @@ class JointMass:
             (*self.sums.shape, self.threads),
             [self.body, self.pairs, self.model.particles, state.x, position, self.threads],
             [self.sums],
+            block_dim=BLOCK,
         )

@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body import CHUNK, BodyPoints
-from piavatar_envs.avatar.lanes import store_sum12
+from piavatar_envs.avatar.bone_sums import AT_ONCE
+from piavatar_envs.avatar.lanes import BLOCK, place_in_chunks, store_sum12
 from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12
@@ -75,7 +76,7 @@ def build_pairs(points: BodyPoints, device: str) -> Pairs:
     return pairs
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(BLOCK, 12))
 def sum_pairs(
     body: Body,
     pairs: Pairs,
@@ -90,21 +91,29 @@ def sum_pairs(
 
     ``position`` are those of the joints [m].
     """
-    e, c, thread = wp.tid()
-    origin = position[e, pairs.first[pairs.chunk_pair[c]]]
+    i, j, k = wp.tid()
+    at = place_in_chunks(i, j, k, pairs.chunk_pair.shape[0])
+    e = at[0]
+    c = at[1]
+    origin = vector_at(position, e, int_at(pairs.first, int_at(pairs.chunk_pair, c)))
     r = row(e, particles.mass.shape[0])
     m = float(0.0)
     mx = wp.vec3()
     diag = wp.vec3()
     off = wp.vec3()
-    for n in range(pairs.entry_start[c] + thread, pairs.entry_start[c + 1], threads):
-        p = body.first + int_at(pairs.entry, n)
-        w = float_at(pairs.entry_weight, n) * number_at(particles.mass, r, p)
-        d = vector_at(x, e, p) - origin
-        wd = w * d
-        m += w
-        mx += wd
-        diag += wp.cw_mul(wd, d)
-        off += wp.vec3(wd[1] * d[2], wd[2] * d[0], wd[0] * d[1])
+    n = int_at(pairs.entry_start, c) + at[2]
+    last = int_at(pairs.entry_start, c + 1) - 1
+    while n <= last:
+        for _ in range(AT_ONCE):
+            entry = wp.min(n, last)
+            p = body.first + int_at(pairs.entry, entry)
+            w = wp.where(n > last, 0.0, float_at(pairs.entry_weight, entry)) * number_at(particles.mass, r, p)
+            d = vector_at(x, e, p) - origin
+            wd = w * d
+            m += w
+            mx += wd
+            diag += wp.cw_mul(wd, d)
+            off += wp.vec3(wd[1] * d[2], wd[2] * d[0], wd[0] * d[1])
+            n += threads
     total = vec12(m, mx[0], mx[1], mx[2], diag[0], diag[1], diag[2], off[0], off[1], off[2], 0.0, 0.0)
     store_sum12(sums, e, c, total, threads)
