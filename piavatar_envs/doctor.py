@@ -15,7 +15,7 @@ from typing import Any
 
 import gymnasium
 
-from piavatar_envs.mpm.cores import available_cores
+from piavatar_envs.mpm.cores import compiling_threads
 
 PACKAGES = ("piavatar-envs", "warp-lang", "numpy", "scipy", "gymnasium", "pydantic", "stable-baselines3", "torch")
 
@@ -124,7 +124,7 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
         package = importlib.import_module(f"piavatar_envs.{room}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
-    wp.force_load(target, max_workers=available_cores())
+    wp.force_load(target, max_workers=compiling_threads())
     for env_id, spec in sorted(gymnasium.registry.items()):
         if environments and spec.namespace == "PIAvatar":
             env = gymnasium.make(env_id, device=device, fidelity="tiny")

@@ -16,10 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from piavatar_envs.mpm.cores import available_cores
-
-#: Modules that are compiled at the same time, at most: each takes some hundred megabytes.
-MOST_AT_ONCE = 16
+from piavatar_envs.mpm.cores import compiling_threads
 
 
 @dataclass(frozen=True)
@@ -170,7 +167,7 @@ def compile_programs(programs: Iterable[Program]) -> None:
         Exception: a kernel that does not compile, or a launch with arguments that are not its kernel's, as Warp has it.
     """
     programs = list(programs)
-    with ThreadPoolExecutor(min(MOST_AT_ONCE, available_cores())) as pool:
+    with ThreadPoolExecutor(compiling_threads()) as pool:
         modules = {
             (new.kernel.module, each.device.alias, new.block_dim): None for each in programs for new in each.unbound
         }
