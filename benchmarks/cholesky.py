@@ -35,6 +35,7 @@ from piavatar_envs.avatar.cholesky import (
     fetch_factor,
     find_pattern,
     keep_factor,
+    lower_entries,
     solve,
 )
 from piavatar_envs.avatar.joint_bench import room_of_warp
@@ -123,17 +124,16 @@ def _whole(matrix: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
 @wp.kernel
 def factorize_sparse(
     pattern: Pattern,
-    matrix: wp.array3d(dtype=float),
+    matrix: wp.array2d(dtype=float),
     diagonal: wp.array2d(dtype=float),
-    threads: int,
     # out
     factor: wp.array2d(dtype=float),
 ):
     """A factor of every matrix, over ``(n, threads)``."""
     e, _thread = wp.tid()
     room = room_of_warp()
-    factorize(pattern, matrix, diagonal, e, e, threads, room, e, factor)
-    keep_factor(threads, room, e, factor)
+    factorize(pattern, matrix, diagonal, e, e, room, e, factor)
+    keep_factor(room, e, factor)
 
 
 @wp.kernel
@@ -148,14 +148,14 @@ def solve_sparse(
     """A solution with every factor, over ``(n, threads)``."""
     e, thread = wp.tid()
     room = room_of_warp()
-    fetch_factor(factor, e, threads, room)
+    fetch_factor(factor, e, room)
     solve(pattern, factor, e, right, e, e, thread, threads, room, x)
 
 
 @wp.kernel
 def solve_sparse_at_once(
     pattern: Pattern,
-    matrix: wp.array3d(dtype=float),
+    matrix: wp.array2d(dtype=float),
     diagonal: wp.array2d(dtype=float),
     right: wp.array2d(dtype=float),
     threads: int,
@@ -166,7 +166,7 @@ def solve_sparse_at_once(
     """Both; on a CPU the factor is kept all the same, for there is no other place for it."""
     e, thread = wp.tid()
     room = room_of_warp()
-    factorize(pattern, matrix, diagonal, e, e, threads, room, e, factor)
+    factorize(pattern, matrix, diagonal, e, e, room, e, factor)
     solve(pattern, factor, e, right, e, e, thread, threads, room, x)
 
 
@@ -174,11 +174,14 @@ def measure_ours(systems: Systems, options: Options) -> dict[str, Any]:
     """The row of the project's own factors."""
     n, threads = len(systems.matrix), warp_threads(options.device)
     pattern = find_pattern(systems.filled, options.device)
-    matrix, diagonal, right = (_upload(part, options) for part in (systems.matrix, systems.diagonal, systems.right))
-    factor = wp.zeros((n, factor_size(NUM_DOF)), dtype=float, device=options.device)
+    rows, columns, numbers = lower_entries(pattern)
+    packed = np.zeros((n, factor_size(pattern)), np.float32)
+    packed[:, numbers] = systems.matrix[:, rows, columns]
+    matrix, diagonal, right = (_upload(part, options) for part in (packed, systems.diagonal, systems.right))
+    factor = wp.zeros_like(matrix)
     x = wp.zeros((n, NUM_DOF), dtype=float, device=options.device)
     launches = {
-        "factorise": (factorize_sparse, [pattern, matrix, diagonal, threads], [factor]),
+        "factorise": (factorize_sparse, [pattern, matrix, diagonal], [factor]),
         "solve": (solve_sparse, [pattern, factor, right, threads], [x]),
         "together": (solve_sparse_at_once, [pattern, matrix, diagonal, right, threads], [factor, x]),
     }

@@ -131,6 +131,6 @@ def widest(gaps: Sequence[np.ndarray]) -> dict[str, Any]:
 
 def critical_damping(body: ArticulatedBody, stiffness: np.ndarray | float) -> np.ndarray:
     """Of all joints but the pelvis, by the inertia of what each carries [N m s/rad], shape ``(21,)``."""
-    diagonal = np.diagonal(body.mass.matrix.numpy()[0])
+    diagonal = np.diagonal(body.mass.read()[0])
     inertia = diagonal[6:].reshape(-1, 3).mean(1).astype(float)
     return 2.0 * np.sqrt(stiffness * inertia)

@@ -2,12 +2,13 @@
 
 The matrix is ``L^T L`` with a lower triangle ``L``: rows are eliminated from the last one up. Where rows are joints
 in an order that has children after their parents, limbs go before what they hang on, and of two limbs neither fills
-the rows of the other (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6.5). Which entries are not zero is
-found once, on the host; rows come in threes, the axes of a joint.
+the rows of the other (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6.5). Which blocks of 3 x 3, the axes
+of two joints, are not zero is found once, on the host.
 
-A factor's rows lie one after the other, row ``k`` from entry ``k (k + 1) / 2`` on. On a CPU one thread has a matrix to
-itself (``threads = 1``). On a GPU a warp has it, in a ``room`` in shared memory
-(:mod:`piavatar_envs.avatar.warp_cholesky`): each row needs the one before, and would wait for global memory every time.
+Matrices and factors are kept as these blocks alone, one after the other, row by row, in a row the diagonal's last; of a
+matrix that one is whole. In a factor it is its inverse, ``L_kk^-1``, lower, which is all that solutions ask for. On a
+GPU a warp works on a factor in a ``room`` in shared memory, on a CPU one thread does where factors are kept: the same
+program, :mod:`piavatar_envs.avatar.warp_cholesky`.
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.lanes import meet_threads
+from piavatar_envs.avatar.lanes import lane_of_warp, meet_threads
 from piavatar_envs.avatar.warp_cholesky import (
     MOST_ROWS,
-    eliminate_together,
-    factorize_together,
-    load_factor,
-    solve_three_together,
-    solve_together,
-    store_factor,
+    add_diagonal,
+    eliminate,
+    load_room,
+    place_of_factor,
+    solve_one,
+    solve_three,
+    store_room,
 )
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -31,16 +33,35 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 @wp.struct
 class Pattern:
-    """Entries of ``L`` before the diagonal that need not be zero: row ``k`` has ``column[start[k] : start[k + 1]]``."""
+    """Blocks of ``L`` that need not be zero, and what the lanes of a warp do with them, in rounds.
 
-    start: wp.array(dtype=int)  # (rows + 1,)
-    column: wp.array(dtype=int)  # in a row from the first to the last
-    # for a warp
-    entry: wp.array(dtype=int)  # all entries, those of the diagonal, too: 256 row + column
-    # entries that change when joint c is eliminated, three of a row at a time: pair[pair_start[c] : pair_start[c + 1]],
-    # place of the first in the factor times 2^16, and which of the joint's columns are its row, times 2^8, and its own
-    pair_start: wp.array(dtype=int)
+    All rounds of a kind are followed by two of nothing, for they are asked for ahead. A lane's word is -1 where it does
+    nothing.
+    """
+
+    block: wp.array(dtype=int)  # (joints * joints,) of two joints, -1 where there is none
+    entry: wp.array(dtype=int)  # (rows,) numbers of the diagonal's entries
+    # (rounds,) of the elimination of a row: bytes to its first block, bytes to that of the diagonal, columns before
+    # that, and 1 where the round goes on with the row before it
+    step: wp.array(dtype=wp.vec4i)
+    # (rounds * 32,) a block that changes by the product of two of the row: 2^16 times the bytes to it, 2^8 times the
+    # numbers from the row's first block to the first, those to the second
     pair: wp.array(dtype=int)
+    # (rounds,) of a solution: 2^10 times the bytes to the diagonal's block, and to the joint's part of a vector that
+    # has sixteen a joint; -1 where the round goes on with the joint before it
+    head: wp.array(dtype=int)
+    # (rounds * 32,) which part of the vector changes, in bytes, and 2^10 times those to the first of three numbers
+    word: wp.array(dtype=int)
+    turn: int  # rounds on the way down, an even number; those on the way up are as well
+
+
+#: Lanes of a warp, which a round has work for, and the bytes of a number and of a block.
+LANES, NUMBER, BLOCK = 32, 4, 36
+
+
+def in_rounds(words: np.ndarray) -> np.ndarray:
+    """The same in whole rounds, one at least."""
+    return np.pad(words, (0, max(LANES, -(-len(words) // LANES) * LANES) - len(words)), constant_values=-1)
 
 
 def find_pattern(filled: np.ndarray, device: str) -> Pattern:
@@ -50,160 +71,75 @@ def find_pattern(filled: np.ndarray, device: str) -> Pattern:
         ValueError: it is not made of filled and empty blocks of 3 x 3, or has too many rows.
     """
     filled = filled | filled.T
-    joints = filled[::3, ::3]
+    joints = filled[::3, ::3].copy()
     if len(filled) > MOST_ROWS or not np.array_equal(np.kron(joints, np.ones((3, 3), bool)), filled):
         raise ValueError(f"filled has shape {filled.shape}, expected at most {MOST_ROWS} rows, in blocks of 3 x 3")
-    columns = []
-    for k in reversed(range(len(filled))):
-        found = np.flatnonzero(filled[k, :k])
-        filled[np.ix_(found, found)] = True
-        columns.append(found)
-    columns.reverse()
-    pairs = []
-    for own in columns[::3]:
-        i, j = np.nonzero(np.tri(len(own), dtype=bool))
-        i, j = i[j % 3 == 0], j[j % 3 == 0]
-        pairs.append((own[i] * (own[i] + 1) // 2 + own[j]) << 16 | i << 8 | j)
-    lists = {
-        "start": np.cumsum([0, *map(len, columns)]),
-        "column": np.concatenate(columns),
-        "entry": np.concatenate([k << 8 | np.r_[own, k] for k, own in enumerate(columns)]),
-        "pair_start": np.cumsum([0, *map(len, pairs)]),
-        "pair": np.concatenate(pairs),
-    }
+    for k in reversed(range(len(joints))):
+        found = np.flatnonzero(joints[k, :k])
+        joints[np.ix_(found, found)] = True
+    row, column = np.nonzero(np.tril(joints))
+    block = np.full(joints.shape, -1)
+    block[row, column] = np.arange(len(row))
+    steps, pairs = plan_elimination(block)
+    heads, words, turn = plan_solution(block)
+    entries = 9 * np.diag(block)[:, None] + np.array([0, 4, 8])
+    lists = {"block": block.ravel(), "entry": entries.ravel(), "pair": pairs, "head": heads, "word": words}
     pattern = Pattern()
     for name, numbers in lists.items():
         setattr(pattern, name, wp.array(numbers.astype(np.int32), dtype=int, device=device))
+    pattern.step, pattern.turn = wp.array(steps.astype(np.int32), dtype=wp.vec4i, device=device), turn
     return pattern
 
 
-def factor_size(rows: int) -> int:
-    """Numbers of a factor, in whole records of four."""
-    return -(-rows * (rows + 1) // 2 // 4) * 4
+def plan_elimination(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and pairs of :class:`Pattern`, from the ``block`` of every two joints."""
+    steps, pairs = [], []
+    for k in reversed(range(len(block))):
+        own = np.flatnonzero(block[k, :k] >= 0)
+        i, j = np.nonzero(np.tri(len(own), dtype=bool))
+        pairs.append(in_rounds(BLOCK * block[own[i], own[j]] << 16 | 9 * i << 8 | 9 * j))
+        first = BLOCK * (block[k, k] - len(own))
+        steps += [(first, BLOCK * block[k, k], 3 * len(own), n > 0) for n in range(len(pairs[-1]) // LANES)]
+    return np.array(steps + 2 * [(0, 0, 0, 1)]), np.concatenate([*pairs, np.full(2 * LANES, -1)])
 
 
-@wp.func
-def start_of_row(k: int):
-    """First entry of row ``k`` of a factor."""
-    return k * (k + 1) // 2
+def plan_solution(block: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Heads, words and turn of :class:`Pattern`, from the ``block`` of every two joints."""
+    count, axis, heads, words, turn = len(block), np.arange(3), [], [], 0
+    for up in (False, True):
+        turn = len(heads)  # even
+        for k in range(count) if up else reversed(range(count)):
+            blocks = block[:, k] if up else block[k]
+            others = np.flatnonzero((blocks >= 0) & (np.arange(count) != k))
+            numbers = BLOCK * blocks[others][:, None] + NUMBER * (3 if up else 1) * axis
+            words.append(in_rounds((numbers << 10 | 16 * others[:, None] + NUMBER * axis).ravel()))
+            heads += [BLOCK * block[k, k] << 10 | 16 * k] + [-1] * (len(words[-1]) // LANES - 1)
+        nothing = (2 if up else 0) + len(heads) % 2
+        heads += nothing * [-1]
+        words.append(np.full(nothing * LANES, -1))
+    return np.array(heads), np.concatenate(words), turn
 
 
-# Rows as plain pointers: on a CPU, finding an entry's address costs more than what is done with it.
-_ROW = """
-const int* const at = column.data;
-const float* const row = &wp::index(factor, f, k * (k + 1) / 2);
-"""
+def factor_size(pattern: Pattern) -> int:
+    """Numbers of a matrix or a factor, in whole records of four."""
+    return -(-9 * (1 + int(pattern.block.numpy().max())) // 4) * 4
 
 
-@wp.func_native(
-    _ROW + "float* const to = &wp::index(factor, f, i * (i + 1) / 2);\n"
-    "for (int n = first; n < last; ++n) to[at[n]] -= share * row[at[n]];"
-)
-def subtract_row(
-    column: wp.array(dtype=int),
-    first: int,
-    last: int,
-    factor: wp.array2d(dtype=float),
-    f: int,
-    k: int,
-    i: int,
-    share: float,
-):
-    """Take ``share`` of row ``k`` of a factor from row ``i``, in columns ``first`` to ``last`` of the pattern."""
-    ...
-
-
-@wp.func_native(
-    _ROW + "float* const to = &wp::index(x, e, 0);\nfor (int n = first; n < last; ++n) to[at[n]] -= row[at[n]] * y;"
-)
-def subtract_column(
-    column: wp.array(dtype=int),
-    first: int,
-    last: int,
-    factor: wp.array2d(dtype=float),
-    f: int,
-    k: int,
-    y: float,
-    e: int,
-    x: wp.array2d(dtype=float),
-):
-    """Take ``y`` times row ``k`` of a factor from a vector."""
-    ...
-
-
-@wp.func_native(
-    _ROW + "const float* const from = &wp::index(x, e, 0);\nfloat sum = 0.0f;\n"
-    "for (int n = first; n < last; ++n) sum += row[at[n]] * from[at[n]];\nreturn sum;"
-)
-def dot_row(
-    column: wp.array(dtype=int),
-    first: int,
-    last: int,
-    factor: wp.array2d(dtype=float),
-    f: int,
-    k: int,
-    e: int,
-    x: wp.array2d(dtype=float),
-) -> float:
-    """Product of row ``k`` of a factor and a vector."""
-    ...
-
-
-@wp.func
-def factorize_alone(
-    pattern: Pattern,
-    matrix: wp.array3d(dtype=float),
-    diagonal: wp.array2d(dtype=float),
-    source: int,
-    e: int,
-    f: int,
-    factor: wp.array2d(dtype=float),
-):
-    """:func:`factorize` for one thread."""
-    size = matrix.shape[1]
-    for k in range(size):
-        at = start_of_row(k)
-        for n in range(pattern.start[k], pattern.start[k + 1]):
-            factor[f, at + pattern.column[n]] = matrix[source, k, pattern.column[n]]
-        factor[f, at + k] = matrix[source, k, k] + diagonal[e, k]
-    for row in range(size):
-        k = size - 1 - row
-        at = start_of_row(k)
-        first = pattern.start[k]
-        last = pattern.start[k + 1]
-        pivot = wp.sqrt(factor[f, at + k])
-        factor[f, at + k] = pivot
-        for n in range(first, last):
-            i = pattern.column[n]
-            share = factor[f, at + i] / pivot
-            factor[f, at + i] = share
-            subtract_row(pattern.column, first, n, factor, f, k, i, share)
-            own = start_of_row(i) + i
-            factor[f, own] = factor[f, own] - share * share
-
-
-@wp.func
-def solve_alone(pattern: Pattern, factor: wp.array2d(dtype=float), f: int, e: int, x: wp.array2d(dtype=float)):
-    """:func:`solve` for one thread, ``x[e]`` with factor ``f``; ``x`` has the right-hand side at first."""
-    size = x.shape[1]
-    for row in range(size):
-        k = size - 1 - row
-        y = x[e, k] / factor[f, start_of_row(k) + k]
-        x[e, k] = y
-        subtract_column(pattern.column, pattern.start[k], pattern.start[k + 1], factor, f, k, y, e, x)
-    for k in range(size):
-        part = dot_row(pattern.column, pattern.start[k], pattern.start[k + 1], factor, f, k, e, x)
-        x[e, k] = (x[e, k] - part) / factor[f, start_of_row(k) + k]
+def lower_entries(pattern: Pattern) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows and columns of the entries of the lower triangle that are kept, and which numbers they are."""
+    row, column = np.nonzero(np.tril(pattern.block.numpy().reshape(2 * [pattern.entry.shape[0] // 3]) >= 0))
+    axis = np.arange(9)
+    i, j = (3 * row[:, None] + axis // 3).ravel(), (3 * column[:, None] + axis % 3).ravel()
+    return i[i >= j], j[i >= j], np.flatnonzero(i >= j)
 
 
 @wp.func
 def factorize(
     pattern: Pattern,
-    matrix: wp.array3d(dtype=float),
+    matrix: wp.array2d(dtype=float),
     diagonal: wp.array2d(dtype=float),
     source: int,
     e: int,
-    threads: int,
     room: wp.uint64,
     f: int,
     # out
@@ -211,36 +147,33 @@ def factorize(
 ):
     """``L`` of ``L^T L = matrix + diag(diagonal)``, of matrix ``source`` and row ``e`` of the ``diagonal``.
 
-    Only the lower triangle of ``matrix`` ``(num_envs, N, N)`` is read, zero where the pattern has nothing. A thread
-    that is alone writes factor ``f``, ``(systems, factor_size(N))``, where the pattern says; a warp has it in its room,
-    from where :func:`keep_factor` writes it.
+    ``matrix`` is ``(num_envs, factor_size)``. A thread that is alone writes factor ``f`` of as many numbers; a warp has
+    it in its room, from where :func:`keep_factor` writes it.
     """
-    if threads == 1:
-        factorize_alone(pattern, matrix, diagonal, source, e, f, factor)
-    else:
-        p = pattern
-        factorize_together(p.start, p.column, p.entry, p.pair_start, p.pair, matrix, diagonal, source, e, room)
+    at = place_of_factor(factor, f, room)
+    load_room(matrix, source, at)
+    factorize_in_room(pattern, diagonal, e, at)
 
 
 @wp.func
-def factorize_in_room(pattern: Pattern, diagonal: wp.array2d(dtype=float), e: int, room: wp.uint64):
-    """:func:`factorize` for a warp that has the matrix in its room."""
-    p = pattern
-    eliminate_together(p.start, p.column, p.pair_start, p.pair, diagonal, e, room)
+def factorize_in_room(pattern: Pattern, diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
+    """:func:`factorize` of the matrix that is there."""
+    add_diagonal(pattern.entry, diagonal, e, at)
+    eliminate(pattern.step, pattern.pair, at)
 
 
 @wp.func
-def keep_factor(threads: int, room: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
+def keep_factor(room: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
     """Write factor ``f``, which :func:`factorize` has just found, where it has not done so itself."""
-    if threads > 1:
-        store_factor(room, f, factor)
+    lane = lane_of_warp()
+    store_room(room, f, lane[0], lane[1], factor)
+    meet_threads(lane[1])  # the room is free
 
 
 @wp.func
-def fetch_factor(factor: wp.array2d(dtype=float), f: int, threads: int, room: wp.uint64):
+def fetch_factor(factor: wp.array2d(dtype=float), f: int, room: wp.uint64):
     """Let a warp solve with factor ``f`` from here on."""
-    if threads > 1:
-        load_factor(factor, f, room)
+    load_room(factor, f, place_of_factor(factor, f, room))
 
 
 @wp.func
@@ -258,44 +191,25 @@ def solve(
     x: wp.array2d(dtype=float),
 ):
     """``x[row]`` with ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its room."""
-    copy_row(right, e, row, thread, threads, x)
-    if threads == 1:
-        solve_alone(pattern, factor, f, row, x)
-    else:
-        solve_together(room, row, 0, x)
-        meet_threads(threads)
+    meet_threads(threads)
+    for i in range(thread, x.shape[1], threads):
+        x[row, i] = right[e, i]
+    meet_threads(threads)
+    solve_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), row, 0, x)
 
 
 @wp.func
-def solve_in_place(
+def solve_three_in_place(
     pattern: Pattern,
     factor: wp.array2d(dtype=float),
     f: int,
     first: int,
     step: int,
-    rows: int,
     threads: int,
     room: wp.uint64,
     # in and out
     x: wp.array2d(dtype=float),
 ):
-    """:func:`solve` of so many ``rows`` of right-hand sides in ``x``, the ``first`` and others ``step`` rows apart.
-
-    A warp solves three at once, whatever is in those that nobody asks for.
-    """
+    """:func:`solve` of three right-hand sides in ``x``, the ``first`` and others ``step`` rows apart."""
     meet_threads(threads)
-    if threads == 1:
-        for n in range(rows):
-            solve_alone(pattern, factor, f, first + n * step, x)
-    else:
-        solve_three_together(room, first, step, x)
-        meet_threads(threads)
-
-
-@wp.func
-def copy_row(right: wp.array2d(dtype=float), e: int, row: int, thread: int, threads: int, x: wp.array2d(dtype=float)):
-    """``x[row] = right[e]``, when all threads have come."""
-    meet_threads(threads)
-    for i in range(thread, x.shape[1], threads):
-        x[row, i] = right[e, i]
-    meet_threads(threads)
+    solve_three(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), first, step, x)

@@ -10,7 +10,7 @@ import warp as wp
 from piavatar_envs.avatar.cholesky import Pattern
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Pose, vec8, vec12, vec16
-from piavatar_envs.avatar.warp_cholesky import MOST_ROWS, ROOM, SPARE
+from piavatar_envs.avatar.warp_cholesky import MOST_ROWS, ROOM
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,7 +26,7 @@ class JointBench:
     pair_sums: wp.array2d(dtype=vec12)  # (num_envs, chunks of pairs)
     records: wp.array(dtype=vec16)
     pattern: Pattern
-    matrix: wp.array3d(dtype=float)  # (num_envs, 69, 69)
+    matrix: wp.array2d(dtype=float)  # (num_envs, entries)
     diagonals: wp.array2d(dtype=float)  # (2 num_envs, 69) what factors have besides
     # (2 num_envs + 1, entries); the last one, where muscles reach their limits, is a CPU's
     factors: wp.array2d(dtype=float)
@@ -53,12 +53,12 @@ class JointBench:
     pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) where its joint begins the substep [m]
 
 
-# Words of shared memory of a warp: the factor's, whose spare ones and some more have the bones' momenta until something
-# is solved with it; three shares, the bones' motion, and the pose.
+# Words of shared memory of a warp: the factor's, which have the bones' momenta until it comes; three shares, the bones'
+# motion, and the pose.
 _ROWS, _VECTORS = wp.constant(MOST_ROWS), wp.constant(3 * NUM_JOINTS)
-_LINEAR = wp.constant(SPARE)
+_LINEAR = wp.constant(0)
 _ANGULAR = wp.constant(int(_LINEAR) + 3 * int(_VECTORS))
-_SHARES = wp.constant(max(ROOM, int(_ANGULAR) + 3 * int(_VECTORS)))
+_SHARES = wp.constant(ROOM)
 _MOVING = wp.constant(int(_SHARES) + 3 * MOST_ROWS)
 _ROTATION = wp.constant(int(_MOVING) + 8 * NUM_JOINTS)
 _POSITION = wp.constant(int(_ROTATION) + 4 * NUM_JOINTS)
@@ -121,6 +121,18 @@ def see_turns(rows: wp.array2d(dtype=wp.quat), room: wp.uint64, at: int, words: 
 @wp.func_native(_SEE)
 def see_motions(rows: wp.array2d(dtype=vec8), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=vec8):
     """:func:`see_numbers` of rigid motions."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+float* const to = reinterpret_cast<float*>(room) + at;
+const float* const from = reinterpret_cast<const float*>(&wp::index(position, e, 0));
+for (int n = thread; n < {3 * NUM_JOINTS}; n += threads) to[n] = from[n];
+#endif
+""")
+def bring_places(position: wp.array2d(dtype=wp.vec3), e: int, thread: int, threads: int, room: wp.uint64, at: int):
+    """Write where the joints of an environment are to the room, from word ``at`` on."""
     ...
 
 

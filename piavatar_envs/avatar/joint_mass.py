@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.cholesky import factor_size, find_pattern
+from piavatar_envs.avatar.cholesky import factor_size, find_pattern, lower_entries
 from piavatar_envs.avatar.influences import in_order
 from piavatar_envs.avatar.lanes import BLOCK, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF, filled_entries
@@ -55,8 +55,8 @@ class JointMass:
     Attributes:
         pairs: of bones that have particles in common.
         sums: their moments, ``(num_envs, chunks)``.
-        matrix: the mass matrix, ``(num_envs, 69, 69)``.
         pattern: where its factors have entries.
+        matrix: the mass matrix, ``(num_envs, factor_size)``; see :meth:`read`.
         records: on a CPU, where the matrix is composed, one body after the other.
         refresh: substeps that a matrix is used in.
     """
@@ -65,8 +65,8 @@ class JointMass:
         n, device = model.num_envs, model.device
         self.body, self.model, self.threads = body, model, warp_threads(device)
         self.pairs = build_pairs(points, device)
-        self.matrix = wp.zeros((n, NUM_DOF, NUM_DOF), dtype=float, device=device)
         self.pattern = find_pattern(filled_entries(self.pairs), device)
+        self.matrix = self.make_factors(n)
         self.sums = wp.zeros((n, len(self.pairs.entry_start) - 1), dtype=vec12, device=device)
         self.records = wp.zeros(NUM_JOINTS * NUM_JOINTS, dtype=vec16, device=device)
         self.refresh = min(MOST_USES, max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6)))
@@ -76,8 +76,15 @@ class JointMass:
         return step % self.refresh == 0
 
     def make_factors(self, systems: int) -> wp.array:
-        """Room for so many Cholesky factors."""
-        return wp.zeros((systems, factor_size(NUM_DOF)), dtype=float, device=self.model.device)
+        """Room for so many Cholesky factors, or matrices."""
+        return wp.zeros((systems, factor_size(self.pattern)), dtype=float, device=self.model.device)
+
+    def read(self) -> np.ndarray:
+        """The mass matrices of all environments, ``(num_envs, 69, 69)``."""
+        rows, columns, numbers = lower_entries(self.pattern)
+        matrix = np.zeros((self.model.num_envs, NUM_DOF, NUM_DOF))
+        matrix[:, rows, columns] = matrix[:, columns, rows] = self.matrix.numpy()[:, numbers]
+        return matrix
 
     def record_sums(self, program: Program, state: State, position: wp.array) -> None:
         """Append: moments of all pairs for joints at ``position`` [m]."""

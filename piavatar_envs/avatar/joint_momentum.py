@@ -6,59 +6,79 @@ import warp as wp
 
 from piavatar_envs.avatar.blending import motion_at
 from piavatar_envs.avatar.joint_motion import set_part
-from piavatar_envs.avatar.lanes import add_rows12, add_rows16, highest_bit, meet_threads, sum_threads16
+from piavatar_envs.avatar.lanes import meet_threads, sum_threads16
 from piavatar_envs.avatar.mass_matrix import BONES, I3
 from piavatar_envs.avatar.rigid_fit import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body, vec8, vec12, vec16
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
-#: Where the momenta of what the pull leaves begin in :attr:`JointBench.other_moments`, and those of the ways.
-LEFT, WAY = wp.constant(0), wp.constant(6)
 
-
-@wp.func
-def gather_bones(
-    body: Body,
+# A lane of a warp has one of the 28 numbers, so that all of a chunk's are asked for at once, of a few chunks ahead.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+const int lane = threadIdx.x & 31;
+constexpr int LANES = 32;
+#else
+constexpr int lane = 0, LANES = 1;
+#endif
+constexpr int AHEAD = 8;
+const int chunks = chunk_bone.shape[0], last = bones.shape[1];
+for (int word = lane; word < 28; word += LANES) {
+    const int vector = word < 16 ? 0 : word < 22 ? 1 : 2, row = vector == 0 ? own : vector == 1 ? taken : off;
+    const int component = word >= 16 ? (word - 16) % 6 : word >= 13 ? word - 10 : word >= 4 && word < 7 ? word - 4 : -1;
+    wp::vec3* const momenta = component < 3 ? &wp::index(linear, row, 0) : &wp::index(angular, row, 0);
+    float* const to = component < 0 ? nullptr : reinterpret_cast<float*>(momenta) + component % 3;
+    const int words = word < 16 ? 16 : 12;
+    const float* const from = word < 16 ? reinterpret_cast<const float*>(&wp::index(moments, e, 0)) + word
+                                        : reinterpret_cast<const float*>(&wp::index(other_moments, e, 0)) + word - 16;
+    float* const whole = reinterpret_cast<float*>(&wp::index(bones, e, 0)) + word;
+    float sum = 0.0f, next[AHEAD];
+    int bone = 0, next_bone[AHEAD];
+    const auto ask = [&](int first) {
+#pragma unroll
+        for (int n = 0; n < AHEAD; ++n) {
+            const int c = first + n;
+            next[n] = c < chunks ? from[words * c] : 0.0f;
+            next_bone[n] = c < chunks ? chunk_bone.data[c] : last;
+        }
+    };
+    ask(0);
+    for (int first = 0; bone < last; first += AHEAD) {
+        float value[AHEAD];
+        int of[AHEAD];
+#pragma unroll
+        for (int n = 0; n < AHEAD; ++n) value[n] = next[n], of[n] = next_bone[n];
+        ask(first + AHEAD);
+#pragma unroll
+        for (int n = 0; n < AHEAD; ++n) {
+            for (; bone < of[n]; ++bone) {
+                if (to) to[3 * bone] = sum;
+                if (word < 16) whole[16 * bone] = sum;
+                sum = 0.0f;
+            }
+            sum += value[n];
+        }
+    }
+}
+""")
+def gather_sums(
+    chunk_bone: wp.array(dtype=int),
     moments: wp.array2d(dtype=vec16),
+    other_moments: wp.array2d(dtype=vec12),
     e: int,
-    row: int,
-    thread: int,
-    threads: int,
-    # out
+    own: int,
+    taken: int,
+    off: int,
     bones: wp.array2d(dtype=vec16),
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
 ):
-    """Moments of the bones about their joints from those of their chunks, and from them two momenta each.
+    """Moments of the ``bones`` about their joints from those of their chunks, and their momenta of three velocities.
 
-    These are in row ``row``.
+    These are in row ``own`` of the velocity that the moments are of, in ``taken`` and in ``off`` of the other two.
     """
-    for b in range(thread, BONES, threads):
-        s = add_rows16(moments, e, body.chunk_start[b], body.chunk_start[b + 1])
-        bones[e, b] = s
-        linear[row, b] = wp.vec3(s[4], s[5], s[6])
-        angular[row, b] = wp.vec3(s[13], s[14], s[15])
-
-
-@wp.func
-def gather_other(
-    body: Body,
-    moments: wp.array2d(dtype=vec12),
-    first: int,
-    e: int,
-    row: int,
-    thread: int,
-    threads: int,
-    # out
-    linear: wp.array2d(dtype=wp.vec3),
-    angular: wp.array2d(dtype=wp.vec3),
-):
-    """The two momenta of one of the velocities that the sums have, in row ``row``."""
-    for b in range(thread, BONES, threads):
-        t = add_rows12(moments, e, body.chunk_start[b], body.chunk_start[b + 1])
-        linear[row, b] = wp.vec3(t[first], t[first + 1], t[first + 2])
-        angular[row, b] = wp.vec3(t[first + 3], t[first + 4], t[first + 5])
+    ...
 
 
 @wp.func
@@ -78,6 +98,73 @@ def take_child(
     linear[row, a] = linear[row, a] + linear[row, b]
 
 
+# Each lane of a warp has a bone. Level by level, bones take what their children have for them, a child at a time.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+constexpr unsigned ALL = 0xffffffffu;
+constexpr int VECTORS = 3;
+const int bones = parent.shape[0], lane = threadIdx.x & 31, own = min(lane, bones - 1);
+const int above = max(parent.data[own], 0);
+const int depth = lane < bones ? depths.data[own] : -1, below = lane < bones ? children.data[own] : 0;
+const wp::vec3 arm = wp::index(position, e, own) - wp::index(position, e, above);
+float sum[VECTORS][6];
+#pragma unroll
+for (int v = 0; v < VECTORS; ++v)
+#pragma unroll
+    for (int c = 0; c < 3; ++c) {
+        sum[v][c] = wp::index(linear, first + v * step, own)[c];
+        sum[v][3 + c] = wp::index(angular, first + v * step, own)[c];
+    }
+#pragma unroll 1
+for (int level = levels - 2; level >= 0; --level) {
+    float given[VECTORS][6];
+#pragma unroll
+    for (int v = 0; v < VECTORS; ++v)
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            const int i = (c + 1) % 3, j = (c + 2) % 3;
+            given[v][c] = sum[v][c];
+            given[v][3 + c] = sum[v][3 + c] + arm[i] * sum[v][j] - arm[j] * sum[v][i];
+        }
+    int left = depth == level ? below : 0;
+#pragma unroll 1
+    while (__any_sync(ALL, left != 0)) {
+        const int from = left != 0 ? 31 - __clz(left) : lane;
+        const float share = left != 0 ? 1.0f : 0.0f;
+        left &= ~(1 << from);
+#pragma unroll
+        for (int v = 0; v < VECTORS; ++v)
+#pragma unroll
+            for (int c = 0; c < 6; ++c) sum[v][c] += share * __shfl_sync(ALL, given[v][c], from);
+    }
+}
+__syncwarp();
+#pragma unroll
+for (int v = 0; v < VECTORS; ++v)
+#pragma unroll
+    for (int c = 0; c < 3; ++c) {
+        if (lane < bones) wp::index(momentum, first + v * step, 3 + 3 * own + c) = sum[v][3 + c];
+        if (lane == 0) wp::index(momentum, first + v * step, c) = sum[v][c];
+    }
+#endif
+""")
+def pass_down_together(
+    parent: wp.array(dtype=int),
+    depths: wp.array(dtype=int),
+    children: wp.array(dtype=int),
+    levels: int,
+    position: wp.array2d(dtype=wp.vec3),
+    e: int,
+    first: int,
+    step: int,
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+    momentum: wp.array2d(dtype=float),
+):
+    """:func:`pass_down` of three velocities by a warp."""
+    ...
+
+
 @wp.func
 def pass_down(
     body: Body,
@@ -86,7 +173,6 @@ def pass_down(
     velocities: int,
     own: int,
     step: int,
-    thread: int,
     threads: int,
     # in and out
     linear: wp.array2d(dtype=wp.vec3),
@@ -96,34 +182,22 @@ def pass_down(
 ):
     """``J^T m u`` from the momenta of the bones about their joints: each joint has what all beyond it have.
 
-    Of so many velocities, the first in row ``own``, others ``step`` rows apart. A thread that is alone goes from bone
-    to bone, the lanes of a warp from level to level, a bone each.
+    Of so many velocities, a warp of three, the first in row ``own``, others ``step`` rows apart.
     """
     meet_threads(threads)
-    if threads == 1:
+    if threads > 1:
+        pass_down_together(
+            body.parent, body.depth, body.children, body.levels, position, e, own, step, linear, angular, momentum
+        )  # fmt: skip
+    else:
         for v in range(velocities):
+            row = own + v * step
             for back in range(BONES - 1):
                 b = BONES - 1 - back  # children come after their parents
-                take_child(position, e, own + v * step, body.parent[b], b, linear, angular)
-    else:
-        depth = int(-1)
-        children = int(0)
-        if thread < BONES:
-            depth = body.depth[thread]
-            children = body.children[thread]
-        for back in range(body.levels - 1):
-            if depth == body.levels - 2 - back:
-                while children != 0:
-                    b = highest_bit(children)
-                    children -= 1 << b
-                    for v in range(velocities):
-                        take_child(position, e, own + v * step, thread, b, linear, angular)
-            meet_threads(threads)
-    for v in range(velocities):
-        for b in range(thread, BONES, threads):
-            set_part(momentum, own + v * step, 3 + 3 * b, angular[own + v * step, b])
-        if thread == 0:
-            set_part(momentum, own + v * step, 0, linear[own + v * step, 0])
+                take_child(position, e, row, body.parent[b], b, linear, angular)
+            for b in range(BONES):
+                set_part(momentum, row, 3 + 3 * b, angular[row, b])
+            set_part(momentum, row, 0, linear[row, 0])
 
 
 @wp.func

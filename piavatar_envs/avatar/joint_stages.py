@@ -18,17 +18,19 @@ from piavatar_envs.avatar.cholesky import (
     fetch_factor,
     keep_factor,
     solve,
-    solve_in_place,
+    solve_three_in_place,
 )
 from piavatar_envs.avatar.joint_bench import (
     JointBench,
+    bring_places,
     enter_room,
     keep_motion,
     leave_room,
     room_of_warp,
     row_in_room,
+    see_vectors,
 )
-from piavatar_envs.avatar.joint_momentum import LEFT, WAY, balance, gather_bones, gather_other, pass_down
+from piavatar_envs.avatar.joint_momentum import balance, gather_sums, pass_down
 from piavatar_envs.avatar.joint_motion import add_change, go_on, move_joints, part_of, spread_motion
 from piavatar_envs.avatar.joint_torques import (
     Springs,
@@ -43,10 +45,11 @@ from piavatar_envs.avatar.joint_torques import (
 from piavatar_envs.avatar.lanes import meet_threads, place_in_block, sum_threads
 from piavatar_envs.avatar.mass_matrix import BONES, compose_mass
 from piavatar_envs.avatar.mass_pairs import Pairs
-from piavatar_envs.avatar.mass_records import room_of_records
+from piavatar_envs.avatar.mass_records import PLACES, room_of_records
 from piavatar_envs.avatar.rotation import rigid_matrix
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.avatar.warp_cholesky import ROOM
+from piavatar_envs.avatar.warp_cholesky import ROOM, place_of_factor, store_room
+from piavatar_envs.mpm.shared_memory import meet
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -95,9 +98,9 @@ def find_shares(
 
     Of the first they are in row ``own``, of others ``step`` rows apart.
     """
-    pass_down(body, w.pose.position, e, rows, own, step, thread, threads, w.linear, w.angular, w.shares)
-    fetch_factor(w.factors, e, threads, room)
-    solve_in_place(w.pattern, w.factors, e, own, step, rows, threads, room, w.shares)
+    pass_down(body, w.pose.position, e, rows, own, step, threads, w.linear, w.angular, w.shares)
+    fetch_factor(w.factors, e, room)
+    solve_three_in_place(w.pattern, w.factors, e, own, step, threads, room, w.shares)
 
 
 @wp.func
@@ -174,7 +177,7 @@ def turn_joints(
         joint_impulse(
             body, dt, w.pose, target, springs, tissue, w.stop, w.velocity, w.outside, e, k, w.muscle, w.impulse
         )
-    fetch_factor(w.factors, driven, threads, room)
+    fetch_factor(w.factors, driven, room)
     factor = int(driven)
     while factor >= 0:  # once more where muscles reach their limits, by the same piece of the program
         solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, room, w.shares)
@@ -183,7 +186,7 @@ def turn_joints(
         if limit_joints(body, dt, springs, strength, driven, own, e, thread, threads, w) == 0.0:
             break
         factor = w.factors.shape[0] - 1
-        factorize(w.pattern, w.matrix, w.left, e, e, threads, room, factor, w.factors)
+        factorize(w.pattern, w.matrix, w.left, e, e, room, factor, w.factors)
     find_given(w.left, w.shares, own, e, thread, threads, w.impulse)
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     support = part_of(w.impulse, e, 0)
@@ -217,17 +220,22 @@ def build_mass(
     for k in range(thread, PARTS, threads):
         implicit_diagonal(body, dt, w.pose, springs, tissue, e, k, n + e, w.stop, w.diagonals)
     records = room_of_records(w.records, 0)
-    compose_mass(body, pairs, w.pair_sums, w.moments, w.pose.position, records, e, thread, threads, w.matrix)
+    bring_places(w.pose.position, e, thread, threads, records, PLACES)
+    position = see_vectors(w.pose.position, records, PLACES, 0)
+    mass = place_of_factor(w.matrix, e, records)
+    compose_mass(body, pairs, w.pair_sums, w.moments, position, w.pattern, records, e, thread, threads, mass)
+    store_room(mass, e, thread, threads, w.matrix)
+    meet()
     lanes = wp.min(threads, WARP)
     warp = thread // lanes
     for which in range(warp, 2, threads // lanes):
         system = which * n + e
         room = room_of_records(w.records, which * _ROOM)
         if threads == 1:
-            factorize(w.pattern, w.matrix, w.diagonals, e, system, lanes, room, system, w.factors)
+            factorize(w.pattern, w.matrix, w.diagonals, e, system, room, system, w.factors)
         else:
             factorize_in_room(w.pattern, w.diagonals, system, room)
-        keep_factor(lanes, room, system, w.factors)
+        keep_factor(room, system, w.factors)
 
 
 @wp.kernel
@@ -280,9 +288,9 @@ def act(
     taken = row_in_room(n + e, 1)
     off = row_in_room(2 * n + e, 2)
     near = enter_room(w, e)
-    gather_bones(body, w.moments, e, own, thread, threads, near.bones, near.linear, near.angular)
-    gather_other(body, w.other_moments, LEFT, e, taken, thread, threads, near.linear, near.angular)
-    gather_other(body, w.other_moments, WAY, e, off, thread, threads, near.linear, near.angular)
+    gather_sums(
+        body.chunk_bone, w.moments, w.other_moments, e, own, taken, off, near.bones, near.linear, near.angular
+    )  # fmt: skip
     find_shares(body, own, taken - own, moves, e, thread, threads, room, near)
     pull_bones(body, own, e, thread, threads, near)
     add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)

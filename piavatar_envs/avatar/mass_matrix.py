@@ -23,7 +23,8 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.lanes import add_rows12, add_rows16, highest_bit
+from piavatar_envs.avatar.cholesky import Pattern
+from piavatar_envs.avatar.lanes import add_rows12, add_rows16, highest_bit, sum_threads16
 from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.mass_records import lift, moved, read_pair, second_moment, transposed, two_sided, write_pair
 from piavatar_envs.avatar.rigid_fit import symmetric
@@ -39,6 +40,8 @@ NUM_DOF = 3 + 3 * NUM_JOINTS
 BONES = wp.constant(NUM_JOINTS)
 #: Pairs of bones whose blocks are in the lower triangle.
 LOWER = wp.constant(NUM_JOINTS * (NUM_JOINTS + 1) // 2)
+#: Lanes that share what a bone moves.
+LANES = wp.constant(4)
 I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 
 
@@ -85,17 +88,26 @@ def place_bone(
     position: wp.array2d(dtype=wp.vec3),
     e: int,
     c: int,
+    thread: int,
+    threads: int,
     # in and out
     records: wp.uint64,
 ):
-    """Moments of what a bone moves alone, about its joint: of all that it moves, less what it moves with others."""
-    s = add_rows16(moments, e, body.chunk_start[c], body.chunk_start[c + 1])
+    """Moments of what a bone moves alone, about its joint: of all that it moves, less what it moves with others.
+
+    So many ``threads`` that follow each other share the bone.
+    """
+    s = vec16()
+    for n in range(body.chunk_start[c] + thread, body.chunk_start[c + 1], threads):
+        s += add_rows16(moments, e, n, n + 1)
     second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
     own = two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second)
-    for d in range(BONES):
-        if pairs.of[c * BONES + d] >= 0:
-            own -= moved(read_pair(records, c, d), wp.vec3(), position[e, d] - position[e, c])
-    write_pair(records, c, c, own)
+    for n in range(pairs.beside_start[c] + thread, pairs.beside_start[c + 1], threads):
+        d = pairs.beside[n]
+        own -= moved(read_pair(records, c, d), wp.vec3(), position[e, d] - position[e, c])
+    own = sum_threads16(own, threads)
+    if thread == 0:
+        write_pair(records, c, c, own)
 
 
 @wp.func
@@ -171,36 +183,24 @@ def row_of_pair(n: int) -> int:
 
 
 @wp.func
-def set_block(matrix: wp.array3d(dtype=float), e: int, i: int, j: int, block: wp.mat33):
-    """Write 3 x 3 numbers."""
-    for a in range(3):
-        for b in range(3):
-            matrix[e, i + a, j + b] = block[a, b]
-
-
-@wp.func
-def fill_blocks(s: vec16, e: int, c: int, d: int, rooms: wp.uint64, mass: wp.array3d(dtype=float)):
+def fill_blocks(s: vec16, pattern: Pattern, c: int, d: int, at: wp.uint64):
     """The block of two joints of the mass matrix; those of the pelvis' velocity with the first joint's."""
     both = second_moment(s)
-    block = wp.trace(both) * I3 - both
-    set_block(mass, e, 3 + 3 * c, 3 + 3 * d, block)
-    set_in_rooms(rooms, 3 + 3 * c, 3 + 3 * d, block)
+    own = (1 + c) * (1 + BONES)
+    set_in_rooms(at, pattern.block[own + 1 + d], wp.trace(both) * I3 - both)
     if d == 0:
-        block = wp.skew(wp.vec3(s[1], s[2], s[3]))  # of v_0 . (w x a), transposed
-        set_block(mass, e, 3 + 3 * c, 0, block)
-        set_in_rooms(rooms, 3 + 3 * c, 0, block)
+        set_in_rooms(at, pattern.block[own], wp.skew(wp.vec3(s[1], s[2], s[3])))  # of v_0 . (w x a), transposed
         if c == 0:
-            set_block(mass, e, 0, 0, s[0] * I3)
-            set_in_rooms(rooms, 0, 0, s[0] * I3)
+            set_in_rooms(at, 0, s[0] * I3)
 
 
 @wp.func
-def fill_mass(records: wp.uint64, e: int, thread: int, threads: int, mass: wp.array3d(dtype=float)):
-    """The mass matrix from its records; a CUDA block writes it to two rooms for factors, too, where records are."""
+def fill_mass(pattern: Pattern, records: wp.uint64, thread: int, threads: int, at: wp.uint64):
+    """The mass matrix ``at`` its place from its records, which are there, too, on a GPU, and where it goes twice."""
     if threads == 1:
         for c in range(BONES):
             for d in range(c + 1):
-                fill_blocks(read_pair(records, c, d), e, c, d, records, mass)
+                fill_blocks(read_pair(records, c, d), pattern, c, d, at)
     else:  # a thread has two blocks of the lower triangle, or one
         n = wp.min(thread + threads, LOWER - 1)
         c = row_of_pair(thread)
@@ -210,9 +210,9 @@ def fill_mass(records: wp.uint64, e: int, thread: int, threads: int, mass: wp.ar
         s = read_pair(records, c, d)
         far = read_pair(records, far_c, far_d)
         meet()
-        fill_blocks(s, e, c, d, records, mass)
+        fill_blocks(s, pattern, c, d, at)
         if thread + threads < LOWER:
-            fill_blocks(far, e, far_c, far_d, records, mass)
+            fill_blocks(far, pattern, far_c, far_d, at)
     meet()
 
 
@@ -223,14 +223,14 @@ def compose_mass(
     sums: wp.array2d(dtype=vec12),
     moments: wp.array2d(dtype=vec16),
     position: wp.array2d(dtype=wp.vec3),
+    pattern: Pattern,
     records: wp.uint64,
     e: int,
     thread: int,
     threads: int,
-    # out
-    mass: wp.array3d(dtype=float),
+    at: wp.uint64,
 ):
-    """The mass matrix from the moments of pairs and of bones; of ``mass`` only the lower triangle is written.
+    """The mass matrix, ``at`` its place, from the moments of pairs and of bones, by blocks of the ``pattern``.
 
     Moments of every two bones become those of all that two joints carry: first for one side of the pairs, then for the
     other. The threads of a CUDA block share the bones.
@@ -241,12 +241,13 @@ def compose_mass(
     for pair in range(thread, pairs.first.shape[0], threads):
         place_pair(pairs, sums, position, e, pair, records)
     meet()
-    for b in range(thread, BONES, threads):
-        place_bone(body, pairs, moments, position, e, b, records)
+    lanes = wp.min(threads, LANES)
+    for n in range(thread, lanes * BONES, threads):
+        place_bone(body, pairs, moments, position, e, n // lanes, n % lanes, lanes, records)
     meet()
     if threads == 1:
         compose_alone(body, position, records, e)
     else:
         compose_together(body, position, records, e, True, thread, threads)
         compose_together(body, position, records, e, False, thread, threads)
-    fill_mass(records, e, thread, threads, mass)
+    fill_mass(pattern, records, thread, threads, at)

@@ -26,6 +26,9 @@ class Pairs:
 
     # (bones * bones,) pair of two bones; -1 where they have no particle in common, and for a bone with itself
     of: wp.array(dtype=int)
+    # bone c has particles in common with others beside[beside_start[c] : beside_start[c + 1]]
+    beside_start: wp.array(dtype=int)
+    beside: wp.array(dtype=int)
     first: wp.array(dtype=int)  # (pairs,) one of the bones of a pair, about whose joint its moments are
     second: wp.array(dtype=int)  # (pairs,) the other one
     chunk_pair: wp.array(dtype=int)  # (chunks,)
@@ -63,6 +66,8 @@ def build_pairs(points: BodyPoints, device: str) -> Pairs:
     pairs = Pairs()
     lists = {
         "of": of.ravel(),
+        "beside_start": np.cumsum([0, *(of >= 0).sum(1)]),
+        "beside": np.nonzero(of >= 0)[1],
         "first": [a for a, _ in sorted(particles)],
         "second": [b for _, b in sorted(particles)],
         "chunk_pair": chunk_pair,

@@ -46,11 +46,13 @@ def moved(s: vec16, alpha: wp.vec3, beta: wp.vec3):
 # read from different banks, whether theirs are the pairs of one bone or those of all with one.
 _ROW, _WORDS = NUM_JOINTS + 1 - NUM_JOINTS % 2, 13
 _WORD = _ROW * NUM_JOINTS
+#: Where the joints' places are, behind all records.
+PLACES = wp.constant(_WORDS * _WORD)
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-__shared__ float __align__(16) words[{_WORDS * _WORD}];
+__shared__ float __align__(16) words[{_WORDS * _WORD + 3 * NUM_JOINTS}];
 return reinterpret_cast<wp::uint64>(words + at);
 #else
 return reinterpret_cast<wp::uint64>(scratch.data);

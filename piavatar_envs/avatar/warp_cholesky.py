@@ -1,7 +1,8 @@
-"""Cholesky factors in the shared memory of a warp, which has a CUDA block of its own. Nothing here runs on a CPU.
+"""What :mod:`piavatar_envs.avatar.cholesky` does with the blocks of a factor, for the lanes of a warp or one thread.
 
-See :mod:`piavatar_envs.avatar.cholesky`, which has the same in plain Warp. A warp has :data:`ROOM` words, where a
-factor stays until the next one comes: what is solved with it need not fetch it again.
+On a GPU a factor is in the room of a warp, in shared memory: each row needs the one before, and would wait for global
+memory every time. A room has :data:`ROOM` words, a factor's and from :data:`SPARE` on those of vectors that are solved
+for. On a CPU a factor is where it is kept, and vectors are where they are wanted.
 """
 
 from __future__ import annotations
@@ -13,252 +14,279 @@ wp.set_module_options({"enable_backward": False})
 #: Rows of the largest matrix that there is room for: as many as an avatar has. 16 warps have room in a multiprocessor,
 #: so that those of 2,048 environments are all at work at once.
 MOST_ROWS = 69
-_FACTOR = -(-MOST_ROWS * (MOST_ROWS + 1) // 2 // 4) * 4
-#: Words of shared memory of a warp: a factor, and from :data:`SPARE` on three rows of it by columns, while it is found,
-#: or what is divided by, while it is solved with.
-SPARE = _FACTOR
-ROOM = SPARE + 4 * MOST_ROWS
-_AT = "float* const room = reinterpret_cast<float*>(at);"
-
-
-# The rows of a joint are eliminated together, so that an entry is read and written once for three of them. What it
-# loses is the product of two of the joint's columns: which, and where it is, a list says, or most lanes of a warp would
-# go through rows that have no entries. A lane has three entries of a row at a time, of which those beyond the diagonal
-# are none; two of these are read before one is written, or each would wait for the one before.
-_ELIMINATE = f"""
-float4* const joint = reinterpret_cast<float4*>(room + {_FACTOR});
-for (int k = size - 3; k >= 0; k -= 3) {{
-    const int first = __ldg(start.data + k), count = __ldg(start.data + k + 1) - first;
-    const int last_pair = __ldg(pair_start.data + k / 3 + 1);
-    const int* const column = columns.data + first;
-    float* const row0 = room + k * (k + 1) / 2;
-    float* const row1 = row0 + k + 1;
-    float* const row2 = row1 + k + 2;
-    const float s2 = row2[k + 2], over2 = rsqrtf(s2), l21 = row2[k + 1] * over2, l20 = row2[k] * over2;
-    const float s1 = row1[k + 1] - l21 * l21, over1 = rsqrtf(s1), l10 = (row1[k] - l21 * l20) * over1;
-    const float s0 = row0[k] - l20 * l20 - l10 * l10, over0 = rsqrtf(s0);
-    __syncwarp();
-    if (lane == 0) {{
-        row2[k + 2] = s2 * over2; row2[k + 1] = l21; row2[k] = l20;
-        row1[k + 1] = s1 * over1; row1[k] = l10;
-        row0[k] = s0 * over0;
-    }}
-    for (int n = lane; n < count; n += 32) {{
-        const int j = __ldg(column + n);
-        const float a2 = row2[j] * over2, a1 = (row1[j] - l21 * a2) * over1;
-        const float a0 = (row0[j] - l20 * a2 - l10 * a1) * over0;
-        row2[j] = a2; row1[j] = a1; row0[j] = a0;
-        joint[n] = make_float4(a0, a1, a2, 0.0f);
-    }}
-    __syncwarp();
-    for (int n = __ldg(pair_start.data + k / 3) + lane; n < last_pair; n += 64) {{
-        float value[2][3];
-        int at[2], own[2];
-#pragma unroll
-        for (int q = 0; q < 2; ++q) {{
-            const int which = n + 32 * q < last_pair ? __ldg(pair.data + n + 32 * q) : 0;
-            const int i = which >> 8 & 255, j = which & 255;
-            const float4 a = joint[i];
-            at[q] = which >> 16;
-            own[q] = n + 32 * q < last_pair ? i - j : -1;
-#pragma unroll
-            for (int c = 0; c < 3; ++c) {{
-                const float4 b = joint[j + c];
-                value[q][c] = room[at[q] + c] - a.x * b.x - a.y * b.y - a.z * b.z;
-            }}
-        }}
-#pragma unroll
-        for (int q = 0; q < 2; ++q)
-#pragma unroll
-            for (int c = 0; c < 3; ++c)
-                if (c <= own[q]) room[at[q] + c] = value[q][c];
-    }}
-    __syncwarp();
-}}
+_JOINTS = MOST_ROWS // 3
+#: Words of shared memory of a warp: all blocks that a factor may have, and three vectors, four words a joint.
+SPARE = 9 * _JOINTS * (_JOINTS + 1) // 2
+ROOM = SPARE + 3 * 4 * _JOINTS
+_ROOM = """
+float* const room = reinterpret_cast<float*>(at);
+#if defined(__CUDA_ARCH__)
+const int lane = threadIdx.x & 31;
+constexpr int LANES = 32;
+const auto meet = [] { __syncwarp(); };
+const auto over_root = [](float x) { return rsqrtf(x); };
+#else
+constexpr int lane = 0, LANES = 1;
+const auto meet = [] {};
+const auto over_root = [](float x) { return 1.0f / sqrtf(x); };
+#endif
 """
 
 
-@wp.func_native(f"""
+# A warp that is alone takes four cycles for an instruction, and hundreds for what it does not find in the first-level
+# cache, of program or data. Places come in bytes, therefore, what is done in a round is asked for two rounds ahead,
+# from lists that end in two rounds of nothing, and all is read before anything is written, which it might be.
+# Of a row all lanes find the inverse of the diagonal's block, a lane a column of the others. Then a lane has two of its
+# blocks, whose product is to be taken from a third.
+@wp.func_native(
+    _ROOM
+    + """
 #if defined(__CUDA_ARCH__)
-{_AT}
-const int lane = threadIdx.x & 31, size = matrix.shape[1], entries = entry.shape[0];
-const float* const from = &wp::index(matrix, source, 0, 0);
-const float* const more = &wp::index(diagonal, e, 0);
-for (int n = lane; n < {_FACTOR} / 4; n += 32) reinterpret_cast<float4*>(room)[n] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-__syncwarp();
-#pragma unroll 8
-for (int n = lane; n < entries; n += 32) {{
-    const int i = __ldg(entry.data + n) >> 8, j = __ldg(entry.data + n) & 255;
-    room[i * (i + 1) / 2 + j] = from[i * size + j] + (j == i ? more[i] : 0.0f);
+using Step = int4;
+#else
+struct Step { int x, y, z, w; };
+#endif
+struct Block { float number[9]; };
+const Step* const all_steps = reinterpret_cast<const Step*>(steps.data);
+const auto at_byte = [&](int n) { return reinterpret_cast<float*>(reinterpret_cast<char*>(room) + n); };
+const int column = 9 * (lane / 3) + lane % 3;
+const auto block_at = [](const float* from) {
+    Block block;
+#pragma unroll
+    for (int c = 0; c < 9; ++c) block.number[c] = from[c];
+    return block;
+};
+const auto take = [&](const float* row, int word, const Block& before) {
+    const Block first = block_at(row + (word >> 8 & 255)), second = block_at(row + (word & 255));
+    const float* const a = first.number;
+    const float* const b = second.number;
+    float* const to = at_byte(word >> 16);
+#pragma unroll
+    for (int c = 0; c < 9; ++c)
+        to[c] = before.number[c] - a[c / 3] * b[c % 3] - a[3 + c / 3] * b[3 + c % 3] - a[6 + c / 3] * b[6 + c % 3];
+};
+Step now = all_steps[0], next = all_steps[1];
+int word = pair.data[lane], next_word = pair.data[32 + lane];
+#pragma unroll 1
+for (int round = 0; round < steps.shape[0] - 2; ++round) {
+    const Step after = all_steps[round + 2];
+    const int after_word = pair.data[32 * (round + 2) + lane];
+    float* const row = at_byte(now.x);
+#if defined(__CUDA_ARCH__)
+    const Block before = block_at(at_byte(word < 0 ? 0 : word >> 16));  // while the row is found
+#endif
+    if (now.w == 0) {
+        float* const d = at_byte(now.y);
+        const float d0 = d[0], d3 = d[3], d4 = d[4], d6 = d[6], d7 = d[7], d8 = d[8];
+        float* const m = row + column;
+        float m0 = 0.0f, m1 = 0.0f, m2 = 0.0f;
+        if (lane < now.z) m0 = m[0], m1 = m[3], m2 = m[6];
+        const float o2 = over_root(d8), l21 = d7 * o2, l20 = d6 * o2;
+        const float o1 = over_root(d4 - l21 * l21), l10 = (d3 - l21 * l20) * o1;
+        const float o0 = over_root(d0 - l20 * l20 - l10 * l10);
+        const float w10 = -o1 * l10 * o0, w21 = -o2 * l21 * o1, w20 = -o2 * (l20 * o0 + l21 * w10);
+        meet();
+        if (lane == 0) d[0] = o0, d[3] = w10, d[4] = o1, d[6] = w20, d[7] = w21, d[8] = o2;
+        const auto put = [&](float* to, float m0, float m1, float m2) {
+            to[0] = o0 * m0 + w10 * m1 + w20 * m2, to[3] = o1 * m1 + w21 * m2, to[6] = o2 * m2;
+        };
+        if (lane < now.z) put(m, m0, m1, m2);
+#pragma unroll 1
+        for (int n = lane + LANES; n < now.z; n += LANES) {
+            float* const more = row + 9 * (n / 3) + n % 3;
+            put(more, more[0], more[3], more[6]);
+        }
+        meet();
+    }
+#if defined(__CUDA_ARCH__)
+    if (word >= 0) take(row, word, before);
+#else
+    for (const int* own = pair.data + 32 * round; own < pair.data + 32 * (round + 1) && *own >= 0; ++own)
+        take(row, *own, block_at(at_byte(*own >> 16)));
+#endif
+    meet();
+    now = next, next = after, word = next_word, next_word = after_word;
+}
+"""
+)
+def eliminate(steps: wp.array(dtype=wp.vec4i), pair: wp.array(dtype=int), at: wp.uint64):
+    """The factor of the matrix in a room, in its place."""
+    ...
+
+
+@wp.func_native(
+    _ROOM
+    + """
+for (int i = lane; i < diagonal.shape[1]; i += LANES) room[entry.data[i]] += wp::index(diagonal, e, i);
+meet();
+"""
+)
+def add_diagonal(entry: wp.array(dtype=int), diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
+    """Add row ``e`` to the diagonal of the matrix in a room, whose entries are there."""
+    ...
+
+
+@wp.func_native(f"""
+float* const to = reinterpret_cast<float*>(at) + 9 * block;
+if (block < 0) return;
+for (int n = 0; n < 9; ++n) {{
+    to[n] = value.data[n / 3][n % 3];
+#if defined(__CUDA_ARCH__)
+    to[n + {ROOM}] = to[n];
+#endif
 }}
-__syncwarp();
-{_ELIMINATE}
-#endif
 """)
-def factorize_together(
-    start: wp.array(dtype=int),
-    columns: wp.array(dtype=int),
-    entry: wp.array(dtype=int),
-    pair_start: wp.array(dtype=int),
-    pair: wp.array(dtype=int),
-    matrix: wp.array3d(dtype=float),
-    diagonal: wp.array2d(dtype=float),
-    source: int,
-    e: int,
-    at: wp.uint64,
-):
-    """The factor of matrix ``source`` and diagonal ``e``, as :mod:`piavatar_envs.avatar.cholesky` has it."""
+def set_in_rooms(at: wp.uint64, block: int, value: wp.mat33):
+    """Write a block, if there is one of that number, to the matrix in a room, and on a GPU to that in the next room."""
     ...
 
 
-@wp.func_native(f"""
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
-{_AT}
-const int lane = threadIdx.x & 31, size = diagonal.shape[1];
-for (int i = lane; i < size; i += 32) room[i * (i + 1) / 2 + i] += wp::index(diagonal, e, i);
-for (int n = size * (size + 1) / 2 + lane; n < {_FACTOR}; n += 32) room[n] = 0.0f;
-__syncwarp();
-{_ELIMINATE}
+float4* const to = reinterpret_cast<float4*>(&wp::index(rows, n, 0));
+for (int k = thread; k < rows.shape[1] / 4; k += threads) to[k] = reinterpret_cast<const float4*>(at)[k];
 #endif
 """)
-def eliminate_together(
-    start: wp.array(dtype=int),
-    columns: wp.array(dtype=int),
-    pair_start: wp.array(dtype=int),
-    pair: wp.array(dtype=int),
-    diagonal: wp.array2d(dtype=float),
-    e: int,
-    at: wp.uint64,
-):
-    """:func:`factorize_together` of the matrix that :func:`set_in_rooms` has written to the room."""
+def store_room(at: wp.uint64, n: int, thread: int, threads: int, rows: wp.array2d(dtype=float)):
+    """Write what is in a room to row ``n``; on a CPU it is there."""
     ...
 
 
-@wp.func_native(f"""
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
-{_AT}
-#pragma unroll
-for (int a = 0; a < 3; ++a)
-#pragma unroll
-    for (int b = 0; b < 3; ++b)
-        if (j + b <= i + a) {{
-            float* const to = room + (i + a) * (i + a + 1) / 2 + j + b;
-            to[0] = to[{ROOM}] = block.data[a][b];
-        }}
-#endif
-""")
-def set_in_rooms(at: wp.uint64, i: int, j: int, block: wp.mat33):
-    """Write 3 x 3 entries, from row ``i`` and column ``j`` on, to a matrix in each of two rooms, if in the triangle."""
-    ...
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-{_AT}
-float4* const to = reinterpret_cast<float4*>(&wp::index(factor, f, 0));
-for (int n = threadIdx.x & 31; n < factor.shape[1] / 4; n += 32) to[n] = reinterpret_cast<const float4*>(room)[n];
-__syncwarp();  // the room is free
-#endif
-""")
-def store_factor(at: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
-    """Write factor ``f`` from a warp's room."""
-    ...
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-{_AT}
-const float4* const from = reinterpret_cast<const float4*>(&wp::index(factor, f, 0));
+const float4* const from = reinterpret_cast<const float4*>(&wp::index(rows, n, 0));
 __syncwarp();
 #pragma unroll 10
-for (int n = threadIdx.x & 31; n < factor.shape[1] / 4; n += 32) reinterpret_cast<float4*>(room)[n] = from[n];
+for (int k = threadIdx.x & 31; k < rows.shape[1] / 4; k += 32) reinterpret_cast<float4*>(at)[k] = from[k];
 __syncwarp();
+#else
+float* const to = reinterpret_cast<float*>(at);
+if (to != &wp::index(rows, n, 0)) memcpy(to, &wp::index(rows, n, 0), sizeof(float) * rows.shape[1]);
 #endif
 """)
-def load_factor(factor: wp.array2d(dtype=float), f: int, at: wp.uint64):
-    """Read factor ``f`` into a warp's room."""
+def load_room(rows: wp.array2d(dtype=float), n: int, at: wp.uint64):
+    """Read row ``n`` into a room."""
     ...
 
 
-# Lanes have the components of one or more vectors in registers, thirty of a part so that those of a joint are together,
-# and tell each other the three of a joint at once. Both substitutions go by columns of what is left: triangular numbers
-# of 32 rows differ modulo 32, so lanes read from different banks.
-_SOLVE = """
+@wp.func_native("""
 #if defined(__CUDA_ARCH__)
-%(at)s
-constexpr int VECTORS = %(vectors)d, PARTS = %(parts)d, PART = 30;
-const int lane = threadIdx.x & 31, size = x.shape[1];
-float* const over = room + %(factor)d;
-float value[VECTORS][PARTS];
-for (int i = lane; i < size; i += 32) over[i] = 1.0f / room[i * (i + 1) / 2 + i];
-#pragma unroll
-for (int q = 0; q < PARTS; ++q)
-#pragma unroll
-    for (int v = 0; v < VECTORS; ++v)
-        value[v][q] = lane < PART && PART * q + lane < size ? wp::index(x, first + v * step, PART * q + lane) : 0.0f;
-__syncwarp();
-#pragma unroll
-for (int part = PARTS - 1; part >= 0; --part)
-    for (int k = min(size, PART * part + PART) - 3; k >= PART * part; k -= 3) {
-        const float* const row0 = room + k * (k + 1) / 2;
-        const float* const row1 = row0 + k + 1;
-        const float* const row2 = row1 + k + 2;
-        const float o0 = over[k], o1 = over[k + 1], o2 = over[k + 2], l10 = row1[k], l20 = row2[k], l21 = row2[k + 1];
-        const int own = k - PART * part;
-#pragma unroll
-        for (int v = 0; v < VECTORS; ++v) {
-            const float f0 = __shfl_sync(0xffffffffu, value[v][part], own);
-            const float f1 = __shfl_sync(0xffffffffu, value[v][part], own + 1);
-            const float x2 = __shfl_sync(0xffffffffu, value[v][part], own + 2) * o2;
-            const float x1 = (f1 - l21 * x2) * o1, x0 = (f0 - l20 * x2 - l10 * x1) * o0;
-            if (lane >= own && lane < own + 3) value[v][part] = lane == own ? x0 : lane == own + 1 ? x1 : x2;
-#pragma unroll
-            for (int q = 0; q <= part; ++q) {
-                const int j = PART * q + lane;
-                if (lane < PART && j < k) value[v][q] -= row2[j] * x2 + row1[j] * x1 + row0[j] * x0;
-            }
-        }
-    }
-#pragma unroll
-for (int part = 0; part < PARTS; ++part)
-    for (int k = PART * part; k < min(size, PART * part + PART); k += 3) {
-        const float* const row1 = room + (k + 1) * (k + 2) / 2;
-        const float* const row2 = row1 + k + 2;
-        const float o0 = over[k], o1 = over[k + 1], o2 = over[k + 2], l10 = row1[k], l20 = row2[k], l21 = row2[k + 1];
-        const int own = k - PART * part;
-#pragma unroll
-        for (int v = 0; v < VECTORS; ++v) {
-            const float f1 = __shfl_sync(0xffffffffu, value[v][part], own + 1);
-            const float f2 = __shfl_sync(0xffffffffu, value[v][part], own + 2);
-            const float x0 = __shfl_sync(0xffffffffu, value[v][part], own) * o0;
-            const float x1 = (f1 - l10 * x0) * o1, x2 = (f2 - l20 * x0 - l21 * x1) * o2;
-            if (lane >= own && lane < own + 3) value[v][part] = lane == own ? x0 : lane == own + 1 ? x1 : x2;
-#pragma unroll
-            for (int q = part; q < PARTS; ++q) {
-                const int i = PART * q + lane;
-                const float* const row = room + i * (i + 1) / 2 + k;
-                if (lane < PART && i > k + 2 && i < size) value[v][q] -= row[0] * x0 + row[1] * x1 + row[2] * x2;
-            }
-        }
-    }
-#pragma unroll
-for (int q = 0; q < PARTS; ++q)
-#pragma unroll
-    for (int v = 0; v < VECTORS; ++v)
-        if (lane < PART && PART * q + lane < size) wp::index(x, first + v * step, PART * q + lane) = value[v][q];
-__syncwarp();  // over is free
+return room;
+#else
+return reinterpret_cast<wp::uint64>(&wp::index(factor, f, 0));
+#endif
+""")
+def place_of_factor(factor: wp.array2d(dtype=float), f: int, room: wp.uint64) -> wp.uint64:
+    """Where factor ``f`` is worked on: in the room of a warp, or on a CPU in the array itself."""
+    ...
+
+
+# All lanes find the part of a joint, and each takes from one number of another joint what that has of it: on the way
+# down, in the columns of its row, and on the way up, in the rows of its column.
+_SOLVE = (
+    _ROOM
+    + f"""
+constexpr int VECTORS = COUNT, STRIDE = {4 * _JOINTS};
+const int size = x.shape[1];
+#if defined(__CUDA_ARCH__)
+float* const spare = room + {SPARE};
+for (int v = 0; v < VECTORS; ++v)
+    for (int n = lane; n < size; n += LANES) spare[STRIDE * v + n + n / 3] = wp::index(x, first + v * step, n);
+meet();
+const auto part = [&](int v, int n) {{
+    return reinterpret_cast<float*>(reinterpret_cast<char*>(spare + STRIDE * v) + n);
+}};
+#else
+const auto part = [&](int v, int n) {{ return &wp::index(x, first + v * step, 3 * (n >> 4) + (n >> 2 & 3)); }};
 #endif
 """
-_SIZES = {"at": _AT, "factor": _FACTOR, "parts": -(-MOST_ROWS // 30)}
+    + """
+const auto at_byte = [&](int n) { return reinterpret_cast<const float*>(reinterpret_cast<const char*>(room) + n); };
+float y[VECTORS][3];
+const auto take = [&](int word, float m0, float m1, float m2) {
+#pragma unroll
+    for (int v = 0; v < VECTORS; ++v) {
+        float* const other = part(v, word & 1023);
+        *other = *other - m0 * y[v][0] - m1 * y[v][1] - m2 * y[v][2];
+    }
+};
+const auto go = [&](auto way, int& head, int& word, int round) {
+    constexpr int ALONG = decltype(way)::value;
+#if defined(__CUDA_ARCH__)
+    const float* const m = at_byte(word < 0 ? 0 : word >> 10);  // while the part is found
+    const float m0 = m[0], m1 = m[ALONG], m2 = m[2 * ALONG];
+#endif
+    if (head >= 0) {
+        const float* const w = at_byte(head >> 10);
+        float b[VECTORS][3];
+        const float w0 = w[0], w3 = w[3], w4 = w[4], w6 = w[6], w7 = w[7], w8 = w[8];
+#pragma unroll
+        for (int v = 0; v < VECTORS; ++v)
+            for (int c = 0; c < 3; ++c) b[v][c] = part(v, head & 1023)[c];
+#pragma unroll
+        for (int v = 0; v < VECTORS; ++v) {
+            if (ALONG == 3) {
+                y[v][0] = w0 * b[v][0] + w3 * b[v][1] + w6 * b[v][2];
+                y[v][1] = w4 * b[v][1] + w7 * b[v][2];
+                y[v][2] = w8 * b[v][2];
+            } else {
+                y[v][0] = w0 * b[v][0];
+                y[v][1] = w3 * b[v][0] + w4 * b[v][1];
+                y[v][2] = w6 * b[v][0] + w7 * b[v][1] + w8 * b[v][2];
+            }
+        }
+        meet();
+        if (lane == 0)
+#pragma unroll
+            for (int v = 0; v < VECTORS; ++v)
+                for (int c = 0; c < 3; ++c) part(v, head & 1023)[c] = y[v][c];
+    }
+#if defined(__CUDA_ARCH__)
+    if (word >= 0) take(word, m0, m1, m2);
+#else
+    for (const int* own = words.data + 32 * round; own < words.data + 32 * (round + 1) && *own >= 0; ++own) {
+        const float* const m = at_byte(*own >> 10);
+        take(*own, m[0], m[ALONG], m[2 * ALONG]);
+    }
+#endif
+    head = heads.data[round + 2];  // two pieces take turns: a loop that hands such values on would wait for them there
+    word = words.data[32 * (round + 2) + lane];
+    meet();
+};
+int even = heads.data[0], odd = heads.data[1], even_word = words.data[lane], odd_word = words.data[32 + lane];
+const auto sweep = [&](auto way, int begin, int end) {
+#pragma unroll 1
+    for (int round = begin; round < end; round += 2) {
+        go(way, even, even_word, round);
+        go(way, odd, odd_word, round + 1);
+    }
+};
+struct Down { enum { value = 3 }; };
+struct Up { enum { value = 1 }; };
+sweep(Down{}, 0, turn);
+sweep(Up{}, turn, heads.shape[0] - 2);
+#if defined(__CUDA_ARCH__)
+for (int v = 0; v < VECTORS; ++v)
+    for (int n = lane; n < size; n += LANES) wp::index(x, first + v * step, n) = spare[STRIDE * v + n + n / 3];
+meet();
+#endif
+"""
+)
 
 
-@wp.func_native(_SOLVE % (_SIZES | {"vectors": 1}))
-def solve_together(at: wp.uint64, first: int, step: int, x: wp.array2d(dtype=float)):
-    """Row ``first`` of what is solved with the factor in a warp's room; it has the right-hand side at first."""
+@wp.func_native(_SOLVE.replace("COUNT", "1"))
+def solve_one(
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
+    x: wp.array2d(dtype=float),
+):  # fmt: skip
+    """Row ``first`` of what is solved with the factor in a room; it has the right-hand side at first."""
     ...
 
 
-@wp.func_native(_SOLVE % (_SIZES | {"vectors": 3}))
-def solve_three_together(at: wp.uint64, first: int, step: int, x: wp.array2d(dtype=float)):
-    """:func:`solve_together` of three rows, a ``step`` from one to the next."""
+@wp.func_native(_SOLVE.replace("COUNT", "3"))
+def solve_three(
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
+    x: wp.array2d(dtype=float),
+):  # fmt: skip
+    """:func:`solve_one` of three rows, a ``step`` from one to the next."""
     ...

@@ -116,9 +116,8 @@ class Joints:
 
     @property
     def mass(self) -> np.ndarray:
-        """The mass matrix, of which the lower triangle is built, shape ``(69, 69)``."""
-        lower = np.tril(self.body.mass.matrix.numpy()[0].astype(float))
-        return lower + np.tril(lower, -1).T
+        """The mass matrix, shape ``(69, 69)``."""
+        return self.body.mass.read()[0]
 
     @property
     def total(self) -> np.ndarray:

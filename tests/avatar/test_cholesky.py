@@ -13,6 +13,7 @@ from piavatar_envs.avatar.cholesky import (
     fetch_factor,
     find_pattern,
     keep_factor,
+    lower_entries,
     solve,
 )
 from piavatar_envs.avatar.joint_bench import room_of_warp
@@ -23,7 +24,7 @@ from piavatar_envs.avatar.mass_matrix import NUM_DOF
 @wp.kernel(enable_backward=False)
 def factorize_and_solve(
     pattern: Pattern,
-    matrix: wp.array3d(dtype=float),
+    matrix: wp.array2d(dtype=float),
     diagonal: wp.array2d(dtype=float),
     right: wp.array2d(dtype=float),
     threads: int,
@@ -35,11 +36,11 @@ def factorize_and_solve(
     n, room = matrix.shape[0], room_of_warp()
     for which in range(2):
         system = which * n + e
-        factorize(pattern, matrix, diagonal, e, system, threads, room, system, factor)
-        keep_factor(threads, room, system, factor)
+        factorize(pattern, matrix, diagonal, e, system, room, system, factor)
+        keep_factor(room, system, factor)
     for which in range(2):
         system = which * n + e
-        fetch_factor(factor, system, threads, room)
+        fetch_factor(factor, system, room)
         solve(pattern, factor, system, right, system, system, thread, threads, room, x)
 
 
@@ -55,14 +56,19 @@ def test_factors_solve(device, sparse):
     matrix = np.where(filled, root @ root.transpose(0, 2, 1), 0.0)
     matrix = (matrix + (2.0 + np.abs(matrix).sum(2).max()) * np.eye(size)).astype(np.float32)
     diagonal, right = rng.uniform(0.0, 3.0, (2 * n, size)), rng.normal(size=(2 * n, size))
-    arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in (matrix, diagonal, right)]
-    factor, x = (wp.zeros((2 * n, rows), dtype=float, device=device) for rows in (factor_size(size), size))
-    inputs = [find_pattern(filled, device), *arrays, threads]
+    pattern = find_pattern(filled, device)
+    rows, columns, numbers = lower_entries(pattern)
+    packed = np.zeros((n, factor_size(pattern)))
+    packed[:, numbers] = matrix[:, rows, columns]
+    arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in (packed, diagonal, right)]
+    factor, x = (wp.zeros((2 * n, rows), dtype=float, device=device) for rows in (factor_size(pattern), size))
+    inputs = [pattern, *arrays, threads]
     wp.launch(factorize_and_solve, (n, threads), inputs, [factor, x], block_dim=threads, device=device)
     whole = np.tile(matrix, (2, 1, 1)) + diagonal[:, :, None] * np.eye(size)
     L = np.zeros((2 * n, size, size))
-    rows, columns = np.tril_indices(size)
-    L[:, rows, columns] = factor.numpy()[:, : len(rows)]
+    L[:, rows, columns] = factor.numpy()[:, numbers]
+    for k in range(0, size, 3):  # of a block of the diagonal the inverse is kept
+        L[:, k : k + 3, k : k + 3] = np.linalg.inv(L[:, k : k + 3, k : k + 3])
     np.testing.assert_allclose(L.transpose(0, 2, 1) @ L, whole, atol=1e-5 * np.abs(whole).max())
     solved = np.linalg.solve(whole, right[..., None])[..., 0]
     np.testing.assert_allclose(x.numpy(), solved, atol=1e-5 * np.abs(solved).max())
