@@ -66,6 +66,7 @@ from piavatar_envs.avatar.joint_torques import UNBOUNDED, Springs, Target, make_
 from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.part_sums import ALL_WORDS, PART_BLOCK, divide
+from piavatar_envs.avatar.quarters import warps_of
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
 from piavatar_envs.mpm.program import Program
@@ -220,7 +221,7 @@ class ArticulatedBody:
         w = self._bench
         program.launch(
             sum_moments,
-            (*w.moments.shape, self.threads),
+            (self.model.num_envs, warps_of(self.body.quarters, self.threads), self.threads),
             [self.body, self.model.particles, state.x, state.u, self.state.position, state.failure, self.threads],
             [w.moments],
             block_dim=BLOCK,

@@ -8,7 +8,7 @@ from piavatar_envs.avatar.blending import blend_images, blend_places
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import blended_motion, motion_apart
 from piavatar_envs.avatar.lanes import lane_of_warp, warp_of_block
-from piavatar_envs.avatar.loads import int_at, number_at, vector_at
+from piavatar_envs.avatar.loads import ask_ahead, int_at, number_at, set_vector, vector_at
 from piavatar_envs.avatar.part_sums import (
     PART_BLOCK,
     Parts,
@@ -19,6 +19,7 @@ from piavatar_envs.avatar.part_sums import (
     sum_chunk,
 )
 from piavatar_envs.avatar.pulls import implicit_velocity
+from piavatar_envs.avatar.quarters import quarters_at_once, share_of
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.colliders import signed_distance
 from piavatar_envs.mpm.matrices import matrix_at, store_matrix
@@ -35,6 +36,21 @@ def pulled_rest(body: Body, e: int, p: int, w: JointBench):
     if p < w.slip.shape[1]:
         rest += vector_at(w.slip, e, p)
     return rest
+
+
+@wp.func
+def sum_part(parts: Parts, room: wp.uint64, pelvis: wp.vec3, e: int, part: int, w: JointBench):
+    """Sums of the chunks of the part in the room, where places are seen from the ``pelvis``."""
+    warp = warp_of_block()
+    lane = lane_of_warp()
+    quarters = quarters_at_once(lane[1])
+    n = int_at(parts.start, part) + quarters * warp[0]
+    end = int_at(parts.start, part + 1)
+    while n < end:
+        share = share_of(parts.quarters, n, lane[0])
+        origin = vector_at(w.pose.position, e, share[1] & 255) - pelvis
+        sum_chunk(parts, room, share, origin, e, w.moments, w.other_moments)
+        n += quarters * warp[1]
 
 
 @wp.kernel(launch_bounds=(PART_BLOCK, 4))
@@ -74,6 +90,9 @@ def attach_flesh(
     r = row(e, mass.shape[0])
     p = first + thread
     pelvis = vector_at(w.pose.position, e, 0)
+    ask_ahead(x, e, body.first + first, last - first, thread)
+    ask_ahead(u, e, body.first + first, last - first, thread)
+    ask_ahead(vk, e, body.first + first, last - first, thread)
     while p < last:
         n = body.first + p
         arm = vector_at(x, e, n) - pelvis
@@ -84,7 +103,7 @@ def attach_flesh(
         apart = wp.vec3()
         if p >= body.alone:
             apart = motion_apart(now)
-            vk[e, n] = apart
+            set_vector(vk, e, n, apart)
         before = v - blended_motion(now, arm) - apart
         way = wp.vec3(now[6], now[7], now[8]) - arm
         after = implicit_velocity(own_rate, dt, way, before)
@@ -92,15 +111,7 @@ def attach_flesh(
         p += threads
     meet()
     store_second(room, last - first, thread, threads, e, body.first + first, u)
-    warp = warp_of_block()
-    lane = lane_of_warp()
-    n = int_at(parts.start, at[1]) + warp[0]
-    end = int_at(parts.start, at[1] + 1)
-    while n < end:
-        c = int_at(parts.chunk, n)
-        origin = vector_at(w.pose.position, e, int_at(body.chunk_bone, c)) - pelvis
-        sum_chunk(body, parts, room, origin, e, c, lane[0], lane[1], w.moments, w.other_moments)
-        n += warp[1]
+    sum_part(parts, room, pelvis, e, at[1], w)
 
 
 @wp.func

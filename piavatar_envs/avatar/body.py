@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.influences import in_order, pack
+from piavatar_envs.avatar.quarters import share_chunks
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS
 from piavatar_envs.avatar.types import Body
 
@@ -49,7 +50,7 @@ class BodyPoints:
 
 
 def bone_lists(points: BodyPoints, part: int) -> dict[str, np.ndarray]:
-    """Chunked lists of the particles that each bone moves, as :class:`Body` has them.
+    """Chunked lists of the particles that each bone moves: chunk ``c`` holds ``entry_start[c] : entry_start[c + 1]``.
 
     The particles of a chunk are in one of the parts that the body has, of ``part`` particles each.
     """
@@ -134,6 +135,14 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.children = upload(children, int)
     body.tracker_start = upload(np.cumsum([0, *map(len, trackers)]), int)
     body.tracker = upload(np.concatenate(trackers), int)
-    for name, numbers in bone_lists(points, points.num_points).items():
-        setattr(body, name, upload(numbers, float if name == "entry_weight" else int))
+    set_lists(body, bone_lists(points, points.num_points), device)
     return body
+
+
+def set_lists(body: Body, lists: dict[str, np.ndarray], device: str) -> None:
+    """Upload what :func:`bone_lists` has found."""
+    borders, bone = lists["entry_start"], lists["chunk_bone"]
+    quarters = share_chunks(borders[:-1], borders[1:], bone, device).astype(np.int32)
+    body.quarters = wp.array(quarters, dtype=wp.vec4i, device=device)
+    for name in ("chunk_start", "chunk_bone", "entry", "entry_weight"):
+        setattr(body, name, wp.array(lists[name], dtype=float if name == "entry_weight" else int, device=device))

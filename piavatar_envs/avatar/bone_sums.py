@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.lanes import BLOCK, place_in_chunks, store_sum12, store_sum16, sum_threads12
+from piavatar_envs.avatar.lanes import BLOCK, place_in_chunks, sum_threads12
 from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
+from piavatar_envs.avatar.quarters import quarters_at_once, share_of, store_moments, store_one
 from piavatar_envs.avatar.types import Body, Drive, vec12, vec16
 from piavatar_envs.mpm.types import Particles, row
 
@@ -54,26 +55,27 @@ def chunk_moments(
     u: wp.array2d(dtype=wp.vec3),
     reference: wp.array2d(dtype=wp.vec3),
     e: int,
-    c: int,
-    thread: int,
-    threads: int,
+    share: wp.vec4i,
     # out
     moments: wp.array2d(dtype=vec16),
 ):
-    """Moments of one chunk of a bone's particles about the bone's reference point (small numbers, small round-off)."""
-    origin = reference[e, body.chunk_bone[c]]
+    """Moments of one chunk of a bone's particles about the bone's reference point (small numbers, small round-off).
+
+    The ``share`` of a thread is as :mod:`piavatar_envs.avatar.quarters` has it.
+    """
+    origin = reference[e, share[1] & 255]
     r = row(e, particles.mass.shape[0])
     total = vec16()
-    last = body.entry_start[c + 1] - 1
-    n = body.entry_start[c] + thread
+    last = share[3] - 1
+    n = share[2]
     while n <= last:
         for _ in range(AT_ONCE):
             entry, weight = entry_of(body, n, last)
             p = body.first + entry
             w = weight * number_at(particles.mass, r, p)
             total += moments_of(w, vector_at(x, e, p) - origin, vector_at(u, e, p))
-            n += threads
-    store_sum16(moments, e, c, total, threads)
+            n += share[1] >> 8
+    store_moments(moments, e, share, total)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 9))
@@ -88,14 +90,13 @@ def sum_moments(
     # out
     moments: wp.array2d(dtype=vec16),
 ):
-    """:func:`chunk_moments` of every chunk, over ``(num_envs, chunks, threads)``."""
+    """:func:`chunk_moments` of every chunk, over ``(num_envs, warps of the quarters, threads)``."""
     i, j, k = wp.tid()
-    at = place_in_chunks(i, j, k, body.chunk_bone.shape[0])
+    quarters = quarters_at_once(threads)
+    at = place_in_chunks(i, j, k, body.quarters.shape[0] // quarters)
     e = at[0]
-    c = at[1]
-    thread = at[2]
     if failure[e] == 0:
-        chunk_moments(body, particles, x, u, reference, e, c, thread, threads, moments)
+        chunk_moments(body, particles, x, u, reference, e, share_of(body.quarters, quarters * at[1], at[2]), moments)
 
 
 @wp.func
@@ -107,21 +108,19 @@ def chunk_corrections(
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
     e: int,
-    c: int,
-    thread: int,
-    threads: int,
+    share: wp.vec4i,
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
     """Momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk."""
-    origin = center[e, body.chunk_bone[c]]
+    origin = center[e, share[1] & 255]
     r = row(e, particles.mass.shape[0])
     p1 = wp.vec3()
     l1 = wp.vec3()
     p2 = wp.vec3()
     l2 = wp.vec3()
-    last = body.entry_start[c + 1] - 1
-    n = body.entry_start[c] + thread
+    last = share[3] - 1
+    n = share[2]
     while n <= last:
         for _ in range(AT_ONCE):
             p, weight = entry_of(body, n, last)
@@ -133,9 +132,9 @@ def chunk_corrections(
             a = w * vector_at(lean, e, p)
             p2 += a
             l2 += wp.cross(d, a)
-            n += threads
+            n += share[1] >> 8
     total = vec12(p1[0], p1[1], p1[2], l1[0], l1[1], l1[2], p2[0], p2[1], p2[2], l2[0], l2[1], l2[2])
-    store_sum12(corrections, e, c, total, threads)
+    store_one(corrections, e, share, total)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 9))
@@ -151,14 +150,14 @@ def sum_corrections(
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """:func:`chunk_corrections` of every chunk, over ``(num_envs, chunks, threads)``."""
+    """:func:`chunk_corrections` of every chunk, over ``(num_envs, warps of the quarters, threads)``."""
     i, j, k = wp.tid()
-    at = place_in_chunks(i, j, k, body.chunk_bone.shape[0])
+    quarters = quarters_at_once(threads)
+    at = place_in_chunks(i, j, k, body.quarters.shape[0] // quarters)
     e = at[0]
-    c = at[1]
-    thread = at[2]
     if failure[e] == 0:
-        chunk_corrections(body, particles, x, center, pull, lean, e, c, thread, threads, corrections)
+        share = share_of(body.quarters, quarters * at[1], at[2])
+        chunk_corrections(body, particles, x, center, pull, lean, e, share, corrections)
 
 
 @wp.func
@@ -189,24 +188,22 @@ def chunk_motion(
     vk: wp.array2d(dtype=wp.vec3),
     center: wp.array2d(dtype=wp.vec3),
     e: int,
-    c: int,
-    thread: int,
-    threads: int,
+    share: wp.vec4i,
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
     """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in one chunk."""
-    origin = center[e, body.chunk_bone[c]]
+    origin = center[e, share[1] & 255]
     r = row(e, particles.mass.shape[0])
     P = wp.vec3()
     K = wp.mat33()
-    for n in range(body.entry_start[c] + thread, body.entry_start[c + 1], threads):
+    for n in range(share[2], share[3], share[1] >> 8):
         p = body.first + int_at(body.entry, n)
         a = (float_at(body.entry_weight, n) * number_at(particles.mass, r, p)) * vector_at(vk, e, p)
         P += a
         K += wp.outer(vector_at(x, e, p) - origin, a)
     total = vec12(P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2])
-    store_sum12(corrections, e, c, total, threads)
+    store_one(corrections, e, share, total)
 
 
 @wp.kernel(launch_bounds=(BLOCK, 10))
@@ -230,5 +227,6 @@ def sum_motion(
     e, group, thread = wp.tid()
     if failure[e] != 0 or (drive.free_motion == 0 and let_go[e] == 0):
         return
-    for c in range(group, body.chunk_bone.shape[0], GROUPS):
-        chunk_motion(body, particles, x, vk, center, e, c, thread, threads, corrections)
+    quarters = quarters_at_once(threads)
+    for n in range(group, body.quarters.shape[0] // quarters, GROUPS):
+        chunk_motion(body, particles, x, vk, center, e, share_of(body.quarters, quarters * n, thread), corrections)

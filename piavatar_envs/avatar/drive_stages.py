@@ -17,6 +17,7 @@ from piavatar_envs.avatar.kinematics import pose_bones
 from piavatar_envs.avatar.lanes import meet_threads, place_in_block, warp_of_block
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.posing import carry_anchor, carry_bone, write_record
+from piavatar_envs.avatar.quarters import share_of
 from piavatar_envs.avatar.rigid_fit import fit_bone, fit_whole
 from piavatar_envs.avatar.root import hold_root, lay_command
 from piavatar_envs.avatar.types import Bench, Body, Drive, Held
@@ -144,9 +145,9 @@ def drive_body(
     e = wp.tid()
     if failure[e] != 0:
         return
-    chunks = body.chunk_bone.shape[0]
+    chunks = body.quarters.shape[0]
     for c in range(chunks):
-        chunk_moments(body, particles, x, u, w.tracked, e, c, 0, 1, w.moments)
+        chunk_moments(body, particles, x, u, w.tracked, e, share_of(body.quarters, c, 0), w.moments)
     pose_end(body, drive, step, w, e, 0, 1)
     pose_command(body, drive, step, w, e, 0, 1)
     fit_motion(body, drive, step, 1, w, e, 0, 1)
@@ -161,10 +162,12 @@ def drive_body(
         drive_particle(body, drive, at, before, w.record, center, let_go, e, p, u, motion, driven, w.pull, w.lean)
     if free:
         for c in range(chunks):
-            chunk_motion(body, particles, x, driven.vk, w.bones.center, e, c, 0, 1, w.corrections)
+            share = share_of(body.quarters, c, 0)
+            chunk_motion(body, particles, x, driven.vk, w.bones.center, e, share, w.corrections)
     settle_removed(body, drive, w, held, e, 0, 1)
     for c in range(chunks):
-        chunk_corrections(body, particles, x, w.bones.center, w.pull, w.lean, e, c, 0, 1, w.corrections)
+        share = share_of(body.quarters, c, 0)
+        chunk_corrections(body, particles, x, w.bones.center, w.pull, w.lean, e, share, w.corrections)
     settle_bones(body, drive, 1, w, e, 0, 1)
     for p in range(body.count):
         at = vector_at(x, e, body.first + p)

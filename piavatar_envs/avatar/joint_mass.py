@@ -11,6 +11,7 @@ from piavatar_envs.avatar.influences import in_order
 from piavatar_envs.avatar.lanes import BLOCK, warp_threads
 from piavatar_envs.avatar.mass_matrix import NUM_DOF, filled_entries
 from piavatar_envs.avatar.mass_pairs import build_pairs, sum_pairs
+from piavatar_envs.avatar.quarters import warps_of
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12, vec16
 from piavatar_envs.mpm.program import Program
@@ -67,7 +68,7 @@ class JointMass:
         self.pairs = build_pairs(points, device)
         self.pattern = find_pattern(filled_entries(self.pairs), device)
         self.matrix = self.make_factors(n)
-        self.sums = wp.zeros((n, len(self.pairs.entry_start) - 1), dtype=vec12, device=device)
+        self.sums = wp.zeros((n, int(self.pairs.chunk_start.numpy()[-1])), dtype=vec12, device=device)
         self.records = wp.zeros(NUM_JOINTS * NUM_JOINTS, dtype=vec16, device=device)
         self.refresh = min(MOST_USES, max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6)))
 
@@ -90,7 +91,7 @@ class JointMass:
         """Append: moments of all pairs for joints at ``position`` [m]."""
         program.launch(
             sum_pairs,
-            (*self.sums.shape, self.threads),
+            (self.sums.shape[0], warps_of(self.pairs.quarters, self.threads), self.threads),
             [self.body, self.pairs, self.model.particles, state.x, position, self.threads],
             [self.sums],
             block_dim=BLOCK,

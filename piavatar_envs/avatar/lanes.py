@@ -87,7 +87,7 @@ return wp::vec_t<3, wp::int32>(e, c, thread);
 #endif
 """)
 def place_in_chunks(e: int, c: int, thread: int, chunks: int) -> wp.vec3i:
-    """Environment, chunk and lane in a launch over ``(num_envs, chunks, warp_threads)``, as Warp says, too."""
+    """Environment, warp and lane in a launch over ``(num_envs, chunks, warp_threads)``, as Warp says, too."""
     ...
 
 
@@ -224,32 +224,6 @@ def sum_threads12(value: vec12, threads: int) -> vec12:
 @wp.func_native(_SUM_OF_WARP + _SUM_MANY % 16)
 def sum_threads16(value: vec16, threads: int) -> vec16:
     """:func:`sum_threads` of sixteen numbers."""
-    ...
-
-
-_STORE_SUM = (
-    "#if defined(__CUDA_ARCH__)\nif (threads == 32) {\n    constexpr int WORDS = %d;"
-    + _HALVE
-    + """
-    const int word = lane >> 1;
-    if ((lane & 1) == 0 && word < WORDS) reinterpret_cast<float*>(&wp::index(into, e, c))[word] = part[0];
-    return;
-}
-#endif
-wp::index(into, e, c) = value;
-"""
-)
-
-
-@wp.func_native(_STORE_SUM % 12)
-def store_sum12(into: wp.array2d(dtype=vec12), e: int, c: int, value: vec12, threads: int):
-    """``into[e, c]`` = the sum of ``value`` over the threads of a warp; ``value`` of a thread that is alone."""
-    ...
-
-
-@wp.func_native(_STORE_SUM % 16)
-def store_sum16(into: wp.array2d(dtype=vec16), e: int, c: int, value: vec16, threads: int):
-    """:func:`store_sum12` of sixteen numbers."""
     ...
 
 

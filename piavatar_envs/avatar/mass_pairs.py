@@ -11,8 +11,9 @@ import warp as wp
 
 from piavatar_envs.avatar.body import CHUNK, BodyPoints
 from piavatar_envs.avatar.bone_sums import AT_ONCE
-from piavatar_envs.avatar.lanes import BLOCK, place_in_chunks, store_sum12
+from piavatar_envs.avatar.lanes import BLOCK, place_in_chunks
 from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
+from piavatar_envs.avatar.quarters import quarters_at_once, share_chunks, share_of, store_one
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12
 from piavatar_envs.mpm.types import Particles, row
@@ -31,10 +32,8 @@ class Pairs:
     beside: wp.array(dtype=int)
     first: wp.array(dtype=int)  # (pairs,) one of the bones of a pair, about whose joint its moments are
     second: wp.array(dtype=int)  # (pairs,) the other one
-    chunk_pair: wp.array(dtype=int)  # (chunks,)
-    # pair q owns chunks chunk_start[q] : chunk_start[q + 1], chunk c holds entries entry_start[c] : entry_start[c + 1]
-    chunk_start: wp.array(dtype=int)
-    entry_start: wp.array(dtype=int)
+    quarters: wp.array(dtype=wp.vec4i)  # of warps that share chunks, see piavatar_envs.avatar.quarters
+    chunk_start: wp.array(dtype=int)  # (pairs + 1,) pair q owns chunks chunk_start[q] : chunk_start[q + 1]
     entry: wp.array(dtype=int)
     entry_weight: wp.array(dtype=float)  # product of the two weights
 
@@ -70,14 +69,15 @@ def build_pairs(points: BodyPoints, device: str) -> Pairs:
         "beside": np.nonzero(of >= 0)[1],
         "first": [a for a, _ in sorted(particles)],
         "second": [b for _, b in sorted(particles)],
-        "chunk_pair": chunk_pair,
         "chunk_start": chunk_start,
-        "entry_start": entry_start,
         "entry": np.concatenate(entries),
     }
     for name, numbers in lists.items():
         setattr(pairs, name, wp.array(np.asarray(numbers, np.int32), dtype=int, device=device))
     pairs.entry_weight = wp.array(np.concatenate(entry_weights).astype(np.float32), dtype=float, device=device)
+    first, borders = np.array(lists["first"])[chunk_pair], np.array(entry_start)
+    quarters = share_chunks(borders[:-1], borders[1:], first, device)
+    pairs.quarters = wp.array(quarters.astype(np.int32), dtype=wp.vec4i, device=device)
     return pairs
 
 
@@ -92,22 +92,23 @@ def sum_pairs(
     # out
     sums: wp.array2d(dtype=vec12),
 ):
-    """Mass, first and second moment of one chunk about a joint; launched over ``(num_envs, chunks, threads)``.
+    """Mass, first and second moment of chunks about a joint; over ``(num_envs, warps of the quarters, threads)``.
 
     ``position`` are those of the joints [m].
     """
     i, j, k = wp.tid()
-    at = place_in_chunks(i, j, k, pairs.chunk_pair.shape[0])
+    quarters = quarters_at_once(threads)
+    at = place_in_chunks(i, j, k, pairs.quarters.shape[0] // quarters)
     e = at[0]
-    c = at[1]
-    origin = vector_at(position, e, int_at(pairs.first, int_at(pairs.chunk_pair, c)))
+    share = share_of(pairs.quarters, quarters * at[1], at[2])
+    origin = vector_at(position, e, share[1] & 255)
     r = row(e, particles.mass.shape[0])
     m = float(0.0)
     mx = wp.vec3()
     diag = wp.vec3()
     off = wp.vec3()
-    n = int_at(pairs.entry_start, c) + at[2]
-    last = int_at(pairs.entry_start, c + 1) - 1
+    n = share[2]
+    last = share[3] - 1
     while n <= last:
         for _ in range(AT_ONCE):
             entry = wp.min(n, last)
@@ -119,6 +120,6 @@ def sum_pairs(
             mx += wd
             diag += wp.cw_mul(wd, d)
             off += wp.vec3(wd[1] * d[2], wd[2] * d[0], wd[0] * d[1])
-            n += threads
+            n += share[1] >> 8
     total = vec12(m, mx[0], mx[1], mx[2], diag[0], diag[1], diag[2], off[0], off[1], off[2], 0.0, 0.0)
-    store_sum12(sums, e, c, total, threads)
+    store_one(sums, e, share, total)

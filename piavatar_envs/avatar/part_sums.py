@@ -1,8 +1,8 @@
 """Sums over bones in the pass over particles that finds what is to be summed.
 
 A body's particles are in parts that follow each other in memory. On a GPU a CUDA block has a part: what its threads
-find of the particles meets in shared memory, from where a warp at a time sums the chunks of bones that are in the part.
-On a CPU a body is one part, and its particles meet in an array that all bodies use after each other.
+find of the particles meets in shared memory, from where its warps sum the chunks of bones that are in the part. On a
+CPU a body is one part, and its particles meet in an array that all bodies use after each other.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.body import BodyPoints, bone_lists
+from piavatar_envs.avatar.body import BodyPoints, bone_lists, set_lists
 from piavatar_envs.avatar.bone_sums import moments_of
-from piavatar_envs.avatar.loads import int_at
+from piavatar_envs.avatar.quarters import share_chunks, store_both
 from piavatar_envs.avatar.types import Body, vec12, vec16
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -34,8 +34,8 @@ class Parts:
     """The particles of a body in parts: part ``i`` has those from ``i * size`` on."""
 
     size: int
-    start: wp.array(dtype=int)  # (parts + 1,) part i has chunks chunk[start[i] : start[i + 1]], the longest first
-    chunk: wp.array(dtype=int)
+    start: wp.array(dtype=int)  # (parts + 1,) chunks of part i are those of quarters[start[i] : start[i + 1]]
+    quarters: wp.array(dtype=wp.vec4i)  # of warps, see piavatar_envs.avatar.quarters
     entry: wp.array(dtype=wp.vec2i)  # as the body's: which particle of its part, bits of the weight
 
 
@@ -51,15 +51,16 @@ def divide(points: BodyPoints, body: Body, device: str) -> tuple[Body, Parts]:
     for name in Body.vars:
         setattr(divided, name, getattr(body, name))
     lists = bone_lists(points, size)
-    for name, numbers in lists.items():
-        dtype = float if name == "entry_weight" else int
-        setattr(divided, name, wp.array(numbers, dtype=dtype, device=device))
-    part = lists["entry"][lists["entry_start"][:-1]] // size
-    order = np.lexsort((-np.diff(lists["entry_start"]), part))
+    set_lists(divided, lists, device)
+    begin, end, bone = lists["entry_start"][:-1], lists["entry_start"][1:], lists["chunk_bone"]
+    part = lists["entry"][begin] // size
+    found = [np.flatnonzero(part == i) for i in range(-(-points.num_points // size))]
+    quarters = [share_chunks(begin[own], end[own], bone[own], device) for own in found]
+    for own, shares in zip(found, quarters, strict=True):
+        shares[:, 0] = np.where(shares[:, 0] < 0, -1, own[shares[:, 0]])
     parts.size = size
-    borders = np.searchsorted(part[order], np.arange(-(-points.num_points // size) + 1))
-    parts.start = wp.array(borders.astype(np.int32), dtype=int, device=device)
-    parts.chunk = wp.array(order.astype(np.int32), dtype=int, device=device)
+    parts.start = wp.array(np.cumsum([0, *map(len, quarters)]).astype(np.int32), dtype=int, device=device)
+    parts.quarters = wp.array(np.concatenate(quarters).astype(np.int32), dtype=wp.vec4i, device=device)
     entry = np.stack([lists["entry"] % size, lists["entry_weight"].view(np.int32)], axis=1)
     parts.entry = wp.array(entry.astype(np.int32), dtype=wp.vec2i, device=device)
     return divided, parts
@@ -163,19 +164,16 @@ def weight_of(entry: wp.vec2i) -> float:
 
 @wp.func
 def sum_chunk(
-    body: Body,
     parts: Parts,
     room: wp.uint64,
+    share: wp.vec4i,
     origin: wp.vec3,
     e: int,
-    c: int,
-    thread: int,
-    threads: int,
     # out
     moments: wp.array2d(dtype=vec16),
     other_moments: wp.array2d(dtype=vec12),
 ):
-    """Moments about ``origin`` of one chunk of the part in the room, with the first vector as velocity.
+    """Moments about ``origin`` of the chunk of a ``share``, of the part in the room, with the first vector as velocity.
 
     Of the second one, and of the way, momentum and angular momentum. A loop of its own for the way, which not every
     substep asks for, would read all particles again.
@@ -185,9 +183,8 @@ def sum_chunk(
     L = wp.vec3()
     way_P = wp.vec3()
     way_L = wp.vec3()
-    n = int_at(body.entry_start, c) + thread
-    last = int_at(body.entry_start, c + 1)
-    while n < last:
+    n = share[2]
+    while n < share[3]:
         entry = entry_at(parts.entry, n)
         s = particle_brought(room, entry[0])
         w = weight_of(entry) * mass_brought(room, parts.size, entry[0])
@@ -199,49 +196,11 @@ def sum_chunk(
         momentum = w * wp.vec3(s[3], s[7], s[11])
         way_P += momentum
         way_L += wp.cross(d, momentum)
-        n += threads
+        n += share[1] >> 8
     # fmt: off
     other = vec12(
         P[0], P[1], P[2], L[0], L[1], L[2],
         way_P[0], way_P[1], way_P[2], way_L[0], way_L[1], way_L[2],
     )
     # fmt: on
-    store_both(moments, other_moments, e, c, total, other, threads)
-
-
-# As piavatar_envs.avatar.lanes has it for sixteen numbers; here are 28, of which a lane stores one.
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-if (threads == 32) {
-    constexpr int WORDS = 28;
-    const int lane = threadIdx.x & 31;
-    float part[WORDS];
-#pragma unroll
-    for (int k = 0; k < WORDS; ++k) part[k] = k < 16 ? value[k] : other[k - 16];
-#define HALVE(half)                                                                               \\
-    _Pragma("unroll") for (int k = 0; k < half; ++k) {                                            \\
-        const bool upper = lane & half, pair = k + half < WORDS;                                  \\
-        const float far = part[pair ? k + half : k], away = pair && !upper ? far : part[k];       \\
-        part[k] = (pair && upper ? far : part[k]) + __shfl_xor_sync(0xffffffffu, away, half);     \\
-    }
-    HALVE(16) HALVE(8) HALVE(4) HALVE(2) HALVE(1)
-#undef HALVE
-    if (lane < 16) reinterpret_cast<float*>(&wp::index(into, e, c))[lane] = part[0];
-    else if (lane < WORDS) reinterpret_cast<float*>(&wp::index(other_into, e, c))[lane - 16] = part[0];
-    return;
-}
-#endif
-wp::index(into, e, c) = value;
-wp::index(other_into, e, c) = other;
-""")
-def store_both(
-    into: wp.array2d(dtype=vec16),
-    other_into: wp.array2d(dtype=vec12),
-    e: int,
-    c: int,
-    value: vec16,
-    other: vec12,
-    threads: int,
-):
-    """``into[e, c]`` = the sum of ``value`` over the threads of a warp, and ``other_into[e, c]`` that of ``other``."""
-    ...
+    store_both(moments, other_moments, e, share, total, other)

@@ -13,6 +13,7 @@ import warp as wp
 from piavatar_envs.avatar import bone_sums, drive_stages, flesh, kinematics, posing
 from piavatar_envs.avatar.injection import inject_velocity
 from piavatar_envs.avatar.lanes import BLOCK, particle_rounds, particle_threads
+from piavatar_envs.avatar.quarters import warps_of
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import (
     Anchor,
@@ -110,7 +111,8 @@ def record_drive(drive: AvatarDrive, program: Program, state: State, step: int) 
         outputs = [bench, g.held, drive.state.motion, state.u, state.kinematic]
         program.launch(drive_stages.drive_body, n, inputs, outputs)
         return
-    chunks, own = (n, drive.num_chunks, drive.threads), [drive.chunk_threads, state.failure, drive.threads]
+    chunks = (n, warps_of(drive.body.quarters, drive.threads), drive.threads)
+    own = [drive.chunk_threads, state.failure, drive.threads]
     each_bone, of_bone = (n, NUM_JOINTS, drive.threads), [drive.body, state.failure, drive.threads]
     inputs = [drive.body, drive.model.particles, state.x, state.u, bench.tracked, state.failure, drive.threads]
     program.launch(bone_sums.sum_moments, chunks, inputs, [s.moments], block_dim=BLOCK)

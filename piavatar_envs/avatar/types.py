@@ -48,11 +48,10 @@ class Body:
     # particles that track bone b: tracker[tracker_start[b] : tracker_start[b + 1]]
     tracker_start: wp.array(dtype=int)
     tracker: wp.array(dtype=int)
-    # particles moved by bone b, in chunks: bone b owns chunks chunk_start[b] : chunk_start[b + 1], chunk c holds
-    # entries entry_start[c] : entry_start[c + 1]
+    # particles moved by bone b, in chunks: bone b owns chunks chunk_start[b] : chunk_start[b + 1]
     chunk_start: wp.array(dtype=int)
     chunk_bone: wp.array(dtype=int)
-    entry_start: wp.array(dtype=int)
+    quarters: wp.array(dtype=wp.vec4i)  # of warps that share chunks, see piavatar_envs.avatar.quarters
     entry: wp.array(dtype=int)
     entry_weight: wp.array(dtype=float)
 

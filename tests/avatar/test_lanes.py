@@ -10,12 +10,12 @@ from piavatar_envs.avatar.blending import blend_changes, blend_places, blend_rec
 from piavatar_envs.avatar.influences import in_order, pack
 from piavatar_envs.avatar.lanes import (
     chunk_threads,
-    store_sum12,
-    store_sum16,
+    place_in_chunks,
     sum_threads12,
     sum_threads16,
     warp_threads,
 )
+from piavatar_envs.avatar.quarters import share_chunks, share_of, store_both, store_moments, store_one
 from piavatar_envs.avatar.types import vec8, vec12, vec16, vec24, vec44
 
 wp.set_module_options({"enable_backward": False})
@@ -41,18 +41,30 @@ def add_up(
 
 
 @wp.kernel
-def store_up(
-    values: wp.array3d(dtype=float), threads: int, out12: wp.array2d(dtype=vec12), out16: wp.array2d(dtype=vec16)
+def store_chunks(
+    quarters: wp.array(dtype=wp.vec4i),
+    values: wp.array3d(dtype=float),
+    warps: int,
+    threads: int,
+    out12: wp.array2d(dtype=vec12),
+    out16: wp.array2d(dtype=vec16),
+    both16: wp.array2d(dtype=vec16),
+    both12: wp.array2d(dtype=vec12),
 ):
-    e, c, thread = wp.tid()
-    v12 = vec12()
-    v16 = vec16()
-    for n in range(16):
-        v16[n] = values[e, c, 16 * thread + n]
-        if n < 12:
-            v12[n] = v16[n]
-    store_sum12(out12, e, c, v12, threads)
-    store_sum16(out16, e, c, v16, threads)
+    i, j, k = wp.tid()
+    at = place_in_chunks(i, j, k, warps)
+    e = at[0]
+    share = share_of(quarters, wp.max(1, threads // 8) * at[1], at[2])
+    first = vec16()
+    other = vec12()
+    for n in range(share[2], share[3], share[1] >> 8):
+        for word in range(16):
+            first[word] += values[e, n, word]
+        for word in range(12):
+            other[word] += values[e, n, 16 + word]
+    store_one(out12, e, share, other)
+    store_moments(out16, e, share, first)
+    store_both(both16, both12, e, share, first, other)
 
 
 @wp.kernel
@@ -101,17 +113,30 @@ def test_threads_add_up_what_each_of_them_has(device, threads):
     assert np.array_equal(*runs)
 
 
-def test_a_warp_stores_its_sum(device):
-    """Each number of the sum goes to its place."""
-    threads = warp_threads(device)
-    values = np.random.default_rng(1).normal(size=(ROWS, 3, 16 * threads)).astype(np.float32)
-    expected = values.reshape(ROWS, 3, threads, 16).astype(float).sum(2)
-    out12 = wp.zeros((ROWS, 3), dtype=vec12, device=device)
-    out16 = wp.zeros((ROWS, 3), dtype=vec16, device=device)
-    given = wp.array(values, dtype=float, device=device)
-    wp.launch(store_up, (ROWS, 3, threads), [given, threads], [out12, out16], device=device)
-    np.testing.assert_allclose(out16.numpy(), expected, atol=1e-5)
-    np.testing.assert_allclose(out12.numpy(), expected[..., :12], atol=1e-5)
+def test_quarters_of_a_warp_share_chunks(device):
+    """Of any length: one quarter has a short one, two or all four a long one, and each sum is that of its entries."""
+    rng, threads = np.random.default_rng(2), warp_threads(device)
+    lengths = np.r_[1, 7, 8, 9, 47, 48, 49, 96, 97, 192, 193, 300, rng.integers(1, 300, 9)]
+    borders = np.cumsum([0, *lengths])
+    bones = rng.integers(0, BONES, len(lengths))
+    shares = share_chunks(borders[:-1], borders[1:], bones, device)
+    stored = shares[:, 0] >= 0
+    assert sorted(shares[stored, 0]) == list(range(len(lengths)))
+    assert np.array_equal(shares[stored, 1] % 256, bones[shares[stored, 0]])
+    if threads > 1:
+        lanes = shares[stored, 1] // 256
+        assert len(shares) % 4 == 0 and set(lanes) == {8, 16, 32}
+        assert (lengths[shares[stored, 0]] <= 6 * lanes)[lanes < 32].all()
+        begin = np.flatnonzero(stored)
+        assert not (begin * 8 % lanes).any()  # lanes that share a chunk are those that add up
+    values = rng.normal(size=(ROWS, borders[-1], 28)).astype(np.float32)
+    expected = np.add.reduceat(values.astype(float), borders[:-1], axis=1)
+    shape, warps = (ROWS, len(lengths)), len(shares) // max(1, threads // 8)
+    out = [wp.zeros(shape, dtype=dtype, device=device) for dtype in (vec12, vec16, vec16, vec12)]
+    given = [wp.array(shares.astype(np.int32), dtype=wp.vec4i, device=device), wp.array(values, device=device)]
+    wp.launch(store_chunks, (ROWS, warps, threads), [*given, warps, threads], out, device=device)
+    for array, words in zip(out, (slice(16, 28), slice(16), slice(16), slice(16, 28)), strict=True):
+        np.testing.assert_allclose(array.numpy(), expected[..., words], atol=1e-4)
 
 
 @pytest.mark.parametrize(("chunks", "threads"), [(0, 1), (1, 1), (2, 1), (3, 2), (5, 4), (8, 4), (9, 0), (5000, 0)])

@@ -58,6 +58,7 @@ _PTX = (
     ),
     (r'asm volatile\("cp\.async\.wait_all;" ::: "memory"\);', ""),
     (r'asm volatile\("" : "\+r"\(t\)\);', ""),
+    (r'asm volatile\("prefetch\.global\.L2 \[%0\];" :: "l"\(line\)\);', ";"),
 )
 
 
