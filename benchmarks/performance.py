@@ -25,6 +25,13 @@ RESULTS = ROOT / "benchmarks" / "results"
 MARKED = re.compile(r"(<!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
 MOST_ROWS = 14  # of a table of kernels
 PROFILE, PICTURE = "profile_reach.json", "profile_reach.png"
+#: Kernels of the projection of bodies under torques, and of the Material Point Method.
+PROJECTION = frozenset({"attach_flesh", "sum_pairs", "build_mass", "act", "take_over", "begin_substep"})
+MATTER = frozenset(
+    {"substep_in_small_room", "substep_in_large_room", "nodes_in_small_room", "nodes_in_large_room", "forget_speeds"}
+    | {"particles_to_grid", "runs_to_grid", "singles_to_grid", "update_grid", "find_facing", "solve_contact"}
+    | {"grid_to_particles", "mark_particles", "forget_blocks", "free_slots", "freeze"}
+)
 Report = dict[str, Any]
 
 
@@ -217,8 +224,23 @@ def profile_table(report: Report) -> list[str]:
         f"{step['world']}, {step['num_envs']} environments: captured step {number(step['ms_per_step'])} ms, "
         f"{step['launches_per_step']} launches, kernels one by one {number(step['kernels_sum_ms'])} ms."
     )
-    picture = f"![Time of the kernels](results/{PICTURE})"
-    return [*origin(report), told, "", *grid(header, rows), "", picture]
+    return [*origin(report), told, "", *grid(header, rows)]
+
+
+def pictured_profile_table(report: Report) -> list[str]:
+    """:func:`profile_table` with its picture."""
+    return [*profile_table(report), "", f"![Time of the kernels](results/{PICTURE})"]
+
+
+def torque_profile_table(report: Report) -> list[str]:
+    """:func:`profile_table`, and what the joints take beside the Material Point Method."""
+    ms = {row["case"]: row["ms_per_step"] for row in report["results"]}
+    joints, matter = (sum(ms[name] for name in ms if name in names) for names in (PROJECTION, MATTER))
+    told = (
+        f"The projection takes {number(joints)} ms, {joints / matter:.3f} of the {number(matter)} ms of the Material "
+        f"Point Method; putting firm particles in their places, once a step, {number(ms['put_in_place'])} ms."
+    )
+    return [*profile_table(report), "", told]
 
 
 _SUBSTEP = ("substep.json", "python -m benchmarks.substep --device cuda")
@@ -228,7 +250,12 @@ TABLES: dict[str, Table] = {
     "stages": Table(*_SUBSTEP, stages_table),
     "vector": Table("vector.json", "python -m benchmarks.vector --device cuda", vector_table),
     "vector_cpu": Table("vector_cpu.json", "python -m benchmarks.vector --device cpu", vector_table),
-    "profile_reach": Table(PROFILE, "python -m benchmarks.profile --device cuda", profile_table),
+    "profile_reach": Table(PROFILE, "python -m benchmarks.profile --device cuda", pictured_profile_table),
+    "profile_stand": Table(
+        "profile_stand.json",
+        "python -m benchmarks.profile --device cuda --case PIAvatar/Stand-v0 --num-envs 2048",
+        torque_profile_table,
+    ),
     "soak": Table("soak.json", "python -m benchmarks.soak --device cuda", soak_table),
 }
 

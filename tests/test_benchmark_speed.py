@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,10 @@ RUNS = {
     "substep.json": (substep, ["--small", "--repeats", "2", "--warm-up", "1"]),
     "vector.json": (vector, ["--fidelity", "tiny", "--num-envs", "1", "3", "--seconds", "0.01", "--repeats", "2"]),
     "profile_reach.json": (profile, ["--fidelity", "tiny", "--num-envs", "2", "--repeats", "2"]),
+    "profile_stand.json": (
+        profile,
+        ["--case", "PIAvatar/Stand-v0", "--fidelity", "tiny", "--num-envs", "2", "--repeats", "1"],
+    ),
     "soak.json": (soak, ["--fidelity", "tiny", "--num-envs", "2", "--steps", "50", "--window", "5"]),
 }
 
@@ -362,6 +367,22 @@ def test_profile_as_a_smoke_run(results: Path):
     assert known, "no kernel has a formula in roofline.kernel_bytes; kernels were renamed"
     assert all(row["gb_per_s"] * row["ms_per_step"] == pytest.approx(row["bytes_per_step"] / 1e6) for row in known)
     assert (results / "profile_reach.png").stat().st_size > 10_000
+
+
+def test_every_kernel_of_a_step_under_torques_is_known(results: Path):
+    """What joints take beside the Material Point Method is told by names: no kernel of either may be missing."""
+    names = {row["case"] for row in rows_of(results, "profile_stand.json")}
+    assert names >= performance.PROJECTION
+    of_matter = {name for module in kernels_by_module("piavatar_envs.mpm.") for name in module} & names
+    assert of_matter - performance.MATTER <= {"clear_sensors", "read_impulses"}  # which only tell what has been
+    of_joints = {name for module in kernels_by_module("piavatar_envs.avatar.joint_") for name in module} & names
+    assert of_joints - performance.PROJECTION <= {"set_springs"}  # once a step
+
+
+def kernels_by_module(prefix: str) -> list[set[str]]:
+    """Names of the kernels of all modules that have been imported, whose names begin so."""
+    modules = [module for name, module in sys.modules.items() if name.startswith(prefix)]
+    return [{value.key for value in vars(module).values() if isinstance(value, wp.Kernel)} for module in modules]
 
 
 def test_tables_are_those_of_the_results(results: Path):
