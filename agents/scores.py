@@ -33,7 +33,8 @@ from benchmarks.runner import describe_run, plain, write_json
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
 
-_COLUMNS = ("agent", "seeds", "episodes", "return", "succeeds at the end", "at some time", "steps", "trained for")
+_RESULTS = ("return", "succeeds at the end", "at some time", "steps", "trained for")
+_COLUMNS = ("agent", "control", "bones", "seeds", "episodes", *_RESULTS)
 #: Script of runs that are random actions of several streams.
 STREAMS = "score_random"
 #: Returns of the same actions in the same episodes, on another device.
@@ -47,7 +48,8 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
         runs: contents of their ``results.json``, by folder.
 
     Returns:
-        A row for each agent in each environment: ``env_id``, ``agent``, the names of its ``runs``, ``train_steps`` and
+        A row for each agent in each environment: ``env_id``, ``agent``, the ``control`` of the avatar and whether it
+        has ``firm_bones``, the names of its ``runs``, ``train_steps`` and
         ``training_s`` of one of them on average, and the figures as in :func:`agents.evaluate.over_seeds`.
 
     Raises:
@@ -75,7 +77,8 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
                 agent = f"{agent}, as {script}" if twins else agent
             else:
                 row = {"runs": list(group), **_cost(group), **row}
-            rows.append({"env_id": env_id, "agent": agent} | {key: row[key] for key in row if key != "case"})
+            played = {"env_id": env_id, "agent": agent, **_drive(run)}
+            rows.append(played | {key: row[key] for key in row if key != "case"})
     return sorted(rows, key=lambda row: (row["env_id"], "runs" in row, row["agent"]))
 
 
@@ -119,6 +122,12 @@ def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     return flattened({"env": settings})
 
 
+def _drive(run: Mapping[str, Any]) -> dict[str, Any]:
+    """What drives the avatar of a run, and whether its bones are firm; None where its environment does not say."""
+    known = _known(run["config"]["env_id"], run["config"]["env"])
+    return {name: known.get(f"env.drive.{name}") for name in ("control", "firm_bones")}
+
+
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """What a training took on average; None where nothing is trained."""
     seconds = [run.get("training_s") for run in group.values()]
@@ -149,6 +158,8 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
         trained = f"{row['train_steps'] / 1e6:.2g} M steps, {trained}"
     return [
         row["agent"],
+        row.get("control") or "",
+        {True: "firm", False: "slipping"}.get(row.get("firm_bones"), ""),
         str(row["seeds"] or ""),
         str(row["episodes"]),
         _with(row["return_mean"], row["return_interval"], ".1f"),
