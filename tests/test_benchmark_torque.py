@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from benchmarks import limbs, runner, stability, torque
+from benchmarks import limbs, performance, runner, stability, torque
 from benchmarks.limbs import Options
 from benchmarks.rig import joint_gaps
 from piavatar_envs.avatar.asset import load_body
@@ -81,6 +81,14 @@ def test_firm_bones_stay_together():
     assert len(firm) == 4 + 3 + 2 + 9 + len(KICKS)
     assert max(firm.values()) < 1.0
     assert max(gaps[f"{case}_slipping"] for case in firm) > 1.0
+
+
+def test_joints_took_less_than_three_tenths_of_the_rest_when_that_was_measured():
+    rows = {row["case"]: row for row in json.loads(RESULTS.read_text(encoding="utf-8"))["results"]}
+    assert max(rows[f"cost{hold}"]["joints_over_mpm"] for hold in HOLDS) < 0.3
+    report = json.loads((RESULTS.parent / "profile_stand.json").read_text(encoding="utf-8"))
+    joints, matter = performance.joints_and_matter(report)
+    assert report["options"]["num_envs"] == 2048 and joints < 0.3 * matter
 
 
 @pytest.mark.parametrize("case", FLOATS)
