@@ -30,12 +30,11 @@ from benchmarks import crowd, runner, timing
 from benchmarks.poses import random_poses
 from piavatar_envs.avatar.cholesky import (
     Pattern,
-    factor_size,
     factorize,
     fetch_factor,
     find_pattern,
     keep_factor,
-    lower_entries,
+    pack,
     solve,
 )
 from piavatar_envs.avatar.joint_bench import room_of_warp
@@ -174,10 +173,8 @@ def measure_ours(systems: Systems, options: Options) -> dict[str, Any]:
     """The row of the project's own factors."""
     n, threads = len(systems.matrix), warp_threads(options.device)
     pattern = find_pattern(systems.filled, options.device)
-    rows, columns, numbers = lower_entries(pattern)
-    packed = np.zeros((n, factor_size(pattern)), np.float32)
-    packed[:, numbers] = systems.matrix[:, rows, columns]
-    matrix, diagonal, right = (_upload(part, options) for part in (packed, systems.diagonal, systems.right))
+    parts = pack(pattern, systems.matrix), systems.diagonal, systems.right
+    matrix, diagonal, right = (_upload(part, options) for part in parts)
     factor = wp.zeros_like(matrix)
     x = wp.zeros((n, NUM_DOF), dtype=float, device=options.device)
     launches = {

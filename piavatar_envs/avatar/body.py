@@ -142,7 +142,7 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
 def set_lists(body: Body, lists: dict[str, np.ndarray], device: str) -> None:
     """Upload what :func:`bone_lists` has found."""
     borders, bone = lists["entry_start"], lists["chunk_bone"]
-    quarters = share_chunks(borders[:-1], borders[1:], bone, device).astype(np.int32)
+    quarters = share_chunks(np.arange(len(bone)), borders[:-1], borders[1:], bone, device)
     body.quarters = wp.array(quarters, dtype=wp.vec4i, device=device)
     for name in ("chunk_start", "chunk_bone", "entry", "entry_weight"):
         setattr(body, name, wp.array(lists[name], dtype=float if name == "entry_weight" else int, device=device))

@@ -133,6 +133,14 @@ def lower_entries(pattern: Pattern) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return i[i >= j], j[i >= j], np.flatnonzero(i >= j)
 
 
+def pack(pattern: Pattern, matrices: np.ndarray) -> np.ndarray:
+    """Symmetric matrices ``(n, N, N)`` as they are kept, ``(n, factor_size)`` float32."""
+    rows, columns, numbers = lower_entries(pattern)
+    packed = np.zeros((len(matrices), factor_size(pattern)), np.float32)
+    packed[:, numbers] = matrices[:, rows, columns]
+    return packed
+
+
 @wp.func
 def factorize(
     pattern: Pattern,

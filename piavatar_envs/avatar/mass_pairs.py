@@ -76,8 +76,8 @@ def build_pairs(points: BodyPoints, device: str) -> Pairs:
         setattr(pairs, name, wp.array(np.asarray(numbers, np.int32), dtype=int, device=device))
     pairs.entry_weight = wp.array(np.concatenate(entry_weights).astype(np.float32), dtype=float, device=device)
     first, borders = np.array(lists["first"])[chunk_pair], np.array(entry_start)
-    quarters = share_chunks(borders[:-1], borders[1:], first, device)
-    pairs.quarters = wp.array(quarters.astype(np.int32), dtype=wp.vec4i, device=device)
+    quarters = share_chunks(np.arange(len(first)), borders[:-1], borders[1:], first, device)
+    pairs.quarters = wp.array(quarters, dtype=wp.vec4i, device=device)
     return pairs
 
 

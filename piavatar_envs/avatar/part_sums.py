@@ -55,12 +55,10 @@ def divide(points: BodyPoints, body: Body, device: str) -> tuple[Body, Parts]:
     begin, end, bone = lists["entry_start"][:-1], lists["entry_start"][1:], lists["chunk_bone"]
     part = lists["entry"][begin] // size
     found = [np.flatnonzero(part == i) for i in range(-(-points.num_points // size))]
-    quarters = [share_chunks(begin[own], end[own], bone[own], device) for own in found]
-    for own, shares in zip(found, quarters, strict=True):
-        shares[:, 0] = np.where(shares[:, 0] < 0, -1, own[shares[:, 0]])
+    quarters = [share_chunks(own, begin[own], end[own], bone[own], device) for own in found]
     parts.size = size
     parts.start = wp.array(np.cumsum([0, *map(len, quarters)]).astype(np.int32), dtype=int, device=device)
-    parts.quarters = wp.array(np.concatenate(quarters).astype(np.int32), dtype=wp.vec4i, device=device)
+    parts.quarters = wp.array(np.concatenate(quarters), dtype=wp.vec4i, device=device)
     entry = np.stack([lists["entry"] % size, lists["entry_weight"].view(np.int32)], axis=1)
     parts.entry = wp.array(entry.astype(np.int32), dtype=wp.vec2i, device=device)
     return divided, parts

@@ -18,24 +18,24 @@ wp.set_module_options({"enable_backward": False})
 LANES, QUARTERS, MOST = 8, 4, 6
 
 
-def share_chunks(begin: np.ndarray, end: np.ndarray, bone: np.ndarray, device: str) -> np.ndarray:
-    """Who shares chunks with entries from ``begin`` on before ``end``, records of four numbers.
+def share_chunks(chunk: np.ndarray, begin: np.ndarray, end: np.ndarray, bone: np.ndarray, device: str) -> np.ndarray:
+    """Who shares chunks of these numbers, with entries from ``begin`` on before ``end``: records of four, int32.
 
     That is, of quarters that follow each other, in whole warps: the chunk whose sum a quarter stores, or -1; the
     ``bone`` of its chunk, and 256 times the lanes that share it; its first entry, and the end of all. On a CPU there is
     one for each chunk.
     """
-    chunks, length = np.arange(len(begin)), end - begin
+    length = end - begin
     if not wp.get_device(device).is_cuda:
-        return np.stack([chunks, bone + 256, begin, end], axis=1)
+        return np.stack([chunk, bone + 256, begin, end], axis=1).astype(np.int32)
     count = np.select([length <= LANES * MOST, length <= 2 * LANES * MOST], [1, 2], QUARTERS)
     order = np.lexsort((-length, -count))  # those that share a warp begin with a whole one, a half one, or anywhere
-    chunk = np.repeat(order, count[order])
+    own = np.repeat(order, count[order])
     rank = np.concatenate([np.arange(n) for n in count[order]])
-    stored = np.where(rank == 0, chunk, -1)
-    records = [stored, bone[chunk] + 256 * LANES * count[chunk], begin[chunk] + LANES * rank, end[chunk]]
-    nothing = np.tile([[-1, 256 * LANES, 0, 0]], (-len(chunk) % QUARTERS, 1))
-    return np.concatenate([np.stack(records, axis=1), nothing])
+    stored = np.where(rank == 0, chunk[own], -1)
+    records = [stored, bone[own] + 256 * LANES * count[own], begin[own] + LANES * rank, end[own]]
+    nothing = np.tile([[-1, 256 * LANES, 0, 0]], (-len(own) % QUARTERS, 1))
+    return np.concatenate([np.stack(records, axis=1), nothing]).astype(np.int32)
 
 
 def warps_of(quarters: wp.array, threads: int) -> int:

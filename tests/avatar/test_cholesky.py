@@ -14,6 +14,7 @@ from piavatar_envs.avatar.cholesky import (
     find_pattern,
     keep_factor,
     lower_entries,
+    pack,
     solve,
 )
 from piavatar_envs.avatar.joint_bench import room_of_warp
@@ -58,9 +59,8 @@ def test_factors_solve(device, sparse):
     diagonal, right = rng.uniform(0.0, 3.0, (2 * n, size)), rng.normal(size=(2 * n, size))
     pattern = find_pattern(filled, device)
     rows, columns, numbers = lower_entries(pattern)
-    packed = np.zeros((n, factor_size(pattern)))
-    packed[:, numbers] = matrix[:, rows, columns]
-    arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in (packed, diagonal, right)]
+    given = pack(pattern, matrix), diagonal, right
+    arrays = [wp.array(a.astype(np.float32), dtype=float, device=device) for a in given]
     factor, x = (wp.zeros((2 * n, rows), dtype=float, device=device) for rows in (factor_size(pattern), size))
     inputs = [pattern, *arrays, threads]
     wp.launch(factorize_and_solve, (n, threads), inputs, [factor, x], block_dim=threads, device=device)

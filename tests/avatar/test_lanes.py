@@ -119,7 +119,7 @@ def test_quarters_of_a_warp_share_chunks(device):
     lengths = np.r_[1, 7, 8, 9, 47, 48, 49, 96, 97, 192, 193, 300, rng.integers(1, 300, 9)]
     borders = np.cumsum([0, *lengths])
     bones = rng.integers(0, BONES, len(lengths))
-    shares = share_chunks(borders[:-1], borders[1:], bones, device)
+    shares = share_chunks(np.arange(len(lengths)), borders[:-1], borders[1:], bones, device)
     stored = shares[:, 0] >= 0
     assert sorted(shares[stored, 0]) == list(range(len(lengths)))
     assert np.array_equal(shares[stored, 1] % 256, bones[shares[stored, 0]])
@@ -133,7 +133,7 @@ def test_quarters_of_a_warp_share_chunks(device):
     expected = np.add.reduceat(values.astype(float), borders[:-1], axis=1)
     shape, warps = (ROWS, len(lengths)), len(shares) // max(1, threads // 8)
     out = [wp.zeros(shape, dtype=dtype, device=device) for dtype in (vec12, vec16, vec16, vec12)]
-    given = [wp.array(shares.astype(np.int32), dtype=wp.vec4i, device=device), wp.array(values, device=device)]
+    given = [wp.array(shares, dtype=wp.vec4i, device=device), wp.array(values, device=device)]
     wp.launch(store_chunks, (ROWS, warps, threads), [*given, warps, threads], out, device=device)
     for array, words in zip(out, (slice(16, 28), slice(16), slice(16), slice(16, 28)), strict=True):
         np.testing.assert_allclose(array.numpy(), expected[..., words], atol=1e-4)
