@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.lanes import BLOCK, place_in_chunks, sum_threads12
+from piavatar_envs.avatar.lanes import BLOCK, sum_threads12
 from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
-from piavatar_envs.avatar.quarters import quarters_at_once, share_of, store_moments, store_one
+from piavatar_envs.avatar.quarters import own_share, quarters_at_once, share_of, store_moments, store_one
 from piavatar_envs.avatar.types import Body, Drive, vec12, vec16
 from piavatar_envs.mpm.types import Particles, row
 
@@ -92,11 +92,9 @@ def sum_moments(
 ):
     """:func:`chunk_moments` of every chunk, over ``(num_envs, warps of the quarters, threads)``."""
     i, j, k = wp.tid()
-    quarters = quarters_at_once(threads)
-    at = place_in_chunks(i, j, k, body.quarters.shape[0] // quarters)
-    e = at[0]
+    e, share = own_share(body.quarters, i, j, k, threads)
     if failure[e] == 0:
-        chunk_moments(body, particles, x, u, reference, e, share_of(body.quarters, quarters * at[1], at[2]), moments)
+        chunk_moments(body, particles, x, u, reference, e, share, moments)
 
 
 @wp.func
@@ -152,11 +150,8 @@ def sum_corrections(
 ):
     """:func:`chunk_corrections` of every chunk, over ``(num_envs, warps of the quarters, threads)``."""
     i, j, k = wp.tid()
-    quarters = quarters_at_once(threads)
-    at = place_in_chunks(i, j, k, body.quarters.shape[0] // quarters)
-    e = at[0]
+    e, share = own_share(body.quarters, i, j, k, threads)
     if failure[e] == 0:
-        share = share_of(body.quarters, quarters * at[1], at[2])
         chunk_corrections(body, particles, x, center, pull, lean, e, share, corrections)
 
 

@@ -11,9 +11,9 @@ import warp as wp
 
 from piavatar_envs.avatar.body import CHUNK, BodyPoints
 from piavatar_envs.avatar.bone_sums import AT_ONCE
-from piavatar_envs.avatar.lanes import BLOCK, place_in_chunks
+from piavatar_envs.avatar.lanes import BLOCK
 from piavatar_envs.avatar.loads import float_at, int_at, number_at, vector_at
-from piavatar_envs.avatar.quarters import quarters_at_once, share_chunks, share_of, store_one
+from piavatar_envs.avatar.quarters import own_share, share_chunks, store_one
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec12
 from piavatar_envs.mpm.types import Particles, row
@@ -97,10 +97,7 @@ def sum_pairs(
     ``position`` are those of the joints [m].
     """
     i, j, k = wp.tid()
-    quarters = quarters_at_once(threads)
-    at = place_in_chunks(i, j, k, pairs.quarters.shape[0] // quarters)
-    e = at[0]
-    share = share_of(pairs.quarters, quarters * at[1], at[2])
+    e, share = own_share(pairs.quarters, i, j, k, threads)
     origin = vector_at(position, e, share[1] & 255)
     r = row(e, particles.mass.shape[0])
     m = float(0.0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.lanes import place_in_chunks
 from piavatar_envs.avatar.types import vec12, vec16
 
 wp.set_module_options({"enable_backward": False})
@@ -60,6 +61,14 @@ return quarters.data[first];
 def share_of(quarters: wp.array(dtype=wp.vec4i), first: int, lane: int) -> wp.vec4i:
     """The share of a ``lane`` of the warp whose quarters are ``first`` and the next, with its own first entry."""
     ...
+
+
+@wp.func
+def own_share(quarters: wp.array(dtype=wp.vec4i), i: int, j: int, k: int, threads: int):
+    """Environment and share of a thread in a launch over ``(num_envs, warps_of(quarters), threads)``."""
+    together = quarters_at_once(threads)
+    at = place_in_chunks(i, j, k, quarters.shape[0] // together)
+    return at[0], share_of(quarters, together * at[1], at[2])
 
 
 # Each step halves the numbers that a lane goes on with, as well as the lanes that go on with the same.

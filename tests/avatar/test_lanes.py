@@ -10,12 +10,11 @@ from piavatar_envs.avatar.blending import blend_changes, blend_places, blend_rec
 from piavatar_envs.avatar.influences import in_order, pack
 from piavatar_envs.avatar.lanes import (
     chunk_threads,
-    place_in_chunks,
     sum_threads12,
     sum_threads16,
     warp_threads,
 )
-from piavatar_envs.avatar.quarters import share_chunks, share_of, store_both, store_moments, store_one
+from piavatar_envs.avatar.quarters import own_share, share_chunks, store_both, store_moments, store_one
 from piavatar_envs.avatar.types import vec8, vec12, vec16, vec24, vec44
 
 wp.set_module_options({"enable_backward": False})
@@ -44,7 +43,6 @@ def add_up(
 def store_chunks(
     quarters: wp.array(dtype=wp.vec4i),
     values: wp.array3d(dtype=float),
-    warps: int,
     threads: int,
     out12: wp.array2d(dtype=vec12),
     out16: wp.array2d(dtype=vec16),
@@ -52,9 +50,7 @@ def store_chunks(
     both12: wp.array2d(dtype=vec12),
 ):
     i, j, k = wp.tid()
-    at = place_in_chunks(i, j, k, warps)
-    e = at[0]
-    share = share_of(quarters, wp.max(1, threads // 8) * at[1], at[2])
+    e, share = own_share(quarters, i, j, k, threads)
     first = vec16()
     other = vec12()
     for n in range(share[2], share[3], share[1] >> 8):
@@ -134,7 +130,7 @@ def test_quarters_of_a_warp_share_chunks(device):
     shape, warps = (ROWS, len(lengths)), len(shares) // max(1, threads // 8)
     out = [wp.zeros(shape, dtype=dtype, device=device) for dtype in (vec12, vec16, vec16, vec12)]
     given = [wp.array(shares, dtype=wp.vec4i, device=device), wp.array(values, device=device)]
-    wp.launch(store_chunks, (ROWS, warps, threads), [*given, warps, threads], out, device=device)
+    wp.launch(store_chunks, (ROWS, warps, threads), [*given, threads], out, device=device)
     for array, words in zip(out, (slice(16, 28), slice(16), slice(16), slice(16, 28)), strict=True):
         np.testing.assert_allclose(array.numpy(), expected[..., words], atol=1e-4)
 
