@@ -18,9 +18,13 @@ from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
 
 try:
-    from pettingzoo import ParallelEnv
+    from pettingzoo import AECEnv, ParallelEnv
+    from pettingzoo.utils.conversions import parallel_to_aec
 except ImportError as error:
     raise ImportError("several agents need PettingZoo; install it with: pip install 'piavatar-envs[multi]'") from error
+
+# the worlds have PettingZoo from here, so that each says what to install if it is not there
+__all__ = ["AECEnv", "AvatarParallelEnv", "parallel_to_aec"]
 
 
 class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):

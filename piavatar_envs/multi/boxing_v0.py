@@ -7,11 +7,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
-from pettingzoo import AECEnv
-from pettingzoo.utils.conversions import parallel_to_aec
 from pydantic import Field
 
-from piavatar_envs.api.pettingzoo import AvatarParallelEnv
+from piavatar_envs.api.pettingzoo import AECEnv, AvatarParallelEnv, parallel_to_aec
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.config import ConfigError, DriveConfig, EnvConfig, SceneConfig

@@ -7,11 +7,9 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import warp as wp
-from pettingzoo import AECEnv
-from pettingzoo.utils.conversions import parallel_to_aec
 from pydantic import Field
 
-from piavatar_envs.api.pettingzoo import AvatarParallelEnv
+from piavatar_envs.api.pettingzoo import AECEnv, AvatarParallelEnv, parallel_to_aec
 from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.observations import ObservationTerm, Parameter

@@ -466,12 +466,13 @@ def test_no_picture_without_a_render_mode(make_world, module_name):
         assert world.render() is None
 
 
-def test_the_view_is_missing_with_its_remedy():
-    code = """
+@pytest.mark.parametrize("module", ["piavatar_envs.api.pettingzoo", *multi_modules()])
+def test_pettingzoo_is_missing_with_its_remedy(module):
+    code = f"""
 import sys
 sys.modules["pettingzoo"] = None
 try:
-    import piavatar_envs.api.pettingzoo
+    import {module}
 except ImportError as error:
     print(error)
 """
