@@ -279,4 +279,4 @@ class ArticulatedBody:
         model, w = self.model, self._bench
         inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, w.pose.position, state.u, state.vk]
         inputs += [state.failure]
-        program.launch(put_in_place, (model.num_envs, self.firm.size), inputs, [state.x, state.C, self.state.slip])
+        program.launch(put_in_place, model.num_envs * self.firm.size, inputs, [state.x, state.C, self.state.slip])

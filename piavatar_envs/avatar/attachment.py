@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_images, blend_places
+from piavatar_envs.avatar.blending import blend_back, blend_images, skinned_place
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import blended_motion, motion_apart
 from piavatar_envs.avatar.lanes import lane_of_warp, warp_of_block
@@ -24,6 +24,7 @@ from piavatar_envs.avatar.types import Body
 from piavatar_envs.mpm.colliders import signed_distance
 from piavatar_envs.mpm.matrices import matrix_at, store_matrix
 from piavatar_envs.mpm.shared_memory import meet, threads_of_block
+from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import Boundaries, Grid, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -139,27 +140,23 @@ def put_in_place(
     C: wp.array3d(dtype=float),
     slip: wp.array2d(dtype=wp.vec3),
 ):
-    """Put the ``firm`` particles where their bones have them, though not beyond boundaries; over ``(E, firm ones)``.
+    """Put the ``firm`` particles where their bones have them, though not beyond boundaries; over ``E * firm ones``.
 
     No particle's velocity ``v`` changes. What a way of ``d`` gives of angular momentum, ``m d x v``, the affine
     velocity takes back: the grid gets ``m (dx^2/4) eps C`` of it (Jiang et al. 2015, quadratic weights). The ``slip``
     remembers the way, in the frame of the rest pose.
     """
-    e, n = wp.tid()
+    own = environment_of(wp.tid(), firm.shape[0])
+    e = own[0]
     if failure[e] != 0:
         return
-    p = firm[n]
+    p = firm[own[1]]
     q = body.first + p
-    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
-    home = blend_places(place, e, body.skin, p, rest)
-    at = keep_outside(boundaries, e, position[e, 0] + home)
-    way = at - x[e, q]
-    x[e, q] = at
-    turned = wp.vec3()
-    for i in range(3):
-        axis = wp.vec3()
-        axis[i] = 1.0
-        turned[i] = wp.dot(blend_places(place, e, body.skin, p, rest + axis) - home, way)
-    slip[e, p] = slip[e, p] + turned
-    spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, u[e, q] + vk[e, q])
-    store_matrix(C, e, q, matrix_at(C, e, q) - wp.skew(spin))
+    at = keep_outside(boundaries, e, vector_at(position, e, 0) + skinned_place(body, place, e, p))
+    way = at - vector_at(x, e, q)
+    spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, vector_at(u, e, q) + vector_at(vk, e, q))
+    affine = matrix_at(C, e, q) - wp.skew(spin)
+    slipped = vector_at(slip, e, p) + blend_back(place, e, body.skin, p, way)
+    set_vector(x, e, q, at)  # not before all has been asked for
+    set_vector(slip, e, p, slipped)
+    store_matrix(C, e, q, affine)

@@ -152,29 +152,31 @@ def blend_steps(record: wp.array2d(dtype=vec12), e: int, skin: wp.array(dtype=wp
     ...
 
 
-@wp.func_native(
-    READ
-    + """
+def _blend_rows(add: str) -> str:
+    """A snippet that adds to a vector what there is of ``row`` ``i`` of a bone's place, which counts by ``w``."""
+    return f"""{READ}
 wp::vec3 sum;
 #pragma unroll
-for (int n = 0; n < 4; ++n) {
+for (int n = 0; n < 4; ++n) {{
     const wp::float32 w = weights[n];
     if (w <= 0.0f) continue;
     const auto& bone = place.data[place.shape[1] * e + joint(n)];
 #pragma unroll
-    for (int i = 0; i < 3; ++i) {
+    for (int i = 0; i < 3; ++i) {{
 #if defined(__CUDA_ARCH__)
-        const float4 row = reinterpret_cast<const float4*>(&bone)[i];
-        sum[i] += w * (row.x * rest[0] + row.y * rest[1] + row.z * rest[2] + row.w);
+        const float4 four = reinterpret_cast<const float4*>(&bone)[i];
+        const wp::float32 row[4] = {{four.x, four.y, four.z, four.w}};
 #else
         const auto& row = bone.data[i];
-        sum[i] += w * (row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3]);
 #endif
-    }
-}
+        {add}
+    }}
+}}
 return sum;
 """
-)
+
+
+@wp.func_native(_blend_rows("sum[i] += w * (row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3]);"))
 def blend_places(
     place: wp.array2d(dtype=wp.mat44),
     e: int,
@@ -183,6 +185,18 @@ def blend_places(
     rest: wp.vec3,
 ) -> wp.vec3:
     """``sum_n weight_n place[e, joint_n] (rest, 1)`` of particle ``p``: linear blend skinning."""
+    ...
+
+
+@wp.func_native(_blend_rows("for (int c = 0; c < 3; ++c) sum[c] += w * row[c] * way[i];"))
+def blend_back(
+    place: wp.array2d(dtype=wp.mat44),
+    e: int,
+    skin: wp.array(dtype=wp.vec4),
+    p: int,
+    way: wp.vec3,
+) -> wp.vec3:
+    """``sum_n weight_n R_n^T way``, ``R_n`` the turns of ``place[e, joint_n]``: a way in the frame of the rest pose."""
     ...
 
 
