@@ -3,9 +3,10 @@
 ``python -m benchmarks.torque --out FILE.json``. A body that flails in empty space, one whose pelvis is held while it
 stretches its arms out or presses its toes on the floor, and one that is asked for the rest pose (``control="pd"``, zero
 actions), with an assisted pelvis and without; what balls do to it and what it does to balls
-(:mod:`benchmarks.blows`), whether its matter stays at the bones (:mod:`benchmarks.wear`), and up to which time step and
-gains it is stable (:mod:`benchmarks.stability`). All but stability is measured both ways of
-:data:`benchmarks.blows.HOLDS`: with firm bones, as environments have them, and with slipping ones.
+(:mod:`benchmarks.blows`), whether its matter stays at the bones (:mod:`benchmarks.wear`) and its bones together on the
+floor (:mod:`benchmarks.floor`), and up to which time step and gains it is stable (:mod:`benchmarks.stability`). All
+but stability is measured both ways of :data:`benchmarks.blows.HOLDS`: with firm bones, as environments have them, and
+with slipping ones.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks import blows, runner, stability, timing, wear
+from benchmarks import blows, floor, runner, stability, timing, wear
 from benchmarks.blows import HOLDS, afloat
 from benchmarks.limbs import Limbs, Options, critical_damping, widest
 from benchmarks.poses import random_pose
@@ -212,7 +213,7 @@ def cost(options: Options, hold: str) -> dict[str, Any]:
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, wear, stability, the cost."""
+    """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, wear, floor, stability, cost."""
     for hold in HOLDS:
         for rate in (0.0, RATE):
             yield flail(options, rate, hold)
@@ -226,6 +227,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
             yield stand(options, assist, hold)
     yield from blows.cases(options)
     yield from wear.cases(options)
+    yield from floor.cases(options)
     yield from stability.cases(options)
     for hold in HOLDS:
         yield cost(options, hold)

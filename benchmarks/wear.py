@@ -35,15 +35,20 @@ def make(options: Options, task: str, **settings: Any) -> BatchEnv:
     return env
 
 
-def ways(env: BatchEnv) -> np.ndarray:
-    """How far each particle of the avatar is from where its bones have it, shape ``(P,)`` [m]."""
+def homes(env: BatchEnv) -> np.ndarray:
+    """Where its bones have each particle of the avatar, shape ``(P, 3)`` [m]."""
     simulation = env.simulation
     pose, points = simulation.avatar.joints.state, simulation.flesh[0].points
     world = Rotation.from_quat(pose.rotation.numpy()[0].astype(float)).as_matrix()
     rest, weights = points.rest[0].astype(float), points.skin_weights.astype(float)
     position, joints = pose.position.numpy()[0].astype(float), points.joints[0].astype(float)
-    home = skin(rest, points.skin_joints, weights / weights.sum(1, keepdims=True), world, position, joints)
-    return np.linalg.norm(simulation.state.x.numpy()[0, : len(home)] - home, axis=1)
+    return skin(rest, points.skin_joints, weights / weights.sum(1, keepdims=True), world, position, joints)
+
+
+def ways(env: BatchEnv) -> np.ndarray:
+    """How far each particle of the avatar is from where its bones have it, shape ``(P,)`` [m]."""
+    home = homes(env)
+    return np.linalg.norm(env.simulation.state.x.numpy()[0, : len(home)] - home, axis=1)
 
 
 def rms(values: np.ndarray) -> float:
