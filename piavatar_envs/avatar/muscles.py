@@ -2,22 +2,27 @@
 
 Axes are those of the rest pose, as the parent bone has turned them, and signs those of
 :mod:`piavatar_envs.avatar.limits`: +x bends the trunk forward, hip and knee backward, points the toe down. The numbers
-are means of young men under isometric load, at the best angle:
+are means of young men under isometric load, at the best angle, where nothing else is said:
 
 - hip, knee and ankle about x: Anderson, Madigan & Nussbaum, "Maximum voluntary joint torque as a function of joint
   angle and angular velocity", J. Biomech. 40 (2007), table 3: hip 0.161 (extension) and 0.113 (flexion), knee 0.163 and
   0.087, ankle 0.095 (toe down) and 0.033 (toe up) of weight times height, which is 1287 N m here. What lies between
   angles and velocities (their other coefficients) is left out.
-- shoulder about x: 90 N m of static flexion, the mean of 26 men in "Dynamic shoulder flexion strength for use in
-  occupational risk analysis and clinical assessment" (arm hanging).
+- shoulder: Holzbaur, Delp, Gold & Murray, "Moment-generating capacity of upper limb muscles in healthy adults",
+  J. Biomech. 40 (2007), pp. 2442-2449: adduction, the strongest group that they measured, 67.9 N m with a standard
+  deviation of 28.4 over ten young adults, from a woman of the 20th percentile of size to a man of the 97th. About x are
+  90 N m, 0.8 standard deviations above, as of a man: static flexion of 26 young men with the arm hanging was 89.9 N m
+  (68.6 raised by 45 degrees) in "Dynamic shoulder flexion strength for use in occupational risk analysis and clinical
+  assessment", of which we know the abstract only, not who wrote it and when. The same for extension is an estimate, and
+  so are 75 N m about y, a quarter of a standard deviation above that adduction, and 60 N m about z.
 - elbow: flexion 0.78 and extension 0.67 N m a kilogram (Lategan & Krueger, AJPHERD 2003).
 - wrist: flexion 12.2, extension 7.1, radial 11.0, ulnar 9.5 N m (Delp, Grigg & Buchanan, J. Biomech. 29, 1996).
 
 All else is *estimated* after the size that textbooks give (Chaffin, Andersson & Martin, "Occupational Biomechanics",
 for the trunk; Vasavada, Li & Delp, "Three-dimensional isometric strength of neck muscles in humans", Spine 2001, for
-the neck): trunk, neck, collars, and hip, knee, ankle and shoulder about y and z. Joints in a row each carry the whole
-torque. In the rest pose the arms are lowered by 45 degrees, so that flexing and twisting an elbow or a wrist are
-mixtures of x and z: the bounds hold each axis, not each movement.
+the neck): trunk, neck, collars, and hip, knee and ankle about y and z. Joints in a row each carry the whole torque. In
+the rest pose the arms are lowered by 45 degrees, so that flexing and twisting an elbow or a wrist are mixtures of x and
+z: the bounds hold each axis, not each movement.
 """
 
 from __future__ import annotations
