@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from functools import partial
 from pathlib import Path
@@ -53,6 +54,18 @@ def test_every_guide_is_linked_from_the_readme():
 def test_what_is_made_smaller_is_there():
     code = "\n".join(block for page in PAGES.values() for block in blocks(page))
     assert [text for text in SMALLER if text not in code] == []
+
+
+def test_walkers_are_as_fast_as_the_guide_says():
+    """Who goes at a steady ``v`` from the first of ``N`` steps on is ``v dt (N + 1) / 2`` from the start on average."""
+    speeds = []
+    for path in sorted((ROOT / "benchmarks" / "results" / "ppo").glob("walk_*/evaluation.json")):
+        run = json.loads(path.read_text(encoding="utf-8"))
+        (row,), dt = run["results"], run["env"]["physics"]["control_dt"]
+        assert row["success_at_end"] == 1.0 and row["mean_steps"] == run["env"]["episode_seconds"] / dt
+        speeds.append(2.0 * row["mean_distance_m"] / (dt * (row["mean_steps"] + 1.0)))
+    guide = PAGES["docs/training.md"].read_text(encoding="utf-8")
+    assert len(speeds) == 5 and f"{min(speeds):.2f} to {max(speeds):.2f} m/s from the first step on" in guide
 
 
 @pytest.mark.parametrize("name", [name for name, page in PAGES.items() if blocks(page)])
