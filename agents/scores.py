@@ -272,7 +272,8 @@ def main(args: list[str] | None = None) -> None:
     commits = sorted({str(one["commit"])[:12] for one in measured} | set(kept["commits"]))
     about = (
         f"{', '.join(devices)}; commits {', '.join(commits)}. Brackets are 95 % intervals: over seeds and episodes "
-        "where there are several seeds, else over episodes; all seeds have played the same, so many each."
+        "where there are several seeds, else over episodes; all seeds have played the same, so many each. Zero actions "
+        "and the PID agent have no seeds: they draw nothing at random, so they play an episode in one way."
     )
     text = markdown(rows, about)
     if options.out is not None:

@@ -106,6 +106,7 @@ def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     assert "| rsl_ppo | pd | firm | 2 | 10 | 85.0 (21.5 to 148.5) |" in text and "2 M steps, 70 s" in text
     assert "| sb3_ppo | pd | slipping | 1 |" in text
     assert "| 0 to 5 | 50% of 10 |" in text
+    assert "some GPU; commits abc." in text and "Zero actions and the PID agent have no seeds" in text
     with pytest.raises(SystemExit, match=r"error: .*nowhere"):
         scores.main([str(tmp_path / "nowhere")])
 
