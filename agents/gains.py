@@ -109,12 +109,13 @@ class LoadSchedule:
     Attributes:
         joints: number of joints.
         legs: places of the joints of each leg.
-        unloaded: factor of a leg that carries nothing [-]; one that carries its even share, or more, has 1.
+        unloaded: factor of a leg that carries nothing [-], 1 for no schedule; one that carries its even share, or more,
+            has 1. :class:`agents.pid_agent.Design` says what came of it in a body that stands.
     """
 
     joints: int
     legs: Mapping[str, Sequence[int]]
-    unloaded: float = 0.3
+    unloaded: float
 
     def __call__(self, forces: np.ndarray) -> np.ndarray:
         """Factors ``(n, joints, 1)`` for forces that the ground exerts on the legs [N], ``(n, legs)`` in their order.
