@@ -116,9 +116,14 @@ def _same_environment(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """All settings of an environment by dotted name; one that a run does not know yet has its default there."""
+    """All settings of an environment by dotted name; one that a run does not know yet has its default there.
+
+    What follows from other settings where it is null is what follows: runs from before it could be null know that.
+    """
     with contextlib.suppress(ValueError):  # a world of several agents, or settings that are no longer there
-        settings = load_config(load_task(env_id).Config, settings).model_dump(mode="json")
+        config = load_config(load_task(env_id).Config, settings)
+        settings = config.model_dump(mode="json")
+        settings["drive"]["free_motion"] = config.drive.moves_freely
     return flattened({"env": settings})
 
 

@@ -35,7 +35,7 @@ def drive_settings(d: DriveConfig) -> DriveSettings:
         alpha=d.alpha,
         shape_preservation=d.shape_preservation,
         root=d.root,
-        free_motion=d.root == "free" if d.free_motion is None else d.free_motion,
+        free_motion=d.moves_freely,
         max_force=d.max_force_weight,
         max_torque=d.max_torque_weight,
         max_tilt=d.let_go_tilt,

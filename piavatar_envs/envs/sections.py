@@ -145,6 +145,11 @@ class DriveConfig(BaseModel):
     )
     let_go_height: float = Field(0.4, gt=0.0, description="height error at which the root wrench lets go [m]")
 
+    @property
+    def moves_freely(self) -> bool:
+        """Whether commanded motion has its rigid part taken out: ``free_motion``, where that is null, too."""
+        return self.root == "free" if self.free_motion is None else self.free_motion
+
 
 class ShapeConfig(BaseModel):
     """The body's shape: fixed parameters, or a random shape at each reset."""

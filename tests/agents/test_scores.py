@@ -92,6 +92,17 @@ def test_the_untrained_of_one_environment_stand_once_also_in_fewer_episodes(runs
     assert {r["agent"] for r in scores.scores(runs)} >= {"random, as score_pid", "zero, as score_pid"}
 
 
+@pytest.mark.parametrize("value, same", [(False, True), (True, False)])
+def test_what_is_null_is_the_same_as_what_follows(value, same, runs):
+    """``free_motion`` is off where nothing is said of it, and a wrench holds the root."""
+    runs["stand_pid"]["config"]["env"]["drive"] = {"free_motion": value}
+    runs["stand_pid"]["results"][:2] = [row("zero", 3.4), row("random", 2.4)]
+    found = {r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"}
+    assert found == {"random", "zero", "PID", "rsl_ppo"} | (
+        set() if same else {"random, as score_pid", "zero, as score_pid"}
+    )
+
+
 def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     """With what drives the avatar; what an environment does not say is as by default."""
     runs["push"]["config"]["env"]["drive"] = {"control": "pd", "firm_bones": False}
