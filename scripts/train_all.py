@@ -1,0 +1,152 @@
+"""Train published configurations, several seeds each: ``python -m scripts.train_all stand_rsl walk_sb3 --gpus 0 1``.
+
+Every training is a process of its own, some at a time on each GPU, and leaves ``runs/<configuration>_<seed>``. Those
+that have ended are left alone and those that were stopped go on from their last checkpoint, so the same command goes on
+after whatever has ended it. ``scripts.keep_run`` keeps what is worth it, ``agents.scores`` draws up the table.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from threading import Event
+from typing import Annotated
+
+import tyro
+from rich.progress import track
+
+#: By the folder of a configuration, the script that trains by it.
+SCRIPTS = {"rsl_rl": "agents.rsl_ppo", "sb3": "agents.train"}
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+#: Seconds between two looks at a training.
+WAIT = 0.2
+
+
+@dataclass(frozen=True)
+class Job:
+    """A training: its configuration, seed and folder."""
+
+    config: Path
+    seed: int
+    folder: Path
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has ended: its scores are the last that it writes."""
+        return (self.folder / "results.json").is_file()
+
+    def command(self, device: str, settings: tuple[str, ...]) -> list[str]:
+        """What trains it, or goes on with it."""
+        script = SCRIPTS[self.config.parent.name]
+        where = ["--device", device, "--out", str(self.folder), "--resume"]
+        return [sys.executable, "-m", script, str(self.config), f"seed={self.seed}", *settings, *where]
+
+    def run(self, gpu: str | None, settings: tuple[str, ...], time_is_up: Callable[[], bool]) -> str:
+        """Train on a GPU, or without one on the CPU, until it is over or ``time_is_up``; returns what went wrong."""
+        if self.is_over or time_is_up():
+            return ""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        environment = dict(os.environ) if gpu is None else os.environ | {"CUDA_VISIBLE_DEVICES": gpu}
+        with (self.folder / "log.txt").open("ab") as log:
+            command = self.command("cpu" if gpu is None else "cuda", settings)
+            process = subprocess.Popen(
+                command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+            )
+        while process.poll() is None and not time_is_up():
+            time.sleep(WAIT)
+        if process.poll() is None:
+            end(process)
+            return ""
+        return "" if process.returncode == 0 else f"exit {process.returncode}; see {self.folder / 'log.txt'}"
+
+
+def end(process: subprocess.Popen) -> None:
+    """Kill a training and the processes that it has; its checkpoints are whole whenever that happens."""
+    if hasattr(os, "killpg"):
+        os.killpg(process.pid, signal.SIGKILL)
+    else:  # on Windows
+        process.kill()
+    process.wait()
+
+
+def main(
+    configs: Annotated[tuple[str, ...], tyro.conf.Positional] = (),
+    settings: Annotated[tuple[str, ...], tyro.conf.arg(help="settings that win over the files': iterations=10")] = (),
+    seeds: Annotated[int, tyro.conf.arg(help="trainings of each configuration")] = 5,
+    gpus: Annotated[tuple[str, ...], tyro.conf.arg(help="numbers of the GPUs to train on; none for the CPU")] = (),
+    each: Annotated[int, tyro.conf.arg(help="trainings at a time on each")] = 3,
+    minutes: Annotated[float | None, tyro.conf.arg(help="stop after so long; the same command goes on")] = None,
+    runs: Annotated[Path, tyro.conf.arg(help="folder of the trainings")] = Path("runs"),
+) -> int:
+    """Train by configurations, by default by all of ``configs/rsl_rl`` and ``configs/sb3``.
+
+    Args:
+        configs: names of files there, without the ending.
+        settings: for all of them.
+        seeds: of each, from 0 on.
+        gpus: as ``CUDA_VISIBLE_DEVICES`` names them.
+        each: trainings at a time on each GPU, or on the CPU.
+        minutes: until all are stopped; as long as it takes if not given.
+        runs: where to.
+
+    Returns:
+        0 if all have ended, or were stopped for the time; 1 if one failed; 130 if all were stopped by Ctrl-C.
+
+    Raises:
+        ValueError: there is no such configuration, or nothing to do at a time.
+    """
+    if seeds < 1 or each < 1:
+        raise ValueError(f"seeds={seeds}, each={each}: both must be >= 1")
+    jobs = [Job(path, n, runs / f"{path.stem}_{n}") for path in find(configs) for n in range(seeds)]
+    slots: SimpleQueue[str | None] = SimpleQueue()
+    for _ in range(each):
+        for gpu in gpus or (None,):
+            slots.put(gpu)
+    until, stopped = time.monotonic() + (float("inf") if minutes is None else 60.0 * minutes), Event()
+
+    def train(job: Job) -> str:
+        gpu = slots.get()
+        try:
+            return job.run(gpu, settings, lambda: stopped.is_set() or time.monotonic() >= until)
+        finally:
+            slots.put(gpu)
+
+    with ThreadPoolExecutor(each * max(1, len(gpus))) as pool:
+        try:
+            said = list(track(pool.map(train, jobs), "training", len(jobs)))
+        except KeyboardInterrupt:
+            stopped.set()
+            print("stopped; the same command goes on", file=sys.stderr)
+            return 130
+    for job, words in zip(jobs, said, strict=True):
+        if words or not job.is_over:
+            print(f"{job.folder}: {words or 'stopped; the same command goes on'}", file=sys.stderr)
+    return int(any(said))
+
+
+def find(names: tuple[str, ...]) -> list[Path]:
+    """Files of configurations by their names, all if there are none.
+
+    Raises:
+        ValueError: there is none of a name.
+    """
+    known = {path.stem: path for folder in SCRIPTS for path in sorted((CONFIGS / folder).glob("*.yaml"))}
+    for name in names:
+        if name not in known:
+            raise ValueError(f"no configuration {name!r}; there are {', '.join(known)}")
+    return [known[name] for name in names or known]
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(tyro.cli(main, description=__doc__))
+    except ValueError as error:
+        sys.exit(f"error: {error}")
