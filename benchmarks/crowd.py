@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.asset import AvatarAsset, dense_weights, load_body, mesh_volume, top_weights
 from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
-from piavatar_envs.avatar.sampling import order_along_curve, order_in_boxes, sample_particles
+from piavatar_envs.avatar.ordering import order_along_curve, order_in_boxes
+from piavatar_envs.avatar.sampling import sample_particles
 from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_JOINTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.substeps import record_drive

@@ -15,14 +15,13 @@ from scipy.spatial import cKDTree
 
 from piavatar_envs.avatar import harmonic
 from piavatar_envs.avatar.asset import AvatarAsset, ShapedBody, dense_weights, mesh_volume, top_weights
+from piavatar_envs.avatar.ordering import order_along_curve, order_of_body
 from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.surface import ClosedSurface
 
 SPACING_PER_DX = 0.57  # lattice spacing over grid spacing: about 5 particles a cell
 SUBDIVISIONS = 3  # points per axis and cell that decide how much of it is inside
 MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
-SMALL_BODY = 8192  # particles up to which they are in the order of their bones
-BOXES = (128, 64, 32)  # particles that lie together in larger ones, as many as P2G takes together or a warp has
 LINK_LENGTH = 1.8  # of a link between neighbouring particles, over the spacing
 SHELL = 0.75  # depth of the particles that simply follow the skin, over the spacing
 INSET = 0.05  # depth of a particle that a change of shape would leave outside, over the spacing
@@ -111,8 +110,7 @@ def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rin
     skin_joints, skin_weights = top_weights(_local(weights))
     volumes = _volumes(positions, bone, interior, mesh_volume(asset.vertices, asset.faces))
     depth = np.maximum(-distance, 0.0)
-    small = len(positions) <= SMALL_BODY
-    order = order_by_bones(bone, skin_joints, skin_weights) if small else order_in_boxes(positions)
+    order = order_of_body(positions, bone, skin_joints, skin_weights)
     links = np.argsort(order).astype(np.int32)[links]
     first = (positions, volumes, skin_joints, skin_weights, bone)
     rest = (anchors, coordinates, shell, depth)
@@ -219,49 +217,6 @@ def _bone_lattice(asset: AvatarAsset, skin: ClosedSurface, rings: int) -> tuple[
             lattice[outside] += 0.4 * (centres[depth.argmax()] - lattice[outside])
         points[joint] = lattice
     return points.reshape(-1, 3), np.repeat(np.arange(NUM_JOINTS), points.shape[1])
-
-
-def order_along_curve(positions: np.ndarray, spacing: float) -> np.ndarray:
-    """Order of the particles along Morton's curve, ``(P,)``: what is close in memory is close in the body.
-
-    Threads and cache lines then share grid nodes and bones.
-    """
-    cells = ((positions - positions.min(axis=0)) / spacing).astype(np.uint64)
-    code = np.zeros(len(cells), np.uint64)
-    for bit, axis in np.ndindex(16, 3):
-        code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return np.argsort(code, kind="stable")
-
-
-def order_by_bones(bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
-    """Order ``(P,)`` in which bones' own particles come first, then those that one bone moves, two, and so on.
-
-    Of as many bones those of the same ones follow each other, as they did. Threads that work together then blend as
-    many bones, and mostly the same: one that blends four makes 31 others wait. Neighbours of large bodies are alike
-    anyway, see :func:`order_in_boxes`.
-    """
-    moves = np.sort(np.where(skin_weights > 0.0, skin_joints, NUM_JOINTS), axis=1)
-    return np.lexsort((*moves.T[::-1], (skin_weights > 0.0).sum(axis=1), bone < 0))
-
-
-def order_in_boxes(positions: np.ndarray) -> np.ndarray:
-    """Order ``(P,)`` in which each ``BOXES[0]`` particles have a compact box of their own, each ``BOXES[1]`` in it, ...
-
-    Boxes are halved along their longest edge; in the smallest, particles stay as they are. The P2G of large bodies
-    takes so many together and adds up on the nodes of the box around them, which a curve's jumps would make large.
-    """
-
-    def halve(inside: np.ndarray, level: int) -> list[np.ndarray]:
-        while level < len(BOXES) and len(inside) <= BOXES[level]:
-            level += 1
-        if level == len(BOXES):
-            return [np.sort(inside)]
-        along = positions[inside, np.ptp(positions[inside], axis=0).argmax()]
-        order = inside[np.argsort(along, kind="stable")]
-        lower = BOXES[level] * -(-len(order) // (2 * BOXES[level]))
-        return halve(order[:lower], level) + halve(order[lower:], level)
-
-    return np.concatenate(halve(np.arange(len(positions)), 0))
 
 
 def _links(
