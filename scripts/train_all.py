@@ -7,6 +7,7 @@ after whatever has ended it. ``scripts.keep_run`` keeps what is worth it, ``agen
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -71,7 +72,8 @@ class Job:
 def end(process: subprocess.Popen) -> None:
     """Kill a training and the processes that it has; its checkpoints are whole whenever that happens."""
     if hasattr(os, "killpg"):
-        os.killpg(process.pid, signal.SIGKILL)
+        with contextlib.suppress(ProcessLookupError):  # it has ended by itself
+            os.killpg(process.pid, signal.SIGKILL)
     else:  # on Windows
         process.kill()
     process.wait()
@@ -133,7 +135,7 @@ def main(
 
 
 def find(names: tuple[str, ...]) -> list[Path]:
-    """Files of configurations by their names, all if there are none.
+    """Files of configurations by their names, each once, all if there are none.
 
     Raises:
         ValueError: there is none of a name.
@@ -142,7 +144,7 @@ def find(names: tuple[str, ...]) -> list[Path]:
     for name in names:
         if name not in known:
             raise ValueError(f"no configuration {name!r}; there are {', '.join(known)}")
-    return [known[name] for name in names or known]
+    return [known[name] for name in dict.fromkeys(names or known)]
 
 
 if __name__ == "__main__":

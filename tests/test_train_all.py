@@ -50,7 +50,9 @@ def test_one_that_fails_is_named_with_its_log(tmp_path, capsys):
 
 
 def test_every_published_training_has_a_job_and_others_are_refused():
-    assert len(train_all.find(())) > 10 and {path.parent.name for path in train_all.find(())} == set(train_all.SCRIPTS)
+    files = {path for folder in train_all.SCRIPTS for path in (train_all.CONFIGS / folder).glob("*.yaml")}
+    assert set(train_all.find(())) == files and len(files) > 10
+    assert [path.stem for path in train_all.find(("walk_sb3", "stand_rsl", "walk_sb3"))] == ["walk_sb3", "stand_rsl"]
     with pytest.raises(ValueError, match=r"no configuration 'fly'.*stand_rsl"):
         train_all.main(("fly",))
     with pytest.raises(ValueError, match=r"seeds=0, each=3: both must be >= 1"):
