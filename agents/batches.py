@@ -91,9 +91,18 @@ def load_batched(
         overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
 
     Raises:
-        ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment.
+        ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment; or more
+            minibatches than there are steps to share.
     """
-    return load_resolved(cls, lambda config: find_task(config.env_id).Config, source, overrides)
+    config = load_resolved(cls, lambda config: find_task(config.env_id).Config, source, overrides)
+    for name in ("ppo", "mappo"):
+        settings = getattr(config, name, None)
+        if settings is not None and settings.minibatches > (steps := config.num_envs * settings.rollout_steps):
+            raise ConfigError(
+                f"{name}.minibatches={settings.minibatches} must be <= {steps}, the steps of a rollout of num_envs="
+                f"{config.num_envs} environments"
+            )
+    return config
 
 
 def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Evaluation:

@@ -13,6 +13,7 @@ import os
 import pickle
 import random
 import warnings
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -25,7 +26,16 @@ from benchmarks.runner import git_commit
 from piavatar_envs.doctor import package_version
 from piavatar_envs.envs.config import ConfigError
 
+try:
+    import fcntl
+except ImportError:  # on Windows nobody finds out that two train in one folder
+    fcntl = None
+
 NAME = "checkpoint.pt"
+#: Folders that this process holds, and by what; the system lets go of them however the process ends.
+_HELD: dict[Path, int] = {}
+#: What a training leaves, by which a folder without a checkpoint is known to hold one that was kept.
+LEFT = ("policy.pt", "policy.zip", "results.json")
 #: Of the file's content; rises with every change.
 FORMAT = 3
 #: Settings that what has been learned so far does not depend on.
@@ -81,9 +91,11 @@ class Checkpoint:
 
         Raises:
             ConfigError: a checkpoint of another configuration, device or version, or one that cannot be read; or
-                there is one, and ``resume`` was not asked for.
+                there is one, and ``resume`` was not asked for; or the folder is another training's, that runs or that
+                was kept without its checkpoint.
         """
         self.path = folder / NAME
+        hold(folder)
         self.state: dict[str, Any] | None = None
         commit, _ = git_commit()
         self._about = {
@@ -94,6 +106,9 @@ class Checkpoint:
             "commit": commit,
         }
         if not self.path.exists():
+            for name in LEFT:
+                if (folder / name).exists():
+                    raise ConfigError(f"{folder / name} is of a training that has ended; write elsewhere with --out")
             return
         if not resume:
             raise ConfigError(
@@ -109,8 +124,8 @@ class Checkpoint:
 
     def _read(self) -> dict[str, Any]:
         try:
-            content = torch.load(self.path, map_location="cpu", weights_only=True)
-        except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+            content = load_whole(self.path, "cpu")
+        except UNREADABLE as error:
             raise ConfigError(f"{self.path} cannot be read ({first_line(error)}); delete it to begin anew") from None
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             found = content.get("format") if isinstance(content, dict) else None
@@ -143,6 +158,46 @@ class Checkpoint:
                 "go on otherwise than it would have",
                 stacklevel=4,
             )
+
+
+#: What may come of reading a file that is damaged, or another's.
+UNREADABLE = (
+    pickle.UnpicklingError, EOFError, RuntimeError, AttributeError, TypeError, OSError, ValueError, KeyError,
+    zipfile.BadZipFile,
+)  # fmt: skip
+
+
+def load_whole(path: Path, device: str) -> Any:
+    """What ``torch.save`` has written, without running code that it might carry; torch does not look at its check sums.
+
+    Raises:
+        Exception: of :data:`UNREADABLE`, the file is damaged or another's.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if (damaged := archive.testzip()) is not None:
+            raise ValueError(f"{damaged} is damaged")
+    return torch.load(path, map_location=device, weights_only=True)
+
+
+def hold(folder: Path) -> None:
+    """Keep other processes from training in a folder as long as this one lives.
+
+    Raises:
+        ConfigError: another one trains there.
+    """
+    path = folder.resolve()
+    if fcntl is None or path in _HELD:
+        return
+    held = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(held)
+        raise ConfigError(f"another training writes to {folder}; end it, or write elsewhere with --out") from None
+    except OSError:  # a file system that knows no locks
+        os.close(held)
+        return
+    _HELD[path] = held
 
 
 def first_line(error: Exception) -> str:

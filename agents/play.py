@@ -136,6 +136,8 @@ def check_options(options: Options) -> None:
     if options.episodes is not None and options.episodes < 2:
         advice = "of one there is no interval; a film alone needs no --episodes"
         raise ConfigError(f"episodes={options.episodes} must be >= 2: {advice}")
+    if options.out and (options.out.suffix != ".json" or options.out.name == "results.json"):
+        raise ConfigError(f"out={options.out} must be a .json file of its own, and results.json is the training's")
     check_film(options.film, options.film_every, options.film_episodes)
     if options.first_seed is not None:
         check_seeds(options.first_seed, name="first_seed")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,7 +13,7 @@ from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
 from agents.batches import BatchTraining
-from agents.checkpoint import no_policy
+from agents.checkpoint import UNREADABLE, load_whole, no_policy
 from agents.evaluate import Agent
 from agents.help import HelpSettings
 from agents.workers import components
@@ -107,8 +106,8 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
     shown = TensorDict({"policy": torch.zeros(1, len(seen))}, [1])
     actor = network(shown, {"actor": ["policy"]}, "actor", action_size, **settings).to(device)
     try:
-        actor.load_state_dict(torch.load(path, map_location=device, weights_only=True))
-    except (pickle.UnpicklingError, EOFError, RuntimeError, AttributeError, TypeError) as error:
+        actor.load_state_dict(load_whole(path, device))
+    except UNREADABLE as error:
         raise no_policy(path, len(seen), action_size, error) from None
     return mean_agent(actor.eval(), seen, device)
 

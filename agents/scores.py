@@ -266,6 +266,8 @@ def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = tyro.cli(Options, prog="python -m agents.scores", args=args)
     try:
+        if options.out is not None and options.out.suffix != ".json":
+            raise ValueError(f"out={options.out} must be a .json file; the same comes beside it as .md")
         runs = {str(path): _read_run(path) for path in options.runs}
         rows = scores(runs)
         kept = _kept(options.keep, rows)

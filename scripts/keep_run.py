@@ -100,5 +100,5 @@ def shortened(curve: str) -> str:
 if __name__ == "__main__":
     try:
         sys.exit(tyro.cli(main, description=__doc__))
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")

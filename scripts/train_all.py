@@ -103,10 +103,13 @@ def main(
         0 if all have ended, or were stopped for the time; 1 if one failed; 130 if all were stopped by Ctrl-C.
 
     Raises:
-        ValueError: there is no such configuration, or nothing to do at a time.
+        OSError: the trainings cannot be written there.
+        ValueError: there is no such configuration, nothing to do at a time, or no time.
     """
     if seeds < 1 or each < 1:
         raise ValueError(f"seeds={seeds}, each={each}: both must be >= 1")
+    if minutes is not None and not minutes >= 0.0:
+        raise ValueError(f"minutes={minutes} must be >= 0")
     jobs = [Job(path, n, runs / f"{path.stem}_{n}") for path in find(configs) for n in range(seeds)]
     slots: SimpleQueue[str | None] = SimpleQueue()
     for _ in range(each):
@@ -125,9 +128,10 @@ def main(
         try:
             said = list(track(pool.map(train, jobs), "training", len(jobs)))
         except KeyboardInterrupt:
-            stopped.set()
             print("stopped; the same command goes on", file=sys.stderr)
             return 130
+        finally:
+            stopped.set()
     for job, words in zip(jobs, said, strict=True):
         if words or not job.is_over:
             print(f"{job.folder}: {words or 'stopped; the same command goes on'}", file=sys.stderr)
@@ -147,8 +151,16 @@ def find(names: tuple[str, ...]) -> list[Path]:
     return [known[name] for name in dict.fromkeys(names or known)]
 
 
+def as_by_ctrl_c(*_: object) -> None:
+    """Where the terminal is gone, or the system asks for an end, trainings must not go on by themselves."""
+    raise KeyboardInterrupt
+
+
 if __name__ == "__main__":
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), as_by_ctrl_c)
     try:
         sys.exit(tyro.cli(main, description=__doc__))
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"error: {error}")

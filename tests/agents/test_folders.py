@@ -1,0 +1,82 @@
+"""What a training's folder holds is not lost to another one, and what is damaged there is not taken for sound."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from agents import play, rsl_ppo, scores
+from agents.batches import load_batched
+from agents.checkpoint import UNREADABLE, Checkpoint, hold, load_whole
+from agents.config import load_training
+from agents.rsl_policy import RslTraining
+from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.tasks import load_task
+from scripts import train_all
+
+
+def test_no_other_process_trains_where_one_does(tmp_path):
+    pytest.importorskip("fcntl", reason="Windows knows no such locks")
+    hold(tmp_path)
+    hold(tmp_path)  # one process may go on where it was
+    code = f"from pathlib import Path; from agents.checkpoint import hold; hold(Path({str(tmp_path)!r}))"
+    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
+    assert "another training writes to" in other.stderr and "--out" in other.stderr
+
+
+@pytest.mark.parametrize("name", ["policy.pt", "policy.zip", "results.json"])
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_run_that_was_kept_is_not_written_over(name, resume, tmp_path):
+    (tmp_path / name).write_text("kept")
+    config = load_training({"env_id": "PIAvatar/Reach-v0", "env": {"fidelity": "tiny"}})
+    with pytest.raises(ConfigError, match=rf"{name} is of a training that has ended"):
+        Checkpoint(tmp_path, "train", config, "cpu", resume)
+    assert (tmp_path / name).read_text() == "kept"
+
+
+def test_damage_anywhere_is_found(tmp_path):
+    whole, damaged = tmp_path / "whole.pt", tmp_path / "damaged.pt"
+    torch.save({"weight": torch.arange(3000.0)}, whole)
+    torch.testing.assert_close(load_whole(whole, "cpu")["weight"], torch.arange(3000.0))
+    content = whole.read_bytes()
+    rng = np.random.default_rng(3)
+    for at in [*rng.integers(0, len(content) - 64, 40), content.index(torch.arange(1000.0, 1004.0).numpy().tobytes())]:
+        # four bytes of the numbers themselves, or of what describes them
+        damaged.write_bytes(content[:at] + bytes(b ^ 0xFF for b in content[at : at + 4]) + content[at + 4 :])
+        try:
+            read = load_whole(damaged, "cpu")
+        except UNREADABLE:
+            continue
+        torch.testing.assert_close(read["weight"], torch.arange(3000.0))  # what nobody reads, such as a date
+    for broken in (content[: len(content) // 2], b"", b"no archive"):
+        damaged.write_bytes(broken)
+        with pytest.raises(UNREADABLE):
+            load_whole(damaged, "cpu")
+    with pytest.raises(UNREADABLE):
+        load_whole(tmp_path, "cpu")
+
+
+def test_more_minibatches_than_steps_are_refused():
+    few = {"env_id": "PIAvatar/Stand-v0", "num_envs": 2, "iterations": 1, "ppo": {"rollout_steps": 2, "minibatches": 5}}
+    with pytest.raises(ConfigError, match=r"ppo\.minibatches=5 must be <= 4"):
+        load_batched(RslTraining, load_task, few)
+    assert rsl_ppo and load_batched(RslTraining, load_task, few | {"num_envs": 3}).ppo.minibatches == 5
+
+
+@pytest.mark.parametrize("out", ["results.json", "config.yaml", "policy.pt"])
+def test_figures_have_a_file_of_their_own(out, tmp_path, capsys):
+    with pytest.raises(SystemExit, match=r"\.json file of its own"):
+        play.main([str(tmp_path), "--out", str(tmp_path / out)])
+    if not out.endswith(".json"):
+        with pytest.raises(SystemExit, match=r"must be a \.json file"):
+            scores.main([str(tmp_path), "--out", str(tmp_path / out)])
+
+
+@pytest.mark.parametrize("minutes", [float("nan"), -1.0])
+def test_no_time_is_refused(minutes):
+    with pytest.raises(ValueError, match=r"minutes=.* must be >= 0"):
+        train_all.main(("stand_sb3",), minutes=minutes)
