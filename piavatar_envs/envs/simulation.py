@@ -34,6 +34,8 @@ GRID_PER_HEIGHT: dict[str, float] = {
     "medium": 64.0,
     "fine": 166.0,
 }
+#: How far all joints together are from what they turn, at most [m]: random commands of 4 rad/s move a hand by 13 m/s.
+COMMANDED_LEVER = 3.75
 
 
 class Simulation:
@@ -148,15 +150,20 @@ class Simulation:
         )
         return domain, domain.walls() if walled else ()
 
-    def _substeps(self, wave: float) -> int | None:
-        """Substeps of a control step as configured; under torques as few as they and such a wave [m/s] allow.
+    def _substeps(self, wave: float) -> int:
+        """Substeps of a control step as configured, or as few as such a wave [m/s] and what drives the body allow.
+
+        Nothing may go further than a grid spacing in a substep, which soft bodies, that need few, soon would.
 
         Raises:
             ConfigError: as configured they are too long for torques.
         """
         physics, control, asked = self.config.physics, self.config.drive.control, self.config.physics.num_substeps
+        wave = max(wave, self.subjects.matter.sound_speed())
         if control == "pose":
-            return asked
+            fastest = COMMANDED_LEVER * self.config.drive.joint_speed_limit
+            few = choose_num_substeps(physics.control_dt, self.dx, max(wave, physics.cfl * fastest), physics.cfl)
+            return few if asked is None else asked
         by_torques = math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
         if asked is not None:
             if asked < by_torques:
@@ -165,7 +172,6 @@ class Simulation:
                     f"for drive.control={control!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {by_torques}"
                 )
             return asked
-        wave = max(wave, self.subjects.matter.sound_speed())
         return max(choose_num_substeps(physics.control_dt, self.dx, wave, physics.cfl), by_torques)
 
     def record_draws(self, program: Program, mask: wp.array, seed: wp.array, episode: wp.array) -> None:

@@ -101,7 +101,7 @@ def test_absurd_stiffness_at_a_forced_time_step(make_env, env_id, equal, stiffne
 
 def test_huge_increments(make_env, env_id, equal):
     """Joints commanded at 50 rad/s, an order beyond a human, cross more than a cell a substep: said, and mended."""
-    env = make_env(env_id, control="pose", joint_speed_limit=50.0)
+    env = make_env(env_id, control="pose", joint_speed_limit=50.0, num_substeps=10)
     expected = [(env.reset(seed=1)[0], 0.0), *(row[:2] for row in steps(env, 5))]
     env.reset(seed=0)
     rng = np.random.default_rng(3)
@@ -152,3 +152,28 @@ def test_a_failure_stays_in_its_environment(make_batch, env_id, equal):
     assert [bool(row[2][1]) for row in runs[1]] == [False] * 4 + [True] * 8
     assert not runs[1][-1][2][[0, 2]].any()
     batch.action.zero_()
+
+
+@pytest.mark.parametrize(
+    "task, settings",
+    [
+        ("PIAvatar/KickBall-v0", {"young_modulus": 1e4}),
+        ("PIAvatar/TrackMotion-v0", {"young_modulus": 2e3}),
+    ],
+)
+def test_soft_bodies_get_the_substeps_that_they_need(task, settings, make_env):
+    """Few were enough for their waves, and every episode ended with the failure ``cfl`` within a second."""
+    env = make_env(task, fidelity="coarse", **settings)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for _ in range(35):
+        *_, terminated, truncated, info = env.step(env.action_space.sample())
+        assert info["failure"] is None
+        if terminated or truncated:
+            env.reset()
+    env.close()
+
+
+def test_no_body_of_the_defaults_has_other_substeps_than_its_waves_ask_for(make_env):
+    model = make_env("PIAvatar/Reach-v0", fidelity="coarse").unwrapped.batch.simulation.model
+    assert model.num_substeps == np.ceil(model.control_dt * model.sound_speed / (0.5 * model.grid.dx) - 1e-6) == 15
