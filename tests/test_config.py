@@ -112,6 +112,13 @@ def test_file_then_keywords(tmp_path):
     assert config.drive == Task().drive  # an empty section is one with defaults
 
 
+def test_a_mapping_may_begin_as_another_one(tmp_path):
+    """By YAML's merge keys; what it says itself wins, and is not given twice by that."""
+    path = tmp_path / "merged.yaml"
+    path.write_text("shape:\n  parameters:\n    <<: {age: 0.5, weight: 0.1}\n    weight: 0.2\n")
+    assert load_config(Task, path).shape.parameters == {"age": 0.5, "weight": 0.2}
+
+
 def test_a_name_shared_with_its_section_means_the_setting():
     assert load_config(Task, None, {"drive": "target"}).drive.drive == "target"
 

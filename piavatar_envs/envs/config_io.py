@@ -24,11 +24,15 @@ class ConfigError(ValueError):
     """A configuration that cannot be used; the message is one line that names the key, the value and the limit."""
 
 
+#: Of a key ``<<``, which stands for those of another mapping.
+_MERGE = "tag:yaml.org,2002:merge"
+
+
 class _Loader(yaml.SafeLoader):
     """SafeLoader that refuses a key given twice and reads ``1e5`` as a number (YAML 1.1 makes it a string)."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value if key.tag != _MERGE]
         twice = next((key for i, key in enumerate(keys) if key in keys[:i]), None)
         if twice is not None:
             raise yaml.constructor.ConstructorError(None, None, f"the key {twice!r} is given twice", node.start_mark)
