@@ -33,7 +33,7 @@ class DodgeConfig(EnvConfig):
     num_balls: int = Field(2, ge=1, le=4, description="balls that are thrown in turn [-]")
     ball_radius: float = Field(0.1, ge=0.06, le=0.2, description="their radius [m]")
     ball_mass: tuple[float, float] = Field((0.3, 1.5), description="range that their masses are drawn from [kg]")
-    throw_interval: float = Field(0.6, ge=0.1, description="time between two throws [s]")
+    throw_interval: float = Field(0.6, ge=0.1, le=3600.0, description="time between two throws [s]")
     throw_speed: tuple[float, float] = Field((4.0, 8.0), description="range of a throw's mean speed [m/s]")
     throw_distance: tuple[float, float] = Field((1.3, 1.5), description="range of the distance thrown from [m]")
     throw_angle: float = Field(

@@ -50,7 +50,7 @@ class PushRecoveryConfig(EnvConfig):
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     ball_radius: float = Field(0.1, ge=0.06, le=0.2, description="radius of the ball [m]")
     ball_mass: tuple[float, float] = Field((0.5, 8.0), description="range of its mass, uniform in its log [kg]")
-    throw_interval: float = Field(2.0, ge=0.2, description="time in which there is one push [s]")
+    throw_interval: float = Field(2.0, ge=0.2, le=3600.0, description="time in which there is one push [s]")
     throw_speed: tuple[float, float] = Field((2.0, 5.0), description="range of a throw's mean speed [m/s]")
     throw_distance: tuple[float, float] = Field((1.0, 1.5), description="range of the distance thrown from [m]")
     throw_angle: float = Field(

@@ -41,7 +41,7 @@ class TrackMotionConfig(EnvConfig):
     random_start: bool = Field(True, description="begin anywhere in a clip that loops")
     root_action: bool = Field(True, description="whether x, y and yaw of the root act too")
     impulse: float = Field(20.0, ge=0.0, le=1000.0, description="greatest impulse on the body, 0 for none [N s]")
-    impulse_interval: float = Field(1.0, gt=0.0, description="time between impulses [s]")
+    impulse_interval: float = Field(1.0, gt=0.0, le=3600.0, description="time between impulses [s]")
     success_distance: float = Field(0.1, gt=0.0, description="MPJPE up to which the motion counts as followed [m]")
     fail_distance: float = Field(0.5, gt=0.0, description="MPJPE at which the episode ends [m]")
     control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
