@@ -159,12 +159,8 @@ class Simulation:
             ConfigError: as configured they are too long for torques.
         """
         physics, control, asked = self.config.physics, self.config.drive.control, self.config.physics.num_substeps
-        wave = max(wave, self.subjects.matter.sound_speed())
-        if control == "pose":
-            fastest = COMMANDED_LEVER * self.config.drive.joint_speed_limit
-            few = choose_num_substeps(physics.control_dt, self.dx, max(wave, physics.cfl * fastest), physics.cfl)
-            return few if asked is None else asked
-        by_torques = math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
+        posed = control == "pose"
+        by_torques = 1 if posed else math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
         if asked is not None:
             if asked < by_torques:
                 raise ConfigError(
@@ -172,7 +168,9 @@ class Simulation:
                     f"for drive.control={control!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {by_torques}"
                 )
             return asked
-        return max(choose_num_substeps(physics.control_dt, self.dx, wave, physics.cfl), by_torques)
+        commanded = COMMANDED_LEVER * self.config.drive.joint_speed_limit if posed else 0.0
+        fastest = max(wave, self.subjects.matter.sound_speed(), physics.cfl * commanded)
+        return max(choose_num_substeps(physics.control_dt, self.dx, fastest, physics.cfl), by_torques)
 
     def record_draws(self, program: Program, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
         """Append: the masked environments draw bodies from pools, then the factors on what those are made of."""
