@@ -191,12 +191,11 @@ def hold(folder: Path) -> None:
     held = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+    except OSError as error:
         os.close(held)
-        raise ConfigError(f"another training writes to {folder}; end it, or write elsewhere with --out") from None
-    except OSError:  # a file system that knows no locks
-        os.close(held)
-        return
+        if isinstance(error, BlockingIOError):
+            raise ConfigError(f"another training writes to {folder}; end it, or write elsewhere with --out") from None
+        return  # a file system that knows no locks
     _HELD[path] = held
 
 

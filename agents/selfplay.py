@@ -15,7 +15,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 
-from agents.checkpoint import write_whole
+from agents.checkpoint import load_whole, write_whole
 from agents.parallel import AgentVecEnv
 from piavatar_envs.envs.config import FROZEN, ConfigError
 
@@ -79,7 +79,7 @@ class Pool:
 
     def load(self, policy: BasePolicy, steps: int) -> None:
         """Give ``policy`` the weights of a snapshot."""
-        policy.load_state_dict(torch.load(self._path(steps), map_location="cpu", weights_only=True))
+        policy.load_state_dict(load_whole(self._path(steps), "cpu"))
 
     def _path(self, steps: int) -> Path:
         return self.folder / _file_name(steps)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents import play, rsl_ppo, scores
+from agents import play, scores
 from agents.batches import load_batched
 from agents.checkpoint import UNREADABLE, Checkpoint, hold, load_whole
 from agents.config import load_training
@@ -64,7 +64,7 @@ def test_more_minibatches_than_steps_are_refused():
     few = {"env_id": "PIAvatar/Stand-v0", "num_envs": 2, "iterations": 1, "ppo": {"rollout_steps": 2, "minibatches": 5}}
     with pytest.raises(ConfigError, match=r"ppo\.minibatches=5 must be <= 4"):
         load_batched(RslTraining, load_task, few)
-    assert rsl_ppo and load_batched(RslTraining, load_task, few | {"num_envs": 3}).ppo.minibatches == 5
+    assert load_batched(RslTraining, load_task, few | {"num_envs": 3}).ppo.minibatches == 5
 
 
 @pytest.mark.parametrize("out", ["results.json", "config.yaml", "policy.pt"])
