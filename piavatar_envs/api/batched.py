@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -125,6 +125,8 @@ class BatchedEpisodes:
         n = self.num_envs
         if seeds is None:
             seeds = [None] * n
+        elif isinstance(seeds, (Set, Mapping)):  # in an order of its own
+            raise ValueError(f"seed is a {type(seeds).__name__}; use a whole number, or a list of one an environment")
         elif isinstance(seeds, (str, bytes)) or not np.iterable(seeds):
             first = _checked_seed(seeds)
             check_seeds(first, n)

@@ -152,6 +152,9 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
 
     def _checked(self, actions: Mapping[str, np.ndarray]) -> np.ndarray:
         """Actions ``(agents, action_size)``, zero for those who have left."""
+        if not isinstance(actions, Mapping):
+            kind = type(actions).__name__
+            raise ValueError(f"actions are a {kind}; give a dictionary of one for each of {', '.join(self.agents)}")
         missing = [name for name in self.agents if name not in actions]
         strange = [name for name in actions if name not in self.agents]
         if missing or strange:

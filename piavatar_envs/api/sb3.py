@@ -144,8 +144,9 @@ class SB3VecEnv(VecEnv):
 
         Raises:
             AttributeError: there is none of this name.
+            IndexError: there is no such environment.
         """
-        return self.vector.attr_of_some(list(self._get_indices(indices)), attr_name)
+        return self.vector.attr_of_some(self._some(indices), attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Set an attribute of one's own, which all environments share and nothing of this package reads.
@@ -153,7 +154,7 @@ class SB3VecEnv(VecEnv):
         Raises:
             ValueError: ``indices`` are not all of them, a setting, or what the environments are made with.
         """
-        if set(self._get_indices(indices)) != set(range(self.num_envs)):
+        if set(self._some(indices)) != set(range(self.num_envs)):
             raise ValueError(f"set_attr({attr_name!r}): environments of a batch share their attributes; leave indices")
         self.vector.set_attr(attr_name, [value] * self.num_envs)
 
@@ -165,11 +166,24 @@ class SB3VecEnv(VecEnv):
 
         Raises:
             AttributeError: the environments of a batch have no such method of their own.
+            IndexError: there is no such environment.
         """
         if method_name == "reset" and not self.vector.episodes.ready:
             self.reset()  # those that are not meant, by their seeds
-        return self.vector.call_some(list(self._get_indices(indices)), method_name, *method_args, **method_kwargs)
+        return self.vector.call_some(self._some(indices), method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
         """Whether environments are wrapped: environments of a batch never are."""
-        return [False for _ in self._get_indices(indices)]
+        return [False for _ in self._some(indices)]
+
+    def _some(self, indices: Indices) -> list[int]:
+        """The environments meant, counted from 0; as in a list, negative ones count from the end.
+
+        Raises:
+            IndexError: there is no such environment.
+        """
+        envs = list(self._get_indices(indices))
+        strange = [env for env in envs if not -self.num_envs <= env < self.num_envs]
+        if strange:
+            raise IndexError(f"indices={strange}: there are num_envs={self.num_envs}; use 0 to {self.num_envs - 1}")
+        return [env % self.num_envs for env in envs]

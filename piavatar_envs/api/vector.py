@@ -36,7 +36,8 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
     When an episode ends, ``metadata["autoreset_mode"]`` says what happens, as Gymnasium defines it. The terminal
     observation is what :meth:`step` returns, except under SAME_STEP, where it is in ``info["final_obs"]``:
 
-    - NEXT_STEP: the next :meth:`step` ignores the action of this environment and begins its next episode instead.
+    - NEXT_STEP: the next :meth:`step` ignores the action of this environment (which is checked all the same) and
+      begins its next episode instead.
     - SAME_STEP: the same step begins the next episode; what it ended with is in ``final_obs`` and ``final_info``.
     - DISABLED: the caller resets, with ``reset(options={"reset_mask": ...})``, before the next :meth:`step`.
 

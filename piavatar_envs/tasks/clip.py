@@ -28,8 +28,8 @@ class Clip:
 
 @wp.func
 def frame_of(clip: Clip, start: int, step: int):
-    """Frame after ``step`` steps; the last is held."""
-    return wp.min(start + step, clip.root.shape[0] - 1)
+    """Frame after ``step`` steps; the last is held. Whatever a state that was set says, it is one of the clip's."""
+    return wp.clamp(start + step, 0, clip.root.shape[0] - 1)
 
 
 @wp.func

@@ -107,6 +107,10 @@ def test_attributes_are_shared_and_methods_are_few(make_sb3, make_env, equal):
     assert vector.get_attr("note") == [3, 3]
     with pytest.raises(ValueError, match="share"):
         vector.set_attr("note", 4, indices=[1])
+    assert len(vector.get_attr("note", [-1, 0])) == 2
+    for call in (vector.get_attr, vector.env_method):
+        with pytest.raises(IndexError, match=r"indices=\[2\]: there are num_envs=2; use 0 to 1"):
+            call("action_names", indices=[1, 2])
     vector.seed(5)
     observation = vector.reset()
     assert equal(single.set_state(vector.env_method("get_state", indices=1)[0]), observation[1])

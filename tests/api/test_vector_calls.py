@@ -51,7 +51,9 @@ def test_never_seeded_vectors_differ(device):
     assert all(np.abs(a - b).max() > 1e-4 for i, a in enumerate(starts) for b in starts[:i])
 
 
-@pytest.mark.parametrize("seed", [-1, 2**32 - 2, [1, 2], [1, 2, 3, 4], [1, -1, 2], [1, 2**32, 2], "one", [0.5, 1, 2]])
+@pytest.mark.parametrize(
+    "seed", [-1, 2**32 - 2, [1, 2], [1, 2, 3, 4], [1, -1, 2], [1, 2**32, 2], "one", [0.5, 1, 2], {3, 1, 2}]
+)
 @pytest.mark.parametrize("masked", [False, True])
 def test_bad_seeds_are_refused_before_anything_changes(make_vec, seed, masked):
     vector = make_vec("PIAvatar/KickBall-v0", 3)

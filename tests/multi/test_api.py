@@ -321,6 +321,8 @@ def spoiled(world, how: str) -> dict[str, np.ndarray]:
         actions[last][1] = np.nan
     elif how == "none":
         actions[last] = None
+    elif how == "no dictionary":
+        return list(actions.values())
     return actions
 
 
@@ -333,6 +335,7 @@ def spoiled(world, how: str) -> dict[str, np.ndarray]:
         ("shape", r"LAST: action has shape \(3,\)"),
         ("nan", r"LAST: action\[1\] \(.*\) is nan"),
         ("none", "LAST: action has shape"),
+        ("no dictionary", "actions are a list; give a dictionary of one for each of agent_0, agent_1"),
     ],
 )
 def test_bad_actions_are_refused_before_anything_changes(make_world, module_name, how, told):

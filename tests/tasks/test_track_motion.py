@@ -254,3 +254,16 @@ def test_joints_know_how_fast_they_begin(make_batch):
         fastest = max(fastest, np.abs(turn).max())
         np.testing.assert_allclose(seen[i], turn, atol=0.1)
     assert fastest > 2.0
+
+
+@pytest.mark.parametrize("name", ["env.step_count", "task.start"])
+def test_a_state_from_before_the_clip_begins_with_it(make_env, name):
+    """Whatever a state says, no frame is read that the clip does not have."""
+    env = make_env(TRACK, random_start=False)
+    env.reset(seed=0)
+    state, turns = env.get_state(), env.observation_layout["reference_turns"].slice
+    state[name] = np.full_like(state[name], -1)
+    first = env.set_state(state)[turns]
+    state[name] = np.full_like(state[name], -(2**30))
+    assert np.array_equal(env.set_state(state)[turns], first)
+    assert np.isfinite(env.step(np.zeros(env.action_space.shape))[0]).all()
