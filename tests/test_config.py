@@ -50,7 +50,7 @@ def test_defaults_are_those_of_the_design():
     [
         ({"drive.tone": 1.5}, "drive.tone=1.5 must be <= 1"),
         ({"drive": {"tone": -0.1}}, "drive.tone=-0.1 must be >= 0"),
-        ({"physics.control_dt": 0}, "physics.control_dt=0 must be > 0 [s]"),
+        ({"physics.control_dt": 0}, "physics.control_dt=0 must be >= 0.0001 [s]"),
         ({"physics.poisson_ratio": 0.5}, "physics.poisson_ratio=0.5 must be < 0.5"),
         ({"fidelity": "ultra"}, "physics.fidelity='ultra' must be one of 'tiny', 'coarse', 'medium' or 'fine'"),
         ({"young_modulus": "soft"}, "physics.young_modulus='soft' must be a number [Pa]"),
@@ -84,7 +84,7 @@ def test_all_errors_come_in_one_line_with_their_file(tmp_path):
     path = tmp_path / "bad.yaml"
     path.write_text("physics:\n  density: -1\nobs_mode: both\n")
     message = refusal(path, {"tone": 7})
-    assert f"{path}: physics.density=-1 must be > 0 [kg/m^3]" in message
+    assert f"{path}: physics.density=-1 must be >= 0.1 [kg/m^3]" in message
     assert f"{path}: obs_mode='both' must be one of 'flat' or 'dict'" in message
     assert "; drive.tone=7 must be <= 1; " in message  # not the file's fault
 

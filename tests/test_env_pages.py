@@ -216,7 +216,7 @@ def test_settings_are_told_with_default_range_and_unit():
         "tuned.gain": ("`3`", "1/s", "(0, 9)", True),
         "drive.root": ('`"free"`', "", '`"wrench"`, `"free"`', True),
         "drive.tone": ("`1`", "-", "[0, 1]", False),
-        "physics.young_modulus": ("`100000`", "Pa", "> 0", False),
+        "physics.young_modulus": ("`100000`", "Pa", "[1, 1e+09]", False),
         "physics.num_substeps": ("`None`", "", "integer [1, 10000] or `None`", False),
         "shape.randomize": ("`False`", "", "`True`, `False`", False),
         "items": ('`[{name: "ball"}, {name: "box", at: [0, 0, 2]}]`', "", "list of entries, see below", True),

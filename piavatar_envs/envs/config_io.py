@@ -6,7 +6,6 @@ and validated once, strictly, so that a file, a keyword and a command line are r
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -17,13 +16,18 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from piavatar_envs.envs.config_errors import (
+    ConfigError,
+    entry_of,
+    error_line,
+    section_of,
+    setting_keys,
+    shown,
+)
+
 Config = TypeVar("Config", bound=BaseModel)
 
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message is one line that names the key, the value and the limit."""
-
-
+_NAMES = "the name of a setting is a string"
 #: Of a key ``<<``, which stands for those of another mapping.
 _MERGE = "tag:yaml.org,2002:merge"
 
@@ -57,19 +61,20 @@ def load_config(
         overrides: settings that win over ``source``; nested, dotted, or bare where the name is unique.
 
     Raises:
-        ConfigError: unknown key, wrong type or value out of range; one line for all that is wrong.
+        ConfigError: what is given is no settings; unknown key, wrong type or value out of range; one line for all that
+            is wrong.
     """
     path = source if isinstance(source, (str, Path)) else None
-    base = _read_yaml(Path(path)) if path is not None else source
-    merged = _merge(_expand(cls, base or {}), _expand(cls, overrides or {}))
+    base = _expand(cls, _read_yaml(Path(path)) if path is not None else _settings("config", source))
+    above = _expand(cls, _settings("overrides", overrides))
+    merged = _merge(base, above)
     merged = _merge(_own_defaults(cls, merged), merged)
     try:
         # JSON is what YAML, keywords and command lines have in common: a list may be a tuple, a string is no number.
-        return cls.model_validate_json(json.dumps(merged, default=_plain))
+        return cls.model_validate_json(json.dumps(_plain(merged)))
     except ValidationError as error:
-        given = set(_flat_keys(_expand(cls, overrides or {})))
-        lines = [_error_line(cls, item, path, given) for item in error.errors(include_url=False)]
-        raise ConfigError("; ".join(lines)) from None
+        given = set(_flat_keys(above))
+        raise ConfigError(*(error_line(cls, item, path, given) for item in error.errors(include_url=False))) from None
 
 
 def replace(config: Config, overrides: Mapping[str, Any] | None = None, /, **settings: Any) -> Config:
@@ -107,15 +112,6 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     return overrides
 
 
-def setting_keys(cls: type[BaseModel]) -> tuple[str, ...]:
-    """The dotted names of all settings of ``cls``, in order, e.g. ``("physics.fidelity", ..., "obs_mode")``."""
-    keys: list[str] = []
-    for name, field in cls.model_fields.items():
-        section = _section(field.annotation)
-        keys += [f"{name}.{key}" for key in setting_keys(section)] if section else [name]
-    return tuple(keys)
-
-
 def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
         with path.open(encoding="utf-8") as stream:
@@ -129,9 +125,20 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     return content or {}
 
 
-def _section(annotation: Any) -> type[BaseModel] | None:
-    """The model that a field nests, or None for a plain value."""
-    return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+def _settings(what: str, given: Any) -> Mapping[str, Any] | BaseModel:
+    """Settings as they are given to a call, nothing for None.
+
+    Raises:
+        ConfigError: they are something else, which would be taken for nothing where it is false.
+    """
+    if given is None:
+        return {}
+    if not isinstance(given, (Mapping, BaseModel)):
+        raise ConfigError(
+            f"{what}={shown(given)} is of type {type(given).__name__}; settings are a mapping of names to values, the "
+            "path of a YAML file, or a configuration"
+        )
+    return given
 
 
 def _expand(cls: type[BaseModel], settings: Mapping[str, Any] | BaseModel, prefix: str = "") -> dict[str, Any]:
@@ -141,9 +148,12 @@ def _expand(cls: type[BaseModel], settings: Mapping[str, Any] | BaseModel, prefi
     nested: dict[str, Any] = {}
     for key, value in settings.items():
         if not isinstance(key, str):
-            raise ConfigError(f"{prefix}{key!r} is of type {type(key).__name__}; the name of a setting is a string")
+            raise ConfigError(f"{prefix}{key!r} is of type {type(key).__name__}; {_NAMES}")
+        if "" in key.split("."):
+            raise ConfigError(f"{prefix}{key!r} is no name of a setting; names are as drive.tone, without empty parts")
         head, _, rest = (key if prefix else _qualified(cls, key)).partition(".")
-        section = _section(cls.model_fields[head].annotation) if head in cls.model_fields else None
+        annotation = cls.model_fields[head].annotation if head in cls.model_fields else None
+        section, entry = section_of(annotation), entry_of(annotation)
         if rest:
             value = {rest: value}
         if section and value is None:
@@ -154,9 +164,14 @@ def _expand(cls: type[BaseModel], settings: Mapping[str, Any] | BaseModel, prefi
             value = _expand(section, value, f"{prefix}{head}.")
         elif isinstance(value, (Mapping, BaseModel)):
             value = dict(value)
+        elif entry and isinstance(value, (list, tuple)):
+            value = [
+                _expand(entry, item, f"{prefix}{head}.{index}.") if isinstance(item, (Mapping, BaseModel)) else item
+                for index, item in enumerate(value)
+            ]
         twice = set(_flat_keys({head: value})) & set(_flat_keys(nested))
         if twice:
-            raise ConfigError(f"{prefix}{min(twice)} is given twice, last as {value!r}; give it once")
+            raise ConfigError(f"{prefix}{min(twice)} is given twice, last as {shown(value)}; give it once")
         nested = _merge(nested, {head: value})
     return nested
 
@@ -182,7 +197,7 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
 
 def _own_defaults(cls: type[BaseModel], settings: Mapping[str, Any]) -> dict[str, Any]:
     """Defaults by ``cls`` of the sections of which ``settings`` has some: a task's may not be the section's own."""
-    sections = {name: field for name, field in cls.model_fields.items() if _section(field.annotation)}
+    sections = {name: field for name, field in cls.model_fields.items() if section_of(field.annotation)}
     return {
         name: field.get_default(call_default_factory=True).model_dump(mode="json")
         for name, field in sections.items()
@@ -197,85 +212,31 @@ def _flat_keys(nested: Mapping[str, Any], prefix: str = "") -> list[str]:
     return keys
 
 
-def _plain(value: Any) -> Any:
-    """JSON form of what Python callers pass: NumPy numbers and arrays, paths, and models in a list."""
+def _plain(value: Any, key: str = "") -> Any:
+    """JSON form of what Python callers and YAML pass: also NumPy numbers and arrays, paths, and models in a list.
+
+    Raises:
+        ConfigError: there is none, or a name is no string.
+    """
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
+    if isinstance(value, Mapping):
+        for name in value:
+            if not isinstance(name, str):
+                raise ConfigError(f"{key}.{name!r} is of type {type(name).__name__}; {_NAMES}")
+        return {name: _plain(item, f"{key}.{name}" if key else name) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item, f"{key}.{index}") for index, item in enumerate(value)]
     if isinstance(value, (np.generic, np.ndarray)):
-        return value.tolist()
+        return _plain(value.tolist(), key)
     if isinstance(value, Path):
         return str(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
     raise ConfigError(
-        f"{value!r} is of type {type(value).__name__}; a setting is a number, a string, a list or a mapping"
+        f"{key}={shown(value)} is of type {type(value).__name__}; a setting is a number, a string, a list or a mapping"
     )
 
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
-
-
-_KINDS = {
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "bool_type": "true or false",
-    "string_type": "a string",
-    "dict_type": "a mapping of names to values",
-    "model_type": "a section, with its settings below it",
-    "tuple_type": "a list",
-    "list_type": "a list",
-    "finite_number": "a finite number",
-}
-_LIMITS = {
-    "greater_than": ("gt", "> {}"),
-    "greater_than_equal": ("ge", ">= {}"),
-    "less_than": ("lt", "< {}"),
-    "less_than_equal": ("le", "<= {}"),
-    "multiple_of": ("multiple_of", "a multiple of {}"),
-}
-
-
-def _error_line(cls: type[BaseModel], error: Mapping[str, Any], path: str | Path | None, given: set[str]) -> str:
-    """One validation error as ``[file: ]key=value must be LIMIT [unit]``."""
-    key, kind, context = ".".join(str(part) for part in error["loc"]), error["type"], error.get("ctx", {})
-    if kind == "extra_forbidden":
-        line = _unknown_key(cls, key)
-    elif kind == "missing":
-        line = f"{key} is missing, and has no default"
-    else:
-        if kind in _LIMITS:
-            name, words = _LIMITS[kind]
-            rule = f"must be {words.format(f'{context[name]:g}')}{_unit(cls, key)}"
-        elif kind == "literal_error":
-            rule = f"must be one of {context['expected']}"
-        elif kind in _KINDS:
-            rule = f"must be {_KINDS[kind]}{_unit(cls, key)}"
-        else:
-            rule = f"is refused: {context.get('error', error['msg'])}"
-        line = f"{key or cls.__name__}={error['input']!r} {rule}"
-    return f"{path}: {line}" if path is not None and key not in given else line
-
-
-def _unit(cls: type[BaseModel], key: str) -> str:
-    """The unit that ends the description of setting ``key``, with a space before it, or nothing."""
-    model: type[BaseModel] | None = cls
-    field = None
-    for part in key.split("."):
-        if model is None or part not in model.model_fields:
-            break
-        field = model.model_fields[part]
-        model = _section(field.annotation)
-    found = re.search(r" (\[[^\]\d-][^\]]*\])", (field.description or "") if field else "")
-    return f" {found[1]}" if found else ""
-
-
-def _unknown_key(cls: type[BaseModel], key: str) -> str:
-    names = setting_keys(cls)
-    section, _, leaf = key.rpartition(".")
-    leaves = {name.rpartition(".")[2]: name for name in reversed(names)}
-    close = difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.6)
-    sections = [name for name in cls.model_fields if name not in names]
-    near = leaves[close[0]] if close else next(iter(difflib.get_close_matches(leaf, sections, n=1)), None)
-    if near:
-        return f"{key} is no setting of {cls.__name__}; did you mean {near}?"
-    siblings = [name for name in names if name.startswith(f"{section}.")] if section else list(cls.model_fields)
-    return f"{key} is no setting of {cls.__name__}; there are {', '.join(siblings or names)}"

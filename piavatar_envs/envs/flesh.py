@@ -22,8 +22,6 @@ from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.materials import material_index
 
-#: Settings of the section ``physics`` that an avatar may have of its own.
-OF_FLESH = ("material", "young_modulus", "soft_young_modulus", "poisson_ratio", "density")
 NUM_PARTS = len(BODY_PARTS)
 
 
@@ -60,16 +58,8 @@ class Flesh:
         """Shape the body.
 
         Raises:
-            ConfigError: an avatar's own setting is unknown, out of range or cannot be its own, or a region holds
-                nothing.
+            ConfigError: a region holds nothing.
         """
-        if "control" in avatar.drive:
-            raise ConfigError("scene.avatars: drive.control cannot differ between avatars; set it for the environment")
-        strange = [name for name in avatar.physics if name not in OF_FLESH]
-        if strange:
-            raise ConfigError(
-                f"scene.avatars: physics.{strange[0]} cannot differ between avatars; only {', '.join(OF_FLESH)}"
-            )
         self.physics = changed(config.physics, avatar.physics)
         self.drive = changed(config.drive, avatar.drive)
         self.shape = changed(config.shape, avatar.shape)
@@ -209,12 +199,9 @@ class Flesh:
         """Which particles a region holds, shape ``(P,)`` bool.
 
         Raises:
-            ConfigError: a joint is unknown, or no particle lies in the region.
+            ConfigError: no particle lies in the region.
         """
-        try:
-            joints = [joint_index(name) for name in region.joints]
-        except KeyError as error:
-            raise ConfigError(f"scene.avatars: region of {error.args[0]}") from None
+        joints = [joint_index(name) for name in region.joints]
         sampled = self.sampled
         inside = np.isin(sampled.skin_joints[:, 0], joints)
         if region.beyond > 0.0:

@@ -31,7 +31,19 @@ class FrozenDict(dict):
         return FrozenDict, (dict(self),)
 
 
+MOST_SUBSTEPS = 10_000
+#: Greatest Young's modulus [Pa] and densities [kg/m^3] of soft matter: a hard plastic, thin smoke, the heaviest metal.
+MOST_MODULUS = 1.0e9
+LEAST_DENSITY, MOST_DENSITY = 0.1, 25_000.0
+#: Greatest distance from the origin of anything in the world, along each axis [m].
+FARTHEST = 1000.0
+#: Of avatars and what they play with, from which other things are a hundred metres away at most [m].
+Place = Annotated[float, Field(ge=-100.0, le=100.0)]
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 ShapeValue = Annotated[float, Field(ge=-1.0, le=1.0)]
+
+
+Rate = Annotated[float, Field(le=1.0e6)]
 
 
 def _check_flesh_rate(rates: tuple[float, float]) -> tuple[float, float]:
@@ -52,9 +64,9 @@ class PhysicsConfig(BaseModel):
         description="resolution of the body: tiny (some 400 particles, for tests), coarse (grid spacing height/32, "
         "2,500-3,000 particles), medium (height/64), fine (grid spacing about 1 cm)",
     )
-    control_dt: float = Field(1.0 / 30.0, gt=0.0, le=0.2, description="time between two actions [s]")
+    control_dt: float = Field(1.0 / 30.0, ge=1.0e-4, le=0.2, description="time between two actions [s]")
     num_substeps: int | None = Field(
-        None, ge=1, le=10_000, description="substeps a control step; null chooses them from the CFL limit"
+        None, ge=1, le=MOST_SUBSTEPS, description="substeps a control step; null chooses them from the CFL limit"
     )
     cfl: float = Field(
         0.5,
@@ -65,14 +77,15 @@ class PhysicsConfig(BaseModel):
     material: Literal["neo_hookean", "fixed_corotated"] = Field(
         "neo_hookean", description="elastic energy of the flesh"
     )
-    young_modulus: float = Field(1.0e5, gt=0.0, description="Young's modulus of the flesh [Pa]")
+    young_modulus: float = Field(1.0e5, ge=1.0, le=MOST_MODULUS, description="Young's modulus of the flesh [Pa]")
     soft_young_modulus: float | None = Field(
         None,
-        gt=0.0,
+        ge=1.0,
+        le=MOST_MODULUS,
         description="Young's modulus of the softest flesh of trunk and thighs; null as the rest [Pa]",
     )
     poisson_ratio: float = Field(0.3, ge=0.0, lt=0.5, description="Poisson's ratio of the flesh [-]")
-    density: float = Field(1000.0, gt=0.0, description="density of the flesh [kg/m^3]")
+    density: float = Field(1000.0, ge=LEAST_DENSITY, le=MOST_DENSITY, description="density of the flesh [kg/m^3]")
     decoupling: Literal["split", "paper", "none", "no_stress"] = Field(
         "split",
         description="how commanded motion is kept out of the strain: split (two velocities, the default), paper (its "
@@ -102,7 +115,7 @@ class DriveConfig(BaseModel):
     )
     joint_damping: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the damping of the joints' springs [-]")
     strength: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the greatest torques of the joints [-]")
-    flesh_rate: Annotated[tuple[float, float], AfterValidator(_check_flesh_rate)] = Field(
+    flesh_rate: Annotated[tuple[Rate, Rate], AfterValidator(_check_flesh_rate)] = Field(
         (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
     )
     firm_bones: bool = Field(
@@ -135,15 +148,22 @@ class DriveConfig(BaseModel):
         description="take the rigid part out of commanded motion, so that it carries no unreacted momentum; null where "
         "nothing holds the root",
     )
-    max_force_weight: float = Field(2.0, ge=0.0, description="largest root force, in body weights [m g]")
-    max_torque_weight: float = Field(0.7, ge=0.0, description="largest root torque, in metres of body weight [m * m g]")
+    max_force_weight: float = Field(2.0, ge=0.0, le=1000.0, description="largest root force, in body weights [m g]")
+    max_torque_weight: float = Field(
+        0.7, ge=0.0, le=1000.0, description="largest root torque, in metres of body weight [m * m g]"
+    )
     let_go_tilt: float = Field(
         math.radians(45.0), gt=0.0, le=math.pi, description="tilt error at which the root wrench lets go [rad]"
     )
     let_go_distance: float = Field(
-        0.5, gt=0.0, description="horizontal error at which the root wrench lets go, until the next reset [m]"
+        0.5,
+        gt=0.0,
+        le=FARTHEST,
+        description="horizontal error at which the root wrench lets go, until the next reset [m]",
     )
-    let_go_height: float = Field(0.4, gt=0.0, description="height error at which the root wrench lets go [m]")
+    let_go_height: float = Field(
+        0.4, gt=0.0, le=FARTHEST, description="height error at which the root wrench lets go [m]"
+    )
 
     @property
     def moves_freely(self) -> bool:
@@ -172,18 +192,19 @@ class ShapeConfig(BaseModel):
     )
 
 
-def _positive_range(bounds: tuple[float, float]) -> tuple[float, float]:
+def _rising(bounds: tuple[float, float]) -> tuple[float, float]:
     """``bounds``, in order.
 
     Raises:
-        ValueError: they are not positive, or fall.
+        ValueError: they fall.
     """
-    if not 0.0 < bounds[0] <= bounds[1]:
-        raise ValueError("both bounds must be positive and must not fall; give the lower one first")
+    if not bounds[0] <= bounds[1]:
+        raise ValueError("bounds must not fall; give the lower one first")
     return bounds
 
 
-FactorRange = Annotated[tuple[float, float], AfterValidator(_positive_range)]
+Factor = Annotated[float, Field(ge=1.0e-3, le=1.0e3)]
+FactorRange = Annotated[tuple[Factor, Factor], AfterValidator(_rising)]
 #: The range of a factor that changes nothing.
 UNCHANGED = (1.0, 1.0)
 
@@ -215,10 +236,10 @@ class RenderConfig(BaseModel):
     width: int = Field(480, ge=16, le=7680, description="width of a frame [pixel]")
     height: int = Field(480, ge=16, le=4320, description="height of a frame [pixel]")
     color: Literal["skin", "strain"] = Field("skin", description="colour of the body: its skin, or its deformation")
-    camera_position: tuple[float, float, float] | None = Field(
+    camera_position: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
         None, description="where the camera is, from the ground below what it follows; null: where the task has it [m]"
     )
-    camera_target: tuple[float, float, float] | None = Field(
+    camera_target: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
         None, description="where it looks, from the same point; null: where the task has it [m]"
     )
     camera_follows: bool | None = Field(

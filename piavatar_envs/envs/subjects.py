@@ -10,6 +10,7 @@ import numpy as np
 from piavatar_envs.avatar.limbs import LIMB_GROUPS, limb_groups
 from piavatar_envs.envs.config import ConfigError, PhysicsConfig, PropConfig, SceneConfig
 from piavatar_envs.envs.flesh import NUM_PARTS, Flesh
+from piavatar_envs.envs.sections import LEAST_DENSITY, MOST_DENSITY
 from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.fields import Fields
@@ -62,9 +63,19 @@ def prop_points(prop: PropConfig, spacing: float) -> PropPoints:
 
 
 def prop_matter(prop: PropConfig, points: PropPoints, physics: PhysicsConfig) -> MaterialPoints:
-    """A prop as matter. Without a modulus of its own its waves are as fast as the flesh's."""
+    """A prop as matter. Without a modulus of its own its waves are as fast as the flesh's.
+
+    Raises:
+        ConfigError: its mass is too small or too great for its size.
+    """
     volume = float(points.volume.sum())
     density = prop.density if prop.mass is None else prop.mass / volume
+    if not LEAST_DENSITY <= density <= MOST_DENSITY:
+        raise ConfigError(
+            f"prop {prop.name!r}: mass={prop.mass:.3g} kg in {volume:.3g} m^3 is a density of {density:.3g} kg/m^3, "
+            f"which must be in [{LEAST_DENSITY:g}, {MOST_DENSITY:g}]; use a mass in "
+            f"[{LEAST_DENSITY * volume:.3g}, {MOST_DENSITY * volume:.3g}] kg, or another size"
+        )
     young = prop.young_modulus
     if young is None:
         # the P-wave modulus over the density is the flesh's
@@ -181,12 +192,21 @@ def _check_pairs(scene: SceneConfig, names: Sequence[str], everything: Sequence[
 
 
 def _colliders(scene: SceneConfig, frictions: np.ndarray) -> tuple[Collider, ...]:
-    """The ground and the scene's solids, ``frictions`` of shape ``(fields, solids)``."""
+    """The ground and the scene's solids, ``frictions`` of shape ``(fields, solids)``.
+
+    Raises:
+        ConfigError: one of the scene's is none.
+    """
     ground = [Collider.plane((0.0, 0.0, 1.0), 0.0, tuple(frictions[:, 0]))] if scene.ground else []
     others = [
         Collider(c.kind, c.size, c.position, c.rotation, c.velocity, c.spin, tuple(frictions[:, column]), True)
         for column, c in enumerate(scene.colliders, start=len(ground))
     ]
+    for config, collider in zip(scene.colliders, others, strict=True):
+        try:
+            collider.check()
+        except ValueError as error:
+            raise ConfigError(f"collider {config.name!r}: {error}") from None
     return (*ground, *others)
 
 

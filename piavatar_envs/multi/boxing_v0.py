@@ -32,6 +32,7 @@ from piavatar_envs.multi.versus import (
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.leash import record_leash
+from piavatar_envs.tasks.ranges import Margin, Weight
 from piavatar_envs.tasks.rewards import mean_square_action
 
 wp.set_module_options({"enable_backward": False})
@@ -66,18 +67,17 @@ class BoxingConfig(EnvConfig):
     root_speed: float = Field(1.0, gt=0.0, le=5.0, description="speed of the root at action 1 [m/s]")
     leash: float = Field(0.08, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body [m]")
     leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning [rad]")
-    blow_impulse: float = Field(
+    blow_impulse: Margin = Field(
         1.0,
-        gt=0.0,
         description="impulse on a target up to which a blow counts for nothing; twice that is a full blow [N s]",
     )
-    head_points: float = Field(1.0, ge=0.0, description="points of a full blow on the head [-]")
-    torso_points: float = Field(0.4, ge=0.0, description="points of a full blow on the trunk [-]")
-    taken_weight: float = Field(0.8, ge=0.0, description="cost of the points that others score on oneself [-]")
+    head_points: Weight = Field(1.0, description="points of a full blow on the head [-]")
+    torso_points: Weight = Field(0.4, description="points of a full blow on the trunk [-]")
+    taken_weight: Weight = Field(0.8, description="cost of the points that others score on oneself [-]")
     fall: FallConfig = Field(FIGHT_FALL, description="what counts as a knock-down under torques")
-    win_reward: float = Field(5.0, ge=0.0, description="reward of the last one on the feet [-]")
-    down_cost: float = Field(5.0, ge=0.0, description="what it costs to be knocked down [-]")
-    control_cost: float = Field(0.01, ge=0.0, description="weight of the mean squared action [-]")
+    win_reward: Weight = Field(5.0, description="reward of the last one on the feet [-]")
+    down_cost: Weight = Field(5.0, description="what it costs to be knocked down [-]")
+    control_cost: Weight = Field(0.01, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle off the first stance [rad]")
     place_noise: float = Field(0.05, ge=0.0, le=0.3, description="greatest displacement along x and y at the start [m]")
 

@@ -19,7 +19,7 @@ from piavatar_envs.multi.together import record_fall_together, record_shift
 from piavatar_envs.multi.versus import Referee
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.fall import UNDER_TORQUES_DOC, FallConfig
-from piavatar_envs.tasks.ranges import check_ranges
+from piavatar_envs.tasks.ranges import ImpulseRange, Margin, Weight, check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 
 SIDES = ("left", "right")
@@ -36,19 +36,21 @@ class HighFiveConfig(EnvConfig):
     spacing: float = Field(0.8, ge=0.5, le=2.0, description="between the two, where the scene does not place them [m]")
     place_noise: float = Field(0.05, ge=0.0, le=0.3, description="greatest displacement of each along x and y [m]")
     pose_noise: float = Field(0.1, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
-    impulse: tuple[float, float] = Field(
+    impulse: ImpulseRange = Field(
         (1.0, 1.0), description="range from which the weakest slap that counts is drawn, for each episode [N s]"
     )
-    impulse_window: float = Field(4.0, gt=1.0, description="strongest slap that counts, over the weakest [-]")
-    reach: float = Field(0.15, gt=0.0, description="distance of the hands' middles up to which a slap counts [m]")
-    least_height: float = Field(1.35, ge=0.0, description="least height of both hands for a slap to count [m]")
+    impulse_window: float = Field(
+        4.0, gt=1.0, le=1000.0, description="strongest slap that counts, over the weakest [-]"
+    )
+    reach: Margin = Field(0.15, description="distance of the hands' middles up to which a slap counts [m]")
+    least_height: float = Field(1.35, ge=0.0, le=10.0, description="least height of both hands for a slap to count [m]")
     upright: float = Field(
         0.5, ge=-1.0, le=1.0, description="least upward part of both hands' directions for a slap to count [-]"
     )
-    margin: float = Field(0.8, gt=0.0, description="way to go beyond reach at which the reward has fallen to 0.1 [m]")
-    approach_weight: float = Field(0.2, ge=0.0, description="greatest reward of a step without a slap [-]")
-    slap_bonus: float = Field(20.0, ge=0.0, description="reward of a slap that counts [-]")
-    control_cost: float = Field(0.02, ge=0.0, description="weight of the mean squared action [-]")
+    margin: Margin = Field(0.8, description="way to go beyond reach at which the reward has fallen to 0.1 [m]")
+    approach_weight: Weight = Field(0.2, description="greatest reward of a step without a slap [-]")
+    slap_bonus: Weight = Field(20.0, description="reward of a slap that counts [-]")
+    control_cost: Weight = Field(0.02, description="weight of the mean squared action [-]")
     fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall under torques")
 
 

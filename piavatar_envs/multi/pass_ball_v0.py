@@ -23,7 +23,7 @@ from piavatar_envs.tasks.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.goal import BALL, ball_config
 from piavatar_envs.tasks.kick_ball import observe_feet
 from piavatar_envs.tasks.leash import record_leash
-from piavatar_envs.tasks.ranges import check_ranges
+from piavatar_envs.tasks.ranges import Margin, MassRange, SpeedRange, Weight, check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 
 JOINTS = tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle") for side in ("left", "right"))
@@ -42,19 +42,19 @@ class PassBallConfig(EnvConfig):
     roam: float = Field(0.4, ge=0.0, le=1.0, description="how far the root may be steered from its place [m]")
     leash: float = Field(0.12, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body [m]")
     leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning [rad]")
-    ball_mass: tuple[float, float] = Field((0.4, 2.0), description="range of the ball's mass, uniform in its log [kg]")
+    ball_mass: MassRange = Field((0.4, 2.0), description="range of the ball's mass, uniform in its log [kg]")
     ball_radius: float = Field(0.11, ge=0.06, le=0.3, description="radius of the ball [m]")
-    serve_speed: tuple[float, float] = Field((1.0, 1.6), description="range of the ball's speed at the start [m/s]")
+    serve_speed: SpeedRange = Field((1.0, 1.6), description="range of the ball's speed at the start [m/s]")
     serve_angle: float = Field(0.15, ge=0.0, le=0.5, description="greatest angle off the way to the first passer [rad]")
     reach: float = Field(0.4, gt=0.1, le=1.0, description="distance from a pelvis at which the ball has arrived [m]")
     sent: float = Field(
         0.5, ge=0.0, le=2.0, description="how far a pass must go from where the passer touched the ball last [m]"
     )
-    dead_speed: float = Field(0.1, gt=0.0, description="horizontal speed below which a ball out of reach is dead [m/s]")
-    goal_passes: int = Field(2, ge=1, description="passes that count as a success [-]")
-    progress_weight: float = Field(1.0, ge=0.0, description="reward for a metre of the ball's way to its goal [1/m]")
-    pass_bonus: float = Field(2.0, ge=0.0, description="reward of a completed pass [-]")
-    control_cost: float = Field(0.01, ge=0.0, description="weight of the mean squared action [-]")
+    dead_speed: Margin = Field(0.1, description="horizontal speed below which a ball out of reach is dead [m/s]")
+    goal_passes: int = Field(2, ge=1, le=1000, description="passes that count as a success [-]")
+    progress_weight: Weight = Field(1.0, description="reward for a metre of the ball's way to its goal [1/m]")
+    pass_bonus: Weight = Field(2.0, description="reward of a completed pass [-]")
+    control_cost: Weight = Field(0.01, description="weight of the mean squared action [-]")
     fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall under torques")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
     place_noise: float = Field(0.05, ge=0.0, le=0.3, description="greatest displacement of each along x and y [m]")

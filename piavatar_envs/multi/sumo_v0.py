@@ -35,6 +35,7 @@ from piavatar_envs.multi.versus import (
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.leash import record_leash
+from piavatar_envs.tasks.ranges import Weight
 from piavatar_envs.tasks.rewards import mean_square_action
 
 wp.set_module_options({"enable_backward": False})
@@ -67,10 +68,10 @@ class SumoConfig(EnvConfig):
     leash: float = Field(0.12, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body [m]")
     leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning [rad]")
     fall: FallConfig = Field(FIGHT_FALL, description="what counts as being pushed over under torques")
-    win_reward: float = Field(10.0, ge=0.0, description="reward of the last one standing [-]")
-    out_cost: float = Field(10.0, ge=0.0, description="what it costs to be out [-]")
-    push_weight: float = Field(0.02, ge=0.0, description="weight of being nearer to the centre than the others [-]")
-    control_cost: float = Field(0.01, ge=0.0, description="weight of the mean squared action [-]")
+    win_reward: Weight = Field(10.0, description="reward of the last one standing [-]")
+    out_cost: Weight = Field(10.0, description="what it costs to be out [-]")
+    push_weight: Weight = Field(0.02, description="weight of being nearer to the centre than the others [-]")
+    control_cost: Weight = Field(0.01, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle off the first stance [rad]")
     place_noise: float = Field(0.05, ge=0.0, le=0.3, description="greatest displacement along x and y at the start [m]")
 

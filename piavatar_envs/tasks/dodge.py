@@ -18,7 +18,7 @@ from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.hits import Hits
 from piavatar_envs.tasks.place import PlaceRule, judge_pose, keep_place, observe_home
-from piavatar_envs.tasks.ranges import check_ranges
+from piavatar_envs.tasks.ranges import DistanceRange, Margin, MassRange, SpeedRange, Weight, check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 from piavatar_envs.tasks.throws import make_throws, record_balls, throwing_domain, waiting_places
 from piavatar_envs.tasks.turns import observe_throws, throw_balls
@@ -32,23 +32,23 @@ class DodgeConfig(EnvConfig):
 
     num_balls: int = Field(2, ge=1, le=4, description="balls that are thrown in turn [-]")
     ball_radius: float = Field(0.1, ge=0.06, le=0.2, description="their radius [m]")
-    ball_mass: tuple[float, float] = Field((0.3, 1.5), description="range that their masses are drawn from [kg]")
+    ball_mass: MassRange = Field((0.3, 1.5), description="range that their masses are drawn from [kg]")
     throw_interval: float = Field(0.6, ge=0.1, le=3600.0, description="time between two throws [s]")
-    throw_speed: tuple[float, float] = Field((4.0, 8.0), description="range of a throw's mean speed [m/s]")
-    throw_distance: tuple[float, float] = Field((1.3, 1.5), description="range of the distance thrown from [m]")
+    throw_speed: SpeedRange = Field((4.0, 8.0), description="range of a throw's mean speed [m/s]")
+    throw_distance: DistanceRange = Field((1.3, 1.5), description="range of the distance thrown from [m]")
     throw_angle: float = Field(
         1.0, ge=0.0, le=math.pi / 2, description="greatest angle of a throw's origin from the front [rad]"
     )
     aim_spread: float = Field(0.1, ge=0.0, le=1.0, description="greatest error of the aim along each axis [m]")
     root_range: float = Field(0.25, ge=0.0, le=0.5, description="how far the root may be steered from its place [m]")
-    pose_margin: float = Field(0.3, gt=0.0, description="mean joint angle at which the reward has fallen to 0.1 [rad]")
-    place_margin: float = Field(0.3, gt=0.0, description="distance from the place at which it has, likewise [m]")
-    hit_impulse: float = Field(0.3, ge=0.0, description="impulse in one step that counts as a hit [N s]")
-    impulse_scale: float = Field(5.0, gt=0.0, description="impulse that costs 1 [N s]")
-    stress_limit: float = Field(
-        0.3, gt=0.0, description="von Mises stress that costs nothing; twice that costs 1 [young_modulus]"
+    pose_margin: Margin = Field(0.3, description="mean joint angle at which the reward has fallen to 0.1 [rad]")
+    place_margin: Margin = Field(0.3, description="distance from the place at which it has, likewise [m]")
+    hit_impulse: float = Field(0.3, ge=0.0, le=1.0e4, description="impulse in one step that counts as a hit [N s]")
+    impulse_scale: Margin = Field(5.0, description="impulse that costs 1 [N s]")
+    stress_limit: Margin = Field(
+        0.3, description="von Mises stress that costs nothing; twice that costs 1 [young_modulus]"
     )
-    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 

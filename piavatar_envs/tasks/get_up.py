@@ -19,6 +19,7 @@ from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.ground import Grounding
 from piavatar_envs.tasks.lying import first_poses, lying_rule, spawn_lying
+from piavatar_envs.tasks.ranges import Margin, Weight
 from piavatar_envs.tasks.rising import RISING_DOCS, RISING_TERMS, record_rising_outcome
 from piavatar_envs.tasks.upright import (
     METRIC_DOCS,
@@ -49,17 +50,16 @@ class GetUpConfig(EnvConfig):
     upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
     still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
-    hold_seconds: float = Field(1.0, gt=0.0, description="how long it must stand [s]")
+    hold_seconds: Margin = Field(1.0, description="how long it must stand [s]")
     face_up: float = Field(0.5, ge=0.0, le=1.0, description="share of episodes that begin face up [-]")
     halfway: float = Field(
         0.0, ge=0.0, le=1.0, description="share of episodes that begin on the way up, as a curriculum [-]"
     )
-    feet_margin: float = Field(
+    feet_margin: Margin = Field(
         0.6,
-        gt=0.0,
         description="how much further off the pelvis than in standing feet have a reward of 0.1, in its heights [-]",
     )
-    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle off the lying pose [rad]")
 
 

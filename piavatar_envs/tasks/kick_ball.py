@@ -14,6 +14,7 @@ from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.draws import STREAM_BALL, generator
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
 from piavatar_envs.envs.parameters import Drawn
+from piavatar_envs.envs.sections import Place
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS, Ball, turn_and_weigh
 from piavatar_envs.tasks.goal import (
@@ -27,7 +28,7 @@ from piavatar_envs.tasks.goal import (
     drawn_goal,
     gate_domain,
 )
-from piavatar_envs.tasks.ranges import check_ranges
+from piavatar_envs.tasks.ranges import DistanceRange, MassRange, Weight, check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
@@ -48,15 +49,15 @@ class KickBallConfig(EnvConfig):
     )
     episode_seconds: float = Field(3.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     joints: tuple[str, ...] | None = Field(KICKING, description="joints that act; null for all 21")
-    ball_mass: tuple[float, float] = Field((0.2, 8.0), description="range of the ball's mass, uniform in its log [kg]")
+    ball_mass: MassRange = Field((0.2, 8.0), description="range of the ball's mass, uniform in its log [kg]")
     ball_radius: float = Field(0.11, ge=0.06, le=0.3, description="radius of the ball [m]")
-    ball_place: tuple[float, float] = Field((-0.17, -0.47), description="middle of where the ball lies, x and y [m]")
+    ball_place: tuple[Place, Place] = Field((-0.17, -0.47), description="middle of where the ball lies, x and y [m]")
     ball_jitter: float = Field(0.05, ge=0.0, le=0.2, description="greatest offset from there along x and y [m]")
-    target_distance: tuple[float, float] = Field((1.2, 1.8), description="range of its distance from the ball [m]")
+    target_distance: DistanceRange = Field((1.2, 1.8), description="range of its distance from the ball [m]")
     target_angle: float = Field(0.35, ge=0.0, le=1.0, description="its greatest angle from straight ahead [rad]")
     target_height: float = Field(0.25, ge=0.0, le=2.0, description="height of the gate's centre [m]")
     target_radius: float = Field(0.4, gt=0.0, le=1.0, description="radius of the gate's opening [m]")
-    control_cost: float = Field(0.002, ge=0.0, description="weight of the mean squared action [-]")
+    control_cost: Weight = Field(0.002, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 

@@ -15,10 +15,11 @@ from piavatar_envs.envs.config import ConfigError, EnvConfig, PropConfig, SceneC
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
+from piavatar_envs.envs.scene import Length
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.leash import record_leash
 from piavatar_envs.tasks.pushing import Push, draw_push, find_hands, judge, observe, observe_lead
-from piavatar_envs.tasks.ranges import check_ranges
+from piavatar_envs.tasks.ranges import DistanceRange, Margin, MassRange, Weight, check_ranges
 from piavatar_envs.tasks.spawn import record_standing
 
 if TYPE_CHECKING:
@@ -44,20 +45,20 @@ class PushBoxConfig(EnvConfig):
 
     episode_seconds: float = Field(8.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     joints: tuple[str, ...] | None = Field(UPPER_BODY, description="joints that act; null for all 21")
-    box_half_size: tuple[float, float, float] = Field(
+    box_half_size: tuple[Length, Length, Length] = Field(
         (0.24, 0.24, 0.33), description="half its width, depth, height [m]"
     )
-    box_mass: tuple[float, float] = Field((5.0, 20.0), description="range that the box's mass is drawn from [kg]")
+    box_mass: MassRange = Field((5.0, 20.0), description="range that the box's mass is drawn from [kg]")
     box_friction: float = Field(0.2, ge=0.0, le=10.0, description="Coulomb coefficient of box and floor [-]")
-    box_distance: tuple[float, float] = Field((0.8, 0.95), description="range of the box's distance at the start [m]")
+    box_distance: DistanceRange = Field((0.8, 0.95), description="range of the box's distance at the start [m]")
     box_turn: float = Field(0.4, ge=0.0, le=math.pi, description="greatest turn of the box at the start [rad]")
-    target_distance: tuple[float, float] = Field((0.5, 1.2), description="range of the way to push it [m]")
+    target_distance: DistanceRange = Field((0.5, 1.2), description="range of the way to push it [m]")
     target_angle: float = Field(
         1.0, ge=0.0, le=math.pi, description="greatest angle of that way from straight ahead [rad]"
     )
     target_radius: float = Field(0.15, gt=0.0, le=1.0, description="distance of box and target that is a success [m]")
-    hand_margin: float = Field(0.6, gt=0.0, description="distance of a hand at which its reward has, likewise [m]")
-    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    hand_margin: Margin = Field(0.6, description="distance of a hand at which its reward has, likewise [m]")
+    control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 

@@ -16,7 +16,7 @@ from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.fall import FallConfig
 from piavatar_envs.tasks.ground import Grounding
 from piavatar_envs.tasks.pushes import Pushes
-from piavatar_envs.tasks.ranges import check_ranges
+from piavatar_envs.tasks.ranges import DistanceRange, MassRange, SpeedRange, Weight, check_ranges
 from piavatar_envs.tasks.throws import make_throws, throwing_domain, waiting_places
 from piavatar_envs.tasks.upright import (
     FALL_DOC,
@@ -49,16 +49,16 @@ class PushRecoveryConfig(EnvConfig):
     fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     ball_radius: float = Field(0.1, ge=0.06, le=0.2, description="radius of the ball [m]")
-    ball_mass: tuple[float, float] = Field((0.5, 8.0), description="range of its mass, uniform in its log [kg]")
+    ball_mass: MassRange = Field((0.5, 8.0), description="range of its mass, uniform in its log [kg]")
     throw_interval: float = Field(2.0, ge=0.2, le=3600.0, description="time in which there is one push [s]")
-    throw_speed: tuple[float, float] = Field((2.0, 5.0), description="range of a throw's mean speed [m/s]")
-    throw_distance: tuple[float, float] = Field((1.0, 1.5), description="range of the distance thrown from [m]")
+    throw_speed: SpeedRange = Field((2.0, 5.0), description="range of a throw's mean speed [m/s]")
+    throw_distance: DistanceRange = Field((1.0, 1.5), description="range of the distance thrown from [m]")
     throw_angle: float = Field(
         math.pi, ge=0.0, le=math.pi, description="greatest angle of a throw's origin from the front [rad]"
     )
     aim_spread: float = Field(0.05, ge=0.0, le=1.0, description="greatest error of the aim along each axis [m]")
-    hit_impulse: float = Field(0.3, ge=0.0, description="impulse of a throw that counts as a push [N s]")
-    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    hit_impulse: float = Field(0.3, ge=0.0, le=1.0e4, description="impulse of a throw that counts as a push [N s]")
+    control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
     @property

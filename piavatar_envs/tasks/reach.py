@@ -18,6 +18,7 @@ from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.mpm.types import row
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.hands import write_hands
+from piavatar_envs.tasks.ranges import Margin, Weight
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 from piavatar_envs.tasks.spawn import record_standing
 
@@ -34,8 +35,8 @@ class ReachConfig(EnvConfig):
     radius: float = Field(0.45, gt=0.0, le=1.0, description="radius of the target's sphere about the chest [m]")
     target_speed: float = Field(0.3, ge=0.0, le=5.0, description="greatest speed of the target [m/s]")
     target_radius: float = Field(0.08, gt=0.0, le=0.5, description="distance that counts as reached [m]")
-    margin: float = Field(0.4, gt=0.0, description="distance beyond it at which the reward has fallen to 0.1 [m]")
-    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    margin: Margin = Field(0.4, description="distance beyond it at which the reward has fallen to 0.1 [m]")
+    control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.1, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 

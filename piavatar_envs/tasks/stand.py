@@ -11,6 +11,7 @@ from piavatar_envs.envs.config import DriveConfig, EnvConfig
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.fall import FallConfig
 from piavatar_envs.tasks.ground import Grounding
+from piavatar_envs.tasks.ranges import Weight
 from piavatar_envs.tasks.upright import (
     FALL_DOC,
     METRIC_DOCS,
@@ -39,7 +40,7 @@ class StandConfig(EnvConfig):
     still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
     fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
-    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 

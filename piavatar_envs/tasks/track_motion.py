@@ -22,6 +22,7 @@ from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.tasks.base import Task
 from piavatar_envs.tasks.clip import Clip, advance_reference, draw_start, read_clip
 from piavatar_envs.tasks.disturb import apply_impulse, draw_impulse, draw_offset
+from piavatar_envs.tasks.ranges import Margin, Weight
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 
 wp.set_module_options({"enable_backward": False})
@@ -42,9 +43,9 @@ class TrackMotionConfig(EnvConfig):
     root_action: bool = Field(True, description="whether x, y and yaw of the root act too")
     impulse: float = Field(20.0, ge=0.0, le=1000.0, description="greatest impulse on the body, 0 for none [N s]")
     impulse_interval: float = Field(1.0, gt=0.0, le=3600.0, description="time between impulses [s]")
-    success_distance: float = Field(0.1, gt=0.0, description="MPJPE up to which the motion counts as followed [m]")
-    fail_distance: float = Field(0.5, gt=0.0, description="MPJPE at which the episode ends [m]")
-    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
+    success_distance: Margin = Field(0.1, description="MPJPE up to which the motion counts as followed [m]")
+    fail_distance: Margin = Field(0.5, description="MPJPE at which the episode ends [m]")
+    control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
 
 
 @wp.kernel

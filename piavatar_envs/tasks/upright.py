@@ -15,6 +15,7 @@ from piavatar_envs.envs.config import FROZEN
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.tasks.fall import FALLEN_DOC, FallConfig, heights_of, is_down
+from piavatar_envs.tasks.ranges import Margin
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 
 if TYPE_CHECKING:
@@ -65,8 +66,8 @@ class UprightConfig(BaseModel):
     model_config = FROZEN
 
     stand_head: float = Field(0.85, gt=0.0, le=1.0, description="head height that counts as standing, a share [-]")
-    height_margin: float = Field(0.25, gt=0.0, description="missing height at which a reward is a tenth, likewise [-]")
-    tilt_margin: float = Field(0.6, gt=0.0, description="tilt at which it is, likewise [rad]")
+    height_margin: Margin = Field(0.25, description="missing height at which a reward is a tenth, likewise [-]")
+    tilt_margin: Margin = Field(0.6, description="tilt at which it is, likewise [rad]")
 
 
 class StillConfig(BaseModel):
@@ -74,8 +75,8 @@ class StillConfig(BaseModel):
 
     model_config = FROZEN
 
-    speed_margin: float = Field(1.0, gt=0.0, description="speed at which a reward is a tenth [m/s]")
-    pose_margin: float = Field(0.4, gt=0.0, description="mean joint angle at which it is, likewise [rad]")
+    speed_margin: Margin = Field(1.0, description="speed at which a reward is a tenth [m/s]")
+    pose_margin: Margin = Field(0.4, description="mean joint angle at which it is, likewise [rad]")
 
 
 @wp.struct

@@ -33,6 +33,7 @@ from piavatar_envs.tasks.gait import (
 )
 from piavatar_envs.tasks.ground import Grounding, forward_of
 from piavatar_envs.tasks.place import PlaceRule, home
+from piavatar_envs.tasks.ranges import Margin, Weight
 from piavatar_envs.tasks.rewards import mean_square_action, tolerance
 from piavatar_envs.tasks.spawn import record_standing
 from piavatar_envs.tasks.upright import (
@@ -72,13 +73,14 @@ class WalkConfig(EnvConfig):
     target_speed: float = Field(1.0, gt=0.0, le=5.0, description="how fast to go [m/s]")
     lane: float = Field(1.0, gt=0.0, le=2.0, description="distance aside of the way at which the episode ends [m]")
     most_behind: float | None = Field(
-        1.5, gt=0.0, description="distance behind the pace at which the episode ends; None: there is no pace [m]"
+        1.5,
+        gt=0.0,
+        le=1000.0,
+        description="distance behind the pace at which the episode ends; None: there is no pace [m]",
     )
-    heading_margin: float = Field(0.8, gt=0.0, description="angle off the way at which the reward is 0.1 [rad]")
-    control_cost: float = Field(0.05, ge=0.0, description="weight of the mean squared action [-]")
-    ease_cost: float = Field(
-        0.0, ge=0.0, description="weight of how far joints are bent beyond what people do [1/rad^2]"
-    )
+    heading_margin: Margin = Field(0.8, description="angle off the way at which the reward is 0.1 [rad]")
+    control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
+    ease_cost: Weight = Field(0.0, description="weight of how far joints are bent beyond what people do [1/rad^2]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 

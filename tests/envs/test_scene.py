@@ -211,7 +211,7 @@ RUBS = {"a": "ball", "b": "agent_0", "friction": 0.1}
         ({"props": [BALL | {"name": "ground"}]}, "'ground' is given twice"),
         ({"props": [BALL | {"size": [0.1, 0.2]}]}, "prop ball: size.*1 numbers"),
         ({"props": [BALL | {"shape": "mesh", "size": [1.0]}]}, "prop ball: .*needs a file"),
-        ({"props": [BALL | {"mass": -1.0}]}, "mass=-1.0 must be > 0"),
+        ({"props": [BALL | {"mass": -1.0}]}, "mass=-1.0 must be >= 1e-06"),
         ({"props": [{"shape": "sphere"}]}, "name is missing"),
         ({"props": [BALL], "pair_friction": [RUBS, RUBS | {"a": "agent_0", "b": "ball"}]}, "'ball' come twice"),
         ({"props": [BALL], "pair_friction": [RUBS | {"b": "ball"}]}, "'ball' does not touch itself; leave it out$"),
