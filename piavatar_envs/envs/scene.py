@@ -86,6 +86,7 @@ Part = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Quaternion = Annotated[tuple[Part, Part, Part, Part], AfterValidator(_not_zero)]
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
+TopSpeed = Annotated[float, Field(ge=0.0, le=1.0e6)]
 Spin = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 MaterialName = Literal["neo_hookean", "fixed_corotated"]
 
@@ -158,6 +159,11 @@ class PropConfig(BaseModel):
     rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="at the start, quaternion wxyz")
     velocity: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="at the start [m/s]")
     spin: tuple[Spin, Spin, Spin] = Field((0.0, 0.0, 0.0), description="angular velocity at the start [rad/s]")
+    top_speed: TopSpeed = Field(
+        0.0,
+        description="greatest speed that a task, or you, will give any part of it later, as in a throw; substeps are "
+        "short enough for it [m/s]",
+    )
     friction: float = Field(0.5, ge=0.0, le=10.0, description="Coulomb coefficient on the ground and colliders [-]")
 
 
@@ -175,6 +181,9 @@ class ColliderConfig(BaseModel):
     rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="quaternion wxyz; a plane faces its local +z")
     velocity: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="of its origin [m/s]")
     spin: tuple[Spin, Spin, Spin] = Field((0.0, 0.0, 0.0), description="angular velocity [rad/s]")
+    top_speed: TopSpeed = Field(
+        0.0, description="greatest speed that a task, or you, will give any part of it later [m/s]"
+    )
     friction: float = Field(0.5, ge=0.0, le=10.0, description="Coulomb coefficient [-]")
 
 

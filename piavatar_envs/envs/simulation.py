@@ -18,7 +18,9 @@ from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.flesh import Flesh, drive_settings
 from piavatar_envs.envs.props import PropSet, check_apart, check_places
 from piavatar_envs.envs.randomize import Randomization, fastest_wave
+from piavatar_envs.envs.sections import MOST_SUBSTEPS
 from piavatar_envs.envs.shapes import Shapes
+from piavatar_envs.envs.speeds import STRUCK, commanded_speed, fastest_thing
 from piavatar_envs.envs.subjects import assemble, prop_matter, prop_points
 from piavatar_envs.mpm.boundaries import Collider, make_boundaries, place_colliders
 from piavatar_envs.mpm.build import build_model, choose_num_substeps, make_grid
@@ -34,8 +36,6 @@ GRID_PER_HEIGHT: dict[str, float] = {
     "medium": 64.0,
     "fine": 166.0,
 }
-#: How far all joints together are from what they turn, at most [m]: random commands of 4 rad/s move a hand by 13 m/s.
-COMMANDED_LEVER = 3.75
 
 
 class Simulation:
@@ -104,7 +104,7 @@ class Simulation:
             num_envs=num_envs,
             device=self.device,
             control_dt=physics.control_dt,
-            num_substeps=self._substeps(wave),
+            num_substeps=self._substeps(wave, solids),
             cfl=physics.cfl,
             gravity=(0.0, 0.0, -physics.gravity),
             decoupling=physics.decoupling,
@@ -150,27 +150,42 @@ class Simulation:
         )
         return domain, domain.walls() if walled else ()
 
-    def _substeps(self, wave: float) -> int:
-        """Substeps of a control step as configured, or as few as such a wave [m/s] and what drives the body allow.
+    def _substeps(self, wave: float, solids: Sequence[PropPoints]) -> int:
+        """Substeps of a control step as configured, or as few as such a wave [m/s], commands and fast things allow.
 
         Nothing may go further than a grid spacing in a substep, which soft bodies, that need few, soon would.
 
         Raises:
-            ConfigError: as configured they are too long for torques.
+            ConfigError: as configured they are too long for torques or for something fast, or more would be needed than
+                can be configured.
         """
         physics, control, asked = self.config.physics, self.config.drive.control, self.config.physics.num_substeps
-        posed = control == "pose"
-        by_torques = 1 if posed else math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
+        by_torques = 1 if control == "pose" else math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
+        thing, speed = fastest_thing(self.scene, solids, self.domain, physics.gravity)
         if asked is not None:
+            least = choose_num_substeps(physics.control_dt, self.dx, speed, 1.0)
+            if asked < least:
+                raise ConfigError(
+                    f"physics.num_substeps={asked}: {thing!r}, at up to {speed:.3g} m/s, would go further than a "
+                    f"grid spacing ({self.dx:.3g} m) in a substep of {1e3 * physics.control_dt / asked:.3g} ms; use at "
+                    f"least {least}"
+                )
             if asked < by_torques:
                 raise ConfigError(
                     f"physics.num_substeps={asked}: substeps of {1e3 * physics.control_dt / asked:.3g} ms are too long "
                     f"for drive.control={control!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {by_torques}"
                 )
             return asked
-        commanded = COMMANDED_LEVER * self.config.drive.joint_speed_limit if posed else 0.0
-        fastest = max(wave, self.subjects.matter.sound_speed(), physics.cfl * commanded)
-        return max(choose_num_substeps(physics.control_dt, self.dx, fastest, physics.cfl), by_torques)
+        moving = max(commanded_speed(self.config.drive), STRUCK * speed)
+        waves = max(wave, self.subjects.matter.sound_speed())
+        chosen = choose_num_substeps(physics.control_dt, self.dx, max(waves, physics.cfl * moving), physics.cfl)
+        if chosen > MOST_SUBSTEPS:
+            raise ConfigError(
+                f"waves of {waves:.3g} m/s and things of up to {moving:.3g} m/s would need {chosen} substeps a control "
+                f"step, and {MOST_SUBSTEPS} is the limit; use a shorter physics.control_dt, softer or denser matter "
+                "(young_modulus, density, randomize), or slower things"
+            )
+        return max(chosen, by_torques)
 
     def record_draws(self, program: Program, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
         """Append: the masked environments draw bodies from pools, then the factors on what those are made of."""

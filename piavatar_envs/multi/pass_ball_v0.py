@@ -111,7 +111,8 @@ than `roam` from its place. All are paid alike, but for the cost of their action
     def build_scene(self) -> SceneConfig:
         config = self.config
         scene = on_circle(config.scene, config.num_agents, config.spacing)
-        ball = ball_config(config, (0.0, 0.0, config.ball_radius))
+        # it rolls: its top goes twice as fast as its middle
+        ball = ball_config(config, (0.0, 0.0, config.ball_radius), 2.0 * config.serve_speed[1])
         return replace(scene, props=[ball, *scene.props])
 
     def terms(self) -> tuple[ObservationTerm, ...]:

@@ -185,6 +185,7 @@ class Task:
 
         Props and colliders start where the scene says, unless this writes other places into
         ``env.simulation.props.spawn`` (and ``.density``) or ``env.simulation.collider_spawn``.
+        How fast they will be then, or later, ``top_speed`` in the scene says: substeps are short enough for it.
 
         Raises:
             NotImplementedError: a task that does not define it.

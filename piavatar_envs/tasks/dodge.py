@@ -20,7 +20,7 @@ from piavatar_envs.tasks.hits import Hits
 from piavatar_envs.tasks.place import PlaceRule, judge_pose, keep_place, observe_home
 from piavatar_envs.tasks.ranges import DistanceRange, Margin, MassRange, SpeedRange, Weight, check_ranges
 from piavatar_envs.tasks.spawn import record_standing
-from piavatar_envs.tasks.throws import make_throws, record_balls, throwing_domain, waiting_places
+from piavatar_envs.tasks.throws import make_throws, record_balls, throwing_domain, thrown_speed, waiting_places
 from piavatar_envs.tasks.turns import observe_throws, throw_balls
 
 #: Speed of the root at action 1 [m/s].
@@ -102,7 +102,7 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
         self.waiting = waiting_places(self.place, config)
         size, mass = (config.ball_radius,), float(np.mean(config.ball_mass))
         balls = [
-            PropConfig(name=f"ball_{index}", size=size, mass=mass, position=tuple(at))
+            PropConfig(name=f"ball_{index}", size=size, mass=mass, position=tuple(at), top_speed=thrown_speed(config))
             for index, at in enumerate(self.waiting.tolist())
         ]
         return replace(scene, props=[*balls, *scene.props])

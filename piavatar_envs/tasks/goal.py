@@ -64,11 +64,16 @@ class GateConfig(BallConfig, Protocol):
     control_cost: float
 
 
-def ball_config(config: BallConfig, position: Sequence[float]) -> PropConfig:
-    """The ball in the scene, of middling mass; episodes make it lighter or heavier."""
+def ball_config(config: BallConfig, position: Sequence[float], top_speed: float = 0.0) -> PropConfig:
+    """The ball in the scene, of middling mass; episodes weigh it anew, and make any part of it so fast [m/s]."""
     mass = math.sqrt(math.prod(config.ball_mass))
     return PropConfig(
-        name=BALL, size=(config.ball_radius,), mass=mass, position=tuple(position), friction=BALL_FRICTION
+        name=BALL,
+        size=(config.ball_radius,),
+        mass=mass,
+        position=tuple(position),
+        top_speed=top_speed,
+        friction=BALL_FRICTION,
     )
 
 

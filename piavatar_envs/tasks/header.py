@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
@@ -187,7 +188,7 @@ that all of them but the control cost add up to at most 1, half of it for the go
 
     def build_scene(self) -> SceneConfig:
         scene, config = super().build_scene(), self.config
-        ball = ball_config(config, (*config.ball_place, config.ball_height[1]))
+        ball = ball_config(config, (*config.ball_place, config.ball_height[1]), math.sqrt(2.0) * config.ball_speed)
         return replace(scene, props=[ball, *scene.props])
 
     def prop_places(self) -> Mapping[str, Sequence[Sequence[float]]]:

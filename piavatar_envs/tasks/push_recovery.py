@@ -17,7 +17,7 @@ from piavatar_envs.tasks.fall import FallConfig
 from piavatar_envs.tasks.ground import Grounding
 from piavatar_envs.tasks.pushes import Pushes
 from piavatar_envs.tasks.ranges import DistanceRange, MassRange, SpeedRange, Weight, check_ranges
-from piavatar_envs.tasks.throws import make_throws, throwing_domain, waiting_places
+from piavatar_envs.tasks.throws import make_throws, throwing_domain, thrown_speed, waiting_places
 from piavatar_envs.tasks.upright import (
     FALL_DOC,
     METRIC_DOCS,
@@ -113,7 +113,7 @@ greatest impulse of the episode so far: of all episodes, the share that lasts ma
         self.waiting = waiting_places(self.place, config)
         mass = math.sqrt(math.prod(config.ball_mass))
         at = tuple(self.waiting[0].tolist())
-        ball = PropConfig(name=BALL, size=(config.ball_radius,), mass=mass, position=at)
+        ball = PropConfig(name=BALL, size=(config.ball_radius,), mass=mass, position=at, top_speed=thrown_speed(config))
         return replace(scene, props=[ball, *scene.props])
 
     def observed_props(self) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ balls are thrown is said in ``turns.py`` and ``pushes.py``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
@@ -32,6 +33,8 @@ OUTWARDS = wp.constant(0.2)
 MAX_SPIN = wp.constant(6.0)
 #: Distance from every joint that a ball keeps where it is thrown: a hand's or a foot's length and its own radius [m].
 CLEARANCE = wp.constant(0.4)
+#: Longest way from where a ball is thrown, out of the body's reach, to where the body has gone [m].
+REACH = 2.5
 #: Of the balls' masses the first draw in their stream, one a ball; the draws around them are the schedule's.
 MASSES = wp.constant(1)
 
@@ -74,6 +77,13 @@ class Throws:
 def catching_distance(config: ThrowConfig) -> float:
     """Distance from the avatar's place beyond which a ball that flies on is caught [m]."""
     return config.throw_distance[1] + 0.1
+
+
+def thrown_speed(config: ThrowConfig) -> float:
+    """Greatest speed of any part of a ball as it is thrown [m/s]: slow ones are thrown high, to come as far."""
+    way = math.hypot(max(config.throw_distance[1], REACH) + math.sqrt(3.0) * config.aim_spread, HEIGHT[1])
+    rising = (speed + 0.5 * config.physics.gravity * way / speed for speed in config.throw_speed)
+    return max(rising) + math.sqrt(3.0) * MAX_SPIN * config.ball_radius
 
 
 def waiting_places(place: Sequence[float], config: ThrowConfig) -> np.ndarray:

@@ -1,0 +1,111 @@
+"""What is known to be fast beforehand gets substeps in which it goes less than a grid spacing."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import math
+
+import numpy as np
+import pytest
+
+from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.envs.simulation import Simulation
+from piavatar_envs.envs.speeds import STRUCK, commanded_speed
+from piavatar_envs.mpm.build import choose_num_substeps
+from piavatar_envs.multi import multi_modules
+from piavatar_envs.tasks import load_task, task_modules
+
+REACH = "PIAvatar/Reach-v0"
+BALL = {"name": "ball", "mass": 2.0, "position": [0.0, -1.2, 1.2]}
+POST = {"name": "post", "kind": "sphere", "size": [0.2], "position": [0.0, -1.2, 1.2]}
+
+
+def world(device, **settings) -> Simulation:
+    return Simulation(load_config(EnvConfig, None, {"fidelity": "tiny", **settings}), 1, device)
+
+
+def substep_way(simulation: Simulation, speed: float) -> float:
+    """How far something goes in a substep [grid spacings]."""
+    return speed * float(simulation.model.step.dt) / simulation.dx
+
+
+def test_no_default_has_other_substeps_than_waves_and_commands_ask_for(device):
+    tasks = [load_task(env_id) for env_id in task_modules()]
+    if importlib.util.find_spec("pettingzoo"):
+        tasks += [importlib.import_module(name).TASK for name in multi_modules()]
+    found = {}
+    for cls in tasks:
+        task = cls(load_config(cls.Config))
+        simulation = Simulation(task.config, 1, device, task.domain(), task.scene, avatar_names=task.agent_names)
+        model, physics = simulation.model, task.config.physics
+        fastest = max(model.sound_speed, physics.cfl * commanded_speed(task.config.drive))
+        assert model.num_substeps == choose_num_substeps(physics.control_dt, simulation.dx, fastest, physics.cfl)
+        found[cls.__name__] = model.num_substeps
+    assert found.pop("KickBallTask") == 17 and set(found.values()) == {15}, found
+
+
+@pytest.mark.parametrize(
+    ("scene", "speed"),
+    [
+        ({"props": [BALL | {"velocity": [0.0, 40.0, 30.0]}]}, 50.0),
+        ({"props": [BALL | {"spin": [0.0, 0.0, 400.0]}]}, 400.0 * 0.08),
+        ({"props": [BALL | {"top_speed": 60.0}]}, 60.0),
+        ({"colliders": [POST | {"velocity": [0.0, 30.0, 0.0]}]}, 30.0),
+        ({"colliders": [POST | {"spin": [0.0, 0.0, 200.0]}]}, 40.0),
+        ({"colliders": [POST | {"kind": "box", "size": [0.1, 0.1, 0.1], "spin": [300.0, 0.0, 0.0]}]}, 51.9),
+        ({"colliders": [POST | {"kind": "capsule", "size": [0.1, 0.3], "spin": [99.0, 0.0, 0.0]}]}, 39.6),
+        ({"colliders": [POST | {"kind": "plane", "size": [], "position": [0, 0, -0.2], "spin": [9.0, 0, 0]}]}, 28.6),
+        ({"colliders": [POST | {"top_speed": 60.0}]}, 60.0),
+    ],
+)  # fmt: skip
+def test_fast_things_go_less_than_a_grid_spacing_in_a_substep(device, scene, speed):
+    plain = substep_way(world(device), speed)
+    assert plain > 1.0 / STRUCK, "it would have been slow enough anyway"
+    assert 0.6 / STRUCK < substep_way(world(device, scene=scene), speed) <= 1.0 / STRUCK + 1e-6
+
+
+def test_what_falls_is_fast_in_the_end(device):
+    scene = {"props": [BALL | {"velocity": [0.0, 12.0, 0.0]}]}
+    assert world(device, scene=scene, gravity=0.0).model.num_substeps == world(device).model.num_substeps
+    simulation = world(device, scene=scene, gravity=80.0)
+    drop = simulation.domain.upper[2] - simulation.domain.lower[2]
+    assert substep_way(simulation, math.sqrt(12.0**2 + 2.0 * 80.0 * drop)) <= 1.0 / STRUCK + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("task", "settings"),
+    [
+        (REACH, {"scene": {"props": [BALL | {"velocity": [0.0, 30.0, 0.0]}]}}),
+        (REACH, {"scene": {"colliders": [POST | {"velocity": [0.0, 0.0, 40.0], "position": [0.0, -0.75, 0.5]}]}}),
+        ("PIAvatar/Dodge-v0", {"throw_speed": (30.0, 30.0)}),
+        ("PIAvatar/Dodge-v0", {"throw_speed": (0.2, 0.2)}),
+    ],
+)
+def test_they_do_not_end_episodes(make_env, task, settings):
+    """All of these ended with the failure ``cfl`` in the step in which they became so fast."""
+    env = make_env(task, **settings)
+    env.reset(seed=0)
+    for _ in range(25):
+        assert env.step(np.zeros(env.action_space.shape))[4]["failure"] is None
+
+
+def test_a_fast_serve_does_not_end_the_game(device):
+    pytest.importorskip("pettingzoo", reason="needs the extra multi")
+    from piavatar_envs.multi.pass_ball_v0 import parallel_env
+
+    game = parallel_env(device=device, fidelity="tiny", serve_speed=(30.0, 30.0))
+    game.reset(seed=0)
+    while game.agents:  # until the ball is out
+        infos = game.step({agent: np.zeros(game.action_space(agent).shape) for agent in game.agents})[4]
+        assert all(info["failure"] is None for info in infos.values())
+    game.close()
+
+
+def test_too_few_substeps_are_refused_with_the_number_that_would_do(device):
+    scene = {"props": [BALL | {"velocity": [0.0, 60.0, 0.0]}]}
+    with pytest.raises(ConfigError, match=r"num_substeps=9: 'ball', at up to 60\.5 m/s, .*; use at least 15"):
+        world(device, scene=scene, num_substeps=9)
+    assert world(device, scene=scene, num_substeps=15).model.num_substeps == 15
+    with pytest.raises(ConfigError, match=r"waves of 1\.16e\+05 m/s .* need \d+ substeps .*, and 10000 is the limit"):
+        world(device, young_modulus=1e9, density=0.1)
