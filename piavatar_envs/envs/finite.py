@@ -1,10 +1,15 @@
-"""What a task writes that is not finite: noted before it is replaced by zeros, which nobody would notice."""
+"""What a task writes that is not finite, or beyond its columns: noted before it is replaced, or in the next row.
+
+Values that are not finite are replaced by zeros, which nobody would notice; a third term where two are declared would
+be the next environment's first.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 import warp as wp
 
 from piavatar_envs.tasks.base import Task
@@ -16,26 +21,46 @@ if TYPE_CHECKING:
 wp.set_module_options({"enable_backward": False})
 
 
+#: Columns behind a task's own in which is seen what it writes beyond them, and what stands there until it does.
+SPARE, UNTOUCHED = 8, -1.2345678e30
+#: Arrays of the batch whose last dimension are a task's names, and how these are called.
+NAMED = {"terms": "reward_terms", "cost_terms": "cost_terms", "metrics": "metrics"}
+
+
 class FiniteWatch:
     """Looks at all that a task writes, in every step of the one batch that is built of it afterwards."""
 
     def __init__(self, task: Task) -> None:
         """Stand between the task and its batch."""
         self._found: dict[tuple[str, ...], wp.array] = {}
-        record_outcome, record_observe = task.record_outcome, task.record_observe
+        self._wide: dict[str, wp.array] = {}
+        self._task = task
+        allocate, record_outcome, record_observe = task.allocate, task.record_outcome, task.record_observe
+
+        def widen(env: BatchEnv) -> None:
+            for name in NAMED:
+                setattr(env, name, self._with_spare(name, getattr(env, name)))
+            allocate(env)
 
         def outcome(env: BatchEnv, program: Program) -> None:
             record_outcome(env, program)
-            self._note(env, program, env.terms, task.reward_terms, 0, range(env.num_agents))
-            self._note(env, program, env.cost_terms, task.cost_terms, 0, range(env.num_agents))
-            self._note(env, program, env.metrics, task.metrics, 0, range(env.num_agents))
+            for name, declared in NAMED.items():
+                self._note(env, program, getattr(env, name), getattr(task, declared), 0, range(env.num_agents))
 
         def observe(env: BatchEnv, program: Program, agent: int, start: int) -> None:
             record_observe(env, program, agent, start)
             names = [f"{term.name}[{index}]" for term in task.terms() for index in range(term.size)]
             self._note(env, program, env.observation, names, start, range(agent, agent + 1))
 
-        task.record_outcome, task.record_observe = outcome, observe
+        task.allocate, task.record_outcome, task.record_observe = widen, outcome, observe
+
+    def _with_spare(self, name: str, array: wp.array) -> wp.array:
+        """A view of the shape of ``array`` whose rows do not follow each other at once."""
+        rows, agents, columns = array.shape
+        wide = np.full((rows, agents, columns + SPARE), UNTOUCHED, np.float32)
+        wide[..., :columns] = 0.0
+        self._wide[name] = wp.array(wide, dtype=float, device=array.device)
+        return self._wide[name][:, :, :columns]
 
     def _note(
         self, env: BatchEnv, program: Program, values: wp.array, names: Sequence[str], start: int, agents: range
@@ -49,6 +74,22 @@ class FiniteWatch:
     def names(self) -> list[str]:
         """Of all that was not finite in an environment that had not failed."""
         return [name for names, found in self._found.items() for name, n in zip(names, found.numpy(), strict=True) if n]
+
+    def beyond(self) -> dict[str, tuple[int, int]]:
+        """Of ``reward_terms``, ``cost_terms`` and ``metrics``, those of which the task writes more than it declares.
+
+        Returns:
+            How many names there are, and how many columns are written, as far as :data:`SPARE` more can tell.
+        """
+        found = {}
+        for name, wide in self._wide.items():
+            declared = len(getattr(self._task, NAMED[name]))
+            untouched = np.full(wide.shape[2], UNTOUCHED, np.float32)
+            untouched[:-SPARE] = 0.0  # without names there is a column that means nothing
+            written = np.flatnonzero((wide.numpy() != untouched).any((0, 1)))
+            if len(written) and written[-1] >= declared:
+                found[NAMED[name]] = declared, int(written[-1]) + 1
+        return found
 
 
 @wp.kernel

@@ -25,6 +25,14 @@ if TYPE_CHECKING:
     from piavatar_envs.render.scene import Marker
 
 
+#: What ``info`` says of every environment, and what views of it add; no metric can have these names.
+NAMES_OF_INFO = (
+    "success", "failure", "root_force", "root_torque", "root_let_go", "reward_terms", "cost", "cost_terms",
+    "final_info", "final_obs", "final_state", "episode", "is_success", "terminal_observation", "TimeLimit.truncated",
+    "acted", "alive", "time_outs", "log",
+)  # fmt: skip
+
+
 class Task:
     """Base of all tasks; a task subclasses it once.
 
@@ -84,10 +92,40 @@ class Task:
     picture_settings: ClassVar[Mapping[str, Any]] = {}
 
     def __init__(self, config: EnvConfig) -> None:
+        """Settle what is in the world.
+
+        Raises:
+            ConfigError: settings that do not fit the task.
+            ValueError: names of its terms or metrics that cannot be told apart in ``info``.
+        """
+        self._check_names()
         self.config = config
         self.joints = select_joints(config.joints)
         self.scene = self.build_scene()
         self._move_camera()
+
+    def _check_names(self) -> None:
+        """See that every number in ``info`` has a name of its own.
+
+        Raises:
+            ValueError: one has not.
+        """
+        for what in ("reward_terms", "cost_terms", "metrics"):
+            names, where = getattr(self, what), f"{type(self).__name__}.{what}"
+            if isinstance(names, str):
+                raise ValueError(f"{where}={names!r} is one string; give a tuple of names: ({names!r},)")
+            for index, name in enumerate(names):
+                if not isinstance(name, str) or not name or name.startswith("_"):
+                    raise ValueError(f"{where} has {name!r}; a name is a string that does not begin with an underscore")
+                if name in names[:index]:
+                    raise ValueError(
+                        f"{where} has {name!r} twice, of which info would keep the last; call one otherwise"
+                    )
+                if what == "metrics" and name in NAMES_OF_INFO:
+                    raise ValueError(
+                        f"{where} has {name!r}, which info has anyway, besides {', '.join(NAMES_OF_INFO)}; call it "
+                        "otherwise"
+                    )
 
     def _move_camera(self) -> None:
         """To where the settings of pictures have it, if they do.
