@@ -22,6 +22,7 @@ from agents.command import meant_for, read_options
 from agents.config import EvaluationSettings, load_resolved
 from agents.curve import Curve
 from agents.evaluate import Agent, Episode, Evaluation, baselines, begin_round, episode_bar
+from agents.folders import made
 from agents.report import conclude, draw_curve, versions
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
@@ -30,7 +31,6 @@ from piavatar_envs.envs.config import (
     ConfigError,
     EnvConfig,
     FrozenDict,
-    dump_yaml,
     load_config,
     parse_assignments,
 )
@@ -215,7 +215,7 @@ def run(
         cls: its configuration.
         find_task: the task of an environment's id.
         learn: trains; given the configuration, the task, the folder to write to, the device, and the checkpoint from
-            which to go on and which to keep up.
+            which to go on and which to keep up. It leaves the configuration in the folder when it refuses no more.
         args: command line, by default the process's own.
     """
     options = read_options(Options, name, args)
@@ -225,23 +225,31 @@ def run(
         check_device(options.device)
     except ValueError as error:
         sys.exit(f"error: {error}{meant_for(options.config, name)}")
+    folder = options.out or Path("runs") / options.config.stem
     try:
         task = new_task(config, find_task)
-        folder = options.out or Path("runs") / options.config.stem
-        folder.mkdir(parents=True, exist_ok=True)
-        checkpoint = Checkpoint(folder, name, config, options.device, options.resume)
-        (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
-        learned = learn(config, task, folder, options.device, checkpoint)
-    except ConfigError as error:
+        with made(folder):
+            checkpoint = Checkpoint(folder, name, config, options.device, options.resume)
+            iterations_of(checkpoint, config.iterations)
+            learned = learn(config, task, folder, options.device, checkpoint)
+        conclude_batch(name, config, find_task, learned, folder, options.device)
+    except (ConfigError, OSError) as error:
         sys.exit(f"error: {error}")
-    batch = BatchedEpisodes(new_task(config, find_task), config.evaluation.episodes, options.device)
+
+
+def conclude_batch(
+    name: str, config: BatchTraining, find_task: FindTask, learned: Learned, folder: Path, device: str
+) -> None:
+    """Evaluate what was learned; leaves ``results.json`` and the curve. Arguments are as for :func:`run`."""
+    task = new_task(config, find_task)
+    batch = BatchedEpisodes(task, config.evaluation.episodes, device)
     results = play_beside_baselines("trained", learned.agent, batch, config.evaluation.first_seed)
     batch.close()
     learned.curve.save(folder / "curve.csv")
     bands = {result.agent: result.estimate() for result in results}
     draw_curve(folder / "curve.png", learned.curve.steps, learned.curve.returns, bands, config.env_id)
-    about = versions(name, options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
-    cost = {"training_s": learned.curve.seconds, "train_steps": learned.curve.last_step}
+    about = versions(name, device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
+    cost = {"training_s": learned.curve.seconds, "train_steps": learned.curve.train_steps}
     extra = {**cost, "num_envs": config.num_envs, "agents": task.agent_names}
     conclude(folder, about, results, extra, "policy.pt, curve.png, curve.csv, config.yaml, results.json")
 

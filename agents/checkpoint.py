@@ -9,33 +9,23 @@ the learner saw last, and the curve so far. It is read without running code that
 
 from __future__ import annotations
 
-import os
 import pickle
 import random
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
 from pydantic import BaseModel
 
+from agents.folders import CHECKPOINT, POLICIES, RESULTS, hold, write_whole
 from benchmarks.runner import git_commit
 from piavatar_envs.doctor import package_version
 from piavatar_envs.envs.config import ConfigError
 
-try:
-    import fcntl
-except ImportError:  # on Windows nobody finds out that two train in one folder
-    fcntl = None
-
-NAME = "checkpoint.pt"
-#: Folders that this process holds, and by what; the system lets go of them however the process ends.
-_HELD: dict[Path, int] = {}
-#: What a training leaves, by which a folder without a checkpoint is known to hold one that was kept.
-LEFT = ("policy.pt", "policy.zip", "results.json")
 #: Of the file's content; rises with every change.
 FORMAT = 3
 #: Settings that what has been learned so far does not depend on.
@@ -47,28 +37,6 @@ LENGTHS, FALLING = ("total_steps", "iterations"), ("ppo.final_kl", "ppo.final_le
 PACKAGES = (
     "piavatar-envs", "numpy", "torch", "warp-lang", "gymnasium", "pettingzoo", "stable-baselines3", "rsl-rl-lib",
 )  # fmt: skip
-
-
-def write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
-    """Replace a file by what ``write`` writes: whoever is killed in between, the old one or the new one is there.
-
-    Args:
-        path: of the file. A half of a new one, left by whoever was killed, lies beside it as ``NAME.partial``, and the
-            next write replaces it.
-        write: given a file that is open for bytes.
-    """
-    partial = path.with_name(f"{path.name}.partial")
-    with partial.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
-    if hasattr(os, "O_DIRECTORY"):  # the new name, too, must outlast a power cut; Windows has no such call
-        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
 
 
 class Checkpoint:
@@ -94,7 +62,7 @@ class Checkpoint:
                 there is one, and ``resume`` was not asked for; or the folder is another training's, that runs or that
                 was kept without its checkpoint.
         """
-        self.path = folder / NAME
+        self.path = folder / CHECKPOINT
         hold(folder)
         self.state: dict[str, Any] | None = None
         commit, _ = git_commit()
@@ -106,7 +74,7 @@ class Checkpoint:
             "commit": commit,
         }
         if not self.path.exists():
-            for name in LEFT:
+            for name in (*POLICIES, RESULTS):
                 if (folder / name).exists():
                     raise ConfigError(f"{folder / name} is of a training that has ended; write elsewhere with --out")
             return
@@ -139,14 +107,10 @@ class Checkpoint:
             ("versions", "install that version, or begin anew in another folder with --out"),
             ("config", "give the same settings, or begin anew in another folder with --out"),
         ):
-            before, now = flattened(was[section]), flattened(self._about[section])
-            falls = any(now.get(name) is not None for name in FALLING)
-            for name in sorted(set(before) | set(now)):
-                free = section == "config" and name.partition(".")[0] in FREE and not (falls and name in LENGTHS)
-                if not free and before.get(name) != now.get(name):
-                    raise ConfigError(
-                        f"{self.path} was written with {name}={before.get(name)}, now it is {now.get(name)}; {remedy}"
-                    )
+            before, now = was[section], self._about[section]
+            unlike = learned_otherwise(before, now) if section == "config" else differences(before, now)
+            for name, old, new in unlike:
+                raise ConfigError(f"{self.path} was written with {name}={old}, now it is {new}; {remedy}")
         for name in ("script", "device"):
             if was[name] != self._about[name]:
                 raise ConfigError(
@@ -179,26 +143,6 @@ def load_whole(path: Path, device: str) -> Any:
     return torch.load(path, map_location=device, weights_only=True)
 
 
-def hold(folder: Path) -> None:
-    """Keep other processes from training in a folder as long as this one lives.
-
-    Raises:
-        ConfigError: another one trains there.
-    """
-    path = folder.resolve()
-    if fcntl is None or path in _HELD:
-        return
-    held = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(held)
-        if isinstance(error, BlockingIOError):
-            raise ConfigError(f"another training writes to {folder}; end it, or write elsewhere with --out") from None
-        return  # a file system that knows no locks
-    _HELD[path] = held
-
-
 def first_line(error: Exception) -> str:
     """What an error says first; of one that says nothing, its name."""
     return str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -219,6 +163,19 @@ def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             found[f"{prefix}{name}"] = value
     return found
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """Dotted names of what is not alike in nested dictionaries, in order, each with its value in both (or None)."""
+    old, new = flattened(before), flattened(now)
+    return [(name, old.get(name), new.get(name)) for name in sorted(old | new) if old.get(name) != new.get(name)]
+
+
+def learned_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """As :func:`differences` of two configurations of trainings, but only what a training does depend on so far."""
+    falls = any(flattened(now).get(name) is not None for name in FALLING)
+    free = [name for name in FREE if not (falls and name in LENGTHS)]
+    return [unlike for unlike in differences(before, now) if unlike[0].partition(".")[0] not in free]
 
 
 def as_tensors(value: Any) -> Any:

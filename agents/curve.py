@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from agents.folders import write_whole
+
 
 @dataclass
 class Curve:
@@ -15,16 +17,13 @@ class Curve:
         steps: control steps taken by then, over all workers and their learning agents.
         returns: undiscounted returns, of actions that were drawn at random from the policy.
         seconds: time that the training took [s], over all its parts where it was resumed.
+        train_steps: control steps of all of it, set when it is over; the last episode that ended did so earlier.
     """
 
     steps: list[int] = field(default_factory=list)
     returns: list[float] = field(default_factory=list)
     seconds: float = 0.0
-
-    @property
-    def last_step(self) -> int:
-        """Control steps taken when the last episode ended."""
-        return self.steps[-1] if self.steps else 0
+    train_steps: int = 0
 
     def csv(self) -> str:
         """It as CSV, a row an episode."""
@@ -33,7 +32,7 @@ class Curve:
 
     def save(self, path: Path) -> None:
         """Write it as CSV."""
-        path.write_text(self.csv(), encoding="utf-8")
+        write_whole(path, lambda file: file.write(self.csv().encode()))
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""

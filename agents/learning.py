@@ -21,6 +21,7 @@ from agents import ppo, resume, sac
 from agents.checkpoint import Checkpoint
 from agents.config import TrainingConfig
 from agents.curve import Curve
+from agents.folders import write_config, write_whole
 from agents.parallel import WAITING
 from agents.rollouts import MarkPlayed
 from agents.workers import EnvFacts, components
@@ -91,17 +92,24 @@ class Progress(BaseCallback):
         self.bar.close()
 
 
-def begin(config: TrainingConfig, venv: VecEnv, facts: EnvFacts) -> BaseAlgorithm:
+def begin(config: TrainingConfig, venv: VecEnv, facts: EnvFacts, checkpoint: Checkpoint | None = None) -> BaseAlgorithm:
     """An untrained agent, of the algorithm that the configuration names.
 
     Args:
         config: resolved.
         venv: where to train: the workers, or the learning agents of their worlds.
         facts: of their environment.
+        checkpoint: from which :func:`learn` will go on, or None.
+
+    Raises:
+        ConfigError: there is no such term to observe, or the checkpoint has had more steps than are asked for.
     """
     seen = components(facts.layout, config.observe)
     build, settings = (ppo.build, config.ppo) if config.sac is None else (sac.build, config.sac)
-    return build(settings, ScaledMonitor(venv, settings.reward_scale), seen, config.seed)
+    model = build(settings, ScaledMonitor(venv, settings.reward_scale), seen, config.seed)
+    if checkpoint is not None and checkpoint.state is not None:
+        _check_steps(config, model, checkpoint)
+    return model
 
 
 def learn(
@@ -112,22 +120,21 @@ def learn(
     deadline: float | None = None,
     watchers: Sequence[BaseCallback] = (),
 ) -> Curve:
-    """Train until the steps or the time are over; leaves policies, curve and TensorBoard's files in ``folder``.
+    """Train until the steps or the time are over.
+
+    Leaves the configuration, policies, the curve and TensorBoard's files in ``folder``; nothing is refused any more.
 
     Args:
         config: resolved.
-        model: from :func:`begin`.
+        model: from :func:`begin`, with the same checkpoint.
         folder: where to write; exists.
         checkpoint: from which to go on, and which to keep up; None for a training that cannot be resumed.
         deadline: by ``time.monotonic()``, or None.
         watchers: what else to call at every step, before the checkpoint is written.
-
-    Raises:
-        ConfigError: the checkpoint has had more steps than the configuration asks for.
     """
+    write_config(folder, config)
     curve = Curve()
     if checkpoint is not None and checkpoint.state is not None:
-        _check_steps(config, model, checkpoint)
         resume.restore(model, curve, checkpoint.state)
     start = time.monotonic() - curve.seconds
     model.set_logger(Logger(folder=None, output_formats=[Events(folder / "tensorboard", model.num_timesteps)]))
@@ -138,9 +145,9 @@ def learn(
     if checkpoint is not None:
         watch.append(resume.KeepCheckpoint(checkpoint, config.checkpoint_every, curve))
     model.learn(config.total_steps - model.num_timesteps, callback=CallbackList(watch), reset_num_timesteps=False)
-    curve.seconds = time.monotonic() - start
+    curve.seconds, curve.train_steps = time.monotonic() - start, model.num_timesteps
     model.logger.close()
-    model.save(folder / "policy.zip")
+    write_whole(folder / "policy.zip", model.save)
     curve.save(folder / "curve.csv")
     return curve
 

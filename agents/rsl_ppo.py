@@ -23,6 +23,7 @@ from torch.utils.tensorboard import SummaryWriter
 from agents.batches import Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, set_random_states
 from agents.curve import Curve
+from agents.folders import write_config, write_whole
 from agents.help import HelpedEnv
 from agents.lessons import with_lessons
 from agents.mirror import Mirror
@@ -284,9 +285,11 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
     env = make_env(config, task, device)
     seed_all(config.seed)
     runner = Runner(env, config, folder, checkpoint)
+    write_config(folder, config)
     runner.train(config.iterations)
+    runner.curve.train_steps = config.iterations * config.num_envs * config.ppo.rollout_steps
     actor = runner.get_inference_policy(str(env.device))
-    torch.save(actor.state_dict(), folder / "policy.pt")
+    write_whole(folder / "policy.pt", lambda file: torch.save(actor.state_dict(), file))
     env.close()
     return Learned(mean_agent(actor, components(env.observation_layout, config.observe), str(env.device)), runner.curve)
 

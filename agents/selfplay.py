@@ -15,7 +15,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 
-from agents.checkpoint import load_whole, write_whole
+from agents.checkpoint import load_whole
+from agents.folders import write_whole
 from agents.parallel import AgentVecEnv
 from piavatar_envs.envs.config import FROZEN, ConfigError
 
@@ -65,10 +66,10 @@ class Pool:
             ConfigError: one of them has no file.
         """
         self.folder, self.steps = folder, sorted(steps)
-        folder.mkdir(parents=True, exist_ok=True)
         missing = sorted(set(self.steps) - set(_snapshots(folder)))
         if missing:
             raise ConfigError(f"{folder} has no {_file_name(missing[0])}; resume in the folder of the run")
+        folder.mkdir(parents=True, exist_ok=True)
         for found in set(_snapshots(folder)) - set(self.steps):
             self._path(found).unlink()
 

@@ -26,6 +26,7 @@ from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, se
 from agents.config import multi_module
 from agents.curve import Curve
 from agents.evaluate import Agent
+from agents.folders import write_config, write_whole
 from agents.skrl_networks import ActedMemory, Critic, MAPPOSettings, Policy
 from agents.workers import components
 from piavatar_envs.api.skrl import AvatarSkrlMultiEnv
@@ -188,9 +189,11 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
             "close_environment_at_exit": False,
         },
     )
+    write_config(folder, config)
     mappo.resume()
     trainer.train()
-    mappo.save(str(folder / "policy.pt"))
+    mappo.curve.train_steps = config.iterations * config.num_envs * config.mappo.rollout_steps
+    write_whole(folder / "policy.pt", mappo.save)
     env.close()
     return Learned(joint_agent(mappo), mappo.curve)
 

@@ -23,12 +23,13 @@ from agents.command import meant_for, read_options
 from agents.config import TrainingConfig, load_training
 from agents.curve import Curve
 from agents.evaluate import Evaluation, baselines, evaluate, policy_agent
+from agents.folders import made
 from agents.learning import begin, learn
 from agents.parallel import AgentVecEnv
 from agents.report import conclude, draw_curve, versions
-from agents.workers import EnvFacts, components, factory, prepare, start_vector, start_workers
+from agents.workers import EnvFacts, components, factory, prepare, start
 from piavatar_envs.doctor import quiet_warp
-from piavatar_envs.envs.config import ConfigError, dump_yaml, parse_assignments
+from piavatar_envs.envs.config import ConfigError, parse_assignments
 from piavatar_envs.envs.simulation import check_device
 
 Results = Sequence[Evaluation] | Sequence[matches.Match]
@@ -55,7 +56,7 @@ def train(
     Raises:
         ConfigError: the checkpoint has had more steps than the configuration asks for.
     """
-    model = begin(config, venv, facts)
+    model = begin(config, venv, facts, checkpoint)
     return model, learn(config, model, folder, checkpoint, deadline)
 
 
@@ -82,7 +83,7 @@ def train_selfplay(
 ) -> tuple[Curve, Results]:
     """Agents that compete: one policy for all, against itself and its snapshots."""
     venv = AgentVecEnv(workers, config.selfplay.num_duels(workers.num_envs))
-    model = begin(config, venv, facts)
+    model = begin(config, venv, facts, checkpoint)
     snapshots = selfplay.enter(config.selfplay, venv, model, folder, pool_of(checkpoint))
     curve = learn(config, model, folder, checkpoint, watchers=[snapshots])
     return curve, matches.play_matches(config, model, snapshots.pool, workers)
@@ -110,6 +111,43 @@ class Options:
     resume: bool = False
 
 
+def run(config: TrainingConfig, folder: Path, device: str, resume: bool) -> None:
+    """Train, or go on, and evaluate.
+
+    Args:
+        config: resolved.
+        folder: where to write; nothing in it changes before all that can be refused has been.
+        device: where to simulate.
+        resume: whether to go on from the folder's checkpoint.
+
+    Raises:
+        ConfigError: the folder is another training's, the checkpoint does not fit, or the configuration does not fit
+            the environment or the device.
+        OSError: something cannot be written.
+    """
+    learns = train_selfplay if config.selfplay else train_together if config.is_multi else train_single
+    with made(folder):
+        checkpoint = Checkpoint(folder, "train", config, device, resume)
+        make = factory(config, device)
+        facts = prepare(make)
+        components(facts.layout, config.observe)
+        try:
+            workers = start(config, make, device)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+        try:
+            curve, results = learns(config, workers, facts, folder, checkpoint)
+        finally:
+            workers.close()
+    bands = {result.agent: result.estimate() for result in results if isinstance(result, Evaluation)}
+    draw_curve(folder / "curve.png", curve.steps, curve.returns, bands, config.env_id)
+    about = versions("train", device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
+    cost = {"training_s": curve.seconds, "train_steps": curve.train_steps}
+    files = "policy.zip, curve.png, curve.csv, config.yaml, results.json, checkpoints/, tensorboard/"
+    files += ", pool/" if config.selfplay else ""
+    conclude(folder, about, results, {**cost, "agents": facts.agents}, files)
+
+
 def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = read_options(Options, "train", args)
@@ -120,30 +158,9 @@ def main(args: list[str] | None = None) -> None:
     except ValueError as error:
         sys.exit(f"error: {error}{meant_for(options.config, 'train')}")
     try:
-        folder = options.out or Path("runs") / options.config.stem
-        folder.mkdir(parents=True, exist_ok=True)
-        checkpoint = Checkpoint(folder, "train", config, options.device, options.resume)
-        (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
-        make = factory(config, options.device)
-        facts = prepare(make)
-        components(facts.layout, config.observe)
-    except ConfigError as error:
+        run(config, options.out or Path("runs") / options.config.stem, options.device, options.resume)
+    except (ConfigError, OSError) as error:
         sys.exit(f"error: {error}")
-    workers = start_vector(config, options.device) if config.vector else start_workers(make, config.num_workers)
-    run = train_selfplay if config.selfplay else train_together if config.is_multi else train_single
-    try:
-        curve, results = run(config, workers, facts, folder, checkpoint)
-    except ConfigError as error:
-        sys.exit(f"error: {error}")
-    finally:
-        workers.close()
-    bands = {result.agent: result.estimate() for result in results if isinstance(result, Evaluation)}
-    draw_curve(folder / "curve.png", curve.steps, curve.returns, bands, config.env_id)
-    about = versions("train", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
-    cost = {"training_s": curve.seconds, "train_steps": curve.last_step}
-    files = "policy.zip, curve.png, curve.csv, config.yaml, results.json, checkpoints/, tensorboard/"
-    files += ", pool/" if config.selfplay else ""
-    conclude(folder, about, results, {**cost, "agents": facts.agents}, files)
 
 
 if __name__ == "__main__":

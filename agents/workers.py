@@ -83,6 +83,15 @@ def prepare(make: EnvFactory | WorldFactory) -> EnvFacts:
         env.close()
 
 
+def start(config: TrainingConfig, make: EnvFactory | WorldFactory, device: str = "cpu") -> VecEnv:
+    """The environments of a configuration, as it says: one batch, or processes.
+
+    Raises:
+        ValueError: a batch that does not fit.
+    """
+    return start_vector(config, device) if config.vector else start_workers(make, config.num_workers)
+
+
 def start_workers(make: EnvFactory | WorldFactory, num_workers: int) -> VecEnv:
     """``num_workers`` environments; a single one stays in this process."""
     torch.set_num_threads(1)  # the workers have the cores; the networks are small

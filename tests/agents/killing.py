@@ -1,8 +1,8 @@
 """Trainings that are killed: by an exception in this process, or by SIGKILL in one of their own.
 
 ``python -m tests.agents.killing train step 40 ARGS`` is ``python -m agents.train ARGS`` until its 40th step of the
-environments, and ``... write 3 ARGS`` until it has written half of what its third ``fsync`` is of: each checkpoint
-synchronises its file, then its folder, so this is the second one.
+environments, and ``... write 5 ARGS`` until it has written half of what its fifth ``fsync`` is of: its configuration,
+and then each checkpoint, synchronises its file, then its folder, so this is the second checkpoint.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def main(script: str, when: str, count: int, args: list[str]) -> None:
         return counted
 
     if when == "write":
-        checkpoint = importlib.import_module("agents.checkpoint")
-        checkpoint.os.fsync = counting(os.fsync)
+        folders = importlib.import_module("agents.folders")
+        folders.os.fsync = counting(os.fsync)
     else:
         module, views, method = _STEPS[script]
         view = getattr(importlib.import_module(module), views)

@@ -11,8 +11,9 @@ import torch
 
 from agents import play, scores
 from agents.batches import load_batched
-from agents.checkpoint import UNREADABLE, Checkpoint, hold, load_whole
+from agents.checkpoint import UNREADABLE, Checkpoint, load_whole
 from agents.config import load_training
+from agents.folders import hold
 from agents.rsl_policy import RslTraining
 from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.tasks import load_task
@@ -23,7 +24,7 @@ def test_no_other_process_trains_where_one_does(tmp_path):
     pytest.importorskip("fcntl", reason="Windows knows no such locks")
     hold(tmp_path)
     hold(tmp_path)  # one process may go on where it was
-    code = f"from pathlib import Path; from agents.checkpoint import hold; hold(Path({str(tmp_path)!r}))"
+    code = f"from pathlib import Path; from agents.folders import hold; hold(Path({str(tmp_path)!r}))"
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert "another training writes to" in other.stderr and "--out" in other.stderr
 

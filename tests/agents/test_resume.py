@@ -14,8 +14,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from agents import train
-from agents.checkpoint import Checkpoint, as_arrays, as_tensors, random_states, set_random_states, write_whole
+from agents.checkpoint import Checkpoint, as_arrays, as_tensors, random_states, set_random_states
 from agents.config import load_training
+from agents.folders import write_whole
 from agents.learning import begin, learn
 from agents.workers import factory, prepare, start_vector, start_workers
 from piavatar_envs.envs.config import ConfigError, dump_yaml
@@ -52,7 +53,7 @@ def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path):
     assert checkpoint_steps(parts) == 64
     assert not (parts / "policy.zip").exists()
     # it keeps one at 96 steps, and half of the one at 128
-    run_killed("train", "write", 3, *command, str(parts), "--resume")
+    run_killed("train", "write", 5, *command, str(parts), "--resume")
     assert checkpoint_steps(parts) == 96
     half = parts / "checkpoint.pt.partial"
     assert 0 < half.stat().st_size < (parts / "checkpoint.pt").stat().st_size
@@ -204,7 +205,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
 
     with pytest.raises(OSError, match="no space"):
         write_whole(path, fail)
-    assert path.read_bytes() == b"old"
+    assert path.read_bytes() == b"old" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
     write_whole(path, lambda file: file.write(b"new"))
     assert path.read_bytes() == b"new" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
 

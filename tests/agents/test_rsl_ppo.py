@@ -91,6 +91,22 @@ def test_updates_aim_at_smaller_and_smaller_divergences(tmp_path, monkeypatch, c
         rsl_ppo.main([*run, "ppo.desired_kl=null", "--out", str(tmp_path / "none")])
 
 
+def test_what_does_not_fit_leaves_nothing_and_the_steps_are_told_without_an_episode(tmp_path, capsys):
+    long = [word for word in TINY if "seconds" not in word] + ["env.episode_seconds=9.0", "lessons={}", "help=null"]
+    path = next(path for path in CONFIGS if path.stem == "reach_rsl")
+    run = [str(path), *long, "--out", str(tmp_path / "run")]
+    for misfit in ("observe=[tail]", "ppo.final_kl=0.01"):
+        with pytest.raises(SystemExit, match=r"^error: "):
+            rsl_ppo.main([*run, misfit, "ppo.desired_kl=null"])
+        assert not (tmp_path / "run").exists()
+    rsl_ppo.main(run)
+    assert json.loads((tmp_path / "run" / "results.json").read_text())["train_steps"] == 48
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+    with pytest.raises(SystemExit, match="has had 3 iterations, iterations=2; ask for as many or more"):
+        rsl_ppo.main([*(word.replace("iterations=3", "iterations=2") for word in run), "--resume"])
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
+
+
 def test_networks_learn_from_noisy_observations_and_play_on_exact_ones(tmp_path, monkeypatch, capsys):
     exact, seen = [], []
     act, record = rsl_ppo.PPO.act, rsl_ppo.PPO.process_env_step
@@ -123,7 +139,7 @@ def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path, capsys
     parts = tmp_path / "parts"
     run_killed("rsl_ppo", "step", 30, *command, str(parts))  # in the fourth iteration; the first and third are kept
     assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 3
-    run_killed("rsl_ppo", "write", 3, *command, str(parts), "--resume")
+    run_killed("rsl_ppo", "write", 5, *command, str(parts), "--resume")
     assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 5
     assert (parts / "checkpoint.pt.partial").exists()
     rsl_ppo.main([*command, str(parts), "--resume"])

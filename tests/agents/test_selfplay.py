@@ -50,7 +50,7 @@ def play(config: TrainingConfig, folder, checkpoint: Checkpoint | None = None, w
     make = factory(config)
     folder.mkdir(parents=True, exist_ok=True)
     venv = AgentVecEnv(DummyVecEnv([make] * config.num_workers), config.selfplay.num_duels(config.num_workers))
-    model = begin(config, venv, prepare(make))
+    model = begin(config, venv, prepare(make), checkpoint)
     snapshots = selfplay.enter(config.selfplay, venv, model, folder, train.pool_of(checkpoint))
     curve = learn(config, model, folder, checkpoint, watchers=[snapshots, *([watcher] if watcher else [])])
     return model, snapshots.pool, curve
@@ -100,6 +100,9 @@ def test_a_pool_goes_on_as_it_was_and_begins_empty(policy, tmp_path):
     assert sorted(path.name for path in pool.folder.iterdir()) == ["snapshot_0_steps.pt", "snapshot_100_steps.pt"]
     with pytest.raises(ConfigError, match=r"has no snapshot_1000_steps\.pt; resume in the folder of the run"):
         Pool(pool.folder, [0, 100, 1000])
+    with pytest.raises(ConfigError, match="has no snapshot_7_steps"):
+        Pool(tmp_path / "elsewhere", [7])
+    assert not (tmp_path / "elsewhere").exists() and len(list(pool.folder.iterdir())) == 2, "nothing has changed"
     assert Pool(pool.folder).steps == []
     assert not list(pool.folder.iterdir())
 
@@ -197,7 +200,7 @@ def test_what_is_interrupted_goes_on_with_its_pool_as_if_it_had_not_been(auction
 
 
 def test_self_play_beats_where_it_began(games, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(train, "start_workers", lambda make, num_workers: DummyVecEnv([make] * num_workers))
+    monkeypatch.setattr("agents.workers.start_workers", lambda make, count: DummyVecEnv([make] * count))
     path = tmp_path / "auction.yaml"
     path.write_text(dump_yaml(load_training(AUCTION)))
     settings = ["total_steps=2304", "selfplay.snapshot_every=576", "checkpoint_every=1000"]
