@@ -110,7 +110,7 @@ class LoadSchedule:
         joints: number of joints.
         legs: places of the joints of each leg.
         unloaded: factor of a leg that carries nothing [-], 1 for no schedule; one that carries its even share, or more,
-            has 1. :class:`agents.pid_agent.Design` says what came of it in a body that stands.
+            has 1. :class:`agents.design.Design` says what came of it in a body that stands.
     """
 
     joints: int

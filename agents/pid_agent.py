@@ -19,7 +19,6 @@ The PID therefore looks ahead with the mass matrix of the whole body (:func:`~ag
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from agents.balance import FRONTAL, GRAVITY, Balance, Effort, Stance
 from agents.bones import NUM_DOF, Bones, Posture, answered, force_moments, in_bones
+from agents.design import DEFAULT, Design
 from agents.gains import LoadSchedule, gains_by_strength
 from agents.pid import PID, PosePID, difference, follow
 from piavatar_envs.avatar.muscles import REFERENCE_HEIGHT, REFERENCE_MASS, make_muscles
@@ -38,59 +38,11 @@ from piavatar_envs.tasks import load_task
 SIDES = ("left", "right")
 #: Joints of each leg, as places among all joints but the root.
 LEGS = {side: [joint_index(f"{side}_{joint}") - 1 for joint in ("hip", "knee", "ankle", "foot")] for side in SIDES}
-#: Joints above the legs: chains whose ends are free, so that their integrals can undo their errors.
-ABOVE_LEGS = tuple(name for name in JOINT_NAMES[1:] if name.partition("_")[2] not in ("hip", "knee", "ankle", "foot"))
 HIPS, ANKLES = ([joint_index(f"{side}_{joint}") for side in SIDES] for joint in ("hip", "ankle"))
 #: Time over which the load of the feet is averaged [s].
 LOAD_TIME = 0.02
 #: Share of the weight on the feet from which on legs push with all of it.
 BEARING = 0.5
-
-
-@dataclass(frozen=True)
-class Design:
-    """Numbers of the controller. Lengths are of a body at grid spacings of 5 cm, ``fidelity="coarse"``.
-
-    Attributes:
-        stiffness: of the joints by their strength [1/rad], see :func:`~agents.gains.gains_by_strength`.
-        damping_time: ``kd / kp`` [s].
-        integral_time: ``kp / ki`` [s] of the joints that have an integral; infinite for none.
-        integrated: names of these joints. The integral takes away the error that is left because tissue gives way and
-            holds back: above the legs, in the second half of 8 episodes of Stand, 13 degrees in neck and arms become 3
-            and 10 in the spine become 5, and no episode ends. Two legs on the ground are a closed chain: errors that
-            friction does not let them undo wind up the integrals of both, against each other, until a foot slips (at
-            2 s after some 15 s). Theirs are for bodies whose pelvis is held.
-        unloaded: factor on the gains of a leg that bears nothing [-], see :class:`~agents.gains.LoadSchedule`; one
-            that bears half of the weight has 1. With 1, the default, the schedule is off, for softer legs are of no use
-            (by hand, firm bones, the same episodes): of 64 of PushRecovery 27 last with 1 and with 0.75, 26 with 0.5,
-            and returns are 0.1 more, give or take 0.1, and 1.2 less, give or take 2.6, of 172; of 24 of Stand, where
-            both feet stay, all last with each of them and return 294.
-        followed: names of the joints that follow a clip of the task; the others hold the rest pose. The balance knows
-            no clip: where feet leave the ground it falls later if only ``ABOVE_LEGS`` follow (step, 4 episodes with
-            impulses of 20 N s: after 3.1 instead of 1.3 s), where they stay all joints follow better (bow, 2 episodes
-            without: a return of 140 instead of 120).
-        support: from the ankles to the hindmost and to the foremost place of the centre of pressure that ankles can
-            hold [m]. A foot that is pressed further back rolls over its heel, up to the stop of its ankle; the rest
-            pose has the centre of mass just 12 mm ahead of the ankles.
-        foot_width: within which ankles can hold it sideways [m].
-        gain: of the balance, see :class:`~agents.balance.Balance`.
-        hip_threshold, hip_gain: of the hip strategy, see :class:`~agents.balance.Balance`.
-        hip_share: share of the strength of both hips that it has [-]. A body that walks is beyond the threshold all
-            the time: after DeepMimic's walk it falls later without (12 episodes: after 0.6 instead of 0.4 s).
-    """
-
-    stiffness: float = 1.75
-    damping_time: float = 0.06
-    integral_time: float = 2.0
-    integrated: tuple[str, ...] = ABOVE_LEGS
-    unloaded: float = 1.0
-    followed: tuple[str, ...] = JOINT_NAMES[1:]
-    support: tuple[float, float] = (0.010, 0.112)
-    foot_width: float = 0.04
-    gain: float = 0.72
-    hip_threshold: float = 0.77
-    hip_gain: float = 6.0
-    hip_share: float = 0.6
 
 
 class PIDAgent:
@@ -105,7 +57,7 @@ class PIDAgent:
     def __init__(
         self,
         env: BatchEnv,
-        design: Design = Design(),
+        design: Design = DEFAULT,
         poses: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
         """Design the controller.
@@ -118,8 +70,10 @@ class PIDAgent:
                 the clip that the observation shows, as that of TrackMotion does, and where it shows none the rest pose.
 
         Raises:
+            ConfigError: a design that is no controller.
             ValueError: joints that are not moved by torques.
         """
+        design.check()
         if env.control != "torque":
             raise ValueError(f'control={env.control!r}; the PID agent gives torques: make it with control="torque"')
         self.design, self.layout, self.dt = design, env.layout, env.config.physics.control_dt
@@ -272,7 +226,7 @@ class PIDAgent:
 def make_pid_agent(
     task: str = "Stand-v0",
     settings: Mapping[str, Any] | None = None,
-    design: Design = Design(),
+    design: Design = DEFAULT,
     poses: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> PIDAgent:
     """An agent for a task.
@@ -284,7 +238,7 @@ def make_pid_agent(
         poses: what to follow, see :class:`PIDAgent`.
 
     Raises:
-        ConfigError: a setting that is unknown, of the wrong type or out of range.
+        ConfigError: a setting that is unknown, of the wrong type or out of range, also of the design.
         ValueError: an unknown task, or joints that are not moved by torques.
     """
     kind = load_task(task)

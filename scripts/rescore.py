@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import tyro
 from rich.progress import track
 
-from agents.pid_agent import Design
+from agents.design import Design
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
 

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra train")
 
 from agents import score_pid, score_random
-from agents.pid_agent import Design
+from agents.design import Design
 from piavatar_envs.envs.config import load_config, parse_assignments
 from piavatar_envs.tasks import load_task
 from scripts import rescore

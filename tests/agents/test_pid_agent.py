@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import agents.pid_agent
+from agents.design import Design
 from agents.pid import motion_poses
-from agents.pid_agent import Design, PIDAgent, make_pid_agent, rest_poses
+from agents.pid_agent import PIDAgent, make_pid_agent, rest_poses
 from piavatar_envs.avatar.asset import load_body
 from piavatar_envs.avatar.limits import joint_limits
 from piavatar_envs.avatar.motion import deepmimic, load_motion
