@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,6 +61,15 @@ def read_options(cls: type[Options], script: str, args: Sequence[str] | None = N
             return tyro.cli(cls, prog=program, args=args)  # says which options there are not, and exits
     # tyro takes settings that stand together, and hands back those beyond an option
     return replace(options, settings=(*options.settings, *unread))
+
+
+@contextmanager
+def in_a_line(*kinds: type[Exception]) -> Iterator[None]:
+    """End the script with what errors of some kinds say, where a traceback would tell its user no more."""
+    try:
+        yield
+    except kinds as error:
+        sys.exit(f"error: {error}")
 
 
 def meant_for(path: Path, script: str) -> str:

@@ -7,7 +7,6 @@ of a training changes (zero and random actions) is shown once, with its interval
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +16,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from agents.checkpoint import flattened
+from agents.checkpoint import differences
+from agents.command import in_a_line
 from agents.evaluate import over_seeds
+from agents.folders import check_figures
 from benchmarks.runner import plain, write_json
 
 #: Settings that may differ: nothing that is learned depends on how often a training is saved.
@@ -44,13 +45,8 @@ def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     (first_name, first), *others = runs.items()
     settings = _settings(first)
     for name, run in others:
-        own = _settings(run)
-        differ = sorted(key for key in settings.keys() | own.keys() if settings.get(key) != own.get(key))
-        if differ:
-            key = differ[0]
-            raise ValueError(
-                f"{name} has {key}={own.get(key)}, {first_name} has {settings.get(key)}; only seeds may differ"
-            )
+        for key, here, there in differences(settings, _settings(run)):
+            raise ValueError(f"{name} has {key}={there}, {first_name} has {here}; only seeds may differ")
     seeds = [run["seed"] for run in runs.values()]
     if len(set(seeds)) < len(seeds):
         raise ValueError(f"the runs have the seeds {seeds}; each must have one of its own")
@@ -64,7 +60,7 @@ def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 def _settings(run: Mapping[str, Any]) -> dict[str, Any]:
     """All that must be alike."""
     config = {key: run["config"][key] for key in run["config"] if key not in FREE}
-    return {"script": run["benchmark"], **flattened(config)}
+    return {"script": run["benchmark"], **config}
 
 
 def _row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -111,13 +107,14 @@ class Options:
 def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = tyro.cli(Options, prog="python -m agents.compare", args=args)
-    try:
+    with in_a_line(ValueError, OSError):
+        if options.out is not None:
+            check_figures(options.out, "compare")
         files = [path / "results.json" if path.is_dir() else path for path in options.runs]
         report = summarize({str(path): json.loads(path.read_text(encoding="utf-8")) for path in files})
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
     if options.out is not None:
-        write_json(options.out, plain(report, "compare"))
+        with in_a_line(OSError):
+            write_json(options.out, plain(report, "compare"))
     show(report, Console(highlight=False, soft_wrap=True))
 
 

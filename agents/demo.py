@@ -7,7 +7,6 @@ Plays zero, random and scripted actions, trains, plays the trained policy in the
 from __future__ import annotations
 
 import copy
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,15 +16,17 @@ import tyro
 from rich.console import Console
 
 from agents import ppo
-from agents.command import read_options
+from agents.command import in_a_line, read_options
 from agents.config import TrainingConfig, load_training
 from agents.evaluate import Evaluation, baselines, evaluate, policy_agent, separated
 from agents.film import film
+from agents.folders import claim, hold
 from agents.ik import ReachIK
 from agents.report import draw_curve, show_table, versions, write_results
 from agents.train import train
 from agents.workers import EnvFacts, components, factory, prepare, start_workers
-from piavatar_envs.envs.config import ConfigError, dump_yaml, parse_assignments
+from piavatar_envs.envs.config import ConfigError, parse_assignments
+from piavatar_envs.envs.simulation import check_device
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "reach_ppo.yaml"
 FILM_EPISODES = 2
@@ -75,21 +76,25 @@ def run(options: Options, console: Console) -> Outcome:
     """Everything that ``make demo`` does.
 
     Raises:
-        ConfigError: a setting that is unknown, of the wrong type or out of range.
+        ConfigError: a setting that is unknown, of the wrong type or out of range; or the folder is not the demo's.
+        ValueError: there is no such device.
+        OSError: something cannot be written.
     """
     begun = time.monotonic()
-    config = load_training(CONFIG, {"seed": options.seed, **parse_assignments(options.settings)})
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
+    config = demonstrated(options)
+    claim(options.out, "demo", own=("policy.zip",))
     make = factory(config, options.device)
     with console.status("compiling kernels (once; they are cached)"):
         facts = prepare(make)
+    seen = components(facts.layout, config.observe)
+    options.out.mkdir(parents=True, exist_ok=True)
+    hold(options.out)
     console.print(f"{config.env_id}: kernels ready after {time.monotonic() - begun:.0f} s")
     venv = start_workers(make, config.num_workers)
     try:
         references = play_references(config, venv, facts)
         deadline = begun + options.seconds - _RESERVE * _time_after(options, config, facts, references)
-        untrained = ppo.build(config.ppo, venv, components(facts.layout, config.observe), config.seed)
+        untrained = ppo.build(config.ppo, venv, seen, config.seed)
         before = policy_agent(copy.deepcopy(untrained.policy))
         model, curve = train(config, venv, facts, options.out, deadline=deadline)
         trained, _ = _timed_play("trained", policy_agent(model), config, venv)
@@ -115,6 +120,32 @@ def run(options: Options, console: Console) -> Outcome:
     about = versions("demo", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
     write_results(options.out / "results.json", about, outcome.evaluations, figures)
     return outcome
+
+
+def demonstrated(options: Options) -> TrainingConfig:
+    """What is trained.
+
+    Raises:
+        ConfigError: a setting that is unknown, of the wrong type or out of range, or that makes it no demo of Reach by
+            PPO; or there is no time.
+        ValueError: there is no such device.
+    """
+    if not options.seconds > 0.0:
+        raise ConfigError(f"seconds={options.seconds} must be > 0")
+    check_device(options.device)
+    config = load_training(CONFIG, {"seed": options.seed, **parse_assignments(options.settings)})
+    shown = load_training(CONFIG)
+    for name in ("env_id", "sac", "vector", "selfplay"):
+        if getattr(config, name) != getattr(shown, name):
+            raise ConfigError(
+                f"{name}={getattr(config, name)!r}: the demo is of PPO on {shown.env_id} in processes; train others by "
+                "python -m agents.train"
+            )
+    if config.env["drive"]["control"] != "pose":
+        raise ConfigError(
+            f"env.drive.control={config.env['drive']['control']!r} must be 'pose': the scripted agent of the demo poses"
+        )
+    return config
 
 
 def _timed_play(name: str, agent, config: TrainingConfig, venv) -> tuple[Evaluation, float]:
@@ -150,10 +181,8 @@ def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = read_options(Options, "demo", args)
     console = Console(highlight=False, soft_wrap=True)
-    try:
+    with in_a_line(ValueError, OSError):
         outcome = run(options, console)
-    except ConfigError as error:
-        sys.exit(f"error: {error}")
     show_table(outcome.evaluations, console)
     verdict = "lies above" if outcome.separated else "does NOT lie above"
     console.print(f"The trained policy's interval {verdict} those of zero and of random actions.")

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
 from agents.evaluate import Agent, begin_round
+from agents.folders import check_writable
 from agents.workers import EnvFactory, start_workers
 from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.render import label, side_by_side, write_video
@@ -45,10 +46,10 @@ def film(
 
 
 def check_film(path: Path | None, every: int, episodes: int = 1) -> None:
-    """Refuse a video without pictures, or that is none by its name, before there is anything to film.
+    """Refuse a video without pictures, or that cannot be written, before there is anything to film.
 
     Raises:
-        ConfigError: ``every`` or ``episodes`` is less than 1.
+        ConfigError: ``every`` or ``episodes`` is less than 1, or nothing can be written there.
         ValueError: an unknown suffix.
     """
     for name, value in (("film_every", every), ("film_episodes", episodes)):
@@ -56,6 +57,7 @@ def check_film(path: Path | None, every: int, episodes: int = 1) -> None:
             raise ConfigError(f"{name}={value} must be >= 1")
     if path is not None:
         check_suffix(path)
+        check_writable(path)
 
 
 def _frames(halves: VecEnv, agents: dict[str, Agent], seeds: Sequence[int], every: int) -> Iterator[np.ndarray]:

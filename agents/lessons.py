@@ -1,23 +1,35 @@
-"""Lessons: settings of an environment that make it easier while an agent learns."""
+"""What a policy is made for, and lessons: settings of an environment that make it easier while an agent learns."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.tasks.base import Task
 
 
-def interface(task: Task) -> dict[str, Any]:
-    """What a policy is made for: what its actions do, and what it sees."""
+def interface(task: Task, observe: Collection[str] | None = None) -> dict[str, Any]:
+    """What a policy is made for: what its actions do, and what it sees.
+
+    Args:
+        task: of the environment.
+        observe: terms of the observation that the policy sees; None for all of it.
+    """
     config = task.config
+    seen = [term for term in task.terms() if observe is None or term.name in observe]
     return {
         "drive.control": config.drive.control,
         "its actions": task.action_spec(),
         "observe_parameters": config.observe_parameters,
-        "its observations": (task.observed_props(), task.terms()),
+        "its observations": (seen, task.observed_props() if observe is None else ()),
     }
+
+
+def changed(task: Task, other: Task, observe: Collection[str] | None = None) -> list[str]:
+    """What of :func:`interface` is not the same in another environment, by name: a policy would take it for another."""
+    then = interface(other, observe)
+    return [name for name, now in interface(task, observe).items() if now != then[name]]
 
 
 def with_lessons(task: Task, lessons: Mapping[str, Any]) -> EnvConfig:
@@ -27,11 +39,9 @@ def with_lessons(task: Task, lessons: Mapping[str, Any]) -> EnvConfig:
         ConfigError: a lesson is no setting, or changes what the policy is made for.
     """
     settings = load_config(type(task.config), task.config, dict(lessons))
-    then = interface(type(task)(settings))
-    changed = [name for name, now in interface(task).items() if now != then[name]]
-    if changed:
+    if unlike := changed(task, type(task)(settings)):
         raise ConfigError(
-            f"lessons={dict(lessons)} change {', '.join(changed)}: what is learned would not fit the "
+            f"lessons={dict(lessons)} change {', '.join(unlike)}: what is learned would not fit the "
             "environment that it is for; give such settings as env"
         )
     return settings

@@ -7,8 +7,7 @@ with ``--live`` it plays in a web browser instead, until Ctrl-C. Nothing in the 
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +17,12 @@ import tyro
 from rich.console import Console
 
 from agents.batches import in_every_seat, play
-from agents.command import read_options
+from agents.command import in_a_line, read_options
 from agents.config import EvaluationSettings, load_training
 from agents.evaluate import Agent, begin_round
 from agents.film import check_film, film
+from agents.folders import RESULTS, check_figures
+from agents.lessons import changed
 from agents.report import show_table, versions, write_results
 from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
@@ -30,6 +31,7 @@ from piavatar_envs.envs.config import ConfigError, load_config, parse_assignment
 from piavatar_envs.envs.draws import check_seeds
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks.base import Task
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Run:
         env_id: registered id.
         env: settings of the environment, resolved.
         evaluation: of the training.
+        observe: terms of the observation that the policy sees; None for all.
         make_agent: the agent, from the layout of the observation and the length of an action; its observations are
             ``(num_envs, 1, size)``.
     """
@@ -47,6 +50,7 @@ class Run:
     env_id: str
     env: dict[str, Any]
     evaluation: EvaluationSettings
+    observe: tuple[str, ...] | None
     make_agent: Callable[[ObservationLayout, int], Agent]
 
 
@@ -70,14 +74,14 @@ def open_run(folder: Path, device: str = "cpu") -> Run:
 
 
 def _open_rsl(settings: Path, policy: Path, device: str) -> Run:
-    from agents.batches import load_batched
-    from agents.rsl_policy import RslTraining, load_agent  # needs the extra rsl
+    from agents.rsl_policy import load_agent, load_rsl  # needs the extra rsl
 
-    config = load_batched(RslTraining, load_task, settings)
+    config = load_rsl(settings)
     return Run(
         config.env_id,
         dict(config.env),
         config.evaluation,
+        config.observe,
         lambda layout, size: load_agent(policy, config, layout, size, device),
     )
 
@@ -92,6 +96,7 @@ def _open_sb3(settings: Path, policy: Path, _device: str) -> Run:
         config.env_id,
         dict(config.env),
         config.evaluation,
+        config.observe,
         lambda layout, size: in_every_seat(load_agent(policy, config, layout, size)),
     )
 
@@ -128,7 +133,7 @@ def check_options(options: Options) -> None:
     """Refuse what can be seen to be wrong without the run.
 
     Raises:
-        ConfigError: options that do not go together, no episodes, or no pictures.
+        ConfigError: options that do not go together, no episodes, no pictures, or files that cannot be written.
         ValueError: a seed that there is not, or what is no video by its name.
     """
     if options.live and (options.out or options.film or options.episodes is not None):
@@ -136,11 +141,32 @@ def check_options(options: Options) -> None:
     if options.episodes is not None and options.episodes < 2:
         advice = "of one there is no interval; a film alone needs no --episodes"
         raise ConfigError(f"episodes={options.episodes} must be >= 2: {advice}")
-    if options.out and (options.out.suffix != ".json" or options.out.name == "results.json"):
-        raise ConfigError(f"out={options.out} must be a .json file of its own, and results.json is the training's")
+    if options.out and (options.out.suffix != ".json" or options.out.name == RESULTS):
+        raise ConfigError(f"out={options.out} must be a .json file of its own, and {RESULTS} is the training's")
+    if options.out:
+        check_figures(options.out, "play")
     check_film(options.film, options.film_every, options.film_episodes)
     if options.first_seed is not None:
         check_seeds(options.first_seed, name="first_seed")
+
+
+def environment(run: Run, assignments: Sequence[str]) -> Task:
+    """The task of a run's environment, with settings that win over those of the training.
+
+    Raises:
+        ConfigError: a setting is unknown, given twice or out of range, or makes another environment of it than the one
+            that the policy was trained for: it would play nonsense.
+    """
+    given = [assignment.removeprefix("env.") for assignment in assignments]
+    task_class = load_task(run.env_id)
+    trained = task_class(load_config(task_class.Config, run.env, {"obs_mode": "flat"}))
+    task = task_class(load_config(task_class.Config, trained.config, parse_assignments(given)))
+    if unlike := changed(trained, task, run.observe):
+        raise ConfigError(
+            f"{' '.join(given)} changes {', '.join(unlike)}: the policy was trained for other ones; leave it out, or "
+            "train a policy with it"
+        )
+    return task
 
 
 def first_seed(run: Run, options: Options) -> int:
@@ -203,28 +229,25 @@ def main(args: list[str] | None = None) -> None:
     options = read_options(Options, "play", args)
     quiet_warp()
     scores = options.film is None or options.out is not None or options.episodes is not None
-    try:
+    with in_a_line(ValueError, ImportError):
         check_options(options)
         run = open_run(options.run, options.device)
-        task_class = load_task(run.env_id)
-        settings = {name.removeprefix("env."): value for name, value in parse_assignments(options.settings).items()}
-        config = load_config(task_class.Config, run.env, settings | {"obs_mode": "flat"})
-        env = config.model_dump(mode="json")
+        task = environment(run, options.settings)
+        env = task.config.model_dump(mode="json")
         if options.live:
             watch_run(run, env, options)
             return
         episodes = (options.episodes or run.evaluation.episodes) if scores else 1
         first = first_seed(run, options)
         check_seeds(first, max(episodes, options.film_episodes), "first_seed")
-        batch = BatchedEpisodes(task_class(config), episodes, options.device)
+        batch = BatchedEpisodes(task, episodes, options.device)
         agent = run.make_agent(batch.layout, batch.action_size)
-    except (ConfigError, ValueError, ImportError) as error:
-        sys.exit(f"error: {error}")
-    if scores:
-        score_run(agent, batch, first, options, env)
-    batch.close()
-    if options.film:
-        film_run(run, agent, config.physics.control_dt, first, options, env)
+    with in_a_line(OSError, ImportError):
+        if scores:
+            score_run(agent, batch, first, options, env)
+        batch.close()
+        if options.film:
+            film_run(run, agent, task.config.physics.control_dt, first, options, env)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,13 +12,14 @@ from pydantic import AfterValidator, BaseModel, Field
 from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
-from agents.batches import BatchTraining
+from agents.batches import BatchTraining, load_batched
 from agents.checkpoint import UNREADABLE, load_whole, no_policy
 from agents.evaluate import Agent
 from agents.help import HelpSettings
 from agents.workers import components
 from piavatar_envs.envs.config import FROZEN, FrozenDict
 from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.tasks import load_task
 
 
 class RslPPOSettings(BaseModel):
@@ -69,6 +70,13 @@ class RslTraining(BatchTraining):
     lessons: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
         default_factory=dict, description="settings of the environment that differ from env while it learns"
     )
+
+
+def load_rsl(
+    source: Mapping[str, Any] | str | Path | None = None, overrides: Mapping[str, Any] | None = None
+) -> RslTraining:
+    """A resolved configuration; arguments and errors are those of :func:`agents.batches.load_batched`."""
+    return load_batched(RslTraining, load_task, source, overrides)
 
 
 def network_settings(ppo: RslPPOSettings) -> dict[str, Any]:

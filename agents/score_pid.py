@@ -6,22 +6,23 @@ which ``agents.scores`` takes as it takes those of trainings.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import tyro
 
 from agents.batches import in_every_seat, play_beside_baselines
-from agents.command import read_options
+from agents.command import in_a_line, read_options
 from agents.config import EvaluationSettings
+from agents.design import Design
 from agents.film import check_film, film
-from agents.pid_agent import Design, make_pid_agent
+from agents.folders import claim, write_config
+from agents.pid_agent import make_pid_agent
 from agents.report import conclude, versions
 from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.doctor import quiet_warp
-from piavatar_envs.envs.config import ConfigError, dump_yaml, load_config, parse_assignments
+from piavatar_envs.envs.config import load_config, parse_assignments
 from piavatar_envs.tasks import listed_name, load_task
 
 
@@ -53,27 +54,26 @@ def main(args: list[str] | None = None) -> None:
     quiet_warp()
     episodes, first = options.evaluation.episodes, options.evaluation.first_seed
     env_id = listed_name(options.env_id)
-    try:
+    folder = options.out or Path("runs") / f"pid_{env_id.rpartition('/')[2].removesuffix('-v0')}"
+    with in_a_line(ValueError):
         check_film(options.film, options.film_every)
+        claim(folder, "score_pid")
         task_class = load_task(env_id)
         config = load_config(task_class.Config, {"control": "torque"}, parse_assignments(options.settings))
-        batch = BatchedEpisodes(task_class(config), episodes, options.device)
         agent = make_pid_agent(env_id, config.model_dump(mode="json"), options.design)
-    except (ConfigError, ValueError) as error:
-        sys.exit(f"error: {error}")
+        batch = BatchedEpisodes(task_class(config), episodes, options.device)
     results = play_beside_baselines("PID", in_every_seat(agent), batch, first)
     batch.close()
-    name = env_id.rpartition("/")[2].removesuffix("-v0")
-    folder = options.out or Path("runs") / f"pid_{name}"
-    folder.mkdir(parents=True, exist_ok=True)
     settings = {"env_id": env_id, "env": config.model_dump(mode="json"), "design": asdict(options.design)}
-    (folder / "config.yaml").write_text(dump_yaml(config), encoding="utf-8")
     about = versions("score_pid", options.device) | {"seed": 0, "config": settings}
-    conclude(folder, about, results, {}, "config.yaml, results.json")
-    if options.film:
-        make = EnvFactory(env_id, config.model_dump(mode="json"), options.device)
-        film(options.film, make, {"PID": agent}, [first], 1.0 / config.physics.control_dt, options.film_every)
-        print(f"wrote {options.film}")
+    with in_a_line(OSError, ImportError):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_config(folder, config)
+        conclude(folder, about, results, {}, "config.yaml, results.json")
+        if options.film:
+            make = EnvFactory(env_id, config.model_dump(mode="json"), options.device)
+            film(options.film, make, {"PID": agent}, [first], 1.0 / config.physics.control_dt, options.film_every)
+            print(f"wrote {options.film}")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ all runs of these settings.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +18,10 @@ import tyro
 
 from agents import seeds
 from agents.batches import in_every_seat, play
-from agents.command import read_options
+from agents.command import in_a_line, read_options
 from agents.config import EvaluationSettings
 from agents.evaluate import over_seeds, random_agent
+from agents.folders import RESULTS, claim
 from agents.report import versions
 from benchmarks.runner import plain, write_json
 from piavatar_envs.api.batched import BatchedEpisodes
@@ -74,21 +74,21 @@ def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = read_options(Options, "score_random", args)
     quiet_warp()
-    try:
+    folder = options.out or Path("runs") / f"random_{options.run.resolve().name}"
+    with in_a_line(ValueError, OSError):
         check_streams(options.seeds)
+        claim(folder, "score_random")
         env_id, env = environment_of(options.run)
         task_class = load_task(env_id)
         config = load_config(task_class.Config, dict(env), parse_assignments(options.settings))
         batch = BatchedEpisodes(task_class(config), options.evaluation.episodes, options.device)
-        row = score(batch, options.evaluation.first_seed, options.seeds)
-    except (ConfigError, ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
+    row = score(batch, options.evaluation.first_seed, options.seeds)
     batch.close()
     row["first_seed"] = options.evaluation.first_seed
-    folder = options.out or Path("runs") / f"random_{options.run.resolve().name}"
     settings = {"env_id": env_id, "env": config.model_dump(mode="json")}
     about = versions("score_random", options.device) | {"seed": 0, "config": settings}
-    write_json(folder / "results.json", plain({**about, "results": [row]}, "results"))
+    with in_a_line(OSError):
+        write_json(folder / RESULTS, plain({**about, "results": [row]}, "results"))
     low, high = row["return_interval"]
     print(f"random, {options.seeds} seeds: {row['return_mean']:.1f} ({low:.1f} to {high:.1f})")
     print(f"in {folder}: results.json")
@@ -101,8 +101,9 @@ def environment_of(folder: Path) -> tuple[str, Mapping[str, Any]]:
         ConfigError: the folder's file is not that of a run.
         OSError: the folder has no ``results.json``.
     """
-    path = folder / "results.json"
-    config = json.loads(path.read_text(encoding="utf-8")).get("config", {})
+    path = folder / RESULTS
+    run = json.loads(path.read_text(encoding="utf-8"))
+    config = run.get("config", {}) if isinstance(run, dict) else {}
     if not {"env_id", "env"} <= set(config):
         raise ConfigError(f"{path} has no config.env_id and config.env; give the folder of a training or of score_pid")
     return config["env_id"], config["env"]

@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +28,8 @@ from rich.markdown import Markdown
 
 from agents import compare
 from agents.checkpoint import flattened
+from agents.command import in_a_line
+from agents.folders import check_figures, check_writable, write_whole
 from benchmarks.runner import describe_run, plain, write_json
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
@@ -250,6 +251,17 @@ def _kept(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any
     return table | {"results": [row for row in table["results"] if row["env_id"] not in known]}
 
 
+def _check_out(path: Path) -> None:
+    """Refuse a table that is none by its name, that cannot be written, or in whose place something else is."""
+    if path.suffix != ".json":
+        raise ValueError(f"out={path} must be a .json file; the same comes beside it as .md")
+    check_figures(path, "scores")
+    beside = path.with_suffix(".md")
+    check_writable(beside)
+    if beside.exists() and not path.exists():
+        raise ValueError(f"{beside} is of something else, and the table would take its place; give --out another name")
+
+
 @dataclass(frozen=True)
 class Options:
     """Sum up runs of several agents, environments and seeds in a table."""
@@ -265,14 +277,12 @@ class Options:
 def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = tyro.cli(Options, prog="python -m agents.scores", args=args)
-    try:
-        if options.out is not None and options.out.suffix != ".json":
-            raise ValueError(f"out={options.out} must be a .json file; the same comes beside it as .md")
+    with in_a_line(ValueError, OSError):
+        if options.out is not None:
+            _check_out(options.out)
         runs = {str(path): _read_run(path) for path in options.runs}
         rows = scores(runs)
         kept = _kept(options.keep, rows)
-    except (ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
     rows = sorted([*kept["results"], *rows], key=lambda row: row["env_id"])
     measured = [*runs.values(), *(run["evaluation"] for run in runs.values() if "evaluation" in run)]
     devices = sorted({one["device"]["name"] for one in measured} | set(kept["devices"]))
@@ -285,8 +295,9 @@ def main(args: list[str] | None = None) -> None:
     text = markdown(rows, about)
     if options.out is not None:
         report = {**describe_run("scores", "cpu"), "devices": devices, "commits": commits, "results": rows}
-        write_json(options.out, plain(report, "scores"))
-        options.out.with_suffix(".md").write_text(text, encoding="utf-8")
+        with in_a_line(OSError):
+            write_json(options.out, plain(report, "scores"))
+            write_whole(options.out.with_suffix(".md"), lambda file: file.write(text.encode()))
     Console(soft_wrap=True).print(Markdown(text))
 
 
