@@ -10,6 +10,7 @@ the curve of returns, an episode a row, rows are averaged until there are at mos
 from __future__ import annotations
 
 import io
+import json
 import sys
 import zipfile
 from pathlib import Path
@@ -17,7 +18,9 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+import yaml
 
+from agents.checkpoint import differences
 from agents.curve import Curve
 from agents.sb3_policy import PARAMETERS
 
@@ -61,12 +64,13 @@ def kept(run: Path) -> dict[str, bytes]:
     """What is kept of a run, by the names of files.
 
     Raises:
-        ValueError: it has not ended, or something in it cannot be read.
+        ValueError: it has not ended, or not as its configuration says; or something in it cannot be read.
     """
     missing = [name for name in NEEDED if not (run / name).is_file()]
     if missing:
         raise ValueError(f"{run} has no {missing[0]}: has the training ended?")
     files = {name: (run / name).read_bytes() for name in (*NEEDED, *WELCOME) if (run / name).is_file()}
+    check_ended(run)
     try:
         if (run / "curve.csv").is_file():
             files["curve.csv"] = shortened((run / "curve.csv").read_text(encoding="utf-8")).encode()
@@ -75,6 +79,25 @@ def kept(run: Path) -> dict[str, bytes]:
     except (ValueError, KeyError, zipfile.BadZipFile) as error:
         raise ValueError(f"{run} has something else than a training leaves: {error}") from error
     return files
+
+
+def check_ended(run: Path) -> None:
+    """Refuse a run that goes on, in which scores are left that it has had before.
+
+    Raises:
+        ValueError: the scores are of other settings than the configuration, or one of them cannot be read.
+    """
+    try:
+        had = json.loads((run / "results.json").read_text(encoding="utf-8"))["config"]
+        asked = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+        unlike = differences(had["env"] if "design" in had else had, asked)  # the PID agent's are its environment's
+    except (ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
+        raise ValueError(f"{run} has something else than a training leaves: {error}") from error
+    for name, then, now in unlike:
+        raise ValueError(
+            f"{run / 'results.json'} is of {name}={then}, and config.yaml says {now}: go on with the training "
+            "(--resume), and keep it when it has ended"
+        )
 
 
 def parameters_of(policy: bytes) -> bytes:

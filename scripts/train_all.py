@@ -1,31 +1,46 @@
 """Train published configurations, several seeds each: ``python -m scripts.train_all stand_rsl walk_sb3 --gpus 0 1``.
 
 Every training is a process of its own, some at a time on each GPU, and leaves ``runs/<configuration>_<seed>``. Those
-that have ended are left alone and those that were stopped go on from their last checkpoint, so the same command goes on
-after whatever has ended it. ``scripts.keep_run`` keeps what is worth it, ``agents.scores`` draws up the table.
+that have ended are left alone and those that were stopped, or were to be shorter, go on from their last checkpoint, so
+the same command goes on after whatever has ended it. ``scripts.keep_run`` keeps what is worth it, ``agents.scores``
+draws up the table.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
+from pydantic import BaseModel
 from rich.progress import track
 
-#: By the folder of a configuration, the script that trains by it.
+from agents.checkpoint import LENGTHS, learned_otherwise
+from agents.config import load_training
+from piavatar_envs.envs.config import parse_assignments
+
+
+def _load_rsl(source: Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> BaseModel:
+    from agents.rsl_policy import load_rsl  # needs the extra rsl
+
+    return load_rsl(source, overrides)
+
+
+#: By the folder of a configuration, the script that trains by it, and what resolves it as that script does.
 SCRIPTS = {"rsl_rl": "agents.rsl_ppo", "sb3": "agents.train"}
+LOADERS = {"rsl_rl": _load_rsl, "sb3": load_training}
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 #: Seconds between two looks at a training.
 WAIT = 0.2
@@ -39,10 +54,32 @@ class Job:
     seed: int
     folder: Path
 
-    @property
-    def is_over(self) -> bool:
-        """Whether it has ended: its scores are the last that it writes."""
-        return (self.folder / "results.json").is_file()
+    def is_over(self, settings: tuple[str, ...]) -> bool:
+        """Whether it has had all that is asked for: its scores are the last that it writes.
+
+        Args:
+            settings: that win over the file's.
+
+        Raises:
+            ValueError: the scores in its folder are of something else; or a setting is refused.
+        """
+        path = self.folder / "results.json"
+        if not path.is_file():
+            return False
+        load = LOADERS[self.config.parent.name]
+        asked = load(self.config, parse_assignments((f"seed={self.seed}", *settings))).model_dump(mode="json")
+        try:
+            # what the settings of then do not name had its default
+            had = load(json.loads(path.read_text(encoding="utf-8"))["config"]).model_dump(mode="json")
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is of no training of {self.config.stem} ({error}); remove it") from None
+        for name, then, now in learned_otherwise(had, asked):
+            raise ValueError(
+                f"{path} is of a training with {name}={then}, now it is {now}; give the same settings, or another "
+                "folder with --runs"
+            )
+        longer = any(had[name] < asked[name] for name in LENGTHS if name in asked)
+        return not longer and had["evaluation"] == asked["evaluation"]
 
     def command(self, device: str, settings: tuple[str, ...]) -> list[str]:
         """What trains it, or goes on with it."""
@@ -52,7 +89,7 @@ class Job:
 
     def run(self, gpu: str | None, settings: tuple[str, ...], time_is_up: Callable[[], bool]) -> str:
         """Train on a GPU, or without one on the CPU, until it is over or ``time_is_up``; returns what went wrong."""
-        if self.is_over or time_is_up():
+        if self.is_over(settings) or time_is_up():
             return ""
         self.folder.mkdir(parents=True, exist_ok=True)
         environment = dict(os.environ) if gpu is None else os.environ | {"CUDA_VISIBLE_DEVICES": gpu}
@@ -104,13 +141,16 @@ def main(
 
     Raises:
         OSError: the trainings cannot be written there.
-        ValueError: there is no such configuration, nothing to do at a time, or no time.
+        ValueError: there is no such configuration, nothing to do at a time, or no time; or a folder holds the scores of
+            a training by other settings.
     """
     if seeds < 1 or each < 1:
         raise ValueError(f"seeds={seeds}, each={each}: both must be >= 1")
     if minutes is not None and not minutes >= 0.0:
         raise ValueError(f"minutes={minutes} must be >= 0")
     jobs = [Job(path, n, runs / f"{path.stem}_{n}") for path in find(configs) for n in range(seeds)]
+    for job in jobs:
+        job.is_over(settings)  # refuses other trainings' folders before anything begins
     slots: SimpleQueue[str | None] = SimpleQueue()
     for _ in range(each):
         for gpu in gpus or (None,):
@@ -133,7 +173,7 @@ def main(
         finally:
             stopped.set()
     for job, words in zip(jobs, said, strict=True):
-        if words or not job.is_over:
+        if words or not job.is_over(settings):
             print(f"{job.folder}: {words or 'stopped; the same command goes on'}", file=sys.stderr)
     return int(any(said))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
 import zipfile
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from scripts import keep_run
 
@@ -19,8 +21,10 @@ def run(tmp_path):
     """A training that has ended, as it lies in its folder."""
     folder = tmp_path / "runs" / "walk_1"
     folder.mkdir(parents=True)
-    for name in ("config.yaml", "results.json", "evaluation.json"):
-        (folder / name).write_text(f"of {name}\n")
+    config = {"env_id": "Walk-v0", "total_steps": 200, "env": {"physics": {"friction": 0.8}}, "observe": None}
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
+    (folder / "results.json").write_text(json.dumps({"benchmark": "train", "config": config}))
+    (folder / "evaluation.json").write_text("of evaluation.json\n")
     rng = np.random.default_rng(2)
     rows = [f"{10 * n},{value:.6g}" for n, value in enumerate(rng.normal(100.0, 9.0, 4321), 1)]
     (folder / "curve.csv").write_text("\n".join(["step,return", *rows]) + "\n")
@@ -71,10 +75,18 @@ def only_an_optimizer(folder):
         content.writestr("policy.optimizer.pth", b"")
 
 
+def goes_on(folder):
+    """It was to be longer when it had ended, and has not ended again."""
+    path = folder / "config.yaml"
+    path.write_text(path.read_text().replace("total_steps: 200", "total_steps: 400"))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda folder: (folder / "results.json").unlink(), r"walk_2 has no results\.json"),
+        (lambda folder: (folder / "results.json").write_text("{}"), "walk_2 has something else"),
+        (goes_on, r"walk_2/results\.json is of total_steps=200, and config\.yaml says 400: go on with the training"),
         (lambda folder: (folder / "policy.zip").write_bytes(b"no archive"), "walk_2 has something else"),
         (only_an_optimizer, r"policy\.pth"),
         (lambda folder: (folder / "curve.csv").write_text(""), r"curve\.csv is empty"),

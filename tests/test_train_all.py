@@ -43,6 +43,30 @@ def test_a_training_that_is_stopped_goes_on(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "stand_sb3_0" / "log.txt").read_text().count("| 0/640 [") == 1, "it began twice"
 
 
+@pytest.mark.parametrize("stem", ["reach_sb3", "stand_rsl"])
+def test_scores_of_less_are_not_the_end_and_of_other_settings_refused(stem, tmp_path):
+    if stem.endswith("rsl"):
+        pytest.importorskip("rsl_rl", reason="needs the extra rsl")
+    (path,) = train_all.find((stem,))
+    length = "iterations" if stem.endswith("rsl") else "total_steps"
+    job = train_all.Job(path, 0, tmp_path / f"{stem}_0")
+    job.folder.mkdir()
+    results = job.folder / "results.json"
+    had = train_all.LOADERS[path.parent.name](path, {"seed": 0, length: 200}).model_dump(mode="json")
+    results.write_text(json.dumps({"config": had}))
+    assert job.is_over((f"{length}=200",)) and job.is_over((f"{length}=100", "checkpoint_every=7"))
+    assert not job.is_over((f"{length}=201",)) and not job.is_over((f"{length}=200", "evaluation.episodes=3"))
+    del had["env"]["physics"]["friction"]  # it knows nothing of it, and had the default
+    results.write_text(json.dumps({"config": had}))
+    assert job.is_over((f"{length}=200",))
+    with pytest.raises(ValueError, match=r"is of a training with ppo\.epochs=\d+, now it is 77; .* --runs"):
+        train_all.main(("walk_sb3", stem), ("ppo.epochs=77", f"{length}=200"), seeds=1, runs=tmp_path)
+    assert [folder.name for folder in tmp_path.iterdir()] == [f"{stem}_0"], "nothing was begun"
+    results.write_text("{}")
+    with pytest.raises(ValueError, match=rf"results\.json is of no training of {stem}"):
+        job.is_over(())
+
+
 def test_one_that_fails_is_named_with_its_log(tmp_path, capsys):
     assert train_all.main(("stand_rsl",), ("env.fidelity=huge",), seeds=1, runs=tmp_path) == 1
     assert "stand_rsl_0: exit" in capsys.readouterr().err
