@@ -13,6 +13,7 @@ from piavatar_envs.avatar.asset import AvatarAsset, load_body
 from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
 from piavatar_envs.avatar.joint_drive import LONGEST_SUBSTEP
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
+from piavatar_envs.envs.clearance import check_beside_solids
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.flesh import Flesh, drive_settings
@@ -138,7 +139,7 @@ class Simulation:
         """The domain, wider where joints are driven by torques, and the walls around it.
 
         Raises:
-            ConfigError: a prop would begin outside, or one of those that are configured in another.
+            ConfigError: a prop would begin outside or in a solid, or one of those that are configured in another.
         """
         own = {prop.name for prop in self.config.scene.props}  # a task places its own at every reset
         given = [(prop, rest) for prop, rest in zip(self.scene.props, solids, strict=True) if prop.name in own]
@@ -148,6 +149,7 @@ class Simulation:
         check_places(
             domain, self.dx, self.scene.props, solids, {prop.name: [prop.position] for prop in self.scene.props}
         )
+        check_beside_solids(self.dx, self.scene, solids)
         return domain, domain.walls() if walled else ()
 
     def _substeps(self, wave: float, solids: Sequence[PropPoints]) -> int:

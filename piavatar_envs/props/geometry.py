@@ -78,7 +78,7 @@ def sphere(radius: float, spacing: float) -> PropPoints:
         ValueError: a length is not positive, or the lattice too large.
     """
     _check_lengths("sphere", radius=radius, spacing=spacing)
-    distance = _primitive_distance("sphere", (radius, 0.0, 0.0))
+    distance = primitive_distance("sphere", (radius, 0.0, 0.0))
     spread = np.eye(3) * radius**2 / 5.0
     volume = 4.0 / 3.0 * np.pi * radius**3
     return _particles(_Solid("sphere", distance, volume, spread, *round_surface(radius, 0.0)), spacing)
@@ -98,7 +98,7 @@ def box(half_size: Sequence[float], spacing: float) -> PropPoints:
     if half.shape != (3,):
         raise ValueError(f"box half_size={half_size!r} needs three lengths [m], along x, y and z")
     _check_lengths("box", spacing=spacing, **{f"half_size[{axis}]": length for axis, length in enumerate(half)})
-    distance = _primitive_distance("box", half)
+    distance = primitive_distance("box", half)
     return _particles(_Solid("box", distance, 8.0 * half.prod(), np.diag(half**2) / 3.0, *box_surface(half)), spacing)
 
 
@@ -114,7 +114,7 @@ def capsule(radius: float, half_length: float, spacing: float) -> PropPoints:
         ValueError: a length is not positive, or the lattice too large.
     """
     _check_lengths("capsule", radius=radius, half_length=half_length, spacing=spacing)
-    distance = _primitive_distance("capsule", (radius, half_length, 0.0))
+    distance = primitive_distance("capsule", (radius, half_length, 0.0))
     tube, ends = 2.0 * np.pi * radius**2 * half_length, 4.0 / 3.0 * np.pi * radius**3
     # of a half ball: the centroid is 3/8 of the radius from its flat side, the mean square a fifth of its square
     across = tube * radius**2 / 4.0 + ends * radius**2 / 5.0
@@ -197,7 +197,7 @@ def _primitive_distance_kernel(
     distance[i] = solid_distance(kind, size, points[i])[3]
 
 
-def _primitive_distance(kind: str, size: Sequence[float]) -> Callable[[np.ndarray], np.ndarray]:
+def primitive_distance(kind: str, size: Sequence[float]) -> Callable[[np.ndarray], np.ndarray]:
     """Signed distances [m] ``(N, 3)`` to ``(N,)`` of a collider's shape; on the CPU whatever the simulation runs on."""
 
     def distance(points: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import warp as wp
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
+from piavatar_envs.envs.clearance import check_beside_standing
 from piavatar_envs.envs.draws import STREAM_POSE, generator
 from piavatar_envs.mpm.types import row
 
@@ -20,7 +21,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 def record_standing(env: BatchEnv, program: Program, noise: float) -> None:
-    """Append: all avatars of the masked environments stand where the scene puts them."""
+    """Append: all avatars of the masked environments stand where the scene puts them.
+
+    Raises:
+        ConfigError: something of the scene would begin inside of one.
+    """
+    check_beside_standing(env.simulation)
     for index, (avatar, config) in enumerate(zip(env.simulation.avatars, env.task.scene.avatars, strict=True)):
         limits = env.action_map.lower, env.action_map.upper
         program.launch(
