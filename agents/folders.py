@@ -32,6 +32,9 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
         path: of the file. A half of a new one, left by whoever was killed, lies beside it as ``NAME.partial``, and the
             next write replaces it; where a write fails, as on a full disk, nothing of it is left.
         write: given a file that is open for bytes.
+
+    Raises:
+        OSError: it cannot be written, as on a full disk.
     """
     partial = path.with_name(f"{path.name}.partial")
     try:
@@ -40,8 +43,12 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
-    except BaseException:
+    except BaseException as error:
         partial.unlink(missing_ok=True)
+        # where a file takes no more, torch counts its bytes instead, and finds that there are too few
+        cause = error.__context__ if isinstance(error, RuntimeError) else error
+        if isinstance(cause, OSError):
+            raise OSError(f"{path} cannot be written ({cause.strerror or cause})") from error
         raise
     if hasattr(os, "O_DIRECTORY"):  # the new name, too, must outlast a power cut; Windows has no such call
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)

@@ -7,7 +7,7 @@ already, while some (the height of a root that is held up) hardly vary, and divi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import torch
@@ -20,6 +20,9 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.rollouts import PlayedBuffer
 from agents.seeds import first_seed
 from piavatar_envs.envs.config import FROZEN
+
+#: Of the hidden layers of a network.
+Widths = tuple[Annotated[int, Field(ge=1)], ...]
 
 
 class PPOSettings(BaseModel):
@@ -42,7 +45,7 @@ class PPOSettings(BaseModel):
     clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
     entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
     log_std: float = Field(-0.5, ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")
-    hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of both networks")
+    hidden: Widths = Field((128, 128), description="widths of the hidden layers of both networks")
 
 
 class SelectTerms(BaseFeaturesExtractor):

@@ -16,6 +16,7 @@ from agents.batches import BatchTraining, load_batched
 from agents.checkpoint import UNREADABLE, load_whole, no_policy
 from agents.evaluate import Agent
 from agents.help import HelpSettings
+from agents.ppo import Widths
 from agents.workers import components
 from piavatar_envs.envs.config import FROZEN, FrozenDict
 from piavatar_envs.envs.observations import ObservationLayout
@@ -58,7 +59,7 @@ class RslPPOSettings(BaseModel):
         "hardly moves then, such as a joint that is held, is not taken for exact",
     )
     mirrored: bool = Field(False, description="whether it also learns from every step as it is in a mirror")
-    hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of both networks")
+    hidden: Widths = Field((128, 128), min_length=1, description="widths of the hidden layers of both networks")
 
 
 class RslTraining(BatchTraining):

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.ppo import networks
+from agents.ppo import Widths, networks
 from agents.seeds import first_seed
 from piavatar_envs.envs.config import FROZEN
 
@@ -36,7 +36,7 @@ class SACSettings(BaseModel):
         1.0, gt=0.0, description="factor on what the networks see of a reward [-]; discounted returns should be about 1"
     )
     averaging: float = Field(0.01, gt=0.0, le=1.0, description="share of the critics in an update of their average [-]")
-    hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of all networks")
+    hidden: Widths = Field((128, 128), description="widths of the hidden layers of all networks")
 
 
 def build(settings: SACSettings, venv: VecEnv, components: Sequence[int], seed: int) -> SAC:

@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 from skrl.memories.torch import RandomMemory
 from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
 
+from agents.ppo import Widths
 from piavatar_envs.envs.config import FROZEN
 
 
@@ -31,7 +32,7 @@ class MAPPOSettings(BaseModel):
     entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
     largest_gradient: float = Field(0.5, ge=0.0, description="norm to which gradients are clipped [-]; 0 for never")
     log_std: float = Field(-0.7, ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")
-    hidden: tuple[int, ...] = Field((128, 128), description="widths of the hidden layers of both networks")
+    hidden: Widths = Field((128, 128), description="widths of the hidden layers of both networks")
 
 
 def layers(seen: int, hidden: Sequence[int], out: int) -> torch.nn.Sequential:

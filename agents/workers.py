@@ -116,9 +116,11 @@ def components(layout: ObservationLayout, observe: tuple[str, ...] | None) -> li
     """Places in the flat observation of the named terms; all of it for None.
 
     Raises:
-        ConfigError: there is no such term.
+        ConfigError: there is no such term, or none is named.
     """
     names = tuple(layout) if observe is None else observe
+    if not names:
+        raise ConfigError(f"observe=[] shows the networks nothing; use some of {', '.join(layout)}, or null for all")
     unknown = [name for name in names if name not in layout]
     if unknown:
         raise ConfigError(f"observe: there is no term {unknown[0]!r}; use some of {', '.join(layout)}")

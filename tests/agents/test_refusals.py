@@ -52,6 +52,7 @@ def test_a_training_says_how_long_it_was_also_if_no_episode_ended(ended):
     [
         (("total_steps=1",), "has had 64 steps, total_steps=1; ask for as many or more"),
         (("observe=[tail]",), "observe"),
+        (("observe=[]",), "was written with observe=None, now it is []"),
         (("seed=5",), "was written with seed=0, now it is 5"),
     ],
 )
@@ -79,11 +80,19 @@ def test_a_resumed_batch_that_is_refused_changes_nothing(tmp_path):
     assert contents(out) == before
 
 
-def test_a_training_that_is_refused_leaves_no_folder(device, tmp_path):
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("observe=[tail]", "there is no term 'tail'"),
+        ("observe=[]", "observe=[] shows the networks nothing; use some of root_height"),
+        ("ppo.hidden=[8, 0]", "must be >= 1"),
+    ],
+)
+def test_a_training_that_is_refused_leaves_no_folder(setting, words, device, tmp_path):
     path = tmp_path / "tiny.yaml"
     path.write_text(dump_yaml(load_training(TINY)))
-    line = (str(path), "observe=[tail]", "--out", str(tmp_path / "new" / "run"), "--device", device)
-    assert "there is no term 'tail'" in refused(train.main, *line)
+    line = (str(path), setting, "--out", str(tmp_path / "new" / "run"), "--device", device)
+    assert words in refused(train.main, *line)
     assert not (tmp_path / "new" / "run").exists()
 
 

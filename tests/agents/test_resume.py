@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import re
 import time
 from pathlib import Path
@@ -205,6 +207,16 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
 
     with pytest.raises(OSError, match="no space"):
         write_whole(path, fail)
+    assert path.read_bytes() == b"old" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+    class Full(io.BytesIO):
+        """A disk that takes no more; torch hides its words behind its own."""
+
+        def write(self, content):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match=r"file cannot be written \(No space left on device\)"):
+        write_whole(path, lambda _: torch.save({"weight": torch.zeros(9)}, Full()))
     assert path.read_bytes() == b"old" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
     write_whole(path, lambda file: file.write(b"new"))
     assert path.read_bytes() == b"new" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
