@@ -62,10 +62,15 @@ def observations(trial: Trial) -> Iterator[str]:
 
 
 def numbers(trial: Trial) -> Iterator[str]:
-    """All that the task writes is finite, and rewards are in their range."""
+    """All that the task writes is finite and has a name, and rewards are in their range."""
     run = trial.run
     for name in trial.watch.names():
         yield f"{name} is not finite in some step, and counts as 0; look for a division by zero, or a negative root"
+    for name, (declared, written) in trial.watch.beyond().items():
+        yield (
+            f"{name} declares {declared} names, and {written} columns are written: those beyond are the next "
+            "environment's, or nobody's; name them, or write fewer"
+        )
     failed = int((run["failure"] != 0).any(0).sum())
     if failed:
         yield (

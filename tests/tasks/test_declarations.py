@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from piavatar_envs.api.check import TaskError, check_task
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.envs.finite import FiniteWatch
@@ -96,3 +97,10 @@ def test_columns_beyond_those_declared_are_seen_and_hurt_nobody(device, declared
     columns = min(2, task.columns[0])
     assert batch.terms.shape == (3, 1, 2) and (batch.terms.numpy()[:, 0, :columns] == 1.0).all()
     assert batch.reward.numpy().tolist() == [[float(columns)]] * 3
+
+
+def test_check_task_tells_what_is_written_beyond_the_names(device):
+    told = "reward_terms declares 2 names, and 3 columns are written: .* name them, or write fewer"
+    with pytest.raises(TaskError, match=told):
+        check_task(type("Wide", (Plain,), {"columns": (3, 1, 1)}), steps=4, device=device)
+    check_task(Plain, steps=4, device=device)
