@@ -44,8 +44,8 @@ def check_task(
 
     That the same seed and actions give the same run; that environment ``i`` of a batch is the single environment of
     seed + ``i``; that what the task observes is in its space and changes, and all its numbers are finite and have
-    names; that returned arrays are the caller's own; that bad actions are refused; that a masked reset and an observation leave
-    everything else alone; and that a restored state goes on as it did.
+    names; that returned arrays are the caller's own; that bad actions are refused; that a masked reset and an
+    observation leave everything else alone; and that a restored state goes on as it did.
 
     Args:
         task: its id, its class, or ``"module:id"``; of one agent or several.
