@@ -28,6 +28,21 @@ FREE = ("seed", "checkpoint_every")
 UNTRAINED = ("zero", "random")
 
 
+def read_run(path: Path) -> dict[str, Any]:
+    """What a run has left as its ``results.json``.
+
+    Raises:
+        OSError: there is no such file.
+        ValueError: the file is something else.
+    """
+    run = json.loads(path.read_text(encoding="utf-8"))
+    needed = ("benchmark", "config", "seed", "results", "commit", "device", "versions")
+    missing = [name for name in needed if not (isinstance(run, dict) and name in run)]
+    if missing:
+        raise ValueError(f"{path} has no {missing[0]!r}; give runs of agents.train, agents.rsl_ppo or agents.score_pid")
+    return run
+
+
 def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """One report for several runs.
 
@@ -111,7 +126,7 @@ def main(args: list[str] | None = None) -> None:
         if options.out is not None:
             check_figures(options.out, "compare")
         files = [path / "results.json" if path.is_dir() else path for path in options.runs]
-        report = summarize({str(path): json.loads(path.read_text(encoding="utf-8")) for path in files})
+        report = summarize({str(path): read_run(path) for path in files})
     if options.out is not None:
         with in_a_line(OSError):
             write_json(options.out, plain(report, "compare"))

@@ -29,7 +29,7 @@ from rich.markdown import Markdown
 from agents import compare
 from agents.checkpoint import flattened
 from agents.command import in_a_line
-from agents.folders import check_figures, check_writable, write_whole
+from agents.folders import RESULTS, check_figures, check_writable, write_whole
 from benchmarks.runner import describe_run, plain, write_json
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
@@ -197,18 +197,11 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _read(path: Path) -> dict[str, Any]:
-    run = json.loads(path.read_text(encoding="utf-8"))
-    missing = [name for name in ("benchmark", "config", "seed", "results") if name not in run]
-    if missing or not all("success_once" in row for row in run["results"]):
-        what = f"has no {missing[0]!r}" if missing else "holds matches of competing agents"
-        raise ValueError(f"{path} {what}; give runs of agents.train with one aim, agents.rsl_ppo or agents.score_pid")
-    return run
-
-
 def _read_run(folder: Path) -> dict[str, Any]:
     """Its ``results.json``; with a later evaluation, that one's row of the policy, and all of it as ``evaluation``."""
-    run, path = _read(folder / "results.json"), folder / "evaluation.json"
+    run, path = compare.read_run(folder / RESULTS), folder / "evaluation.json"
+    if not all("success_once" in row for row in run["results"]):
+        raise ValueError(f"{folder / RESULTS} holds matches of competing agents; give runs of agents with one aim")
     if not path.is_file():
         return run
     evaluation = json.loads(path.read_text(encoding="utf-8"))
@@ -220,6 +213,9 @@ def _read_run(folder: Path) -> dict[str, Any]:
 
 def _check_evaluation(evaluation: Mapping[str, Any], run: Mapping[str, Any], folder: Path, path: Path) -> None:
     """Refuse what is no evaluation of this run's policy in the same episodes; a task is known by its settings."""
+    anew = f"write it anew: python -m agents.play {folder} --out {path}"
+    if evaluation.get("date", "") < run.get("date", ""):
+        raise ValueError(f"{path} is older than {folder / RESULTS}: the policy has learned since; {anew}")
     seeds = {row["case"]: row["first_seed"] for row in run["results"] if row["case"] == "trained"}
     if not seeds:
         raise ValueError(f"{path} is of a policy, but {folder / 'results.json'} has no row 'trained'; remove {path}")
@@ -234,8 +230,7 @@ def _check_evaluation(evaluation: Mapping[str, Any], run: Mapping[str, Any], fol
     for key in wanted | found:
         if found.get(key) != wanted.get(key):
             raise ValueError(
-                f"{path} has {key}={found.get(key)!r}, of this run it would have {wanted.get(key)!r}; write it anew: "
-                f"python -m agents.play {folder} --out {path}"
+                f"{path} has {key}={found.get(key)!r}, of this run it would have {wanted.get(key)!r}; {anew}"
             )
 
 

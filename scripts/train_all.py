@@ -63,11 +63,10 @@ class Job:
         Raises:
             ValueError: the scores in its folder are of something else; or a setting is refused.
         """
-        path = self.folder / "results.json"
+        load, path = LOADERS[self.config.parent.name], self.folder / "results.json"
+        asked = load(self.config, parse_assignments((f"seed={self.seed}", *settings))).model_dump(mode="json")
         if not path.is_file():
             return False
-        load = LOADERS[self.config.parent.name]
-        asked = load(self.config, parse_assignments((f"seed={self.seed}", *settings))).model_dump(mode="json")
         try:
             # what the settings of then do not name had its default
             had = load(json.loads(path.read_text(encoding="utf-8"))["config"]).model_dump(mode="json")
@@ -141,8 +140,9 @@ def main(
 
     Raises:
         OSError: the trainings cannot be written there.
-        ValueError: there is no such configuration, nothing to do at a time, or no time; or a folder holds the scores of
-            a training by other settings.
+        ImportError: a configuration is for an extra that is not installed.
+        ValueError: there is no such configuration, nothing to do at a time, or no time; or a setting is refused, or a
+            folder holds the scores of a training by other settings.
     """
     if seeds < 1 or each < 1:
         raise ValueError(f"seeds={seeds}, each={each}: both must be >= 1")
@@ -150,7 +150,7 @@ def main(
         raise ValueError(f"minutes={minutes} must be >= 0")
     jobs = [Job(path, n, runs / f"{path.stem}_{n}") for path in find(configs) for n in range(seeds)]
     for job in jobs:
-        job.is_over(settings)  # refuses other trainings' folders before anything begins
+        job.is_over(settings)  # refuses settings, and other trainings' folders, before anything begins
     slots: SimpleQueue[str | None] = SimpleQueue()
     for _ in range(each):
         for gpu in gpus or (None,):
@@ -202,5 +202,5 @@ if __name__ == "__main__":
             signal.signal(getattr(signal, name), as_by_ctrl_c)
     try:
         sys.exit(tyro.cli(main, description=__doc__))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         sys.exit(f"error: {error}")

@@ -60,7 +60,7 @@ def test_scores_of_less_are_not_the_end_and_of_other_settings_refused(stem, tmp_
     results.write_text(json.dumps({"config": had}))
     assert job.is_over((f"{length}=200",))
     with pytest.raises(ValueError, match=r"is of a training with ppo\.epochs=\d+, now it is 77; .* --runs"):
-        train_all.main(("walk_sb3", stem), ("ppo.epochs=77", f"{length}=200"), seeds=1, runs=tmp_path)
+        train_all.main((f"walk_{stem[-3:]}", stem), ("ppo.epochs=77", f"{length}=200"), seeds=1, runs=tmp_path)
     assert [folder.name for folder in tmp_path.iterdir()] == [f"{stem}_0"], "nothing was begun"
     results.write_text("{}")
     with pytest.raises(ValueError, match=rf"results\.json is of no training of {stem}"):
@@ -68,9 +68,16 @@ def test_scores_of_less_are_not_the_end_and_of_other_settings_refused(stem, tmp_
 
 
 def test_one_that_fails_is_named_with_its_log(tmp_path, capsys):
-    assert train_all.main(("stand_rsl",), ("env.fidelity=huge",), seeds=1, runs=tmp_path) == 1
-    assert "stand_rsl_0: exit" in capsys.readouterr().err
-    assert "huge" in (tmp_path / "stand_rsl_0" / "log.txt").read_text()
+    assert train_all.main(("stand_sb3",), (*SMALL, "observe=[tail]"), seeds=1, runs=tmp_path) == 1
+    assert "stand_sb3_0: exit" in capsys.readouterr().err
+    assert "tail" in (tmp_path / "stand_sb3_0" / "log.txt").read_text()
+
+
+@pytest.mark.parametrize("setting", ["env.fidelity=huge", "seed=3", "total_steps"])
+def test_settings_that_are_none_are_refused_before_anything_begins(setting, tmp_path):
+    with pytest.raises(ValueError, match=setting.partition("=")[0].rpartition(".")[2]):
+        train_all.main(("stand_sb3",), (setting,), seeds=1, runs=tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
 
 
 def test_every_published_training_has_a_job_and_others_are_refused():

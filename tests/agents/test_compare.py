@@ -59,7 +59,7 @@ def test_how_often_a_training_is_saved_does_not_matter(runs):
     assert report["seeds"] == [0, 1] and "checkpoint_every" not in report["config"]
 
 
-def test_what_cannot_be_compared_is_refused(runs):
+def test_what_cannot_be_compared_is_refused(runs, tmp_path):
     first, second = (json.loads((run / "results.json").read_text()) for run in runs[:2])
     other = copy.deepcopy(second)
     other["config"]["ppo"]["epochs"] = 7
@@ -74,3 +74,7 @@ def test_what_cannot_be_compared_is_refused(runs):
         compare.summarize({"a": games[0], "b": games[1]})
     with pytest.raises(SystemExit, match=r"error: .*nowhere"):
         compare.main([str(runs[0]), "nowhere.json"])
+    for content in ("[]", "{}"):
+        (tmp_path / "other.json").write_text(content)
+        with pytest.raises(SystemExit, match=r"error: .*other\.json has no 'benchmark'; give runs of"):
+            compare.main([str(runs[0]), str(tmp_path / "other.json")])

@@ -170,14 +170,15 @@ def test_a_setting_that_the_training_did_not_know_has_its_default_in_a_later_eva
         ("push", {"env": {"physics": {"fidelity": "coarse"}, "speed": 1.0}}, "env.speed=1.0, .* None"),
         ("push", {"results": [row("trained", 60.0, first_seed=8)]}, "first_seed.trained=8, .* 7"),
         ("push", {"results": []}, "first_seed.trained=None, .* 7"),
+        ("push", {"date": "2026-01-01T00:00:01+00:00"}, "is older than .*results.json"),
         ("stand_pid", {}, r"is of a policy, but .*results.json has no row 'trained'; remove"),
     ],
 )
 def test_evaluations_of_something_else_are_refused(run_name, more, words, runs, tmp_path):
     folder = tmp_path / run_name
     folder.mkdir()
-    (folder / "results.json").write_text(json.dumps(runs[run_name]))
-    later(folder, **more)
+    (folder / "results.json").write_text(json.dumps(runs[run_name] | {"date": "2026-01-01T00:00:02+00:00"}))
+    later(folder, **{"date": "2026-01-01T00:00:02+00:00"} | more)
     with pytest.raises(SystemExit, match=f"error: .*evaluation.json (has )?{words}") as refused:
         scores.main([str(folder)])
     assert run_name == "stand_pid" or f"python -m agents.play {folder} --out" in str(refused.value)
