@@ -20,7 +20,7 @@ from agents.command import in_a_line, read_options
 from agents.config import TrainingConfig, load_training
 from agents.evaluate import Evaluation, baselines, evaluate, policy_agent, separated
 from agents.film import film
-from agents.folders import claim, hold
+from agents.folders import RESULTS, claim, hold
 from agents.ik import ReachIK
 from agents.report import draw_curve, show_table, versions, write_results
 from agents.train import train
@@ -93,6 +93,9 @@ def run(options: Options, console: Console) -> Outcome:
     venv = start_workers(make, config.num_workers)
     try:
         references = play_references(config, venv, facts)
+        # of a demo that is stopped from here on, too, the next one knows that it was one, and takes its place
+        about = versions("demo", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
+        write_results(options.out / RESULTS, about, [evaluation for evaluation, _ in references], {})
         deadline = begun + options.seconds - _RESERVE * _time_after(options, config, facts, references)
         untrained = ppo.build(config.ppo, venv, seen, config.seed)
         before = policy_agent(copy.deepcopy(untrained.policy))
@@ -117,8 +120,7 @@ def run(options: Options, console: Console) -> Outcome:
         separated=separated(trained, references[:2]),
     )
     figures = {key: value for key, value in vars(outcome).items() if key != "evaluations"}
-    about = versions("demo", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
-    write_results(options.out / "results.json", about, outcome.evaluations, figures)
+    write_results(options.out / RESULTS, about, outcome.evaluations, figures)
     return outcome
 
 

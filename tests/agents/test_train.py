@@ -173,13 +173,22 @@ def test_the_command_line_trains_and_refuses(tiny, device, tmp_path, capsys):
     assert str(refused.value) == "error: ppo.epoch is no setting of TrainingConfig; did you mean ppo.epochs?"
 
 
-def test_the_demo_leaves_what_it_promises(device, tmp_path):
+def test_the_demo_leaves_what_it_promises_after_one_that_was_stopped(device, tmp_path, monkeypatch):
     settings = (
         "env.fidelity=tiny", "env.episode_seconds=0.3", "total_steps=64", "num_workers=2", "ppo.rollout_steps=16",
         "ppo.batch_size=16", "evaluation.episodes=2", "env.render.width=64", "env.render.height=64",
     )  # fmt: skip
     pytest.importorskip("imageio_ffmpeg", reason="needs the extra render")
-    outcome = demo.run(demo.Options(settings=settings, out=tmp_path, seed=4), Console(quiet=True))
+    options = demo.Options(settings=settings, out=tmp_path, seed=4)
+
+    def stopped(*args, **kwargs):
+        (tmp_path / "policy.zip").write_bytes(b"learned")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(demo, "train", stopped)
+        demo.run(options, Console(quiet=True))
+    outcome = demo.run(options, Console(quiet=True))
     assert [e.agent for e in outcome.evaluations] == ["zero", "random", "scripted IK", "trained"]
     assert len({tuple(e.seed for e in evaluation.episodes) for evaluation in outcome.evaluations}) == 1
     for name in ("policy.zip", "curve.png", "before_after.mp4", "config.yaml", "results.json"):
