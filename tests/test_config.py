@@ -91,6 +91,9 @@ def test_all_errors_come_in_one_line_with_their_file(tmp_path):
 
 def test_files_that_cannot_be_read(tmp_path):
     assert "cannot read the configuration" in refusal(tmp_path / "none.yaml")
+    endless = tmp_path / "endless.yaml"
+    endless.write_text("drive: &d {tone: 0.3, more: *d}")
+    assert "has a value that holds itself; write it out" in refusal(endless)
     broken = tmp_path / "broken.yaml"
     broken.write_text("physics: [1,\n")
     assert f"{broken} is not YAML" in refusal(broken)

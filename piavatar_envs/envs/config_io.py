@@ -122,6 +122,10 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
         raise ConfigError(f"{path} is not YAML: {_one_line(error)}") from None
     if content is not None and not isinstance(content, dict):
         raise ConfigError(f"{path} holds a {type(content).__name__}, not settings; write lines of KEY: VALUE")
+    try:
+        json.dumps(content, default=str, skipkeys=True)
+    except ValueError:  # an alias (*name) within its own anchor (&name)
+        raise ConfigError(f"{path} has a value that holds itself; write it out instead of by an alias") from None
     return content or {}
 
 
