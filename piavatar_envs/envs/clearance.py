@@ -1,7 +1,7 @@
 """Things that would begin inside one another, from which they fly apart or in which they stick.
 
 Contact is allowed, and more: what reaches less than a grid spacing into another is pushed out, and arms, which hold and
-embrace, may be anywhere.
+embrace, may be anywhere. Only what is configured is looked at: a task places what it adds itself at every reset.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.skeleton import JOINT_NAMES
-from piavatar_envs.envs.config import AvatarConfig, ColliderConfig, ConfigError, PropConfig, SceneConfig
+from piavatar_envs.envs.config import AvatarConfig, ColliderConfig, ConfigError, PropConfig
 from piavatar_envs.envs.subjects import GROUND
 from piavatar_envs.mpm.colliders import COLLIDER_KINDS
 from piavatar_envs.props.geometry import PropPoints, primitive_distance
@@ -33,92 +33,126 @@ _FIRM = [
 #: Middles of small things that are so near to a particle of flesh are inside [grid spacings]. The lattice of flesh is
 #: 0.57 wide: no point in it is farther than 0.5 from a particle, and the skin is some 0.3 from the outermost.
 WITHIN = 0.4
+#: Points along half of a box's edge, at most.
+MOST_POINTS = 20
 #: How far the message looks for room [m].
 _FARTHEST_MOVE = 3.0
 
 
 @dataclass(frozen=True)
-class _Solid:
-    """A prop or a collider as a shape.
+class _Thing:
+    """A prop or a collider where it is.
 
     Attributes:
         name: what messages call it.
         middle: of its shape [m].
         distance: signed distance of points from its surface, negative inside, ``(N, 3)`` to ``(N,)`` [m].
-        bounded: whether it has a middle; a plane has none.
+        inner: points all over it, ``(N, 3)`` [m]; a plane, which has no middle, has none.
+        lift: the way in which it is moved where aside is farther: props up, colliders down.
     """
 
     name: str
     middle: np.ndarray
     distance: Callable[[np.ndarray], np.ndarray]
-    bounded: bool = True
+    inner: np.ndarray
+    lift: float
+
+    @property
+    def bounded(self) -> bool:
+        """Whether it has an end, as all but planes have."""
+        return len(self.inner) > 0
 
 
-def _solid(name: str, thing: PropConfig | ColliderConfig, kind: str) -> _Solid:
-    size = (*thing.size, 0.0, 0.0, 0.0)[:3]
-    turn, middle = Rotation.from_quat(np.roll(thing.rotation, -1)), np.array(thing.position)
-    local = primitive_distance(kind, size)
-    return _Solid(name, middle, lambda points: local(turn.inv().apply(points - middle)), kind != "plane")
+def _distance(kind: str, thing: PropConfig | ColliderConfig, turn: Rotation) -> Callable[[np.ndarray], np.ndarray]:
+    """Signed distances [m] from where a thing is; none from a mesh, which is known by its particles alone."""
+    if kind not in COLLIDER_KINDS:
+        return lambda points: np.full(len(points), np.inf)
+    local = primitive_distance(kind, (*thing.size, 0.0, 0.0, 0.0)[:3])  # a size of another length is refused later
+    return lambda points: local(turn.inv().apply(points - np.array(thing.position)))
 
 
-def _colliders(scene: SceneConfig) -> list[_Solid]:
-    return [_solid(f"collider {collider.name!r}", collider, collider.kind) for collider in scene.colliders]
+def _collider(collider: ColliderConfig, dx: float) -> _Thing:
+    turn, middle = Rotation.from_quat(np.roll(collider.rotation, -1)), np.array(collider.position)
+    size = (*collider.size, 0.0, 0.0, 0.0)[:3]
+    ends = {"box": size, "capsule": (0.0, 0.0, size[1]), "sphere": (0.0, 0.0, 0.0)}
+    inner = np.empty((0, 3))
+    if collider.kind in ends:
+        axes = [np.linspace(-end, end, 1 + 2 * min(math.ceil(end / dx), MOST_POINTS)) for end in ends[collider.kind]]
+        inner = middle + turn.apply(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3))
+    name = GROUND if collider.name == GROUND else f"collider {collider.name!r}"
+    return _Thing(name, middle, _distance(collider.kind, collider, turn), inner, -1.0)
 
 
-def check_beside_solids(dx: float, scene: SceneConfig, points: Sequence[PropPoints]) -> None:
+def _prop(prop: PropConfig, rest: PropPoints) -> _Thing:
+    turn, middle = Rotation.from_quat(np.roll(prop.rotation, -1)), np.array(prop.position)
+    inner = middle + turn.apply(rest.rest)
+    return _Thing(f"prop {prop.name!r}", middle, _distance(prop.shape, prop, turn), inner, 1.0)
+
+
+def check_beside_solids(
+    dx: float, ground: bool, colliders: Sequence[ColliderConfig], props: Sequence[tuple[PropConfig, PropPoints]]
+) -> None:
     """Refuse props that would begin in the floor or in a collider.
 
     Args:
         dx: grid spacing [m].
-        scene: what is in the world.
-        points: particles of its props.
+        ground: whether there is a floor.
+        colliders: those that are configured.
+        props: likewise, each with its particles.
 
     Raises:
         ConfigError: there are such.
     """
-    solids = _colliders(scene)
-    if scene.ground:
-        solids.insert(0, _solid(GROUND, ColliderConfig(name=GROUND, kind="plane"), "plane"))
-    for prop, rest in zip(scene.props, points, strict=True):
-        matter = prop.position + Rotation.from_quat(np.roll(prop.rotation, -1)).apply(rest.rest)
+    floor = [ColliderConfig(name=GROUND, kind="plane")] if ground else []
+    solids = [_collider(collider, dx) for collider in (*floor, *colliders)]
+    for prop, rest in props:
+        thing = _prop(prop, rest)
+        matter = np.vstack([thing.inner, thing.middle])
         for solid in solids:
-            deep = -solid.distance(np.vstack([matter, prop.position]))
+            deep = -solid.distance(matter)
             # most of it is, or more than contact is
             if deep[-1] > 0.0 or deep.max() > dx:
-                way = _way_out(solid, np.array(prop.position), dx)
-                move = _room(lambda s, solid=solid, matter=matter, way=way: solid.distance(matter + s * way), dx)
-                _refuse(f"prop {prop.name!r}", deep.max(), solid.name, dx, move, way)
+                ways = _ways(solid, thing.middle, thing.lift, dx)
+                move = _shortest(
+                    ways, lambda by, solid=solid, matter=matter: solid.distance(matter + by).min() >= 0, dx
+                )
+                _refuse(thing.name, deep.max(), solid.name, dx, move)
 
 
 def check_beside_standing(simulation: Simulation) -> None:
     """Refuse props and colliders that would begin in an avatar that stands where the scene puts it.
 
-    The props are those that are configured: a task places its own at every reset.
-
     Raises:
         ConfigError: there are such.
     """
-    own = {prop.name for prop in simulation.config.scene.props}
-    solids = _colliders(simulation.scene)
-    solids += [
-        _solid(f"prop {prop.name!r}", prop, prop.shape)
-        for prop in simulation.scene.props
-        if prop.name in own and prop.shape in COLLIDER_KINDS
-    ]
-    if not solids:
+    dx, given = simulation.dx, simulation.config.scene
+    points = dict(zip((prop.name for prop in simulation.scene.props), simulation.props.points, strict=True))
+    things = [_collider(collider, dx) for collider in given.colliders]
+    things += [_prop(prop, points[prop.name]) for prop in given.props]
+    if not things:
         return
     names = simulation.subjects.names
     for name, avatar, flesh in zip(names, simulation.scene.avatars, simulation.flesh, strict=False):
         firm = np.isin(flesh.sampled.skin_joints[:, 0], _FIRM)
-        body = _standing(avatar, flesh.points.rest[0][firm])
+        body, depth = _standing(avatar, flesh.points.rest[0][firm]), flesh.sampled.depth[firm]
         tree = cKDTree(body)
-        for solid in solids:
-            deep = -solid.distance(body)
-            inside = solid.bounded and tree.query(solid.middle)[0] < WITHIN * simulation.dx
-            if inside or deep.max() > simulation.dx:
-                way = -_way_out(solid, np.array([*avatar.position, solid.middle[2]]), simulation.dx)
-                move = _room(lambda s, solid=solid, body=body, way=way: solid.distance(body - s * way), simulation.dx)
-                _refuse(solid.name, max(deep.max(), 0.0), name, simulation.dx, move, way)
+
+        def depth_of(points: np.ndarray, tree: cKDTree = tree, depth: np.ndarray = depth) -> np.ndarray:
+            """How deep points are below the skin [m], 0 outside."""
+            near, index = tree.query(points)
+            return np.where(near < WITHIN * dx, depth[index], 0.0)
+
+        for thing in things:
+            deep = max((-thing.distance(body)).max(), depth_of(thing.inner).max(initial=0.0))
+            if deep > dx or (thing.bounded and depth_of(thing.middle) > 0.0):
+
+                def is_out(by: np.ndarray, thing: _Thing = thing, body: np.ndarray = body, depth_of=depth_of) -> bool:
+                    """Whether nothing of the thing is inside any more, once it has been moved."""
+                    return thing.distance(body - by).min() >= 0.0 and not depth_of(thing.inner + by).any()
+
+                # away from the body, which is as seen from a plane below its slope
+                ways = [-way for way in _ways(thing, np.array([*avatar.position, thing.middle[2]]), -thing.lift, dx)]
+                _refuse(thing.name, max(deep, 0.0), name, dx, _shortest(ways, is_out, dx))
 
 
 def _standing(avatar: AvatarConfig, rest: np.ndarray) -> np.ndarray:
@@ -126,31 +160,38 @@ def _standing(avatar: AvatarConfig, rest: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec([0.0, 0.0, avatar.yaw]).apply(rest) + np.array([*avatar.position, 0.0])
 
 
-def _way_out(solid: _Solid, middle: np.ndarray, dx: float) -> np.ndarray:
-    """Unit vector along which what has its ``middle`` [m] there leaves a solid: aside; of a plane, up its slope."""
-    if not solid.bounded:
-        ends = solid.distance(np.array([middle + dx * axis for axis in np.eye(3)])) - solid.distance(middle[None])
-        return ends / np.linalg.norm(ends)
-    way = (middle - solid.middle) * (1.0, 1.0, 0.0)
+def _ways(thing: _Thing, middle: np.ndarray, lift: float, dx: float) -> list[np.ndarray]:
+    """Unit vectors along which what has its ``middle`` [m] there may leave a thing: aside, up or down by ``lift``.
+
+    Of a plane it is up its slope.
+    """
+    if not thing.bounded:
+        ends = thing.distance(np.array([middle + dx * axis for axis in np.eye(3)])) - thing.distance(middle[None])
+        return [ends / np.linalg.norm(ends)]
+    way = (middle - thing.middle) * (1.0, 1.0, 0.0)
     length = np.linalg.norm(way)
-    return way / length if length > 0.01 else np.array([0.0, 1.0, 0.0])
+    aside = way / length if length > 0.01 else np.array([0.0, 1.0, 0.0])
+    return [aside, np.array([0.0, 0.0, lift])]
 
 
-def _room(distances: Callable[[float], np.ndarray], dx: float) -> float | None:
-    """How far to move until nothing is inside any more [m]; None where that is too far."""
+def _shortest(ways: Sequence[np.ndarray], is_out: Callable[[np.ndarray], bool], dx: float) -> np.ndarray | None:
+    """The shortest move after which nothing is inside any more [m], ``(3,)``; None where all are too far."""
     for step in range(1, math.ceil(_FARTHEST_MOVE / (0.25 * dx))):
-        if distances(0.25 * dx * step).min() >= 0.0:
-            return 0.25 * dx * step
+        for way in ways:
+            if is_out(0.25 * dx * step * way):
+                return 0.25 * dx * step * way
     return None
 
 
-def _refuse(what: str, deep: float, where: str, dx: float, move: float | None, way: np.ndarray) -> None:
+def _refuse(what: str, deep: float, where: str, dx: float, move: np.ndarray | None) -> None:
     """Say how deep something begins in something else, and how to get it out.
 
     Raises:
         ConfigError: always.
     """
-    along = [round(float(part), 2) + 0.0 for part in way]
-    remedy = "place it elsewhere, or make it smaller" if move is None else f"move it by {move:.2g} m along {along}"
+    remedy = "place it elsewhere, or make it smaller"
+    if move is not None:
+        length = float(np.linalg.norm(move))
+        remedy = f"move it by {length:.2g} m along {[round(float(part), 2) + 0.0 for part in move / length]}"
     inside = f"{deep:.2g} m deep inside {where}" if deep > dx else f"with its middle inside {where}"
     raise ConfigError(f"{what} would begin {inside}; less than a grid spacing ({dx:.2g} m) is contact; {remedy}")

@@ -149,7 +149,7 @@ class Simulation:
         check_places(
             domain, self.dx, self.scene.props, solids, {prop.name: [prop.position] for prop in self.scene.props}
         )
-        check_beside_solids(self.dx, self.scene, solids)
+        check_beside_solids(self.dx, self.scene.ground, self.config.scene.colliders, given)
         return domain, domain.walls() if walled else ()
 
     def _substeps(self, wave: float, solids: Sequence[PropPoints]) -> int:

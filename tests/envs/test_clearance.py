@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.envs.config import ColliderConfig, ConfigError, PropConfig, load_config, replace
+from piavatar_envs.multi.sumo_v0 import SumoTask
 from piavatar_envs.tasks import load_task
 
 REACH = "PIAvatar/Reach-v0"
@@ -17,9 +18,9 @@ CRATE = {"name": "crate", "kind": "box", "size": [0.3, 0.3, 0.3]}
 FLOOR = {"name": "floor", "kind": "plane"}
 
 
-def build(device, env_id=REACH, **scene) -> BatchEnv:
-    task = load_task(env_id)
-    return BatchEnv(task(load_config(task.Config, None, {"fidelity": "tiny", "scene": scene})), 1, device)
+def build(device, task=REACH, fidelity="tiny", **scene) -> BatchEnv:
+    cls = load_task(task)
+    return BatchEnv(cls(load_config(cls.Config, None, {"fidelity": fidelity, "scene": scene})), 1, device)
 
 
 INSIDE = {
@@ -77,3 +78,86 @@ def test_a_ball_may_lie_in_a_hand(device):
 
 def test_who_does_not_stand_is_not_taken_to_stand(device):
     build(device, "PIAvatar/GetUp-v0", props=[BALL | {"position": [0.0, 0.0, 1.3]}])
+
+
+#: At ``coarse`` a grid spacing is 5.2 cm; each with what differs where it is allowed.
+BEHIND = {"name": "wall", "kind": "box", "size": [0.3, 0.1, 0.3], "position": [0.0, 0.2, 1.0]}
+ROD = {"name": "rod", "shape": "capsule", "size": [0.05, 0.4], "mass": 2.0, "position": [0.0, -1.0, 1.0]}
+POST = {"name": "post", "kind": "box", "size": [0.1, 0.1, 0.1], "position": [0.0, -1.35, 1.0]}
+PEA = {"name": "pea", "mass": 0.1, "size": [0.03], "position": [0.0, -1.2, 1.095]}
+COARSE = {
+    "a turned avatar": ({"colliders": [BEHIND], "avatars": [{"yaw": 1.57}]}, {"avatars": [{"yaw": 0.0}]}),
+    "a turned rod": (
+        {"props": [ROD | {"rotation": [0.7071, 0.7071, 0.0, 0.0]}], "colliders": [POST]},
+        {"props": [ROD]},
+    ),
+    "the middle of a pea": (
+        {"props": [PEA | {"position": [0.0, -1.2, 1.09]}], "colliders": [POST | {"position": [0.0, -1.2, 1.0]}]},
+        {"props": [PEA | {"position": [0.0, -1.2, 1.11]}]},
+    ),
+    "a ball that is not only in contact": (
+        {"props": [BALL | {"position": [0.0, -1.2, 1.18]}], "colliders": [POST | {"position": [0.0, -1.2, 1.0]}]},
+        {"props": [BALL | {"position": [0.0, -1.2, 1.21]}]},
+    ),
+    "the end of a pole": (
+        {
+            "colliders": [
+                {"name": "pole", "kind": "capsule", "size": [0.045, 0.6], "position": [0.5, -0.03, 1.1],
+                 "rotation": [0.7071, 0.0, 0.7071, 0.0]}
+            ]
+        },
+        {
+            "colliders": [
+                {"name": "pole", "kind": "capsule", "size": [0.045, 0.6], "position": [0.8, -0.03, 1.1],
+                 "rotation": [0.7071, 0.0, 0.7071, 0.0]}
+            ]
+        },
+    ),
+    "a table through the waist": (
+        {"colliders": [{"name": "table", "kind": "box", "size": [0.5, 0.5, 0.02], "position": [0.0, 0.0, 1.05]}]},
+        {"colliders": [{"name": "table", "kind": "box", "size": [0.5, 0.4, 0.02], "position": [0.0, -0.5, 1.05]}]},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("scene", "instead"), COARSE.values(), ids=COARSE)
+def test_how_things_lie_is_seen(device, scene, instead):
+    with pytest.raises(ConfigError, match=r"would begin .*inside .*; move it by "):
+        build(device, fidelity="coarse", **scene)
+    build(device, fidelity="coarse", **scene | instead)
+
+
+def test_the_shortest_way_out_is_told(device):
+    table = {"name": "table", "kind": "box", "size": [0.5, 0.3, 0.45], "position": [0.0, -0.55, 0.45]}
+    ball = {"name": "ball", "mass": 0.5, "size": [0.11], "position": [0.0, -0.5, 0.94]}
+    with pytest.raises(ConfigError, match=r"move it by 0\.\d+ m along \[0.0, 0.0, 1.0\]"):
+        build(device, fidelity="coarse", props=[ball], colliders=[table])
+
+
+def test_meshes_are_looked_at(device, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    path = tmp_path / "cube.obj"
+    trimesh.creation.box((2.0, 2.0, 2.0)).export(path)
+    cube = {"name": "cube", "shape": "mesh", "file": str(path), "size": [0.12], "mass": 2.0}
+    with pytest.raises(ConfigError, match=r"prop 'cube' would begin .* inside agent_0; .* move it by"):
+        build(device, fidelity="coarse", props=[cube | {"position": [0.0, 0.0, 1.1]}])
+    build(device, fidelity="coarse", props=[cube | {"position": [0.0, -0.4, 1.1]}])
+
+
+def test_all_avatars_are_looked_at(device):
+    x, y = SumoTask(load_config(SumoTask.Config)).scene.avatars[-1].position
+    with pytest.raises(ConfigError, match=r"prop 'ball' would begin .* inside agent_1"):
+        build(device, SumoTask, props=[BALL | {"position": [x, y, 1.0]}])
+
+
+class Ram(load_task(REACH)):
+    """What it adds begins in the body and in each other, if it began there."""
+
+    def build_scene(self):
+        ball = PropConfig(name="own", size=(0.1,), position=(0.0, 0.0, 1.0))
+        ram = ColliderConfig(name="ram", kind="sphere", size=(0.25,), position=(0.0, 0.1, 1.0))
+        return replace(super().build_scene(), props=[ball], colliders=[ram])
+
+
+def test_a_task_places_what_it_adds_itself(device):
+    build(device, Ram)
