@@ -29,7 +29,7 @@ from piavatar_envs.envs.config import ConfigError
 #: Of the file's content; rises with every change.
 FORMAT = 3
 #: Settings that what has been learned so far does not depend on.
-FREE = ("total_steps", "iterations", "checkpoint_every", "evaluation")
+FREE = ("total_steps", "iterations", "checkpoint_every", "evaluation", "env.render")
 #: Of these, how long a training is, and the settings that change with how much of it is over: where there is one, what
 #: has been learned so far does depend on the length.
 LENGTHS, FALLING = ("total_steps", "iterations"), ("ppo.final_kl", "ppo.final_learning_rate")
@@ -175,7 +175,11 @@ def learned_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> list
     """As :func:`differences` of two configurations of trainings, but only what a training does depend on so far."""
     falls = any(flattened(now).get(name) is not None for name in FALLING)
     free = [name for name in FREE if not (falls and name in LENGTHS)]
-    return [unlike for unlike in differences(before, now) if unlike[0].partition(".")[0] not in free]
+    return [
+        unlike
+        for unlike in differences(before, now)
+        if not any(unlike[0] == name or unlike[0].startswith(f"{name}.") for name in free)
+    ]
 
 
 def as_tensors(value: Any) -> Any:

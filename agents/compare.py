@@ -6,7 +6,6 @@ of a training changes (zero and random actions) is shown once, with its interval
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from rich.table import Table
 from agents.checkpoint import differences
 from agents.command import in_a_line
 from agents.evaluate import over_seeds
-from agents.folders import check_figures
+from agents.folders import check_figures, read_json
 from benchmarks.runner import plain, write_json
 
 #: Settings that may differ: nothing that is learned depends on how often a training is saved.
@@ -35,7 +34,7 @@ def read_run(path: Path) -> dict[str, Any]:
         OSError: there is no such file.
         ValueError: the file is something else.
     """
-    run = json.loads(path.read_text(encoding="utf-8"))
+    run = read_json(path)
     needed = ("benchmark", "config", "seed", "results", "commit", "device", "versions")
     missing = [name for name in needed if not (isinstance(run, dict) and name in run)]
     if missing:

@@ -30,6 +30,8 @@ from piavatar_envs.envs.simulation import check_device
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "reach_ppo.yaml"
 FILM_EPISODES = 2
+#: What comes when the training is over.
+LATER = ("policy.zip", "curve.csv", "curve.png", "before_after.mp4")
 _RESERVE = 1.25  # what comes after the training is allowed to take this much longer than foreseen
 _FRAME = 0.1  # rendering and encoding a frame whose halves are drawn in parallel, on slow cores [s]
 
@@ -96,6 +98,8 @@ def run(options: Options, console: Console) -> Outcome:
         # of a demo that is stopped from here on, too, the next one knows that it was one, and takes its place
         about = versions("demo", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
         write_results(options.out / RESULTS, about, [evaluation for evaluation, _ in references], {})
+        for name in LATER:  # of an earlier one, which would lie beside this one's figures
+            (options.out / name).unlink(missing_ok=True)
         deadline = begun + options.seconds - _RESERVE * _time_after(options, config, facts, references)
         untrained = ppo.build(config.ppo, venv, seen, config.seed)
         before = policy_agent(copy.deepcopy(untrained.policy))

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from pydantic import BaseModel
 
@@ -113,6 +113,19 @@ def check_writable(path: Path) -> None:
         raise ConfigError(f"{path} cannot be written ({error.strerror}); write elsewhere") from None
 
 
+def read_json(path: Path) -> Any:
+    """What a file of figures holds.
+
+    Raises:
+        OSError: there is no such file.
+        ValueError: it is no JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is no JSON ({error}); write it anew") from None
+
+
 def check_figures(path: Path, script: str) -> None:
     """Refuse to write figures over anything but earlier ones of the same script.
 
@@ -127,7 +140,7 @@ def check_figures(path: Path, script: str) -> None:
     if not path.exists():
         return
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))["benchmark"]
+        found = read_json(path)["benchmark"]
     except (ValueError, KeyError, TypeError):
         found = "something else"
     if found != script:

@@ -7,7 +7,7 @@ with ``--live`` it plays in a web browser instead, until Ctrl-C. Nothing in the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -162,11 +162,21 @@ def environment(run: Run, assignments: Sequence[str]) -> Task:
     trained = task_class(load_config(task_class.Config, run.env, {"obs_mode": "flat"}))
     task = task_class(load_config(task_class.Config, trained.config, parse_assignments(given)))
     if unlike := changed(trained, task, run.observe):
+        alone = [one for one in given if _changes_alone(trained, one, run.observe)]
         raise ConfigError(
-            f"{' '.join(given)} changes {', '.join(unlike)}: the policy was trained for other ones; leave it out, or "
-            "train a policy with it"
+            f"{' '.join(alone or given)} changes {', '.join(unlike)}: the policy was trained for other ones; leave it "
+            "out, or train a policy with it"
         )
     return task
+
+
+def _changes_alone(trained: Task, assignment: str, observe: Collection[str] | None) -> bool:
+    """Whether a setting by itself makes another environment for a policy, or none."""
+    try:
+        config = load_config(type(trained.config), trained.config, parse_assignments([assignment]))
+        return bool(changed(trained, type(trained)(config), observe))
+    except ConfigError:
+        return False  # it needs another one, which is to blame then
 
 
 def first_seed(run: Run, options: Options) -> int:

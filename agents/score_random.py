@@ -8,7 +8,6 @@ all runs of these settings.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ from agents.batches import in_every_seat, play
 from agents.command import in_a_line, read_options
 from agents.config import EvaluationSettings
 from agents.evaluate import over_seeds, random_agent
-from agents.folders import RESULTS, claim
+from agents.folders import RESULTS, claim, read_json
 from agents.report import versions
 from benchmarks.runner import plain, write_json
 from piavatar_envs.api.batched import BatchedEpisodes
@@ -102,7 +101,7 @@ def environment_of(folder: Path) -> tuple[str, Mapping[str, Any]]:
         OSError: the folder has no ``results.json``.
     """
     path = folder / RESULTS
-    run = json.loads(path.read_text(encoding="utf-8"))
+    run = read_json(path)
     config = run.get("config", {}) if isinstance(run, dict) else {}
     if not {"env_id", "env"} <= set(config):
         raise ConfigError(f"{path} has no config.env_id and config.env; give the folder of a training or of score_pid")

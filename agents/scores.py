@@ -15,7 +15,6 @@ then takes the place of the training's own; what the training took, and zero and
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ from rich.markdown import Markdown
 from agents import compare
 from agents.checkpoint import flattened
 from agents.command import in_a_line
-from agents.folders import RESULTS, check_figures, check_writable, write_whole
+from agents.folders import RESULTS, check_figures, check_writable, read_json, write_whole
 from benchmarks.runner import describe_run, plain, write_json
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
@@ -204,7 +203,7 @@ def _read_run(folder: Path) -> dict[str, Any]:
         raise ValueError(f"{folder / RESULTS} holds matches of competing agents; give runs of agents with one aim")
     if not path.is_file():
         return run
-    evaluation = json.loads(path.read_text(encoding="utf-8"))
+    evaluation = read_json(path)
     _check_evaluation(evaluation, run, folder, path)
     (trained,) = evaluation["results"]
     rows = [trained if row["case"] == "trained" else row for row in run["results"]]
@@ -215,7 +214,7 @@ def _check_evaluation(evaluation: Mapping[str, Any], run: Mapping[str, Any], fol
     """Refuse what is no evaluation of this run's policy in the same episodes; a task is known by its settings."""
     anew = f"write it anew: python -m agents.play {folder} --out {path}"
     if evaluation.get("date", "") < run.get("date", ""):
-        raise ValueError(f"{path} is older than {folder / RESULTS}: the policy has learned since; {anew}")
+        raise ValueError(f"{path} is older than {folder / RESULTS}: the policy may have learned since; {anew}")
     seeds = {row["case"]: row["first_seed"] for row in run["results"] if row["case"] == "trained"}
     if not seeds:
         raise ValueError(f"{path} is of a policy, but {folder / 'results.json'} has no row 'trained'; remove {path}")
@@ -238,7 +237,7 @@ def _kept(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any
     """What an earlier table says of environments that ``rows`` are not about, with its devices and commits."""
     if path is None:
         return {"results": [], "devices": [], "commits": []}
-    table = json.loads(path.read_text(encoding="utf-8"))
+    table = read_json(path)
     missing = [name for name in ("results", "devices", "commits") if name not in table]
     if missing:
         raise ValueError(f"{path} has no {missing[0]!r}; give a table that agents.scores has written")

@@ -12,9 +12,10 @@ pytest.importorskip("stable_baselines3", reason="needs the extra train")
 
 from agents import compare, demo, play, score_pid, score_random, scores, train
 from agents.batches import BatchTraining, load_batched, run
-from agents.checkpoint import Checkpoint
+from agents.checkpoint import Checkpoint, learned_otherwise
 from agents.config import load_training
-from piavatar_envs.envs.config import dump_yaml
+from agents.lessons import changed
+from piavatar_envs.envs.config import dump_yaml, load_config
 from piavatar_envs.tasks import load_task
 from tests.agents.conftest import TINY
 
@@ -172,8 +173,9 @@ def test_what_is_no_demo_is_refused(line, words, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (("control=torque",), "control=torque changes drive.control: the policy was trained for other ones"),
+        (("control=torque",), "control=torque changes drive.control, its actions: the policy was trained for other ones"),
         (("joints=[left_knee]",), "changes its actions"),
+        (("joint_speed_limit=3", "color=strain"), "error: joint_speed_limit=3 changes its actions"),
         (("env.observe_parameters=true",), "changes observe_parameters"),
         (("fidelity=tiny", "env.fidelity=tiny"), "fidelity is given twice"),
         (("fidelity=tiny", "physics.fidelity=tiny"), "fidelity is given twice"),
@@ -182,6 +184,26 @@ def test_what_is_no_demo_is_refused(line, words, tmp_path, monkeypatch):
 def test_policies_play_only_what_they_were_trained_for(settings, words, ended, device, monkeypatch):
     monkeypatch.setattr(play, "BatchedEpisodes", None)
     assert words in refused(play.main, str(ended), *settings, "--device", device)
+
+
+def test_under_torques_nothing_has_a_speed_that_could_change():
+    stand = load_task("Stand-v0")
+    made = [stand(load_config(stand.Config, {"control": "torque"}, more)) for more in ({}, {"joint_speed_limit": 3.0})]
+    assert changed(*made) == []
+    made = [stand(load_config(stand.Config, {"control": "pd"}, more)) for more in ({}, {"joints": ["left_knee"]})]
+    assert changed(*made) == ["its actions"]
+
+
+def test_files_that_are_no_figures_are_named(tmp_path):
+    (tmp_path / "results.json").write_text("not json")
+    for main in (scores.main, compare.main, score_random.main):
+        assert f"{tmp_path / 'results.json'} is no JSON" in refused(main, str(tmp_path))
+
+
+def test_what_pictures_look_like_is_free_when_a_training_goes_on(ended):
+    had = load_training(ended / "config.yaml").model_dump(mode="json")
+    other = load_training(ended / "config.yaml", {"env.render.width": 64, "env.physics.friction": 0.1})
+    assert learned_otherwise(had, other.model_dump(mode="json")) == [("env.physics.friction", 0.8, 0.1)]
 
 
 def test_a_policy_that_does_not_see_a_prop_plays_beside_it(ended):

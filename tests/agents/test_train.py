@@ -188,6 +188,14 @@ def test_the_demo_leaves_what_it_promises_after_one_that_was_stopped(device, tmp
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(demo, "train", stopped)
         demo.run(options, Console(quiet=True))
+    (tmp_path / "before_after.mp4").write_bytes(b"of an earlier one")
+
+    def looks(*args, **kwargs):
+        assert not any((tmp_path / name).exists() for name in demo.LATER)
+        return trained(*args, **kwargs)
+
+    trained = demo.train
+    monkeypatch.setattr(demo, "train", looks)
     outcome = demo.run(options, Console(quiet=True))
     assert [e.agent for e in outcome.evaluations] == ["zero", "random", "scripted IK", "trained"]
     assert len({tuple(e.seed for e in evaluation.episodes) for evaluation in outcome.evaluations}) == 1

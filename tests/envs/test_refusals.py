@@ -80,7 +80,7 @@ def test_what_yaml_makes_of_values_is_refused_by_name(tmp_path):
         assert told in refusal(path)
 
 
-def test_every_number_has_limits_on_both_sides():
+def test_every_number_has_an_upper_limit():
     """Beyond them are overflows, not physics; lengths of lists and counts are limited where they are used."""
 
     def numbers(annotation, limits):
