@@ -173,7 +173,10 @@ def test_what_is_no_demo_is_refused(line, words, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        (("control=torque",), "control=torque changes drive.control, its actions: the policy was trained for other ones"),
+        (
+            ("control=torque",),
+            "control=torque changes drive.control, its actions: the policy was trained for other ones",
+        ),
         (("joints=[left_knee]",), "changes its actions"),
         (("joint_speed_limit=3", "color=strain"), "error: joint_speed_limit=3 changes its actions"),
         (("env.observe_parameters=true",), "changes observe_parameters"),
