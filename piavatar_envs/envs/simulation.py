@@ -13,6 +13,7 @@ from piavatar_envs.avatar.asset import AvatarAsset, load_body
 from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
 from piavatar_envs.avatar.joint_drive import LONGEST_SUBSTEP
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
+from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.envs.clearance import check_beside_solids
 from piavatar_envs.envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig
 from piavatar_envs.envs.domain import Domain
@@ -178,7 +179,7 @@ class Simulation:
                     f"for drive.control={control!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {by_torques}"
                 )
             return asked
-        moving = max(commanded_speed(self.config.drive), STRUCK * speed)
+        moving = max(commanded_speed(self.config.drive, select_joints(self.config.joints), self.flesh), STRUCK * speed)
         waves = max(wave, self.subjects.matter.sound_speed())
         chosen = choose_num_substeps(physics.control_dt, self.dx, max(waves, physics.cfl * moving), physics.cfl)
         if chosen > MOST_SUBSTEPS:

@@ -9,9 +9,10 @@ import math
 import numpy as np
 import pytest
 
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.envs.simulation import Simulation
-from piavatar_envs.envs.speeds import STRUCK, commanded_speed
+from piavatar_envs.envs.speeds import STRUCK, lever
 from piavatar_envs.mpm.build import choose_num_substeps
 from piavatar_envs.multi import multi_modules
 from piavatar_envs.tasks import load_task, task_modules
@@ -30,7 +31,7 @@ def substep_way(simulation: Simulation, speed: float) -> float:
     return speed * float(simulation.model.step.dt) / simulation.dx
 
 
-def test_no_default_has_other_substeps_than_waves_and_commands_ask_for(device):
+def test_no_default_has_other_substeps_than_its_waves_ask_for(device):
     tasks = [load_task(env_id) for env_id in task_modules()]
     if importlib.util.find_spec("pettingzoo"):
         tasks += [importlib.import_module(name).TASK for name in multi_modules()]
@@ -39,10 +40,22 @@ def test_no_default_has_other_substeps_than_waves_and_commands_ask_for(device):
         task = cls(load_config(cls.Config))
         simulation = Simulation(task.config, 1, device, task.domain(), task.scene, avatar_names=task.agent_names)
         model, physics = simulation.model, task.config.physics
-        fastest = max(model.sound_speed, physics.cfl * commanded_speed(task.config.drive))
-        assert model.num_substeps == choose_num_substeps(physics.control_dt, simulation.dx, fastest, physics.cfl)
+        wave = choose_num_substeps(physics.control_dt, simulation.dx, model.sound_speed, physics.cfl)
+        assert model.num_substeps == wave
         found[cls.__name__] = model.num_substeps
-    assert found.pop("KickBallTask") == 17 and set(found.values()) == {15}, found
+    assert set(found.values()) == {15}, found
+
+
+def test_a_chain_of_joints_adds_up_what_they_are_from_its_end():
+    places = np.zeros((NUM_JOINTS, 3))
+    hip, knee, ankle = (joint_index(f"left_{name}") for name in ("hip", "knee", "ankle"))
+    places[hip], places[knee], places[ankle] = (0.0, 0.0, 0.9), (0.0, 0.0, 0.5), (0.0, 0.0, 0.1)
+    toe, shin = np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 0.3]])
+    of, about_all = (np.array([ankle]), np.array([knee])), math.sqrt(3.0)
+    assert lever(JOINT_NAMES, toe, places, of[0]) == pytest.approx(about_all * (0.9 + 0.1) + 0.5)
+    assert lever(("left_hip", "left_ankle"), toe, places, of[0]) == pytest.approx(about_all * (0.9 + 0.1))
+    assert lever(("left_hip", "left_ankle"), shin, places, of[1]) == pytest.approx(about_all * 0.6)
+    assert lever(("right_hip",), toe, places, of[0]) == 0.0
 
 
 @pytest.mark.parametrize(
