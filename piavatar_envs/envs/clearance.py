@@ -17,11 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.skeleton import JOINT_NAMES
 from piavatar_envs.envs.config import AvatarConfig, ColliderConfig, ConfigError, PropConfig
+from piavatar_envs.envs.props import turn_of
 from piavatar_envs.envs.subjects import GROUND
 from piavatar_envs.mpm.colliders import COLLIDER_KINDS
 from piavatar_envs.props.geometry import PropPoints, primitive_distance
 
 if TYPE_CHECKING:
+    from piavatar_envs.envs.flesh import Flesh
     from piavatar_envs.envs.simulation import Simulation
 
 #: Joints whose flesh is where it is, whichever way arms are held.
@@ -72,7 +74,7 @@ def _distance(kind: str, thing: PropConfig | ColliderConfig, turn: Rotation) -> 
 
 
 def _collider(collider: ColliderConfig, dx: float) -> _Thing:
-    turn, middle = Rotation.from_quat(np.roll(collider.rotation, -1)), np.array(collider.position)
+    turn, middle = turn_of(collider), np.array(collider.position)
     size = (*collider.size, 0.0, 0.0, 0.0)[:3]
     ends = {"box": size, "capsule": (0.0, 0.0, size[1]), "sphere": (0.0, 0.0, 0.0)}
     inner = np.empty((0, 3))
@@ -84,7 +86,7 @@ def _collider(collider: ColliderConfig, dx: float) -> _Thing:
 
 
 def _prop(prop: PropConfig, rest: PropPoints) -> _Thing:
-    turn, middle = Rotation.from_quat(np.roll(prop.rotation, -1)), np.array(prop.position)
+    turn, middle = turn_of(prop), np.array(prop.position)
     inner = middle + turn.apply(rest.rest)
     return _Thing(f"prop {prop.name!r}", middle, _distance(prop.shape, prop, turn), inner, 1.0)
 
@@ -133,31 +135,52 @@ def check_beside_standing(simulation: Simulation) -> None:
         return
     names = simulation.subjects.names
     for name, avatar, flesh in zip(names, simulation.scene.avatars, simulation.flesh, strict=False):
-        firm = np.isin(flesh.sampled.skin_joints[:, 0], _FIRM)
-        body, depth = _standing(avatar, flesh.points.rest[0][firm]), flesh.sampled.depth[firm]
-        tree = cKDTree(body)
-
-        def depth_of(points: np.ndarray, tree: cKDTree = tree, depth: np.ndarray = depth) -> np.ndarray:
-            """How deep points are below the skin [m], 0 outside."""
-            near, index = tree.query(points)
-            return np.where(near < WITHIN * dx, depth[index], 0.0)
-
+        body = _Body.standing(avatar, flesh, dx)
         for thing in things:
-            deep = max((-thing.distance(body)).max(), depth_of(thing.inner).max(initial=0.0))
-            if deep > dx or (thing.bounded and depth_of(thing.middle) > 0.0):
-
-                def is_out(by: np.ndarray, thing: _Thing = thing, body: np.ndarray = body, depth_of=depth_of) -> bool:
-                    """Whether nothing of the thing is inside any more, once it has been moved."""
-                    return thing.distance(body - by).min() >= 0.0 and not depth_of(thing.inner + by).any()
-
+            deep = max(body.depth_in(thing), body.depth_at(thing.inner).max(initial=0.0))
+            if deep > dx or (thing.bounded and body.depth_at(thing.middle) > 0.0):
                 # away from the body, which is as seen from a plane below its slope
                 ways = [-way for way in _ways(thing, np.array([*avatar.position, thing.middle[2]]), -thing.lift, dx)]
-                _refuse(thing.name, max(deep, 0.0), name, dx, _shortest(ways, is_out, dx))
+                move = _shortest(ways, lambda by, body=body, thing=thing: body.is_clear_of(thing, by), dx)
+                _refuse(thing.name, max(deep, 0.0), name, dx, move)
 
 
-def _standing(avatar: AvatarConfig, rest: np.ndarray) -> np.ndarray:
-    """Flesh in the rest pose where an avatar stands [m], shape ``(P, 3)``."""
-    return Rotation.from_rotvec([0.0, 0.0, avatar.yaw]).apply(rest) + np.array([*avatar.position, 0.0])
+@dataclass(frozen=True)
+class _Body:
+    """The flesh of an avatar that stands, but for its arms.
+
+    Attributes:
+        places: of its particles [m], shape ``(P, 3)``.
+        depth: of these below the skin [m], shape ``(P,)``.
+        tree: of the places.
+        near: how far a particle reaches [m].
+    """
+
+    places: np.ndarray
+    depth: np.ndarray
+    tree: cKDTree
+    near: float
+
+    @classmethod
+    def standing(cls, avatar: AvatarConfig, flesh: Flesh, dx: float) -> _Body:
+        """The body in the rest pose where an avatar stands."""
+        firm = np.isin(flesh.sampled.skin_joints[:, 0], _FIRM)
+        turn = Rotation.from_rotvec([0.0, 0.0, avatar.yaw])
+        places = turn.apply(flesh.points.rest[0][firm]) + np.array([*avatar.position, 0.0])
+        return cls(places, flesh.sampled.depth[firm], cKDTree(places), WITHIN * dx)
+
+    def depth_at(self, points: np.ndarray) -> np.ndarray:
+        """How deep points are below the skin [m], 0 outside."""
+        away, index = self.tree.query(points)
+        return np.where(away < self.near, self.depth[index], 0.0)
+
+    def depth_in(self, thing: _Thing) -> float:
+        """How deep the body is inside of a thing [m]; negative outside."""
+        return float((-thing.distance(self.places)).max())
+
+    def is_clear_of(self, thing: _Thing, by: np.ndarray) -> bool:
+        """Whether nothing of a thing is inside any more once it has been moved ``by`` [m]."""
+        return thing.distance(self.places - by).min() >= 0.0 and not self.depth_at(thing.inner + by).any()
 
 
 def _ways(thing: _Thing, middle: np.ndarray, lift: float, dx: float) -> list[np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.envs.config import ConfigError, PropConfig
+from piavatar_envs.envs.config import ColliderConfig, ConfigError, PropConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.materials import lame_parameters
@@ -178,9 +178,14 @@ def check_places(
                 _refuse_place(name, centre, int(np.argmin(inside)), box, box - reach)
 
 
+def turn_of(config: PropConfig | ColliderConfig) -> Rotation:
+    """How a thing is turned as it begins."""
+    return Rotation.from_quat(np.roll(config.rotation, -1))
+
+
 def _turned(config: PropConfig, rest: np.ndarray) -> np.ndarray:
     """Particles of a prop about its centre of mass as it begins [m], shape ``(P, 3)``."""
-    return Rotation.from_quat(np.roll(config.rotation, -1)).apply(rest)
+    return turn_of(config).apply(rest)
 
 
 def check_apart(dx: float, configs: Sequence[PropConfig], points: Sequence[PropPoints]) -> None:
