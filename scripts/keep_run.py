@@ -10,7 +10,6 @@ the curve of returns, an episode a row, rows are averaged until there are at mos
 from __future__ import annotations
 
 import io
-import json
 import sys
 import zipfile
 from pathlib import Path
@@ -22,6 +21,7 @@ import yaml
 
 from agents.checkpoint import differences
 from agents.curve import Curve
+from agents.folders import read_json
 from agents.sb3_policy import PARAMETERS
 
 #: Rows of a curve, at most.
@@ -88,7 +88,7 @@ def check_ended(run: Path) -> None:
         ValueError: the scores are of other settings than the configuration, or one of them cannot be read.
     """
     try:
-        had = json.loads((run / "results.json").read_text(encoding="utf-8"))["config"]
+        had = read_json(run / "results.json")["config"]
         asked = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
         unlike = differences(had["env"] if "design" in had else had, asked)  # the PID agent's are its environment's
     except (ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:

@@ -20,6 +20,7 @@ import tyro
 from rich.progress import track
 
 from agents.design import Design
+from agents.folders import read_json
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
 
@@ -70,7 +71,7 @@ def find_jobs(results: Path, device: str) -> list[Job]:
     for folder in sorted(path.parent for path in results.glob("pid/*/results.json")):
         jobs.append(Job(folder, ("agents.score_pid", *pid_arguments(folder), *written(folder, device))))
     for folder in sorted(path.parent for path in results.glob("random/*/results.json")):
-        count = json.loads((folder / "results.json").read_text(encoding="utf-8"))["results"][0]["seeds"]
+        count = read_json(folder / "results.json")["results"][0]["seeds"]
         command = ("agents.score_random", str(folder), "--seeds", str(count), *written(folder, device))
         jobs.append(Job(folder, command))
     for folder in sorted(path.parent for path in results.glob("ppo/*/config.yaml")):
@@ -81,14 +82,14 @@ def find_jobs(results: Path, device: str) -> list[Job]:
 
 def written(folder: Path, device: str) -> tuple[str, ...]:
     """Arguments for the same episodes in the same place."""
-    row = json.loads((folder / "results.json").read_text(encoding="utf-8"))["results"][0]
+    row = read_json(folder / "results.json")["results"][0]
     episodes = ("--evaluation.episodes", str(row["episodes"]), "--evaluation.first-seed", str(row["first_seed"]))
     return (*episodes, "--device", device, "--out", str(folder))
 
 
 def pid_arguments(folder: Path) -> list[str]:
     """The task, its settings and the controller's numbers, as far as they are not the defaults."""
-    config = json.loads((folder / "results.json").read_text(encoding="utf-8"))["config"]
+    config = read_json(folder / "results.json")["config"]
     default = load_config(load_task(config["env_id"]).Config, {"control": "torque"}).model_dump(mode="json")
     settings = [f"{name}={json.dumps(value)}" for name, value in differences(config["env"], default)]
     arguments = [config["env_id"], *settings]

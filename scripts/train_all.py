@@ -9,7 +9,6 @@ draws up the table.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -29,6 +28,7 @@ from rich.progress import track
 
 from agents.checkpoint import LENGTHS, learned_otherwise
 from agents.config import load_training
+from agents.folders import read_json
 from piavatar_envs.envs.config import parse_assignments
 
 
@@ -69,7 +69,7 @@ class Job:
             return False
         try:
             # what the settings of then do not name had its default
-            had = load(json.loads(path.read_text(encoding="utf-8"))["config"]).model_dump(mode="json")
+            had = load(read_json(path)["config"]).model_dump(mode="json")
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is of no training of {self.config.stem} ({error}); remove it") from None
         for name, then, now in learned_otherwise(had, asked):
