@@ -54,10 +54,12 @@ class Limbs:
         rate: float = 0.0,
         ground: bool = False,
         firm_bones: bool = True,
+        bone_contact: bool = True,
     ) -> None:
         """Build it in a pose of rotation vectors ``(22, 3)``; ``rate`` holds flesh to bones, if not zero.
 
-        With ``firm_bones`` particles of bones are put into their places after every control step, as in environments.
+        With ``firm_bones`` particles of bones are put into their places after every control step, with
+        ``bone_contact`` bones stop at the floor, as in environments.
         """
         world = World(
             fidelity=options.fidelity, num_substeps=None, gravity=gravity, ground=ground, device=options.device
@@ -68,7 +70,8 @@ class Limbs:
         rates = np.full((1, self.rig.points.num_points), rate) if rate > 0.0 else None
         none = np.zeros((1, 1 + NUM_JOINTS))
         chosen = firm_bones & (self.rig.points.bone >= 0)
-        self.body = ArticulatedBody(self.rig.points, self.rig.avatar.body, self.rig.model, none, none, rates, chosen)
+        built = self.rig.points, self.rig.avatar.body, self.rig.model
+        self.body = ArticulatedBody(*built, none, none, rates, chosen, bone_contact)
         local, joints = Rotation.from_rotvec(rotations), self.rig.points.joints[0].astype(float)
         world_rotations, positions = forward_kinematics(local.as_matrix(), joints[0], joints)
         self.body.state.rotation.assign(Rotation.from_matrix(world_rotations).as_quat()[None].astype(np.float32))
@@ -90,7 +93,7 @@ class Limbs:
         record_begin(program, rig.model, rig.state, rig.scratch)
         for step in range(rig.model.num_substeps):
             if joints:
-                self.body.record_substep(program, rig.state, step)
+                self.body.record_substep(program, rig.state, rig.scratch, step)
             record_substep(program, rig.model, rig.state, rig.scratch, step)
         record_end(program, rig.model, rig.state, rig.scratch)
         if joints:

@@ -51,12 +51,14 @@ of more than some 5 ms ago makes fast limbs unstable.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.attachment import attach_flesh, put_in_place
 from piavatar_envs.avatar.body import BodyPoints
+from piavatar_envs.avatar.bone_contact import Ground, find_reach
 from piavatar_envs.avatar.bone_sums import sum_moments
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_mass import JointMass, grid_inertia
@@ -70,7 +72,7 @@ from piavatar_envs.avatar.quarters import warps_of
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, JointState, Pose, vec8, vec12, vec16
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.types import Model, State, group
+from piavatar_envs.mpm.types import Model, Scratch, State, group
 
 
 class ArticulatedBody:
@@ -84,6 +86,7 @@ class ArticulatedBody:
         tissue: what resists in the joints; nothing until :meth:`set_tissue`.
         attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s].
         firm: particles that are put into their places on the bones, by index in the body.
+        solid: whether bones stop at boundaries.
         mass: the mass matrix.
         impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` is what held the pelvis.
         support: force and torque of what holds the pelvis: every substep adds its share of a control step's mean.
@@ -98,6 +101,7 @@ class ArticulatedBody:
         damping: np.ndarray,
         attachment: np.ndarray | None = None,
         firm: np.ndarray | None = None,
+        solid: bool = False,
     ) -> None:
         """Allocate.
 
@@ -111,6 +115,7 @@ class ArticulatedBody:
                 without them, or where they are 0, flesh is held by its own stiffness only.
             firm: which particles are put into their places on the bones after every control step, shape
                 ``(num_points,)`` bool; none if not given.
+            solid: whether bones stop at boundaries, see :mod:`piavatar_envs.avatar.bone_contact`.
 
         Raises:
             ValueError: a stiffness, damping or rate is negative or not finite, or the shape of one, or of ``firm``, is
@@ -150,6 +155,7 @@ class ArticulatedBody:
         target = {"rotation": zeros(bones, wp.quat), "root": zeros(n, wp.vec3)}
         self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
         self.target.rotation.fill_(wp.quat_identity())
+        self.solid, self._reach = solid, self._upload(find_reach(points))
         self.mass = JointMass(points, body, model)
         self._inertia = grid_inertia(points, model.grid.dx)
         self._scratch = zeros(ALL_WORDS * points.num_points if self.threads == 1 else 0, float)
@@ -186,6 +192,7 @@ class ArticulatedBody:
             linear=zeros(wp.vec3, 3 * n, NUM_JOINTS),
             angular=zeros(wp.vec3, 3 * n, NUM_JOINTS),
             shares=zeros(float, 3 * n, NUM_DOF),
+            touch=zeros(float, 4 * n, NUM_DOF),
             muscle=zeros(float, n, NUM_DOF),
             impulse=self.impulse,
             left=zeros(float, n, NUM_DOF),
@@ -235,17 +242,18 @@ class ArticulatedBody:
         inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure]
         program.launch(build_mass, (self.model.num_envs, threads), inputs, [self._bench], block_dim=threads)
 
-    def _record_stage(self, program: Program, stage: wp.Kernel, inputs: list, state: State, *more: Support) -> None:
+    def _record_stage(self, program: Program, stage: wp.Kernel, inputs: list, state: State, *more: Any) -> None:
         """Append what a warp does for an environment."""
         inputs, outputs = [*inputs, state.failure], [*more, self._bench]
         program.launch(stage, (self.model.num_envs, self.threads), inputs, outputs, block_dim=self.threads)
 
-    def record_substep(self, program: Program, state: State, step: int) -> None:
+    def record_substep(self, program: Program, state: State, scratch: Scratch, step: int) -> None:
         """Append what the joints do before an MPM substep: take over, act, and move the pose on.
 
         Args:
             program: records.
             state: of the particles.
+            scratch: of the world, whose sensors are told what bones meet.
             step: which substep of its control step it is. The first one finds joints wherever they are; all others go
                 on from the one before.
         """
@@ -257,9 +265,22 @@ class ArticulatedBody:
             self._record_mass(program, state)
         inputs = [self.body, model.step.dt, 1.0 / model.control_dt, 3 if fit else 2]
         inputs += [self.target, self.springs, self.tissue, self.strength]
-        self._record_stage(program, act, inputs, state, self.support)
+        self._record_stage(program, act, inputs, state, self._ground(scratch), self.support)
         inputs = [self.body, model.step.dt, state.x, w.pelvis, w.steps, state.failure]
         program.launch(take_over, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
+
+    def _ground(self, scratch: Scratch) -> Ground:
+        """What bones meet."""
+        model = self.model
+        return group(
+            Ground,
+            solid=int(self.solid),
+            boundaries=model.boundaries,
+            reach=self._reach,
+            field=model.particles.field,
+            subject=model.contact.subject,
+            sensors=scratch.sensors,
+        )
 
     def _record_pull(self, program: Program, state: State) -> None:
         """Append the pass over particles that pulls them to the bones, and sums what joints are to take over."""

@@ -202,7 +202,7 @@ def record_control_step(
     for step in range(model.num_substeps):
         for avatar in () if injected else avatars:
             if avatar.joints:
-                avatar.joints.record_substep(program, state, step)
+                avatar.joints.record_substep(program, state, scratch, step)
             else:
                 record_drive(avatar, program, state, step)
         record_substep(program, model, state, scratch, step)

@@ -40,6 +40,8 @@ class JointBench:
     angular: wp.array2d(dtype=wp.vec3)
     # (3 num_envs, 69) momenta, then changes of the velocity: the joints' own, what is taken over; and of the pose
     shares: wp.array2d(dtype=float)
+    # (4 num_envs, 69) what an impulse on a bone does along each axis, and the velocity of all that acts
+    touch: wp.array2d(dtype=float)
     # what the joints do
     muscle: wp.array2d(dtype=float)  # (num_envs, 69) impulses
     impulse: wp.array2d(dtype=float)

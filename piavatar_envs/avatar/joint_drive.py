@@ -24,7 +24,7 @@ from piavatar_envs.avatar.settings import ROOT_RATE
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.types import State, group, row
+from piavatar_envs.mpm.types import Scratch, State, group, row
 
 if TYPE_CHECKING:
     from piavatar_envs.avatar.drive import AvatarDrive
@@ -49,12 +49,14 @@ class JointSettings:
         assist: of the pelvis at first, 0 to 1.
         attachment: rates of the pulls that hold flesh to bones, shape ``(P,)`` [1/s].
         firm: which particles are put into their places on the bones after every control step, shape ``(P,)`` bool.
+        solid: whether bones stop at boundaries.
     """
 
     muscles: Muscles
     assist: float
     attachment: np.ndarray
     firm: np.ndarray
+    solid: bool
 
 
 @wp.kernel
@@ -181,7 +183,8 @@ class JointDrive:
         n, model, muscles = drive.model.num_envs, drive.model, settings.muscles
         self.drive = drive
         rows = np.zeros((n, 1 + NUM_JOINTS))
-        self.body = ArticulatedBody(points, drive.body, model, rows, rows, settings.attachment[None], settings.firm)
+        flesh = settings.attachment[None], settings.firm
+        self.body = ArticulatedBody(points, drive.body, model, rows, rows, *flesh, settings.solid)
         self.body.set_strength(muscles.lower, muscles.upper, n)
         ranges = muscles.range_lower, muscles.range_upper
         locked = [joint_index(name) for name in LOCKED_JOINTS]
@@ -247,9 +250,9 @@ class JointDrive:
             [body.strength.factor, body.springs],
         )
 
-    def record_substep(self, program: Program, state: State, step: int) -> None:
+    def record_substep(self, program: Program, state: State, scratch: Scratch, step: int) -> None:
         """Append what the joints do before substep ``step`` of a control step."""
-        self.body.record_substep(program, state, step)
+        self.body.record_substep(program, state, scratch, step)
 
     def record_end(self, program: Program, state: State) -> None:
         """Append what ends a control step: particles of bones are in their places."""

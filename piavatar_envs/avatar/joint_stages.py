@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.bone_contact import Ground, stop_bones, tell_sensors
 from piavatar_envs.avatar.cholesky import (
     factorize,
     factorize_in_room,
@@ -47,7 +48,7 @@ from piavatar_envs.avatar.mass_matrix import BONES, compose_mass
 from piavatar_envs.avatar.mass_pairs import Pairs
 from piavatar_envs.avatar.mass_records import PLACES, room_of_records
 from piavatar_envs.avatar.rotation import rigid_matrix
-from piavatar_envs.avatar.types import Body
+from piavatar_envs.avatar.types import Body, vec8
 from piavatar_envs.avatar.warp_cholesky import ROOM, place_of_factor, store_room
 from piavatar_envs.mpm.shared_memory import meet
 from piavatar_envs.mpm.types import row
@@ -163,6 +164,7 @@ def turn_joints(
     springs: Springs,
     tissue: Tissue,
     strength: Strength,
+    ground: Ground,
     driven: int,
     own: int,
     e: int,
@@ -171,7 +173,10 @@ def turn_joints(
     room: wp.uint64,
     w: JointBench,
 ):
-    """Springs, torques and tissue change the velocity of the joints, by share ``own``; ``driven`` is their factor."""
+    """Springs, torques, tissue and what bones meet change the velocity of the joints, by share ``own``.
+
+    ``driven`` is the factor of the mass matrix with all that is implicit.
+    """
     meet_threads(threads)
     for k in range(thread, PARTS, threads):
         joint_impulse(
@@ -179,8 +184,10 @@ def turn_joints(
         )
     fetch_factor(w.factors, driven, room)
     factor = int(driven)
+    met = vec8()
     while factor >= 0:  # once more where muscles reach their limits, by the same piece of the program
         solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, room, w.shares)
+        met = stop_bones(body, ground, dt, own, factor, e, thread, threads, room, w)
         if factor != driven:
             break
         if limit_joints(body, dt, springs, strength, driven, own, e, thread, threads, w) == 0.0:
@@ -189,8 +196,10 @@ def turn_joints(
         factorize(w.pattern, w.matrix, w.left, e, e, room, factor, w.factors)
     find_given(w.left, w.shares, own, e, thread, threads, w.impulse)
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
-    support = part_of(w.impulse, e, 0)
-    moment = part_of(w.impulse, e, 3)
+    support = part_of(w.impulse, e, 0) + wp.vec3(met[0], met[1], met[2])
+    moment = part_of(w.impulse, e, 3) + wp.vec3(met[3], met[4], met[5])
+    if thread == 0:
+        tell_sensors(body, ground, met, e, w.pose.position[e, 0])
     balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, own, thread, threads, w.shares)
 
 
@@ -267,6 +276,7 @@ def act(
     strength: Strength,
     failure: wp.array(dtype=int),
     # in and out
+    ground: Ground,
     support: Support,
     w: JointBench,
 ):
@@ -294,7 +304,7 @@ def act(
     find_shares(body, own, taken - own, moves, e, thread, threads, room, near)
     pull_bones(body, own, e, thread, threads, near)
     add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)
-    turn_joints(body, dt, target, springs, tissue, strength, n + e, own, e, thread, threads, room, near)
+    turn_joints(body, dt, target, springs, tissue, strength, ground, n + e, own, e, thread, threads, room, near)
     go_on(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
     spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.moving)
     keep_motion(near.moving, e, 0, thread, threads, w.steps)

@@ -229,6 +229,21 @@ def sum_threads16(value: vec16, threads: int) -> vec16:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+for (int distance = threads >> 1; distance > 0; distance >>= 1) {
+    const float other = __shfl_xor_sync(0xffffffffu, value, distance);
+    const int whose = __shfl_xor_sync(0xffffffffu, which, distance);
+    if (other > value || (other == value && whose < which)) value = other, which = whose;
+}
+#endif
+return wp::vec_t<2, wp::float32>(value, (float)which);
+""")
+def most_of_threads(value: float, which: int, threads: int) -> wp.vec2:
+    """The largest value of the threads of a warp, and ``which`` of theirs it is, the lower of two; told to all."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
 if (threads > 1) __syncwarp();
 #endif
 """)

@@ -149,6 +149,7 @@ class Flesh:
             assist=d.root_assist,
             attachment=attachment_rates(sampled.depth, distance, firm, *d.flesh_rate),
             firm=(sampled.bone >= 0) & d.firm_bones,
+            solid=d.bone_contact,
         )
 
     def masses(self, volume: np.ndarray) -> np.ndarray:

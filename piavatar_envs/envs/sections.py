@@ -104,8 +104,8 @@ class DriveConfig(BaseModel):
     control: Literal["pose", "pd", "torque"] = Field(
         "pose",
         description="what actions are: pose (increments of a pose that moves the body), pd (joint targets of springs "
-        "with limited torques) or torque (torques of the joints); root_assist to firm_bones are for pd and torque, all "
-        "other settings of this section for pose",
+        "with limited torques) or torque (torques of the joints); root_assist to bone_contact are for pd and torque, "
+        "all other settings of this section for pose",
     )
     root_assist: float = Field(
         0.0, ge=0.0, le=1.0, description="help for the pelvis from outside: 0 none, 1 springs that nearly hold it [-]"
@@ -122,6 +122,11 @@ class DriveConfig(BaseModel):
         True,
         description="whether particles of bones, which slip from them under load, are put into their places after "
         "every control step, unless these lie beyond a surface: tracked bones stay together",
+    )
+    bone_contact: bool = Field(
+        True,
+        description="whether bones stop at the floor and at colliders, a millimetre before; else only flesh does, and "
+        "bones go through it into them",
     )
     drive: Literal["increment", "target"] = Field(
         "increment",

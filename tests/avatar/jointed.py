@@ -33,11 +33,11 @@ def momentum_of(J: np.ndarray, m: np.ndarray, v: np.ndarray) -> np.ndarray:
 class Joints:
     """An articulated body beside a rig's particles, and programs of its parts."""
 
-    def __init__(self, rig, stiffness=0.0, damping=0.0, attachment=None):
+    def __init__(self, rig, stiffness=0.0, damping=0.0, attachment=None, firm=None, solid=False):
         self.rig, self.model, self.state = rig, rig.model, rig.state
         rates = None if attachment is None else np.broadcast_to(attachment, (1, rig.points.num_points))
         body = rig.points, rig.drive.body, rig.model
-        self.body = ArticulatedBody(*body, stiffness * GAINS, damping * GAINS, rates)
+        self.body = ArticulatedBody(*body, stiffness * GAINS, damping * GAINS, rates, firm, solid)
 
     def pose(self, rotvec, root=None):
         """Put pose and particles where the local rotation vectors have them, at rest."""
@@ -69,7 +69,7 @@ class Joints:
         program, self.body.mass.refresh = Program(self.model.device), 2
         if step > 0:
             self.body.record_pose(program, self.state)
-        self.body.record_substep(program, self.state, step)
+        self.body.record_substep(program, self.state, self.rig.scratch, step)
         return program
 
     @property

@@ -54,7 +54,7 @@ def test_a_control_step_has_a_mass_matrix_for_every_two_substeps(joints):
     assert made.body.mass.refresh * made.model.step.dt <= LONGEST_REFRESH and made.body.mass.refresh <= MOST_USES
     made.body.mass.refresh, program = 2, Program(made.model.device)
     for step in range(5):
-        made.body.record_substep(program, made.state, step)
+        made.body.record_substep(program, made.state, made.rig.scratch, step)
     alone = ["attach_flesh", "act", "take_over"]
     own = ["attach_flesh", "sum_pairs", "build_mass", "act", "take_over"]
     assert program.names == ["begin_substep", *own, *alone, *own, *alone, *own]
@@ -236,7 +236,7 @@ def test_free_float_keeps_momentum(make_rig, wild_pose):
     program, model = Program(rig.model.device), rig.model
     record_begin(program, model, rig.state, rig.scratch)
     for step in range(model.num_substeps):
-        made.body.record_substep(program, rig.state, step)
+        made.body.record_substep(program, rig.state, rig.scratch, step)
         record_substep(program, model, rig.state, rig.scratch, step)
     record_end(program, model, rig.state, rig.scratch)
     start = rig.totals()
@@ -353,7 +353,7 @@ def test_a_held_pelvis_bears_the_weight(make_rig):
     model, program = rig.model, Program(rig.model.device)
     record_begin(program, model, rig.state, rig.scratch)
     for step in range(model.num_substeps):
-        body.record_substep(program, rig.state, step)
+        body.record_substep(program, rig.state, rig.scratch, step)
         record_substep(program, model, rig.state, rig.scratch, step)
     record_end(program, model, rig.state, rig.scratch)
     for _ in range(30):

@@ -47,7 +47,7 @@ class Held(Joints):
         rig, self.program = self.rig, Program(self.model.device)
         record_begin(self.program, rig.model, rig.state, rig.scratch)
         for step in range(rig.model.num_substeps):
-            self.body.record_substep(self.program, rig.state, step)
+            self.body.record_substep(self.program, rig.state, rig.scratch, step)
             record_substep(self.program, rig.model, rig.state, rig.scratch, step)
         record_end(self.program, rig.model, rig.state, rig.scratch)
         return self

@@ -111,7 +111,7 @@ def test_the_pull_goes_on_as_if_particles_had_not_been_put_in_place(make_batch):
         put_in_place(batch)
         joints = batch.simulation.avatar.joints
         program = Program(batch.simulation.model.device)
-        joints.record_substep(program, state, 0)
+        joints.record_substep(program, state, batch.simulation.scratch, 0)
         before = state.u.numpy() + state.vk.numpy()
         program.run()
         changes[firm] = (state.u.numpy() + state.vk.numpy() - before)[0]
