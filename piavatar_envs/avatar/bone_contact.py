@@ -24,7 +24,7 @@ from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.cholesky import solve_three_in_place
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import part_of, set_part, spread_motion
-from piavatar_envs.avatar.lanes import meet_threads, most_of_threads, sum_threads12
+from piavatar_envs.avatar.lanes import bits_of_threads, meet_threads, most_of_threads, sum_threads12
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.mass_matrix import BONES, NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
@@ -120,21 +120,39 @@ def may_touch(boundaries: Boundaries, reach: float, dt: float, w: JointBench, e:
 
 
 @wp.func
+def find_near(body: Body, ground: Ground, dt: float, e: int, thread: int, threads: int, w: JointBench):
+    """Bits of the bones that may touch a boundary."""
+    near = int(0)
+    r = row(e, ground.reach.shape[0])
+    for b in range(thread, BONES, threads):
+        for k in range(ground.boundaries.count):
+            if may_touch(ground.boundaries, ground.reach[r, b], dt, w, e, b, k):
+                near = near | (1 << b)
+    return bits_of_threads(near, threads)
+
+
+@wp.func
 def find_fastest(body: Body, ground: Ground, dt: float, e: int, thread: int, threads: int, w: JointBench) -> wp.vec2:
-    """By how much the point is too fast that is so by most [m/s], and which: tracker times boundaries, and boundary."""
+    """By how much the point is too fast that is so by most [m/s], and which: tracker times boundaries, and boundary.
+
+    Few bones are near a boundary: the threads share the points of one after the other.
+    """
     most = float(0.0)
     which = int(0)
-    r = row(e, ground.reach.shape[0])
     count = ground.boundaries.count
-    for b in range(thread, BONES, threads):
-        for k in range(count):
-            if may_touch(ground.boundaries, ground.reach[r, b], dt, w, e, b, k):
-                for tracker in range(body.tracker_start[b], body.tracker_start[b + 1]):
+    near = find_near(body, ground, dt, e, thread, threads, w)
+    b = int(0)
+    while near != 0:
+        if (near & 1) != 0:
+            for tracker in range(body.tracker_start[b] + thread, body.tracker_start[b + 1], threads):
+                for k in range(count):
                     touch = touch_of(body, ground.boundaries, w, e, b, tracker, k)
                     lacking = least_speed(touch.distance, dt) - wp.dot(touch.velocity, touch.normal)
                     if lacking > most:
                         most = lacking
                         which = tracker * count + k
+        near = near >> 1
+        b += 1
     return most_of_threads(most, which, threads)
 
 

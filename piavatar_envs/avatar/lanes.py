@@ -229,6 +229,17 @@ def sum_threads16(value: vec16, threads: int) -> vec16:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+for (int distance = threads >> 1; distance > 0; distance >>= 1) bits |= __shfl_xor_sync(0xffffffffu, bits, distance);
+#endif
+return bits;
+""")
+def bits_of_threads(bits: int, threads: int) -> int:
+    """All bits that any thread of a warp has set, told to all of them."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
 for (int distance = threads >> 1; distance > 0; distance >>= 1) {
     const float other = __shfl_xor_sync(0xffffffffu, value, distance);
     const int whose = __shfl_xor_sync(0xffffffffu, which, distance);
