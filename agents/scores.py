@@ -49,8 +49,8 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     Returns:
         A row for each agent in each environment: ``env_id``, ``agent``, the ``control`` of the avatar and whether it
-        has ``firm_bones``, the names of its ``runs``, ``train_steps`` and
-        ``training_s`` of one of them on average, and the figures as in :func:`agents.evaluate.over_seeds`.
+        has ``firm_bones`` and ``bone_contact``, the names of its ``runs``, ``train_steps`` and ``training_s`` of one of
+        them on average, and the figures as in :func:`agents.evaluate.over_seeds`.
 
     Raises:
         ValueError: no runs; or runs of one script and environment, not all of the same settings but for the seed.
@@ -128,9 +128,9 @@ def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _drive(run: Mapping[str, Any]) -> dict[str, Any]:
-    """What drives the avatar of a run, and whether its bones are firm; None where its environment does not say."""
+    """What drives the avatar of a run, and what holds its bones; None where its environment does not say."""
     known = _known(run["config"]["env_id"], run["config"]["env"])
-    return {name: known.get(f"env.drive.{name}") for name in ("control", "firm_bones")}
+    return {name: known.get(f"env.drive.{name}") for name in ("control", "firm_bones", "bone_contact")}
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -157,6 +157,15 @@ def markdown(rows: Sequence[Mapping[str, Any]], about: str) -> str:
     return "\n".join(lines)
 
 
+def _bones(row: Mapping[str, Any]) -> str:
+    """What holds the bones of a row's avatar; nothing where its environment does not say."""
+    if row.get("firm_bones") is None:
+        return ""
+    if not row["firm_bones"]:
+        return "slipping"
+    return "solid" if row.get("bone_contact") else "firm"
+
+
 def _cells(row: Mapping[str, Any]) -> list[str]:
     trained = "" if row.get("training_s") is None else f"{row['training_s']:.0f} s"
     if row.get("train_steps"):
@@ -164,7 +173,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     return [
         row["agent"],
         row.get("control") or "",
-        {True: "firm", False: "slipping"}.get(row.get("firm_bones"), ""),
+        _bones(row),
         str(row["seeds"] or ""),
         str(row["episodes"]),
         _with(row["return_mean"], row["return_interval"], ".1f"),
@@ -284,7 +293,8 @@ def main(args: list[str] | None = None) -> None:
     about = (
         f"{', '.join(devices)}; commits {', '.join(commits)}. Brackets are 95 % intervals: over seeds and episodes "
         "where there are several seeds, else over episodes; all seeds have played the same, so many each. Zero actions "
-        "and the PID agent have no seeds: they draw nothing at random, so they play an episode in one way."
+        "and the PID agent have no seeds: they draw nothing at random, so they play an episode in one way. Bones are "
+        "solid by default, firm without `bone_contact`, and slipping without `firm_bones`."
     )
     text = markdown(rows, about)
     if options.out is not None:

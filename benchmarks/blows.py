@@ -26,7 +26,8 @@ BALLS = (0.45, 1.5, 8.0)  # [kg]
 SPEED, DISTANCE = 5.0, 0.1  # of a ball that is thrown at the chest [m/s], and its way there [m]
 STIFFNESSES = (100.0, 300.0, 1000.0)  # of all joints of a body that is hit [N m/rad]
 BOUNDLESS = 1000.0  # factor on the torques of muscles, which are not to be the limit here
-# settings of ``drive``: particles of bones are put into their places after a control step, or slip from them under load
+# settings of ``drive``: particles of bones are put into their places after a control step, and bones stop at the floor;
+# or they slip under load, and the floor stops only flesh
 HOLDS: dict[str, dict[str, Any]] = {"": {}, "_slipping": {"firm_bones": False, "bone_contact": False}}
 FINER = 4  # control steps in one of the environments': peaks are short
 SETTLING = 0.2  # last share of the time over which an error is averaged

@@ -1,8 +1,8 @@
 """Gaps between the bones of a body on the floor, and how far its feet slide and sink in; of :mod:`benchmarks.torque`.
 
-No particle is put beyond a boundary, not even a firm one: where the skeleton comes below the floor, particles of its
-bones lie on it, and the joints that are tracked from them gape. So a body is measured while the floor bears it: as it
-stands by its own torques, as it falls down limp, and as it thrashes about where it lies.
+No particle is put beyond a boundary, not even a firm one: where the skeleton came below the floor, particles of its
+bones would lie on it, and the joints that are tracked from them would gape. So a body is measured while the floor bears
+it: as it stands by its own torques, as it falls down limp, and as it thrashes about where it lies.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def on_floor(options: Options, way: str, hold: str) -> dict[str, Any]:
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """A body that stands, one that falls and one that lies; with firm bones and slipping ones."""
+    """A body that stands, one that falls and one that lies; with bones that are firm and stop, and without either."""
     for hold in HOLDS:
         for way in WAYS:
             yield on_floor(options, way, hold)

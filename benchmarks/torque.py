@@ -5,8 +5,8 @@ stretches its arms out or presses its toes on the floor, and one that is asked f
 actions), with an assisted pelvis and without; what balls do to it and what it does to balls
 (:mod:`benchmarks.blows`), whether its matter stays at the bones (:mod:`benchmarks.wear`) and its bones together on the
 floor (:mod:`benchmarks.floor`), and up to which time step and gains it is stable (:mod:`benchmarks.stability`). All
-but stability is measured both ways of :data:`benchmarks.blows.HOLDS`: with firm bones, as environments have them, and
-with slipping ones.
+but stability is measured both ways of :data:`benchmarks.blows.HOLDS`: with firm bones that stop at the floor, as
+environments have them, and with slipping ones that do not.
 """
 
 from __future__ import annotations

@@ -72,29 +72,28 @@ def test_matter_stays_at_the_bones(hold):
 
 
 def test_firm_bones_stay_together():
-    """To a millimetre wherever nothing but feet is pressed on the floor; slipping ones do not."""
+    """To a millimetre, also of bodies that fall on the floor and thrash about there; slipping ones do not."""
     gaps = {
         row["case"]: row["largest_gap_mm"]
         for row in json.loads(RESULTS.read_text(encoding="utf-8"))["results"]
-        if "largest_gap_mm" in row and not row["case"].startswith(("floor_falling", "floor_lying"))
+        if "largest_gap_mm" in row
     }
     firm = {case: gap for case, gap in gaps.items() if not case.endswith("_slipping")}
-    assert len(firm) == 4 + 3 + 2 + 9 + len(KICKS) + 1
+    assert len(firm) == 4 + 3 + 2 + 9 + len(KICKS) + 3
     assert max(firm.values()) < 1.0
     assert max(gaps[f"{case}_slipping"] for case in firm) > 1.0
 
 
-def test_feet_bear_a_standing_body_and_firm_bones_hardly_gape_on_the_floor():
-    """Feet that stand do not slide off or sink in; firm bones gape for moments where a limb hits the floor."""
+def test_feet_bear_a_standing_body_and_bones_stay_above_the_floor():
+    """Feet that stand do not slide off or sink in; of bodies that fall or lie no bone comes through the floor."""
     rows = {row["case"]: row for row in json.loads(RESULTS.read_text(encoding="utf-8"))["results"]}
     for hold in HOLDS:
         standing = rows[f"floor_standing{hold}"]
         assert standing["pelvis_m"] > 0.8 and standing["feet_slid_mm"] < 5.0 and standing["bones_below_floor_mm"] < 1.0
     for way in ("falling", "lying"):
         firm, slipping = rows[f"floor_{way}"], rows[f"floor_{way}_slipping"]
-        assert firm["pelvis_m"] < 0.3 and firm["median_gap_mm"] < 0.001
-        assert firm["share_of_time_beyond_wanted"] < 0.1 < 0.9 < slipping["share_of_time_beyond_wanted"]
-        assert 1.0 < firm["largest_gap_mm"] < slipping["largest_gap_mm"]
+        assert firm["pelvis_m"] < 0.3 and firm["bones_below_floor_mm"] < 0.5 < 3.0 < slipping["bones_below_floor_mm"]
+        assert firm["share_of_time_beyond_wanted"] == 0.0 and slipping["share_of_time_beyond_wanted"] > 0.9
 
 
 def test_joints_took_less_than_three_tenths_of_the_rest_when_that_was_measured():
@@ -105,11 +104,9 @@ def test_joints_took_less_than_three_tenths_of_the_rest_when_that_was_measured()
     assert report["options"]["num_envs"] == 2048 and joints < 0.3 * matter
 
 
-def test_firm_bones_gape_only_where_they_are_below_the_floor(rows):
-    firm = [rows[f"floor_{way}"] for way in ("standing", "falling", "lying")]
-    above = [row for row in firm if row["bones_below_floor_mm"] == 0.0]
-    assert above and all(row["largest_gap_mm"] < 0.01 for row in above)
-    assert min(row["bones_below_floor_mm"] for row in firm) >= 0.0
+def test_no_bone_comes_below_the_floor_or_gapes(rows):
+    for way in ("standing", "falling", "lying"):
+        assert rows[f"floor_{way}"]["bones_below_floor_mm"] < 0.5 and rows[f"floor_{way}"]["largest_gap_mm"] < 0.1
 
 
 def test_bones_have_their_particles_where_the_joints_are(device):

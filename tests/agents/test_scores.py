@@ -106,6 +106,7 @@ def test_what_is_null_is_the_same_as_what_follows(value, same, runs):
 def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     """With what drives the avatar; what an environment does not say is as by default."""
     runs["push"]["config"]["env"]["drive"] = {"control": "pd", "firm_bones": False}
+    runs["stand_pid"]["config"]["env"]["drive"] = {"control": "torque", "bone_contact": False}
     for name, content in runs.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "results.json").write_text(json.dumps(content))
@@ -114,8 +115,8 @@ def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     assert len(report["results"]) == 7 and report["devices"] == ["some GPU"] and report["commits"] == ["abc"]
     text = (tmp_path / "table.md").read_text()
     assert text.index("## Push-v0") < text.index("## Stand-v0")
-    assert "| rsl_ppo | pd | firm | 2 | 10 | 85.0 (21.5 to 148.5) |" in text and "2 M steps, 70 s" in text
-    assert "| sb3_ppo | pd | slipping | 1 |" in text
+    assert "| rsl_ppo | pd | solid | 2 | 10 | 85.0 (21.5 to 148.5) |" in text and "2 M steps, 70 s" in text
+    assert "| sb3_ppo | pd | slipping | 1 |" in text and "| PID | torque | firm |" in text
     assert "| 0 to 5 | 50% of 10 |" in text
     assert "some GPU; commits abc." in text and "Zero actions and the PID agent have no seeds" in text
     with pytest.raises(SystemExit, match=r"error: .*nowhere"):
