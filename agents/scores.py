@@ -39,6 +39,8 @@ _COLUMNS = ("agent", "control", "bones", "seeds", "episodes", *_RESULTS)
 STREAMS = "score_random"
 #: Returns of the same actions in the same episodes, on another device.
 _ALIKE = 1.0e-3
+#: What a policy may be scored on though it was trained on another; the row says which.
+_PLAYED = "env.drive.bone_contact"
 
 
 def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -76,6 +78,7 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
                 # other settings of the environment, where an action means something else
                 agent = f"{agent}, as {script}" if twins else agent
             else:
+                _check_alike(group)
                 row = {"runs": list(group), **_cost(group), **row}
             played = {"env_id": env_id, "agent": agent, **_drive(run)}
             rows.append(played | {key: row[key] for key in row if key != "case"})
@@ -128,9 +131,16 @@ def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _drive(run: Mapping[str, Any]) -> dict[str, Any]:
-    """What drives the avatar of a run, and what holds its bones; None where its environment does not say."""
-    known = _known(run["config"]["env_id"], run["config"]["env"])
+    """What drives the avatar that was scored, and what holds its bones; None where its environment does not say."""
+    known = _known(run["config"]["env_id"], run.get("evaluation", run["config"])["env"])
     return {name: known.get(f"env.drive.{name}") for name in ("control", "firm_bones", "bone_contact")}
+
+
+def _check_alike(group: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse seeds that were not all scored on the same bones."""
+    bones = {name: _drive(run)["bone_contact"] for name, run in group.items()}
+    if len(set(bones.values())) > 1:
+        raise ValueError(f"drive.bone_contact of what was scored differs: {bones}; score all of them alike")
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -236,7 +246,7 @@ def _check_evaluation(evaluation: Mapping[str, Any], run: Mapping[str, Any], fol
     env = evaluation.get("env")  # what names none has not got the defaults
     found |= (_known(env_id, env) if env else {}) | flattened({"first_seed": seeds})
     for key in wanted | found:
-        if found.get(key) != wanted.get(key):
+        if found.get(key) != wanted.get(key) and key != _PLAYED:
             raise ValueError(
                 f"{path} has {key}={found.get(key)!r}, of this run it would have {wanted.get(key)!r}; {anew}"
             )

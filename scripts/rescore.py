@@ -44,13 +44,16 @@ def main(
     results: Annotated[Path, tyro.conf.arg(help="folder with ppo, pid and random")] = Path("benchmarks/results"),
     device: Annotated[str, tyro.conf.arg(help="where to simulate")] = "cpu",
     jobs: Annotated[int, tyro.conf.arg(help="agents that play at a time")] = 1,
+    bone_contact: Annotated[
+        bool | None, tyro.conf.arg(help="score policies with bones that stop, or do not; else as each was trained")
+    ] = None,
 ) -> int:
     """Score what is kept, and draw up the table.
 
     Raises:
         ValueError: there is nothing, or ``jobs`` is no number of jobs.
     """
-    todo = find_jobs(results, device)
+    todo = find_jobs(results, device, bone_contact)
     if not todo or jobs < 1:
         raise ValueError(f"{results} has {len(todo)} agents and jobs={jobs}; both must be >= 1")
     with ThreadPoolExecutor(jobs) as pool:
@@ -65,9 +68,10 @@ def main(
     return subprocess.run([sys.executable, "-m", "agents.scores", *folders, "--out", str(results / TABLE)]).returncode
 
 
-def find_jobs(results: Path, device: str) -> list[Job]:
-    """A job for every agent that is kept, the longest first."""
+def find_jobs(results: Path, device: str, bone_contact: bool | None = None) -> list[Job]:
+    """A job for every agent that is kept, the longest first; policies on bones that stop or do not, if that is said."""
     jobs = []
+    bones = [] if bone_contact is None else [f"drive.bone_contact={str(bone_contact).lower()}"]
     for folder in sorted(path.parent for path in results.glob("pid/*/results.json")):
         jobs.append(Job(folder, ("agents.score_pid", *pid_arguments(folder), *written(folder, device))))
     for folder in sorted(path.parent for path in results.glob("random/*/results.json")):
@@ -75,7 +79,8 @@ def find_jobs(results: Path, device: str) -> list[Job]:
         command = ("agents.score_random", str(folder), "--seeds", str(count), *written(folder, device))
         jobs.append(Job(folder, command))
     for folder in sorted(path.parent for path in results.glob("ppo/*/config.yaml")):
-        command = ("agents.play", str(folder), "--device", device, "--out", str(folder / "evaluation.json"))
+        out = ("--device", device, "--out", str(folder / "evaluation.json"))
+        command = ("agents.play", str(folder), *bones, *out)
         jobs.append(Job(folder, command))
     return jobs
 

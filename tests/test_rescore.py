@@ -73,6 +73,14 @@ def test_a_job_that_fails_is_told_and_leaves_the_table(tmp_path, device, capsys)
     assert not (tmp_path / rescore.TABLE).exists()
 
 
+def test_policies_can_be_scored_on_other_bones(tmp_path):
+    folder = tmp_path / "ppo" / "stand_0"
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text("env_id: PIAvatar/Stand-v0\n")
+    (as_trained,), (stopping,) = (rescore.find_jobs(tmp_path, "cpu", bones) for bones in (None, True))
+    assert "drive.bone_contact=true" in stopping.command and len(stopping.command) == len(as_trained.command) + 1
+
+
 def test_nothing_to_score_is_refused(tmp_path):
     with pytest.raises(ValueError, match="has 0 agents and jobs=1; both must be >= 1"):
         rescore.main(tmp_path)

@@ -156,6 +156,16 @@ def test_a_setting_that_the_training_did_not_know_has_its_default_in_a_later_eva
     later(folder, env={})
     with pytest.raises(SystemExit, match=r"has env\.\S+=None, of this run it would have"):
         scores.main([str(folder)])
+    later(folder, env=older["env"] | {"drive": {"bone_contact": False}})  # a policy may be scored on other bones
+    scores.main([str(folder), "--out", str(tmp_path / "table.json")])
+    found = {row["agent"]: row["bone_contact"] for row in json.loads((tmp_path / "table.json").read_text())["results"]}
+    assert found["rsl_ppo"] is False
+    other = tmp_path / "stand_1"
+    other.mkdir()
+    again = runs["stand_1"]["config"] | {"env_id": env_id}
+    (other / "results.json").write_text(json.dumps(runs["stand_1"] | {"config": again}))
+    with pytest.raises(SystemExit, match=r"drive\.bone_contact of what was scored differs"):
+        scores.main([str(folder), str(other)])
     later(folder, env=older["env"] | {"drive": {"firm_bones": False}})
     with pytest.raises(SystemExit, match=r"env\.drive\.firm_bones=False, of this run it would have True"):
         scores.main([str(folder)])
