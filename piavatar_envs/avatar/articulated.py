@@ -5,10 +5,11 @@ Jacobian ``J`` at the particles. Every substep gives the joints what they can ta
 lets torques act on them:
 
     M dq = J^T m u,   qdot <- qdot + dq,   u <- u - J dq,   c <- c + dq
-    (M + A) d = dt (K e + tau) - A (qdot + c),   A = dt D + dt^2 K
+    (M + A) d = dt (K e + tau) + J_b^T p - A (qdot + c),   A = dt D + dt^2 K
     qdot <- qdot + d + c,   u <- u - J c,   vk = J qdot
 
-``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each.
+``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each;
+``p`` are impulses on points of bones that come to a boundary, see :mod:`piavatar_envs.avatar.bone_contact`.
 Light joints take over less than all: to the first ``M = J^T m J`` some inertia is added, of which torques know nothing,
 see :func:`piavatar_envs.avatar.joint_mass.grid_inertia`.
 ``c`` is what all else, contact, weight and flesh, did to the joints in the last substep, and is expected to do again.
@@ -58,7 +59,7 @@ import warp as wp
 
 from piavatar_envs.avatar.attachment import attach_flesh, put_in_place
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.bone_contact import Ground, find_reach
+from piavatar_envs.avatar.bone_contact import Ground
 from piavatar_envs.avatar.bone_sums import sum_moments
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_mass import JointMass, grid_inertia
@@ -155,7 +156,7 @@ class ArticulatedBody:
         target = {"rotation": zeros(bones, wp.quat), "root": zeros(n, wp.vec3)}
         self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
         self.target.rotation.fill_(wp.quat_identity())
-        self.solid, self._reach = solid, self._upload(find_reach(points))
+        self.solid = solid
         self.mass = JointMass(points, body, model)
         self._inertia = grid_inertia(points, model.grid.dx)
         self._scratch = zeros(ALL_WORDS * points.num_points if self.threads == 1 else 0, float)
@@ -193,6 +194,7 @@ class ArticulatedBody:
             angular=zeros(wp.vec3, 3 * n, NUM_JOINTS),
             shares=zeros(float, 3 * n, NUM_DOF),
             touch=zeros(float, 4 * n, NUM_DOF),
+            reach=zeros(float, n, NUM_JOINTS),
             muscle=zeros(float, n, NUM_DOF),
             impulse=self.impulse,
             left=zeros(float, n, NUM_DOF),
@@ -276,7 +278,6 @@ class ArticulatedBody:
             Ground,
             solid=int(self.solid),
             boundaries=model.boundaries,
-            reach=self._reach,
             field=model.particles.field,
             subject=model.contact.subject,
             sensors=scratch.sensors,

@@ -7,27 +7,25 @@ a substep by what there is left, and no more.
 
 An impulse ``p`` at a point of a bone changes the joints' velocities by ``M^-1 J^T p``, ``J`` the Jacobian of the point,
 and the point's own by ``K p``, ``K = J M^-1 J^T``. It is the least that stops the point, by Coulomb's law: it sticks if
-the impulse is in the friction cone, else it slides on as it did, with friction. ``M`` is that of all that is implicit,
-springs and dampers included: so these answer to a bone that is stopped as they do to any load. Of all points the one
-that is too fast by most is stopped, then the next, until none is left or there have been :data:`MOST_STOPS` (Gauss and
-Southwell's order; for contact of articulated bodies in such coordinates see Featherstone, "Rigid Body Dynamics
-Algorithms", 2008, ch. 11). No point is pulled, and where nothing has come below its boundary no energy is made.
+the impulse is in the friction cone, else friction is against the slip that there would be without, as strong as the
+cone allows but no stronger than what halts it. ``M`` is that of all that is implicit, springs and dampers included: so
+these answer to a bone that is stopped as they do to any load. Of all points the one that is too fast by most is
+stopped, then the next, until none is left or there have been :data:`MOST_STOPS` (Gauss and Southwell's order; for
+contact of articulated bodies in such coordinates see Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 11). No
+point is pulled, and where nothing has come below a boundary at rest no energy is made.
 """
 
 from __future__ import annotations
 
-import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.blending import motion_at
-from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.avatar.cholesky import solve_three_in_place
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_motion import part_of, set_part, spread_motion
 from piavatar_envs.avatar.lanes import bits_of_threads, meet_threads, most_of_threads, sum_threads12
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.mass_matrix import BONES, NUM_DOF
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body, vec8, vec12
 from piavatar_envs.mpm.colliders import signed_distance, surface_velocity
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
@@ -44,7 +42,7 @@ _LAYER, _MOST_STOPS = wp.constant(LAYER), wp.constant(MOST_STOPS)
 _BACK_SHARE, _BACK_SPEED = wp.constant(0.2), wp.constant(0.5)
 #: Speeds below are none [m/s].
 _TOLERANCE = wp.constant(1.0e-3)
-#: Share of the answer along the normal below which friction would jam a point: then it has none.
+#: Share of the straight answer along the normal below which friction would jam a point: then it has none.
 _JAMMED = wp.constant(0.1)
 
 
@@ -54,7 +52,6 @@ class Ground:
 
     solid: int  # whether bones stop at all
     boundaries: Boundaries
-    reach: wp.array2d(dtype=float)  # (1 or num_envs, bones) from a joint to the furthest point of its bone [m]
     field: wp.array(dtype=int)  # (num_particles,) velocity field, whose friction it is
     subject: wp.array(dtype=int)  # (fields,) of a field
     sensors: Sensors
@@ -70,13 +67,21 @@ class Touch:
     velocity: wp.vec3  # against the boundary's matter [m/s]
 
 
-def find_reach(points: BodyPoints) -> np.ndarray:
-    """From each joint to the furthest of the particles that track its bone [m], shape ``(rows, 22)``."""
-    reach = [
-        np.linalg.norm(points.rest[:, points.bone == b] - points.joints[:, b, None], axis=2).max(axis=1)
-        for b in range(NUM_JOINTS)
-    ]
-    return np.stack(reach, axis=1)
+@wp.func
+def at_rest(body: Body, e: int, b: int, tracker: int):
+    """From a joint to a point of its bone in the rest pose [m]; the point by its place in the list of trackers."""
+    joint = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+    return vector_at(body.rest, row(e, body.rest.shape[0]), body.tracker[tracker]) - joint
+
+
+@wp.func
+def measure_bones(body: Body, e: int, thread: int, threads: int, w: JointBench):
+    """How far bones reach, of the body as it is: another one may have been drawn."""
+    for b in range(thread, BONES, threads):
+        reach = float(0.0)
+        for tracker in range(body.tracker_start[b], body.tracker_start[b + 1]):
+            reach = wp.max(reach, wp.length(at_rest(body, e, b, tracker)))
+        w.reach[e, b] = reach
 
 
 @wp.func
@@ -88,10 +93,8 @@ def motion_of_bone(w: JointBench, e: int, b: int, x: wp.vec3):
 @wp.func
 def touch_of(body: Body, boundaries: Boundaries, w: JointBench, e: int, b: int, tracker: int, k: int) -> Touch:
     """A point of bone ``b``, by its place in the list of trackers, and boundary ``k``."""
-    p = body.tracker[tracker]
-    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p) - body.rest_joint[row(e, body.rest_joint.shape[0]), b]
     touch = Touch()
-    touch.place = w.pose.position[e, b] + wp.quat_rotate(w.pose.rotation[e, b], rest)
+    touch.place = w.pose.position[e, b] + wp.quat_rotate(w.pose.rotation[e, b], at_rest(body, e, b, tracker))
     d = signed_distance(boundaries, e, k, touch.place)
     touch.normal = wp.vec3(d[0], d[1], d[2])
     touch.distance = d[3]
@@ -109,8 +112,9 @@ def least_speed(distance: float, dt: float):
 
 
 @wp.func
-def may_touch(boundaries: Boundaries, reach: float, dt: float, w: JointBench, e: int, b: int, k: int):
+def may_touch(boundaries: Boundaries, dt: float, w: JointBench, e: int, b: int, k: int):
     """Whether any point of a bone may come to a boundary in a substep."""
+    reach = w.reach[e, b]
     joint = w.pose.position[e, b]
     motion = w.moving[e, b]
     turn = wp.length(wp.vec3(motion[3], motion[4], motion[5]))
@@ -120,13 +124,12 @@ def may_touch(boundaries: Boundaries, reach: float, dt: float, w: JointBench, e:
 
 
 @wp.func
-def find_near(body: Body, ground: Ground, dt: float, e: int, thread: int, threads: int, w: JointBench):
+def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: JointBench):
     """Bits of the bones that may touch a boundary."""
     near = int(0)
-    r = row(e, ground.reach.shape[0])
     for b in range(thread, BONES, threads):
         for k in range(ground.boundaries.count):
-            if may_touch(ground.boundaries, ground.reach[r, b], dt, w, e, b, k):
+            if may_touch(ground.boundaries, dt, w, e, b, k):
                 near = near | (1 << b)
     return bits_of_threads(near, threads)
 
@@ -140,7 +143,7 @@ def find_fastest(body: Body, ground: Ground, dt: float, e: int, thread: int, thr
     most = float(0.0)
     which = int(0)
     count = ground.boundaries.count
-    near = find_near(body, ground, dt, e, thread, threads, w)
+    near = find_near(ground, dt, e, thread, threads, w)
     b = int(0)
     while near != 0:
         if (near & 1) != 0:
@@ -205,7 +208,12 @@ def stopping_impulse(K: wp.mat33, v: wp.vec3, normal: wp.vec3, least: float, fri
     lacking = wp.max(least - wp.dot(v, normal), 0.0)
     straight = wp.dot(normal, K * normal)
     slip = v + lacking / straight * (K * normal)  # without friction, which is against it
-    direction = normal - friction * wp.normalize(slip - wp.dot(slip, normal) * normal)
+    along = wp.normalize(slip - wp.dot(slip, normal) * normal)
+    share = friction
+    halting = wp.dot(along, v) * wp.dot(normal, K * along) + lacking * wp.dot(along, K * along)
+    if halting > 0.0:  # more than halts the slip would turn it
+        share = wp.min(friction, straight * wp.dot(along, slip) / halting)
+    direction = normal - share * along
     answer = wp.dot(normal, K * direction)
     if answer < _JAMMED * straight:
         direction = normal
@@ -272,16 +280,16 @@ def stop_bones(
     total = 3 * w.velocity.shape[0] + e
     for i in range(thread, NUM_DOF, threads):
         w.touch[total, i] = w.velocity[e, i] + w.outside[e, i] + w.shares[own, i]
-    left = int(_MOST_STOPS)
-    while left > 0:
-        left -= 1
+    stops = int(0)
+    while stops < _MOST_STOPS:
         spread_motion(body, w.pose.position, w.touch, total, e, thread, threads, w.moving)
         meet_threads(threads)
         fastest = find_fastest(body, ground, dt, e, thread, threads, w)
-        if fastest[0] > _TOLERANCE:
-            given += stop_point(body, ground, dt, int(fastest[1]), own, factor, e, thread, threads, room, w)
-        else:
-            left = 0
+        if fastest[0] <= _TOLERANCE:
+            break
+        given += stop_point(body, ground, dt, int(fastest[1]), own, factor, e, thread, threads, room, w)
+        stops += 1
+    meet_threads(threads)
     return given
 
 

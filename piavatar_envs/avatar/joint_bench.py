@@ -42,6 +42,7 @@ class JointBench:
     shares: wp.array2d(dtype=float)
     # (4 num_envs, 69) what an impulse on a bone does along each axis, and the velocity of all that acts
     touch: wp.array2d(dtype=float)
+    reach: wp.array2d(dtype=float)  # (num_envs, bones) from a joint to the furthest point of its bone [m]
     # what the joints do
     muscle: wp.array2d(dtype=float)  # (num_envs, 69) impulses
     impulse: wp.array2d(dtype=float)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.bone_contact import Ground, stop_bones, tell_sensors
+from piavatar_envs.avatar.bone_contact import Ground, measure_bones, stop_bones, tell_sensors
 from piavatar_envs.avatar.cholesky import (
     factorize,
     factorize_in_room,
@@ -254,13 +254,17 @@ def begin_substep(
     # in and out
     w: JointBench,
 ):
-    """:func:`begin` where something else has moved the joints; over ``(num_envs, WARP)``, a CUDA block each."""
+    """:func:`begin` where something else has moved the joints, or made them another body's.
+
+    Over ``(num_envs, WARP)``, a CUDA block each.
+    """
     i, _ = wp.tid()
     at = place_in_block(i, WARP)
     e = at[0]
     thread = at[1]
     threads = at[2]
     if failure[e] == 0:
+        measure_bones(body, e, thread, threads, w)
         begin(body, e, thread, threads, w)
 
 

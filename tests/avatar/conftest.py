@@ -242,12 +242,14 @@ def build_rig(
     num_substeps: int | None = None,
     room: float = 1.3,
     others: int = 0,
+    colliders: Sequence[Collider] = (),
     **settings,
 ) -> Rig:
     """A standing avatar ``cells`` grid spacings tall.
 
     ``shapes`` are shape parameters by name, one set an environment; ``room`` is the half width of the domain [m]; so
-    many ``others`` are particles that come before the avatar's, in a row in the domain's corner.
+    many ``others`` are particles that come before the avatar's, in a row in the domain's corner. ``colliders`` follow
+    the ``floor``.
     """
     asset = load_body()
     dx = float(np.ptp(asset.vertices[:, 2])) / cells
@@ -267,7 +269,7 @@ def build_rig(
         gravity=(0.0, 0.0, -gravity),
         decoupling=decoupling,
         num_substeps=num_substeps,
-        colliders=[Collider.plane((0.0, 0.0, 1.0), 0.0, 0.8)] if floor else (),
+        colliders=[*([Collider.plane((0.0, 0.0, 1.0), 0.0, 0.8)] if floor else ()), *colliders],
     )
     state, scratch = allocate(model)
     x = state.x.numpy()

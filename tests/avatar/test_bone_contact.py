@@ -1,4 +1,4 @@
-"""Bones that stop at the floor: the impulse against Coulomb's law and the Jacobian in double precision; falls."""
+"""Bones that stop at surfaces: impulses against Coulomb's law and the Jacobian in double precision; falls."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from scipy.spatial.transform import Rotation
 from benchmarks.rig import joint_gaps
 from piavatar_envs.avatar.bone_contact import LAYER
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from tests.avatar.jointed import Joints
 
-FRICTION = 0.8  # of the rig's floor
 UP = np.array([0.0, 0.0, 1.0])
+FACING = Collider.plane((0.0, 0.0, -1.0), -1.9, 0.8)  # a ceiling
+SLOPE = Collider.plane((0.6, 0.0, 0.8), -9.0, 0.8)  # far below
 
 
 @dataclass
@@ -25,30 +27,43 @@ class Lying:
 
     Attributes:
         joints: the body.
-        points: of its bones, by index of the particle, shape ``(B,)``.
-        place: where they are, shape ``(B, 3)`` [m].
+        place: of the points of its bones, shape ``(B, 3)`` [m].
         J: their Jacobian, shape ``(B, 3, 69)``.
         lowest: which is the lowest.
     """
 
     joints: Joints
-    points: np.ndarray
     place: np.ndarray
     J: np.ndarray
     lowest: int
-
-    @property
-    def dt(self) -> float:
-        return self.joints.model.step.dt
 
     @property
     def before(self) -> np.ndarray:
         """Velocity of the joints, shape ``(69,)``."""
         return self.joints.body.state.velocity.numpy()[0].astype(float)
 
+    @property
+    def M(self) -> np.ndarray:
+        """Mass matrix, shape ``(69, 69)``; there are no springs."""
+        return self.joints.mass.astype(float)
+
     def least(self) -> np.ndarray:
-        """Speeds along the normal at which points come to the layer of flesh in a substep, shape ``(B,)`` [m/s]."""
-        return (LAYER - self.place[:, 2]) / self.dt
+        """Speeds at which points come to the layer of flesh above the floor in a substep, shape ``(B,)`` [m/s]."""
+        return (LAYER - self.place[:, 2]) / self.joints.model.step.dt
+
+    def set(self, name: str, value: float | np.ndarray, boundary: int = 0) -> None:
+        """Of a boundary: its ``friction``, or its ``velocity`` [m/s] or ``spin`` [rad/s]."""
+        array = getattr(self.joints.model.boundaries, name)
+        values = array.numpy()
+        values[0, boundary] = value
+        array.assign(values)
+
+    def leave_one_point(self) -> None:
+        """Nothing but the lowest point of a bone can be stopped."""
+        body, bones = self.joints.body.body, self.joints.rig.points.bone
+        point = np.flatnonzero(bones >= 0)[self.lowest]
+        body.tracker_start.assign((np.arange(NUM_JOINTS + 1) > bones[point]).astype(np.int32))
+        body.tracker.assign(np.full(body.tracker.shape, point, np.int32))
 
     def stop(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Let the body, which moves with its joints, do a substep: their velocity before and after."""
@@ -62,72 +77,93 @@ class Lying:
 
 @pytest.fixture
 def lying(make_rig, wild_pose):
-    def build(seed: int, height: float, solid: bool = True, **springs: float) -> Lying:
-        rig = make_rig(cells=16, floor=True)
-        bones = rig.points.bone >= 0
-        made = Joints(rig, solid=solid, **springs)
+    def build(seed: int, height: float, solid: bool = True, highest: bool = False, colliders=()) -> Lying:
+        rig = make_rig(cells=16, floor=True, colliders=colliders, room=2.0)
+        bones = np.flatnonzero(rig.points.bone >= 0)
+        made = Joints(rig, solid=solid)
         pose = wild_pose(np.random.default_rng(seed))
         made.pose(pose)
-        points = np.flatnonzero(bones)
         root = rig.points.joints[0, 0].astype(float)
-        root[2] += height - made.rig.read("x")[points, 2].min()
+        heights = made.rig.read("x")[bones, 2]
+        root[2] += height - (heights.max() if highest else heights.min())
         made.pose(pose, root)
-        place = made.rig.read("x")[points]
-        return Lying(made, points, place, made.jacobian[points], int(place[:, 2].argmin()))
+        place = made.rig.read("x")[bones]
+        return Lying(made, place, made.jacobian[bones], int(place[:, 2].argmin()))
 
     return build
 
 
-def response(body: Lying) -> np.ndarray:
-    """``M^-1`` with which joints answer, shape ``(69, 69)``, of joints without springs."""
-    return np.linalg.inv(body.joints.mass.astype(float))
+def moving(velocity) -> np.ndarray:
+    """A body that moves as a whole."""
+    return np.r_[velocity, np.zeros(66)]
 
 
-def coulomb(K: np.ndarray, v: np.ndarray, least: float) -> np.ndarray:
-    """The impulse that stops a point: it sticks, or it slides on, against the slip that there would be without."""
-    stick = np.linalg.solve(K, least * UP - v)
-    if np.linalg.norm(stick[:2]) <= FRICTION * stick[2]:
-        return stick
-    slip = v + (least - v[2]) / K[2, 2] * K[:, 2]
-    direction = UP - FRICTION * np.r_[slip[:2], 0.0] / np.linalg.norm(slip[:2])
-    return (least - v[2]) / (UP @ K @ direction) * direction
+@pytest.mark.parametrize("friction", [0.0, 0.3, 0.8, 3.0, 10.0])
+@pytest.mark.parametrize("along", [0.0, 0.02, 3.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_one_point_is_stopped_by_coulombs_law(lying, seed, along, friction):
+    """It is stopped along the normal, by an impulse in the cone of friction, against the slip that is left.
 
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("along", [0.0, 3.0])
-def test_one_point_is_stopped_by_coulombs_law(lying, seed, along):
-    """It goes just too fast for the layer; standing on the spot it sticks, fast along the floor it slides."""
+    A point that has got less than the cone allows does not slip against it any more.
+    """
     body = lying(seed, height=0.004)
-    target = np.array([along, 0.0, body.least()[body.lowest] - 0.05])
-    velocity = np.zeros(69)
-    velocity[:3] = target
-    before, after = body.stop(velocity)
-    J, inverse = body.J[body.lowest], response(body)
-    K = J @ inverse @ J.T
-    p = coulomb(K, J @ before, body.least()[body.lowest])
-    assert p[2] > 0.0
-    assert along == 0.0 or np.linalg.norm(p[:2]) == pytest.approx(FRICTION * p[2])
-    expected = inverse @ J.T @ p
-    np.testing.assert_allclose(after - before, expected, atol=2e-3 * np.abs(expected).max())
-    assert (J @ after)[2] == pytest.approx(body.least()[body.lowest], abs=1e-3)
-    assert ((body.J @ after)[:, 2] > body.least() - 2e-3).all()
+    body.leave_one_point()
+    body.set("friction", friction)
+    least, J = body.least()[body.lowest], body.J[body.lowest]
+    before, after = body.stop(moving([0.6 * along, 0.8 * along, least - 0.5]))
+    p = (body.M @ (after - before))[:3]
+    np.testing.assert_allclose(body.M @ (after - before), J.T @ p, atol=2e-3 * np.abs(J.T @ p).max())
+    v = J @ after
+    assert v[2] == pytest.approx(least, abs=1e-3)
+    tangential = np.linalg.norm(p[:2])
+    assert p[2] > 0.0 and tangential <= (1.001 * friction + 1e-3) * p[2]
+    if friction > 0.0:
+        against = p[:2] @ v[:2] / tangential
+        assert against < 1e-3
+        if tangential < 0.999 * friction * p[2]:
+            assert against > -1e-3
+    K = J @ np.linalg.inv(body.M) @ J.T
+    assert p @ (J @ before) + 0.5 * p @ K @ p < 0.0  # kinetic energy
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_many_points_are_stopped_and_no_energy_is_made(lying, seed):
+@pytest.mark.parametrize("friction", [0.0, 0.8, 10.0])
+@pytest.mark.parametrize("seed", range(8))
+def test_many_points_are_stopped_and_no_energy_is_made(lying, seed, friction):
     """A body in any motion onto the floor: no point too fast, momentum in the cone of friction, energy no greater."""
     body, rng = lying(seed, height=0.003), np.random.default_rng(10 + seed)
+    body.set("friction", friction)
     velocity = rng.normal(0.0, 1.0, 69)
     velocity[:3] = [1.0, -0.5, -2.0]
     before, after = body.stop(velocity)
-    too_fast = (body.least() - (body.J @ before)[:, 2]) > 1e-3
-    left = (body.least() - (body.J @ after)[:, 2]).max()
-    assert too_fast.sum() > 1
-    assert left < 0.05 * (body.least() - (body.J @ before)[:, 2]).max()
-    M = body.joints.mass.astype(float)
-    gained = (M @ (after - before))[:3]
-    assert gained[2] > 0.0 and np.linalg.norm(gained[:2]) <= 1.001 * FRICTION * gained[2]
-    assert after @ M @ after < before @ M @ before
+    lacking = (body.least() - (body.J @ before)[:, 2]).max()
+    assert lacking > 0.1
+    assert (body.least() - (body.J @ after)[:, 2]).max() < 0.05 * lacking
+    gained = (body.M @ (after - before))[:3]
+    assert gained[2] > 0.0 and np.linalg.norm(gained[:2]) <= 1.001 * friction * gained[2] + 1e-3
+    assert after @ body.M @ after < before @ body.M @ before
+
+
+def test_a_surface_that_moves_is_met_with_its_own_velocity(lying):
+    """At the point: it comes up and turns, and drags along what sticks to it."""
+    body = lying(1, height=0.002)
+    body.leave_one_point()
+    body.set("friction", 3.0)
+    body.set("velocity", [0.3, -0.2, 1.0])
+    body.set("spin", [0.0, 0.0, 0.5])
+    place = body.place[body.lowest]
+    surface = np.array([0.3, -0.2, 1.0]) + np.cross([0.0, 0.0, 0.5], place)
+    _, after = body.stop(np.zeros(69))
+    v = body.J[body.lowest] @ after
+    np.testing.assert_allclose(v[:2], surface[:2], atol=5e-3)
+    assert v[2] == pytest.approx(1.0 + body.least()[body.lowest], abs=2e-3)
+
+
+def test_every_boundary_stops_bones(lying):
+    """A ceiling, which is the last of three."""
+    body = lying(0, height=1.9 - 0.002, highest=True, colliders=(SLOPE, FACING))
+    top = int(body.place[:, 2].argmax())
+    _, after = body.stop(moving([0.0, 0.0, 1.0]))
+    assert (body.J[top] @ after)[2] == pytest.approx((0.002 - LAYER) / body.joints.model.step.dt, abs=2e-3)
 
 
 def test_a_bone_that_has_come_too_low_goes_back_slowly(lying):
@@ -137,27 +173,22 @@ def test_a_bone_that_has_come_too_low_goes_back_slowly(lying):
     assert 0.2 < speed < 0.7 and LAYER - body.place[body.lowest, 2] > 0.02
 
 
-def test_nothing_happens_above_the_floor_or_to_bones_that_slip(lying):
-    away = lying(0, height=0.05)
-    velocity = np.zeros(69)
-    velocity[2] = -0.5  # a millimetre in a substep
-    before, after = away.stop(velocity)
-    np.testing.assert_allclose(after, before, atol=1e-5)
-    slipping = lying(0, height=0.0, solid=False)
-    before, after = slipping.stop(velocity)
-    np.testing.assert_allclose(after, before, atol=1e-5)
+def test_nothing_happens_above_the_floor_or_to_bones_that_do_not_stop(lying):
+    velocity = moving([0.0, 0.0, -0.5])  # a millimetre in a substep
+    for body in (lying(0, height=0.05), lying(0, height=0.0, solid=False)):
+        before, after = body.stop(velocity)
+        np.testing.assert_allclose(after, before, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
 def fall(make_rig):
     """A limp body that falls on the floor head first: what happens in every control step."""
     rig = make_rig(cells=16, gravity=9.81, floor=True)
-    bones = rig.points.bone >= 0
-    made = Joints(rig, damping=2.0, attachment=300.0, firm=bones, solid=True)
-    root = rig.points.joints[0, 0] + np.array([0.0, 0.0, 0.3])
+    bones = np.flatnonzero(rig.points.bone >= 0)
+    made = Joints(rig, damping=2.0, attachment=300.0, firm=rig.points.bone >= 0, solid=True)
     pose = np.zeros((NUM_JOINTS, 3))
     pose[0, 0] = 1.9  # from upright to beyond level
-    made.pose(pose, root)
+    made.pose(pose, rig.points.joints[0, 0] + np.array([0.0, 0.0, 0.3]))
     program, model = Program(rig.model.device), rig.model
     record_begin(program, model, rig.state, rig.scratch)
     for step in range(model.num_substeps):
@@ -166,34 +197,42 @@ def fall(make_rig):
     record_end(program, model, rig.state, rig.scratch)
     made.body.record_end(program, rig.state)
     rig.drive.record_tracking(program, rig.state)
-    seen = {"momentum": [rig.totals().momentum], "impulse": [], "moment": [], "gap": [], "lowest": []}
-    seen["turn"] = [rig.totals().angular_momentum]
-    first = np.flatnonzero(bones)
+    seen = {name: [] for name in ("momentum", "turn", "center", "impulse", "moment", "gap", "lowest")}
+
+    def look() -> None:
+        totals = rig.totals()
+        seen["momentum"].append(totals.momentum)
+        seen["turn"].append(totals.angular_momentum)
+        seen["center"].append(rig.mass @ rig.read("x") / rig.mass.sum())
+
+    look()
     for _ in range(30):
         program.run()
-        seen["momentum"].append(rig.totals().momentum)
-        seen["turn"].append(rig.totals().angular_momentum)
-        seen["impulse"].append(rig.scratch.sensors.boundary_impulse.numpy()[0, 0].astype(float))
-        seen["moment"].append(rig.scratch.sensors.boundary_moment.numpy()[0, 0].astype(float))
+        look()
+        sensors = rig.scratch.sensors
+        seen["impulse"].append(sensors.boundary_impulse.numpy()[0, 0].astype(float))
+        seen["moment"].append(sensors.boundary_moment.numpy()[0, 0].astype(float))
         seen["gap"].append(joint_gaps(rig.drive.tracked, rig.points.joints)[0].max())
         world = Rotation.from_quat(made.body.state.rotation.numpy()[0].astype(float)).as_matrix()
-        bone, at = rig.points.bone[first], made.body.state.position.numpy()[0].astype(float)
-        arm = (rig.points.rest[0, first] - rig.points.joints[0, bone]).astype(float)
+        bone, at = rig.points.bone[bones], made.body.state.position.numpy()[0].astype(float)
+        arm = (rig.points.rest[0, bones] - rig.points.joints[0, bone]).astype(float)
         seen["lowest"].append((at[bone] + np.einsum("pij,pj->pi", world[bone], arm))[:, 2].min())
     assert rig.state.failure.numpy().sum() == 0
-    return {name: np.array(values) for name, values in seen.items()} | {"mass": rig.mass.sum(), "model": model}
+    weight = -rig.mass.sum() * 9.81 * model.control_dt * UP
+    return {name: np.array(values) for name, values in seen.items()} | {"weight": weight}
 
 
 def test_bones_of_a_falling_body_stay_above_the_floor_and_together(fall):
-    assert fall["lowest"].min() < 2.0 * LAYER  # some do come down to it
-    assert fall["lowest"].min() > 0.0
+    assert 0.0 < fall["lowest"].min() < 2.0 * LAYER  # some do come down to it
     assert fall["gap"].max() < 1e-5
 
 
 def test_sensors_tell_all_that_the_floor_gave(fall):
-    """Weight and what the sensors tell are the change of momentum."""
-    weight = fall["mass"] * 9.81 * fall["model"].control_dt * UP
-    changes = np.diff(fall["momentum"], axis=0)
+    """Weight and what the sensors tell are the change of momentum, and their moments that of angular momentum."""
     scale = np.abs(fall["impulse"]).max()
-    assert scale > 3.0 * weight[2]
-    np.testing.assert_allclose(changes, fall["impulse"] - weight, atol=2e-4 * scale)
+    assert scale > 3.0 * np.abs(fall["weight"]).max()
+    np.testing.assert_allclose(np.diff(fall["momentum"], axis=0), fall["impulse"] + fall["weight"], atol=2e-4 * scale)
+    middle = 0.5 * (fall["center"][1:] + fall["center"][:-1])
+    moment = fall["moment"] + np.cross(middle, fall["weight"])
+    scale = np.abs(fall["moment"]).max()
+    np.testing.assert_allclose(np.diff(fall["turn"], axis=0), moment, atol=1e-2 * scale)
