@@ -99,7 +99,7 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
         """Restore what :meth:`get_state` returned; returns the observation.
 
         Raises:
-            ValueError: the state is of another environment or not finite; nothing has changed then.
+            ValueError: the state is of another environment, of other settings or not finite; nothing has changed then.
         """
         self._episode.restore(state)
         return self._episode.observation(0)

@@ -263,7 +263,7 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
         """Restore what :meth:`get_state` returned; returns the observations.
 
         Raises:
-            ValueError: the state is of other environments or not finite; nothing has changed then.
+            ValueError: the state is of other environments, of other settings or not finite; nothing has changed then.
         """
         self.episodes.set_state(state)
         return self._observation()
