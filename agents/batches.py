@@ -21,6 +21,7 @@ from agents.checkpoint import Checkpoint
 from agents.command import meant_for, read_options
 from agents.config import EvaluationSettings, load_resolved
 from agents.curve import Curve
+from agents.divergence import Diverged
 from agents.evaluate import Agent, Episode, Evaluation, baselines, begin_round, episode_bar
 from agents.folders import made
 from agents.report import conclude, draw_curve, versions
@@ -233,7 +234,7 @@ def run(
             iterations_of(checkpoint, config.iterations)
             learned = learn(config, task, folder, options.device, checkpoint)
         conclude_batch(name, config, find_task, learned, folder, options.device)
-    except (ConfigError, OSError) as error:
+    except (ConfigError, Diverged, OSError) as error:
         sys.exit(f"error: {error}")
 
 

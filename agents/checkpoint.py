@@ -27,7 +27,7 @@ from piavatar_envs.doctor import package_version
 from piavatar_envs.envs.config import ConfigError
 
 #: Of the file's content; rises with every change.
-FORMAT = 3
+FORMAT = 4
 #: Settings that what has been learned so far does not depend on.
 FREE = ("total_steps", "iterations", "checkpoint_every", "evaluation", "env.render")
 #: Of these, how long a training is, and the settings that change with how much of it is over: where there is one, what

@@ -18,6 +18,7 @@ from rich.console import Console
 from agents import ppo
 from agents.command import in_a_line, read_options
 from agents.config import TrainingConfig, load_training
+from agents.divergence import Diverged
 from agents.evaluate import Evaluation, baselines, evaluate, policy_agent, separated
 from agents.film import film
 from agents.folders import RESULTS, claim, hold
@@ -187,7 +188,7 @@ def main(args: list[str] | None = None) -> None:
     """The command line."""
     options = read_options(Options, "demo", args)
     console = Console(highlight=False, soft_wrap=True)
-    with in_a_line(ValueError, OSError):
+    with in_a_line(ValueError, Diverged, OSError):
         outcome = run(options, console)
     show_table(outcome.evaluations, console)
     verdict = "lies above" if outcome.separated else "does NOT lie above"

@@ -5,9 +5,11 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, CheckpointCallback
@@ -21,6 +23,7 @@ from agents import ppo, resume, sac
 from agents.checkpoint import Checkpoint
 from agents.config import TrainingConfig
 from agents.curve import Curve
+from agents.divergence import check_finite
 from agents.folders import write_config, write_whole
 from agents.parallel import WAITING
 from agents.rollouts import MarkPlayed
@@ -69,6 +72,7 @@ class Progress(BaseCallback):
             deadline: by ``time.monotonic()``, or None.
         """
         super().__init__()
+        self.bar: tqdm | None = None
         self.curve, self.total_steps, self.start, self.deadline = curve, total_steps, start, deadline
 
     def _on_training_start(self) -> None:
@@ -89,7 +93,12 @@ class Progress(BaseCallback):
         return self.deadline is None or time.monotonic() < self.deadline
 
     def _on_training_end(self) -> None:
-        self.bar.close()
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the bar's line, if there is one; closing twice is fine."""
+        if self.bar is not None:
+            self.bar.close()
 
 
 def begin(config: TrainingConfig, venv: VecEnv, facts: EnvFacts, checkpoint: Checkpoint | None = None) -> BaseAlgorithm:
@@ -122,7 +131,7 @@ def learn(
 ) -> Curve:
     """Train until the steps or the time are over.
 
-    Leaves the configuration, policies, the curve and TensorBoard's files in ``folder``; nothing is refused any more.
+    Leaves the configuration, policies, the curve and TensorBoard's files in ``folder``; no setting is refused any more.
 
     Args:
         config: resolved.
@@ -131,6 +140,9 @@ def learn(
         checkpoint: from which to go on, and which to keep up; None for a training that cannot be resumed.
         deadline: by ``time.monotonic()``, or None.
         watchers: what else to call at every step, before the checkpoint is written.
+
+    Raises:
+        Diverged: the networks are not finite any more.
     """
     write_config(folder, config)
     curve = Curve()
@@ -141,15 +153,50 @@ def learn(
     snapshots = CheckpointCallback(max(1, config.checkpoint_every // model.n_envs), str(folder / "checkpoints"))
     snapshots.n_calls = model.num_timesteps // model.n_envs
     watch = [MarkPlayed()] if isinstance(model, PPO) else []
-    watch += [snapshots, *watchers, Progress(curve, config.total_steps, start, deadline)]
+    progress, check = (
+        Progress(curve, config.total_steps, start, deadline),
+        partial(_check_finite, config, model, checkpoint),
+    )
+    watch += [snapshots, *watchers, progress]
     if checkpoint is not None:
-        watch.append(resume.KeepCheckpoint(checkpoint, config.checkpoint_every, curve))
-    model.learn(config.total_steps - model.num_timesteps, callback=CallbackList(watch), reset_num_timesteps=False)
+        watch.append(resume.KeepCheckpoint(checkpoint, config.checkpoint_every, curve, check))
+    try:
+        model.learn(config.total_steps - model.num_timesteps, callback=CallbackList(watch), reset_num_timesteps=False)
+    except ValueError:  # what torch says of broken networks says nothing to whoever trains
+        check()
+        raise
+    finally:
+        progress.close()
+    check()
     curve.seconds, curve.train_steps = time.monotonic() - start, model.num_timesteps
     model.logger.close()
     write_whole(folder / "policy.zip", model.save)
     curve.save(folder / "curve.csv")
     return curve
+
+
+def _check_finite(config: TrainingConfig, model: BaseAlgorithm, checkpoint: Checkpoint | None) -> None:
+    """Refuse to go on with networks that have diverged, or to keep them.
+
+    Raises:
+        Diverged: they have.
+    """
+    if model._last_obs is None:  # nothing has been observed, or learned
+        return
+    try:
+        actions, _ = model.predict(model._last_obs, deterministic=True)
+    except ValueError:  # torch's distributions refuse them
+        actions = np.nan
+    name, settings = ("ppo", config.ppo) if config.sac is None else ("sac", config.sac)
+    rate = f"{name}.learning_rate", settings.learning_rate
+    path = None if checkpoint is None else checkpoint.path
+    check_finite(
+        {"policy": model.policy},
+        {"the distribution of actions": torch.as_tensor(actions)},
+        model.num_timesteps,
+        rate,
+        path,
+    )
 
 
 def _check_steps(config: TrainingConfig, model: BaseAlgorithm, checkpoint: Checkpoint) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from operator import attrgetter
 from typing import Any
 
@@ -125,16 +126,17 @@ def set_env_state(venv: VecEnv, state: Any) -> None:
 class KeepCheckpoint(BaseCallback):
     """Writes the checkpoint between rollouts, when its time has come, and at the end."""
 
-    def __init__(self, checkpoint: Checkpoint, every: int, curve: Curve) -> None:
+    def __init__(self, checkpoint: Checkpoint, every: int, curve: Curve, check: Callable[[], None]) -> None:
         """Watch a training.
 
         Args:
             checkpoint: where to write.
             every: steps between two of them, at least.
             curve: of the training.
+            check: refuses to keep a model that is not worth it.
         """
         super().__init__()
-        self.checkpoint, self.every, self.curve = checkpoint, every, curve
+        self.checkpoint, self.every, self.curve, self.check = checkpoint, every, curve, check
         self._in_rollout = False
 
     def _on_training_start(self) -> None:
@@ -157,5 +159,6 @@ class KeepCheckpoint(BaseCallback):
             self._keep()
 
     def _keep(self) -> None:
+        self.check()
         self.checkpoint.save(capture(self.model, self.curve))
         self._kept = self.model.num_timesteps

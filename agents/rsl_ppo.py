@@ -8,13 +8,11 @@ nothing had happened.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from rsl_rl.algorithms import PPO
 from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.utils.log_writer import LogWriter
 from tensordict import TensorDict
@@ -23,61 +21,18 @@ from torch.utils.tensorboard import SummaryWriter
 from agents.batches import Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, set_random_states
 from agents.curve import Curve
+from agents.divergence import check_finite
 from agents.folders import write_config, write_whole
 from agents.help import HelpedEnv
 from agents.lessons import with_lessons
 from agents.mirror import Mirror
+from agents.rsl_algorithm import ScaledPPO
 from agents.rsl_policy import RslTraining, actor_settings, mean_agent, network_settings
 from agents.workers import components
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
 from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.base import Task
-
-
-class ScaledPPO(PPO):
-    """rsl_rl's PPO, which learns from scaled rewards and noisy observations, and in smaller and smaller updates.
-
-    What is logged are the environment's own rewards.
-
-    Attributes:
-        updates: how many there have been; to be set where a training goes on.
-    """
-
-    def __init__(
-        self, *args: Any, reward_scale: float, observation_noise: float, kl_targets: Sequence[float], **settings: Any
-    ) -> None:
-        """As rsl_rl's.
-
-        Args:
-            args: of the base.
-            reward_scale: the factor.
-            observation_noise: standard deviation of what is added to every component.
-            kl_targets: of the first update and all that follow, in place of ``desired_kl``; none for a fixed one.
-            settings: of the base.
-        """
-        super().__init__(*args, **settings)
-        self.reward_scale, self.kl_targets, self.updates = reward_scale, kl_targets, 0
-        self.observation_noise = observation_noise
-
-    def update(self) -> dict[str, float]:
-        """Learn from a rollout."""
-        if self.kl_targets:
-            self.desired_kl = self.kl_targets[min(self.updates, len(self.kl_targets) - 1)]
-        self.updates += 1
-        return super().update()
-
-    def process_env_step(
-        self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, torch.Tensor]
-    ) -> None:
-        """Record a step."""
-        super().process_env_step(obs, self.reward_scale * rewards, dones, extras)
-
-    def act(self, obs: TensorDict) -> torch.Tensor:
-        """Draw actions, and record what they are drawn for."""
-        if self.observation_noise > 0.0:
-            obs = obs.apply(lambda seen: seen + self.observation_noise * torch.randn_like(seen))
-        return super().act(obs)
 
 
 class CurveWriter(LogWriter):
@@ -133,6 +88,7 @@ class Runner(OnPolicyRunner):
             }
         }
         super().__init__(env, settings, log_dir=str(folder / "rsl_rl"), device=str(env.device))
+        self.alg.check, self._config = self._check_finite, config
         self.logger.git_status_repos.clear()  # results.json says which commit; no diffs of what is around
         if saved:
             self._restore(saved)
@@ -154,6 +110,19 @@ class Runner(OnPolicyRunner):
         self.iterations, self.curve = self.current_learning_iteration + 1, self.logger.writer.curve
         self.curve.seconds = time.monotonic() - self._begun
         self.checkpoint.save(self._state())
+
+    def _check_finite(self) -> None:
+        """Refuse to go on, or to keep anything, after networks have diverged.
+
+        Raises:
+            Diverged: they have.
+        """
+        networks, config = {"actor": self.alg.actor, "critic": self.alg.critic}, self._config
+        seen = self.env.get_observations()
+        with torch.no_grad():
+            outputs = {f"the {name}'s output": network(seen) for name, network in networks.items()}
+        steps = self.alg.updates * config.num_envs * config.ppo.rollout_steps
+        check_finite(networks, outputs, steps, ("ppo.learning_rate", config.ppo.learning_rate), self.checkpoint.path)
 
     def _state(self) -> dict[str, Any]:
         log = self.logger
@@ -281,6 +250,7 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
 
     Raises:
         ConfigError: what is asked for does not fit the environment, or the checkpoint has had more iterations.
+        Diverged: the networks are not finite any more.
     """
     env = make_env(config, task, device)
     seed_all(config.seed)

@@ -25,6 +25,7 @@ from agents.batches import BatchTraining, Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, random_states, seed_all, set_random_states
 from agents.config import multi_module
 from agents.curve import Curve
+from agents.divergence import check_finite
 from agents.evaluate import Agent
 from agents.folders import write_config, write_whole
 from agents.skrl_networks import ActedMemory, Critic, MAPPOSettings, Policy
@@ -116,14 +117,25 @@ class WorldMAPPO(MAPPO):
         self._totals[ended] = 0.0
 
     def post_interaction(self, *, timestep: int, timesteps: int) -> None:
-        """Learn at the end of a rollout, and write the checkpoint when its time has come, and at the end."""
+        """Learn at the end of a rollout, and write the checkpoint when its time has come, and at the end.
+
+        Raises:
+            Diverged: the networks are not finite any more.
+        """
         super().post_interaction(timestep=self._first_step + timestep, timesteps=timesteps)
         if self._rollout % self.cfg.rollouts == 0:
             self.iterations += 1
+            self._check_finite()
             self.curve.seconds = time.monotonic() - self._begun
             due = self.iterations % self.checkpoint_every == 0 or timestep + 1 == timesteps
             if self.checkpoint is not None and due:
                 self.checkpoint.save(self._state())
+
+    def _check_finite(self) -> None:
+        networks = {f"{name} {part}": network for name, own in self.models.items() for part, network in own.items()}
+        actions = torch.as_tensor(joint_agent(self)(self.env.episodes.observation()))
+        rate = "mappo.learning_rate", self.cfg.learning_rate[self.possible_agents[0]][0]
+        check_finite(networks, {"an action": actions}, self._steps, rate, self.checkpoint and self.checkpoint.path)
 
     def _state(self) -> dict[str, Any]:
         return {
@@ -173,6 +185,7 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
 
     Raises:
         ConfigError: there is no such term to observe, or the checkpoint has had more iterations than are asked for.
+        Diverged: the networks are not finite any more.
     """
     env = Worlds(type(task), config.num_envs, device, task.config)
     seed_all(config.seed)

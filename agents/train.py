@@ -22,6 +22,7 @@ from agents.checkpoint import Checkpoint
 from agents.command import meant_for, read_options
 from agents.config import TrainingConfig, load_training
 from agents.curve import Curve
+from agents.divergence import Diverged
 from agents.evaluate import Evaluation, baselines, evaluate, policy_agent
 from agents.folders import made
 from agents.learning import begin, learn
@@ -123,6 +124,7 @@ def run(config: TrainingConfig, folder: Path, device: str, resume: bool) -> None
     Raises:
         ConfigError: the folder is another training's, the checkpoint does not fit, or the configuration does not fit
             the environment or the device.
+        Diverged: the networks are not finite any more.
         OSError: something cannot be written.
     """
     learns = train_selfplay if config.selfplay else train_together if config.is_multi else train_single
@@ -159,7 +161,7 @@ def main(args: list[str] | None = None) -> None:
         sys.exit(f"error: {error}{meant_for(options.config, 'train')}")
     try:
         run(config, options.out or Path("runs") / options.config.stem, options.device, options.resume)
-    except (ConfigError, OSError) as error:
+    except (ConfigError, Diverged, OSError) as error:
         sys.exit(f"error: {error}")
 
 

@@ -29,7 +29,8 @@ def _register(env_id: str, task: str) -> None:
         vector_entry_point="piavatar_envs.api.vector:AvatarVectorEnv",
         # the time limit lives inside, so that a saved state holds it
         max_episode_steps=None,
-        kwargs={"task": task},
+        # the task a second time, where nobody who makes the id can replace it
+        kwargs={"task": task, "registered": [env_id, task]},
     )
 
 

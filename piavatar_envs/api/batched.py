@@ -18,6 +18,7 @@ from piavatar_envs.avatar.joint_drive import checked_assist
 from piavatar_envs.envs.batch_env import BatchEnv, check_count
 from piavatar_envs.envs.draws import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.simulation import check_device
+from piavatar_envs.envs.states import check_settings
 from piavatar_envs.mpm.cores import available_cores
 from piavatar_envs.tasks.base import Task
 
@@ -241,9 +242,11 @@ class BatchedEpisodes:
         """Restore what :meth:`get_state` returned, under any number of threads.
 
         Raises:
-            ValueError: the state is of another environment, of another number or not finite; nothing has changed then.
+            ValueError: the state is of another environment, another number or other settings, or not finite; nothing
+                has changed then.
         """
         check_state(state, self.num_envs)
+        check_settings(state, self.config)  # of all, before any of the groups has changed
         self.adopt(state, ready=True)
 
     def adopt(self, state: dict[str, np.ndarray], ready: bool) -> None:

@@ -182,7 +182,7 @@ class Episode:
         """Go on from what :meth:`get_state` returned.
 
         Raises:
-            ValueError: the state is of another environment or not finite; nothing has changed then.
+            ValueError: the state is of another environment, of other settings or not finite; nothing has changed then.
         """
         check_state(state, 1)
         self.adopt(state, ready=True)

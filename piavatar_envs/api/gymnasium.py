@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -12,7 +13,7 @@ from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
 from piavatar_envs.api.view import EpisodeView
 from piavatar_envs.envs.config import load_config
-from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks import load_registered
 from piavatar_envs.tasks.base import Task
 
 
@@ -35,6 +36,7 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
         render_mode: str | None = None,
         device: str = "cpu",
         config: Settings = None,
+        registered: Sequence[str] | None = None,
         **overrides: Any,
     ) -> None:
         """Build the environment.
@@ -44,14 +46,15 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
             render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
+            registered: for Gymnasium alone: the id that is made, and the task that it was registered for.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
             ImportError: ``render_mode="human"`` without the extra ``live``.
-            ValueError: an unknown task, render mode or device.
+            ValueError: an unknown task or one that is not the id's, an unknown render mode or device.
         """
-        task_class = load_task(task)
+        task_class = load_registered(task, registered)
         settings = load_config(task_class.Config, config, overrides)
         made = {"task": task_class, "render_mode": render_mode, "device": device, "config": settings}
         self._build = partial(AvatarEnv.__init__, **made)
@@ -96,7 +99,7 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
         """Restore what :meth:`get_state` returned; returns the observation.
 
         Raises:
-            ValueError: the state is of another environment or not finite; nothing has changed then.
+            ValueError: the state is of another environment, of other settings or not finite; nothing has changed then.
         """
         self._episode.restore(state)
         return self._episode.observation(0)

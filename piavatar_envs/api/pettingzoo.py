@@ -184,7 +184,7 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
         """Restore what :meth:`get_state` returned, and who plays; returns the observations of these.
 
         Raises:
-            ValueError: the state is of another environment or not finite; nothing has changed then.
+            ValueError: the state is of another environment, of other settings or not finite; nothing has changed then.
         """
         self._episode.restore(state)
         self.agents = self._playing()

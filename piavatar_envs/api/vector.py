@@ -20,7 +20,7 @@ from piavatar_envs.api.infos import outcome, standing, vector_format
 from piavatar_envs.api.picture import Pictures
 from piavatar_envs.api.view import BatchedView
 from piavatar_envs.envs.config import load_config
-from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks import load_registered
 from piavatar_envs.tasks.base import Task
 
 
@@ -63,6 +63,7 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
         array_api: str = "numpy",
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         num_threads: int | None = None,
+        registered: Sequence[str] | None = None,
         **overrides: Any,
     ) -> None:
         """Build the environments.
@@ -76,15 +77,17 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
             array_api: what goes in and comes out: ``"numpy"`` or ``"torch"`` (on ``device``).
             autoreset_mode: what happens at the end of an episode; an ``AutoresetMode`` or its value.
             num_threads: threads that share the environments on a CPU; one a core if not given. Changes no result.
+            registered: for Gymnasium alone: the id that is made, and the task that it was registered for.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
             ImportError: ``array_api="torch"`` and torch is not installed.
-            ValueError: an unknown task, render mode, device, kind of arrays or autoreset mode, or no environments.
+            ValueError: an unknown task or one that is not the id's, an unknown render mode, device, kind of arrays or
+                autoreset mode, or no environments.
         """
         self.render_mode, self.autoreset_mode = check_batch_render_mode(render_mode), _autoreset_mode(autoreset_mode)
-        task_class = load_task(task)
+        task_class = load_registered(task, registered)
         self.config = load_config(task_class.Config, config, overrides)
         made = {"num_envs": num_envs, "render_mode": render_mode, "device": device, "array_api": array_api}
         made |= {"autoreset_mode": self.autoreset_mode, "num_threads": num_threads, "config": self.config}
@@ -260,7 +263,7 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
         """Restore what :meth:`get_state` returned; returns the observations.
 
         Raises:
-            ValueError: the state is of other environments or not finite; nothing has changed then.
+            ValueError: the state is of other environments, of other settings or not finite; nothing has changed then.
         """
         self.episodes.set_state(state)
         return self._observation()

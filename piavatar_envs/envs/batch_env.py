@@ -18,6 +18,7 @@ from piavatar_envs.envs.joint_actions import apply_targets, apply_torques, follo
 from piavatar_envs.envs.observer import Observer
 from piavatar_envs.envs.props import check_places
 from piavatar_envs.envs.simulation import Simulation
+from piavatar_envs.envs.states import SETTINGS, check_settings, settings_rows
 from piavatar_envs.mpm.program import Program, compile_programs
 from piavatar_envs.tasks.base import Task
 
@@ -264,8 +265,9 @@ class BatchEnv:
         )
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on, as copies on the host."""
+        """Everything that the future depends on, as copies on the host; the settings, too."""
         state = {name: array.numpy().copy() for name, array in self.arrays().items()}
+        state[SETTINGS] = settings_rows(self.config, self.num_envs)
         for avatar in self.simulation.shapes.of_host:
             state[f"shape.{avatar}"] = self.simulation.flesh[avatar].shape_parameters.copy()
         return state
@@ -274,12 +276,15 @@ class BatchEnv:
         """Restore what :meth:`get_state` returned; the observation follows. On the CPU the future is bit-identical.
 
         Raises:
-            ValueError: arrays are missing, unknown, or of the wrong shape or type; nothing has changed then.
+            ValueError: it was saved under other settings, or arrays are missing, unknown, or of the wrong shape or
+                type; nothing has changed then.
         """
+        check_settings(state, self.config)
         present = self.get_state()
         if set(state) != set(present):
             missing, unknown = sorted(set(present) - set(state)), sorted(set(state) - set(present))
             raise ValueError(f"the state is of another environment: missing {missing}, unknown {unknown}")
+        del present[SETTINGS]  # they are compared already
         for name, have in present.items():
             if np.shape(state[name]) != have.shape or np.asarray(state[name]).dtype != have.dtype:
                 raise ValueError(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 wp.set_module_options({"enable_backward": False})
 
 
-#: Columns behind a task's own in which is seen what it writes beyond them, and what stands there until it does.
+#: Numbers behind the last row in which is seen what a task writes beyond its columns, and what stands there until then.
 SPARE, UNTOUCHED = 8, -1.2345678e30
 #: Arrays of the batch whose last dimension are a task's names, and how these are called.
 NAMED = {"terms": "reward_terms", "cost_terms": "cost_terms", "metrics": "metrics"}
@@ -33,11 +33,11 @@ class FiniteWatch:
     def __init__(self, task: Task) -> None:
         """Stand between the task and its batch."""
         self._found: dict[tuple[str, ...], wp.array] = {}
-        self._wide: dict[str, wp.array] = {}
+        self._long: dict[str, wp.array] = {}
         self._task = task
         allocate, record_outcome, record_observe = task.allocate, task.record_outcome, task.record_observe
 
-        def widen(env: BatchEnv) -> None:
+        def lengthen(env: BatchEnv) -> None:
             for name in NAMED:
                 setattr(env, name, self._with_spare(name, getattr(env, name)))
             allocate(env)
@@ -52,15 +52,14 @@ class FiniteWatch:
             names = [f"{term.name}[{index}]" for term in task.terms() for index in range(term.size)]
             self._note(env, program, env.observation, names, start, range(agent, agent + 1))
 
-        task.allocate, task.record_outcome, task.record_observe = widen, outcome, observe
+        task.allocate, task.record_outcome, task.record_observe = lengthen, outcome, observe
 
     def _with_spare(self, name: str, array: wp.array) -> wp.array:
-        """A view of the shape of ``array`` whose rows do not follow each other at once."""
-        rows, agents, columns = array.shape
-        wide = np.full((rows, agents, columns + SPARE), UNTOUCHED, np.float32)
-        wide[..., :columns] = 0.0
-        self._wide[name] = wp.array(wide, dtype=float, device=array.device)
-        return self._wide[name][:, :, :columns]
+        """An array such as ``array``, whose rows follow each other as they do there: it can be reshaped."""
+        long = np.full(array.size + SPARE, UNTOUCHED, np.float32)
+        long[: array.size] = 0.0
+        self._long[name] = wp.array(long, dtype=float, device=array.device)
+        return self._long[name][: array.size].reshape(array.shape)
 
     def _note(
         self, env: BatchEnv, program: Program, values: wp.array, names: Sequence[str], start: int, agents: range
@@ -78,17 +77,20 @@ class FiniteWatch:
     def beyond(self) -> dict[str, tuple[int, int]]:
         """Of ``reward_terms``, ``cost_terms`` and ``metrics``, those of which the task writes more than it declares.
 
+        What is written beyond a row is the next one's, where nobody can tell it from what that row's agent has written;
+        it is seen behind the last agent of the last environment.
+
         Returns:
             How many names there are, and how many columns are written, as far as :data:`SPARE` more can tell.
         """
         found = {}
-        for name, wide in self._wide.items():
-            declared = len(getattr(self._task, NAMED[name]))
-            untouched = np.full(wide.shape[2], UNTOUCHED, np.float32)
-            untouched[:-SPARE] = 0.0  # without names there is a column that means nothing
-            written = np.flatnonzero((wide.numpy() != untouched).any((0, 1)))
-            if len(written) and written[-1] >= declared:
-                found[NAMED[name]] = declared, int(written[-1]) + 1
+        for name, long in self._long.items():
+            declared, values = len(getattr(self._task, NAMED[name])), long.numpy()
+            behind = np.flatnonzero(values[-SPARE:] != np.float32(UNTOUCHED))
+            if len(behind):
+                found[NAMED[name]] = declared, max(1, declared) + int(behind[-1]) + 1
+            elif not declared and values[:-SPARE].any():  # without names there is a column that means nothing
+                found[NAMED[name]] = declared, 1
         return found
 
 

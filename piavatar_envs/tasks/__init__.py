@@ -6,7 +6,7 @@ import difflib
 import importlib
 import pkgutil
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -116,6 +116,30 @@ def load_task(task: str | type[Task]) -> type[Task]:
     if full not in _added:
         raise ValueError(f"unknown task {task!r}; {instead_of(task, [*modules, *_added])}")
     return load_task(_added[full])
+
+
+def load_registered(task: str | type[Task], registered: Sequence[str] | None) -> type[Task]:
+    """The class of the task of an environment that may be made by its id.
+
+    Args:
+        task: as for :func:`load_task`.
+        registered: the id and the task that it was registered for; None for an environment made without one.
+
+    Raises:
+        ImportError: the module cannot be imported.
+        ValueError: there is no such task, or it is not that of the id.
+    """
+    found = load_task(task)
+    if registered is None:
+        return found
+    env_id, own = registered
+    if found is not load_task(own):
+        known = [*task_modules(), *_added]
+        others = [other for other in known if task in (other, other.removeprefix(f"{NAMESPACE}/"))]
+        remedy = f"make {others[0]!r}" if others else "make the id that piavatar_envs.register_task gives it"
+        name = task if isinstance(task, str) else found.__name__
+        raise ValueError(f"task={name!r} is not that of {env_id}; {remedy}")
+    return found
 
 
 def how_to_name(env_id: str) -> str:

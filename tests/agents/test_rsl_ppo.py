@@ -12,7 +12,7 @@ torch = pytest.importorskip("torch", reason="needs the extras train and rsl")
 for needed in ("rsl_rl", "tensordict", "git"):
     pytest.importorskip(needed, reason="needs the extra rsl")
 
-from agents import rsl_ppo  # noqa: E402
+from agents import rsl_algorithm, rsl_ppo  # noqa: E402
 from agents.batches import load_batched, new_task  # noqa: E402
 from agents.checkpoint import Checkpoint  # noqa: E402
 from agents.rsl_policy import RslTraining  # noqa: E402
@@ -82,8 +82,8 @@ def test_training_changes_the_policy_repeats_and_depends_on_its_seed(device, tmp
 
 
 def test_updates_aim_at_smaller_and_smaller_divergences(tmp_path, monkeypatch, capsys):
-    aims, update = [], rsl_ppo.PPO.update
-    monkeypatch.setattr(rsl_ppo.PPO, "update", lambda self: aims.append(self.desired_kl) or update(self))
+    aims, update = [], rsl_algorithm.PPO.update
+    monkeypatch.setattr(rsl_algorithm.PPO, "update", lambda self: aims.append(self.desired_kl) or update(self))
     run = [str(CONFIGS[0]), *TINY, "help=null", "ppo.final_kl=0.01"]
     rsl_ppo.main([*run, "ppo.desired_kl=0.02", "--out", str(tmp_path / "falls")])
     assert aims == pytest.approx([0.02, 0.015, 0.01])
@@ -109,10 +109,12 @@ def test_what_does_not_fit_leaves_nothing_and_the_steps_are_told_without_an_epis
 
 def test_networks_learn_from_noisy_observations_and_play_on_exact_ones(tmp_path, monkeypatch, capsys):
     exact, seen = [], []
-    act, record = rsl_ppo.PPO.act, rsl_ppo.PPO.process_env_step
-    monkeypatch.setattr(rsl_ppo.PPO, "act", lambda self, obs: seen.append(obs["policy"].clone()) or act(self, obs))
+    act, record = rsl_algorithm.PPO.act, rsl_algorithm.PPO.process_env_step
     monkeypatch.setattr(
-        rsl_ppo.PPO,
+        rsl_algorithm.PPO, "act", lambda self, obs: seen.append(obs["policy"].clone()) or act(self, obs)
+    )
+    monkeypatch.setattr(
+        rsl_algorithm.PPO,
         "process_env_step",
         lambda self, obs, *of_step: exact.append(obs["policy"].clone()) or record(self, obs, *of_step),
     )

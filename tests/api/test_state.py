@@ -14,6 +14,9 @@ SETTINGS = [
     {"control": "pose", "drive.tone": 0.2, "root": "free", "decoupling": "paper"},
 ]
 
+#: Of a scene, beside the avatar.
+BALL = {"name": "ball", "position": (0.0, -1.0, 0.2), "mass": 0.4}
+
 
 def run_on(env, steps: int, seed: int) -> list:
     rng = np.random.default_rng(seed)
@@ -173,11 +176,89 @@ def test_what_is_no_state_is_refused(make_env, state, told):
     assert all(before[name].tobytes() == after[name].tobytes() for name in before)
 
 
-def test_states_of_another_environment_are_refused(make_env, env_id):
-    env, other = make_env(env_id), make_env(env_id, **{"shape.randomize": True})
+def bytes_of(state) -> dict[str, bytes]:
+    return {name: value.tobytes() for name, value in state.items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "told"),
+    [
+        ("Reach-v0", {"friction": 0.3}, r"physics.friction=0.8, this environment has 0.3; make one"),
+        ("Reach-v0", {"young_modulus": 9e4}, r"physics.young_modulus=100000.0, .* has 90000.0"),
+        ("Reach-v0", {"gravity": 1.62}, r"physics.gravity=9.81, .* has 1.62"),
+        ("Reach-v0", {"control_dt": 0.03}, r"physics.control_dt=0.0333\d*, .* has 0.03"),
+        ("Reach-v0", {"radius": 0.2}, r"with radius=0.45, .* has 0.2"),
+        ("Reach-v0", {"mass_factor": (0.8, 1.25)}, r"randomize.mass_factor=\[1.0, 1.0\], .* has \[0.8, 1.25\]"),
+        ("Reach-v0", {"shape.randomize": True}, r"shape.randomize=False, .* has True"),
+        ("Stand-v0", {"bone_contact": False}, r"drive.bone_contact=True, .* has False"),
+        ("Reach-v0", {"scene.props": [BALL]}, r"scene.props=\[\], .* has \[{'"),
+    ],
+)
+def test_states_of_other_settings_are_refused_and_change_nothing(make_env, name, settings, told):
+    env, other = make_env(f"PIAvatar/{name}"), make_env(f"PIAvatar/{name}", **settings)
     env.reset(seed=0)
-    other.reset(seed=0)
-    with pytest.raises(ValueError, match=r"of another environment.*missing.*body"):
+    other.reset(seed=1)
+    before, restarts = bytes_of(other.get_state()), other.batch.restarts
+    with pytest.raises(ValueError, match=told) as caught:
         other.set_state(env.get_state())
-    with pytest.raises(ValueError, match=r"of another environment.*unknown.*body"):
-        env.set_state(other.get_state())
+    assert "\n" not in str(caught.value)
+    assert bytes_of(other.get_state()) == before and other.batch.restarts == restarts
+
+
+def test_of_things_in_a_scene_the_setting_is_named(make_env):
+    env, other = (make_env("PIAvatar/Reach-v0", **{"scene.props": [{**BALL, "mass": mass}]}) for mass in (0.4, 0.5))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"scene.props.0.mass=0.4, .* has 0.5"):
+        other.set_state(env.get_state())
+
+
+def test_settings_that_decide_nothing_may_differ(make_env, equal):
+    """Pictures, how observations are packed, and help that the state has as it is."""
+    env = make_env("PIAvatar/Stand-v0", control="pd", root_assist=0.4)
+    other = make_env("PIAvatar/Stand-v0", control="pd", obs_mode="dict", width=64)
+    observation = env.reset(seed=0)[0]
+    seen = other.set_state(env.get_state())
+    assert equal(np.concatenate([part.ravel() for part in seen.values()]), observation)
+    assert other.batch.simulation.avatar.joints.assist.numpy().tolist() == pytest.approx([0.4])
+
+
+def test_one_may_go_on_under_other_settings_on_purpose(make_env):
+    env, other = make_env("PIAvatar/Reach-v0"), make_env("PIAvatar/Reach-v0", friction=0.3)
+    env.reset(seed=0)
+    state = env.get_state()
+    other.set_state({**state, "env.settings": other.get_state()["env.settings"]})
+    assert other.get_state()["particles.x"].tobytes() == state["particles.x"].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (None, r"of another environment: missing \['env.settings'\], unknown \[\]"),
+        (np.zeros((1, 4), np.int32), r"'env.settings'\] has shape \(1, 4\) and type int32; use what get_state"),
+        (np.full((1, 4), 255, np.uint8), r"'env.settings'\] is no text of settings; use what get_state"),
+    ],
+)
+def test_a_state_without_its_settings_is_refused(make_env, settings, told):
+    env = make_env("PIAvatar/Reach-v0")
+    env.reset(seed=0)
+    state = {name: value for name, value in env.get_state().items() if name != "env.settings"}
+    with pytest.raises(ValueError, match=told):
+        env.set_state(state if settings is None else {**state, "env.settings": settings})
+
+
+def test_a_vector_of_other_settings_in_one_place_is_refused_before_any_has_changed(make_vec):
+    """Also in the last of them, which another thread has."""
+    vector, other = make_vec("PIAvatar/Reach-v0", 3), make_vec("PIAvatar/Reach-v0", 3, friction=0.3)
+    for each in (vector, other):
+        each.reset(seed=0)
+    state = vector.get_state()
+    vector.reset(seed=5)
+    before, strange = bytes_of(vector.get_state()), state["env.settings"].copy()
+    strange[2] = other.get_state()["env.settings"][2]
+    for bad in ({**state, "env.settings": strange}, other.get_state()):
+        with pytest.raises(ValueError, match=r"physics.friction=0.3, this environment has 0.8"):
+            vector.set_state(bad)
+        assert bytes_of(vector.get_state()) == before
+    with pytest.raises(ValueError, match=r"physics.friction=0.3, this environment has 0.8"):
+        vector.call_some([2], "set_state", other.call("get_state")[0])
+    assert bytes_of(vector.get_state()) == before

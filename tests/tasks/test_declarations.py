@@ -29,6 +29,15 @@ def write(
         out[e, 0, k] = 3.0
 
 
+@wp.kernel
+def write_flat(columns: int, terms: wp.array(dtype=float), costs: wp.array(dtype=float), out: wp.array2d(dtype=float)):
+    e = wp.tid()
+    for k in range(columns):
+        terms[2 * e + k] = 1.0
+    costs[e] = 1.0
+    out[e, 0] = 1.0
+
+
 class Plain(Task):
     """Writes as many columns of each as it is told."""
 
@@ -87,7 +96,7 @@ def test_no_metric_can_take_a_name_of_info(make_env, env_id):
         ({"columns": (2, 0, 1), "cost_terms": ()}, {}),
     ],
 )
-def test_columns_beyond_those_declared_are_seen_and_hurt_nobody(device, declared, found):
+def test_columns_beyond_those_declared_are_seen(device, declared, found):
     task = made(**declared)
     watch = FiniteWatch(task)
     batch = BatchEnv(task, 3, device)
@@ -104,3 +113,19 @@ def test_check_task_tells_what_is_written_beyond_the_names(device):
     with pytest.raises(TaskError, match=told):
         check_task(type("Wide", (Plain,), {"columns": (3, 1, 1)}), steps=4, device=device)
     check_task(Plain, steps=4, device=device)
+
+
+class Flat(Plain):
+    """Has arrays of its own shape, of which nobody but itself knows where a row ends."""
+
+    def allocate(self, env):
+        self.flat = env.terms.flatten(), env.cost_terms.reshape(env.num_envs), env.metrics.reshape((env.num_envs, 1))
+
+    def record_outcome(self, env, program):
+        program.launch(write_flat, env.num_envs, [self.columns[0]], list(self.flat))
+
+
+def test_a_task_may_reshape_its_arrays(device):
+    check_task(Flat, steps=4, device=device)
+    with pytest.raises(TaskError, match="reward_terms declares 2 names, and 4 columns are written"):
+        check_task(type("Wide", (Flat,), {"columns": (4, 1, 1)}), steps=4, device=device)

@@ -14,6 +14,7 @@ import piavatar_envs
 from piavatar_envs import cli
 from piavatar_envs.api.gymnasium import AvatarEnv
 from piavatar_envs.api.vector import AvatarVectorEnv
+from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.tasks import load_task, reach
 from piavatar_envs.tasks.base import Task
 
@@ -57,6 +58,33 @@ def test_it_is_an_environment_like_all_others(module, device):
     assert np.array_equal(same.reset(seed=3)[0], one)
     for made in (env, many, same):
         made.close()
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+@pytest.mark.parametrize(
+    "made, task, told",
+    [
+        ("PIAvatar/Reach-v0", "KickBall-v0", "task='KickBall-v0' is not that of PIAvatar/Reach-v0; make 'PIA"),
+        ("PIAvatar/Reach-v0", "Somebody/Near-v0", "not that of PIAvatar/Reach-v0; make 'Somebody/Near-v0'"),
+        ("PIAvatar/KickBall-v0", reach.ReachTask, "task='ReachTask' is not .*make the id that .*register_task"),
+        ("Somebody/Near-v0", "PIAvatar/Reach-v0", "is not that of Somebody/Near-v0; make 'PIAvatar/Reach-v0'"),
+    ],
+)
+def test_an_id_makes_no_other_task(module, monkeypatch, make, made, task, told):
+    load_task(f"{module}:Somebody/Near-v0")
+    monkeypatch.setattr(BatchEnv, "__init__", None)  # refused before anything is built
+    with pytest.raises(ValueError, match=told) as caught:
+        make(made, task=task, fidelity="tiny")
+    assert "\n" not in str(caught.value)
+
+
+def test_an_id_makes_its_own_task_by_any_name(module, device):
+    found = load_task(f"{module}:Somebody/Near-v0")
+    specs = [gym.spec("Somebody/Near-v0")]
+    for name in ("Somebody/Near-v0", f"{module}:NearTask", found):
+        env = gym.make(specs[-1], task=name, fidelity="tiny", device=device)
+        assert type(env.unwrapped.batch.task) is found
+        specs.append(env.spec)  # what has been made can be made again
 
 
 def test_its_module_is_imported_when_its_id_names_it(module):
