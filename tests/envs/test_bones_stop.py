@@ -23,7 +23,7 @@ def reach_of(points) -> np.ndarray:
 def test_bones_reach_as_far_as_those_of_the_body_that_was_drawn(make_batch, pool):
     batch = make_batch("PIAvatar/Stand-v0", 3, control="torque", **{"shape.randomize": True, "shape.pool": pool})
     found = []
-    for seeds in ([0, 1, 2], [7, 8, 9]):
+    for seeds in ([0, 1, 2], [31, 32, 33]):
         batch.reset(seeds=seeds)
         batch.step()
         batch.simulation.shapes.fall_behind()
