@@ -98,9 +98,9 @@ def moving(velocity) -> np.ndarray:
     return np.r_[velocity, np.zeros(66)]
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.3, 0.8, 3.0, 10.0])
+@pytest.mark.parametrize("friction", [0.0, 0.3, 0.8, 10.0])
 @pytest.mark.parametrize("along", [0.0, 0.02, 3.0])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_one_point_is_stopped_by_coulombs_law(lying, seed, along, friction):
     """It is stopped along the normal, by an impulse in the cone of friction, against the slip that is left.
 
@@ -126,7 +126,7 @@ def test_one_point_is_stopped_by_coulombs_law(lying, seed, along, friction):
     assert p @ (J @ before) + 0.5 * p @ K @ p < 0.0  # kinetic energy
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.8, 10.0])
+@pytest.mark.parametrize("friction", [0.0, 10.0])
 @pytest.mark.parametrize("seed", range(8))
 def test_many_points_are_stopped_and_no_energy_is_made(lying, seed, friction):
     """A body in any motion onto the floor: no point too fast, momentum in the cone of friction, energy no greater."""
