@@ -64,7 +64,13 @@ class BatchEnv:
         check_count("num_envs", num_envs)
         self.task, self.config, self.num_envs = task, task.config, num_envs
         self.simulation = Simulation(
-            task.config, num_envs, device, task.domain(), task.scene, avatar_names=task.agent_names
+            task.config,
+            num_envs,
+            device,
+            task.domain(),
+            task.scene,
+            avatar_names=task.agent_names,
+            impulses=task.impulses(),
         )
         placed = self.simulation.props.points, task.prop_places()
         check_places(self.simulation.domain, self.simulation.dx, task.scene.props, *placed)

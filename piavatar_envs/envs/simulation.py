@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -22,7 +22,7 @@ from piavatar_envs.envs.props import PropSet, check_apart, check_places
 from piavatar_envs.envs.randomize import Randomization, fastest_wave
 from piavatar_envs.envs.sections import MOST_SUBSTEPS
 from piavatar_envs.envs.shapes import Shapes
-from piavatar_envs.envs.speeds import STRUCK, commanded_speed, fastest_thing
+from piavatar_envs.envs.speeds import STRUCK, commanded_speed, fastest_blow, fastest_thing
 from piavatar_envs.envs.subjects import assemble, prop_matter, prop_points
 from piavatar_envs.mpm.boundaries import Collider, make_boundaries, place_colliders
 from piavatar_envs.mpm.build import build_model, choose_num_substeps, make_grid
@@ -64,6 +64,7 @@ class Simulation:
         scene: SceneConfig | None = None,
         avatar_names: Sequence[str] | None = None,
         asset: AvatarAsset | None = None,
+        impulses: Mapping[str, float] | None = None,
     ) -> None:
         """Build and allocate; nothing is placed until the first reset.
 
@@ -75,6 +76,7 @@ class Simulation:
             scene: what is in the world; the configuration's own if not given.
             avatar_names: of the avatars; ``agent_0`` ... if not given.
             asset: the body; the embedded one if not given.
+            impulses: the greatest that a bone may get at once [N s], by joint.
 
         Raises:
             ConfigError: a scene that cannot be.
@@ -92,8 +94,7 @@ class Simulation:
         self.flesh = [Flesh(config, avatar, self.asset, sampled, num_envs) for avatar in avatars]
         solids = [prop_points(prop, spacing) for prop in self.scene.props]
         matter = [prop_matter(p, points, physics) for p, points in zip(self.scene.props, solids, strict=True)]
-        own_rows = bool(solids) or any(flesh.shape.randomize for flesh in self.flesh)
-        rows = num_envs if own_rows else 1
+        rows = num_envs if solids or any(flesh.shape.randomize for flesh in self.flesh) else 1
         joints = [flesh.joint_settings() for flesh in self.flesh]
         domain = domain or Domain().around([a.position for a in avatars])
         self.domain, walls = self._room(domain, solids, any(joints))
@@ -106,7 +107,7 @@ class Simulation:
             num_envs=num_envs,
             device=self.device,
             control_dt=physics.control_dt,
-            num_substeps=self._substeps(wave, solids),
+            num_substeps=self._substeps(wave, solids, impulses or {}),
             cfl=physics.cfl,
             gravity=(0.0, 0.0, -physics.gravity),
             decoupling=physics.decoupling,
@@ -118,9 +119,8 @@ class Simulation:
         )
         self.state, self.scratch = allocate(self.model)
         self.sensors = self.scratch.sensors
-        rows = self.model.contact.num_fields, num_envs
-        self.collider_spawn = make_boundaries(self.subjects.colliders, *rows, self.device)
-        first, count = self.subjects.first, len(self.flesh)
+        first, count, fields = self.subjects.first, len(self.flesh), self.model.contact.num_fields
+        self.collider_spawn = make_boundaries(self.subjects.colliders, fields, num_envs, self.device)
         self.avatars = [
             AvatarDrive(flesh.points, first[index], self.model, drive_settings(flesh.drive), joints[index])
             for index, flesh in enumerate(self.flesh)
@@ -153,8 +153,10 @@ class Simulation:
         check_beside_solids(self.dx, self.scene.ground, self.config.scene.colliders, given)
         return domain, domain.walls() if walled else ()
 
-    def _substeps(self, wave: float, solids: Sequence[PropPoints]) -> int:
+    def _substeps(self, wave: float, solids: Sequence[PropPoints], impulses: Mapping[str, float]) -> int:
         """Substeps of a control step as configured, or as few as such a wave [m/s], commands and fast things allow.
+
+        Fast is also flesh that gets one of the ``impulses``.
 
         Nothing may go further than a grid spacing in a substep, which soft bodies, that need few, soon would.
 
@@ -164,7 +166,9 @@ class Simulation:
         """
         physics, control, asked = self.config.physics, self.config.drive.control, self.config.physics.num_substeps
         by_torques = 1 if control == "pose" else math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
-        thing, speed = fastest_thing(self.scene, solids, self.domain, physics.gravity)
+        striking = fastest_thing(self.scene, solids, self.domain, physics.gravity)
+        struck = fastest_blow(impulses, self.flesh, self.config.randomize.mass_factor[0])
+        thing, speed = max(striking, struck, key=lambda found: found[1])
         if asked is not None:
             least = choose_num_substeps(physics.control_dt, self.dx, speed, 1.0)
             if asked < least:
@@ -179,7 +183,8 @@ class Simulation:
                     f"for drive.control={control!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {by_torques}"
                 )
             return asked
-        moving = max(commanded_speed(self.config.drive, select_joints(self.config.joints), self.flesh), STRUCK * speed)
+        commanded = commanded_speed(self.config.drive, select_joints(self.config.joints), self.flesh)
+        moving = max(commanded, STRUCK * striking[1], struck[1])
         waves = max(wave, self.subjects.matter.sound_speed())
         chosen = choose_num_substeps(physics.control_dt, self.dx, max(waves, physics.cfl * moving), physics.cfl)
         if chosen > MOST_SUBSTEPS:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS
+from piavatar_envs.avatar.body import bone_masses
+from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS, joint_index
 from piavatar_envs.envs.config import ColliderConfig, DriveConfig, PropConfig, SceneConfig
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.props.geometry import PropPoints
@@ -21,6 +22,8 @@ HINGES = ("left_knee", "right_knee", "left_elbow", "right_elbow")
 #: What fast things strike leaves them faster than they came: bodies that colliders of 20 to 60 m/s ran into still went
 #: further than a grid spacing in a substep in which the collider went 0.8 of one, and no longer where it went 2/3.
 STRUCK = 1.5
+#: Mass of a bone with its flesh in the lightest random body, over that in the body that was built.
+LIGHTEST = 0.5
 
 
 def lever(joints: Sequence[str], rest: np.ndarray, places: np.ndarray, bones: np.ndarray) -> float:
@@ -71,6 +74,25 @@ def fastest_thing(
         prop.name: _prop_speed(prop, solid, drop, gravity) for prop, solid in zip(scene.props, solids, strict=True)
     }
     speeds |= {collider.name: _collider_speed(collider, domain) for collider in scene.colliders}
+    return max(speeds.items(), key=lambda item: item[1], default=("", 0.0))
+
+
+def fastest_blow(impulses: Mapping[str, float], flesh: Sequence[Flesh], mass_factor: float) -> tuple[str, float]:
+    """Which of a task's impulses may make flesh the fastest, and by how much [m/s].
+
+    Args:
+        impulses: the greatest on each bone [N s], by joint.
+        flesh: of the avatars.
+        mass_factor: the least on their masses.
+
+    Returns:
+        Its name and the change of velocity; no name and 0 where there are no impulses.
+    """
+    speeds = {}
+    for name, impulse in impulses.items():
+        of_bone = [bone_masses(one.points)[0][:, joint_index(name)].min() for one in flesh]
+        lightest = [mass * (LIGHTEST if one.shape.randomize else 1.0) for mass, one in zip(of_bone, flesh, strict=True)]
+        speeds[f"the impulse on {name}"] = impulse / (mass_factor * min(lightest))
     return max(speeds.items(), key=lambda item: item[1], default=("", 0.0))
 
 

@@ -211,6 +211,10 @@ class Task:
         """Where particles may go."""
         return Domain().around([avatar.position for avatar in self.scene.avatars])
 
+    def impulses(self) -> dict[str, float]:
+        """Greatest impulse that the task gives a bone at once [N s], by joint: substeps are short enough for it."""
+        return {}
+
     def allocate(self, env: BatchEnv) -> None:
         """Create the task's arrays."""
 

@@ -192,6 +192,10 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         upper = (*(np.asarray(box.upper[:2]) + way.max(0)).tolist(), max(box.upper[2], self.roots[:, 2].max() + 1.3))
         return Domain(lower, upper)
 
+    def impulses(self) -> dict[str, float]:
+        """On any of the bones that are struck."""
+        return dict.fromkeys(STRUCK, self.config.impulse)
+
     def allocate(self, env) -> None:
         n, device = env.num_envs, env.device
 

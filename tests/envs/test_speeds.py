@@ -38,7 +38,8 @@ def test_no_default_has_other_substeps_than_its_waves_ask_for(device):
     found = {}
     for cls in tasks:
         task = cls(load_config(cls.Config))
-        simulation = Simulation(task.config, 1, device, task.domain(), task.scene, avatar_names=task.agent_names)
+        world_of = task.config, 1, device, task.domain(), task.scene
+        simulation = Simulation(*world_of, avatar_names=task.agent_names, impulses=task.impulses())
         model, physics = simulation.model, task.config.physics
         wave = choose_num_substeps(physics.control_dt, simulation.dx, model.sound_speed, physics.cfl)
         assert model.num_substeps == wave
@@ -122,3 +123,22 @@ def test_too_few_substeps_are_refused_with_the_number_that_would_do(device):
     assert world(device, scene=scene, num_substeps=15).model.num_substeps == 15
     with pytest.raises(ConfigError, match=r"waves of 1\.16e\+05 m/s .* need \d+ substeps .*, and 10000 is the limit"):
         world(device, young_modulus=1e9, density=0.1)
+
+
+@pytest.mark.parametrize("impulse", [100.0, 200.0])
+def test_flesh_that_gets_a_great_impulse_goes_less_than_a_cell_in_a_substep(make_batch, impulse):
+    """Of 2 kg in a shoulder 200 N s make 100 m/s; in the default's substeps bodies ended in the failure ``cfl``."""
+    batch = make_batch("PIAvatar/TrackMotion-v0", 6, impulse=impulse, impulse_interval=0.3)
+    simulation, usual = batch.simulation, make_batch("PIAvatar/TrackMotion-v0", 6, impulse_interval=0.3).simulation
+    assert simulation.model.num_substeps > 1.5 * usual.model.num_substeps
+    batch.reset(seeds=list(range(6)))
+    for _ in range(40):
+        batch.action.zero_()
+        batch.step()
+    assert batch.failure.numpy().sum() == 0
+    assert np.linalg.norm(simulation.state.u.numpy(), axis=2).max() > 0.1
+
+
+def test_too_few_substeps_for_an_impulse_are_refused(make_batch):
+    with pytest.raises(ConfigError, match=r"num_substeps=6: 'the impulse on .*shoulder', at up to"):
+        make_batch("PIAvatar/TrackMotion-v0", 1, impulse=300.0, num_substeps=6)
