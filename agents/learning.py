@@ -153,10 +153,8 @@ def learn(
     snapshots = CheckpointCallback(max(1, config.checkpoint_every // model.n_envs), str(folder / "checkpoints"))
     snapshots.n_calls = model.num_timesteps // model.n_envs
     watch = [MarkPlayed()] if isinstance(model, PPO) else []
-    progress, check = (
-        Progress(curve, config.total_steps, start, deadline),
-        partial(_check_finite, config, model, checkpoint),
-    )
+    progress = Progress(curve, config.total_steps, start, deadline)
+    check = partial(_check_finite, config, model, checkpoint)
     watch += [snapshots, *watchers, progress]
     if checkpoint is not None:
         watch.append(resume.KeepCheckpoint(checkpoint, config.checkpoint_every, curve, check))

@@ -9,6 +9,7 @@ from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 
 #: Springs of the joints, none of the pelvis.
 GAINS = np.r_[0.0, 0.0, np.ones(NUM_JOINTS - 1)][None]
@@ -70,6 +71,16 @@ class Joints:
         if step > 0:
             self.body.record_pose(program, self.state)
         self.body.record_substep(program, self.state, self.rig.scratch, step)
+        return program
+
+    def control_step(self) -> Program:
+        """A control step of joints and particles; nothing of it has run."""
+        rig, model, program = self.rig, self.model, Program(self.model.device)
+        record_begin(program, model, rig.state, rig.scratch)
+        for step in range(model.num_substeps):
+            self.body.record_substep(program, rig.state, rig.scratch, step)
+            record_substep(program, model, rig.state, rig.scratch, step)
+        record_end(program, model, rig.state, rig.scratch)
         return program
 
     @property

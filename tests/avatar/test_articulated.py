@@ -16,7 +16,6 @@ from piavatar_envs.avatar.joint_torques import UNBOUNDED
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from tests.avatar.jointed import GAINS, Joints, carried_by, momentum_of
 
 TOES = [joint_index("left_foot"), joint_index("right_foot")]
@@ -233,12 +232,7 @@ def test_free_float_keeps_momentum(make_rig, wild_pose):
     rig = make_rig(cells=16)
     made = Joints(rig, stiffness=100.0, damping=3.0).pose(np.zeros((NUM_JOINTS, 3)))
     rng = np.random.default_rng(7)
-    program, model = Program(rig.model.device), rig.model
-    record_begin(program, model, rig.state, rig.scratch)
-    for step in range(model.num_substeps):
-        made.body.record_substep(program, rig.state, rig.scratch, step)
-        record_substep(program, model, rig.state, rig.scratch, step)
-    record_end(program, model, rig.state, rig.scratch)
+    program = made.control_step()
     start = rig.totals()
     largest, worst = 0.0, np.zeros(2)
     for _ in range(6):
@@ -350,12 +344,7 @@ def test_a_held_pelvis_bears_the_weight(make_rig):
     made.pose(np.zeros((NUM_JOINTS, 3)))
     root = body.state.position.numpy()[0, 0].copy()
     body.target.root.assign(root[None])
-    model, program = rig.model, Program(rig.model.device)
-    record_begin(program, model, rig.state, rig.scratch)
-    for step in range(model.num_substeps):
-        body.record_substep(program, rig.state, rig.scratch, step)
-        record_substep(program, model, rig.state, rig.scratch, step)
-    record_end(program, model, rig.state, rig.scratch)
+    program = made.control_step()
     for _ in range(30):
         program.run()
     assert rig.state.failure.numpy().sum() == 0

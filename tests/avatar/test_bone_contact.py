@@ -12,8 +12,6 @@ from benchmarks.rig import joint_gaps
 from piavatar_envs.avatar.bone_contact import LAYER
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.mpm.boundaries import Collider
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from tests.avatar.jointed import Joints
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -189,12 +187,7 @@ def fall(make_rig):
     pose = np.zeros((NUM_JOINTS, 3))
     pose[0, 0] = 1.9  # from upright to beyond level
     made.pose(pose, rig.points.joints[0, 0] + np.array([0.0, 0.0, 0.3]))
-    program, model = Program(rig.model.device), rig.model
-    record_begin(program, model, rig.state, rig.scratch)
-    for step in range(model.num_substeps):
-        made.body.record_substep(program, rig.state, rig.scratch, step)
-        record_substep(program, model, rig.state, rig.scratch, step)
-    record_end(program, model, rig.state, rig.scratch)
+    program = made.control_step()
     made.body.record_end(program, rig.state)
     rig.drive.record_tracking(program, rig.state)
     seen = {name: [] for name in ("momentum", "turn", "center", "impulse", "moment", "gap", "lowest")}
@@ -218,7 +211,7 @@ def fall(make_rig):
         arm = (rig.points.rest[0, bones] - rig.points.joints[0, bone]).astype(float)
         seen["lowest"].append((at[bone] + np.einsum("pij,pj->pi", world[bone], arm))[:, 2].min())
     assert rig.state.failure.numpy().sum() == 0
-    weight = -rig.mass.sum() * 9.81 * model.control_dt * UP
+    weight = -rig.mass.sum() * 9.81 * rig.model.control_dt * UP
     return {name: np.array(values) for name, values in seen.items()} | {"weight": weight}
 
 

@@ -13,8 +13,6 @@ from piavatar_envs.avatar.muscles import attachment_rates, firmness, joint_torqu
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.soft_tissue import bone_distance
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from tests.avatar.jointed import Joints
 
 ANKLES = [joint_index("left_ankle"), joint_index("right_ankle")]
@@ -44,12 +42,7 @@ class Held(Joints):
         """In the rest pose, where the pelvis is held."""
         self.pose(np.zeros((NUM_JOINTS, 3)))
         self.body.target.root.assign(self.body.state.position.numpy()[:, 0])
-        rig, self.program = self.rig, Program(self.model.device)
-        record_begin(self.program, rig.model, rig.state, rig.scratch)
-        for step in range(rig.model.num_substeps):
-            self.body.record_substep(self.program, rig.state, rig.scratch, step)
-            record_substep(self.program, rig.model, rig.state, rig.scratch, step)
-        record_end(self.program, rig.model, rig.state, rig.scratch)
+        self.program = self.control_step()
         return self
 
     def aim(self, rotvec) -> None:
