@@ -9,7 +9,9 @@ as Markdown. Environments that none of the runs is about can keep the rows that 
 (``--keep FILE.json``).
 
 A policy can be scored anew without training it anew: ``python -m agents.play RUN --out RUN/evaluation.json``. Its row
-then takes the place of the training's own; what the training took, and zero and random actions, stay as they were.
+then takes the place of the training's own; what the training took, and zero and random actions, stay as they were. If
+it was scored on other bones than those that it was trained on, zero and random actions of the training are left out:
+they were not played where the policy was.
 """
 
 from __future__ import annotations
@@ -107,6 +109,8 @@ def _rows(
     else:
         own = 1 if "training_s" in first else None
         rows = [row | {"seeds": None if row["case"] in compare.UNTRAINED else own} for row in first["results"]]
+    if _drive(first) != _drive({"config": first["config"]}):
+        rows = [row for row in rows if row["case"] not in compare.UNTRAINED]
     several = next((run["results"][0] for run in streams if _same_environment(run, first)), None)
     return [(first, several if several and row["case"] == several["case"] else row) for row in rows]
 
