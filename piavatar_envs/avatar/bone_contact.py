@@ -20,19 +20,21 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.blending import motion_at
-from piavatar_envs.avatar.cholesky import solve_three_in_place
-from piavatar_envs.avatar.joint_bench import JointBench
+from piavatar_envs.avatar.cholesky import begin_solution, end_solution
+from piavatar_envs.avatar.joint_bench import JointBench, place_of_part, row_in_room, see_columns
 from piavatar_envs.avatar.joint_motion import part_of, set_part, spread_motion
-from piavatar_envs.avatar.lanes import bits_of_threads, meet_threads, most_of_threads, sum_threads12
+from piavatar_envs.avatar.lanes import bits_of_threads, meet_threads, most_of_threads, sum_threads6
 from piavatar_envs.avatar.loads import vector_at
 from piavatar_envs.avatar.mass_matrix import BONES, NUM_DOF
-from piavatar_envs.avatar.types import Body, vec8, vec12
-from piavatar_envs.mpm.colliders import signed_distance, surface_velocity
+from piavatar_envs.avatar.types import Body, vec8
+from piavatar_envs.mpm.colliders import PLANE, signed_distance, surface_velocity
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.types import Boundaries, Sensors, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
+#: The pelvis' place, then all joints.
+PARTS = wp.constant(1 + int(BONES))
 #: Flesh that is left between a bone and a boundary [m].
 LAYER = 0.001
 #: Impulses in a substep, at most.
@@ -42,6 +44,7 @@ _LAYER, _MOST_STOPS = wp.constant(LAYER), wp.constant(MOST_STOPS)
 _BACK_SHARE, _BACK_SPEED = wp.constant(0.2), wp.constant(0.5)
 #: Speeds below are none [m/s].
 _TOLERANCE = wp.constant(1.0e-3)
+_FAR = wp.constant(1.0e3)  # no point of a bone is as far from its joint [m]
 #: Share of the straight answer along the normal below which friction would jam a point: then it has none.
 _JAMMED = wp.constant(0.1)
 
@@ -76,12 +79,16 @@ def at_rest(body: Body, e: int, b: int, tracker: int):
 
 @wp.func
 def measure_bones(body: Body, e: int, thread: int, threads: int, w: JointBench):
-    """How far bones reach, of the body as it is: another one may have been drawn."""
+    """Find boxes that hold the points of bones, of the body as it is: another one may have been drawn."""
     for b in range(thread, BONES, threads):
-        reach = float(0.0)
+        low = wp.vec3(_FAR)
+        high = wp.vec3(-_FAR)
         for tracker in range(body.tracker_start[b], body.tracker_start[b + 1]):
-            reach = wp.max(reach, wp.length(at_rest(body, e, b, tracker)))
-        w.reach[e, b] = reach
+            point = at_rest(body, e, b, tracker)
+            low = wp.min(low, point)
+            high = wp.max(high, point)
+        w.middle[e, b] = 0.5 * (low + high)
+        w.half[e, b] = 0.5 * (high - low)  # below zero where there are no points
 
 
 @wp.func
@@ -112,33 +119,50 @@ def least_speed(distance: float, dt: float):
 
 
 @wp.func
-def may_touch(boundaries: Boundaries, dt: float, w: JointBench, e: int, b: int, k: int):
-    """Whether any point of a bone may come to a boundary in a substep."""
-    reach = w.reach[e, b]
-    joint = w.pose.position[e, b]
+def reach_along(half: wp.vec3, turn: wp.quat, n: wp.vec3):
+    """The greatest component along ``n`` of what is in a box of half extents ``half`` about the origin, turned."""
+    own = wp.quat_rotate_inv(turn, n)
+    return wp.dot(half, wp.abs(own))
+
+
+@wp.func
+def may_lack(boundaries: Boundaries, dt: float, w: JointBench, e: int, b: int, k: int):
+    """Whether any point of a bone may be too fast for a boundary, by the box that holds them.
+
+    A boundary that is no plane has other normals elsewhere: there it is by the ball around the box, and by speeds.
+    """
+    half = w.half[e, b]
+    turn = w.pose.rotation[e, b]
+    middle = w.pose.position[e, b] + wp.quat_rotate(turn, w.middle[e, b])
     motion = w.moving[e, b]
-    turn = wp.length(wp.vec3(motion[3], motion[4], motion[5]))
-    turn += wp.length(boundaries.spin[row(e, boundaries.spin.shape[0]), k])
-    speed = wp.length(motion_of_bone(w, e, b, joint) - surface_velocity(boundaries, e, k, joint)) + reach * turn
-    return signed_distance(boundaries, e, k, joint)[3] < reach + _LAYER + dt * speed
+    spin = wp.vec3(motion[3], motion[4], motion[5]) - boundaries.spin[row(e, boundaries.spin.shape[0]), k]
+    velocity = motion_of_bone(w, e, b, middle) - surface_velocity(boundaries, e, k, middle)
+    d = signed_distance(boundaries, e, k, middle)
+    normal = wp.vec3(d[0], d[1], d[2])
+    reach = wp.length(half)
+    least = -wp.length(velocity) - reach * wp.length(spin)
+    if boundaries.kind[k] == PLANE:
+        reach = reach_along(half, turn, normal)
+        least = wp.dot(velocity, normal) - reach_along(half, turn, wp.cross(normal, spin))
+    return half[0] >= 0.0 and least_speed(d[3] - reach, dt) - least > _TOLERANCE
 
 
 @wp.func
 def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: JointBench):
-    """Bits of the bones that may touch a boundary."""
+    """Bits of the bones of which points may be too fast."""
     near = int(0)
     for b in range(thread, BONES, threads):
         for k in range(ground.boundaries.count):
-            if may_touch(ground.boundaries, dt, w, e, b, k):
+            if may_lack(ground.boundaries, dt, w, e, b, k):
                 near = near | (1 << b)
     return bits_of_threads(near, threads)
 
 
 @wp.func
 def find_fastest(body: Body, ground: Ground, dt: float, e: int, thread: int, threads: int, w: JointBench) -> wp.vec2:
-    """By how much the point is too fast that is so by most [m/s], and which: tracker times boundaries, and boundary.
+    """By how much the point is too fast that is so by most [m/s], and which: point, bone and boundary in a number.
 
-    Few bones are near a boundary: the threads share the points of one after the other.
+    Few bones come near a boundary: the threads share the points of one after the other.
     """
     most = float(0.0)
     which = int(0)
@@ -147,13 +171,14 @@ def find_fastest(body: Body, ground: Ground, dt: float, e: int, thread: int, thr
     b = int(0)
     while near != 0:
         if (near & 1) != 0:
-            for tracker in range(body.tracker_start[b] + thread, body.tracker_start[b + 1], threads):
+            first = body.tracker_start[b]
+            for n in range(thread, body.tracker_start[b + 1] - first, threads):
                 for k in range(count):
-                    touch = touch_of(body, ground.boundaries, w, e, b, tracker, k)
+                    touch = touch_of(body, ground.boundaries, w, e, b, first + n, k)
                     lacking = least_speed(touch.distance, dt) - wp.dot(touch.velocity, touch.normal)
                     if lacking > most:
                         most = lacking
-                        which = tracker * count + k
+                        which = (n * BONES + b) * count + k
         near = near >> 1
         b += 1
     return most_of_threads(most, which, threads)
@@ -172,30 +197,58 @@ def carries(body: Body, a: int, b: int):
 def answer_at(
     body: Body, factor: int, e: int, b: int, x: wp.vec3, thread: int, threads: int, room: wp.uint64, w: JointBench
 ) -> wp.mat33:
-    """``K`` of bone ``b`` at ``x`` [1/kg]; rows of ``w.touch`` have ``M^-1 J^T`` of an impulse along each axis."""
+    """``K`` of bone ``b`` at ``x`` [1/kg], ``Y^T Y`` with ``Y = L^-T J^T``, which stays in the columns.
+
+    ``J^T`` has something in joints that carry the bone, and ``Y`` hardly anywhere else: ``L`` is a tree's.
+    """
     n = w.velocity.shape[0]
+    wanted = w.pattern.reach[1 + b]
+    columns = see_columns(w.touch, room)
     meet_threads(threads)
-    for a in range(thread, BONES, threads):
-        arm = carries(body, a, b) * (x - w.pose.position[e, a])
+    for k in range(thread, PARTS, threads):
+        arm = wp.vec3()
+        if k > 0:
+            arm = carries(body, k - 1, b) * (x - w.pose.position[e, wp.max(k - 1, 0)])
         for axis in range(3):
             along = wp.vec3()
             along[axis] = 1.0
-            set_part(w.touch, axis * n + e, 3 + 3 * a, wp.cross(arm, along))
-            if a == 0:
-                set_part(w.touch, axis * n + e, 0, along)
-    solve_three_in_place(w.pattern, w.factors, factor, e, n, threads, room, w.touch)
+            if k > 0:  # else the pelvis' place
+                along = wp.cross(arm, along)
+            set_part(columns, row_in_room(axis * n + e, axis), place_of_part(k), along)
+    begin_solution(w.pattern, w.factors, factor, wanted, e, n, threads, room, w.touch)
     meet_threads(threads)
-    s = vec12()
-    for a in range(thread, BONES, threads):
-        arm = carries(body, a, b) * (x - w.pose.position[e, a])
-        for axis in range(3):
-            v = wp.cross(part_of(w.touch, axis * n + e, 3 + 3 * a), arm)
-            if a == 0:
-                v += part_of(w.touch, axis * n + e, 0)
-            for i in range(3):
-                s[3 * axis + i] = s[3 * axis + i] + v[i]
-    s = sum_threads12(s, threads)
-    return wp.mat33(s[0], s[3], s[6], s[1], s[4], s[7], s[2], s[5], s[8])
+    s = vec8()
+    for k in range(thread, PARTS, threads):
+        if (wanted >> k) & 1 == 1:
+            y = wp.mat33()
+            for axis in range(3):
+                y[axis] = part_of(columns, row_in_room(axis * n + e, axis), place_of_part(k))
+            s += vec8(
+                wp.dot(y[0], y[0]), wp.dot(y[1], y[1]), wp.dot(y[2], y[2]),
+                wp.dot(y[1], y[2]), wp.dot(y[0], y[2]), wp.dot(y[0], y[1]), 0.0, 0.0,
+            )  # fmt: skip
+    s = sum_threads6(s, threads)
+    return wp.mat33(s[0], s[5], s[4], s[5], s[1], s[3], s[4], s[3], s[2])
+
+
+@wp.func
+def push(p: wp.vec3, b: int, own: int, factor: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench):
+    """Give bone ``b`` an impulse at the point that the columns are of: by ``M^-1 J^T p = L^-1 Y p``."""
+    n = w.velocity.shape[0]
+    wanted = w.pattern.reach[1 + b]
+    columns = see_columns(w.touch, room)
+    for k in range(thread, PARTS, threads):
+        y = wp.vec3()
+        if (wanted >> k) & 1 == 1:
+            for axis in range(3):
+                y += p[axis] * part_of(columns, row_in_room(axis * n + e, axis), place_of_part(k))
+        set_part(columns, row_in_room(e, 0), place_of_part(k), y)
+    end_solution(w.pattern, w.factors, factor, e, threads, room, w.touch)
+    meet_threads(threads)
+    for k in range(thread, PARTS, threads):
+        change = part_of(columns, row_in_room(e, 0), place_of_part(k))
+        set_part(w.whole, e, 3 * k, part_of(w.whole, e, 3 * k) + change)
+        set_part(w.shares, own, 3 * k, part_of(w.shares, own, 3 * k) + change)
 
 
 @wp.func
@@ -236,22 +289,16 @@ def stop_point(
     w: JointBench,
 ) -> vec8:
     """Stop a point as :func:`find_fastest` names it; the impulse, and its moment about the pelvis joint."""
-    n = w.velocity.shape[0]
     boundaries = ground.boundaries
     k = which % boundaries.count
-    tracker = which // boundaries.count
-    b = int(0)
-    while body.tracker_start[b + 1] <= tracker:
-        b += 1
+    b = which // boundaries.count % BONES
+    tracker = body.tracker_start[b] + which // (boundaries.count * BONES)
     touch = touch_of(body, boundaries, w, e, b, tracker, k)
     K = answer_at(body, factor, e, b, touch.place, thread, threads, room, w)
     field = ground.field[body.first + body.tracker[tracker]]
     friction = boundaries.friction[row(e, boundaries.friction.shape[0]), field * boundaries.count + k]
     p = stopping_impulse(K, touch.velocity, touch.normal, least_speed(touch.distance, dt), friction)
-    for i in range(thread, NUM_DOF, threads):
-        change = p[0] * w.touch[e, i] + p[1] * w.touch[n + e, i] + p[2] * w.touch[2 * n + e, i]
-        w.touch[3 * n + e, i] = w.touch[3 * n + e, i] + change
-        w.shares[own, i] = w.shares[own, i] + change
+    push(p, b, own, factor, e, thread, threads, room, w)
     moment = wp.cross(touch.place - w.pose.position[e, 0], p)
     return vec8(p[0], p[1], p[2], moment[0], moment[1], moment[2], 0.0, 0.0)
 
@@ -277,12 +324,11 @@ def stop_bones(
     given = vec8()
     if ground.solid == 0:
         return given
-    total = 3 * w.velocity.shape[0] + e
     for i in range(thread, NUM_DOF, threads):
-        w.touch[total, i] = w.velocity[e, i] + w.outside[e, i] + w.shares[own, i]
+        w.whole[e, i] = w.velocity[e, i] + w.outside[e, i] + w.shares[own, i]
     stops = int(0)
     while stops < _MOST_STOPS:
-        spread_motion(body, w.pose.position, w.touch, total, e, thread, threads, w.moving)
+        spread_motion(body, w.pose.position, w.whole, e, e, thread, threads, w.moving)
         meet_threads(threads)
         fastest = find_fastest(body, ground, dt, e, thread, threads, w)
         if fastest[0] <= _TOLERANCE:

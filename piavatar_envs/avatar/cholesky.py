@@ -20,6 +20,8 @@ from piavatar_envs.avatar.lanes import lane_of_warp, meet_threads
 from piavatar_envs.avatar.warp_cholesky import (
     MOST_ROWS,
     add_diagonal,
+    ascend_one,
+    descend_three,
     eliminate,
     load_room,
     place_of_factor,
@@ -53,6 +55,7 @@ class Pattern:
     # (rounds * 32,) which part of the vector changes, in bytes, and 2^10 times those to the first of three numbers
     word: wp.array(dtype=int)
     turn: int  # rounds on the way down, an even number; those on the way up are as well
+    reach: wp.array(dtype=int)  # (joints,) bits of the joints to which what is in one comes on the way down
 
 
 #: Lanes of a warp, which a round has work for, and the bytes of a number and of a block.
@@ -84,6 +87,7 @@ def find_pattern(filled: np.ndarray, device: str) -> Pattern:
     heads, words, turn = plan_solution(block)
     entries = 9 * np.diag(block)[:, None] + np.array([0, 4, 8])
     lists = {"block": block.ravel(), "entry": entries.ravel(), "pair": pairs, "head": heads, "word": words}
+    lists["reach"] = plan_reach(block)
     pattern = Pattern()
     for name, numbers in lists.items():
         setattr(pattern, name, wp.array(numbers.astype(np.int32), dtype=int, device=device))
@@ -118,6 +122,14 @@ def plan_solution(block: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
         heads += nothing * [-1]
         words.append(np.full(nothing * LANES, -1))
     return np.array(heads), np.concatenate(words), turn
+
+
+def plan_reach(block: np.ndarray) -> np.ndarray:
+    """``reach`` of :class:`Pattern`, from the ``block`` of every two joints."""
+    reach = 1 << np.arange(len(block))
+    for k, own in enumerate(block):
+        reach[k] |= np.bitwise_or.reduce(reach[:k][own[:k] >= 0], initial=0)
+    return reach
 
 
 def factor_size(pattern: Pattern) -> int:
@@ -221,3 +233,42 @@ def solve_three_in_place(
     """:func:`solve` of three right-hand sides in ``x``, the ``first`` and others ``step`` rows apart."""
     meet_threads(threads)
     solve_three(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), first, step, x)
+
+
+@wp.func
+def begin_solution(
+    pattern: Pattern,
+    factor: wp.array2d(dtype=float),
+    f: int,
+    wanted: int,
+    first: int,
+    step: int,
+    threads: int,
+    room: wp.uint64,
+    # in and out
+    x: wp.array2d(dtype=float),
+):
+    """``Y = L^-T B`` of three right-hand sides ``B`` in ``x``, with which ``B^T M^-1 B = Y^T Y``.
+
+    Both have something in joints whose bits are ``wanted`` alone, which is what ``Pattern.reach`` tells; elsewhere
+    nothing is read or written. A warp has them in its room, see :func:`piavatar_envs.avatar.joint_bench.see_columns`.
+    """
+    meet_threads(threads)
+    at = place_of_factor(factor, f, room)
+    descend_three(pattern.head, pattern.word, pattern.turn, at, first, step, wanted, x)
+
+
+@wp.func
+def end_solution(
+    pattern: Pattern,
+    factor: wp.array2d(dtype=float),
+    f: int,
+    first: int,
+    threads: int,
+    room: wp.uint64,
+    # in and out
+    x: wp.array2d(dtype=float),
+):
+    """``L^-1`` times the first of the columns of :func:`begin_solution`."""
+    meet_threads(threads)
+    ascend_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), first, x)

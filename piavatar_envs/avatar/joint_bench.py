@@ -10,7 +10,7 @@ import warp as wp
 from piavatar_envs.avatar.cholesky import Pattern
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Pose, vec8, vec12, vec16
-from piavatar_envs.avatar.warp_cholesky import MOST_ROWS, ROOM
+from piavatar_envs.avatar.warp_cholesky import MOST_ROWS, ROOM, SPARE
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,9 +40,12 @@ class JointBench:
     angular: wp.array2d(dtype=wp.vec3)
     # (3 num_envs, 69) momenta, then changes of the velocity: the joints' own, what is taken over; and of the pose
     shares: wp.array2d(dtype=float)
-    # (4 num_envs, 69) what an impulse on a bone does along each axis, and the velocity of all that acts
+    # (3 num_envs, 69) moments of an impulse on a bone along each axis, and how far they are solved for; a CPU's
     touch: wp.array2d(dtype=float)
-    reach: wp.array2d(dtype=float)  # (num_envs, bones) from a joint to the furthest point of its bone [m]
+    whole: wp.array2d(dtype=float)  # (num_envs, 69) velocity of all that acts
+    # (num_envs, bones) boxes that hold the points of bones, in the rest pose: from joints to middles, half extents [m]
+    middle: wp.array2d(dtype=wp.vec3)
+    half: wp.array2d(dtype=wp.vec3)
     # what the joints do
     muscle: wp.array2d(dtype=float)  # (num_envs, 69) impulses
     impulse: wp.array2d(dtype=float)
@@ -66,6 +69,8 @@ _MOVING = wp.constant(int(_SHARES) + 3 * MOST_ROWS)
 _ROTATION = wp.constant(int(_MOVING) + 8 * NUM_JOINTS)
 _POSITION = wp.constant(int(_ROTATION) + 4 * NUM_JOINTS)
 _WORDS = -(-(int(_POSITION) + 3 * NUM_JOINTS) // 4) * 4
+# Of vectors that are solved for: where they are in a room, and words of one.
+_SPARE, _COLUMN = wp.constant(SPARE), wp.constant((ROOM - SPARE) // 3)
 
 
 @wp.func_native(f"""
@@ -124,6 +129,24 @@ def see_turns(rows: wp.array2d(dtype=wp.quat), room: wp.uint64, at: int, words: 
 @wp.func_native(_SEE)
 def see_motions(rows: wp.array2d(dtype=vec8), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=vec8):
     """:func:`see_numbers` of rigid motions."""
+    ...
+
+
+@wp.func
+def see_columns(rows: wp.array2d(dtype=float), room: wp.uint64):
+    """Three vectors that are solved for, in the room of a warp; on a CPU ``rows``. See :func:`place_of_part`."""
+    return see_numbers(rows, room, _SPARE, _COLUMN)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 4 * k;
+#else
+return 3 * k;
+#endif
+""")
+def place_of_part(k: int) -> int:
+    """Where in a column of :func:`see_columns` the part of joint ``k`` begins; the pelvis' place comes first."""
     ...
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.bone_contact import Ground, measure_bones, stop_bones, tell_sensors
+from piavatar_envs.avatar.bone_contact import PARTS, Ground, measure_bones, stop_bones, tell_sensors
 from piavatar_envs.avatar.cholesky import (
     factorize,
     factorize_in_room,
@@ -58,8 +58,6 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 WARP = wp.constant(32)
 #: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
 MASS_BLOCK = wp.constant(128)
-#: The pelvis' place, then all joints.
-PARTS = wp.constant(1 + int(BONES))
 _ROOM = wp.constant(ROOM)
 #: Share of what the pose is off the particles that one fit takes away. Those of a fast, light joint (a head, a hand)
 #: are not where it has them for other reasons, too: to follow them at once throws it about.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.types import vec12, vec16
+from piavatar_envs.avatar.types import vec8, vec12, vec16
 
 wp.set_module_options({"enable_backward": False})
 
@@ -212,6 +212,12 @@ _SUM_OF_WARP = (
 @wp.func_native(_SUM_ONE)
 def sum_threads(value: float, threads: int) -> float:
     """Sum over ``threads`` threads, told to all of them."""
+    ...
+
+
+@wp.func_native(_SUM_MANY % 6)
+def sum_threads6(value: vec8, threads: int) -> vec8:
+    """:func:`sum_threads` of six numbers."""
     ...
 
 

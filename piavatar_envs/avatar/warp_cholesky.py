@@ -182,17 +182,13 @@ def place_of_factor(factor: wp.array2d(dtype=float), f: int, room: wp.uint64) ->
 
 
 # All lanes find the part of a joint, and each takes from one number of another joint what that has of it: on the way
-# down, in the columns of its row, and on the way up, in the rows of its column.
-_SOLVE = (
+# down, in the columns of its row, and on the way up, in the rows of its column. What is not in ``wanted`` is passed by.
+_PARTS = (
     _ROOM
     + f"""
 constexpr int VECTORS = COUNT, STRIDE = {4 * _JOINTS};
-const int size = x.shape[1];
 #if defined(__CUDA_ARCH__)
 float* const spare = room + {SPARE};
-for (int v = 0; v < VECTORS; ++v)
-    for (int n = lane; n < size; n += LANES) spare[STRIDE * v + n + n / 3] = wp::index(x, first + v * step, n);
-meet();
 const auto part = [&](int v, int n) {{
     return reinterpret_cast<float*>(reinterpret_cast<char*>(spare + STRIDE * v) + n);
 }};
@@ -200,7 +196,8 @@ const auto part = [&](int v, int n) {{
 const auto part = [&](int v, int n) {{ return &wp::index(x, first + v * step, 3 * (n >> 4) + (n >> 2 & 3)); }};
 #endif
 """
-    + """
+)
+_SWEEPS = """
 const auto at_byte = [&](int n) { return reinterpret_cast<const float*>(reinterpret_cast<const char*>(room) + n); };
 float y[VECTORS][3];
 const auto take = [&](int word, float m0, float m1, float m2) {
@@ -210,51 +207,56 @@ const auto take = [&](int word, float m0, float m1, float m2) {
         *other = *other - m0 * y[v][0] - m1 * y[v][1] - m2 * y[v][2];
     }
 };
+bool passed = false;
 const auto go = [&](auto way, int& head, int& word, int round) {
     constexpr int ALONG = decltype(way)::value;
+    if (head >= 0) passed = !(wanted >> (head >> 4 & 63) & 1);
+    if (!passed) {
 #if defined(__CUDA_ARCH__)
-    const float* const m = at_byte(word < 0 ? 0 : word >> 10);  // while the part is found
-    const float m0 = m[0], m1 = m[ALONG], m2 = m[2 * ALONG];
+        const float* const m = at_byte(word < 0 ? 0 : word >> 10);  // while the part is found
+        const float m0 = m[0], m1 = m[ALONG], m2 = m[2 * ALONG];
 #endif
-    if (head >= 0) {
-        const float* const w = at_byte(head >> 10);
-        float b[VECTORS][3];
-        const float w0 = w[0], w3 = w[3], w4 = w[4], w6 = w[6], w7 = w[7], w8 = w[8];
-#pragma unroll
-        for (int v = 0; v < VECTORS; ++v)
-            for (int c = 0; c < 3; ++c) b[v][c] = part(v, head & 1023)[c];
-#pragma unroll
-        for (int v = 0; v < VECTORS; ++v) {
-            if (ALONG == 3) {
-                y[v][0] = w0 * b[v][0] + w3 * b[v][1] + w6 * b[v][2];
-                y[v][1] = w4 * b[v][1] + w7 * b[v][2];
-                y[v][2] = w8 * b[v][2];
-            } else {
-                y[v][0] = w0 * b[v][0];
-                y[v][1] = w3 * b[v][0] + w4 * b[v][1];
-                y[v][2] = w6 * b[v][0] + w7 * b[v][1] + w8 * b[v][2];
-            }
-        }
-        meet();
-        if (lane == 0)
+        if (head >= 0) {
+            const float* const w = at_byte(head >> 10);
+            float b[VECTORS][3];
+            const float w0 = w[0], w3 = w[3], w4 = w[4], w6 = w[6], w7 = w[7], w8 = w[8];
 #pragma unroll
             for (int v = 0; v < VECTORS; ++v)
-                for (int c = 0; c < 3; ++c) part(v, head & 1023)[c] = y[v][c];
-    }
+                for (int c = 0; c < 3; ++c) b[v][c] = part(v, head & 1023)[c];
+#pragma unroll
+            for (int v = 0; v < VECTORS; ++v) {
+                if (ALONG == 3) {
+                    y[v][0] = w0 * b[v][0] + w3 * b[v][1] + w6 * b[v][2];
+                    y[v][1] = w4 * b[v][1] + w7 * b[v][2];
+                    y[v][2] = w8 * b[v][2];
+                } else {
+                    y[v][0] = w0 * b[v][0];
+                    y[v][1] = w3 * b[v][0] + w4 * b[v][1];
+                    y[v][2] = w6 * b[v][0] + w7 * b[v][1] + w8 * b[v][2];
+                }
+            }
+            meet();
+            if (lane == 0)
+#pragma unroll
+                for (int v = 0; v < VECTORS; ++v)
+                    for (int c = 0; c < 3; ++c) part(v, head & 1023)[c] = y[v][c];
+        }
 #if defined(__CUDA_ARCH__)
-    if (word >= 0) take(word, m0, m1, m2);
+        if (word >= 0) take(word, m0, m1, m2);
 #else
-    for (const int* own = words.data + 32 * round; own < words.data + 32 * (round + 1) && *own >= 0; ++own) {
-        const float* const m = at_byte(*own >> 10);
-        take(*own, m[0], m[ALONG], m[2 * ALONG]);
-    }
+        for (const int* own = words.data + 32 * round; own < words.data + 32 * (round + 1) && *own >= 0; ++own) {
+            const float* const m = at_byte(*own >> 10);
+            take(*own, m[0], m[ALONG], m[2 * ALONG]);
+        }
 #endif
+    }
     head = heads.data[round + 2];  // two pieces take turns: a loop that hands such values on would wait for them there
     word = words.data[32 * (round + 2) + lane];
-    meet();
+    if (!passed) meet();
 };
-int even = heads.data[0], odd = heads.data[1], even_word = words.data[lane], odd_word = words.data[32 + lane];
 const auto sweep = [&](auto way, int begin, int end) {
+    int even = heads.data[begin], odd = heads.data[begin + 1];
+    int even_word = words.data[32 * begin + lane], odd_word = words.data[32 * begin + 32 + lane];
 #pragma unroll 1
     for (int round = begin; round < end; round += 2) {
         go(way, even, even_word, round);
@@ -263,15 +265,25 @@ const auto sweep = [&](auto way, int begin, int end) {
 };
 struct Down { enum { value = 3 }; };
 struct Up { enum { value = 1 }; };
-sweep(Down{}, 0, turn);
-sweep(Up{}, turn, heads.shape[0] - 2);
+"""
+_DOWN, _UP = "sweep(Down{}, 0, turn);", "sweep(Up{}, turn, heads.shape[0] - 2);"
+_ALL = "constexpr int wanted = -1;"
+_BRING = """
+#if defined(__CUDA_ARCH__)
+const int size = x.shape[1];
+for (int v = 0; v < VECTORS; ++v)
+    for (int n = lane; n < size; n += LANES) spare[STRIDE * v + n + n / 3] = wp::index(x, first + v * step, n);
+meet();
+#endif
+"""
+_TAKE = """
 #if defined(__CUDA_ARCH__)
 for (int v = 0; v < VECTORS; ++v)
     for (int n = lane; n < size; n += LANES) wp::index(x, first + v * step, n) = spare[STRIDE * v + n + n / 3];
 meet();
 #endif
 """
-)
+_SOLVE = _ALL + _PARTS + _BRING + _SWEEPS + _DOWN + _UP + _TAKE
 
 
 @wp.func_native(_SOLVE.replace("COUNT", "1"))
@@ -289,4 +301,25 @@ def solve_three(
     x: wp.array2d(dtype=float),
 ):  # fmt: skip
     """:func:`solve_one` of three rows, a ``step`` from one to the next."""
+    ...
+
+
+@wp.func_native((_PARTS + _SWEEPS + _DOWN).replace("COUNT", "3"))
+def descend_three(
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
+    wanted: int, x: wp.array2d(dtype=float),
+):  # fmt: skip
+    """``L^-T`` times three vectors that have nothing but in joints whose bits are ``wanted``, as have the answers.
+
+    Of a warp they are in its room, of a thread that is alone in rows of ``x`` as in :func:`solve_three`.
+    """
+    ...
+
+
+@wp.func_native((_ALL + "constexpr int step = 0;" + _PARTS + _SWEEPS + _UP).replace("COUNT", "1"))
+def ascend_one(
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int,
+    x: wp.array2d(dtype=float),
+):  # fmt: skip
+    """``L^-1`` times the first of the vectors of :func:`descend_three`, in its place."""
     ...

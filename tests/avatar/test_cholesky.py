@@ -70,6 +70,10 @@ def test_factors_solve(device, sparse):
     for k in range(0, size, 3):  # of a block of the diagonal the inverse is kept
         L[:, k : k + 3, k : k + 3] = np.linalg.inv(L[:, k : k + 3, k : k + 3])
     np.testing.assert_allclose(L.transpose(0, 2, 1) @ L, whole, atol=1e-5 * np.abs(whole).max())
+    joints = np.arange(size // 3)
+    reached = pattern.reach.numpy() >> joints[:, None] & 1 == 1
+    half = np.abs(np.linalg.inv(L[0].T)).reshape(2 * (size // 3, 3)).max(axis=(1, 3)) > 1e-9
+    np.testing.assert_array_equal(half, reached)  # what is in a joint comes there on the way down, and nowhere else
     solved = np.linalg.solve(whole, right[..., None])[..., 0]
     np.testing.assert_allclose(x.numpy(), solved, atol=1e-5 * np.abs(solved).max())
 
