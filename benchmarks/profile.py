@@ -35,6 +35,8 @@ class Options(runner.Options):
     num_envs: int = 1024
     #: resolution of the bodies
     fidelity: str = "coarse"
+    #: settings of the environment, as drive.bone_contact=false
+    settings: tuple[str, ...] = ()
     #: steps that are timed, each way
     repeats: int = 10
 
@@ -42,7 +44,7 @@ class Options(runner.Options):
 def cases(options: Options) -> Iterator[dict[str, Any]]:
     """A row for the step as a whole, and one for each kernel, the slowest first; then the picture."""
     world = WORLDS.get(options.case, options.case)
-    batch = BatchEnv(make_task(world, options.fidelity), options.num_envs, options.device)
+    batch = BatchEnv(make_task(world, options.fidelity, options.settings), options.num_envs, options.device)
     batch.reset()
     stepper = Stepper(batch)
     for _ in range(LEAST_STEPS):

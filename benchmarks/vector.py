@@ -16,7 +16,7 @@ import gc
 import importlib
 import importlib.util
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,7 +27,7 @@ from benchmarks import runner, timing
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.api.same_step import step_and_reset
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import load_config
+from piavatar_envs.envs.config import load_config, parse_assignments
 from piavatar_envs.mpm.cores import available_cores
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.tasks import load_task
@@ -72,17 +72,17 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
         yield scaling(options.worlds[0], max(batches), options)
 
 
-def make_task(world: str, fidelity: str) -> Task:
-    """The task of a world at a resolution.
+def make_task(world: str, fidelity: str, settings: Sequence[str] = ()) -> Task:
+    """The task of a world at a resolution, with settings such as ``drive.bone_contact=false``.
 
     Raises:
-        ValueError: there is no such world.
+        ValueError: there is no such world or setting.
     """
     if "/" in world:
         task = load_task(world)
     else:
         task = importlib.import_module(f"piavatar_envs.multi.{world}").TASK
-    return task(load_config(task.Config, None, {"fidelity": fidelity}))
+    return task(load_config(task.Config, None, {"fidelity": fidelity, **parse_assignments(settings)}))
 
 
 class Stepper:
