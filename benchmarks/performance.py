@@ -241,13 +241,22 @@ def joints_and_matter(report: Report) -> tuple[float, float]:
 
 def torque_profile_table(report: Report) -> list[str]:
     """:func:`profile_table`, and what the joints take beside the Material Point Method."""
-    joints, matter = joints_and_matter(report)
     (firm,) = (row["ms_per_step"] for row in report["results"] if row["case"] == "put_in_place")
-    told = (
-        f"The projection takes {number(joints)} ms, {joints / matter:.3f} of the {number(matter)} ms of the Material "
-        f"Point Method; putting firm particles in their places, once a step, {number(firm)} ms."
-    )
+    told = f"{share_of_joints(report)}; putting firm particles in their places, once a step, {number(firm)} ms."
     return [*profile_table(report), "", told]
+
+
+def share_of_joints(report: Report) -> str:
+    """What the joints take beside the Material Point Method, in words."""
+    joints, matter = joints_and_matter(report)
+    share = f"{joints / matter:.3f} of the {number(matter)} ms of the Material Point Method"
+    return f"The joints take {number(joints)} ms, {share}"
+
+
+def projection_table(report: Report) -> list[str]:
+    """The projection alone, of a profile with bones that do not stop at surfaces."""
+    (act,) = (row["ms_per_step"] for row in report["results"] if row["case"] == "act")
+    return ["", f"{share_of_joints(report)}: that is the projection alone, `act` {number(act)} ms."]
 
 
 _SUBSTEP = ("substep.json", "python -m benchmarks.substep --device cuda")
@@ -262,6 +271,12 @@ TABLES: dict[str, Table] = {
         "profile_stand.json",
         "python -m benchmarks.profile --device cuda --case PIAvatar/Stand-v0 --num-envs 2048",
         torque_profile_table,
+    ),
+    "profile_projection": Table(
+        "profile_projection.json",
+        "python -m benchmarks.profile --device cuda --case PIAvatar/Stand-v0 --num-envs 2048 "
+        "--settings drive.bone_contact=false",
+        projection_table,
     ),
     "soak": Table("soak.json", "python -m benchmarks.soak --device cuda", soak_table),
 }
