@@ -59,10 +59,10 @@ def test_what_is_made_smaller_is_there():
 def test_walkers_are_as_fast_as_the_guide_says():
     """Who goes at a steady ``v`` from the first of ``N`` steps on is ``v dt (N + 1) / 2`` from the start on average."""
     speeds = []
-    for path in sorted((ROOT / "benchmarks" / "results" / "ppo").glob("walk_*/results.json")):
+    for path in sorted((ROOT / "benchmarks" / "results" / "ppo").glob("walk_*/evaluation.json")):
         run = json.loads(path.read_text(encoding="utf-8"))
-        env, dt = run["config"]["env"], run["config"]["env"]["physics"]["control_dt"]
-        (row,) = (row for row in run["results"] if row["case"] == "trained")
+        env, dt = run["env"], run["env"]["physics"]["control_dt"]
+        (row,) = run["results"]
         assert row["success_at_end"] == 1.0 and row["mean_steps"] == env["episode_seconds"] / dt
         speeds.append(2.0 * row["mean_distance_m"] / (dt * (row["mean_steps"] + 1.0)))
     guide = PAGES["docs/training.md"].read_text(encoding="utf-8")

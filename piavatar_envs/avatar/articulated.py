@@ -59,8 +59,8 @@ import warp as wp
 
 from piavatar_envs.avatar.attachment import attach_flesh, put_in_place
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.bone_contact import Ground
 from piavatar_envs.avatar.bone_sums import sum_moments
+from piavatar_envs.avatar.bone_touch import Ground
 from piavatar_envs.avatar.joint_bench import JointBench
 from piavatar_envs.avatar.joint_mass import JointMass, grid_inertia
 from piavatar_envs.avatar.joint_motion import take_over

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.bone_contact import PARTS, Ground, measure_bones, stop_bones, tell_sensors
+from piavatar_envs.avatar.bone_contact import PARTS, stop_bones, tell_sensors
+from piavatar_envs.avatar.bone_touch import Ground, measure_bones
 from piavatar_envs.avatar.cholesky import (
     factorize,
     factorize_in_room,

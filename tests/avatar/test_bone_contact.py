@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.rig import joint_gaps
-from piavatar_envs.avatar.bone_contact import LAYER
+from piavatar_envs.avatar.bone_touch import LAYER
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.mpm.boundaries import Collider
 from tests.avatar.jointed import Joints

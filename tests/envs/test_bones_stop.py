@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.bone_contact import LAYER
+from piavatar_envs.avatar.bone_touch import LAYER
 from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.envs.batch_env import BatchEnv
 
@@ -13,23 +13,25 @@ THRASHING = {"fidelity": "coarse", "control": "torque"}
 GET_UP = "PIAvatar/GetUp-v0"
 
 
-def reach_of(points) -> np.ndarray:
-    """From each joint to the furthest of the particles that track its bone [m], shape ``(rows, 22)``."""
-    far = [points.rest[:, points.bone == b] - points.joints[:, b, None] for b in range(NUM_JOINTS)]
-    return np.stack([np.linalg.norm(arm, axis=2).max(axis=1) for arm in far], axis=1)
+def boxes_of(points) -> np.ndarray:
+    """Lowest and highest of the particles that track a bone, from its joint [m], shape ``(2, rows, 22, 3)``."""
+    arms = [points.rest[:, points.bone == b] - points.joints[:, b, None] for b in range(NUM_JOINTS)]
+    return np.stack([np.stack([end(arm, axis=1) for arm in arms], axis=1) for end in (np.min, np.max)])
 
 
 @pytest.mark.parametrize("pool", [None, 3])
-def test_bones_reach_as_far_as_those_of_the_body_that_was_drawn(make_batch, pool):
+def test_boxes_hold_the_bones_of_the_body_that_was_drawn(make_batch, pool):
     batch = make_batch("PIAvatar/Stand-v0", 3, control="torque", **{"shape.randomize": True, "shape.pool": pool})
     found = []
     for seeds in ([0, 1, 2], [31, 32, 33]):
         batch.reset(seeds=seeds)
         batch.step()
         batch.simulation.shapes.fall_behind()
-        reach = batch.simulation.avatar.joints.body._bench.reach.numpy().copy()
-        np.testing.assert_allclose(reach, reach_of(batch.simulation.flesh[0].points), atol=1e-5)
-        found.append(reach)
+        bench = batch.simulation.avatar.joints.body._bench
+        middle, half = bench.middle.numpy().copy(), bench.half.numpy().copy()
+        boxes = np.stack([middle - half, middle + half])
+        np.testing.assert_allclose(boxes, boxes_of(batch.simulation.flesh[0].points), atol=1e-5)
+        found.append(boxes)
     assert np.abs(found[1] - found[0]).max() > 1e-3
 
 
