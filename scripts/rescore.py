@@ -2,7 +2,7 @@
 
 Policies play the episodes of their evaluations (``ppo/*/evaluation.json``), the PID agent and streams of random actions
 those that are recorded (``pid/*``, ``random/*``), each with the settings that it was recorded with; then comes the
-table of all (``torque_baselines.json``, ``.md``). On an H200 that is some four minutes, on a CPU many hours.
+table of all (``torque_baselines.json``, ``.md``). On an H200 that is some nine minutes, on a CPU many hours.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def main(
     device: Annotated[str, tyro.conf.arg(help="where to simulate")] = "cpu",
     jobs: Annotated[int, tyro.conf.arg(help="agents that play at a time")] = 1,
     bone_contact: Annotated[
-        bool | None, tyro.conf.arg(help="score policies with bones that stop, or do not; else as each was trained")
+        bool | None, tyro.conf.arg(help="score policies on bones that stop, or do not; else as each was scored last")
     ] = None,
 ) -> int:
     """Score what is kept, and draw up the table.
@@ -71,7 +71,6 @@ def main(
 def find_jobs(results: Path, device: str, bone_contact: bool | None = None) -> list[Job]:
     """A job for every agent that is kept, the longest first; policies on bones that stop or do not, if that is said."""
     jobs = []
-    bones = [] if bone_contact is None else [f"drive.bone_contact={str(bone_contact).lower()}"]
     for folder in sorted(path.parent for path in results.glob("pid/*/results.json")):
         jobs.append(Job(folder, ("agents.score_pid", *pid_arguments(folder), *written(folder, device))))
     for folder in sorted(path.parent for path in results.glob("random/*/results.json")):
@@ -80,9 +79,17 @@ def find_jobs(results: Path, device: str, bone_contact: bool | None = None) -> l
         jobs.append(Job(folder, command))
     for folder in sorted(path.parent for path in results.glob("ppo/*/config.yaml")):
         out = ("--device", device, "--out", str(folder / "evaluation.json"))
-        command = ("agents.play", str(folder), *bones, *out)
+        bones = scored_on(folder) if bone_contact is None else bone_contact
+        said = () if bones is None else (f"drive.bone_contact={str(bones).lower()}",)
+        command = ("agents.play", str(folder), *said, *out)
         jobs.append(Job(folder, command))
     return jobs
+
+
+def scored_on(folder: Path) -> bool | None:
+    """Whether bones stopped where a policy was scored last; None if it has only its training's own evaluation."""
+    path = folder / "evaluation.json"
+    return read_json(path)["env"]["drive"]["bone_contact"] if path.is_file() else None
 
 
 def written(folder: Path, device: str) -> tuple[str, ...]:

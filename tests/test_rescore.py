@@ -73,12 +73,26 @@ def test_a_job_that_fails_is_told_and_leaves_the_table(tmp_path, device, capsys)
     assert not (tmp_path / rescore.TABLE).exists()
 
 
-def test_policies_can_be_scored_on_other_bones(tmp_path):
+def test_policies_are_scored_on_the_bones_of_last_time_or_on_others(tmp_path):
     folder = tmp_path / "ppo" / "stand_0"
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text("env_id: PIAvatar/Stand-v0\n")
-    (as_trained,), (stopping,) = (rescore.find_jobs(tmp_path, "cpu", bones) for bones in (None, True))
-    assert "drive.bone_contact=true" in stopping.command and len(stopping.command) == len(as_trained.command) + 1
+
+    def command(bones: bool | None = None) -> tuple[str, ...]:
+        (job,) = rescore.find_jobs(tmp_path, "cpu", bones)
+        return job.command
+
+    as_trained = command()
+    assert not any("bone_contact" in word for word in as_trained)
+    assert set(command(True)) - set(as_trained) == {"drive.bone_contact=true"}
+    (folder / "evaluation.json").write_text(json.dumps({"env": {"drive": {"bone_contact": False}}}))
+    assert set(command()) - set(as_trained) == {"drive.bone_contact=false"}
+    assert command(True) == (*as_trained[:2], "drive.bone_contact=true", *as_trained[2:])
+
+
+def test_kept_policies_were_scored_in_the_environment_as_it_comes():
+    bones = [rescore.scored_on(path.parent) for path in RESULTS.glob("ppo/*/evaluation.json")]
+    assert len(bones) > 40 and all(bones)
 
 
 def test_nothing_to_score_is_refused(tmp_path):
