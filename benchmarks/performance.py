@@ -25,8 +25,8 @@ RESULTS = ROOT / "benchmarks" / "results"
 MARKED = re.compile(r"(<!-- table: (?P<name>\w+) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
 MOST_ROWS = 14  # of a table of kernels
 PROFILE, PICTURE = "profile_reach.json", "profile_reach.png"
-#: Kernels of the projection of bodies under torques, and of the Material Point Method.
-PROJECTION = frozenset({"attach_flesh", "sum_pairs", "build_mass", "act", "take_over", "begin_substep"})
+#: Kernels of the joints of bodies under torques, which project and stop bones, and of the Material Point Method.
+JOINTS = frozenset({"attach_flesh", "sum_pairs", "build_mass", "act", "take_over", "begin_substep"})
 MATTER = frozenset(
     {"substep_in_small_room", "substep_in_large_room", "nodes_in_small_room", "nodes_in_large_room", "forget_speeds"}
     | {"particles_to_grid", "runs_to_grid", "singles_to_grid", "update_grid", "find_facing", "solve_contact"}
@@ -233,9 +233,9 @@ def pictured_profile_table(report: Report) -> list[str]:
 
 
 def joints_and_matter(report: Report) -> tuple[float, float]:
-    """Time of the projection and of the Material Point Method in a profiled step [ms]."""
+    """Time of the joints and of the Material Point Method in a profiled step [ms]."""
     ms = {row["case"]: row["ms_per_step"] for row in report["results"]}
-    joints, matter = (sum(ms[name] for name in ms if name in names) for names in (PROJECTION, MATTER))
+    joints, matter = (sum(ms[name] for name in ms if name in names) for names in (JOINTS, MATTER))
     return joints, matter
 
 

@@ -87,9 +87,10 @@ def find_jobs(results: Path, device: str, bone_contact: bool | None = None) -> l
 
 
 def scored_on(folder: Path) -> bool | None:
-    """Whether bones stopped where a policy was scored last; None if it has only its training's own evaluation."""
+    """Whether bones stopped where a policy was scored last; None if nothing says so."""
     path = folder / "evaluation.json"
-    return read_json(path)["env"]["drive"]["bone_contact"] if path.is_file() else None
+    env = read_json(path).get("env", {}) if path.is_file() else {}
+    return env.get("drive", {}).get("bone_contact")
 
 
 def written(folder: Path, device: str) -> tuple[str, ...]:

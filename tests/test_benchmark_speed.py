@@ -377,11 +377,11 @@ def test_profile_as_a_smoke_run(results: Path):
 def test_every_kernel_of_a_step_under_torques_is_known(results: Path):
     """What joints take beside the Material Point Method is told by names: no kernel of either may be missing."""
     names = {row["case"] for row in rows_of(results, "profile_stand.json")}
-    assert names >= performance.PROJECTION
+    assert names >= performance.JOINTS
     of_matter = {name for module in kernels_by_module("piavatar_envs.mpm.") for name in module} & names
     assert of_matter - performance.MATTER <= {"clear_sensors", "read_impulses"}  # which only tell what has been
     of_joints = {name for module in kernels_by_module("piavatar_envs.avatar.joint_") for name in module} & names
-    assert of_joints - performance.PROJECTION <= {"set_springs"}  # once a step
+    assert of_joints - performance.JOINTS <= {"set_springs"}  # once a step
 
 
 def kernels_by_module(prefix: str) -> list[set[str]]:

@@ -85,6 +85,8 @@ def test_policies_are_scored_on_the_bones_of_last_time_or_on_others(tmp_path):
     as_trained = command()
     assert not any("bone_contact" in word for word in as_trained)
     assert set(command(True)) - set(as_trained) == {"drive.bone_contact=true"}
+    (folder / "evaluation.json").write_text(json.dumps({"env": {"physics": {"fidelity": "coarse"}}}))
+    assert command() == as_trained  # from before there was this setting
     (folder / "evaluation.json").write_text(json.dumps({"env": {"drive": {"bone_contact": False}}}))
     assert set(command()) - set(as_trained) == {"drive.bone_contact=false"}
     assert command(True) == (*as_trained[:2], "drive.bone_contact=true", *as_trained[2:])

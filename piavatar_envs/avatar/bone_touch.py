@@ -143,7 +143,8 @@ def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: J
 def find_fastest(body: Body, ground: Ground, dt: float, e: int, thread: int, threads: int, w: JointBench) -> wp.vec2:
     """By how much the point is too fast that is so by most [m/s], and which: point, bone and boundary in a number.
 
-    Few bones come near a boundary: the threads share the points of one after the other.
+    Few bones come near a boundary: the threads share the points of one after the other. The number is exact in single
+    precision, below 2^24.
     """
     most = float(0.0)
     which = int(0)
