@@ -276,14 +276,14 @@ for (int v = 0; v < VECTORS; ++v)
 meet();
 #endif
 """
-_TAKE = """
+_KEEP = """
 #if defined(__CUDA_ARCH__)
 for (int v = 0; v < VECTORS; ++v)
     for (int n = lane; n < size; n += LANES) wp::index(x, first + v * step, n) = spare[STRIDE * v + n + n / 3];
 meet();
 #endif
 """
-_SOLVE = _ALL + _PARTS + _BRING + _SWEEPS + _DOWN + _UP + _TAKE
+_SOLVE = _ALL + _PARTS + _BRING + _SWEEPS + _DOWN + _UP + _KEEP
 
 
 @wp.func_native(_SOLVE.replace("COUNT", "1"))
