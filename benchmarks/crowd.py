@@ -27,9 +27,9 @@ from piavatar_envs.avatar.substeps import record_drive
 from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.fields import Fields
-from piavatar_envs.mpm.memory import allocate, estimate_slots
+from piavatar_envs.mpm.memory import SLOT_MARGIN, allocate, estimate_slots
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
+from piavatar_envs.mpm.solver import record_begin, record_end, record_substeps
 from piavatar_envs.mpm.types import Grid, failure_name
 
 DENSITY = 1000.0
@@ -40,6 +40,8 @@ TOUCH = 0.5  # between the nearest particles of neighbours in a queue, over the 
 SWAY = 0.004  # of the root in a control step, neighbours in opposite directions [m]
 #: Of the joints that act [rad]; small, because particles leave the arc for its tangent, which stretches a limb.
 TURN = 0.03
+#: Slots of a skin, over those that it takes at rest: substeps in one launch each are marked anew every 50 only.
+SKIN_MARGIN = 3.0
 ACTING = ("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "neck", "spine2")
 
 
@@ -173,6 +175,13 @@ def _one_a_cell(positions: np.ndarray, dx: float) -> np.ndarray:
     return (np.unique(np.floor(positions / dx - 0.5).astype(int), axis=0) + 1.0) * dx
 
 
+def _slots(rest: np.ndarray, dx: float) -> int:
+    """Slots of a body of particles ``rest`` ``(P, 3)`` [m]; a skin leaves blocks behind for longer than others."""
+    cells = _one_a_cell(rest, dx)
+    margin = SKIN_MARGIN if 2 * len(cells) > len(rest) else SLOT_MARGIN
+    return estimate_slots(cells, None, dx, margin)
+
+
 class Crowd:
     """``count`` equal bodies in one world, each a subject with a velocity field of its own, in a queue along y.
 
@@ -218,7 +227,7 @@ class Crowd:
             gravity=(0.0, 0.0, 0.0),
             colliders=[Collider.plane((0.0, 0.0, 1.0), 0.0, FRICTION)],
             fields=Fields(tuple(range(count)), FRICTION, DENSITY, num_sensors=count * len(BODY_PARTS)),
-            max_slots=count * estimate_slots(_one_a_cell(points.rest[0], scale.dx), None, scale.dx),
+            max_slots=count * _slots(points.rest[0], scale.dx),
             rest=np.tile(points.rest[0], (count, 1)),
             scatter=scatter,
         )
@@ -234,8 +243,7 @@ class Crowd:
         for avatar in self.avatars:
             avatar.record_begin(self.once)
             record_drive(avatar, self.once, self.state, 0)
-        for index in range(self.model.num_substeps):
-            record_substep(self.once, *world, index)
+        record_substeps(self.once, *world)
         record_end(self.once, *world)
         for avatar in self.avatars:
             avatar.record_end(self.once, self.state)

@@ -154,6 +154,8 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
         "particles_to_grid": scatter,
         "runs_to_grid": scatter,
         "singles_to_grid": scatter,
+        # x, F, vk, spin in; x, u, C, F out; physical halves of sums in, added to, and cleared
+        "carry_on": particles * (72 + constants + WRITTEN_BYTES) + 2 * sums,
         # mass and physical momentum in and cleared, physical velocities out; more where contact is at hand
         "update_grid": 2 * sums // (2 if SCATTERS[model.scatter] else 1) + nodes * NODE_BYTES // 2,
         # x, F, vk, spin and physical velocities in; x, u, C, F out
@@ -175,5 +177,5 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
 
 def kernel_additions(kernel: str, counts: Counts) -> int | None:
     """Records that one launch of a kernel adds to nodes if it adds each particle's by itself; None for others."""
-    scatters = ("particles_to_grid", "runs_to_grid", "singles_to_grid", *SUBSTEPS, *NODE_PASSES)
+    scatters = ("particles_to_grid", "runs_to_grid", "singles_to_grid", "carry_on", *SUBSTEPS, *NODE_PASSES)
     return counts.particles * STENCIL if kernel in scatters else None

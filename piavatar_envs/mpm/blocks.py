@@ -37,6 +37,10 @@ _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
 
 
+#: What ``held`` says of a slot that nobody has got yet.
+NOBODY = wp.constant(-1)
+
+
 @wp.func
 def has_field(mask: int, f: int):
     """Whether bit ``f`` of a block's mask is set."""
@@ -84,6 +88,21 @@ def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
 
 
 # A GPU finds out anew: to write it down and read it takes as long
+@wp.func_native(f"""
+const volatile int* const slot_of = &wp::index(blocks.slot, e, held);
+const volatile int* const failing = &wp::index(failure, e);
+do {{
+    const int slot = *slot_of;
+    if (slot >= 0 && slot < blocks.held.shape[1] && *(const volatile int*)&wp::index(blocks.held, e, slot) == held)
+        return slot;
+}} while (!(*failing & {FAILURE_BLOCKS}));
+return {int(NOBODY)};
+""")
+def awaited_slot(blocks: Blocks, e: int, held: int, failure: wp.array(dtype=int)) -> int:
+    """Slot of a field's block that is marked in this launch, maybe by another thread; ``NOBODY`` if there is none."""
+    ...
+
+
 @wp.func_native(f"""
 #if !defined(__CUDA_ARCH__)
 wp::index(blocks.around, e, p) = tells ? {int(TELLS)} | (beside ? {int(BESIDE)} : 0) : 0;
@@ -201,6 +220,7 @@ def forget_blocks(grid: Grid, blocks: Blocks):
     e, slot = wp.tid()
     if slot < slots_used(blocks, e):
         blocks.fields[e, blocks.held[e, slot] % grid.num_blocks] = 0
+        blocks.held[e, slot] = NOBODY
 
 
 @wp.kernel

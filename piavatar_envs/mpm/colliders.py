@@ -39,6 +39,8 @@ NEAR_BLOCK = wp.constant(7.0)
 #: Slabs of nodes closer than this may hold matter within the gate: CONTACT_GATE, half a stencil's and half a slab's
 #: diagonal.
 GATED_SLAB = wp.constant(5.3)
+#: Particles closer than this may have a node with matter within the gate: CONTACT_GATE, and a stencil's diagonal.
+GATED_STENCIL = wp.constant(5.7)
 
 #: A direction shorter than this [m] is round-off, and another is taken for it.
 _NO_LENGTH = wp.constant(1.0e-9)

@@ -92,6 +92,48 @@ def asks_kinematic(grid: Grid, step: Step, boundaries: Boundaries, e: int, x: wp
 
 
 @wp.func
+def begun(grid: Grid, physical: Gradients, f: wp.vec3):
+    """Physical velocity and its gradient of a particle that is ``f`` from the lowest node."""
+    s = Gathered()
+    s.u = wp.vec3(physical.mean[1], physical.mean[2], physical.mean[3])
+    s.C = gradient_of(grid, physical, f)
+    return s
+
+
+@wp.func
+def own_velocity(
+    grid: Grid, boundaries: Boundaries, e: int, x: wp.vec3, vk: wp.vec3, kinematic: Gradients, asked: bool
+):
+    """Kinematic velocity that carries a particle at ``x``: what the grid did not see of it enters no boundary.
+
+    ``kinematic`` has nothing where it was not ``asked`` for, see :func:`asks_kinematic`.
+    """
+    if not asked:
+        return vk
+    seen = wp.vec3(kinematic.mean[1], kinematic.mean[2], kinematic.mean[3])
+    return seen + remove_approach(boundaries, e, x, vk - seen, CONTACT_GATE * grid.dx)
+
+
+@wp.func
+def settled(
+    grid: Grid,
+    step: Step,
+    s: Gathered,
+    x: wp.vec3,
+    advection: wp.vec3,
+    F: wp.mat33,
+    grad_vk: wp.mat33,
+    spin: wp.vec3,
+):
+    """``s`` with the rest of what becomes of a particle that was at ``x`` and is carried by ``advection``."""
+    decoupling = wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
+    s.F = advance_deformation(F, s.C, grad_vk, spin, step.dt, decoupling)
+    s.x = x + step.dt * advection
+    s.fault = fault_of(grid, step, s.F, advection, s.x)
+    return s
+
+
+@wp.func
 def finish_gather(
     grid: Grid,
     step: Step,
@@ -110,27 +152,17 @@ def finish_gather(
     """Particle ``p`` a substep later; the blocks that it comes to are marked.
 
     It is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking exact
-    (1e-5 m against 1e-2 m). What the grid did not see of it is projected out of the boundaries. ``kinematic`` has
-    nothing where it was not ``asked`` for, see :func:`asks_kinematic`.
+    (1e-5 m against 1e-2 m).
     """
     x = moved.x[e, p]
-    advection = wp.vec3(physical.mean[1], physical.mean[2], physical.mean[3])
-    s = Gathered()
-    s.u = advection
-    s.C = gradient_of(grid, physical, stencil.f)
+    s = begun(grid, physical, stencil.f)
+    advection = s.u
     grad_vk = wp.mat33()
     if step.decoupling == PAPER:
         grad_vk = gradient_of(grid, kinematic, stencil.f)
     elif step.decoupling == SPLIT or step.decoupling == NO_STRESS:
-        own = moved.vk[e, p]
-        if asked:
-            seen = wp.vec3(kinematic.mean[1], kinematic.mean[2], kinematic.mean[3])
-            own = seen + remove_approach(boundaries, e, x, own - seen, CONTACT_GATE * grid.dx)
-        advection += own
-    decoupling = wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
-    s.F = advance_deformation(matrix_at(moved.F, e, p), s.C, grad_vk, moved.spin[e, p], step.dt, decoupling)
-    s.x = x + step.dt * advection
-    s.fault = fault_of(grid, step, s.F, advection, s.x)
+        advection += own_velocity(grid, boundaries, e, x, moved.vk[e, p], kinematic, asked)
+    s = settled(grid, step, s, x, advection, matrix_at(moved.F, e, p), grad_vk, moved.spin[e, p])
     if s.fault != 0:
         wp.atomic_or(failure, e, s.fault)
     else:

@@ -7,11 +7,13 @@ import math
 import numpy as np
 import warp as wp
 
+from piavatar_envs.mpm.blocks import NOBODY
 from piavatar_envs.mpm.matrices import allocate_matrices, components_of, whole_lines
 from piavatar_envs.mpm.shared_room import plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.sums import units
 from piavatar_envs.mpm.sweep import most_shared
+from piavatar_envs.mpm.turns import TURNS, sets_of_sums
 from piavatar_envs.mpm.types import (
     SCATTERS,
     Blocks,
@@ -76,10 +78,11 @@ def estimate_bytes(
 ) -> int:
     """Device memory of state and scratch [bytes].
 
-    120 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 32 more
-    where there are several fields; the map of blocks.
+    120 B a particle; 80 B a node of a slot, 48 more in fixed point, 192 more where sums are in turns, 32 less where
+    they are in shared memory, 32 more where there are several fields; the map of blocks.
     """
-    sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter])
+    turns = TURNS if scatter == "singles" and num_fields == 1 else 1
+    sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter]) * turns
     node = sums + 32 + (16 + 16 if num_fields > 1 else 0)
     slots = max_slots * (BLOCK**3 * node + (10 if num_fields > 1 else 4) + (0 if scatter == "shared" else 4))
     particles = 48 * num_particles + 72 * whole_lines(num_particles)  # four vectors and two matrices
@@ -153,7 +156,7 @@ def allocate_blocks(model: Model) -> Blocks:
         Blocks,
         fields=_zeros(model, (n, count), int),
         slot=_zeros(model, (n, model.contact.num_fields * count), int),
-        held=_zeros(model, (n, model.max_slots), int),
+        held=wp.full((n, model.max_slots), int(NOBODY), dtype=int, device=model.device),
         count=_zeros(model, n, int),
         shared=_zeros(model, (n, most_shared(model)), int),
         num_shared=_zeros(model, n, int),
@@ -165,19 +168,20 @@ def allocate_blocks(model: Model) -> Blocks:
 
 def allocate_sums(model: Model, velocity: wp.array) -> Sums:
     """Zeroed sums of the nodes, and their units. Sums from shared memory come to the records of the ``velocity``."""
-    fixed, records = SCATTERS[model.scatter], (model.num_envs, int(BLOCK_NODES) * model.max_slots)
+    slots = model.max_slots * sets_of_sums(model)
+    fixed, records = SCATTERS[model.scatter], (model.num_envs, int(BLOCK_NODES) * slots)
     mass, momentum = units(model.contact.density.numpy(), model.grid, model.step)
     floats, integers = ((1, 1), records) if fixed else (records, (1, 1))
     return group(
         Sums,
         is_fixed=int(fixed),
         value=velocity if model.scatter == "shared" else _zeros(model, (1, 1) if fixed else velocity.shape, wp.vec4),
-        fixed=_zeros(model, velocity.shape if fixed else (1, 1), vec4l),
+        fixed=_zeros(model, (records[0], 2 * records[1]) if fixed else (1, 1), vec4l),
         offset=_zeros(model, floats, wp.vec4),
         offset_fixed=_zeros(model, integers, vec4l),
         mass_unit=wp.array(mass.astype(np.float32), dtype=float, device=model.device),
         momentum_unit=wp.array(momentum.astype(np.float32), dtype=float, device=model.device),
-        told=_zeros(model, (1, 1) if model.scatter == "shared" else (model.num_envs, model.max_slots), int),
+        told=_zeros(model, (1, 1) if model.scatter == "shared" else (model.num_envs, slots), int),
     )
 
 

@@ -46,10 +46,16 @@ def scattered(grid: Grid, step: Step, particles: Particles, moving: Moving, e: i
     """Mass and momentum of a particle, how it is driven, or its place ``w m (x_i - x_p) / dx`` and a seam's ``w m``."""
     if kind == MOMENTUM:
         return prepare(grid, step, particles, moving, e, p, False)
-    s = placed(grid, moving.x[e, p])
+    return told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], kind)
+
+
+@wp.func
+def told_by(grid: Grid, particles: Particles, e: int, p: int, x: wp.vec3, vk: wp.vec3, kind: int):
+    """How particle ``p`` at ``x`` is driven, or its place, see :func:`scattered`."""
+    s = placed(grid, x)
     m = particles.mass[row(e, particles.mass.shape[0]), p]
     if kind == KINEMATIC:
-        k = m * moving.vk[e, p]
+        k = m * vk
         s.at_base = vec8(0.0, k[0], k[1], k[2], 0.0, 0.0, 0.0, 0.0)
     else:
         s.at_base = vec8(particles.seam[p] * m, -m * s.f[0], -m * s.f[1], -m * s.f[2], 0.0, 0.0, 0.0, 0.0)

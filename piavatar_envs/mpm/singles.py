@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattered
+from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattered, told_by
 from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_index, grid_position, spline
 from piavatar_envs.mpm.sweep import any_lane, lane_of_thread
@@ -84,9 +84,6 @@ for (int n = 1; n < 4; ++n)
     if (c == n) value = s[n], along_x = A.data[n - 1][0], along_y = A.data[n - 1][1], along_z = A.data[n - 1][2];
 if (!takes) value = along_x = along_y = along_z = massive = 0.0f;
 value *= scale, along_x *= scale, along_y *= scale, along_z *= scale;
-auto least = [](const wp::vec_t<3, wp::float32>& w) {{ return fminf(fminf(w[0], w[1]), w[2]); }};
-// who adds no mass adds nothing; hardly a particle is so near a node's plane that this has to be asked node by node
-const bool sure = __all_sync(ALL, !takes || least(wx) * least(wy) * least(wz) * massive > 0.5f);
 const int word = kind == {int(MOMENTUM)} ? c : c + 3 & 3;  // a vector begins where the mass was, if there is none
 const void* records_at = &wp::index(sums.value, is_fixed ? 0 : e, 0);
 if (is_fixed) records_at = &wp::index(sums.fixed, e, 0);
@@ -96,9 +93,8 @@ const size_t to = __cvta_generic_to_global(records_at) + (is_fixed ? 8 : 4) * wo
     + (kind == {int(KINEMATIC)} ? 64 * (is_fixed ? 32 : 16) : 0);
 const int size = is_fixed ? 32 : 16;  // from a node to the next of a block [bytes]
 const int blocks_apart = is_place ? 1 : 2;  // the halves of records lie apart
-struct Fixed {{ enum {{ FIXED = 1, SURE = 0 }}; }};
-struct Sure {{ enum {{ FIXED = 1, SURE = 1 }}; }};
-struct Floating {{ enum {{ FIXED = 0, SURE = 1 }}; }};
+struct Fixed {{ enum {{ FIXED = 1 }}; }};
+struct Floating {{ enum {{ FIXED = 0 }}; }};
 const int bx = base[0] & 3, by = base[1] & 3, bz = base[2] & 3;
 int lower[4], upper[4];  // of the threads that have looked them up
 #pragma unroll
@@ -107,7 +103,7 @@ for (int n = 0; n < 4; ++n) {{
     upper[n] = blocks_apart * __shfl_sync(ALL, record, lane & 24 | 4 | n);
 }}
 auto add = [&](auto sum) {{
-    constexpr bool FIXED = decltype(sum)::FIXED, SURE = decltype(sum)::SURE;
+    constexpr bool FIXED = decltype(sum)::FIXED;
 #pragma unroll
     for (int pair = 0; pair < 5; ++pair) {{
         if (pair == 4 && is_second) break;
@@ -126,16 +122,16 @@ auto add = [&](auto sum) {{
             asm("mad.wide.s32 %0, %1, %2, %3;"
                 : "=l"(node) : "r"((bz + l > 3 ? next : near) + (bz + l & 3)), "r"(size), "l"(to));
             if (FIXED) {{
-                const long long added = SURE || w * massive > 0.5f ? __float2ll_rn(number) : 0ll;
+                // who adds no mass adds nothing
+                const long long added = w * massive > 0.5f ? __float2ll_rn(number) : 0ll;
                 asm volatile("red.global.add.u64 [%0], %1;" :: "l"(node), "l"(added) : "memory");
             }} else if (massive > 0.0f)
                 asm volatile("red.global.add.f32 [%0], %1;" :: "l"(node), "f"(number) : "memory");
         }}
     }}
 }};
-if (!is_fixed) add(Floating());
-else if (sure) add(Sure());
-else add(Fixed());
+if (is_fixed) add(Fixed());
+else add(Floating());
 """)
 )
 def add_to_nodes(
@@ -162,6 +158,51 @@ def add_to_nodes(
     ...
 
 
+@wp.func
+def add_single(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    sums: Sums,
+    e: int,
+    p: int,
+    x: wp.vec3,
+    vk: wp.vec3,
+    takes: bool,
+    tells: bool,
+    record: int,
+    units: wp.vec2,
+    momentum: Scattered,
+):
+    """Add to the nodes what particle ``p`` scatters, if it ``takes`` part: its mass and ``momentum``, what it tells.
+
+    All threads of a warp come here, ``record`` and ``units`` as for :func:`add_to_nodes`.
+    """
+    mass = momentum.at_base[0]
+    kind = int(KINEMATIC)
+    adds = takes and (tells or step.decoupling == PAPER)  # which needs that gradient everywhere
+    while any_lane(adds):
+        add_one(grid, sums, e, adds, kind, told_by(grid, particles, e, p, x, vk, kind), mass, record, units)
+        kind += 1
+        adds = takes and tells and kind <= PLACE
+        if adds:
+            sums.told[e, record // BLOCK_NODES] = 1
+    # comes last: what a thread reads after its additions waits for them
+    add_one(grid, sums, e, takes, MOMENTUM, momentum, mass, record, units)
+
+
+@wp.func
+def add_one(
+    grid: Grid, sums: Sums, e: int, takes: bool, kind: int, s: Scattered, mass: float, record: int, units: wp.vec2
+):
+    """:func:`add_to_nodes` of what a particle scatters of a ``kind``."""
+    at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
+    add_to_nodes(
+        grid, sums, e, takes, kind, s.base, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), at_base, s.A, mass, record,
+        units,
+    )  # fmt: skip
+
+
 @wp.kernel(launch_bounds=(THREADS, 5))
 def singles_to_grid(
     grid: Grid,
@@ -185,9 +226,12 @@ def singles_to_grid(
     record = int(0)
     units = wp.vec2()
     s = Scattered()
+    x = wp.vec3()
+    vk = wp.vec3()
     if p < moving.x.shape[1]:
         # all is asked for at once, before it is known who takes part: a warp with few particles has little else to do
         x = moving.x[e, p]
+        vk = moving.vk[e, p]
         field = particles.field[p]
         moves = moves_finitely(moving, e, p)
         here = takes_part(blocks, e, failure)
@@ -203,24 +247,11 @@ def singles_to_grid(
         if takes:
             takes = bounded(s, units[1], failure, e) >= 0.0
     tells = any_of_team(tells)
-    mass = s.at_base[0]
-    driven = step.decoupling == PAPER  # that variant needs the gradient of kinematic momentum everywhere
-    kind = int(MOMENTUM)
-    adds = takes
-    while any_lane(adds):
-        wx = spline(s.f[0])
-        wy = spline(s.f[1])
-        wz = spline(s.f[2])
-        at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
-        add_to_nodes(grid, sums, e, adds, kind, s.base, wx, wy, wz, at_base, s.A, mass, record, units)
-        kind += 1
-        adds = takes and kind <= PLACE and (tells or (driven and kind == KINEMATIC))
-        if adds:
-            s = scattered(grid, step, particles, moving, e, p, kind)
-            if kind == KINEMATIC:
-                adds = bounded(s, units[1], failure, e) >= 0.0
-            else:
-                sums.told[e, record // BLOCK_NODES] = 1
+    if takes and (tells or step.decoupling == PAPER):
+        takes = bounded(told_by(grid, particles, e, p, x, vk, KINEMATIC), units[1], failure, e) >= 0.0
+    add_single(
+        grid, step, particles, sums, e, wp.min(p, moving.x.shape[1] - 1), x, vk, takes, tells, record, units, s
+    )  # fmt: skip
 
 
 def record_singles(program: Program, inputs: list[Any], shape: tuple[int, int], failure: Any, sums: Sums) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from piavatar_envs.mpm import runs
 from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
@@ -12,11 +14,13 @@ from piavatar_envs.mpm.groups import record_runs
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.relay import portions, record_relay
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
 from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
 from piavatar_envs.mpm.singles import record_singles
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep, slot_threads, slots_at_once
 from piavatar_envs.mpm.transfer import particles_to_grid
+from piavatar_envs.mpm.turns import has_turns
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 #: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In so
@@ -51,6 +55,21 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
         _record_gather(program, model, state, scratch)
     if m.moving_boundaries:
         program.launch(move_colliders, m.boundaries.position.shape, [m.step.dt], [m.boundaries])
+
+
+def record_substeps(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """Append all substeps of a control step between which nothing acts, see :func:`record_substep`.
+
+    Where that suits them, each is one launch, see :mod:`piavatar_envs.mpm.relay`.
+    """
+    if not has_turns(model):
+        for index in range(model.num_substeps):
+            record_substep(program, model, state, scratch, index)
+        return
+    for index, count in enumerate(portions(model.num_substeps)):
+        if index > 0:
+            _record_new_marks(program, model, state, scratch)
+        record_relay(program, model, state, scratch, _moving(state), _scattering(model, state, scratch), count)
 
 
 def _record_gather(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -110,13 +129,17 @@ def record_scatter(program: Program, model: Model, state: State, scratch: Scratc
     if m.scatter == "shared":
         record_in_block(program, model, state, scratch, _moving(s))
         return
-    inputs = [m.grid, m.step, m.particles, m.boundaries, m.contact, _moving(s), scratch.blocks]
+    inputs = _scattering(m, s, scratch)
     if m.scatter == "plain":
         program.launch(particles_to_grid, s.x.shape, inputs, [s.failure, scratch.sums])
     elif m.scatter in ("singles", "singles_float"):
         record_singles(program, inputs, s.x.shape, s.failure, scratch.sums)
     else:
         record_runs(program, inputs, m.particles, s.failure, scratch.sums)
+
+
+def _scattering(m: Model, s: State, scratch: Scratch) -> list[Any]:
+    return [m.grid, m.step, m.particles, m.boundaries, m.contact, _moving(s), scratch.blocks]
 
 
 def _moving(s: State) -> Moving:

@@ -104,6 +104,20 @@ def begin_sum(sums: Sums, e: int, r: int):
 
 
 @wp.func
+def counted_sum(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l, driven: bool):
+    """Mass, physical momentum and, if ``driven``, kinematic momentum of record ``r`` in fixed point; it stays."""
+    s = vec8()
+    a = counted(begun)
+    if a[0] > 0.0:  # who adds no mass adds nothing
+        p = units[1]
+        s = vec8(units[0] * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
+        if driven:
+            b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
+            s = s + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
+    return s
+
+
+@wp.func
 def take_sum(sums: Sums, e: int, f: int, r: int):
     """Mass, physical and kinematic momentum of record ``r`` of field ``f``, which is cleared."""
     return end_sum(sums, e, units_of(sums, e, f), r, begin_sum(sums, e, r), True)
@@ -121,16 +135,10 @@ def end_sum(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l, driven: bo
         s = read_record(sums.value, e, r)
         write_record(sums.value, e, r, vec8())
     else:
-        a = counted(begun)
-        if a[0] > 0.0:  # who adds no mass adds nothing
-            p = units[1]
-            s = vec8(units[0] * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
-            if driven:
-                b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
-                s = s + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
-        clear_numbers(sums.fixed, e, half_of(r, 0), a[0] > 0.0)
+        s = counted_sum(sums, e, units, r, begun, driven)
+        clear_numbers(sums.fixed, e, half_of(r, 0), s[0] > 0.0)
         if driven:
-            clear_numbers(sums.fixed, e, half_of(r, 1), a[0] > 0.0)
+            clear_numbers(sums.fixed, e, half_of(r, 1), s[0] > 0.0)
     return s
 
 

@@ -60,6 +60,22 @@ def placed(grid: Grid, x: wp.vec3):
 
 
 @wp.func
+def impulse_of_stress(grid: Grid, step: Step, volume: float, tau: wp.mat33):
+    """What a particle's Kirchhoff stress takes from its affine momentum in a substep [kg/s]."""
+    return (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
+
+
+@wp.func
+def with_momentum(grid: Grid, s: Scattered, m: float, u: wp.vec3, k: wp.vec3, C: wp.mat33, stress: wp.mat33):
+    """``s`` with mass, physical momentum less the impulse of its ``stress``, and kinematic momentum of a particle."""
+    affine = m * C - stress
+    s.A = grid.dx * affine
+    q = m * u - s.A * s.f
+    s.at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
+    return s
+
+
+@wp.func
 def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, tells: bool):
     """What particle ``p`` of environment ``e`` scatters.
 
@@ -79,15 +95,11 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
             particles.mu[row(e, particles.mu.shape[0]), p],
             particles.lam[row(e, particles.lam.shape[0]), p],
         )
-        stress = (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
-    affine = m * C - stress
-    s.A = grid.dx * affine
-    q = m * moving.u[e, p] - s.A * s.f
+        stress = impulse_of_stress(grid, step, volume, tau)
     k = wp.vec3()
     if tells or step.decoupling == PAPER:
         k = m * moving.vk[e, p]
-    s.at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
-    return s
+    return with_momentum(grid, s, m, moving.u[e, p], k, C, stress)
 
 
 @wp.func

@@ -1,0 +1,192 @@
+"""The gather of a particle's eight threads: they share the nodes of its stencil, and make velocities out of their sums.
+
+There is no grid pass before it, so what boundaries do at nodes is found here, too, by all who gather from them.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.colliders import CONTACT_GATE, GATED_STENCIL, boundary_contact
+from piavatar_envs.mpm.gather import Gradients
+from piavatar_envs.mpm.grid import total_velocity
+from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
+from piavatar_envs.mpm.records import half_of
+from piavatar_envs.mpm.stencil import Stencil, node_position
+from piavatar_envs.mpm.sums import begin_sum, numbers_at
+from piavatar_envs.mpm.sweep import any_lane, lane_of_thread
+from piavatar_envs.mpm.team import (
+    node_of_thread,
+    record_in_team,
+    sum_of_team,
+    vector_sum_of_team,
+    vector_sum_of_warp,
+    weight_at,
+)
+from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Boundaries, Contact, Grid, Sensors, Step, Sums, vec4l, vec8
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+
+
+@wp.func
+def add_node(g: Gradients, stencil: Stencil, n: wp.vec3i, x: float, y: float, z: float):
+    """``g`` and a node's velocity, ``n`` its place in the stencil."""
+    w = weight_at(stencil.wx, n[0]) * weight_at(stencil.wy, n[1]) * weight_at(stencil.wz, n[2])
+    return add_weighted(g, n, w * wp.vec4(0.0, x, y, z))
+
+
+@wp.func
+def add_weighted(g: Gradients, n: wp.vec3i, v: wp.vec4):
+    """:func:`add_node` of a velocity that has been weighted."""
+    return Gradients(
+        g.mean + v, g.along_x + float(n[0]) * v, g.along_y + float(n[1]) * v, g.along_z + float(n[2]) * v
+    )  # fmt: skip
+
+
+@wp.func
+def velocity_of(step: Step, units: wp.vec2, begun: vec4l):
+    """Units of mass and physical velocity of a node, from its sum."""
+    p = units[1]
+    count = float(begun[0])
+    total = total_velocity(
+        step,
+        False,
+        vec8(units[0] * count, p * float(begun[1]), p * float(begun[2]), p * float(begun[3]), 0.0, 0.0, 0.0, 0.0),
+    )
+    return wp.vec4(count, total[1], total[2], total[3])
+
+
+@wp.func
+def add_free(g: Gradients, stencil: Stencil, n: wp.vec3i, u: wp.vec4):
+    """:func:`add_node` with :func:`velocity_of` it; nothing if it is none."""
+    if n[0] < 0:
+        return g
+    return add_node(g, stencil, n, u[1], u[2], u[3])
+
+
+@wp.func
+def total_of_team(own: Gradients):
+    """Sums over the threads of a particle."""
+    total = sum_of_team(wp.matrix_from_rows(own.mean, own.along_x, own.along_y, own.along_z))
+    return Gradients(total[0], total[1], total[2], total[3])
+
+
+@wp.func
+def add_push(
+    grid: Grid,
+    step: Step,
+    boundaries: Boundaries,
+    e: int,
+    units: wp.vec2,
+    stencil: Stencil,
+    n: wp.vec3i,
+    u: wp.vec4,
+    driven: vec4l,
+    offset: vec4l,
+    g: Gradients,
+    seen: wp.vec3,
+):
+    """Add what the boundaries do at a node with :func:`velocity_of` ``u``, and its kinematic velocity, weighted."""
+    if n[0] < 0 or u[0] <= 0.0:
+        return g, seen
+    vk = (units[1] / (units[0] * u[0])) * wp.vec3(float(driven[0]), float(driven[1]), float(driven[2]))
+    v = wp.vec3(u[1], u[2], u[3])
+    if step.decoupling == SPLIT or step.decoupling == NO_STRESS:
+        v += vk
+    node = stencil.base + n
+    way = (grid.dx / u[0]) * wp.vec3(float(offset[0]), float(offset[1]), float(offset[2]))
+    matter = node_position(grid, node[0], node[1], node[2]) - way
+    dv = boundary_contact(boundaries, e, 0, matter, v, CONTACT_GATE * grid.dx) - v
+    w = weight_at(stencil.wx, n[0]) * weight_at(stencil.wy, n[1]) * weight_at(stencil.wz, n[2])
+    return add_weighted(g, n, w * wp.vec4(0.0, dv[0], dv[1], dv[2])), seen + w * vk
+
+
+@wp.func
+def tell_sensors(contact: Contact, sensors: Sensors, e: int, m: float, corner: wp.vec3, dx: float, g: Gradients):
+    """Add what the boundaries have done to the particles of a warp, of mass ``m``, by the sums ``g`` of its threads.
+
+    ``corner`` is the lowest node of a stencil. All threads of a warp come here.
+    """
+    J = m * wp.vec3(g.mean[1], g.mean[2], g.mean[3])
+    along_x = wp.vec3(g.along_x[1], g.along_x[2], g.along_x[3])
+    along_y = wp.vec3(g.along_y[1], g.along_y[2], g.along_y[3])
+    along_z = wp.vec3(g.along_z[1], g.along_z[2], g.along_z[3])
+    # the sum of x_i x dv_i over the nodes, by the sums of dv_i and of dv_i times their places along each axis
+    own = wp.vec3(along_y[2] - along_z[1], along_z[0] - along_x[2], along_x[1] - along_y[0])
+    moment = vector_sum_of_warp(wp.cross(corner, J) + (m * dx) * own)
+    J = vector_sum_of_warp(J)
+    if lane_of_thread() == 0 and wp.length_sq(J) > 0.0:
+        add_impulse(sensors, e, boundary_entry(sensors, contact.subject[0]), J)
+        add_impulse(sensors, e, moment_entry(sensors, contact.subject[0]), moment)
+
+
+@wp.func
+def added(a: Gradients, b: Gradients):
+    """Sum of both."""
+    return Gradients(a.mean + b.mean, a.along_x + b.along_x, a.along_y + b.along_y, a.along_z + b.along_z)
+
+
+@wp.func
+def gather_by_team(
+    grid: Grid,
+    step: Step,
+    boundaries: Boundaries,
+    contact: Contact,
+    sums: Sums,
+    e: int,
+    units: wp.vec2,
+    stencil: Stencil,
+    record: int,
+    distance: float,
+    m: float,
+    sensors: Sensors,
+):
+    """Sums of a stencil's physical velocities, and the mean kinematic one where a boundary is near.
+
+    ``record`` is as for :func:`piavatar_envs.mpm.team.record_in_team`, ``distance`` [grid spacings] how far the
+    particle is from any boundary, ``m`` its mass, 0 if it takes no part. All threads of a warp come here.
+    """
+    n0 = node_of_thread(0)
+    n1 = node_of_thread(1)
+    n2 = node_of_thread(2)
+    n3 = node_of_thread(3)
+    r0 = record_in_team(stencil.base, n0, record)
+    r1 = record_in_team(stencil.base, n1, record)
+    r2 = record_in_team(stencil.base, n2, record)
+    r3 = record_in_team(stencil.base, n3, record)
+    r3 = wp.where(n3[0] < 0, r2, r3)  # who has three reads one of them twice
+    s0 = begin_sum(sums, e, r0)  # all are asked for before the first has answered
+    s1 = begin_sum(sums, e, r1)
+    s2 = begin_sum(sums, e, r2)
+    s3 = begin_sum(sums, e, r3)
+    u0 = velocity_of(step, units, s0)
+    u1 = velocity_of(step, units, s1)
+    u2 = velocity_of(step, units, s2)
+    u3 = velocity_of(step, units, s3)
+    physical = add_free(Gradients(), stencil, n0, u0)
+    physical = add_free(physical, stencil, n1, u1)
+    physical = add_free(physical, stencil, n2, u2)
+    physical = add_free(physical, stencil, n3, u3)
+    kinematic = Gradients()
+    if any_lane(distance < GATED_STENCIL):
+        g = Gradients()
+        seen = wp.vec3()
+        # two at a time: a GPU has too few registers for what all of them were told, and few particles come here
+        k0 = numbers_at(sums.fixed, e, half_of(r0, 1))
+        o0 = numbers_at(sums.offset_fixed, e, r0)
+        k1 = numbers_at(sums.fixed, e, half_of(r1, 1))
+        o1 = numbers_at(sums.offset_fixed, e, r1)
+        g, seen = add_push(grid, step, boundaries, e, units, stencil, n0, u0, k0, o0, g, seen)
+        g, seen = add_push(grid, step, boundaries, e, units, stencil, n1, u1, k1, o1, g, seen)
+        k2 = numbers_at(sums.fixed, e, half_of(r2, 1))
+        o2 = numbers_at(sums.offset_fixed, e, r2)
+        k3 = numbers_at(sums.fixed, e, half_of(r3, 1))
+        o3 = numbers_at(sums.offset_fixed, e, r3)
+        g, seen = add_push(grid, step, boundaries, e, units, stencil, n2, u2, k2, o2, g, seen)
+        g, seen = add_push(grid, step, boundaries, e, units, stencil, n3, u3, k3, o3, g, seen)
+        seen = vector_sum_of_team(seen)
+        kinematic.mean = wp.vec4(0.0, seen[0], seen[1], seen[2])
+        corner = node_position(grid, stencil.base[0], stencil.base[1], stencil.base[2])
+        tell_sensors(contact, sensors, e, m, corner, grid.dx, g)
+        physical = added(physical, g)
+    return total_of_team(physical), kinematic

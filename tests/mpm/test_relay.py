@@ -1,0 +1,161 @@
+"""Substeps that are one launch each give what substeps of three launches give."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.relay import MARKS_EVERY, portions
+from piavatar_envs.mpm.solver import record_end, record_marks, record_substep
+from piavatar_envs.mpm.turns import has_turns
+from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, FAILURE_NONFINITE, FAILURE_OUT_OF_GRID
+
+ARRAYS = ("x", "u", "C", "F")
+FLOOR = [((0.0, 0.0, 1.0), -0.11, 0.5)]
+
+
+@pytest.fixture
+def drop(simulate, device):
+    """A box that slides on a floor, in three worlds, for a control step of ``num_substeps``."""
+    if device == "cpu":
+        pytest.skip("relays are a GPU's")
+
+    def build(num_substeps=12, num_envs=3, **kwargs):
+        world = {"planes": FLOOR, "gravity": (0.0, 0.0, -9.81), "margin": 0.6} | kwargs
+        world.setdefault("scatter", "singles")
+        sim = simulate(num_substeps=num_substeps, num_envs=num_envs, **world)
+        rng = np.random.default_rng(4)
+        shape = (num_envs, len(sim.rest), 3)
+        return sim.set(
+            u=rng.normal(0.0, 0.2, shape) + [1.5, 0.3, -1.0],
+            C=rng.normal(0.0, 1.0, (*shape, 3)),
+            vk=rng.normal(0.0, 0.3, shape),
+            spin=rng.normal(0.0, 0.3, shape),
+        )
+
+    return build
+
+
+def one_by_one(sim):
+    """The same world, whose substeps are launches of their own."""
+    program = Program(sim.model.device)
+    record_marks(program, sim.model, sim.state, sim.scratch)
+    for index in range(sim.model.num_substeps):
+        record_substep(program, sim.model, sim.state, sim.scratch, index)
+    record_end(program, sim.model, sim.state, sim.scratch)
+    sim.program = program
+    return sim
+
+
+def same(a, b, atol=(1e-6, 1e-4, 1e-2, 1e-5)):
+    for array, tolerance in zip(ARRAYS, atol, strict=True):
+        for e in range(a.model.num_envs):
+            np.testing.assert_allclose(a.get(array, e), b.get(array, e), atol=tolerance, err_msg=array)
+
+
+@pytest.mark.parametrize("decoupling", ["split", "none", "no_stress"])
+def test_relays_are_substeps(drop, decoupling):
+    """With a floor that the body slides on, kinematic velocities, and what the sensors say of it."""
+    relay, apart = drop(decoupling=decoupling), one_by_one(drop(decoupling=decoupling))
+    assert "carry_on" in relay.program.names and "carry_on" not in apart.program.names
+    start = relay.get("x")
+    relay.run(2), apart.run(2)
+    assert relay.failures == apart.failures == [0, 0, 0]
+    assert np.abs(relay.get("x") - start).max() > 0.01
+    same(relay, apart)
+    for name in ("boundary_impulse", "boundary_moment"):
+        found, expected = (getattr(sim.scratch.sensors, name).numpy() for sim in (relay, apart))
+        assert np.abs(expected).max() > 0.01
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4, err_msg=name)
+    assert relay.sums_are_clear and apart.sums_are_clear
+
+
+@pytest.mark.parametrize("count", [1, MARKS_EVERY, MARKS_EVERY + 1, 100, 3 * MARKS_EVERY + 2])
+def test_portions_are_equal(count):
+    parts = portions(count)
+    assert sum(parts) == count and max(parts) <= MARKS_EVERY and max(parts) - min(parts) <= 1
+
+
+def test_a_single_substep_is_one_too(drop):
+    relay, apart = drop(num_substeps=1, control_dt=1e-3), one_by_one(drop(num_substeps=1, control_dt=1e-3))
+    same(relay.run(3), apart.run(3))
+    assert relay.sums_are_clear
+
+
+def test_bodies_that_go_far(drop):
+    """Through blocks that they mark themselves, over several portions, turned by nothing."""
+    settings = {"num_substeps": MARKS_EVERY + 10, "num_envs": 1, "planes": (), "gravity": (0.0, 0.0, 0.0)}
+    relay, apart = drop(**settings), one_by_one(drop(**settings))
+    for sim in (relay, apart):
+        sim.set(u=(12.0, 3.0, -5.0), C=np.zeros((3, 3)), vk=(-1.0, 0.0, 0.5), spin=np.zeros(3)).run()
+    assert relay.failures == [0]
+    np.testing.assert_allclose(
+        relay.get("x") - relay.rest, [[11.0 / 30, 3.0 / 30, -4.5 / 30]] * len(relay.rest), atol=1e-3
+    )
+    same(relay, apart)
+    assert relay.sums_are_clear
+
+
+def test_more_blocks_than_warps(drop):
+    """Each particle is in blocks of its own, and a warp of four clears dozens."""
+    rest = np.random.default_rng(6).uniform(-0.5, 0.5, (60, 3))
+    settings = {"rest": rest, "num_envs": 2, "planes": [((0.0, 0.0, 1.0), -0.51, 0.5)]}
+    relay, apart = drop(**settings).run(), one_by_one(drop(**settings)).run()
+    assert relay.scratch.blocks.count.numpy().min() > 4 * 60 / 4
+    same(relay, apart)
+    assert relay.sums_are_clear and relay.failures == [0, 0]
+
+
+def test_relays_repeat_bit_for_bit(drop):
+    first, second = (drop().run(3) for _ in range(2))
+    for array in ARRAYS:
+        np.testing.assert_array_equal(getattr(first.state, array).numpy(), getattr(second.state, array).numpy())
+    for name in ("boundary_impulse", "boundary_moment"):
+        found = getattr(first.scratch.sensors, name).numpy()
+        np.testing.assert_array_equal(found, getattr(second.scratch.sensors, name).numpy(), err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("array", "value", "failure"),
+    [
+        ("u", np.nan, FAILURE_NONFINITE),
+        ("u", 400.0, FAILURE_CFL),
+        ("vk", np.inf, FAILURE_NONFINITE),
+        ("x", 3.0, FAILURE_OUT_OF_GRID),
+    ],
+)
+def test_who_fails_fails_alone(drop, array, value, failure):
+    """As without relays: the others go on bit for bit, and the failed environment stands still for good."""
+    well, ill = drop(), drop()
+    values = ill.state.numpy()[array]
+    values[1, 7] = value
+    apart = one_by_one(drop().set(**{array: values}))
+    well.run(2), ill.set(**{array: values}).run(), apart.run()
+    assert ill.failures[0] == ill.failures[2] == 0 and ill.failures[1] & failure
+    assert ill.failures == apart.failures
+    stopped = ill.state.numpy()
+    ill.run()
+    for name in ARRAYS:
+        after = ill.state.numpy()[name]
+        np.testing.assert_array_equal(after[1], stopped[name][1], err_msg=name)
+        np.testing.assert_array_equal(after[[0, 2]], well.state.numpy()[name][[0, 2]], err_msg=name)
+    assert ill.sums_are_clear
+
+
+def test_slots_that_run_out(drop):
+    """In flight, with none to spare: the environment fails and says so, and nobody waits for a slot for ever."""
+    still = drop(planes=(), gravity=(0.0, 0.0, 0.0), num_envs=1).set(u=np.zeros(3), vk=np.zeros(3), C=np.zeros((3, 3)))
+    used = int(still.run().scratch.blocks.count.numpy()[0])
+    sim = drop(planes=(), gravity=(0.0, 0.0, 0.0), num_envs=1, max_slots=used + 1, scatter="singles", num_substeps=30)
+    sim.set(u=(15.0, 0.0, 0.0), vk=np.zeros(3), C=np.zeros((3, 3))).run()
+    assert sim.failures == [FAILURE_BLOCKS] and sim.sums_are_clear
+
+
+def test_what_relays_are_for(drop, simulate, meet):
+    """One field, resting boundaries, and another variant than the paper's."""
+    assert has_turns(drop().model)
+    assert not has_turns(drop(decoupling="paper").model)
+    assert not has_turns(simulate(scatter="runs").model)
+    cubes = [{"ball": ((x, 0.0, 0.0), 0.1)} for x in (-0.2, 0.2)]
+    assert not has_turns(meet(cubes, scatter="singles").model)
