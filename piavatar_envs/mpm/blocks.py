@@ -87,7 +87,6 @@ def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
     return mask
 
 
-# A GPU finds out anew: to write it down and read it takes as long
 @wp.func_native(f"""
 const volatile int* const slot_of = &wp::index(blocks.slot, e, held);
 const volatile int* const failing = &wp::index(failure, e);
@@ -103,6 +102,7 @@ def awaited_slot(blocks: Blocks, e: int, held: int, failure: wp.array(dtype=int)
     ...
 
 
+# A GPU finds out anew: to write it down and read it takes as long
 @wp.func_native(f"""
 #if !defined(__CUDA_ARCH__)
 wp::index(blocks.around, e, p) = tells ? {int(TELLS)} | (beside ? {int(BESIDE)} : 0) : 0;

@@ -13,7 +13,6 @@ from piavatar_envs.mpm.shared_room import plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.sums import units
 from piavatar_envs.mpm.sweep import most_shared
-from piavatar_envs.mpm.turns import TURNS, sets_of_sums
 from piavatar_envs.mpm.types import (
     SCATTERS,
     Blocks,
@@ -78,11 +77,10 @@ def estimate_bytes(
 ) -> int:
     """Device memory of state and scratch [bytes].
 
-    120 B a particle; 80 B a node of a slot, 48 more in fixed point, 192 more where sums are in turns, 32 less where
-    they are in shared memory, 32 more where there are several fields; the map of blocks.
+    120 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 32 more
+    where there are several fields; the map of blocks. Sums in turns are made by who records them.
     """
-    turns = TURNS if scatter == "singles" and num_fields == 1 else 1
-    sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter]) * turns
+    sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter])
     node = sums + 32 + (16 + 16 if num_fields > 1 else 0)
     slots = max_slots * (BLOCK**3 * node + (10 if num_fields > 1 else 4) + (0 if scatter == "shared" else 4))
     particles = 48 * num_particles + 72 * whole_lines(num_particles)  # four vectors and two matrices
@@ -166,9 +164,12 @@ def allocate_blocks(model: Model) -> Blocks:
     )
 
 
-def allocate_sums(model: Model, velocity: wp.array) -> Sums:
-    """Zeroed sums of the nodes, and their units. Sums from shared memory come to the records of the ``velocity``."""
-    slots = model.max_slots * sets_of_sums(model)
+def allocate_sums(model: Model, velocity: wp.array, sets: int = 1) -> Sums:
+    """Zeroed sums of the nodes, and their units; ``sets`` of them, one after the other.
+
+    Sums from shared memory come to the records of the ``velocity``.
+    """
+    slots = model.max_slots * sets
     fixed, records = SCATTERS[model.scatter], (model.num_envs, int(BLOCK_NODES) * slots)
     mass, momentum = units(model.contact.density.numpy(), model.grid, model.step)
     floats, integers = ((1, 1), records) if fixed else (records, (1, 1))

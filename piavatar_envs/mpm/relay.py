@@ -23,7 +23,7 @@ from piavatar_envs.mpm.gather import Gathered, begun, own_velocity, settled
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import KINEMATIC, bounded, told_by
-from piavatar_envs.mpm.singles import SHARE, TEAM, THREADS, add_single, block_of_thread, record_singles
+from piavatar_envs.mpm.singles import SHARE, TEAM, THREADS, add_single, any_of_team, block_of_thread, record_singles
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, grid_position, in_same_brick, stencil_at
 from piavatar_envs.mpm.sums import clear_offset
 from piavatar_envs.mpm.sweep import LANES, lane_of_thread, lanes_of_warp, nodes_of_lane
@@ -64,8 +64,9 @@ from piavatar_envs.mpm.types import (
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: At most so many substeps between two marks of all blocks.
-MARKS_EVERY = 50
+#: At most so many substeps between two marks of all blocks: each costs six launches. Blocks that a body leaves behind
+#: keep their slots until then, so that a fast one needs more of them than where blocks are marked every eight substeps.
+PORTION = 50
 
 
 @wp.struct
@@ -95,7 +96,8 @@ def clear_slot(sums: Sums, e: int, slot: int, told: bool):
 def come_to(grid: Grid, blocks: Blocks, e: int, x: wp.vec3, base: wp.vec3i, slot: int, failure: wp.array(dtype=int)):
     """Slot of the block that a thread looks up of a particle that has come to ``x``, marked if that is another one.
 
-    The particle's stencil was at ``base``, and the thread's slot ``slot``. Also, whether it had to be looked up.
+    The particle's stencil was at ``base``, and the thread's slot ``slot``. Also, whether it had to be looked up. It is
+    ``NOBODY`` where slots have run out, which may be so for some threads of a particle only.
     """
     to = base_node(grid_position(grid, x))
     comes = not in_same_brick(to, base)
@@ -179,7 +181,8 @@ def carry_on(
     tells = distance - wp.length(s.x - x) * grid.inv_dx < NEAR_PARTICLE
     momentum = momentum_of_team(grid, step, read, s)
     if turn.scattered >= 0:
-        adds = admitted(adds and slot != NOBODY, wp.isfinite(wp.length_sq(s.u) + wp.length_sq(vk)), e, failure)
+        homeless = any_of_team(slot == NOBODY)  # all threads of a particle add it up, or none
+        adds = admitted(adds and not homeless, wp.isfinite(wp.length_sq(s.u) + wp.length_sq(vk)), e, failure)
         if adds:
             adds = bounded(momentum, units[1], failure, e) >= 0.0
         if adds and tells:
@@ -187,7 +190,7 @@ def carry_on(
     if takes and (comes or not adds) and wp.atomic_or(failure, e, 0) != 0:  # nobody fails without coming here
         wp.atomic_min(turn.stops, e, turn.substep + 1)
     if turn.scattered >= 0:  # comes last: what a thread reads after its additions waits for them
-        record = BLOCK_NODES * (turn.scattered + slot)
+        record = BLOCK_NODES * (turn.scattered + wp.max(slot, 0))
         add_single(grid, step, particles, sums, e, p, s.x, vk, adds, tells, record, units, momentum)
 
 
@@ -195,7 +198,7 @@ def carry_on(
 def begin_turns(failure: wp.array(dtype=int), stops: wp.array(dtype=int)):
     """Environments that have failed take no part."""
     e = wp.tid()
-    stops[e] = wp.where(failure[e] != 0, 0, MARKS_EVERY + 1)
+    stops[e] = wp.where(failure[e] != 0, 0, PORTION + 1)
 
 
 @wp.kernel
@@ -211,7 +214,7 @@ def record_relay(
     program: Program, model: Model, state: State, scratch: Scratch, moving: Moving, inputs: list[Any], count: int
 ) -> None:
     """Append ``count`` substeps whose blocks have just been marked; ``inputs`` are those of :func:`record_singles`."""
-    m, s, sums = model, state, scratch.sums
+    m, s, sums = model, state, scratch.turns
     stops = wp.zeros(m.num_envs, dtype=int, device=m.device)
     record_singles(program, inputs, s.x.shape, s.failure, sums)
     program.launch(begin_turns, m.num_envs, [s.failure], [stops])
@@ -241,6 +244,6 @@ def record_relay(
 
 
 def portions(count: int) -> list[int]:
-    """``count`` substeps in as few equal parts as may be, none longer than ``MARKS_EVERY``."""
-    ends = np.linspace(0, count, -(-count // MARKS_EVERY) + 1).round().astype(int)
+    """``count`` substeps in as few equal parts as may be, none longer than ``PORTION``."""
+    ends = np.linspace(0, count, -(-count // PORTION) + 1).round().astype(int)
     return [int(end - begin) for begin, end in pairwise(ends)]

@@ -176,7 +176,8 @@ def add_single(
 ):
     """Add to the nodes what particle ``p`` scatters, if it ``takes`` part: its mass and ``momentum``, what it tells.
 
-    All threads of a warp come here, ``record`` and ``units`` as for :func:`add_to_nodes`.
+    All threads of a warp come here, ``record`` and ``units`` as for :func:`add_to_nodes`: all threads of a particle
+    take part or none, and their records exist even where they do not.
     """
     mass = momentum.at_base[0]
     kind = int(KINEMATIC)

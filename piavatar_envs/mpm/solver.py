@@ -12,6 +12,7 @@ from piavatar_envs.mpm.gather import grid_to_particles
 from piavatar_envs.mpm.grid import update_grid
 from piavatar_envs.mpm.groups import record_runs
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
+from piavatar_envs.mpm.memory import allocate_sums
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay import portions, record_relay
@@ -20,7 +21,7 @@ from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
 from piavatar_envs.mpm.singles import record_singles
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep, slot_threads, slots_at_once
 from piavatar_envs.mpm.transfer import particles_to_grid
-from piavatar_envs.mpm.turns import has_turns
+from piavatar_envs.mpm.turns import TURNS, has_turns
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 #: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In so
@@ -66,6 +67,8 @@ def record_substeps(program: Program, model: Model, state: State, scratch: Scrat
         for index in range(model.num_substeps):
             record_substep(program, model, state, scratch, index)
         return
+    if scratch.turns is None:
+        scratch.turns = allocate_sums(model, scratch.velocity, TURNS)
     for index, count in enumerate(portions(model.num_substeps)):
         if index > 0:
             _record_new_marks(program, model, state, scratch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from piavatar_envs.mpm.memory import MOST_SLOTS
 from piavatar_envs.mpm.types import PAPER, Model
 
 #: Sets of sums that those worlds have.
@@ -11,12 +12,10 @@ TURNS = 3
 def has_turns(model: Model) -> bool:
     """Whether substeps between which nothing acts are one launch each, see :mod:`piavatar_envs.mpm.relay`.
 
-    Few particles a cell, one field, boundaries that rest, and no need of kinematic gradients.
+    Few particles a cell, one field, boundaries that rest, no need of kinematic gradients, and sums that strides of 32
+    bits can count.
     """
+    if TURNS * model.max_slots >= MOST_SLOTS:
+        return False
     alone = model.contact.num_fields == 1 and not model.moving_boundaries
     return model.scatter == "singles" and alone and model.step.decoupling != int(PAPER)
-
-
-def sets_of_sums(model: Model) -> int:
-    """How many sets of sums a world has."""
-    return TURNS if has_turns(model) else 1

@@ -312,6 +312,7 @@ class Scratch:
             :mod:`piavatar_envs.mpm.normals`; of blocks with several fields only.
         sensors: what contact did in this control step.
         room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
+        turns: sets of sums in turns, of ``TURNS * S`` slots, where :mod:`piavatar_envs.mpm.relay` has been recorded.
     """
 
     blocks: Blocks
@@ -321,3 +322,4 @@ class Scratch:
     sensors: Sensors
     room: Room
     large_room: bool
+    turns: Sums | None = None

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.relay import MARKS_EVERY, portions
+from piavatar_envs.mpm.relay import PORTION, portions
 from piavatar_envs.mpm.solver import record_end, record_marks, record_substep
 from piavatar_envs.mpm.turns import has_turns
 from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, FAILURE_NONFINITE, FAILURE_OUT_OF_GRID
@@ -71,10 +74,10 @@ def test_relays_are_substeps(drop, decoupling):
     assert relay.sums_are_clear and apart.sums_are_clear
 
 
-@pytest.mark.parametrize("count", [1, MARKS_EVERY, MARKS_EVERY + 1, 100, 3 * MARKS_EVERY + 2])
+@pytest.mark.parametrize("count", [1, PORTION, PORTION + 1, 100, 3 * PORTION + 2])
 def test_portions_are_equal(count):
     parts = portions(count)
-    assert sum(parts) == count and max(parts) <= MARKS_EVERY and max(parts) - min(parts) <= 1
+    assert sum(parts) == count and max(parts) <= PORTION and max(parts) - min(parts) <= 1
 
 
 def test_a_single_substep_is_one_too(drop):
@@ -85,7 +88,7 @@ def test_a_single_substep_is_one_too(drop):
 
 def test_bodies_that_go_far(drop):
     """Through blocks that they mark themselves, over several portions, turned by nothing."""
-    settings = {"num_substeps": MARKS_EVERY + 10, "num_envs": 1, "planes": (), "gravity": (0.0, 0.0, 0.0)}
+    settings = {"num_substeps": PORTION + 10, "num_envs": 1, "planes": (), "gravity": (0.0, 0.0, 0.0)}
     relay, apart = drop(**settings), one_by_one(drop(**settings))
     for sim in (relay, apart):
         sim.set(u=(12.0, 3.0, -5.0), C=np.zeros((3, 3)), vk=(-1.0, 0.0, 0.5), spin=np.zeros(3)).run()
@@ -143,13 +146,35 @@ def test_who_fails_fails_alone(drop, array, value, failure):
     assert ill.sums_are_clear
 
 
-def test_slots_that_run_out(drop):
-    """In flight, with none to spare: the environment fails and says so, and nobody waits for a slot for ever."""
-    still = drop(planes=(), gravity=(0.0, 0.0, 0.0), num_envs=1).set(u=np.zeros(3), vk=np.zeros(3), C=np.zeros((3, 3)))
-    used = int(still.run().scratch.blocks.count.numpy()[0])
-    sim = drop(planes=(), gravity=(0.0, 0.0, 0.0), num_envs=1, max_slots=used + 1, scatter="singles", num_substeps=30)
-    sim.set(u=(15.0, 0.0, 0.0), vk=np.zeros(3), C=np.zeros((3, 3))).run()
-    assert sim.failures == [FAILURE_BLOCKS] and sim.sums_are_clear
+@pytest.mark.parametrize("extra", [1, 3, 6])
+@pytest.mark.parametrize("way", [(15.0, 0.0, 0.0), (0.0, 13.0, 5.0)])
+def test_slots_that_run_out(drop, extra, way):
+    """In flight: that environment fails and says so, nobody waits for ever, nothing of it comes to its neighbour."""
+    world = {"planes": (), "gravity": (0.0, 0.0, 0.0), "num_envs": 2, "num_substeps": 30}
+    still = {"u": np.zeros(3), "vk": np.zeros(3), "C": np.zeros((3, 3)), "spin": np.zeros(3)}
+    used = int(drop(**world).set(**still).run().scratch.blocks.count.numpy()[0])
+    rest = drop(max_slots=used + extra, **world).set(**still).run()
+    sims = []
+    for _ in range(2):
+        sim = drop(max_slots=used + extra, **world).set(**still)
+        sims.append(sim.set(u=np.stack([np.zeros((len(sim.rest), 3)), np.tile(way, (len(sim.rest), 1))])).run())
+        assert sim.failures == [0, FAILURE_BLOCKS] and sim.sums_are_clear
+    for name in ARRAYS:
+        first, second = (sim.state.numpy()[name] for sim in sims)
+        np.testing.assert_array_equal(first[0], rest.state.numpy()[name][0], err_msg=name)
+        np.testing.assert_array_equal(first, second, err_msg=name)
+
+
+@pytest.mark.parametrize("count", [401, 402, 403])
+def test_warps_that_are_not_full(drop, count):
+    """Two oblique walls besides, and particles of several masses that differ from world to world."""
+    rest = np.random.default_rng(9).uniform(-0.1, 0.1, (count, 3))
+    planes = [*FLOOR, ((0.6, 0.0, 0.8), -0.13, 0.3), ((0.0, 1.0, 1.0), -0.16, 0.0)]
+    density = np.random.default_rng(1).uniform(900.0, 1100.0, (3, count))
+    points = replace(MaterialPoints.uniform(np.full(count, 2e-5)), density=density)
+    relay, apart = (drop(rest=rest, planes=planes, points=points) for _ in range(2))
+    same(relay.run(), one_by_one(apart).run())
+    assert relay.failures == [0, 0, 0] and relay.sums_are_clear
 
 
 def test_what_relays_are_for(drop, simulate, meet):

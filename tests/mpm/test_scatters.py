@@ -68,7 +68,7 @@ def node_sums(sim):
     if scratch.sums.is_fixed:
         sums[..., 0] *= scratch.sums.mass_unit.numpy()[0, 0]
         sums[..., 1:] *= scratch.sums.momentum_unit.numpy()[0, 0]
-    records = sums.reshape(model.num_envs, -1, 64, 7)  # of the first set, if there are several in turns
+    records = sums.reshape(model.num_envs, model.max_slots, 64, 7)
     return {(e, held[e, s]): records[e, s] for e in range(model.num_envs) for s in range(count[e])}
 
 
