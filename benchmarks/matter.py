@@ -83,8 +83,9 @@ class Matter:
     @property
     def sums_are_clear(self) -> bool:
         """Whether no node holds anything that a later substep would add to."""
-        sums, turns = self.scratch.sums, self.scratch.turns or self.scratch.sums
-        arrays = [each for s in (sums, turns) for each in (s.fixed, s.offset, s.offset_fixed, s.told)]
+        sums = self.scratch.sums
+        sets = [sums] if self.scratch.turns is None else [sums, self.scratch.turns]
+        arrays = [each for s in sets for each in (s.fixed, s.offset, s.offset_fixed, s.told)]
         if self.model.scatter != "shared":  # whose sums are written, not added up
             arrays.append(sums.value)
         return not any(array.numpy().any() for array in arrays)

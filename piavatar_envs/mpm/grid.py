@@ -50,19 +50,6 @@ def total_velocity(step: Step, split: bool, s: vec8):
 
 
 @wp.func
-def push_of_boundaries(
-    grid: Grid, boundaries: Boundaries, contact: Contact, sums: Sums, e: int, f: int, r: int, at: wp.vec3, total: vec8
-):
-    """Change of the total velocity of a field's matter at node ``at`` by contact with the boundaries."""
-    if total[0] <= MASS_MIN:
-        return wp.vec3()
-    offset = offset_at(grid, sums, e, f, r)
-    matter = at - wp.vec3(offset[0], offset[1], offset[2]) / total[0]
-    v = wp.vec3(total[1], total[2], total[3])
-    return boundary_contact(boundaries, e, f, matter, v, CONTACT_GATE * grid.dx) - v
-
-
-@wp.func
 def meet_boundaries(
     grid: Grid,
     boundaries: Boundaries,
@@ -76,7 +63,12 @@ def meet_boundaries(
     sensors: Sensors,
 ):
     """Total velocity of a field's matter at node ``at`` after contact with the boundaries; their impulse is sensed."""
-    dv = push_of_boundaries(grid, boundaries, contact, sums, e, f, r, at, total)
+    if total[0] <= MASS_MIN:
+        return total
+    offset = offset_at(grid, sums, e, f, r)
+    matter = at - wp.vec3(offset[0], offset[1], offset[2]) / total[0]
+    v = wp.vec3(total[1], total[2], total[3])
+    dv = boundary_contact(boundaries, e, f, matter, v, CONTACT_GATE * grid.dx) - v
     if wp.length_sq(dv) > 0.0:
         subject = contact.subject[f]
         add_impulse(sensors, e, boundary_entry(sensors, subject), total[0] * dv)

@@ -84,6 +84,13 @@ def counted(n: vec4l):
 
 
 @wp.func
+def physical_sum(units: wp.vec2, a: wp.vec4):
+    """Mass and physical momentum that ``a`` counts."""
+    p = units[1]
+    return vec8(units[0] * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
+
+
+@wp.func
 def units_of(sums: Sums, e: int, f: int):
     """Units of mass [kg] and of momentum [kg m/s] of field ``f``."""
     return wp.vec2(
@@ -100,20 +107,6 @@ def begin_sum(sums: Sums, e: int, r: int):
     s = vec4l()
     if sums.is_fixed != 0:
         s = numbers_at(sums.fixed, e, half_of(r, 0))
-    return s
-
-
-@wp.func
-def counted_sum(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l, driven: bool):
-    """Mass, physical momentum and, if ``driven``, kinematic momentum of record ``r`` in fixed point; it stays."""
-    s = vec8()
-    a = counted(begun)
-    if a[0] > 0.0:  # who adds no mass adds nothing
-        p = units[1]
-        s = vec8(units[0] * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
-        if driven:
-            b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
-            s = s + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
     return s
 
 
@@ -135,10 +128,16 @@ def end_sum(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l, driven: bo
         s = read_record(sums.value, e, r)
         write_record(sums.value, e, r, vec8())
     else:
-        s = counted_sum(sums, e, units, r, begun, driven)
-        clear_numbers(sums.fixed, e, half_of(r, 0), s[0] > 0.0)
+        a = counted(begun)
+        if a[0] > 0.0:  # who adds no mass adds nothing
+            p = units[1]
+            s = physical_sum(units, a)
+            if driven:
+                b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
+                s = s + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
+        clear_numbers(sums.fixed, e, half_of(r, 0), a[0] > 0.0)
         if driven:
-            clear_numbers(sums.fixed, e, half_of(r, 1), s[0] > 0.0)
+            clear_numbers(sums.fixed, e, half_of(r, 1), a[0] > 0.0)
     return s
 
 

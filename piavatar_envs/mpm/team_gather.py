@@ -13,7 +13,7 @@ from piavatar_envs.mpm.grid import total_velocity
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.records import half_of
 from piavatar_envs.mpm.stencil import Stencil, node_position
-from piavatar_envs.mpm.sums import begin_sum, numbers_at
+from piavatar_envs.mpm.sums import begin_sum, counted, numbers_at, physical_sum
 from piavatar_envs.mpm.sweep import any_lane, lane_of_thread
 from piavatar_envs.mpm.team import (
     node_of_thread,
@@ -23,16 +23,21 @@ from piavatar_envs.mpm.team import (
     vector_sum_of_warp,
     weight_at,
 )
-from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Boundaries, Contact, Grid, Sensors, Step, Sums, vec4l, vec8
+from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Boundaries, Contact, Grid, Sensors, Step, Sums, vec4l
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 
 @wp.func
+def weight_of(stencil: Stencil, n: wp.vec3i):
+    """Weight of the node at place ``n`` of a stencil."""
+    return weight_at(stencil.wx, n[0]) * weight_at(stencil.wy, n[1]) * weight_at(stencil.wz, n[2])
+
+
+@wp.func
 def add_node(g: Gradients, stencil: Stencil, n: wp.vec3i, x: float, y: float, z: float):
     """``g`` and a node's velocity, ``n`` its place in the stencil."""
-    w = weight_at(stencil.wx, n[0]) * weight_at(stencil.wy, n[1]) * weight_at(stencil.wz, n[2])
-    return add_weighted(g, n, w * wp.vec4(0.0, x, y, z))
+    return add_weighted(g, n, weight_of(stencil, n) * wp.vec4(0.0, x, y, z))
 
 
 @wp.func
@@ -46,14 +51,9 @@ def add_weighted(g: Gradients, n: wp.vec3i, v: wp.vec4):
 @wp.func
 def velocity_of(step: Step, units: wp.vec2, begun: vec4l):
     """Units of mass and physical velocity of a node, from its sum."""
-    p = units[1]
-    count = float(begun[0])
-    total = total_velocity(
-        step,
-        False,
-        vec8(units[0] * count, p * float(begun[1]), p * float(begun[2]), p * float(begun[3]), 0.0, 0.0, 0.0, 0.0),
-    )
-    return wp.vec4(count, total[1], total[2], total[3])
+    a = counted(begun)
+    total = total_velocity(step, False, physical_sum(units, a))
+    return wp.vec4(a[0], total[1], total[2], total[3])
 
 
 @wp.func
@@ -97,7 +97,7 @@ def add_push(
     way = (grid.dx / u[0]) * wp.vec3(float(offset[0]), float(offset[1]), float(offset[2]))
     matter = node_position(grid, node[0], node[1], node[2]) - way
     dv = boundary_contact(boundaries, e, 0, matter, v, CONTACT_GATE * grid.dx) - v
-    w = weight_at(stencil.wx, n[0]) * weight_at(stencil.wy, n[1]) * weight_at(stencil.wz, n[2])
+    w = weight_of(stencil, n)
     return add_weighted(g, n, w * wp.vec4(0.0, dv[0], dv[1], dv[2])), seen + w * vk
 
 
