@@ -49,9 +49,12 @@ def coulomb(m_a: float, m_b: float, approach: wp.vec3, n: wp.vec3, friction: flo
 
 
 @wp.func
-def book_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, sensors: Sensors):
-    """Add a change of velocity [m/s] to a node's record, and keep the subject that has done most of it."""
-    sensors.touched[e, r // BLOCK_NODES] = 1
+def book_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, mark: int, sensors: Sensors):
+    """Add a change of velocity [m/s] to a node's record, and keep the subject that has done most of it.
+
+    What ``touched`` says of the slot then is ``mark``.
+    """
+    sensors.touched[e, r // BLOCK_NODES] = mark
     before = read_change(sensors.node, e, r)
     so_far = wp.vec3(before[0], before[1], before[2])
     subject = wp.where(wp.length_sq(change) >= wp.length_sq(so_far), float(contact.subject[other]), before[3])
@@ -123,8 +126,8 @@ def touch(
         return
     write_record(node_velocity, e, ra, va - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / va[0])
     write_record(node_velocity, e, rb, vb + vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / vb[0])
-    book_contact(contact, e, ra, b, -J / va[0], sensors)
-    book_contact(contact, e, rb, a, J / vb[0], sensors)
+    book_contact(contact, e, ra, b, -J / va[0], 1, sensors)
+    book_contact(contact, e, rb, a, J / vb[0], 1, sensors)
     book_pair(contact, e, a, b, J, sensors)
 
 
@@ -170,7 +173,7 @@ def project_alone(
                 # against a wall that moves with the common velocity
                 J = coulomb(1.0, 1.0, 2.0 * (wp.vec3(v[1], v[2], v[3]) - common), out, mu)
                 write_record(node_velocity, e, r, v - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0))
-                book_contact(contact, e, r, other, -J, sensors)
+                book_contact(contact, e, r, other, -J, 1, sensors)
 
 
 @wp.func

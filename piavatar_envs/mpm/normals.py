@@ -87,6 +87,17 @@ def weighted_gradient(grid: Grid, V: float, m: float, offset: wp.vec4):
 
 
 @wp.func
+def facing_of(grid: Grid, contact: Contact, sums: Sums, e: int, f: int, r: int, m: float):
+    """Weighted outward gradient and volume [cells] of field ``f`` of mass ``m`` at the node of record ``r``."""
+    V = volume_at(grid, contact, e, f, m)
+    facing = wp.vec4()
+    if V > 0.0:
+        outward = weighted_gradient(grid, V, m, offset_at(grid, sums, e, f, r))
+        facing = wp.vec4(outward[0], outward[1], outward[2], V)
+    return facing
+
+
+@wp.func
 def face_node(
     grid: Grid,
     contact: Contact,
@@ -105,12 +116,7 @@ def face_node(
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
             m = mass_of(node_velocity, e, r)
-            V = volume_at(grid, contact, e, f, m)
-            facing = wp.vec4()
-            if V > 0.0:
-                outward = weighted_gradient(grid, V, m, offset_at(grid, sums, e, f, r))
-                facing = wp.vec4(outward[0], outward[1], outward[2], V)
-            write_change(node_facing, e, r, facing)
+            write_change(node_facing, e, r, facing_of(grid, contact, sums, e, f, r, m))
 
 
 @wp.func

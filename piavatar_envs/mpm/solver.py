@@ -69,10 +69,14 @@ def record_substeps(program: Program, model: Model, state: State, scratch: Scrat
         return
     if scratch.turns is None:
         scratch.turns = allocate_sums(model, scratch.velocity, TURNS)
-    for index, count in enumerate(portions(model.num_substeps)):
+    # what is sensed once a step of several fields asks for the nodes' velocities of the last substep
+    apart = int(model.contact.num_fields > 1)
+    for index, count in enumerate(portions(model.num_substeps - apart)):
         if index > 0:
             _record_new_marks(program, model, state, scratch)
         record_relay(program, model, state, scratch, _moving(state), _scattering(model, state, scratch), count)
+    if apart:
+        record_substep(program, model, state, scratch, model.num_substeps - 1)
 
 
 def _record_gather(program: Program, model: Model, state: State, scratch: Scratch) -> None:

@@ -117,6 +117,25 @@ def take_sum(sums: Sums, e: int, f: int, r: int):
 
 
 @wp.func
+def sum_of(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l):
+    """Mass, physical and kinematic momentum in fixed point, of what has ``begun``; nothing is cleared."""
+    b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
+    p = units[1]
+    return physical_sum(units, counted(begun)) + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
+
+
+@wp.func
+def give_momentum(sums: Sums, e: int, f: int, r: int, J: wp.vec3):
+    """Add an impulse [N s] to record ``r`` of field ``f``, in fixed point, where nobody else adds."""
+    unit = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
+    J = J / unit
+    at = half_of(r, 0)
+    sums.fixed[e, at] = sums.fixed[e, at] + vec4l(
+        wp.int64(0), wp.int64(wp.rint(J[0])), wp.int64(wp.rint(J[1])), wp.int64(wp.rint(J[2]))
+    )
+
+
+@wp.func
 def end_sum(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l, driven: bool):
     """:func:`take_sum` of what has ``begun``, of a field with these ``units``.
 
@@ -130,11 +149,10 @@ def end_sum(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l, driven: bo
     else:
         a = counted(begun)
         if a[0] > 0.0:  # who adds no mass adds nothing
-            p = units[1]
-            s = physical_sum(units, a)
             if driven:
-                b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
-                s = s + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
+                s = sum_of(sums, e, units, r, begun)
+            else:
+                s = physical_sum(units, a)
         clear_numbers(sums.fixed, e, half_of(r, 0), a[0] > 0.0)
         if driven:
             clear_numbers(sums.fixed, e, half_of(r, 1), a[0] > 0.0)

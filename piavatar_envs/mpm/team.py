@@ -183,15 +183,15 @@ const float* third = constant(particles.volume, p);
 if (t == {int(_MU) - 16}) third = constant(particles.mu, p);
 if (t == {int(_LAM) - 16}) third = constant(particles.lam, p);
 if (t == {int(_MATERIAL) - 16}) third = constant(particles.material, p);
-if (t == {int(_UNITS) - 16}) third = constant(sums.mass_unit, 0);
-if (t == {int(_UNITS) - 15}) third = constant(sums.momentum_unit, 0);
+if (t == {int(_UNITS) - 16}) third = constant(sums.mass_unit, field);
+if (t == {int(_UNITS) - 15}) third = constant(sums.momentum_unit, field);
 return wp::vec_t<3, wp::float32>(*at(moved.F, t * apart + p), *second, *third);
 """,
         "return wp::vec_t<3, wp::float32>();",
     )
 )
-def read_by_team(particles: Particles, moved: Moving, sums: Sums, e: int, p: int) -> wp.vec3:
-    """A thread's three of the numbers of a particle of the first field.
+def read_by_team(particles: Particles, moved: Moving, sums: Sums, e: int, p: int, field: int) -> wp.vec3:
+    """A thread's three of the numbers of a particle of a ``field``.
 
     Those are its deformation, kinematic velocity, spin and substance, and the units of its sums: they would take many
     registers of every thread until it needs them, and as many loads.
@@ -255,3 +255,12 @@ def substance_of_team(read: wp.vec3):
 def units_of_team(read: wp.vec3):
     """Units of mass [kg] and of momentum [kg m/s]."""
     return wp.vec2(number_of_team(read, _UNITS), number_of_team(read, _UNITS + 1))
+
+
+@wp.func
+def field_of(several: bool, particles: Particles, p: int):
+    """Field of a particle; nothing is read where there are not ``several``."""
+    field = int(0)
+    if several:
+        field = particles.field[p]
+    return field

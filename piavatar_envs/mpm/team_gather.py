@@ -79,6 +79,7 @@ def add_push(
     e: int,
     units: wp.vec2,
     stencil: Stencil,
+    f: int,
     n: wp.vec3i,
     u: wp.vec4,
     driven: vec4l,
@@ -86,7 +87,10 @@ def add_push(
     g: Gradients,
     seen: wp.vec3,
 ):
-    """Add what the boundaries do at a node with :func:`velocity_of` ``u``, and its kinematic velocity, weighted."""
+    """Add what the boundaries do to field ``f`` at a node with :func:`velocity_of` ``u``, weighted.
+
+    Also, its kinematic velocity to what has been ``seen``.
+    """
     if n[0] < 0 or u[0] <= 0.0:
         return g, seen
     vk = (units[1] / (units[0] * u[0])) * wp.vec3(float(driven[0]), float(driven[1]), float(driven[2]))
@@ -96,16 +100,27 @@ def add_push(
     node = stencil.base + n
     way = (grid.dx / u[0]) * wp.vec3(float(offset[0]), float(offset[1]), float(offset[2]))
     matter = node_position(grid, node[0], node[1], node[2]) - way
-    dv = boundary_contact(boundaries, e, 0, matter, v, CONTACT_GATE * grid.dx) - v
+    dv = boundary_contact(boundaries, e, f, matter, v, CONTACT_GATE * grid.dx) - v
     w = weight_of(stencil, n)
     return add_weighted(g, n, w * wp.vec4(0.0, dv[0], dv[1], dv[2])), seen + w * vk
 
 
 @wp.func
-def tell_sensors(contact: Contact, sensors: Sensors, e: int, m: float, corner: wp.vec3, dx: float, g: Gradients):
+def tell_sensors(
+    several: bool,
+    contact: Contact,
+    sensors: Sensors,
+    e: int,
+    f: int,
+    m: float,
+    corner: wp.vec3,
+    dx: float,
+    g: Gradients,
+):
     """Add what the boundaries have done to the particles of a warp, of mass ``m``, by the sums ``g`` of its threads.
 
-    ``corner`` is the lowest node of a stencil. All threads of a warp come here.
+    They are of one field, the first, unless there are ``several``; ``corner`` is the lowest node of a stencil. All
+    threads of a warp come here.
     """
     J = m * wp.vec3(g.mean[1], g.mean[2], g.mean[3])
     along_x = wp.vec3(g.along_x[1], g.along_x[2], g.along_x[3])
@@ -113,11 +128,18 @@ def tell_sensors(contact: Contact, sensors: Sensors, e: int, m: float, corner: w
     along_z = wp.vec3(g.along_z[1], g.along_z[2], g.along_z[3])
     # the sum of x_i x dv_i over the nodes, by the sums of dv_i and of dv_i times their places along each axis
     own = wp.vec3(along_y[2] - along_z[1], along_z[0] - along_x[2], along_x[1] - along_y[0])
-    moment = vector_sum_of_warp(wp.cross(corner, J) + (m * dx) * own)
-    J = vector_sum_of_warp(J)
-    if lane_of_thread() == 0 and wp.length_sq(J) > 0.0:
-        add_impulse(sensors, e, boundary_entry(sensors, contact.subject[0]), J)
-        add_impulse(sensors, e, moment_entry(sensors, contact.subject[0]), moment)
+    moment = wp.cross(corner, J) + (m * dx) * own
+    speaker = lane_of_thread()
+    if several:
+        moment = vector_sum_of_team(moment)
+        J = vector_sum_of_team(J)
+        speaker = speaker & 7
+    else:
+        moment = vector_sum_of_warp(moment)
+        J = vector_sum_of_warp(J)
+    if speaker == 0 and wp.length_sq(J) > 0.0:
+        add_impulse(sensors, e, boundary_entry(sensors, contact.subject[f]), J)
+        add_impulse(sensors, e, moment_entry(sensors, contact.subject[f]), moment)
 
 
 @wp.func
@@ -128,12 +150,14 @@ def added(a: Gradients, b: Gradients):
 
 @wp.func
 def gather_by_team(
+    several: bool,
     grid: Grid,
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
     sums: Sums,
     e: int,
+    f: int,
     units: wp.vec2,
     stencil: Stencil,
     record: int,
@@ -144,7 +168,8 @@ def gather_by_team(
     """Sums of a stencil's physical velocities, and the mean kinematic one where a boundary is near.
 
     ``record`` is as for :func:`piavatar_envs.mpm.team.record_in_team`, ``distance`` [grid spacings] how far the
-    particle is from any boundary, ``m`` its mass, 0 if it takes no part. All threads of a warp come here.
+    particle is from any boundary, ``m`` its mass, 0 if it takes no part, ``f`` its field, the first unless there are
+    ``several``. All threads of a warp come here.
     """
     n0 = node_of_thread(0)
     n1 = node_of_thread(1)
@@ -176,17 +201,17 @@ def gather_by_team(
         o0 = numbers_at(sums.offset_fixed, e, r0)
         k1 = numbers_at(sums.fixed, e, half_of(r1, 1))
         o1 = numbers_at(sums.offset_fixed, e, r1)
-        g, seen = add_push(grid, step, boundaries, e, units, stencil, n0, u0, k0, o0, g, seen)
-        g, seen = add_push(grid, step, boundaries, e, units, stencil, n1, u1, k1, o1, g, seen)
+        g, seen = add_push(grid, step, boundaries, e, units, stencil, f, n0, u0, k0, o0, g, seen)
+        g, seen = add_push(grid, step, boundaries, e, units, stencil, f, n1, u1, k1, o1, g, seen)
         k2 = numbers_at(sums.fixed, e, half_of(r2, 1))
         o2 = numbers_at(sums.offset_fixed, e, r2)
         k3 = numbers_at(sums.fixed, e, half_of(r3, 1))
         o3 = numbers_at(sums.offset_fixed, e, r3)
-        g, seen = add_push(grid, step, boundaries, e, units, stencil, n2, u2, k2, o2, g, seen)
-        g, seen = add_push(grid, step, boundaries, e, units, stencil, n3, u3, k3, o3, g, seen)
+        g, seen = add_push(grid, step, boundaries, e, units, stencil, f, n2, u2, k2, o2, g, seen)
+        g, seen = add_push(grid, step, boundaries, e, units, stencil, f, n3, u3, k3, o3, g, seen)
         seen = vector_sum_of_team(seen)
         kinematic.mean = wp.vec4(0.0, seen[0], seen[1], seen[2])
         corner = node_position(grid, stencil.base[0], stencil.base[1], stencil.base[2])
-        tell_sensors(contact, sensors, e, m, corner, grid.dx, g)
+        tell_sensors(several, contact, sensors, e, f, m, corner, grid.dx, g)
         physical = added(physical, g)
     return total_of_team(physical), kinematic

@@ -12,10 +12,11 @@ TURNS = 3
 def has_turns(model: Model) -> bool:
     """Whether substeps between which nothing acts are one launch each, see :mod:`piavatar_envs.mpm.relay`.
 
-    Few particles a cell, one field, boundaries that rest, no need of kinematic gradients, and sums that strides of 32
-    bits can count.
+    Few particles a cell, a field a subject, normals that are a pair's, boundaries that rest, no need of kinematic
+    gradients, and sums that strides of 32 bits can count.
     """
     if TURNS * model.max_slots >= MOST_SLOTS:
         return False
-    alone = model.contact.num_fields == 1 and not model.moving_boundaries
-    return model.scatter == "singles" and alone and model.step.decoupling != int(PAPER)
+    contact = model.contact
+    plain = contact.num_fields == contact.num_subjects and contact.own_normals == 0 and not model.moving_boundaries
+    return model.scatter == "singles" and plain and model.step.decoupling != int(PAPER)

@@ -10,7 +10,7 @@ import pytest
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay import PORTION, portions
-from piavatar_envs.mpm.solver import record_end, record_marks, record_substep
+from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
 from piavatar_envs.mpm.turns import has_turns
 from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, FAILURE_NONFINITE, FAILURE_OUT_OF_GRID
 
@@ -43,7 +43,8 @@ def drop(simulate, device):
 def one_by_one(sim):
     """The same world, whose substeps are launches of their own."""
     program = Program(sim.model.device)
-    record_marks(program, sim.model, sim.state, sim.scratch)
+    several = sim.model.contact.num_fields > 1  # whose sensors forget
+    (record_begin if several else record_marks)(program, sim.model, sim.state, sim.scratch)
     for index in range(sim.model.num_substeps):
         record_substep(program, sim.model, sim.state, sim.scratch, index)
     record_end(program, sim.model, sim.state, sim.scratch)
@@ -178,9 +179,101 @@ def test_warps_that_are_not_full(drop, count):
 
 
 def test_what_relays_are_for(drop, simulate, meet):
-    """One field, resting boundaries, and another variant than the paper's."""
+    """A field a subject, normals of pairs, resting boundaries, and another variant than the paper's."""
     assert has_turns(drop().model)
     assert not has_turns(drop(decoupling="paper").model)
     assert not has_turns(simulate(scatter="runs").model)
-    cubes = [{"ball": ((x, 0.0, 0.0), 0.1)} for x in (-0.2, 0.2)]
-    assert not has_turns(meet(cubes, scatter="singles").model)
+    balls = [{"ball": ((x, 0.0, 0.0), 0.1)} for x in (-0.2, 0.2)]
+    assert has_turns(meet(balls, scatter="singles").model)
+    assert not has_turns(meet(balls, scatter="singles", normals="own").model)
+
+
+@pytest.fixture
+def clash(meet, device):
+    """Boxes of three subjects that come together in two worlds, one of them on a floor, all driven besides."""
+    if device == "cpu":
+        pytest.skip("relays are a GPU's")
+
+    def build(num_substeps=12, num_envs=2, planes=FLOOR, **kwargs):
+        bodies = [
+            {"box": ((-0.23, -0.1, -0.1), (-0.03, 0.1, 0.1)), "velocity": (2.0, 0.2, -0.3)},
+            {"box": ((0.0, -0.08, -0.1), (0.2, 0.12, 0.1)), "velocity": (-1.5, 0.0, -0.3), "density": 600.0},
+            {"box": ((-0.1, -0.1, 0.13), (0.1, 0.1, 0.23)), "velocity": (0.0, 0.0, -3.0)},
+        ]
+        world = {"planes": planes, "scatter": "singles", "friction": 0.4, "num_envs": num_envs, "control_dt": 0.012}
+        sim = meet(bodies, num_substeps=num_substeps, **(world | kwargs))
+        rng = np.random.default_rng(8)
+        shape = (num_envs, len(sim.rest), 3)
+        return sim.set(
+            u=sim.state.u.numpy() + rng.normal(0.0, 0.1, shape),
+            vk=rng.normal(0.0, 0.1, shape) + [0.0, 0.2, 0.0],
+            spin=rng.normal(0.0, 0.1, shape),
+        )
+
+    return build
+
+
+SENSED = ("boundary_impulse", "boundary_moment", "pair_impulse", "part_impulse", "penetration")
+
+
+def test_relays_of_several_fields_are_substeps(clash):
+    """Three subjects that meet each other and a floor, and what sensors say of all that."""
+    relay, apart = clash(), one_by_one(clash())
+    assert "carry_fields_on" in relay.program.names and "carry_fields_on" not in apart.program.names
+    for _ in range(3):
+        relay.run(), apart.run()
+        assert relay.failures == apart.failures == [0, 0]
+        same(relay, apart, (2e-5, 1e-2, 1.0, 1e-3))  # contact of nodes that are new comes a substep late
+        for name in SENSED:
+            found, expected = (getattr(sim.scratch.sensors, name).numpy() for sim in (relay, apart))
+            np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3, err_msg=name)
+    assert all(np.abs(getattr(apart.scratch.sensors, name).numpy()).max() > 0.01 for name in SENSED)
+    assert relay.sums_are_clear and apart.sums_are_clear
+
+
+def test_fields_that_meet_keep_momentum(clash):
+    """What one loses the other gains: in the world, and in what sensors say of every body."""
+    sim = clash(planes=(), num_substeps=30, control_dt=0.03)
+    mass = sim.model.particles.mass.numpy()[0]
+    field = sim.model.particles.field.numpy()
+
+    def momenta():
+        p = mass[:, None] * sim.get("u").astype(float)
+        return np.stack([p[field == f].sum(0) for f in range(3)])
+
+    before = momenta()
+    sim.run()
+    after = momenta()
+    given = np.abs(after - before).max()
+    assert sim.failures == [0, 0] and given > 0.5
+    np.testing.assert_allclose(after.sum(0), before.sum(0), atol=1e-6 * np.abs(before).sum() + 1e-5)
+    felt = sim.scratch.sensors.part_impulse.numpy()[0].sum(1)  # on the sensor of each, from all
+    np.testing.assert_allclose(felt, after - before, atol=2e-4 * given)
+    pairs = sim.scratch.sensors.pair_impulse.numpy()[0].reshape(3, 3, 3)
+    np.testing.assert_allclose(pairs.sum(1) - pairs.sum(0), after - before, atol=2e-4 * given)
+
+
+def test_relays_of_several_fields_repeat_bit_for_bit(clash):
+    """Blocks are marked in flight in another order each time, and fields come to each other's."""
+    first, second = (clash(num_substeps=PORTION + 9, control_dt=0.05).run(2) for _ in range(2))
+    assert first.failures == [0, 0]
+    for array in ARRAYS:
+        np.testing.assert_array_equal(getattr(first.state, array).numpy(), getattr(second.state, array).numpy())
+    for name in SENSED:
+        found = getattr(first.scratch.sensors, name).numpy()
+        np.testing.assert_array_equal(found, getattr(second.scratch.sensors, name).numpy(), err_msg=name)
+
+
+def test_fields_that_fail_fail_alone(clash):
+    """The others go on bit for bit, and nothing is left on the grid."""
+    well, ill = clash().run(2), clash()
+    u = ill.state.u.numpy()
+    u[1, 5] = 400.0
+    ill.set(u=u).run(2)
+    assert ill.failures[0] == 0 and ill.failures[1] & FAILURE_CFL
+    for name in ARRAYS:
+        np.testing.assert_array_equal(ill.state.numpy()[name][0], well.state.numpy()[name][0], err_msg=name)
+    for name in SENSED:
+        found, expected = (getattr(sim.scratch.sensors, name).numpy()[0] for sim in (ill, well))
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+    assert ill.sums_are_clear

@@ -1,0 +1,274 @@
+"""Contact between velocity fields where substeps are one launch each: see :mod:`piavatar_envs.mpm.relay`.
+
+Between two such launches, two short ones go over the nodes of blocks with several fields, before anybody gathers. What
+a pair gives each other there is added to its sums: who gathers makes velocities out of these, and need not know which
+nodes have been in contact. In integers, what one loses the other gains exactly.
+
+Contact asks where the particles of a node are, so all of them must tell it. Whoever scatters goes by where fields were
+*before* the launch, which does not depend on the order in which others of it come to their nodes: a field has told a
+node if another was there in the substep before, and only nodes that both have told are in contact. That is a substep
+after the second has come to it, with next to no weight.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.blocks import (
+    end_of_fields,
+    first_record,
+    has_field,
+    lowest_field,
+    nodes_shared,
+    shared_block,
+    slots_used,
+)
+from piavatar_envs.mpm.contact import book_contact, book_pair, impulse_between
+from piavatar_envs.mpm.grid import total_velocity
+from piavatar_envs.mpm.impulses import write_change
+from piavatar_envs.mpm.normals import MASS_MIN, facing_of, normal_from, records_around
+from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.shared_memory import native
+from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
+from piavatar_envs.mpm.sums import begin_sum, give_momentum, offset_at, sum_of, units_of
+from piavatar_envs.mpm.sweep import THREADS, Sweep, lane_of_thread, plan_sweep
+from piavatar_envs.mpm.threads import environment_of
+from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Contact, Grid, Model, Scratch, Sensors, Step, Sums
+
+# divisions and roots to two units in the last place, in a few instructions instead of calls
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+
+
+@wp.func_native(native("return (int)__ballot_sync(0xffffffffu, here);", "return here;"))
+def lanes_with(here: bool) -> int:
+    """A bit for each thread of a warp, whether it is so ``here``; all of them come here."""
+    ...
+
+
+@wp.func
+def place_of_bits(slots: int, substep: int, slot: int, half: int):
+    """Where the bits of half of a slot's nodes are, those that the launches of a ``substep`` write."""
+    return 2 * ((substep & 1) * slots + slot) + half
+
+
+@wp.func
+def had_others(others: wp.array2d(dtype=int), slots: int, e: int, substep: int, r: int):
+    """Whether the node of a field's record ``r`` had another field in ``substep``; in the next, its own has told it."""
+    local = r % BLOCK_NODES
+    return ((others[e, place_of_bits(slots, substep, r // BLOCK_NODES, local // 32)] >> (local & 31)) & 1) != 0
+
+
+@wp.func
+def nodes_along(base: int, upper: bool):
+    """Bits of the nodes ``base`` to ``base + 2`` in a block of 4 along an axis, the lower or upper that they lie in."""
+    block = base >> 2
+    if upper:
+        block = (base + 2) >> 2
+    return (7 << (base - 4 * block + 2) >> 2) & 15
+
+
+@wp.func
+def meets_others(others: wp.array2d(dtype=int), slots: int, e: int, substep: int, slot: int, base: wp.vec3i):
+    """Whether there was another field at those nodes of the stencil at ``base`` that are in a thread's block.
+
+    That of :func:`piavatar_envs.mpm.singles.block_of_thread`, whose ``slot`` this is.
+    """
+    at = place_of_bits(slots, substep, slot, 0)
+    lower = others[e, at]
+    upper = others[e, at + 1]
+    lane = lane_of_thread()
+    x = nodes_along(base[0], (lane & 4) != 0)
+    y = nodes_along(base[1], (lane & 2) != 0)
+    z = nodes_along(base[2], (lane & 1) != 0)
+    plane = z * ((y & 1) | ((y & 2) << 3) | ((y & 4) << 6) | ((y & 8) << 9))
+    first = plane * (x & 1) | (plane << 16) * ((x >> 1) & 1)
+    second = plane * ((x >> 2) & 1) | (plane << 16) * (x >> 3)
+    return ((lower & first) | (upper & second)) != 0
+
+
+@wp.kernel
+def begin_contact(blocks: Blocks, others: wp.array2d(dtype=int), sensors: Sensors):
+    """All have told where blocks have several fields, and nothing has been touched."""
+    e, slot = wp.tid()
+    slots = blocks.held.shape[1]
+    held = blocks.held[e, slot]
+    told = int(0)
+    if slot < slots_used(blocks, e):
+        mask = blocks.fields[e, held % blocks.fields.shape[1]]
+        if (mask & (mask - 1)) != 0:
+            told = -1  # the first scatter of a relay goes by blocks, and tells all nodes of these
+    for half in range(2):
+        others[e, place_of_bits(slots, 0, slot, half)] = 0
+        others[e, place_of_bits(slots, 1, slot, half)] = told
+    sensors.touched[e, slot] = 0
+
+
+@wp.kernel(launch_bounds=(THREADS, 6))
+def face_fields(
+    grid: Grid,
+    contact: Contact,
+    sweep: Sweep,
+    substep: int,
+    gathered: int,
+    blocks: Blocks,
+    sums: Sums,
+    # in and out
+    others: wp.array2d(dtype=int),
+    # out
+    node_facing: wp.array2d(dtype=wp.vec4),
+):
+    """What every node of a block with several fields says about the normals around it, and who is there."""
+    at = environment_of(wp.tid(), sweep.threads)
+    e = at[0]
+    slots = blocks.held.shape[1]
+    end = nodes_shared(blocks, e)
+    for turn in range(sweep.turns):
+        n = at[1] + turn * sweep.stride
+        block = shared_block(blocks, e, n)
+        if n >= end:  # so for all threads of a warp, which have half of a block
+            break
+        local = n % BLOCK_NODES
+        mask = blocks.fields[e, block]
+        first = lowest_field(mask, contact.num_fields)
+        last = end_of_fields(mask, contact.num_fields)
+        present = int(0)
+        for f in range(first, last):
+            if has_field(mask, f):
+                r = first_record(grid, blocks, e, f, block) + local
+                m = units_of(sums, e, f)[0] * float(begin_sum(sums, e, BLOCK_NODES * gathered + r)[0])
+                facing = wp.vec4()
+                if m > 0.0:
+                    present = present | (1 << f)
+                    if had_others(others, slots, e, substep + 1, r):
+                        facing = facing_of(grid, contact, sums, e, f, BLOCK_NODES * gathered + r, m)
+                write_change(node_facing, e, r, facing)
+        for f in range(first, last):
+            if has_field(mask, f):
+                r = first_record(grid, blocks, e, f, block) + local
+                bits = lanes_with((present & ~(1 << f)) != 0)
+                if lane_of_thread() == 0:
+                    others[e, place_of_bits(slots, substep, r // BLOCK_NODES, local // 32)] = bits
+
+
+@wp.func
+def meet_pair(
+    grid: Grid,
+    step: Step,
+    contact: Contact,
+    blocks: Blocks,
+    sums: Sums,
+    sensors: Sensors,
+    node_facing: wp.array2d(dtype=wp.vec4),
+    others: wp.array2d(dtype=int),
+    substep: int,
+    gathered: int,
+    e: int,
+    block: int,
+    local: int,
+    a: int,
+    b: int,
+):
+    """Contact of the fields ``a < b`` at a node that both have told where they are, added to their sums."""
+    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    ra = first_record(grid, blocks, e, a, block) + local
+    rb = first_record(grid, blocks, e, b, block) + local
+    sa = BLOCK_NODES * gathered + ra
+    sb = BLOCK_NODES * gathered + rb
+    node = node_of_block(block_corner(grid, block), local)
+    around_a, around_b = records_around(grid, blocks, e, node, a, b)  # asked for before it is known who needs them
+    va = total_velocity(step, split, sum_of(sums, e, units_of(sums, e, a), sa, begin_sum(sums, e, sa)))
+    vb = total_velocity(step, split, sum_of(sums, e, units_of(sums, e, b), sb, begin_sum(sums, e, sb)))
+    slots = blocks.held.shape[1]
+    told = had_others(others, slots, e, substep + 1, ra) and had_others(others, slots, e, substep + 1, rb)
+    if va[0] <= MASS_MIN or vb[0] <= MASS_MIN or not told:
+        return
+    n_ab = normal_from(grid, e, node, around_a, around_b, node_facing)
+    offset_a = offset_at(grid, sums, e, a, sa)
+    offset_b = offset_at(grid, sums, e, b, sb)
+    J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
+    if wp.length_sq(J) <= 0.0:
+        return
+    give_momentum(sums, e, a, sa, -J)
+    give_momentum(sums, e, b, sb, J)
+    book_contact(contact, e, ra, b, -J / va[0], substep + 1, sensors)
+    book_contact(contact, e, rb, a, J / vb[0], substep + 1, sensors)
+    book_pair(contact, e, a, b, J, sensors)
+
+
+@wp.kernel(launch_bounds=(THREADS, 2))
+def meet_fields(
+    grid: Grid,
+    step: Step,
+    contact: Contact,
+    sweep: Sweep,
+    substep: int,
+    gathered: int,
+    stops: wp.array(dtype=int),
+    blocks: Blocks,
+    node_facing: wp.array2d(dtype=wp.vec4),
+    others: wp.array2d(dtype=int),
+    # in and out
+    sums: Sums,
+    sensors: Sensors,
+):
+    """Contact of all fields at every node of a block that has several, in pairs; what follows reads the sums."""
+    at = environment_of(wp.tid(), sweep.threads)
+    e = at[0]
+    end = nodes_shared(blocks, e)
+    for turn in range(sweep.turns):
+        n = at[1] + turn * sweep.stride
+        block = shared_block(blocks, e, n)
+        if n >= end or stops[e] <= substep:
+            break
+        local = n % BLOCK_NODES
+        mask = blocks.fields[e, block]
+        first = lowest_field(mask, contact.num_fields)
+        last = end_of_fields(mask, contact.num_fields)
+        for f in range(first, last):
+            if has_field(mask, f):
+                write_change(sensors.node, e, first_record(grid, blocks, e, f, block) + local, wp.vec4())
+        for a in range(first, last - 1):
+            for b in range(a + 1, last):
+                if has_field(mask, a) and has_field(mask, b):
+                    meet_pair(
+                        grid, step, contact, blocks, sums, sensors, node_facing, others, substep, gathered, e, block,
+                        local, a, b,
+                    )  # fmt: skip
+
+
+def record_contact(program: Program, model: Model, scratch: Scratch) -> wp.array:
+    """Append what comes before the first contact, blocks having been marked; returns where other fields are.
+
+    Bits of a field's slots, in turns: see :func:`had_others`.
+    """
+    others = wp.zeros((model.num_envs, 4 * model.max_slots), dtype=int, device=model.device)
+    program.launch(begin_contact, (model.num_envs, model.max_slots), [scratch.blocks], [others, scratch.sensors])
+    return others
+
+
+def record_meeting(
+    program: Program,
+    model: Model,
+    scratch: Scratch,
+    others: wp.array,
+    stops: wp.array,
+    substep: int,
+    gathered: int,
+) -> None:
+    """Append the contact of a substep, the set of sums whose first slot is ``gathered`` being complete."""
+    m, sweep, turn = model, plan_sweep(model), [substep, gathered]
+    threads = m.num_envs * sweep.threads
+    program.launch(
+        face_fields,
+        threads,
+        [m.grid, m.contact, sweep, *turn, scratch.blocks, scratch.turns],
+        [others, scratch.facing],
+        block_dim=THREADS,
+    )
+    program.launch(
+        meet_fields,
+        threads,
+        [m.grid, m.step, m.contact, sweep, *turn, stops, scratch.blocks, scratch.facing, others],
+        [scratch.turns, scratch.sensors],
+        block_dim=THREADS,
+    )
