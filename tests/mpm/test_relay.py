@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay import PORTION, portions
+from piavatar_envs.mpm.relay_contact import meets_others
 from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
 from piavatar_envs.mpm.turns import has_turns
 from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, FAILURE_NONFINITE, FAILURE_OUT_OF_GRID
@@ -229,6 +231,51 @@ def test_relays_of_several_fields_are_substeps(clash):
             np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3, err_msg=name)
     assert all(np.abs(getattr(apart.scratch.sensors, name).numpy()).max() > 0.01 for name in SENSED)
     assert relay.sums_are_clear and apart.sums_are_clear
+
+
+@pytest.mark.parametrize("num_substeps", [1, 2])
+def test_few_substeps_of_several_fields(clash, num_substeps):
+    """The last is always launched apart: with one, nothing is left for a relay."""
+    settings = {"num_substeps": num_substeps, "control_dt": 1e-3 * num_substeps}
+    relay, apart = clash(**settings).run(3), one_by_one(clash(**settings)).run(3)
+    assert ("carry_fields_on" in relay.program.names) == (num_substeps > 1)
+    assert relay.failures == [0, 0] and relay.sums_are_clear
+    same(relay, apart, (2e-5, 1e-2, 1.0, 1e-3))
+
+
+@wp.kernel
+def ask_around(others: wp.array2d(dtype=int), base: wp.array(dtype=wp.vec3i), found: wp.array(dtype=bool)):
+    """A particle of eight threads, each with the slot of its own number, in the second substep."""
+    i = wp.tid()
+    found[i] = meets_others(others, 8, 0, 1, i % 8, base[i // 8])
+
+
+def test_who_has_others_at_its_nodes(device):
+    """By the bits of every node of the blocks around: all places of a stencil, one node at a time and several."""
+    if device == "cpu":
+        pytest.skip("relays are a GPU's")
+    rng = np.random.default_rng(3)
+    base = np.array(list(np.ndindex(4, 4, 4)))
+    for count in (1, 1, 1, 2, 5):
+        nodes = np.zeros((8, 8, 8), bool)  # two blocks along each axis
+        nodes[tuple(rng.integers(0, 6, (3, count)))] = True
+        bits = np.zeros((2, 8, 2), np.uint32)  # substep, slot, half
+        for x, y, z in np.argwhere(nodes):
+            local = 16 * (x % 4) + 4 * (y % 4) + z % 4
+            bits[1, 4 * (x // 4) + 2 * (y // 4) + z // 4, local // 32] |= np.uint32(1 << (local % 32))
+        expected = [nodes[i : i + 3, j : j + 3, k : k + 3].any() for i, j, k in base]
+        assert 0 < sum(expected) < len(base)
+        # the slots of a stencil that lies in one block along an axis are those of the lower
+        lower = base % 4 < 2
+        found = wp.zeros(8 * len(base), dtype=bool, device=device)
+        others = wp.array(bits.reshape(1, -1).view(np.int32), dtype=int, device=device)
+        at = wp.array(base.astype(np.int32), dtype=wp.vec3i, device=device)
+        wp.launch(ask_around, 8 * len(base), [others, at], [found], device=device, block_dim=128)
+        by_thread = found.numpy().reshape(-1, 8)
+        for axis, bit in enumerate((4, 2, 1)):
+            upper = (np.arange(8) & bit) != 0
+            by_thread &= ~(lower[:, axis, None] & upper)
+        np.testing.assert_array_equal(by_thread.any(1), expected)
 
 
 def test_fields_that_meet_keep_momentum(clash):
