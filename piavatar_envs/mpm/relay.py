@@ -24,8 +24,16 @@ from piavatar_envs.mpm.gather import Gathered, begun, own_velocity, settled
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay_contact import meets_others, record_contact, record_meeting
-from piavatar_envs.mpm.runs import KINEMATIC, bounded, told_by
-from piavatar_envs.mpm.singles import SHARE, TEAM, THREADS, add_single, any_of_team, block_of_thread, record_singles
+from piavatar_envs.mpm.singles import (
+    SHARE,
+    TEAM,
+    THREADS,
+    add_single,
+    any_of_team,
+    block_of_thread,
+    fits,
+    record_singles,
+)
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, grid_position, in_same_brick, stencil_at
 from piavatar_envs.mpm.sweep import LANES, lanes_of_warp
 from piavatar_envs.mpm.team import (
@@ -45,7 +53,7 @@ from piavatar_envs.mpm.team_clear import clear_share, clear_slot
 from piavatar_envs.mpm.team_gather import gather_by_team
 from piavatar_envs.mpm.team_sense import sense_by_team
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.transfer import Scattered, admitted, impulse_of_stress, placed, with_momentum
+from piavatar_envs.mpm.transfer import admitted, impulse_of_stress, placed, with_momentum
 from piavatar_envs.mpm.turns import TURNS
 from piavatar_envs.mpm.types import (
     NO_STRESS,
@@ -112,28 +120,6 @@ def momentum_of_team(grid: Grid, step: Step, read: wp.vec3, s: Gathered):
         tau = kirchhoff_stress(made_of.material, s.F, made_of.mu, made_of.lam)
         stress = impulse_of_stress(grid, step, made_of.volume, tau)
     return with_momentum(grid, placed(grid, s.x), made_of.mass, s.u, wp.vec3(), s.C, stress)
-
-
-@wp.func
-def fits(
-    grid: Grid,
-    particles: Particles,
-    e: int,
-    p: int,
-    x: wp.vec3,
-    vk: wp.vec3,
-    adds: bool,
-    tells: bool,
-    momentum: Scattered,
-    unit: float,
-    failure: wp.array(dtype=int),
-):
-    """Whether what a particle ``adds`` to its nodes, and ``tells`` them, can be counted."""
-    if adds:
-        adds = bounded(momentum, unit, failure, e) >= 0.0
-    if adds and tells:
-        adds = bounded(told_by(grid, particles, e, p, x, vk, KINEMATIC), unit, failure, e) >= 0.0
-    return adds
 
 
 @wp.func

@@ -30,7 +30,7 @@ from piavatar_envs.mpm.normals import MASS_MIN, facing_of, normal_from, records_
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
-from piavatar_envs.mpm.sums import begin_sum, give_momentum, offset_at, sum_of, units_of
+from piavatar_envs.mpm.sums import begin_sum, counted, give_momentum, offset_at, physical_sum, sum_of, units_of
 from piavatar_envs.mpm.sweep import THREADS, Sweep, lane_of_thread, plan_sweep
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Contact, Grid, Model, Scratch, Sensors, Step, Sums
@@ -135,7 +135,7 @@ def face_fields(
         for f in range(first, last):
             if has_field(mask, f):
                 r = first_record(grid, blocks, e, f, block) + local
-                m = units_of(sums, e, f)[0] * float(begin_sum(sums, e, BLOCK_NODES * gathered + r)[0])
+                m = physical_sum(units_of(sums, e, f), counted(begin_sum(sums, e, BLOCK_NODES * gathered + r)))[0]
                 facing = wp.vec4()
                 if m > 0.0:
                     present = present | (1 << f)

@@ -204,6 +204,28 @@ def add_one(
     )  # fmt: skip
 
 
+@wp.func
+def fits(
+    grid: Grid,
+    particles: Particles,
+    e: int,
+    p: int,
+    x: wp.vec3,
+    vk: wp.vec3,
+    adds: bool,
+    tells: bool,
+    momentum: Scattered,
+    unit: float,
+    failure: wp.array(dtype=int),
+):
+    """Whether what a particle ``adds`` to its nodes, and ``tells`` them, can be counted."""
+    if adds:
+        adds = bounded(momentum, unit, failure, e) >= 0.0
+    if adds and tells:
+        adds = bounded(told_by(grid, particles, e, p, x, vk, KINEMATIC), unit, failure, e) >= 0.0
+    return adds
+
+
 @wp.kernel(launch_bounds=(THREADS, 5))
 def singles_to_grid(
     grid: Grid,
@@ -245,11 +267,9 @@ def singles_to_grid(
         s = scattered(grid, step, particles, moving, e, p, MOMENTUM)
         tells = tells or near_boundary(grid, boundaries, e, x)
         takes = admitted(here, moves, e, failure)
-        if takes:
-            takes = bounded(s, units[1], failure, e) >= 0.0
     tells = any_of_team(tells)
-    if takes and (tells or step.decoupling == PAPER):
-        takes = bounded(told_by(grid, particles, e, p, x, vk, KINEMATIC), units[1], failure, e) >= 0.0
+    driven = tells or step.decoupling == PAPER
+    takes = fits(grid, particles, e, p, x, vk, takes, driven, s, units[1], failure)
     add_single(
         grid, step, particles, sums, e, wp.min(p, moving.x.shape[1] - 1), x, vk, takes, tells, record, units, s
     )  # fmt: skip
