@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import held_by, slots_used
+from piavatar_envs.mpm.blocks import fields_at_corner, held_by, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, GATED_SLAB, NEAR_BLOCK, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.normals import MASS_MIN, face_shared
@@ -12,7 +12,7 @@ from piavatar_envs.mpm.records import write_physical, write_record
 from piavatar_envs.mpm.shared_memory import meet_warp
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, units_of
-from piavatar_envs.mpm.sweep import THREADS, Sweep, lane_of_thread, lanes_of_warp, nodes_of_lane
+from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, lane_of_thread, lanes_of_warp, nodes_of_lane
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import (
     NO_STRESS,
@@ -188,6 +188,20 @@ def update_block(
             update_free(step, sums, e, units, r + n * lanes, begin_sum(sums, e, r + n * lanes), node_velocity)
 
 
+@wp.func
+def note_beside(grid: Grid, blocks: Blocks, e: int, slot: int, held: wp.vec2i):
+    """Note whether a stencil that begins in a slot's block, ``held`` by a field, may lie in a block of another one.
+
+    Nearly no particles of large bodies do, and their gather need not look around. All threads of a warp come here.
+    """
+    if blocks.beside.shape[1] == 1:
+        return
+    around = fields_at_corner(grid, blocks, block_corner(grid, held[1]), e, lane_of_thread() & 7)
+    others = any_lane((around & ~(1 << held[0])) != 0)
+    if lane_of_thread() == 0:
+        blocks.beside[e, slot] = int(others)
+
+
 @wp.kernel(launch_bounds=(THREADS, 7))
 def update_grid(
     grid: Grid,
@@ -243,6 +257,7 @@ def update_grid(
                 held = held_by(grid, n)
                 alone = blocks.fields[e, held[1]] == (1 << held[0])
                 sensors.touched[e, slot] = 0
+                note_beside(grid, blocks, e, slot, held)
             if alone:
                 update_block(
                     grid, step, boundaries, contact, sums, begun, begun_next, e, slot, held, told, node_velocity,

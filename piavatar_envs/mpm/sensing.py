@@ -18,7 +18,6 @@ from piavatar_envs.mpm.stencil import (
 from piavatar_envs.mpm.stencil_records import VECTORS, line_of_records, slab_records
 from piavatar_envs.mpm.sweep import THREADS
 from piavatar_envs.mpm.types import BESIDE, Blocks, Contact, Grid, Particles, Sensors, row
-from piavatar_envs.mpm.warp_blocks import fields_may_meet
 
 # unrolled, the stencil takes so many registers that a GPU has few threads at once
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -112,10 +111,10 @@ def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Se
 
 @wp.func
 def sense_gathered(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
-    """:func:`sense_particle` of a warp's particles, before they move; few warps have any that contact may reach."""
-    if blocks.num_shared[e] == 0:
-        return
-    if fields_may_meet(grid, blocks, e, base_node(xg)):
+    """:func:`sense_particle` of one at which the grid pass may have seen another field; nearly all leave here."""
+    base = base_node(xg)
+    r = first_record(grid, blocks, e, particles.field[p], block_index(grid, base[0], base[1], base[2]))
+    if blocks.beside[e, r // BLOCK_NODES] != 0:
         sense_particle(grid, particles, blocks, sensors, e, p, xg)
 
 

@@ -166,6 +166,8 @@ class Blocks:
     num_shared: wp.array(dtype=int)  # (num_envs,) how many, also such as found no slot for it
     swept: wp.array(dtype=int)  # (num_envs,) slots whose records the last grid pass has written
     frozen: wp.array(dtype=int)  # (num_envs,) not 0: had failed when this was last looked at, see :func:`freeze`
+    # (num_envs, S) not 0: a stencil that begins in this slot's block may lie in one of another field; of large bodies
+    beside: wp.array2d(dtype=int)
     # (num_envs, num_particles) TELLS and BESIDE, as the scatter has found them in this substep; of a CPU
     around: wp.array2d(dtype=wp.uint8)
 
