@@ -9,6 +9,7 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import NOBODY
 from piavatar_envs.mpm.matrices import allocate_matrices, components_of, whole_lines
+from piavatar_envs.mpm.sensing import senses_in_gather
 from piavatar_envs.mpm.shared_room import plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.sums import units
@@ -150,7 +151,6 @@ def _zeros(model: Model, shape: int | tuple[int, ...], dtype: type) -> wp.array:
 def allocate_blocks(model: Model) -> Blocks:
     """No block holds matter yet."""
     n, count = model.num_envs, model.num_blocks
-    several = model.contact.num_fields > 1 and model.scatter not in ("plain", "shared")
     return group(
         Blocks,
         fields=_zeros(model, (n, count), int),
@@ -161,7 +161,7 @@ def allocate_blocks(model: Model) -> Blocks:
         num_shared=_zeros(model, n, int),
         swept=_zeros(model, n, int),
         frozen=_zeros(model, n, int),
-        beside=_zeros(model, (n, model.max_slots) if several else (1, 1), int),
+        beside=_zeros(model, (n, model.max_slots) if senses_in_gather(model) else (1, 1), int),
         around=_zeros(model, (n, model.num_particles) if wp.get_device(model.device).is_cpu else (1, 1), wp.uint8),
     )
 

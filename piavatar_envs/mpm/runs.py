@@ -115,7 +115,7 @@ def grid_to_particles(
     """Move every particle with the grid, see :func:`piavatar_envs.mpm.gather.gather`.
 
     Unlike the gather of a CPU it has its loops unrolled, and its threads store together. If it ``senses``, it does the
-    work of :func:`piavatar_envs.mpm.sensing.sense_contact`, too, for the same particles.
+    work of :func:`piavatar_envs.mpm.sensing.sense_contact` first, for the same particles.
     """
     at = environment_of(wp.tid(), moved.x.shape[1])
     e = at[0]

@@ -17,7 +17,7 @@ from piavatar_envs.mpm.stencil import (
 )
 from piavatar_envs.mpm.stencil_records import VECTORS, line_of_records, slab_records
 from piavatar_envs.mpm.sweep import THREADS
-from piavatar_envs.mpm.types import BESIDE, Blocks, Contact, Grid, Particles, Sensors, row
+from piavatar_envs.mpm.types import BESIDE, Blocks, Contact, Grid, Model, Particles, Sensors, row
 
 # unrolled, the stencil takes so many registers that a GPU has few threads at once
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
@@ -111,11 +111,17 @@ def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Se
 
 @wp.func
 def sense_gathered(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
-    """:func:`sense_particle` of one at which the grid pass may have seen another field; nearly all leave here."""
+    """:func:`sense_particle` of one near which the grid pass has seen another field; nearly all leave here."""
     base = base_node(xg)
     r = first_record(grid, blocks, e, particles.field[p], block_index(grid, base[0], base[1], base[2]))
     if blocks.beside[e, r // BLOCK_NODES] != 0:
         sense_particle(grid, particles, blocks, sensors, e, p, xg)
+
+
+def senses_in_gather(model: Model) -> bool:
+    """Whether particles sense contact in the gather, that of large bodies on a GPU, and not in a launch of its own."""
+    senses = model.contact.num_fields > 1 and model.num_sensors > 0
+    return senses and model.scatter not in ("plain", "shared")
 
 
 @wp.kernel(launch_bounds=(THREADS, 7))

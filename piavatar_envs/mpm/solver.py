@@ -16,7 +16,7 @@ from piavatar_envs.mpm.memory import allocate_sums
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay import portions, record_relay
-from piavatar_envs.mpm.sensing import sense_contact, sense_penetration
+from piavatar_envs.mpm.sensing import sense_contact, sense_penetration, senses_in_gather
 from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
 from piavatar_envs.mpm.singles import record_singles
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep, slot_threads, slots_at_once
@@ -87,18 +87,9 @@ def _record_gather(program: Program, model: Model, state: State, scratch: Scratc
     if m.scatter == "plain":
         program.launch(grid_to_particles, s.x.shape, inputs, outputs, block_dim=runs.THREADS)
         return
-    inputs.append(int(_senses(m) and not _senses_apart(m)))
+    inputs.append(int(senses_in_gather(m)))
     outputs.append(scratch.sensors)
     program.launch(runs.grid_to_particles, s.x.size, inputs, outputs, block_dim=runs.THREADS)
-
-
-def _senses(model: Model) -> bool:
-    return model.contact.num_fields > 1 and model.num_sensors > 0
-
-
-def _senses_apart(model: Model) -> bool:
-    """Whether particles sense contact in a launch of its own: the gather of large bodies on a GPU does it, too."""
-    return model.scatter in ("plain", "shared")
 
 
 def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -120,7 +111,7 @@ def _record_contact(program: Program, model: Model, state: State, scratch: Scrat
         [sums, scratch.velocity, scratch.sensors],
         block_dim=THREADS,
     )
-    if _senses(m) and _senses_apart(m):
+    if m.num_sensors > 0 and not senses_in_gather(m):
         program.launch(
             sense_contact,
             state.x.shape,
