@@ -21,6 +21,7 @@ from piavatar_envs.mpm.contact import book_pair, impulse_between, touch_all
 from piavatar_envs.mpm.grid import meet_boundaries, physical_velocity, place_of, slab_is_near, total_velocity
 from piavatar_envs.mpm.impulses import read_change, write_change
 from piavatar_envs.mpm.normals import GROWN_TOGETHER, MASS_MIN, normal_from, records_around
+from piavatar_envs.mpm.others import has_told, note_others
 from piavatar_envs.mpm.records import read_record, write_record
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
 from piavatar_envs.mpm.sums import clear_offset, offset_at
@@ -89,17 +90,28 @@ def solve_node(
 ):
     """A node with any number of fields, those of ``mask``."""
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    present = int(0)
+    told = int(0)
     near = slab_is_near(grid, boundaries, e, block_corner(grid, block), local, GATED_SLAB)
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
-            v = total_velocity(step, split, read_record(node_velocity, e, r))
+            v = read_record(node_velocity, e, r)
+            if v[0] != 0.0:
+                present = present | (1 << f)
+            if has_told(blocks, e, r):
+                told = told | (1 << f)
+            v = total_velocity(step, split, v)
             write_record(node_velocity, e, r, v)
             write_change(sensors.node, e, r, wp.vec4(0.0))
-    touch_all(grid, contact, blocks, sums, mask, e, block, local, node_facing, node_velocity, sensors)
+    touch_all(grid, contact, blocks, sums, told, e, block, local, node_facing, node_velocity, sensors)
     settle_node(
         grid, step, boundaries, contact, blocks, sums, mask, near, e, block, local, node_velocity, sensors
     )  # fmt: skip
+    for f in range(contact.num_fields):
+        if has_field(mask, f):
+            r = first_record(grid, blocks, e, f, block) + local
+            note_others(blocks, e, r, (present & ~(1 << f)) != 0)
 
 
 @wp.func
@@ -131,12 +143,15 @@ def solve_pair(
     offset_a = offset_at(grid, sums, e, a, ra)
     offset_b = offset_at(grid, sums, e, b, rb)
     near = slab_is_near(grid, boundaries, e, corner, local, GATED_SLAB)
+    told = has_told(blocks, e, ra) and has_told(blocks, e, rb)
+    here_a = va[0] != 0.0
+    here_b = vb[0] != 0.0
     grown = vb[0] == GROWN_TOGETHER  # only to a trunk, which comes first
     va = total_velocity(step, split, va)
     vb = total_velocity(step, split, vb)
     change_a = wp.vec4()
     change_b = wp.vec4()
-    if va[0] > MASS_MIN and vb[0] > MASS_MIN:
+    if told and va[0] > MASS_MIN and vb[0] > MASS_MIN:
         n_ab = normal_from(grid, e, node, around_a, around_b, node_facing)
         J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
         if wp.length_sq(J) > 0.0:
@@ -163,6 +178,8 @@ def solve_pair(
     write_change(sensors.node, e, rb, change_b)
     clear_offset(sums, e, ra)
     clear_offset(sums, e, rb)
+    note_others(blocks, e, ra, here_b)
+    note_others(blocks, e, rb, here_a)
 
 
 @wp.kernel(launch_bounds=(THREADS, 2))

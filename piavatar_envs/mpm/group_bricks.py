@@ -25,11 +25,11 @@ CAPACITY = wp.constant(128)
 REACH = wp.constant(3)
 #: Words of the header: bits of what else is added up; whether some particles are left for another turn; the first of
 #: these; the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units;
-#: the least and the greatest lowest node of a stencil, along three axes.
+#: the least and the greatest lowest node of a stencil, along three axes, and whether any of the nodes has others.
 MORE, LEFT, FIRST = (wp.constant(n) for n in range(3))
 HEAVIEST, FASTEST, DRIVEN = (wp.constant(n) for n in range(3, 6))
 MASS_UNIT, MOMENTUM_UNIT = (wp.constant(n) for n in (6, 7))
-LOWEST, HIGHEST = (wp.constant(n) for n in (8, 12))
+LOWEST, BESIDE, HIGHEST = (wp.constant(n) for n in (8, 11, 12))
 RECORDS = wp.constant(16)
 MASSIVE = wp.constant(int(RECORDS) + int(CAPACITY))
 WITHIN = wp.constant(int(MASSIVE) + int(CAPACITY))
@@ -38,8 +38,9 @@ NODES = wp.constant(-(-(int(WITHIN) + int(CAPACITY)) // 32) * 32)
 WORDS = wp.constant(int(NODES) + int(BRICK_WORDS) * int(CAPACITY))
 #: Units of the most that a particle has.
 UNITS = wp.constant(float(2**25))
-#: What a brick has besides its place in its block, if there is matter of another field there.
-SHARED = wp.constant(1 << 30)
+#: What a brick has besides its place in its block: whether there is matter of another field there; then bits of its
+#: nodes, those that had another field.
+SHARED, OTHERS = wp.constant(1 << 30), wp.constant(256)
 
 #: The least power of two that is not below the positive number in a word.
 POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fffff) & 0x7f800000); };"
@@ -56,7 +57,7 @@ for (int c = 0; c < 3; ++c) {
 def in_group(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
     names = "CAPACITY REACH MORE LEFT FIRST HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT LOWEST HIGHEST RECORDS"
-    names += " MASSIVE WITHIN NODES BRICK_WORDS SHARED"
+    names += " BESIDE MASSIVE WITHIN NODES BRICK_WORDS SHARED OTHERS"
     values = {name: globals()[name] for name in names.split()} | {"KINEMATIC": KINEMATIC, "PLACE": PLACE}
     known = ", ".join(f"{name} = {int(value)}" for name, value in values.items())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
@@ -65,7 +66,7 @@ def in_group(cuda: str, otherwise: str = "") -> str:
 @wp.func_native(
     in_group("""
 if (threadIdx.x != 0) return;
-room[LEFT] = 0, room[FIRST] = 0x7fffffff;
+room[LEFT] = 0, room[BESIDE] = 0, room[FIRST] = 0x7fffffff;
 room[MORE] = driven ? 1 << KINEMATIC : 0;
 for (int c = 0; c < 3; ++c) room[LOWEST + c] = 0x7fffffff, room[HIGHEST + c] = -1;
 """)
@@ -194,13 +195,23 @@ def fetch_slots(grid: Grid, blocks: Blocks, num_fields: int, e: int, field: int)
 asm volatile("cp.async.wait_all;" ::: "memory");
 #endif
 const int bricks = size[0] * size[1] * size[2];
-for (int n = threadIdx.x; n < bricks; n += blockDim.x)
-    room[RECORDS + n] = 128 * room[RECORDS + n] + (room[WITHIN + n] & ~SHARED);
+for (int n = threadIdx.x; n < bricks; n += blockDim.x) {
+    const int slot = room[RECORDS + n], within = room[WITHIN + n];
+    room[RECORDS + n] = 128 * slot + (within & ~SHARED);
+    if (within & SHARED) {
+        // of half a block, two planes of 16 nodes, those of a brick: two nodes along each axis
+        const unsigned half = wp::index(blocks.others, e, 2 * slot + (within >> 5 & 1));
+        const unsigned two = half >> (within & 10) & 0x330033u, four = (two | two >> 2) & 0xf000fu;
+        const int others = (four | four >> 12) & 0xff;
+        room[WITHIN + n] = OTHERS * others;
+        if (others != 0) room[BESIDE] = 1;
+    }
+}
 """
     )
 )
-def note_records():
-    """Find the record of every brick's first node, of its momentum.
+def note_records(blocks: Blocks, e: int):
+    """Find the record of every brick's first node, of its momentum, and which of its nodes had another field.
 
     The slots are those that the same threads have fetched.
     """
@@ -210,18 +221,25 @@ def note_records():
 @wp.func_native(
     in_group(
         """
+if (room[BESIDE] == 0) return false;
+// of a brick's two nodes along an axis, those that are in the stencil: of the lower brick, and of the upper one
+int lower[3], upper[3];
+for (int c = 0; c < 3; ++c) lower[c] = base[c] & 1 ? 2 : 3, upper[c] = base[c] & 1 ? 3 : 1;
 int all = 0;
+#pragma unroll 1
 for (int n = 0; n < 8; ++n) {
     const int at = box[0] + (n & 4 ? box[1] : 0) + (n & 2 ? box[2] : 0) + (n & 1 ? BRICK_WORDS : 0);
-    all |= room[WITHIN + (at - NODES) / BRICK_WORDS];
+    const int x = n & 4 ? upper[0] : lower[0], y = n & 2 ? upper[1] : lower[1], z = n & 1 ? upper[2] : lower[2];
+    const int plane = z * ((y & 1) + 2 * (y & 2));
+    all |= room[WITHIN + (at - NODES) / BRICK_WORDS] & OTHERS * plane * ((x & 1) + 8 * (x & 2));
 }
-return (all & SHARED) != 0;
+return all != 0;
 """,
         "return false;",
     )
 )
-def is_shared(box: wp.vec3i) -> bool:
-    """Whether a block of a particle's stencil has matter of another field."""
+def has_others(box: wp.vec3i, base: wp.vec3i) -> bool:
+    """Whether any node of the stencil at ``base`` had another field, its bricks :func:`bricks_around` it."""
     ...
 
 

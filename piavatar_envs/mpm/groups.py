@@ -28,8 +28,8 @@ from piavatar_envs.mpm.group_bricks import (
     begin_turn,
     bricks_around,
     fetch_slots,
+    has_others,
     has_turn,
-    is_shared,
     note_records,
     per_unit_of,
     raise_most,
@@ -44,6 +44,7 @@ from piavatar_envs.mpm.shared_memory import (
     block_of_launch,
     clear_words,
     meet,
+    native,
     number,
     or_word,
     set_number,
@@ -69,6 +70,12 @@ from piavatar_envs.mpm.types import (
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls: a
 # warp with a few particles waits for its instructions as much as for its numbers
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+
+
+@wp.func_native(native("return (first + (int)threadIdx.x) & 0x7fffffff;", "return first;"))
+def particle_of_thread(first: int) -> int:
+    """The particle of a thread, of a group's ``first``; the mask tells the compiler that it is not negative."""
+    ...
 
 
 @wp.func
@@ -136,13 +143,13 @@ def scatter_turn(
     step: Step,
     particles: Particles,
     moving: Moving,
+    boundaries: Boundaries,
     blocks: Blocks,
     failure: wp.array(dtype=int),
     sums: Sums,
     num_fields: int,
     at: wp.vec3i,
     left: bool,
-    near: bool,
 ):
     """Scatter those of the particles that are ``left`` whose turn it is; returns whether this one is left then.
 
@@ -152,7 +159,7 @@ def scatter_turn(
     driven = step.decoupling == PAPER  # that variant needs the gradient of kinematic momentum everywhere
     ours = bool(left)
     stays = bool(False)
-    tells = bool(near)
+    tells = bool(False)
     box = wp.vec3i()
     kind = int(MOMENTUM)
     while kind <= PLACE:
@@ -170,10 +177,12 @@ def scatter_turn(
         if adds:
             add_up(kind, box, s)
         if kind == MOMENTUM:
-            note_records()  # nobody needs them before
+            note_records(blocks, e)  # nobody needs them before
         meet()
         if kind == MOMENTUM:
-            tells = tells or (num_fields > 1 and ours and is_shared(box))
+            # not before: the less a thread keeps while it waits for what particles have, the earlier it asks for it
+            near = near_boundary(grid, boundaries, e, moving.x[e, wp.min(at[1], moving.x.shape[1] - 1)])
+            tells = (ours and near) or (num_fields > 1 and ours and has_others(box, s.base))
             if ours and tells:
                 or_word(MORE, (1 << KINEMATIC) + (1 << PLACE))
         put_down(grid, sums, failure, e, kind)
@@ -207,19 +216,18 @@ def runs_to_grid(
     e = group[0]
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
     begins = particles.groups[group[1]]
-    p = begins[0] + thread_of_block()
+    p = particle_of_thread(begins[0])
     driven = step.decoupling == PAPER
     begin_group(sums, e, begins[1], driven)
     left = bool(False)
-    near = bool(False)
     if p < particles.groups[group[1] + 1][0]:
-        x = moving.x[e, p]
         left = scatters(blocks, moving, e, p, failure)
-        near = near_boundary(grid, boundaries, e, x)
     at = wp.vec3i(e, p, begins[1])
     goes_on = bool(True)
     while goes_on:
-        left = scatter_turn(grid, step, particles, moving, blocks, failure, sums, contact.num_fields, at, left, near)
+        left = scatter_turn(
+            grid, step, particles, moving, boundaries, blocks, failure, sums, contact.num_fields, at, left
+        )  # fmt: skip
         goes_on = word(LEFT) != 0
         if goes_on:
             meet()

@@ -148,6 +148,11 @@ def _zeros(model: Model, shape: int | tuple[int, ...], dtype: type) -> wp.array:
     return wp.zeros(shape, dtype=dtype, device=model.device)
 
 
+def notes_others(model: Model) -> bool:
+    """Whether it is noted where other fields are, see :mod:`piavatar_envs.mpm.others`."""
+    return model.scatter in ("runs", "runs_float") and model.contact.num_fields > 1
+
+
 def allocate_blocks(model: Model) -> Blocks:
     """No block holds matter yet."""
     n, count = model.num_envs, model.num_blocks
@@ -162,6 +167,7 @@ def allocate_blocks(model: Model) -> Blocks:
         swept=_zeros(model, n, int),
         frozen=_zeros(model, n, int),
         beside=_zeros(model, (n, model.max_slots) if senses_in_gather(model) else (1, 1), int),
+        others=_zeros(model, (n, 2 * model.max_slots) if notes_others(model) else (1, 1), int),
         around=_zeros(model, (n, model.num_particles) if wp.get_device(model.device).is_cpu else (1, 1), wp.uint8),
     )
 

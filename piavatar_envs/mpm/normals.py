@@ -17,6 +17,7 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import first_record, has_field, nodes_shared, shared_block
 from piavatar_envs.mpm.impulses import read_change, write_change
+from piavatar_envs.mpm.others import has_told
 from piavatar_envs.mpm.records import mass_of, read_record, write_record
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_index, node_in_block
 from piavatar_envs.mpm.sums import move_offset, offset_at, take_sum
@@ -67,7 +68,8 @@ def take_sums(
             t = contact.trunk[f]
             if t != f and has_field(mask, t):
                 into = first_record(grid, blocks, e, t, block) + local
-                if offset_at(grid, sums, e, f, r)[3] > 0.0 and offset_at(grid, sums, e, t, into)[3] > 0.0:
+                told = has_told(blocks, e, r) and has_told(blocks, e, into)
+                if told and offset_at(grid, sums, e, f, r)[3] > 0.0 and offset_at(grid, sums, e, t, into)[3] > 0.0:
                     write_record(node_velocity, e, into, read_record(node_velocity, e, into) + s)
                     move_offset(sums, e, r, into)
                     write_record(node_velocity, e, r, vec8(GROWN_TOGETHER, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -116,7 +118,10 @@ def face_node(
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
             m = mass_of(node_velocity, e, r)
-            write_change(node_facing, e, r, facing_of(grid, contact, sums, e, f, r, m))
+            facing = wp.vec4()
+            if has_told(blocks, e, r):
+                facing = facing_of(grid, contact, sums, e, f, r, m)
+            write_change(node_facing, e, r, facing)
 
 
 @wp.func

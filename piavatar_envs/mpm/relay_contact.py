@@ -21,28 +21,21 @@ from piavatar_envs.mpm.blocks import (
     lowest_field,
     nodes_shared,
     shared_block,
-    slots_used,
 )
 from piavatar_envs.mpm.contact import book_contact, book_pair, impulse_between
 from piavatar_envs.mpm.grid import total_velocity
 from piavatar_envs.mpm.impulses import write_change
 from piavatar_envs.mpm.normals import MASS_MIN, facing_of, normal_from, records_around
+from piavatar_envs.mpm.others import told_at_first
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
 from piavatar_envs.mpm.sums import begin_sum, counted, give_momentum, offset_at, physical_sum, sum_of, units_of
-from piavatar_envs.mpm.sweep import THREADS, Sweep, lane_of_thread, plan_sweep
+from piavatar_envs.mpm.sweep import THREADS, Sweep, lane_of_thread, lanes_with, plan_sweep
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Contact, Grid, Model, Scratch, Sensors, Step, Sums
 
 # divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
-
-
-@wp.func_native(native("return (int)__ballot_sync(0xffffffffu, here);", "return here;"))
-def lanes_with(here: bool) -> int:
-    """A bit for each thread of a warp, whether it is so ``here``; all of them come here."""
-    ...
 
 
 @wp.func
@@ -91,12 +84,7 @@ def begin_contact(blocks: Blocks, others: wp.array2d(dtype=int), sensors: Sensor
     """All have told where blocks have several fields, and nothing has been touched."""
     e, slot = wp.tid()
     slots = blocks.held.shape[1]
-    held = blocks.held[e, slot]
-    told = int(0)
-    if slot < slots_used(blocks, e):
-        mask = blocks.fields[e, held % blocks.fields.shape[1]]
-        if (mask & (mask - 1)) != 0:
-            told = -1  # the first scatter of a relay goes by blocks, and tells all nodes of these
+    told = told_at_first(blocks, e, slot)
     for half in range(2):
         others[e, place_of_bits(slots, 0, slot, half)] = 0
         others[e, place_of_bits(slots, 1, slot, half)] = told

@@ -12,8 +12,9 @@ from piavatar_envs.mpm.gather import grid_to_particles
 from piavatar_envs.mpm.grid import update_grid
 from piavatar_envs.mpm.groups import record_runs
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
-from piavatar_envs.mpm.memory import allocate_sums
+from piavatar_envs.mpm.memory import allocate_sums, notes_others
 from piavatar_envs.mpm.normals import find_facing
+from piavatar_envs.mpm.others import begin_others
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay import portions, record_relay
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration, senses_in_gather
@@ -166,6 +167,8 @@ def _record_new_marks(program: Program, model: Model, state: State, scratch: Scr
     program.launch(forget_blocks, (m.num_envs, m.max_slots), [m.grid], [blocks])
     program.launch(free_slots, m.num_envs, [state.failure], [blocks])
     program.launch(mark_particles, state.x.shape, [m.grid, m.particles, state.x], [blocks, state.failure])
+    if notes_others(m):
+        program.launch(begin_others, (m.num_envs, m.max_slots), [], [blocks])
 
 
 def record_end(program: Program, model: Model, state: State, scratch: Scratch) -> None:

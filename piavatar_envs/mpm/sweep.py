@@ -71,6 +71,18 @@ def any_lane(here: bool) -> bool:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+return (int)__ballot_sync(0xffffffffu, here);
+#else
+return here;
+#endif
+""")
+def lanes_with(here: bool) -> int:
+    """A bit for each thread of a warp, whether it is so ``here``; all of them come here."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
 return 32;
 #else
 return 1;

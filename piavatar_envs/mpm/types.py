@@ -168,6 +168,7 @@ class Blocks:
     frozen: wp.array(dtype=int)  # (num_envs,) not 0: had failed when this was last looked at, see :func:`freeze`
     # (num_envs, S) not 0: a stencil that begins in this slot's block may lie in one of another field; of large bodies
     beside: wp.array2d(dtype=int)
+    others: wp.array2d(dtype=int)  # (num_envs, 2 S) bits of nodes, see :mod:`piavatar_envs.mpm.others`; of those, too
     # (num_envs, num_particles) TELLS and BESIDE, as the scatter has found them in this substep; of a CPU
     around: wp.array2d(dtype=wp.uint8)
 
