@@ -28,6 +28,7 @@ from piavatar_envs.mpm.impulses import write_change
 from piavatar_envs.mpm.normals import MASS_MIN, facing_of, normal_from, records_around
 from piavatar_envs.mpm.others import told_at_first
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.singles import place_of_block
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
 from piavatar_envs.mpm.sums import begin_sum, counted, give_momentum, offset_at, physical_sum, sum_of, units_of
 from piavatar_envs.mpm.sweep import THREADS, Sweep, lane_of_thread, lanes_with, plan_sweep
@@ -61,18 +62,28 @@ def nodes_along(base: int, upper: bool):
 
 
 @wp.func
-def meets_others(others: wp.array2d(dtype=int), slots: int, e: int, substep: int, slot: int, base: wp.vec3i):
-    """Whether there was another field at those nodes of the stencil at ``base`` that are in a thread's block.
+def meets_others(
+    team: int, others: wp.array2d(dtype=int), slots: int, e: int, substep: int, slot: wp.vec2i, base: wp.vec3i
+):
+    """Whether there was another field at those nodes of the stencil at ``base`` that are in a thread's blocks.
 
-    That of :func:`piavatar_envs.mpm.singles.block_of_thread`, whose ``slot`` this is.
+    Those of :func:`piavatar_envs.mpm.singles.slots_of_thread`, which these are.
     """
+    meets = has_others(others, slots, e, substep, slot[0], place_of_block(team, 0), base)
+    if team == 4:
+        meets = has_others(others, slots, e, substep, slot[1], place_of_block(team, 1), base) or meets
+    return meets
+
+
+@wp.func
+def has_others(others: wp.array2d(dtype=int), slots: int, e: int, substep: int, slot: int, place: int, base: wp.vec3i):
+    """:func:`meets_others` in one ``slot``, by its :func:`piavatar_envs.mpm.singles.place_of_block`."""
     at = place_of_bits(slots, substep, slot, 0)
     lower = others[e, at]
     upper = others[e, at + 1]
-    lane = lane_of_thread()
-    x = nodes_along(base[0], (lane & 4) != 0)
-    y = nodes_along(base[1], (lane & 2) != 0)
-    z = nodes_along(base[2], (lane & 1) != 0)
+    x = nodes_along(base[0], (place & 4) != 0)
+    y = nodes_along(base[1], (place & 2) != 0)
+    z = nodes_along(base[2], (place & 1) != 0)
     plane = z * ((y & 1) | ((y & 2) << 3) | ((y & 4) << 6) | ((y & 8) << 9))
     first = plane * (x & 1) | (plane << 16) * ((x >> 1) & 1)
     second = plane * ((x >> 2) & 1) | (plane << 16) * (x >> 3)

@@ -35,7 +35,8 @@ from piavatar_envs.mpm.types import (
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: Threads of a particle. Four, eight of which add the particles of both in turn, need fewer instructions and more time.
+#: Threads of a particle here. Teams of eight and of four are known, see :mod:`piavatar_envs.mpm.team`. Four, eight of
+#: which add the particles of both in turn, need fewer instructions and more time.
 TEAM = wp.constant(8)
 #: Particles of a warp.
 SHARE = wp.constant(32 // int(TEAM))
@@ -44,25 +45,40 @@ THREADS = 128
 
 
 @wp.func
-def block_of_thread(grid: Grid, base: wp.vec3i):
-    """The one that a thread looks up, of the eight blocks that the stencil at ``base`` may lie in.
+def place_of_block(team: int, n: int):
+    """Which one of eight blocks is the ``n``-th that a thread looks up: bits for the upper along x, y and z."""
+    return (lane_of_thread() & (team - 1)) + team * n
 
-    Bits of the thread's place in its team say whether it is the upper along x, y and z; where the stencil lies in one
-    block along an axis, that is the lower. It exists also where a particle is outside the grid, and takes no part.
+
+@wp.func
+def block_of_thread(team: int, grid: Grid, base: wp.vec3i, n: int):
+    """The ``n``-th that a thread looks up, of the eight blocks that the stencil at ``base`` may lie in.
+
+    :func:`place_of_block` says which, by the thread's place in its ``team``; where the stencil lies in one block along
+    an axis, that is the lower. It exists also where a particle is outside the grid, and takes no part.
     """
-    upper = lane_of_thread()
+    upper = place_of_block(team, n)
     i = base[0] + 2 * ((upper >> 2) & 1)
     j = base[1] + (upper & 2)
     return wp.clamp(block_index(grid, i, j, base[2] + 2 * (upper & 1)), 0, grid.num_blocks - 1)
 
 
+@wp.func
+def slots_of_thread(team: int, grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i):
+    """Slots of field ``f`` in the blocks that a thread looks up: one, or two in a ``team`` of four."""
+    slots = wp.vec2i(blocks.slot[e, f * grid.num_blocks + block_of_thread(team, grid, base, 0)], 0)
+    if team == 4:
+        slots = wp.vec2i(slots[0], blocks.slot[e, f * grid.num_blocks + block_of_thread(team, grid, base, 1)])
+    return slots
+
+
 @wp.func_native(
     native(
-        "return (__ballot_sync(0xffffffffu, here) >> (threadIdx.x & 24) & 255u) != 0u;",
+        "return (__ballot_sync(0xffffffffu, here) >> (threadIdx.x & 32 - team) & (1u << team) - 1u) != 0u;",
         "return here;",
     )
 )
-def any_of_team(here: bool) -> bool:
+def any_of_team(team: int, here: bool) -> bool:
     """Whether it is so ``here`` in any thread of a particle's; all of the warp come here."""
     ...
 
@@ -72,7 +88,7 @@ def any_of_team(here: bool) -> bool:
 constexpr unsigned ALL = 0xffffffffu;
 if (!__any_sync(ALL, takes)) return;
 const int lane = threadIdx.x & 31, c = lane & 3;  // of the four numbers
-const bool is_second = lane & 4;  // of the two who add up one number, on every other line of nodes
+const bool is_second = lane & team - 1 & 4;  // of two who add up one number, on every other line of nodes
 const bool is_place = kind == {int(PLACE)}, is_fixed = sums.is_fixed != 0;
 // units are powers of two: one over them is exact, however the module divides
 auto per = [](float unit) {{ return __int_as_float(0x7f000000 - __float_as_int(unit)); }};
@@ -95,21 +111,30 @@ const int size = is_fixed ? 32 : 16;  // from a node to the next of a block [byt
 const int blocks_apart = is_place ? 1 : 2;  // the halves of records lie apart
 struct Fixed {{ enum {{ FIXED = 1 }}; }};
 struct Floating {{ enum {{ FIXED = 0 }}; }};
-const int bx = base[0] & 3, by = base[1] & 3, bz = base[2] & 3;
+int bx = base[0] & 3;
+const int by = base[1] & 3, bz = base[2] & 3;
+wp::vec_t<3, wp::float32> x = wx;
+if (team == 4) {{  // or a compiler keeps the nodes and weights of all kinds, for which there are too few registers
+    asm volatile("" : "+r"(bx));
+    asm volatile("" : "+f"(x[0]));
+    asm volatile("" : "+f"(x[1]));
+    asm volatile("" : "+f"(x[2]));
+}}
 int lower[4], upper[4];  // of the threads that have looked them up
 #pragma unroll
 for (int n = 0; n < 4; ++n) {{
-    lower[n] = blocks_apart * __shfl_sync(ALL, record, lane & 24 | n);
-    upper[n] = blocks_apart * __shfl_sync(ALL, record, lane & 24 | 4 | n);
+    lower[n] = blocks_apart * __shfl_sync(ALL, record[0], lane & 32 - team | n);
+    upper[n] = blocks_apart * __shfl_sync(ALL, team == 4 ? record[1] : record[0], lane & 32 - team | team - 1 & 4 | n);
 }}
 auto add = [&](auto sum) {{
     constexpr bool FIXED = decltype(sum)::FIXED;
 #pragma unroll
-    for (int pair = 0; pair < 5; ++pair) {{
-        if (pair == 4 && is_second) break;
-        const int first = 2 * pair, second = first < 8 ? first + 1 : first;
+    for (int first = 0; first < 9; ++first) {{
+        if (team == 8 && first % 2 != 0) continue;  // the second of the two has it
+        if (first == 8 && is_second) break;
+        const int second = first < 8 ? first + 1 : first;
         const int i = is_second ? second / 3 : first / 3, j = is_second ? second % 3 : first % 3;
-        const float w_line = is_second ? wx[second / 3] * wy[second % 3] : wx[first / 3] * wy[first % 3];
+        const float w_line = is_second ? x[second / 3] * wy[second % 3] : x[first / 3] * wy[first % 3];
         const float line = value + (float)i * along_x + (float)j * along_y;
         const bool is_upper = bx + i > 3, is_far = by + j > 3;
         const int in_block = 16 * (bx + i & 3) + 4 * (by + j & 3);
@@ -135,6 +160,7 @@ else add(Floating());
 """)
 )
 def add_to_nodes(
+    team: int,
     grid: Grid,
     sums: Sums,
     e: int,
@@ -147,12 +173,12 @@ def add_to_nodes(
     s: wp.vec4,
     A: wp.mat33,
     mass: float,
-    record: int,
+    record: wp.vec2i,
     units: wp.vec2,
 ):
     """Add a scalar and a vector to the 27 nodes of a stencil, ``s`` at the lowest node, the latter changing by ``A``.
 
-    ``record`` is the first of :func:`block_of_thread`, ``units`` are of mass and of momentum. All threads of a warp
+    ``record`` are the first of :func:`slots_of_thread`, ``units`` are of mass and of momentum. All threads of a warp
     come here.
     """
     ...
@@ -160,6 +186,7 @@ def add_to_nodes(
 
 @wp.func
 def add_single(
+    team: int,
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -170,7 +197,7 @@ def add_single(
     vk: wp.vec3,
     takes: bool,
     tells: bool,
-    record: int,
+    record: wp.vec2i,
     units: wp.vec2,
     momentum: Scattered,
 ):
@@ -183,24 +210,35 @@ def add_single(
     kind = int(KINEMATIC)
     adds = takes and (tells or step.decoupling == PAPER)  # which needs that gradient everywhere
     while any_lane(adds):
-        add_one(grid, sums, e, adds, kind, told_by(grid, particles, e, p, x, vk, kind), mass, record, units)
+        add_one(team, grid, sums, e, adds, kind, told_by(grid, particles, e, p, x, vk, kind), mass, record, units)
         kind += 1
         adds = takes and tells and kind <= PLACE
         if adds:
-            sums.told[e, record // BLOCK_NODES] = 1
+            sums.told[e, record[0] // BLOCK_NODES] = 1
+            if team == 4:
+                sums.told[e, record[1] // BLOCK_NODES] = 1
     # comes last: what a thread reads after its additions waits for them
-    add_one(grid, sums, e, takes, MOMENTUM, momentum, mass, record, units)
+    add_one(team, grid, sums, e, takes, MOMENTUM, momentum, mass, record, units)
 
 
 @wp.func
 def add_one(
-    grid: Grid, sums: Sums, e: int, takes: bool, kind: int, s: Scattered, mass: float, record: int, units: wp.vec2
+    team: int,
+    grid: Grid,
+    sums: Sums,
+    e: int,
+    takes: bool,
+    kind: int,
+    s: Scattered,
+    mass: float,
+    record: wp.vec2i,
+    units: wp.vec2,
 ):
     """:func:`add_to_nodes` of what a particle scatters of a ``kind``."""
     at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
     add_to_nodes(
-        grid, sums, e, takes, kind, s.base, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), at_base, s.A, mass, record,
-        units,
+        team, grid, sums, e, takes, kind, s.base, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), at_base, s.A, mass,
+        record, units,
     )  # fmt: skip
 
 
@@ -246,7 +284,7 @@ def singles_to_grid(
     p = at[1]
     takes = bool(False)
     tells = bool(False)
-    record = int(0)
+    record = wp.vec2i()
     units = wp.vec2()
     s = Scattered()
     x = wp.vec3()
@@ -258,8 +296,8 @@ def singles_to_grid(
         field = particles.field[p]
         moves = moves_finitely(moving, e, p)
         here = takes_part(blocks, e, failure)
-        block = block_of_thread(grid, base_node(grid_position(grid, x)))
-        record = BLOCK_NODES * blocks.slot[e, field * grid.num_blocks + block]
+        block = block_of_thread(TEAM, grid, base_node(grid_position(grid, x)), 0)
+        record[0] = BLOCK_NODES * blocks.slot[e, field * grid.num_blocks + block]
         units[0] = sums.mass_unit[row(e, sums.mass_unit.shape[0]), field]
         units[1] = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
         if contact.num_fields > 1:
@@ -267,11 +305,11 @@ def singles_to_grid(
         s = scattered(grid, step, particles, moving, e, p, MOMENTUM)
         tells = tells or near_boundary(grid, boundaries, e, x)
         takes = admitted(here, moves, e, failure)
-    tells = any_of_team(tells)
+    tells = any_of_team(TEAM, tells)
     driven = tells or step.decoupling == PAPER
     takes = fits(grid, particles, e, p, x, vk, takes, driven, s, units[1], failure)
     add_single(
-        grid, step, particles, sums, e, wp.min(p, moving.x.shape[1] - 1), x, vk, takes, tells, record, units, s
+        TEAM, grid, step, particles, sums, e, wp.min(p, moving.x.shape[1] - 1), x, vk, takes, tells, record, units, s
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The gather of a particle's eight threads: they share the nodes of its stencil, and make velocities out of their sums.
+"""The gather of a particle's threads: they share the nodes of its stencil, and make velocities out of their sums.
 
 There is no grid pass before it, so what boundaries do at nodes is found here, too, by all who gather from them.
 """
@@ -14,13 +14,12 @@ from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.records import half_of
 from piavatar_envs.mpm.stencil import Stencil, node_position
 from piavatar_envs.mpm.sums import begin_sum, counted, numbers_at, physical_sum
-from piavatar_envs.mpm.sweep import any_lane, lane_of_thread
+from piavatar_envs.mpm.sweep import LANES, any_lane, lane_of_thread
 from piavatar_envs.mpm.team import (
     node_of_thread,
     record_in_team,
     sum_of_team,
     vector_sum_of_team,
-    vector_sum_of_warp,
     weight_at,
 )
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Boundaries, Contact, Grid, Sensors, Step, Sums, vec4l
@@ -65,9 +64,9 @@ def add_free(g: Gradients, stencil: Stencil, n: wp.vec3i, u: wp.vec4):
 
 
 @wp.func
-def total_of_team(own: Gradients):
+def total_of_team(team: int, own: Gradients):
     """Sums over the threads of a particle."""
-    total = sum_of_team(wp.matrix_from_rows(own.mean, own.along_x, own.along_y, own.along_z))
+    total = sum_of_team(team, wp.matrix_from_rows(own.mean, own.along_x, own.along_y, own.along_z))
     return Gradients(total[0], total[1], total[2], total[3])
 
 
@@ -107,6 +106,7 @@ def add_push(
 
 @wp.func
 def tell_sensors(
+    team: int,
     several: bool,
     contact: Contact,
     sensors: Sensors,
@@ -129,15 +129,12 @@ def tell_sensors(
     # the sum of x_i x dv_i over the nodes, by the sums of dv_i and of dv_i times their places along each axis
     own = wp.vec3(along_y[2] - along_z[1], along_z[0] - along_x[2], along_x[1] - along_y[0])
     moment = wp.cross(corner, J) + (m * dx) * own
-    speaker = lane_of_thread()
+    threads = LANES
     if several:
-        moment = vector_sum_of_team(moment)
-        J = vector_sum_of_team(J)
-        speaker = speaker & 7
-    else:
-        moment = vector_sum_of_warp(moment)
-        J = vector_sum_of_warp(J)
-    if speaker == 0 and wp.length_sq(J) > 0.0:
+        threads = team
+    moment = vector_sum_of_team(threads, moment)
+    J = vector_sum_of_team(threads, J)
+    if (lane_of_thread() & (threads - 1)) == 0 and wp.length_sq(J) > 0.0:
         add_impulse(sensors, e, boundary_entry(sensors, contact.subject[f]), J)
         add_impulse(sensors, e, moment_entry(sensors, contact.subject[f]), moment)
 
@@ -148,8 +145,97 @@ def added(a: Gradients, b: Gradients):
     return Gradients(a.mean + b.mean, a.along_x + b.along_x, a.along_y + b.along_y, a.along_z + b.along_z)
 
 
+@wp.struct
+class Few:
+    """Four of a thread's nodes: their places in the stencil, records, sums, and :func:`velocity_of` these."""
+
+    n0: wp.vec3i
+    n1: wp.vec3i
+    n2: wp.vec3i
+    n3: wp.vec3i
+    r0: int
+    r1: int
+    r2: int
+    r3: int
+    s0: vec4l
+    s1: vec4l
+    s2: vec4l
+    s3: vec4l
+    u0: wp.vec4
+    u1: wp.vec4
+    u2: wp.vec4
+    u3: wp.vec4
+
+
+@wp.func
+def ask_few(team: int, sums: Sums, e: int, stencil: Stencil, record: wp.vec2i, first: int):
+    """A thread's nodes from its ``first`` on, four of them; all threads of a warp come here."""
+    few = Few()
+    few.n0 = node_of_thread(team, first)
+    few.n1 = node_of_thread(team, first + 1)
+    few.n2 = node_of_thread(team, first + 2)
+    few.n3 = node_of_thread(team, first + 3)
+    few.r0 = record_in_team(team, stencil.base, few.n0, record)
+    few.r1 = record_in_team(team, stencil.base, few.n1, record)
+    few.r2 = record_in_team(team, stencil.base, few.n2, record)
+    few.r3 = record_in_team(team, stencil.base, few.n3, record)
+    few.r2 = wp.where(few.n2[0] < 0, few.r1, few.r2)  # who has fewer reads one of them twice
+    few.r3 = wp.where(few.n3[0] < 0, few.r2, few.r3)
+    few.s0 = begin_sum(sums, e, few.r0)  # all are asked for before the first has answered
+    few.s1 = begin_sum(sums, e, few.r1)
+    few.s2 = begin_sum(sums, e, few.r2)
+    few.s3 = begin_sum(sums, e, few.r3)
+    return few
+
+
+@wp.func
+def add_few(g: Gradients, step: Step, units: wp.vec2, stencil: Stencil, few: Few):
+    """:func:`add_free` of them, when they have answered; also, they with their velocities."""
+    few.u0 = velocity_of(step, units, few.s0)
+    few.u1 = velocity_of(step, units, few.s1)
+    few.u2 = velocity_of(step, units, few.s2)
+    few.u3 = velocity_of(step, units, few.s3)
+    g = add_free(g, stencil, few.n0, few.u0)
+    g = add_free(g, stencil, few.n1, few.u1)
+    g = add_free(g, stencil, few.n2, few.u2)
+    return add_free(g, stencil, few.n3, few.u3), few
+
+
+@wp.func
+def push_two(
+    grid: Grid,
+    step: Step,
+    boundaries: Boundaries,
+    sums: Sums,
+    e: int,
+    units: wp.vec2,
+    stencil: Stencil,
+    f: int,
+    na: wp.vec3i,
+    nb: wp.vec3i,
+    ra: int,
+    rb: int,
+    ua: wp.vec4,
+    ub: wp.vec4,
+    g: Gradients,
+    seen: wp.vec3,
+):
+    """:func:`add_push` of two nodes.
+
+    A GPU has too few registers for what more were told, and few particles come here.
+    """
+    ka = numbers_at(sums.fixed, e, half_of(ra, 1))
+    oa = numbers_at(sums.offset_fixed, e, ra)
+    kb = numbers_at(sums.fixed, e, half_of(rb, 1))
+    ob = numbers_at(sums.offset_fixed, e, rb)
+    g, seen = add_push(grid, step, boundaries, e, units, stencil, f, na, ua, ka, oa, g, seen)
+    g, seen = add_push(grid, step, boundaries, e, units, stencil, f, nb, ub, kb, ob, g, seen)
+    return g, seen
+
+
 @wp.func
 def gather_by_team(
+    team: int,
     several: bool,
     grid: Grid,
     step: Step,
@@ -160,58 +246,56 @@ def gather_by_team(
     f: int,
     units: wp.vec2,
     stencil: Stencil,
-    record: int,
+    record: wp.vec2i,
     distance: float,
     m: float,
     sensors: Sensors,
 ):
     """Sums of a stencil's physical velocities, and the mean kinematic one where a boundary is near.
 
-    ``record`` is as for :func:`piavatar_envs.mpm.team.record_in_team`, ``distance`` [grid spacings] how far the
+    ``record`` are as for :func:`piavatar_envs.mpm.team.record_in_team`, ``distance`` [grid spacings] how far the
     particle is from any boundary, ``m`` its mass, 0 if it takes no part, ``f`` its field, the first unless there are
     ``several``. All threads of a warp come here.
     """
-    n0 = node_of_thread(0)
-    n1 = node_of_thread(1)
-    n2 = node_of_thread(2)
-    n3 = node_of_thread(3)
-    r0 = record_in_team(stencil.base, n0, record)
-    r1 = record_in_team(stencil.base, n1, record)
-    r2 = record_in_team(stencil.base, n2, record)
-    r3 = record_in_team(stencil.base, n3, record)
-    r3 = wp.where(n3[0] < 0, r2, r3)  # who has three reads one of them twice
-    s0 = begin_sum(sums, e, r0)  # all are asked for before the first has answered
-    s1 = begin_sum(sums, e, r1)
-    s2 = begin_sum(sums, e, r2)
-    s3 = begin_sum(sums, e, r3)
-    u0 = velocity_of(step, units, s0)
-    u1 = velocity_of(step, units, s1)
-    u2 = velocity_of(step, units, s2)
-    u3 = velocity_of(step, units, s3)
-    physical = add_free(Gradients(), stencil, n0, u0)
-    physical = add_free(physical, stencil, n1, u1)
-    physical = add_free(physical, stencil, n2, u2)
-    physical = add_free(physical, stencil, n3, u3)
+    few = ask_few(team, sums, e, stencil, record, 0)
+    more = Few()
+    if team == 4:
+        more = ask_few(team, sums, e, stencil, record, 4)
+    physical, few = add_few(Gradients(), step, units, stencil, few)
+    if team == 4:
+        physical, more = add_few(physical, step, units, stencil, more)
     kinematic = Gradients()
     if any_lane(distance < GATED_STENCIL):
         g = Gradients()
         seen = wp.vec3()
-        # two at a time: a GPU has too few registers for what all of them were told, and few particles come here
-        k0 = numbers_at(sums.fixed, e, half_of(r0, 1))
-        o0 = numbers_at(sums.offset_fixed, e, r0)
-        k1 = numbers_at(sums.fixed, e, half_of(r1, 1))
-        o1 = numbers_at(sums.offset_fixed, e, r1)
-        g, seen = add_push(grid, step, boundaries, e, units, stencil, f, n0, u0, k0, o0, g, seen)
-        g, seen = add_push(grid, step, boundaries, e, units, stencil, f, n1, u1, k1, o1, g, seen)
-        k2 = numbers_at(sums.fixed, e, half_of(r2, 1))
-        o2 = numbers_at(sums.offset_fixed, e, r2)
-        k3 = numbers_at(sums.fixed, e, half_of(r3, 1))
-        o3 = numbers_at(sums.offset_fixed, e, r3)
-        g, seen = add_push(grid, step, boundaries, e, units, stencil, f, n2, u2, k2, o2, g, seen)
-        g, seen = add_push(grid, step, boundaries, e, units, stencil, f, n3, u3, k3, o3, g, seen)
-        seen = vector_sum_of_team(seen)
+        if team == 4:
+            pairs = 16 // team  # not a constant, and sums are asked for again: code and registers would be too many
+            for pair in range(pairs):
+                na = node_of_thread(team, 2 * pair)
+                nb = node_of_thread(team, 2 * pair + 1)
+                ra = record_in_team(team, stencil.base, na, record)
+                rb = record_in_team(team, stencil.base, nb, record)
+                ra = wp.where(na[0] < 0, 0, ra)  # any that exists
+                rb = wp.where(nb[0] < 0, ra, rb)
+                sa = begin_sum(sums, e, ra)
+                sb = begin_sum(sums, e, rb)
+                ua = velocity_of(step, units, sa)
+                ub = velocity_of(step, units, sb)
+                g, seen = push_two(
+                    grid, step, boundaries, sums, e, units, stencil, f, na, nb, ra, rb, ua, ub, g, seen
+                )  # fmt: skip
+        else:
+            g, seen = push_two(
+                grid, step, boundaries, sums, e, units, stencil, f, few.n0, few.n1, few.r0, few.r1, few.u0, few.u1, g,
+                seen,
+            )  # fmt: skip
+            g, seen = push_two(
+                grid, step, boundaries, sums, e, units, stencil, f, few.n2, few.n3, few.r2, few.r3, few.u2, few.u3, g,
+                seen,
+            )  # fmt: skip
+        seen = vector_sum_of_team(team, seen)
         kinematic.mean = wp.vec4(0.0, seen[0], seen[1], seen[2])
         corner = node_position(grid, stencil.base[0], stencil.base[1], stencil.base[2])
-        tell_sensors(several, contact, sensors, e, f, m, corner, grid.dx, g)
+        tell_sensors(team, several, contact, sensors, e, f, m, corner, grid.dx, g)
         physical = added(physical, g)
-    return total_of_team(physical), kinematic
+    return total_of_team(team, physical), kinematic

@@ -57,7 +57,7 @@ _PTX = (
         r"*(wp::int32*)((char*)gpu::room + \1) = *(const wp::int32*)(\2);",
     ),
     (r'asm volatile\("cp\.async\.wait_all;" ::: "memory"\);', ""),
-    (r'asm volatile\("" : "\+r"\(t\)\);', ""),
+    (r'asm volatile\("" : "\+[rf]"\(.*?\)\);', ""),
     (r'asm volatile\("prefetch\.global\.L2 \[%0\];" :: "l"\(line\)\);', ";"),
 )
 

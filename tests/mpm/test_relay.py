@@ -247,10 +247,23 @@ def test_few_substeps_of_several_fields(clash, num_substeps):
 def ask_around(others: wp.array2d(dtype=int), base: wp.array(dtype=wp.vec3i), found: wp.array(dtype=bool)):
     """A particle of eight threads, each with the slot of its own number, in the second substep."""
     i = wp.tid()
-    found[i] = meets_others(others, 8, 0, 1, i % 8, base[i // 8])
+    found[i] = meets_others(8, others, 8, 0, 1, wp.vec2i(i % 8, 0), base[i // 8])
 
 
-def test_who_has_others_at_its_nodes(device):
+@wp.kernel
+def four_ask_around(others: wp.array2d(dtype=int), base: wp.array(dtype=wp.vec3i), found: wp.array(dtype=bool)):
+    """The same of four threads, each with two slots, the lower and the upper along x."""
+    i = wp.tid()
+    at = base[i // 4]
+    lower = i % 4
+    upper = lower + 4
+    if (at[0] & 3) < 2:
+        upper = lower  # where the stencil lies in one block along an axis, that is the lower
+    found[i] = meets_others(4, others, 8, 0, 1, wp.vec2i(lower, upper), at)
+
+
+@pytest.mark.parametrize(("kernel", "team"), [(ask_around, 8), (four_ask_around, 4)])
+def test_who_has_others_at_its_nodes(device, kernel, team):
     """By the bits of every node of the blocks around: all places of a stencil, one node at a time and several."""
     if device == "cpu":
         pytest.skip("relays are a GPU's")
@@ -267,13 +280,13 @@ def test_who_has_others_at_its_nodes(device):
         assert 0 < sum(expected) < len(base)
         # the slots of a stencil that lies in one block along an axis are those of the lower
         lower = base % 4 < 2
-        found = wp.zeros(8 * len(base), dtype=bool, device=device)
+        found = wp.zeros(team * len(base), dtype=bool, device=device)
         others = wp.array(bits.reshape(1, -1).view(np.int32), dtype=int, device=device)
         at = wp.array(base.astype(np.int32), dtype=wp.vec3i, device=device)
-        wp.launch(ask_around, 8 * len(base), [others, at], [found], device=device, block_dim=128)
-        by_thread = found.numpy().reshape(-1, 8)
+        wp.launch(kernel, team * len(base), [others, at], [found], device=device, block_dim=128)
+        by_thread = found.numpy().reshape(-1, team)
         for axis, bit in enumerate((4, 2, 1)):
-            upper = (np.arange(8) & bit) != 0
+            upper = (np.arange(team) & bit) != 0
             by_thread &= ~(lower[:, axis, None] & upper)
         np.testing.assert_array_equal(by_thread.any(1), expected)
 
