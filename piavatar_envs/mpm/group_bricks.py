@@ -65,6 +65,21 @@ def in_group(cuda: str, otherwise: str = "") -> str:
 
 @wp.func_native(
     in_group("""
+int4* const nodes = reinterpret_cast<int4*>(room + NODES);
+if (blockDim.x == 128) {  // the usual case without a loop
+#pragma unroll
+    for (int n = 0; n < BRICK_WORDS * CAPACITY / 512; ++n) nodes[threadIdx.x + 128 * n] = make_int4(0, 0, 0, 0);
+} else
+    for (int n = threadIdx.x; n < BRICK_WORDS * CAPACITY / 4; n += blockDim.x) nodes[n] = make_int4(0, 0, 0, 0);
+""")
+)
+def clear_nodes():
+    """Nothing has been added to any node."""
+    ...
+
+
+@wp.func_native(
+    in_group("""
 if (threadIdx.x != 0) return;
 room[LEFT] = 0, room[BESIDE] = 0, room[FIRST] = 0x7fffffff;
 room[MORE] = driven ? 1 << KINEMATIC : 0;
@@ -95,15 +110,18 @@ def raise_most(takes: bool, kind: int, scalar: float, momentum: float):
 
 @wp.func_native(
     in_group("""
+int low[3], high[3];
 for (int c = 0; c < 3; ++c) {
-    int low = takes ? base[c] : 0x7fffffff, high = takes ? base[c] : -1;
-    bool tells = takes;
+    low[c] = takes ? base[c] : 0x7fffffff, high[c] = takes ? base[c] : -1;
 #if __CUDA_ARCH__ >= 800
-    low = __reduce_min_sync(ALL, low), high = __reduce_max_sync(ALL, high);
-    tells = (threadIdx.x & 31) == 0;
+    low[c] = __reduce_min_sync(ALL, low[c]), high[c] = __reduce_max_sync(ALL, high[c]);
 #endif
-    if (tells) atomicMin(room + LOWEST + c, low), atomicMax(room + HIGHEST + c, high);
 }
+#if __CUDA_ARCH__ >= 800
+takes = (threadIdx.x & 31) == 0;
+#endif
+if (!takes) return;
+for (int c = 0; c < 3; ++c) atomicMin(room + LOWEST + c, low[c]), atomicMax(room + HIGHEST + c, high[c]);
 """)
 )
 def widen_box(takes: bool, base: wp.vec3i):

@@ -20,7 +20,9 @@ wp.set_module_options({"enable_backward": False})
 @wp.func_native(
     in_group(f"""
 {POWER}{SIZE}
-const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, warps = blockDim.x >> 5, c = lane & 3;  // of four sums
+const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, c = lane & 3;  // of four sums
+int warps = blockDim.x >> 5;
+asm volatile("" : "+r"(warps));  // or a compiler finds it anew for each brick
 const int bricks = size[0] * size[1] * size[2];
 const bool is_place = kind == PLACE, of_mass = c == 0 || is_place;
 const int word = kind == 0 ? c : c + 3 & 3;  // a vector begins where the mass was, if there is none
@@ -30,16 +32,23 @@ const unsigned mass_of_node = 1u << (lane & 28);
 float unit = power_of_two(room[of_mass ? HEAVIEST : kind == KINEMATIC ? DRIVEN : FASTEST]);
 unit *= is_place && c > 0 ? 0x1p-24f : 0x1p-25f;
 const int shift = __float_as_int(unit) - room[of_mass ? MASS_UNIT : MOMENTUM_UNIT] >> 23;
-auto put = [&](auto add) {{
+// a loop for what comes first and one for the rest: threads that branch in it would wait for each other
+struct First {{ enum {{ IS = 1 }}; }};
+struct Later {{ enum {{ IS = 0 }}; }};
+auto put_bricks = [&](auto which, auto add) {{
     int* from = room + NODES + BRICK_WORDS * warp + lane;
+#pragma unroll 1
     for (int n = RECORDS + warp; n < RECORDS + bricks; n += warps, from += BRICK_WORDS * warps) {{
         const int sum = *from, record = room[n] + within;
         *from = 0;
-        unsigned massive = __ballot_sync(ALL, sum != 0);
-        if (kind != 0) massive = room[n - RECORDS + MASSIVE];
-        else if (lane == 0) room[n - RECORDS + MASSIVE] = massive;
+        int& massive = room[n - RECORDS + MASSIVE];
+        if (decltype(which)::IS) massive = __ballot_sync(ALL, sum != 0);  // written by all threads, the same
         if (sum != 0 && (massive & mass_of_node)) add(record, sum);  // who adds no mass adds nothing
     }}
+}};
+auto put = [&](auto add) {{
+    if (kind == 0) put_bricks(First(), add);
+    else put_bricks(Later(), add);
 }};
 // memory takes the four numbers of a node at a time
 auto red = [](size_t to, int record, long long added) {{

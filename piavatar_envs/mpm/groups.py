@@ -13,8 +13,6 @@ from typing import Any
 import warp as wp
 
 from piavatar_envs.mpm.group_bricks import (
-    BRICK_WORDS,
-    CAPACITY,
     DRIVEN,
     FASTEST,
     HEAVIEST,
@@ -22,11 +20,11 @@ from piavatar_envs.mpm.group_bricks import (
     MASS_UNIT,
     MOMENTUM_UNIT,
     MORE,
-    NODES,
     UNITS,
     WORDS,
     begin_turn,
     bricks_around,
+    clear_nodes,
     fetch_slots,
     has_others,
     has_turn,
@@ -42,7 +40,6 @@ from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattere
 from piavatar_envs.mpm.shared_add import add_to_box
 from piavatar_envs.mpm.shared_memory import (
     block_of_launch,
-    clear_words,
     meet,
     native,
     number,
@@ -90,7 +87,7 @@ def begin_group(sums: Sums, e: int, field: int, driven: bool):
         set_number(FASTEST, UNITS * momentum)
         set_number(DRIVEN, UNITS * momentum)
     begin_turn(driven)
-    clear_words(NODES, BRICK_WORDS * CAPACITY)
+    clear_nodes()
 
 
 @wp.func
