@@ -7,12 +7,12 @@ import warp as wp
 from piavatar_envs.mpm.blocks import fields_at_corner, held_by, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, GATED_SLAB, NEAR_BLOCK, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
-from piavatar_envs.mpm.normals import MASS_MIN, face_shared
+from piavatar_envs.mpm.normals import MASS_MIN
 from piavatar_envs.mpm.records import write_physical, write_record
 from piavatar_envs.mpm.shared_memory import meet_warp
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, units_of
-from piavatar_envs.mpm.sweep import THREADS, Sweep, any_lane, lane_of_thread, lanes_of_warp, nodes_of_lane
+from piavatar_envs.mpm.sweep import THREADS, any_lane, lane_of_thread, lanes_of_warp, nodes_of_lane
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import (
     NO_STRESS,
@@ -208,7 +208,6 @@ def update_grid(
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
-    of_shared: Sweep,
     slots: int,
     failure: wp.array(dtype=int),
     # in and out: sums are read, then cleared
@@ -216,26 +215,20 @@ def update_grid(
     sums: Sums,
     # out
     node_velocity: wp.array2d(dtype=wp.vec4),
-    node_facing: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """Velocity of every node with mass in blocks of one field; a warp has every ``slots``-th, on a CPU a thread.
 
-    Contact acts on the total velocity ``v = u + vk``; the rest is physical. Where there are several fields, the first
-    threads prepare contact, see :func:`piavatar_envs.mpm.normals.face_shared`: they are few, and have the longest to
-    wait.
+    Contact acts on the total velocity ``v = u + vk``; the rest is physical. Blocks with several fields are seen to by
+    :mod:`piavatar_envs.mpm.contact_pass`, maybe at the same time.
 
     Nodes have offsets and, but for the paper's variant, kinematic momentum only from particles that tell their place,
     see :func:`piavatar_envs.mpm.transfer.tells_place`, and who scatters those notes in which slots. Matter within the
     gate of a boundary is of such particles only, so elsewhere nobody asks for boundaries.
     """
-    at = environment_of(wp.tid(), of_shared.threads + slots * lanes_of_warp())
+    at = environment_of(wp.tid(), slots * lanes_of_warp())
     e = at[0]
-    place = at[1]
-    if place < of_shared.threads:
-        face_shared(grid, contact, of_shared, blocks, sums, e, place, node_velocity, node_facing)
-        return
-    slot = (place - of_shared.threads) // lanes_of_warp()
+    slot = at[1] // lanes_of_warp()
     used = slots_used(blocks, e)
     goes_on = bool(True)
     while goes_on:
@@ -245,7 +238,7 @@ def update_grid(
         n = blocks.held[e, slot]
         told = sums.told[e, slot] != 0
         meet_warp()  # all is asked for before the first has answered, and read before it is written
-        if place == of_shared.threads:
+        if at[1] == 0 and slot == 0:
             blocks.swept[e] = used
             blocks.frozen[e] = failure[e]  # the scatter has ended
         if slot < used:
@@ -256,9 +249,10 @@ def update_grid(
             if contact.num_fields > 1:
                 held = held_by(grid, n)
                 alone = blocks.fields[e, held[1]] == (1 << held[0])
-                sensors.touched[e, slot] = 0
                 note_beside(grid, blocks, e, slot, held)
             if alone:
+                if contact.num_fields > 1:
+                    sensors.touched[e, slot] = 0
                 update_block(
                     grid, step, boundaries, contact, sums, begun, begun_next, e, slot, held, told, node_velocity,
                     sensors,

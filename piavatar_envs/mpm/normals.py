@@ -22,7 +22,8 @@ from piavatar_envs.mpm.records import mass_of, read_record, write_record
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_index, node_in_block
 from piavatar_envs.mpm.sums import move_offset, offset_at, take_sum
 from piavatar_envs.mpm.sweep import THREADS, Sweep
-from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums, row, vec8, vec8i
+from piavatar_envs.mpm.threads import environment_of
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums, row, vec8, vec8i
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
@@ -112,8 +113,9 @@ def face_node(
     node_velocity: wp.array2d(dtype=wp.vec4),
     # out
     node_facing: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
 ):
-    """What a node says of every field: its weighted outward gradient, and its volume [cells]."""
+    """What a node says of every field: its weighted outward gradient, and its volume [cells]; nothing has touched."""
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
@@ -122,36 +124,8 @@ def face_node(
             if has_told(blocks, e, r):
                 facing = facing_of(grid, contact, sums, e, f, r, m)
             write_change(node_facing, e, r, facing)
-
-
-@wp.func
-def face_shared(
-    grid: Grid,
-    contact: Contact,
-    sweep: Sweep,
-    blocks: Blocks,
-    sums: Sums,
-    e: int,
-    thread: int,
-    # out
-    node_velocity: wp.array2d(dtype=wp.vec4),
-    node_facing: wp.array2d(dtype=wp.vec4),
-):
-    """What every node of a block with several fields says about the normals around it, for the nodes of a thread.
-
-    Gradients and volumes of its fields, from which a pair makes its own summand: a third body has no say in it. Limbs
-    grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
-    """
-    end = nodes_shared(blocks, e)
-    for turn in range(sweep.turns):
-        first = thread * sweep.share + turn * sweep.stride
-        block = shared_block(blocks, e, first)
-        if first >= end:
-            break
-        mask = blocks.fields[e, block]
-        for n in range(first, first + sweep.share):
-            take_sums(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity)
-            face_node(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity, node_facing)
+            if local == 0:
+                sensors.touched[e, r // BLOCK_NODES] = 0
 
 
 @wp.kernel(launch_bounds=(THREADS, 6))
@@ -165,10 +139,25 @@ def find_facing(
     # out
     node_velocity: wp.array2d(dtype=wp.vec4),
     node_facing: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
 ):
-    """:func:`face_shared` alone, where no grid pass is launched that could do it as well."""
-    e, thread = wp.tid()
-    face_shared(grid, contact, sweep, blocks, sums, e, thread, node_velocity, node_facing)
+    """What every node of a block with several fields says about the normals around it.
+
+    Gradients and volumes of its fields, from which a pair makes its own summand: a third body has no say in it. Limbs
+    grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
+    """
+    at = environment_of(wp.tid(), sweep.threads)
+    e = at[0]
+    end = nodes_shared(blocks, e)
+    for turn in range(sweep.turns):
+        first = at[1] * sweep.share + turn * sweep.stride
+        block = shared_block(blocks, e, first)
+        if first >= end:
+            break
+        mask = blocks.fields[e, block]
+        for n in range(first, first + sweep.share):
+            take_sums(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity)
+            face_node(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity, node_facing, sensors)
 
 
 @wp.func

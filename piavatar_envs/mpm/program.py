@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Any
 
 import warp as wp
@@ -28,6 +29,8 @@ class Launch:
     inputs: list[Any]
     outputs: list[Any]
     block_dim: int
+    fork: int = 0  # of the program's forks, from 1 on; 0 if it is in none
+    urgent: bool = False  # in which of a fork's two branches it is
 
     def recorded(self, device: wp.Device) -> Callable[[], None]:
         """What makes the launch; the kernel is compiled if it is not."""
@@ -41,7 +44,7 @@ class Program:
     Arrays are bound when a launch is recorded: write new values into them, never replace them.
     """
 
-    def __init__(self, device: str, condition: wp.array | None = None) -> None:
+    def __init__(self, device: str | wp.Device, condition: wp.array | None = None) -> None:
         """Begin without launches.
 
         Args:
@@ -77,6 +80,27 @@ class Program:
         if self._graph is not None:
             raise RuntimeError(f"cannot append {kernel.key} to a program that has run; build a new one")
         self._launches.append(Launch(kernel, dim, list(inputs), list(outputs), block_dim))
+
+    def fork(self, urgent: Program, beside: Program) -> None:
+        """Append what two programs launch, beside each other; what is appended later waits for both.
+
+        Where a GPU has no room for all of their threads, it takes those of ``urgent`` first. A CPU runs that program,
+        then the other.
+
+        Raises:
+            RuntimeError: the program has already run.
+            ValueError: one of the two has a fork or a condition.
+        """
+        if self._graph is not None:
+            raise RuntimeError("cannot append a fork to a program that has run; build a new one")
+        branches = (urgent, beside)
+        if any(each._condition is not None or any(launch.fork for launch in each._launches) for each in branches):
+            raise ValueError("a branch of a fork has a fork or a condition; append that to the program itself")
+        number = 1 + max(launch.fork for launch in self._launches) if self._launches else 1
+        if not (urgent and beside):
+            number = 0  # of an empty one there is nothing to wait for
+        for branch in branches:
+            self._launches += [replace(each, fork=number, urgent=branch is urgent) for each in branch._launches]
 
     def __len__(self) -> int:
         return len(self._launches)
@@ -151,13 +175,33 @@ class Program:
         """Launch one after the other, if the condition holds; into a graph, if one is being captured."""
 
         def launch_all() -> None:
-            for launch in self._recorded:
-                launch()
+            each = zip(self._launches, self._recorded, strict=True)
+            for fork, launches in groupby(each, key=lambda pair: pair[0].fork):
+                if fork == 0:
+                    for _, launch in launches:
+                        launch()
+                else:
+                    self._launch_fork(list(launches))
 
         if self._condition is None or not _can_branch(self._condition.device):
             launch_all()
         else:
             wp.capture_if(self._condition, launch_all)
+
+    def _launch_fork(self, launches: list[tuple[Launch, Callable[[], None]]]) -> None:
+        """Launch two branches, on a GPU on streams of their own, whose priorities a graph keeps."""
+        side = wp.Stream(self.device, priority=-1) if self.device.is_cuda else None
+        if side is not None:
+            side.wait_stream(self.device.stream)
+        with wp.ScopedStream(side, sync_enter=False):
+            for what, launch in launches:
+                if what.urgent:
+                    launch()
+        for what, launch in launches:
+            if not what.urgent:
+                launch()
+        if side is not None:
+            self.device.stream.wait_stream(side)
 
 
 def compile_programs(programs: Iterable[Program]) -> None:

@@ -36,23 +36,13 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     The physical velocity, position and deformation in ``state`` advance by ``model.step.dt`` under the kinematic
     velocity ``state.vk``; contact is added to the sensors.
     """
-    m, s, blocks, sums = model, state, scratch.blocks, scratch.sums
+    m = model
     if index == 0 and m.scatter == "shared":
         program.launch(forget_speeds, scratch.room.speed.shape, [scratch.room])
     if index > 0 and index % MARKS_EVERY == 0:
         _record_new_marks(program, model, state, scratch)
     record_scatter(program, model, state, scratch)
-    if m.scatter != "shared":
-        of_shared, slots = plan_sweep(m), slots_at_once(m)
-        program.launch(
-            update_grid,
-            m.num_envs * (of_shared.threads + slots * slot_threads(m)),
-            [m.grid, m.step, m.boundaries, m.contact, of_shared, slots, s.failure],
-            [blocks, sums, scratch.velocity, scratch.facing, scratch.sensors],
-            block_dim=THREADS,
-        )
-    if m.contact.num_fields > 1:
-        _record_contact(program, model, state, scratch)
+    _record_grid(program, model, state, scratch)
     if m.contact.num_fields > 1 or m.scatter != "shared":
         _record_gather(program, model, state, scratch)
     if m.moving_boundaries:
@@ -93,18 +83,46 @@ def _record_gather(program: Program, model: Model, state: State, scratch: Scratc
     program.launch(runs.grid_to_particles, s.x.size, inputs, outputs, block_dim=runs.THREADS)
 
 
-def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
-    """Append the grid pass over the blocks with several fields, and what the contact sensors feel."""
-    m, blocks, sums = model, scratch.blocks, scratch.sums
-    sweep = plan_sweep(m)
-    if m.scatter == "shared":  # else the grid pass has done it
-        program.launch(
-            find_facing,
-            (m.num_envs, sweep.threads),
-            [m.grid, m.contact, sweep, blocks],
-            [sums, scratch.velocity, scratch.facing],
+def _record_grid(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """Append the grid pass, and what the contact sensors feel.
+
+    Blocks with several fields are few, and what contact does there mostly waits: the others go on beside it.
+    """
+    m = model
+    contact, beside = Program(program.device), Program(program.device)
+    if m.contact.num_fields > 1:
+        _record_contact(contact, model, scratch)
+    if m.scatter != "shared":  # else that pass has been made in shared memory
+        slots = slots_at_once(m)
+        beside.launch(
+            update_grid,
+            m.num_envs * slots * slot_threads(m),
+            [m.grid, m.step, m.boundaries, m.contact, slots, state.failure],
+            [scratch.blocks, scratch.sums, scratch.velocity, scratch.sensors],
             block_dim=THREADS,
         )
+    program.fork(contact, beside)
+    if m.contact.num_fields > 1 and m.num_sensors > 0 and not senses_in_gather(m):
+        program.launch(
+            sense_contact,
+            state.x.shape,
+            [m.grid, m.particles, state.x, scratch.blocks, state.failure],
+            [scratch.sensors],
+            block_dim=THREADS,
+        )
+
+
+def _record_contact(program: Program, model: Model, scratch: Scratch) -> None:
+    """Append the pass over the blocks with several fields."""
+    m, blocks, sums = model, scratch.blocks, scratch.sums
+    sweep = plan_sweep(m)
+    program.launch(
+        find_facing,
+        m.num_envs * sweep.threads,
+        [m.grid, m.contact, sweep, blocks],
+        [sums, scratch.velocity, scratch.facing, scratch.sensors],
+        block_dim=THREADS,
+    )
     program.launch(
         solve_contact,
         m.num_envs * sweep.threads,
@@ -112,14 +130,6 @@ def _record_contact(program: Program, model: Model, state: State, scratch: Scrat
         [sums, scratch.velocity, scratch.sensors],
         block_dim=THREADS,
     )
-    if m.num_sensors > 0 and not senses_in_gather(m):
-        program.launch(
-            sense_contact,
-            state.x.shape,
-            [m.grid, m.particles, state.x, blocks, state.failure],
-            [scratch.sensors],
-            block_dim=THREADS,
-        )
 
 
 def record_scatter(program: Program, model: Model, state: State, scratch: Scratch) -> None:

@@ -127,16 +127,22 @@ def gpu_on_cpu() -> Iterator[str]:
         path.write_text(on_cpu(path.read_text()))
         return compile_cpu(obj_path, cpp_path, *args, **kwargs)
 
+    def stream(device: Any, **kwargs: Any) -> Any:
+        return None if device == NAME else make_stream(device, **kwargs)  # what is launched there runs at once
+
     get_device, compile_cpu, blocks = wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks
+    make_stream = wp.Stream
     caches = wp.config.kernel_cache_dir, build._resolved_kernel_cache_dir
     build.init_kernel_cache(str(_own_cache()))
     context.runtime.device_map[NAME] = context.runtime.device_map["cpu"]
     wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks = seen_device, build_cpu, True
+    wp.Stream = stream
     context._resolve_launch_block_dim = threads_of_block
     try:
         yield NAME
     finally:
         wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks = get_device, compile_cpu, blocks
+        wp.Stream = make_stream
         context._resolve_launch_block_dim = resolve
         del context.runtime.device_map[NAME]
         wp.config.kernel_cache_dir, build._resolved_kernel_cache_dir = caches

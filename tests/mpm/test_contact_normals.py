@@ -74,10 +74,10 @@ class Look:
         record_marks(program, model, state, scratch)
         record_scatter(program, model, state, scratch)
         sweep = plan_sweep(model)
-        found = [scratch.sums, scratch.velocity, scratch.facing]
+        found = [scratch.sums, scratch.velocity, scratch.facing, scratch.sensors]
         program.launch(
             find_facing,
-            (1, sweep.threads),
+            sweep.threads,
             [model.grid, model.contact, sweep, scratch.blocks],
             found,
             block_dim=THREADS,

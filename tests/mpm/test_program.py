@@ -1,0 +1,78 @@
+"""Programs whose launches go beside each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from piavatar_envs.mpm.program import Program
+
+
+@wp.kernel
+def double(values: wp.array(dtype=int), turns: int):
+    """A long way to twice as much and one more, to be still on it when others come too early."""
+    i = wp.tid()
+    value = values[i]
+    for _ in range(turns):
+        value = value ^ 1
+    values[i] = 2 * value + 1
+
+
+@wp.kernel
+def add_up(a: wp.array(dtype=int), b: wp.array(dtype=int), total: wp.array(dtype=int)):
+    i = wp.tid()
+    total[i] += a[i] + b[i]
+
+
+class Forked:
+    """Two arrays, each doubled twice in a branch of its own, and the sum of both, twice in a row."""
+
+    def __init__(self, device: str) -> None:
+        self.a, self.b = (wp.array(np.full(64, n), dtype=int, device=device) for n in (1, 10))
+        self.total = wp.zeros(64, dtype=int, device=device)
+        self.program = Program(device)
+        for _ in range(2):
+            self.program.fork(self.branch(self.a, 100_000), self.branch(self.b, 0))
+            self.program.launch(add_up, 64, [self.a, self.b], [self.total], block_dim=32)
+
+    def branch(self, values: wp.array, turns: int) -> Program:
+        branch = Program(values.device)
+        for _ in range(2):
+            branch.launch(double, 64, [values, turns], block_dim=32)
+        return branch
+
+
+@pytest.mark.parametrize("run", ["run", "run_eager"])
+def test_what_follows_a_fork_waits_for_both_branches(device, run):
+    forked = Forked(device)
+    assert forked.program.names == 2 * (4 * ["double"] + ["add_up"])
+    getattr(forked.program, run)()
+    after = [4 * 1 + 3, 4 * 10 + 3]
+    again = [4 * n + 3 for n in after]
+    np.testing.assert_array_equal(forked.total.numpy(), np.full(64, sum(after) + sum(again)))
+
+
+def test_a_branch_without_launches_is_no_fork(device):
+    program, one, none = Program(device), Program(device), Program(device)
+    values = wp.zeros(4, dtype=int, device=device)
+    one.launch(double, 4, [values, 0], block_dim=32)
+    program.fork(none, one)
+    program.fork(one, none)
+    program.fork(none, none)
+    program.launch(double, 4, [values, 0], block_dim=32)
+    program.run()
+    np.testing.assert_array_equal(values.numpy(), [7, 7, 7, 7])
+
+
+def test_forks_are_refused(device):
+    forked = Forked(device)
+    conditional = Program(device, condition=wp.zeros(1, dtype=int, device=device))
+    for branches in ((forked.program, Program(device)), (Program(device), conditional)):
+        program = Program(device)
+        with pytest.raises(ValueError, match="a fork or a condition"):
+            program.fork(*branches)
+        assert len(program) == 0
+    forked.program.run()
+    with pytest.raises(RuntimeError, match="build a new one"):
+        forked.program.fork(Program(device), Program(device))
