@@ -23,7 +23,7 @@ wp.set_module_options({"enable_backward": False})
 #: Bricks that there is room for, enough for a box of ``REACH`` grid spacings to each side of a particle.
 CAPACITY = wp.constant(128)
 REACH = wp.constant(3)
-#: Words of the header: bits of what else is added up; whether some particles are left for another turn; the first of
+#: Words of the header: whether more than momentum is added up; whether some are left for another turn; the first of
 #: these; the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units;
 #: the least and the greatest lowest node of a stencil, along three axes, and whether any of the nodes has others.
 MORE, LEFT, FIRST = (wp.constant(n) for n in range(3))
@@ -82,7 +82,7 @@ def clear_nodes():
     in_group("""
 if (threadIdx.x != 0) return;
 room[LEFT] = 0, room[BESIDE] = 0, room[FIRST] = 0x7fffffff;
-room[MORE] = driven ? 1 << KINEMATIC : 0;
+room[MORE] = driven;
 for (int c = 0; c < 3; ++c) room[LOWEST + c] = 0x7fffffff, room[HIGHEST + c] = -1;
 """)
 )

@@ -36,8 +36,8 @@ from piavatar_envs.mpm.group_bricks import (
 from piavatar_envs.mpm.group_plan import THREADS, share_of
 from piavatar_envs.mpm.group_sums import put_down
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattered
-from piavatar_envs.mpm.shared_add import add_to_box
+from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattered, told_by
+from piavatar_envs.mpm.shared_add import add_to_box, few_add_to_box
 from piavatar_envs.mpm.shared_memory import (
     block_of_launch,
     meet,
@@ -91,47 +91,65 @@ def begin_group(sums: Sums, e: int, field: int, driven: bool):
 
 
 @wp.func
-def prepare_kind(
+def raised(s: Scattered, takes: bool, kind: int, failure: wp.array(dtype=int), e: int):
+    """Whether a particle can be added up; if so, the group's units are raised to its momenta. All threads come here."""
+    momentum = float(0.0)
+    if takes:
+        momentum = bounded(s, number(MOMENTUM_UNIT), failure, e)
+        takes = momentum >= 0.0
+    raise_most(takes, kind, s.at_base[0], momentum)
+    return takes
+
+
+@wp.func
+def add_momentum(box: wp.vec3i, s: Scattered):
+    """Add mass and momentum of a particle to the group's nodes."""
+    add_to_box(
+        box, thread_of_block(), s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_unit_of(HEAVIEST),
+        per_unit_of(FASTEST),
+    )  # fmt: skip
+
+
+@wp.func
+def add_more(kind: int, box: wp.vec3i, s: Scattered):
+    """Add how a particle is driven, or its place, to the group's nodes."""
+    per_scalar = per_unit_of(HEAVIEST)
+    per_vector = 0.5 * per_scalar  # of places, up to 1.5 masses
+    if kind != PLACE:
+        per_vector = per_unit_of(DRIVEN)
+    few_add_to_box(
+        box, thread_of_block(), s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_scalar, per_vector
+    )  # fmt: skip
+
+
+@wp.func
+def scatter_more(
     grid: Grid,
     step: Step,
     particles: Particles,
     moving: Moving,
     failure: wp.array(dtype=int),
-    e: int,
-    p: int,
-    kind: int,
-    adds: bool,
+    sums: Sums,
+    at: wp.vec3i,
+    ours: bool,
+    tells: bool,
+    box: wp.vec3i,
 ):
-    """What a particle has of a ``kind``, and whether it ``adds`` that; the group's units are raised to it.
-
-    All threads come here, and meet after they have found what they have of momentum, before which a turn has begun.
-    """
-    active = adds
-    momentum = float(0.0)
-    s = Scattered()
-    if adds:
-        s = scattered(grid, step, particles, moving, e, p, kind)
-    if kind == MOMENTUM:
-        meet()  # not before memory has been asked for what particles have
-    if kind != PLACE:  # whose numbers are no momenta, and as sound as the masses were
+    """Scatter what those of ``ours`` that tell have besides momentum; all threads come here, few groups do."""
+    e = at[0]
+    p = wp.min(at[1], moving.x.shape[1] - 1)
+    for kind in range(int(KINEMATIC), int(PLACE) + 1):
+        # the paper's variant needs the gradient of kinematic momentum everywhere
+        adds = ours and (tells or (step.decoupling == PAPER and kind == KINEMATIC))
+        s = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], kind)
+        if kind == KINEMATIC:  # those of places are no momenta, and as sound as the masses were
+            adds = raised(s, adds, kind, failure, e)
+        meet()
         if adds:
-            momentum = bounded(s, number(MOMENTUM_UNIT), failure, e)
-            active = momentum >= 0.0
-        raise_most(active, kind, s.at_base[0], momentum)
-    return s, active
-
-
-@wp.func
-def add_up(kind: int, box: wp.vec3i, s: Scattered):
-    """Add what a particle has of a ``kind`` to the group's nodes."""
-    per_scalar = per_unit_of(HEAVIEST)
-    per_vector = 0.5 * per_scalar  # of places, up to 1.5 masses
-    if kind != PLACE:
-        per_vector = per_unit_of(wp.where(kind == MOMENTUM, FASTEST, DRIVEN))
-    wx = spline(s.f[0])
-    wy = spline(s.f[1])
-    wz = spline(s.f[2])
-    add_to_box(box, thread_of_block(), s, wx, wy, wz, per_scalar, per_vector)
+            add_more(kind, box, s)
+        meet()
+        put_down(grid, sums, failure, e, kind)
+        meet()
 
 
 @wp.func
@@ -153,41 +171,30 @@ def scatter_turn(
     All threads come here.
     """
     e = at[0]
-    driven = step.decoupling == PAPER  # that variant needs the gradient of kinematic momentum everywhere
-    ours = bool(left)
-    stays = bool(False)
-    tells = bool(False)
-    box = wp.vec3i()
-    kind = int(MOMENTUM)
-    while kind <= PLACE:
-        wanted = ours and (kind == MOMENTUM or tells or (driven and kind == KINEMATIC))
-        s, adds = prepare_kind(grid, step, particles, moving, failure, e, at[1], kind, wanted)
-        if kind == MOMENTUM:
-            widen_box(adds, s.base)
-        meet()
-        if kind == MOMENTUM:
-            ours = has_turn(grid, adds, s.base)
-            stays = adds and not ours
-            adds = ours
-            box = bricks_around(s.base)
-            fetch_slots(grid, blocks, num_fields, e, at[2])
-        if adds:
-            add_up(kind, box, s)
-        if kind == MOMENTUM:
-            note_records(blocks, e)  # nobody needs them before
-        meet()
-        if kind == MOMENTUM:
-            # not before: the less a thread keeps while it waits for what particles have, the earlier it asks for it
-            near = near_boundary(grid, boundaries, e, moving.x[e, wp.min(at[1], moving.x.shape[1] - 1)])
-            tells = (ours and near) or (num_fields > 1 and ours and has_others(box, s.base))
-            if ours and tells:
-                or_word(MORE, (1 << KINEMATIC) + (1 << PLACE))
-        put_down(grid, sums, failure, e, kind)
-        kind += 1
-        meet()
-        if word(MORE) == 0:
-            kind = PLACE + 1
-    return stays
+    s = Scattered()
+    if left:
+        s = scattered(grid, step, particles, moving, e, at[1], MOMENTUM)
+    meet()  # not before memory has been asked for what particles have; a turn has begun then
+    takes = raised(s, left, MOMENTUM, failure, e)
+    widen_box(takes, s.base)
+    meet()
+    ours = has_turn(grid, takes, s.base)
+    box = bricks_around(s.base)
+    fetch_slots(grid, blocks, num_fields, e, at[2])
+    if ours:
+        add_momentum(box, s)
+    note_records(blocks, e)  # nobody needs them before
+    meet()
+    # not before: the less a thread keeps while it waits for what particles have, the earlier it asks for it
+    near = near_boundary(grid, boundaries, e, moving.x[e, wp.min(at[1], moving.x.shape[1] - 1)])
+    tells = ours and (near or (num_fields > 1 and has_others(box, s.base)))
+    if tells:
+        or_word(MORE, 1)
+    put_down(grid, sums, failure, e, MOMENTUM)
+    meet()
+    if word(MORE) != 0:
+        scatter_more(grid, step, particles, moving, failure, sums, at, ours, tells, box)
+    return takes and not ours
 
 
 # that leaves a thread 80 registers, all but a few of those that it asks for

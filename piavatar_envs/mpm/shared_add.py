@@ -114,16 +114,17 @@ def add_to_bricks(
     ...
 
 
-@wp.func_native(
-    adding(
-        unit=4,
-        before="for (int n = 0; n < 3; ++n) place_z[n] += upper_z[n] ? UNIT * BRICK : 0;",
-        plane="const int first = UNIT * (box[0] + (far ? box[1] : 0));",
-        line="const int first_of_line = first + line + UNIT * (upper ? box[2] : 0);",
-        node="first_of_line + place_z[l]",
-        unrolled=3,
-    )
-)
+#: The pieces for bricks that lie in a row.
+_IN_A_ROW = {
+    "unit": 4,
+    "before": "for (int n = 0; n < 3; ++n) place_z[n] += upper_z[n] ? UNIT * BRICK : 0;",
+    "plane": "const int first = UNIT * (box[0] + (far ? box[1] : 0));",
+    "line": "const int first_of_line = first + line + UNIT * (upper ? box[2] : 0);",
+    "node": "first_of_line + place_z[l]",
+}
+
+
+@wp.func_native(adding(**_IN_A_ROW, unrolled=3))
 def add_to_box(
     box: wp.vec3i,
     p: int,
@@ -138,6 +139,21 @@ def add_to_box(
 
     ``box`` has the word at which the first brick begins, and how far on the next ones along x and along y do.
     """
+    ...
+
+
+@wp.func_native(adding(**_IN_A_ROW, unrolled=1))
+def few_add_to_box(
+    box: wp.vec3i,
+    p: int,
+    s: Scattered,
+    wx: wp.vec3,
+    wy: wp.vec3,
+    wz: wp.vec3,
+    per_mass: float,
+    per_momentum: float,
+):
+    """:func:`add_to_box`, as short as can be, for what few particles add."""
     ...
 
 
