@@ -144,7 +144,7 @@ def project_alone(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """The paper's rule: each field loses its approach to the common velocity along its own normal."""
+    """The paper's rule: each field loses its approach to the common velocity, of a ``mask``, along its own normal."""
     m = float(0.0)
     p = wp.vec3()
     heaviest = int(0)
@@ -190,7 +190,7 @@ def touch_all(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """Contact of all fields at a node."""
+    """Contact of the fields of a ``mask`` at a node, of those that have told it where they are."""
     if contact.own_normals != 0:
         project_alone(grid, contact, blocks, sums, mask, e, block, local, node_velocity, sensors)
         return

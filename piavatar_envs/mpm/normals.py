@@ -58,8 +58,9 @@ def take_sums(
 ):
     """Move the sums of a node to where its velocities will be, and join limbs to their trunk.
 
-    They grow together where both have seam particles, those that are skinned to both. Mass, momentum *and* kinematic
-    momentum are summed, or the shoulders would tear. Without the condition a hand would grow to the belly.
+    They grow together where both have seam particles, those that are skinned to both, and have told the node so. Mass,
+    momentum *and* kinematic momentum are summed, or the shoulders would tear. Without the condition a hand would grow
+    to the belly.
     """
     for f in range(contact.num_fields):
         if has_field(mask, f):

@@ -2,8 +2,9 @@
 
 Contact acts at nodes to which all particles of both fields have told that. Which these are must be known before the
 particles are scattered, and is known of the substep before: a field tells a node if another one was there then, and
-only fields that have told a node touch there. That is a substep after the second has come to it, with next to no
-weight. When blocks are marked anew, their slots are others, and fields tell all nodes of blocks that have several.
+only fields that have told a node touch there. That is a substep after the second has come to it, with little weight
+unless it moves nearly a grid spacing in a time step. When blocks are marked anew, their slots are others, and fields
+tell all nodes of blocks that have several: who comes then touches at once.
 
 For :mod:`piavatar_envs.mpm.groups`, where a group takes three times as long if one of its particles tells; other
 scatters tell all nodes of blocks with several fields in every substep.

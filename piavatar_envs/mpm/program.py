@@ -89,13 +89,18 @@ class Program:
 
         Raises:
             RuntimeError: the program has already run.
-            ValueError: one of the two has a fork or a condition.
+            ValueError: one of the two has a fork or a condition, is on another device, or is the other one.
         """
         if self._graph is not None:
             raise RuntimeError("cannot append a fork to a program that has run; build a new one")
         branches = (urgent, beside)
         if any(each._condition is not None or any(launch.fork for launch in each._launches) for each in branches):
             raise ValueError("a branch of a fork has a fork or a condition; append that to the program itself")
+        if urgent is beside or any(each.device != self.device for each in branches):
+            raise ValueError(
+                f"branches on {urgent.device} and {beside.device} of a program on {self.device}; "
+                "give two programs on its device"
+            )
         number = 1 + max(launch.fork for launch in self._launches) if self._launches else 1
         if not (urgent and beside):
             number = 0  # of an empty one there is nothing to wait for

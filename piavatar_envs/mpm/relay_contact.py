@@ -7,7 +7,7 @@ nodes have been in contact. In integers, what one loses the other gains exactly.
 Contact asks where the particles of a node are, so all of them must tell it. Whoever scatters goes by where fields were
 *before* the launch, which does not depend on the order in which others of it come to their nodes: a field has told a
 node if another was there in the substep before, and only nodes that both have told are in contact. That is a substep
-after the second has come to it, with next to no weight.
+after the second has come to it, with little weight unless it moves nearly a grid spacing in a time step.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """The scatter of a GPU for large bodies of few particles a cell, skins for example: each goes to the nodes by itself.
 
 Groups of particles, see :mod:`piavatar_envs.mpm.groups`, take time to find out which nodes they have in common. Where
-these are few, memory is faster asked for all additions. A particle has eight threads, all of which know what it
-scatters. Each looks one of the eight blocks up that its stencil may lie in, and to every node four add together, one of
-four numbers each: 32 bytes, which memory takes at a time. What is added are integers: runs repeat bit for bit.
+these are few, memory is faster asked for all additions. A particle has eight threads here, four in some relays (see
+:mod:`piavatar_envs.mpm.carry`), all of which know what it scatters. Each looks one or two of the eight blocks up that
+its stencil may lie in, and to every node four add together, one of four numbers each: 32 bytes, which memory takes at a
+time. What is added are integers: runs repeat bit for bit.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ from piavatar_envs.mpm.types import (
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: Threads of a particle here. Teams of eight and of four are known, see :mod:`piavatar_envs.mpm.team`. Four, eight of
-#: which add the particles of both in turn, need fewer instructions and more time.
+#: Threads of a particle in the scatter alone. Teams of eight and of four are known, see :mod:`piavatar_envs.mpm.team`;
+#: here four, eight of which add the particles of both in turn, need fewer instructions and more time.
 TEAM = wp.constant(8)
 #: Particles of a warp.
 SHARE = wp.constant(32 // int(TEAM))

@@ -77,7 +77,7 @@ return here;
 #endif
 """)
 def lanes_with(here: bool) -> int:
-    """A bit for each thread of a warp, whether it is so ``here``; all of them come here."""
+    """A bit for each thread of a warp, whether it is so ``here``; all of them come here. One bit on a CPU."""
     ...
 
 

@@ -59,7 +59,7 @@ def test_a_branch_without_launches_is_no_fork(device):
     one.launch(double, 4, [values, 0], block_dim=32)
     program.fork(none, one)
     program.fork(one, none)
-    program.fork(none, none)
+    program.fork(none, Program(device))
     program.launch(double, 4, [values, 0], block_dim=32)
     program.run()
     np.testing.assert_array_equal(values.numpy(), [7, 7, 7, 7])
@@ -73,6 +73,9 @@ def test_forks_are_refused(device):
         with pytest.raises(ValueError, match="a fork or a condition"):
             program.fork(*branches)
         assert len(program) == 0
+    program, branch = Program(device), Program(device)
+    with pytest.raises(ValueError, match="give two programs"):
+        program.fork(branch, branch)
     forked.program.run()
     with pytest.raises(RuntimeError, match="build a new one"):
         forked.program.fork(Program(device), Program(device))
