@@ -250,9 +250,9 @@ def update_grid(
                 held = held_by(grid, n)
                 alone = blocks.fields[e, held[1]] == (1 << held[0])
                 note_beside(grid, blocks, e, slot, held)
-            if alone:
-                if contact.num_fields > 1:
+                if alone:
                     sensors.touched[e, slot] = 0
+            if alone:
                 update_block(
                     grid, step, boundaries, contact, sums, begun, begun_next, e, slot, held, told, node_velocity,
                     sensors,

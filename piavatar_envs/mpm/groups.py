@@ -36,7 +36,7 @@ from piavatar_envs.mpm.group_bricks import (
 from piavatar_envs.mpm.group_plan import THREADS, share_of
 from piavatar_envs.mpm.group_sums import put_down
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattered, told_by
+from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, told_by
 from piavatar_envs.mpm.shared_add import add_to_box, few_add_to_box
 from piavatar_envs.mpm.shared_memory import (
     block_of_launch,
@@ -50,7 +50,7 @@ from piavatar_envs.mpm.shared_memory import (
 )
 from piavatar_envs.mpm.stencil import spline
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.transfer import Scattered, near_boundary, scatters
+from piavatar_envs.mpm.transfer import Scattered, near_boundary, prepare, scatters
 from piavatar_envs.mpm.types import (
     PAPER,
     Blocks,
@@ -173,7 +173,7 @@ def scatter_turn(
     e = at[0]
     s = Scattered()
     if left:
-        s = scattered(grid, step, particles, moving, e, at[1], MOMENTUM)
+        s = prepare(grid, step, particles, moving, e, at[1], False)
     meet()  # not before memory has been asked for what particles have; a turn has begun then
     takes = raised(s, left, MOMENTUM, failure, e)
     widen_box(takes, s.base)

@@ -9,6 +9,7 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import NOBODY
 from piavatar_envs.mpm.matrices import allocate_matrices, components_of, whole_lines
+from piavatar_envs.mpm.others import notes_others
 from piavatar_envs.mpm.sensing import senses_in_gather
 from piavatar_envs.mpm.shared_room import plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
@@ -146,11 +147,6 @@ def allocate(model: Model) -> tuple[State, Scratch]:
 
 def _zeros(model: Model, shape: int | tuple[int, ...], dtype: type) -> wp.array:
     return wp.zeros(shape, dtype=dtype, device=model.device)
-
-
-def notes_others(model: Model) -> bool:
-    """Whether it is noted where other fields are, see :mod:`piavatar_envs.mpm.others`."""
-    return model.scatter in ("runs", "runs_float") and model.contact.num_fields > 1
 
 
 def allocate_blocks(model: Model) -> Blocks:

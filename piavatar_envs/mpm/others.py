@@ -17,9 +17,14 @@ import warp as wp
 from piavatar_envs.mpm.blocks import slots_used
 from piavatar_envs.mpm.stencil import BLOCK_NODES
 from piavatar_envs.mpm.sweep import lane_of_thread, lanes_with
-from piavatar_envs.mpm.types import Blocks
+from piavatar_envs.mpm.types import Blocks, Model
 
 wp.set_module_options({"enable_backward": False})
+
+
+def notes_others(model: Model) -> bool:
+    """Whether that is noted, and not told everywhere."""
+    return model.scatter in ("runs", "runs_float") and model.contact.num_fields > 1
 
 
 @wp.func
@@ -43,6 +48,20 @@ def begin_others(blocks: Blocks):
 
 
 @wp.func
+def has_bit(words: wp.array2d(dtype=int), e: int, first: int, local: int):
+    """Whether a node of a block has its bit, of the two words from ``first`` on."""
+    return ((words[e, first + local // 32] >> (local & 31)) & 1) != 0
+
+
+@wp.func
+def note_bits(words: wp.array2d(dtype=int), e: int, first: int, local: int, here: bool):
+    """Give a node of a block its bit, or take it away; all threads of a warp, with half a block, come here."""
+    bits = lanes_with(here)
+    if lane_of_thread() == 0:
+        words[e, first + local // 32] = bits
+
+
+@wp.func
 def has_told(blocks: Blocks, e: int, r: int):
     """Whether all particles have told the node of a field's record ``r``, in a block that has several, where they are.
 
@@ -50,8 +69,7 @@ def has_told(blocks: Blocks, e: int, r: int):
     """
     if blocks.others.shape[1] == 1:
         return True
-    local = r % BLOCK_NODES
-    return ((blocks.others[e, 2 * (r // BLOCK_NODES) + local // 32] >> (local & 31)) & 1) != 0
+    return has_bit(blocks.others, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES)
 
 
 @wp.func
@@ -59,6 +77,4 @@ def note_others(blocks: Blocks, e: int, r: int, here: bool):
     """Note whether others are ``here``, at the node of record ``r``; all threads of a warp, with half a block, do."""
     if blocks.others.shape[1] == 1:
         return
-    bits = lanes_with(here)
-    if lane_of_thread() == 0:
-        blocks.others[e, 2 * (r // BLOCK_NODES) + (r % BLOCK_NODES) // 32] = bits
+    note_bits(blocks.others, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES, here)

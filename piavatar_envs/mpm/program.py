@@ -101,7 +101,7 @@ class Program:
                 f"branches on {urgent.device} and {beside.device} of a program on {self.device}; "
                 "give two programs on its device"
             )
-        number = 1 + max(launch.fork for launch in self._launches) if self._launches else 1
+        number = 1 + max((launch.fork for launch in self._launches), default=0)
         if not (urgent and beside):
             number = 0  # of an empty one there is nothing to wait for
         for branch in branches:

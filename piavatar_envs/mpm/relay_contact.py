@@ -26,12 +26,12 @@ from piavatar_envs.mpm.contact import book_contact, book_pair, impulse_between
 from piavatar_envs.mpm.grid import total_velocity
 from piavatar_envs.mpm.impulses import write_change
 from piavatar_envs.mpm.normals import MASS_MIN, facing_of, normal_from, records_around
-from piavatar_envs.mpm.others import told_at_first
+from piavatar_envs.mpm.others import has_bit, note_bits, told_at_first
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.singles import place_of_block
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
 from piavatar_envs.mpm.sums import begin_sum, counted, give_momentum, offset_at, physical_sum, sum_of, units_of
-from piavatar_envs.mpm.sweep import THREADS, Sweep, lane_of_thread, lanes_with, plan_sweep
+from piavatar_envs.mpm.sweep import THREADS, Sweep, plan_sweep
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Contact, Grid, Model, Scratch, Sensors, Step, Sums
 
@@ -40,16 +40,15 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 
 
 @wp.func
-def place_of_bits(slots: int, substep: int, slot: int, half: int):
-    """Where the bits of half of a slot's nodes are, those that the launches of a ``substep`` write."""
-    return 2 * ((substep & 1) * slots + slot) + half
+def place_of_bits(slots: int, substep: int, slot: int):
+    """The first of two words with the bits of a slot's nodes, those that the launches of a ``substep`` write."""
+    return 2 * ((substep & 1) * slots + slot)
 
 
 @wp.func
 def had_others(others: wp.array2d(dtype=int), slots: int, e: int, substep: int, r: int):
     """Whether the node of a field's record ``r`` had another field in ``substep``; in the next, its own has told it."""
-    local = r % BLOCK_NODES
-    return ((others[e, place_of_bits(slots, substep, r // BLOCK_NODES, local // 32)] >> (local & 31)) & 1) != 0
+    return has_bit(others, e, place_of_bits(slots, substep, r // BLOCK_NODES), r % BLOCK_NODES)
 
 
 @wp.func
@@ -78,7 +77,7 @@ def meets_others(
 @wp.func
 def has_others(others: wp.array2d(dtype=int), slots: int, e: int, substep: int, slot: int, place: int, base: wp.vec3i):
     """:func:`meets_others` in one ``slot``, by its :func:`piavatar_envs.mpm.singles.place_of_block`."""
-    at = place_of_bits(slots, substep, slot, 0)
+    at = place_of_bits(slots, substep, slot)
     lower = others[e, at]
     upper = others[e, at + 1]
     x = nodes_along(base[0], (place & 4) != 0)
@@ -97,8 +96,8 @@ def begin_contact(blocks: Blocks, others: wp.array2d(dtype=int), sensors: Sensor
     slots = blocks.held.shape[1]
     told = told_at_first(blocks, e, slot)
     for half in range(2):
-        others[e, place_of_bits(slots, 0, slot, half)] = 0
-        others[e, place_of_bits(slots, 1, slot, half)] = told
+        others[e, place_of_bits(slots, 0, slot) + half] = 0
+        others[e, place_of_bits(slots, 1, slot) + half] = told
     sensors.touched[e, slot] = 0
 
 
@@ -144,9 +143,8 @@ def face_fields(
         for f in range(first, last):
             if has_field(mask, f):
                 r = first_record(grid, blocks, e, f, block) + local
-                bits = lanes_with((present & ~(1 << f)) != 0)
-                if lane_of_thread() == 0:
-                    others[e, place_of_bits(slots, substep, r // BLOCK_NODES, local // 32)] = bits
+                first_word = place_of_bits(slots, substep, r // BLOCK_NODES)
+                note_bits(others, e, first_word, local, (present & ~(1 << f)) != 0)
 
 
 @wp.func

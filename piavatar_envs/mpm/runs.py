@@ -12,7 +12,7 @@ from piavatar_envs.mpm.sensing import sense_gathered
 from piavatar_envs.mpm.stencil import grid_position
 from piavatar_envs.mpm.stores import store_particle
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.transfer import Scattered, momentum_bounds, placed, prepare
+from piavatar_envs.mpm.transfer import Scattered, momentum_bounds, placed
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -42,16 +42,8 @@ THREADS = 128
 
 
 @wp.func
-def scattered(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, kind: int):
-    """Mass and momentum of a particle, how it is driven, or its place ``w m (x_i - x_p) / dx`` and a seam's ``w m``."""
-    if kind == MOMENTUM:
-        return prepare(grid, step, particles, moving, e, p, False)
-    return told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], kind)
-
-
-@wp.func
 def told_by(grid: Grid, particles: Particles, e: int, p: int, x: wp.vec3, vk: wp.vec3, kind: int):
-    """How particle ``p`` at ``x`` is driven, or its place, see :func:`scattered`."""
+    """How particle ``p`` at ``x`` is driven, or its place ``w m (x_i - x_p) / dx`` and a seam's ``w m``."""
     s = placed(grid, x)
     m = particles.mass[row(e, particles.mass.shape[0]), p]
     if kind == KINEMATIC:

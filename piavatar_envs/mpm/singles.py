@@ -14,12 +14,12 @@ from typing import Any
 import warp as wp
 
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, scattered, told_by
+from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, told_by
 from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_index, grid_position, spline
 from piavatar_envs.mpm.sweep import any_lane, lane_of_thread
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.transfer import Scattered, admitted, moves_finitely, near_boundary, takes_part
+from piavatar_envs.mpm.transfer import Scattered, admitted, moves_finitely, near_boundary, prepare, takes_part
 from piavatar_envs.mpm.types import (
     PAPER,
     Blocks,
@@ -303,7 +303,7 @@ def singles_to_grid(
         units[1] = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
         if contact.num_fields > 1:
             tells = blocks.fields[e, block] != (1 << field)
-        s = scattered(grid, step, particles, moving, e, p, MOMENTUM)
+        s = prepare(grid, step, particles, moving, e, p, False)
         tells = tells or near_boundary(grid, boundaries, e, x)
         takes = admitted(here, moves, e, failure)
     tells = any_of_team(TEAM, tells)

@@ -12,9 +12,9 @@ from piavatar_envs.mpm.gather import grid_to_particles
 from piavatar_envs.mpm.grid import update_grid
 from piavatar_envs.mpm.groups import record_runs
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
-from piavatar_envs.mpm.memory import allocate_sums, notes_others
+from piavatar_envs.mpm.memory import allocate_sums
 from piavatar_envs.mpm.normals import find_facing
-from piavatar_envs.mpm.others import begin_others
+from piavatar_envs.mpm.others import begin_others, notes_others
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay import portions, record_relay
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration, senses_in_gather
