@@ -6,8 +6,9 @@ joints move under torques has a :class:`~piavatar_envs.avatar.joint_drive.JointD
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -192,23 +193,37 @@ def record_control_step(
     program: Program, avatars: Sequence[AvatarDrive], model: Model, state: State, scratch: Scratch
 ) -> None:
     """Append one control step of all ``avatars`` of a world through all substeps."""
-    record_begin(program, model, state, scratch)
-    for avatar in avatars:
-        avatar.record_begin(program)
     injected = model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"])
-    if injected:
-        for avatar in avatars:
-            record_injection(avatar, program, state)
+
+    def begin(avatar: AvatarDrive, own: Program) -> None:
+        avatar.record_begin(own)
+        if injected:
+            record_injection(avatar, own, state)
+
+    def drive(avatar: AvatarDrive, own: Program, step: int) -> None:
+        if avatar.joints:
+            avatar.joints.record_substep(own, state, scratch, step)
+        else:
+            record_drive(avatar, own, state, step)
+
+    record_begin(program, model, state, scratch)
+    record_each(program, avatars, begin)
     for step in range(model.num_substeps):
-        for avatar in () if injected else avatars:
-            if avatar.joints:
-                avatar.joints.record_substep(program, state, scratch, step)
-            else:
-                record_drive(avatar, program, state, step)
+        if not injected:
+            record_each(program, avatars, partial(drive, step=step))
         record_substep(program, model, state, scratch, step)
     record_end(program, model, state, scratch)
-    for avatar in avatars:
-        avatar.record_end(program, state)
+    record_each(program, avatars, lambda avatar, own: avatar.record_end(own, state))
+
+
+def record_each(
+    program: Program, avatars: Iterable[AvatarDrive], record: Callable[[AvatarDrive, Program], None]
+) -> None:
+    """Append what ``record`` appends for each of the ``avatars``, beside each other: none has to do with another's."""
+    branches = [Program(program.device) for _ in avatars]
+    for avatar, branch in zip(avatars, branches, strict=True):
+        record(avatar, branch)
+    program.fork(*branches)
 
 
 @wp.kernel

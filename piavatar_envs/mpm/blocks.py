@@ -47,22 +47,28 @@ def has_field(mask: int, f: int):
     return ((mask >> f) & 1) != 0
 
 
-@wp.func
-def lowest_field(mask: int, num_fields: int):
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return mask != 0 ? __ffs(mask) - 1 : num_fields;
+#else
+return mask != 0 ? __builtin_ctz(mask) : num_fields;
+#endif
+""")
+def lowest_field(mask: int, num_fields: int) -> int:
     """First field of a mask; ``num_fields`` if it is empty."""
-    f = int(0)
-    while f < num_fields and not has_field(mask, f):
-        f += 1
-    return f
+    ...
 
 
-@wp.func
-def end_of_fields(mask: int, num_fields: int):
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 32 - __clz(mask);
+#else
+return mask != 0 ? 32 - __builtin_clz(mask) : 0;
+#endif
+""")
+def end_of_fields(mask: int) -> int:
     """One more than the last field of a mask; 0 if it is empty."""
-    f = num_fields
-    while f > 0 and not has_field(mask, f - 1):
-        f -= 1
-    return f
+    ...
 
 
 @wp.func

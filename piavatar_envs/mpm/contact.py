@@ -194,7 +194,7 @@ def touch_all(
     if contact.own_normals != 0:
         project_alone(grid, contact, blocks, sums, mask, e, block, local, node_velocity, sensors)
         return
-    end = end_of_fields(mask, contact.num_fields)
+    end = end_of_fields(mask)
     for a in range(lowest_field(mask, contact.num_fields), end - 1):
         if has_field(mask, a):
             for b in range(a + 1, end):

@@ -210,7 +210,7 @@ def solve_contact(
         if first >= end:
             break
         mask = blocks.fields[e, block]
-        b = end_of_fields(mask, contact.num_fields) - 1
+        b = end_of_fields(mask) - 1
         last = 1 << wp.max(b, 0)
         for n in range(first, first + sweep.share):
             local = n % BLOCK_NODES

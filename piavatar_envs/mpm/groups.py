@@ -35,6 +35,7 @@ from piavatar_envs.mpm.group_bricks import (
 )
 from piavatar_envs.mpm.group_plan import THREADS, share_of
 from piavatar_envs.mpm.group_sums import put_down
+from piavatar_envs.mpm.parts import Part
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, told_by
 from piavatar_envs.mpm.shared_add import add_to_box, few_add_to_box
@@ -207,24 +208,26 @@ def runs_to_grid(
     contact: Contact,
     moving: Moving,
     blocks: Blocks,
+    those: wp.vec2i,
     # in and out
     failure: wp.array(dtype=int),
     sums: Sums,
 ):
     """The same sums as :func:`piavatar_envs.mpm.transfer.particles_to_grid`.
 
-    A CUDA block takes one of the groups of an environment, a thread a particle; all of its threads come to what they do
-    together.
+    A CUDA block takes one of ``those`` groups of an environment, the first and how many there are, a thread a particle;
+    all of its threads come to what they do together.
     """
-    group = environment_of(block_of_launch(), particles.groups.shape[0] - 1)
-    e = group[0]
+    at_group = environment_of(block_of_launch(), those[1])
+    e = at_group[0]
+    group = those[0] + at_group[1]
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
-    begins = particles.groups[group[1]]
+    begins = particles.groups[group]
     p = particle_of_thread(begins[0])
     driven = step.decoupling == PAPER
     begin_group(sums, e, begins[1], driven)
     left = bool(False)
-    if p < particles.groups[group[1] + 1][0]:
+    if p < particles.groups[group + 1][0]:
         left = scatters(blocks, moving, e, p, failure)
     at = wp.vec3i(e, p, begins[1])
     goes_on = bool(True)
@@ -238,8 +241,8 @@ def runs_to_grid(
             begin_turn(driven)
 
 
-def record_runs(program: Program, inputs: list[Any], particles: Particles, failure: wp.array, sums: Sums) -> None:
-    """Append :func:`runs_to_grid` for all environments: no CUDA block has two of them."""
-    share, groups = share_of(particles.field.shape[0]), particles.groups.shape[0] - 1
-    threads = failure.shape[0] * groups * share
-    program.launch(runs_to_grid, threads, inputs, [failure, sums], block_dim=share)
+def record_runs(program: Program, inputs: list[Any], per_env: int, part: Part, failure: wp.array, sums: Sums) -> None:
+    """Append :func:`runs_to_grid` for a part of all environments of ``per_env`` particles: no CUDA block has two."""
+    share = share_of(per_env)
+    threads = failure.shape[0] * part.groups[1] * share
+    program.launch(runs_to_grid, threads, [*inputs, part.groups], [failure, sums], block_dim=share)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, zip_longest
 from typing import Any
 
 import warp as wp
@@ -30,7 +30,7 @@ class Launch:
     outputs: list[Any]
     block_dim: int
     fork: int = 0  # of the program's forks, from 1 on; 0 if it is in none
-    urgent: bool = False  # in which of a fork's two branches it is
+    branch: int = 0  # of that fork
 
     def recorded(self, device: wp.Device) -> Callable[[], None]:
         """What makes the launch; the kernel is compiled if it is not."""
@@ -63,6 +63,7 @@ class Program:
         self._launches: list[Launch] = []
         self._recorded: list[Callable[[], None]] = []  # of the first of these
         self._graph: Any = None
+        self._streams: list[wp.Stream] = []  # of the branches of forks, one fork after the other
 
     def launch(
         self,
@@ -81,31 +82,29 @@ class Program:
             raise RuntimeError(f"cannot append {kernel.key} to a program that has run; build a new one")
         self._launches.append(Launch(kernel, dim, list(inputs), list(outputs), block_dim))
 
-    def fork(self, urgent: Program, beside: Program) -> None:
-        """Append what two programs launch, beside each other; what is appended later waits for both.
+    def fork(self, *branches: Program) -> None:
+        """Append what some programs launch, beside each other; what is appended later waits for all of them.
 
-        Where a GPU has no room for all of their threads, it takes those of ``urgent`` first. A CPU runs that program,
-        then the other.
+        Where a GPU has no room for all of their threads, it takes those of the first program first. A CPU runs one
+        program after the other.
 
         Raises:
             RuntimeError: the program has already run.
-            ValueError: one of the two has a fork or a condition, is on another device, or is the other one.
+            ValueError: one of them has a fork or a condition, is on another device, or is given twice.
         """
         if self._graph is not None:
             raise RuntimeError("cannot append a fork to a program that has run; build a new one")
-        branches = (urgent, beside)
         if any(each._condition is not None or any(launch.fork for launch in each._launches) for each in branches):
             raise ValueError("a branch of a fork has a fork or a condition; append that to the program itself")
-        if urgent is beside or any(each.device != self.device for each in branches):
+        if len(set(map(id, branches))) < len(branches) or any(each.device != self.device for each in branches):
             raise ValueError(
-                f"branches on {urgent.device} and {beside.device} of a program on {self.device}; "
-                "give two programs on its device"
+                f"branches on {', '.join(str(each.device) for each in branches)} of a program on {self.device}; "
+                "give different ones on its device"
             )
-        number = 1 + max((launch.fork for launch in self._launches), default=0)
-        if not (urgent and beside):
-            number = 0  # of an empty one there is nothing to wait for
-        for branch in branches:
-            self._launches += [replace(each, fork=number, urgent=branch is urgent) for each in branch._launches]
+        branches = tuple(each for each in branches if each)  # of an empty one there is nothing to wait for
+        number = 1 + max((launch.fork for launch in self._launches), default=0) if len(branches) > 1 else 0
+        for index, each in enumerate(branches):
+            self._launches += [replace(launch, fork=number, branch=index) for launch in each._launches]
 
     def __len__(self) -> int:
         return len(self._launches)
@@ -194,19 +193,23 @@ class Program:
             wp.capture_if(self._condition, launch_all)
 
     def _launch_fork(self, launches: list[tuple[Launch, Callable[[], None]]]) -> None:
-        """Launch two branches, on a GPU on streams of their own, whose priorities a graph keeps."""
-        side = wp.Stream(self.device, priority=-1) if self.device.is_cuda else None
-        if side is not None:
-            side.wait_stream(self.device.stream)
-        with wp.ScopedStream(side, sync_enter=False):
-            for what, launch in launches:
-                if what.urgent:
+        """Launch branches, on a GPU on streams of their own, whose priorities a graph keeps."""
+        branches = [list(each) for _, each in groupby(launches, key=lambda pair: pair[0].branch)]
+        own = self._streams_for(len(branches) - 1)
+        for stream in own:
+            stream.wait_stream(self.device.stream)
+        for branch, stream in zip_longest(branches, own):  # the last one has the program's stream
+            with wp.ScopedStream(stream, sync_enter=False):
+                for _, launch in branch:
                     launch()
-        for what, launch in launches:
-            if not what.urgent:
-                launch()
-        if side is not None:
-            self.device.stream.wait_stream(side)
+        for stream in own:
+            self.device.stream.wait_stream(stream)
+
+    def _streams_for(self, count: int) -> list[wp.Stream]:
+        """That many streams, of which the first is urgent; none on a CPU."""
+        while self.device.is_cuda and len(self._streams) < count:
+            self._streams.append(wp.Stream(self.device, priority=0 if self._streams else -1))
+        return self._streams[:count]
 
 
 def compile_programs(programs: Iterable[Program]) -> None:

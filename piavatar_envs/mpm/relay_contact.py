@@ -128,7 +128,7 @@ def face_fields(
         local = n % BLOCK_NODES
         mask = blocks.fields[e, block]
         first = lowest_field(mask, contact.num_fields)
-        last = end_of_fields(mask, contact.num_fields)
+        last = end_of_fields(mask)
         present = int(0)
         for f in range(first, last):
             if has_field(mask, f):
@@ -220,7 +220,7 @@ def meet_fields(
         local = n % BLOCK_NODES
         mask = blocks.fields[e, block]
         first = lowest_field(mask, contact.num_fields)
-        last = end_of_fields(mask, contact.num_fields)
+        last = end_of_fields(mask)
         for f in range(first, last):
             if has_field(mask, f):
                 write_change(sensors.node, e, first_record(grid, blocks, e, f, block) + local, wp.vec4())

@@ -98,6 +98,7 @@ def grid_to_particles(
     boundaries: Boundaries,
     node_velocity: wp.array2d(dtype=wp.vec4),
     senses: int,
+    those: wp.vec2i,
     # in and out; vk is read
     blocks: Blocks,
     moved: Moving,
@@ -106,12 +107,13 @@ def grid_to_particles(
 ):
     """Move every particle with the grid, see :func:`piavatar_envs.mpm.gather.gather`.
 
-    Unlike the gather of a CPU it has its loops unrolled, and its threads store together. If it ``senses``, it does the
-    work of :func:`piavatar_envs.mpm.sensing.sense_contact` first, for the same particles.
+    It moves ``those`` of every environment: the first, and how many there are. Unlike the gather of a CPU it has its
+    loops unrolled, and its threads store together. If it ``senses``, it does the work of
+    :func:`piavatar_envs.mpm.sensing.sense_contact` first, for the same particles.
     """
-    at = environment_of(wp.tid(), moved.x.shape[1])
+    at = environment_of(wp.tid(), those[1])
     e = at[0]
-    p = at[1]
+    p = (those[0] + at[1]) & 0x7FFFFFFF  # tells the compiler that it is not negative
     stays = blocks.frozen[e] != 0
     s = Gathered()
     if not stays:

@@ -15,6 +15,7 @@ from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
 from piavatar_envs.mpm.memory import allocate_sums
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.others import begin_others, notes_others
+from piavatar_envs.mpm.parts import Part, parts_of_world, whole_world
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay import portions, record_relay
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration, senses_in_gather
@@ -25,9 +26,11 @@ from piavatar_envs.mpm.transfer import particles_to_grid
 from piavatar_envs.mpm.turns import TURNS, has_turns
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
-#: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In so
-#: many substeps nothing moves further than two blocks.
+#: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In eight
+#: substeps nothing moves further than two blocks.
 MARKS_EVERY = 8
+#: The same for large bodies, which have many more blocks than they leave behind; marking them takes longer.
+MARKS_OF_GROUPS = 16
 
 
 def record_substep(program: Program, model: Model, state: State, scratch: Scratch, index: int) -> None:
@@ -39,7 +42,7 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     m = model
     if index == 0 and m.scatter == "shared":
         program.launch(forget_speeds, scratch.room.speed.shape, [scratch.room])
-    if index > 0 and index % MARKS_EVERY == 0:
+    if index > 0 and _marks_before(m, index):
         _record_new_marks(program, model, state, scratch)
     record_scatter(program, model, state, scratch)
     _record_grid(program, model, state, scratch)
@@ -52,12 +55,22 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
 def record_substeps(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append all substeps of a control step between which nothing acts, see :func:`record_substep`.
 
-    Where that suits them, each is one launch, see :mod:`piavatar_envs.mpm.relay`.
+    Where that suits them, each is one launch, see :mod:`piavatar_envs.mpm.relay`, or parts of the world are scattered
+    again while others are still gathered, see :mod:`piavatar_envs.mpm.parts`.
     """
-    if not has_turns(model):
-        for index in range(model.num_substeps):
-            record_substep(program, model, state, scratch, index)
+    if has_turns(model):
+        _record_turns(program, model, state, scratch)
         return
+    parts = parts_of_world(model)
+    if len(parts) > 1 and not model.moving_boundaries:
+        _record_parts(program, model, state, scratch, parts)
+        return
+    for index in range(model.num_substeps):
+        record_substep(program, model, state, scratch, index)
+
+
+def _record_turns(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """:func:`record_substeps` of one launch each."""
     if scratch.turns is None:
         scratch.turns = allocate_sums(model, scratch.velocity, TURNS)
     # what is sensed once a step of several fields asks for the nodes' velocities of the last substep
@@ -70,17 +83,43 @@ def record_substeps(program: Program, model: Model, state: State, scratch: Scrat
         record_substep(program, model, state, scratch, model.num_substeps - 1)
 
 
-def _record_gather(program: Program, model: Model, state: State, scratch: Scratch) -> None:
-    """Append the transfer of nodes to particles, and what their contact sensors feel."""
+def _record_parts(program: Program, model: Model, state: State, scratch: Scratch, parts: list[Part]) -> None:
+    """:func:`record_substeps` in which each of the ``parts`` goes from gather to scatter by itself."""
+    world = (model, state, scratch)
+    record_scatter(program, *world)
+    for index in range(1, model.num_substeps + 1):
+        _record_grid(program, *world)
+        if index == model.num_substeps:
+            _record_gather(program, *world)
+        elif _marks_before(model, index):
+            _record_gather(program, *world)
+            _record_new_marks(program, *world)
+            record_scatter(program, *world)
+        else:
+            branches = [Program(program.device) for _ in parts]
+            for part, branch in zip(parts, branches, strict=True):
+                _record_gather(branch, *world, part)
+                record_scatter(branch, *world, part)
+            program.fork(*branches)
+
+
+def _marks_before(model: Model, index: int) -> bool:
+    """Whether blocks are marked anew before substep ``index`` of a control step, which is not the first."""
+    return index % (MARKS_OF_GROUPS if model.scatter in ("runs", "runs_float") else MARKS_EVERY) == 0
+
+
+def _record_gather(program: Program, model: Model, state: State, scratch: Scratch, part: Part | None = None) -> None:
+    """Append the transfer of nodes to particles, of a ``part`` or of all, and what their contact sensors feel."""
     m, s = model, state
     inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
     outputs = [scratch.blocks, _moving(s), s.failure]
     if m.scatter == "plain":
         program.launch(grid_to_particles, s.x.shape, inputs, outputs, block_dim=runs.THREADS)
         return
-    inputs.append(int(senses_in_gather(m)))
+    those = (part or whole_world(m)).particles
+    inputs += [int(senses_in_gather(m)), those]
     outputs.append(scratch.sensors)
-    program.launch(runs.grid_to_particles, s.x.size, inputs, outputs, block_dim=runs.THREADS)
+    program.launch(runs.grid_to_particles, m.num_envs * those[1], inputs, outputs, block_dim=runs.THREADS)
 
 
 def _record_grid(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -132,8 +171,11 @@ def _record_contact(program: Program, model: Model, scratch: Scratch) -> None:
     )
 
 
-def record_scatter(program: Program, model: Model, state: State, scratch: Scratch) -> None:
-    """Append the transfer of particles to nodes, in the way of ``model.scatter``; if shared, what goes with it."""
+def record_scatter(program: Program, model: Model, state: State, scratch: Scratch, part: Part | None = None) -> None:
+    """Append the transfer of particles to nodes, in the way of ``model.scatter``; if shared, what goes with it.
+
+    Of all particles, or of a ``part`` of those that groups scatter.
+    """
     m, s = model, state
     if m.scatter == "shared":
         record_in_block(program, model, state, scratch, _moving(s))
@@ -144,7 +186,7 @@ def record_scatter(program: Program, model: Model, state: State, scratch: Scratc
     elif m.scatter in ("singles", "singles_float"):
         record_singles(program, inputs, s.x.shape, s.failure, scratch.sums)
     else:
-        record_runs(program, inputs, m.particles, s.failure, scratch.sums)
+        record_runs(program, inputs, m.num_particles, part or whole_world(m), s.failure, scratch.sums)
 
 
 def _scattering(m: Model, s: State, scratch: Scratch) -> list[Any]:
@@ -157,8 +199,10 @@ def _moving(s: State) -> Moving:
 
 def record_begin(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append what comes before the first substep of a control step: sensors forget, blocks with matter are marked."""
-    program.launch(clear_sensors, model.num_envs, [], [scratch.sensors])
-    record_marks(program, model, state, scratch)
+    sensors, marks = Program(program.device), Program(program.device)
+    sensors.launch(clear_sensors, model.num_envs, [], [scratch.sensors])
+    record_marks(marks, model, state, scratch)
+    program.fork(sensors, marks)
 
 
 def record_marks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -183,12 +227,13 @@ def _record_new_marks(program: Program, model: Model, state: State, scratch: Scr
 
 def record_end(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append what comes after the last substep of a control step: what is sensed once a step."""
-    m = model
-    program.launch(read_impulses, m.num_envs, [], [scratch.sensors])
+    m, impulses, depths = model, Program(program.device), Program(program.device)
+    impulses.launch(read_impulses, m.num_envs, [], [scratch.sensors])
     if m.contact.num_subjects > 1:
-        program.launch(
+        depths.launch(
             sense_penetration,
             state.x.shape,
             [m.grid, m.particles, m.contact, state.x, scratch.blocks, scratch.velocity, state.failure],
             [scratch.sensors.penetration],
         )
+    program.fork(impulses, depths)

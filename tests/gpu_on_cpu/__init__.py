@@ -86,12 +86,20 @@ def on_cpu(source: str) -> str:
     return source
 
 
+class Stream:
+    """What is launched there runs at once, and nobody need wait."""
+
+    def wait_stream(self, other: Any) -> None:
+        """Nothing to do."""
+
+
 class EmulatedGpu(str):
     """A name of the CPU that says it were an H200."""
 
     is_cuda, is_cpu, arch, sm_count, max_shared_memory_per_block = True, False, 90, 132, 227 * 1024
     free_memory = 2**37
     alias = name = NAME
+    stream = Stream()
 
 
 def _own_cache() -> Path:
@@ -128,21 +136,24 @@ def gpu_on_cpu() -> Iterator[str]:
         return compile_cpu(obj_path, cpp_path, *args, **kwargs)
 
     def stream(device: Any, **kwargs: Any) -> Any:
-        return None if device == NAME else make_stream(device, **kwargs)  # what is launched there runs at once
+        return Stream() if device == NAME else make_stream(device, **kwargs)
+
+    def on_stream(stream: Any, **kwargs: Any) -> Any:
+        return scoped_stream(None if isinstance(stream, Stream) else stream, **kwargs)
 
     get_device, compile_cpu, blocks = wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks
-    make_stream = wp.Stream
+    make_stream, scoped_stream = wp.Stream, wp.ScopedStream
     caches = wp.config.kernel_cache_dir, build._resolved_kernel_cache_dir
     build.init_kernel_cache(str(_own_cache()))
     context.runtime.device_map[NAME] = context.runtime.device_map["cpu"]
     wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks = seen_device, build_cpu, True
-    wp.Stream = stream
+    wp.Stream, wp.ScopedStream = stream, on_stream
     context._resolve_launch_block_dim = threads_of_block
     try:
         yield NAME
     finally:
         wp.get_device, build.build_cpu, wp.config.enable_cpu_blocks = get_device, compile_cpu, blocks
-        wp.Stream = make_stream
+        wp.Stream, wp.ScopedStream = make_stream, scoped_stream
         context._resolve_launch_block_dim = resolve
         del context.runtime.device_map[NAME]
         wp.config.kernel_cache_dir, build._resolved_kernel_cache_dir = caches

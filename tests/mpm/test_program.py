@@ -26,14 +26,14 @@ def add_up(a: wp.array(dtype=int), b: wp.array(dtype=int), total: wp.array(dtype
 
 
 class Forked:
-    """Two arrays, each doubled twice in a branch of its own, and the sum of both, twice in a row."""
+    """Three arrays, each doubled twice in a branch of its own, and the sum of two, twice in a row."""
 
-    def __init__(self, device: str) -> None:
-        self.a, self.b = (wp.array(np.full(64, n), dtype=int, device=device) for n in (1, 10))
+    def __init__(self, device: str, condition: wp.array | None = None) -> None:
+        self.a, self.b, self.c = (wp.array(np.full(64, n), dtype=int, device=device) for n in (1, 10, 100))
         self.total = wp.zeros(64, dtype=int, device=device)
-        self.program = Program(device)
+        self.program = Program(device, condition)
         for _ in range(2):
-            self.program.fork(self.branch(self.a, 100_000), self.branch(self.b, 0))
+            self.program.fork(*map(self.branch, (self.a, self.c, self.b), (100_000, 0, 0)))
             self.program.launch(add_up, 64, [self.a, self.b], [self.total], block_dim=32)
 
     def branch(self, values: wp.array, turns: int) -> Program:
@@ -46,11 +46,20 @@ class Forked:
 @pytest.mark.parametrize("run", ["run", "run_eager"])
 def test_what_follows_a_fork_waits_for_both_branches(device, run):
     forked = Forked(device)
-    assert forked.program.names == 2 * (4 * ["double"] + ["add_up"])
+    assert forked.program.names == 2 * (6 * ["double"] + ["add_up"])
     getattr(forked.program, run)()
     after = [4 * 1 + 3, 4 * 10 + 3]
     again = [4 * n + 3 for n in after]
     np.testing.assert_array_equal(forked.total.numpy(), np.full(64, sum(after) + sum(again)))
+    np.testing.assert_array_equal(forked.c.numpy(), np.full(64, 16 * 100 + 15))
+
+
+@pytest.mark.parametrize("holds", [0, 1])
+def test_a_fork_of_a_program_with_a_condition(device, holds):
+    condition = wp.array([holds], dtype=int, device=device)
+    forked = Forked(device, condition)
+    forked.program.run()
+    assert (forked.total.numpy()[0] > 0) == (forked.c.numpy()[0] > 100) == bool(holds)
 
 
 def test_a_branch_without_launches_is_no_fork(device):
@@ -74,7 +83,7 @@ def test_forks_are_refused(device):
             program.fork(*branches)
         assert len(program) == 0
     program, branch = Program(device), Program(device)
-    with pytest.raises(ValueError, match="give two programs"):
+    with pytest.raises(ValueError, match="give different ones"):
         program.fork(branch, branch)
     forked.program.run()
     with pytest.raises(RuntimeError, match="build a new one"):
