@@ -71,7 +71,7 @@ def kernel_times(program: Program, repeats: int = 1) -> dict[str, KernelTime]:
 
 
 def _launch_times(program: Program) -> dict[str, list[float]]:
-    """Milliseconds of every launch of a run on a GPU, one after the other, by kernel."""
+    """Milliseconds of every launch of a run on a GPU, one after the other, by kernel; no condition is asked for."""
     launches = program.launches
     wp.timing_begin(wp.TIMING_ALL)
     with wp.ScopedDevice(program.device):

@@ -6,7 +6,7 @@ joints move under torques has a :class:`~piavatar_envs.avatar.joint_drive.JointD
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from functools import partial
 
@@ -217,7 +217,7 @@ def record_control_step(
 
 
 def record_each(
-    program: Program, avatars: Iterable[AvatarDrive], record: Callable[[AvatarDrive, Program], None]
+    program: Program, avatars: Sequence[AvatarDrive], record: Callable[[AvatarDrive, Program], None]
 ) -> None:
     """Append what ``record`` appends for each of the ``avatars``, beside each other: none has to do with another's."""
     branches = [Program(program.device) for _ in avatars]

@@ -1,7 +1,7 @@
 """The sparse grid: blocks of 4 x 4 x 4 nodes get room for their nodes' records when matter comes to them.
 
 A block has a bit for every velocity field with matter in it, and a slot for each of those. Slots are given out as
-particles arrive and taken back at the next control step, so memory and time depend on the bodies, not on the empty
+particles arrive and taken back when blocks are marked anew, so memory and time depend on the bodies, not on the empty
 space around them. In which order they are given out is not determined on a GPU; nothing but addresses depends on it.
 """
 
@@ -186,6 +186,12 @@ def list_shared(blocks: Blocks, e: int, block: int, before: int):
 def nodes_shared(blocks: Blocks, e: int):
     """Nodes of the blocks of environment ``e`` that have several fields."""
     return BLOCK_NODES * wp.min(blocks.num_shared[e], blocks.shared.shape[1])
+
+
+@wp.func
+def lacks_slots(failure: wp.array(dtype=int), e: int):
+    """Whether slots have run out: some particles have none. No scatter and no grid pass sets that flag."""
+    return (failure[e] & _BLOCKS) != 0
 
 
 @wp.func

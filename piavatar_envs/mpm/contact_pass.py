@@ -12,6 +12,7 @@ from piavatar_envs.mpm.blocks import (
     end_of_fields,
     first_record,
     has_field,
+    lacks_slots,
     lowest_field,
     nodes_shared,
     shared_block,
@@ -190,6 +191,7 @@ def solve_contact(
     contact: Contact,
     sweep: Sweep,
     blocks: Blocks,
+    failure: wp.array(dtype=int),
     node_facing: wp.array2d(dtype=wp.vec4),
     # in and out: offsets are read, then cleared; sums become velocities
     sums: Sums,
@@ -203,7 +205,7 @@ def solve_contact(
     at = environment_of(wp.tid(), sweep.threads)
     e = at[0]
     thread = at[1]
-    end = nodes_shared(blocks, e)
+    end = wp.where(lacks_slots(failure, e), 0, nodes_shared(blocks, e))  # else nobody has added up all particles
     for turn in range(sweep.turns):
         first = thread * sweep.share + turn * sweep.stride
         block = shared_block(blocks, e, first)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import fields_at_corner, held_by, slots_used
+from piavatar_envs.mpm.blocks import fields_at_corner, held_by, lacks_slots, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, GATED_SLAB, NEAR_BLOCK, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.normals import MASS_MIN
 from piavatar_envs.mpm.records import write_physical, write_record
 from piavatar_envs.mpm.shared_memory import meet_warp
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block, node_position
-from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, units_of
+from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, take_sum, units_of
 from piavatar_envs.mpm.sweep import THREADS, any_lane, lane_of_thread, lanes_of_warp, nodes_of_lane
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import (
@@ -189,6 +189,18 @@ def update_block(
 
 
 @wp.func
+def forget_nodes(sums: Sums, e: int, f: int, slot: int):
+    """Forget the sums of a slot's nodes, of field ``f``; a warp shares them.
+
+    Slots have run out: what has been added up is of some particles only, and nobody goes on from it.
+    """
+    for n in range(nodes_of_lane()):
+        r = BLOCK_NODES * slot + lane_of_thread() + n * lanes_of_warp()
+        take_sum(sums, e, f, r)
+        clear_offset(sums, e, r)
+
+
+@wp.func
 def note_beside(grid: Grid, blocks: Blocks, e: int, slot: int, held: wp.vec2i):
     """Note whether a stencil that begins in a slot's block, ``held`` by a field, may lie in a block of another one.
 
@@ -225,11 +237,14 @@ def update_grid(
     Nodes have offsets and, but for the paper's variant, kinematic momentum only from particles that tell their place,
     see :func:`piavatar_envs.mpm.transfer.tells_place`, and who scatters those notes in which slots. Matter within the
     gate of a boundary is of such particles only, so elsewhere nobody asks for boundaries.
+
+    Where slots have run out, sums are forgotten: a part of the world may have been scattered that did not know of it.
     """
     at = environment_of(wp.tid(), slots * lanes_of_warp())
     e = at[0]
     slot = at[1] // lanes_of_warp()
     used = slots_used(blocks, e)
+    stops = lacks_slots(failure, e)
     goes_on = bool(True)
     while goes_on:
         first = BLOCK_NODES * slot + lane_of_thread()
@@ -246,7 +261,10 @@ def update_grid(
                 sums.told[e, slot] = 0
             held = wp.vec2i(0, n)
             alone = bool(True)
-            if contact.num_fields > 1:
+            if stops:
+                alone = bool(False)
+                forget_nodes(sums, e, n // grid.num_blocks, slot)
+            elif contact.num_fields > 1:
                 held = held_by(grid, n)
                 alone = blocks.fields[e, held[1]] == (1 << held[0])
                 note_beside(grid, blocks, e, slot, held)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import first_record, has_field, nodes_shared, shared_block
+from piavatar_envs.mpm.blocks import first_record, has_field, lacks_slots, nodes_shared, shared_block
 from piavatar_envs.mpm.impulses import read_change, write_change
 from piavatar_envs.mpm.others import has_told
 from piavatar_envs.mpm.records import mass_of, read_record, write_record
@@ -135,6 +135,7 @@ def find_facing(
     contact: Contact,
     sweep: Sweep,
     blocks: Blocks,
+    failure: wp.array(dtype=int),
     # in and out: taken where several fields are
     sums: Sums,
     # out
@@ -149,7 +150,7 @@ def find_facing(
     """
     at = environment_of(wp.tid(), sweep.threads)
     e = at[0]
-    end = nodes_shared(blocks, e)
+    end = wp.where(lacks_slots(failure, e), 0, nodes_shared(blocks, e))  # else nobody has added up all particles
     for turn in range(sweep.turns):
         first = at[1] * sweep.share + turn * sweep.stride
         block = shared_block(blocks, e, first)

@@ -90,13 +90,15 @@ class Program:
 
         Raises:
             RuntimeError: the program has already run.
-            ValueError: one of them has a fork or a condition, is on another device, or is given twice.
+            ValueError: one of them has a fork or a condition, is on another device, is given twice, or is this program.
         """
         if self._graph is not None:
             raise RuntimeError("cannot append a fork to a program that has run; build a new one")
         if any(each._condition is not None or any(launch.fork for launch in each._launches) for each in branches):
             raise ValueError("a branch of a fork has a fork or a condition; append that to the program itself")
-        if len(set(map(id, branches))) < len(branches) or any(each.device != self.device for each in branches):
+        if len({id(each) for each in (self, *branches)}) <= len(branches) or any(
+            each.device != self.device for each in branches
+        ):
             raise ValueError(
                 f"branches on {', '.join(str(each.device) for each in branches)} of a program on {self.device}; "
                 "give different ones on its device"
@@ -193,7 +195,7 @@ class Program:
             wp.capture_if(self._condition, launch_all)
 
     def _launch_fork(self, launches: list[tuple[Launch, Callable[[], None]]]) -> None:
-        """Launch branches, on a GPU on streams of their own, whose priorities a graph keeps."""
+        """Launch branches, on a GPU on streams, whose priorities a graph keeps; the last one on the program's own."""
         branches = [list(each) for _, each in groupby(launches, key=lambda pair: pair[0].branch)]
         own = self._streams_for(len(branches) - 1)
         for stream in own:

@@ -131,7 +131,7 @@ def _record_grid(program: Program, model: Model, state: State, scratch: Scratch)
     m = model
     contact, beside = Program(program.device), Program(program.device)
     if m.contact.num_fields > 1:
-        _record_contact(contact, model, scratch)
+        _record_contact(contact, model, state, scratch)
     if m.scatter != "shared":  # else that pass has been made in shared memory
         slots = slots_at_once(m)
         beside.launch(
@@ -152,21 +152,21 @@ def _record_grid(program: Program, model: Model, state: State, scratch: Scratch)
         )
 
 
-def _record_contact(program: Program, model: Model, scratch: Scratch) -> None:
+def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append the pass over the blocks with several fields."""
     m, blocks, sums = model, scratch.blocks, scratch.sums
     sweep = plan_sweep(m)
     program.launch(
         find_facing,
         m.num_envs * sweep.threads,
-        [m.grid, m.contact, sweep, blocks],
+        [m.grid, m.contact, sweep, blocks, state.failure],
         [sums, scratch.velocity, scratch.facing, scratch.sensors],
         block_dim=THREADS,
     )
     program.launch(
         solve_contact,
         m.num_envs * sweep.threads,
-        [m.grid, m.step, m.boundaries, m.contact, sweep, blocks, scratch.facing],
+        [m.grid, m.step, m.boundaries, m.contact, sweep, blocks, state.failure, scratch.facing],
         [sums, scratch.velocity, scratch.sensors],
         block_dim=THREADS,
     )

@@ -115,7 +115,11 @@ def momentum_bounds(s: Scattered):
 
 @wp.func
 def takes_part(blocks: Blocks, e: int, failure: wp.array(dtype=int)):
-    """Whether an environment goes on. Where slots have run out, some particles have none; no scatter sets that flag."""
+    """Whether an environment goes on. Where slots have run out, some particles have none.
+
+    No scatter sets that flag, but a gather beside it may, of another part of the world: some go on then who have not
+    seen it, and the grid pass forgets what they add.
+    """
     return (blocks.frozen[e] | (failure[e] & _BLOCKS)) == 0
 
 

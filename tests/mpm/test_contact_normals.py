@@ -78,7 +78,7 @@ class Look:
         program.launch(
             find_facing,
             sweep.threads,
-            [model.grid, model.contact, sweep, scratch.blocks],
+            [model.grid, model.contact, sweep, scratch.blocks, state.failure],
             found,
             block_dim=THREADS,
         )

@@ -97,10 +97,19 @@ def test_contact_acts_only_where_fields_have_told(heap, told):
     assert (scratch.blocks.others.numpy()[0].reshape(-1, 2)[shared_slots(scratch.blocks)] == -1).all()
     if not told:
         scratch.blocks.others.zero_()
-    inputs = [model.grid, model.contact, sweep, scratch.blocks]
+    inputs = [model.grid, model.contact, sweep, scratch.blocks, heap.state.failure]
     outputs = [scratch.sums, scratch.velocity, scratch.facing, scratch.sensors]
     contact.launch(find_facing, sweep.threads, inputs, outputs, block_dim=THREADS)
-    inputs = [model.grid, model.step, model.boundaries, model.contact, sweep, scratch.blocks, scratch.facing]
+    inputs = [
+        model.grid,
+        model.step,
+        model.boundaries,
+        model.contact,
+        sweep,
+        scratch.blocks,
+        heap.state.failure,
+        scratch.facing,
+    ]
     outputs = [scratch.sums, scratch.velocity, scratch.sensors]
     contact.launch(solve_contact, sweep.threads, inputs, outputs, block_dim=THREADS)
     contact.run()

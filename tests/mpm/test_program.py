@@ -20,21 +20,21 @@ def double(values: wp.array(dtype=int), turns: int):
 
 
 @wp.kernel
-def add_up(a: wp.array(dtype=int), b: wp.array(dtype=int), total: wp.array(dtype=int)):
+def add_up(a: wp.array(dtype=int), b: wp.array(dtype=int), c: wp.array(dtype=int), total: wp.array(dtype=int)):
     i = wp.tid()
-    total[i] += a[i] + b[i]
+    total[i] += a[i] + b[i] + c[i]
 
 
 class Forked:
-    """Three arrays, each doubled twice in a branch of its own, and the sum of two, twice in a row."""
+    """Three arrays, each doubled twice in a branch of its own, and the sum of all, twice in a row."""
 
     def __init__(self, device: str, condition: wp.array | None = None) -> None:
         self.a, self.b, self.c = (wp.array(np.full(64, n), dtype=int, device=device) for n in (1, 10, 100))
         self.total = wp.zeros(64, dtype=int, device=device)
         self.program = Program(device, condition)
         for _ in range(2):
-            self.program.fork(*map(self.branch, (self.a, self.c, self.b), (100_000, 0, 0)))
-            self.program.launch(add_up, 64, [self.a, self.b], [self.total], block_dim=32)
+            self.program.fork(*map(self.branch, (self.a, self.c, self.b), (100_000, 100_000, 0)))
+            self.program.launch(add_up, 64, [self.a, self.b, self.c], [self.total], block_dim=32)
 
     def branch(self, values: wp.array, turns: int) -> Program:
         branch = Program(values.device)
@@ -44,14 +44,13 @@ class Forked:
 
 
 @pytest.mark.parametrize("run", ["run", "run_eager"])
-def test_what_follows_a_fork_waits_for_both_branches(device, run):
+def test_what_follows_a_fork_waits_for_its_branches(device, run):
     forked = Forked(device)
     assert forked.program.names == 2 * (6 * ["double"] + ["add_up"])
     getattr(forked.program, run)()
-    after = [4 * 1 + 3, 4 * 10 + 3]
+    after = [4 * n + 3 for n in (1, 10, 100)]
     again = [4 * n + 3 for n in after]
     np.testing.assert_array_equal(forked.total.numpy(), np.full(64, sum(after) + sum(again)))
-    np.testing.assert_array_equal(forked.c.numpy(), np.full(64, 16 * 100 + 15))
 
 
 @pytest.mark.parametrize("holds", [0, 1])
@@ -60,6 +59,19 @@ def test_a_fork_of_a_program_with_a_condition(device, holds):
     forked = Forked(device, condition)
     forked.program.run()
     assert (forked.total.numpy()[0] > 0) == (forked.c.numpy()[0] > 100) == bool(holds)
+
+
+def test_a_fork_waits_for_the_one_before(device):
+    """Though nothing is launched between them; the branches of the second begin where those of the first had ended."""
+    program, forked = Program(device), Forked(device)
+    program.fork(forked.branch(forked.a, 0), forked.branch(forked.b, 100_000))
+    program.fork(forked.branch(forked.b, 0), forked.branch(forked.a, 0))
+    program.run()
+    assert [(launch.fork, launch.branch) for launch in program._launches] == [
+        (fork, branch) for fork in (1, 2) for branch in (0, 0, 1, 1)
+    ]
+    np.testing.assert_array_equal(forked.a.numpy(), np.full(64, 16 + 15))
+    np.testing.assert_array_equal(forked.b.numpy(), np.full(64, 160 + 15))
 
 
 def test_a_branch_without_launches_is_no_fork(device):
@@ -83,8 +95,9 @@ def test_forks_are_refused(device):
             program.fork(*branches)
         assert len(program) == 0
     program, branch = Program(device), Program(device)
-    with pytest.raises(ValueError, match="give different ones"):
-        program.fork(branch, branch)
+    for branches in ((branch, branch), (program, branch)):
+        with pytest.raises(ValueError, match="give different ones"):
+            program.fork(*branches)
     forked.program.run()
     with pytest.raises(RuntimeError, match="build a new one"):
         forked.program.fork(Program(device), Program(device))
