@@ -15,6 +15,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.blocks import slots_used
+from piavatar_envs.mpm.parts import has_groups
 from piavatar_envs.mpm.stencil import BLOCK_NODES
 from piavatar_envs.mpm.sweep import lane_of_thread, lanes_with
 from piavatar_envs.mpm.types import Blocks, Model
@@ -24,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 
 def notes_others(model: Model) -> bool:
     """Whether that is noted, and not told everywhere."""
-    return model.scatter in ("runs", "runs_float") and model.contact.num_fields > 1
+    return has_groups(model) and model.contact.num_fields > 1
 
 
 @wp.func

@@ -27,6 +27,11 @@ class Part:
     particles: wp.vec2i
 
 
+def has_groups(model: Model) -> bool:
+    """Whether particles are scattered by groups, see :mod:`piavatar_envs.mpm.groups`."""
+    return model.scatter in ("runs", "runs_float")
+
+
 def whole_world(model: Model) -> Part:
     """All groups, and all particles."""
     return Part(wp.vec2i(0, model.particles.groups.shape[0] - 1), wp.vec2i(0, model.num_particles))
@@ -34,7 +39,7 @@ def whole_world(model: Model) -> Part:
 
 def parts_of_world(model: Model) -> list[Part]:
     """Parts of about the same size; one where fields lie among each other, or where it is not groups that scatter."""
-    if model.scatter not in ("runs", "runs_float"):
+    if not has_groups(model):
         return [whole_world(model)]
     groups = model.particles.groups.numpy()
     begins, cuts = groups[:, 0], first_groups(groups)

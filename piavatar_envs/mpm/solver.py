@@ -15,7 +15,7 @@ from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
 from piavatar_envs.mpm.memory import allocate_sums
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.others import begin_others, notes_others
-from piavatar_envs.mpm.parts import Part, parts_of_world, whole_world
+from piavatar_envs.mpm.parts import Part, has_groups, parts_of_world, whole_world
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay import portions, record_relay
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration, senses_in_gather
@@ -106,7 +106,7 @@ def _record_parts(program: Program, model: Model, state: State, scratch: Scratch
 
 def _marks_before(model: Model, index: int) -> bool:
     """Whether blocks are marked anew before substep ``index`` of a control step, which is not the first."""
-    return index % (MARKS_OF_GROUPS if model.scatter in ("runs", "runs_float") else MARKS_EVERY) == 0
+    return index % (MARKS_OF_GROUPS if has_groups(model) else MARKS_EVERY) == 0
 
 
 def _record_gather(program: Program, model: Model, state: State, scratch: Scratch, part: Part | None = None) -> None:
