@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.asset import AvatarAsset, dense_weights, load_body, mesh_volume, top_weights
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.drive import AvatarDrive, record_control_step, record_each
+from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
 from piavatar_envs.avatar.ordering import order_along_curve, order_in_boxes
 from piavatar_envs.avatar.sampling import sample_particles
 from piavatar_envs.avatar.settings import DriveSettings
@@ -245,13 +245,13 @@ class Crowd:
             record_drive(avatar, own, self.state, 0)
 
         record_begin(self.once, *world)
-        record_each(self.once, self.avatars, begin)
+        self.once.fork_each(self.avatars, begin)
         record_substeps(self.once, *world)
         record_end(self.once, *world)
-        record_each(self.once, self.avatars, lambda avatar, own: avatar.record_end(own, self.state))
+        self.once.fork_each(self.avatars, lambda avatar, own: avatar.record_end(own, self.state))
         record_control_step(self.each, self.avatars, *world)
         for program in (self.once, self.each):
-            record_each(program, self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
+            program.fork_each(self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
 
     def _place(self, points: BodyPoints) -> None:
         step = queue_step(points.rest[0], TOUCH * self.scale.dx) if self.count > 1 else 0.0

@@ -6,7 +6,7 @@ joints move under torques has a :class:`~piavatar_envs.avatar.joint_drive.JointD
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
 
@@ -192,7 +192,10 @@ class AvatarDrive:
 def record_control_step(
     program: Program, avatars: Sequence[AvatarDrive], model: Model, state: State, scratch: Scratch
 ) -> None:
-    """Append one control step of all ``avatars`` of a world through all substeps."""
+    """Append one control step of all ``avatars`` of a world through all substeps.
+
+    They go beside each other: what one does between substeps has nothing to do with another.
+    """
     injected = model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"])
 
     def begin(avatar: AvatarDrive, own: Program) -> None:
@@ -207,23 +210,13 @@ def record_control_step(
             record_drive(avatar, own, state, step)
 
     record_begin(program, model, state, scratch)
-    record_each(program, avatars, begin)
+    program.fork_each(avatars, begin)
     for step in range(model.num_substeps):
         if not injected:
-            record_each(program, avatars, partial(drive, step=step))
+            program.fork_each(avatars, partial(drive, step=step))
         record_substep(program, model, state, scratch, step)
     record_end(program, model, state, scratch)
-    record_each(program, avatars, lambda avatar, own: avatar.record_end(own, state))
-
-
-def record_each(
-    program: Program, avatars: Sequence[AvatarDrive], record: Callable[[AvatarDrive, Program], None]
-) -> None:
-    """Append what ``record`` appends for each of the ``avatars``, beside each other: none has to do with another's."""
-    branches = [Program(program.device) for _ in avatars]
-    for avatar, branch in zip(avatars, branches, strict=True):
-        record(avatar, branch)
-    program.fork(*branches)
+    program.fork_each(avatars, lambda avatar, own: avatar.record_end(own, state))
 
 
 @wp.kernel

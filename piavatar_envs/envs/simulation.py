@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.asset import AvatarAsset, load_body
-from piavatar_envs.avatar.drive import AvatarDrive, record_control_step, record_each
+from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
 from piavatar_envs.avatar.joint_drive import LONGEST_SUBSTEP
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.envs.actions import select_joints
@@ -217,7 +217,7 @@ class Simulation:
         self._record_tracking(program)
 
     def _record_tracking(self, program: Program) -> None:
-        record_each(program, self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
+        program.fork_each(self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
         self.props.record_tracking(program, self.state)
 
     def arrays(self) -> dict[str, wp.array]:

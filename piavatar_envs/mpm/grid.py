@@ -263,7 +263,7 @@ def update_grid(
             alone = bool(True)
             if stops:
                 alone = bool(False)
-                forget_nodes(sums, e, n // grid.num_blocks, slot)
+                forget_nodes(sums, e, held_by(grid, n)[0], slot)
             elif contact.num_fields > 1:
                 held = held_by(grid, n)
                 alone = blocks.fields[e, held[1]] == (1 << held[0])

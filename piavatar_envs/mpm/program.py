@@ -13,11 +13,13 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import groupby, zip_longest
-from typing import Any
+from typing import Any, TypeVar
 
 import warp as wp
 
 from piavatar_envs.mpm.cores import compiling_threads
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,14 @@ class Program:
         number = 1 + max((launch.fork for launch in self._launches), default=0) if len(branches) > 1 else 0
         for index, each in enumerate(branches):
             self._launches += [replace(launch, fork=number, branch=index) for launch in each._launches]
+
+    def fork_each(self, things: Iterable[T], record: Callable[[T, Program], None]) -> None:
+        """:meth:`fork` into what ``record`` appends for each of some ``things`` to a program of its own."""
+        branches = []
+        for each in things:
+            branches.append(Program(self.device))
+            record(each, branches[-1])
+        self.fork(*branches)
 
     def __len__(self) -> int:
         return len(self._launches)

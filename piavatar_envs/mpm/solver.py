@@ -87,6 +87,11 @@ def _record_turns(program: Program, model: Model, state: State, scratch: Scratch
 def _record_parts(program: Program, model: Model, state: State, scratch: Scratch, parts: list[Part]) -> None:
     """:func:`record_substeps` in which each of the ``parts`` goes from gather to scatter by itself."""
     world = (model, state, scratch)
+
+    def gather_and_scatter(part: Part, branch: Program) -> None:
+        _record_gather(branch, *world, part)
+        record_scatter(branch, *world, part)
+
     record_scatter(program, *world)
     for index in range(1, model.num_substeps + 1):
         _record_grid(program, *world)
@@ -97,11 +102,7 @@ def _record_parts(program: Program, model: Model, state: State, scratch: Scratch
             _record_new_marks(program, *world)
             record_scatter(program, *world)
         else:
-            branches = [Program(program.device) for _ in parts]
-            for part, branch in zip(parts, branches, strict=True):
-                _record_gather(branch, *world, part)
-                record_scatter(branch, *world, part)
-            program.fork(*branches)
+            program.fork_each(parts, gather_and_scatter)
 
 
 def _marks_before(model: Model, index: int) -> bool:

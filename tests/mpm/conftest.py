@@ -20,6 +20,16 @@ def simulate(device: str) -> Callable[..., Matter]:
     return partial(build_matter, device=device)
 
 
+@pytest.fixture
+def three_boxes() -> list[dict]:
+    """Bodies for ``meet``: two that come together, and one that comes down on both."""
+    return [
+        {"box": ((-0.23, -0.1, -0.1), (-0.03, 0.1, 0.1)), "velocity": (2.0, 0.2, -0.3)},
+        {"box": ((0.0, -0.08, -0.1), (0.2, 0.12, 0.1)), "velocity": (-1.5, 0.0, -0.3), "density": 600.0},
+        {"box": ((-0.1, -0.1, 0.13), (0.1, 0.1, 0.23)), "velocity": (0.0, 0.0, -3.0)},
+    ]
+
+
 @pytest.fixture(scope="session")
 def meet(simulate) -> Callable[..., Matter]:
     """Builds boxes and balls with velocities, each a subject and a row of the contact sensor of its own.

@@ -14,16 +14,11 @@ from piavatar_envs.mpm.sweep import THREADS, plan_sweep
 
 
 @pytest.fixture
-def heap(meet, device):
+def heap(meet, three_boxes, device):
     """Three boxes that come together on a floor, added up by groups."""
     if device == "cpu":
         pytest.skip("groups are a GPU's")
-    bodies = [
-        {"box": ((-0.23, -0.1, -0.1), (-0.03, 0.1, 0.1)), "velocity": (2.0, 0.2, -0.3)},
-        {"box": ((0.0, -0.08, -0.1), (0.2, 0.12, 0.1)), "velocity": (-1.5, 0.0, -0.3), "density": 600.0},
-        {"box": ((-0.1, -0.1, 0.13), (0.1, 0.1, 0.23)), "velocity": (0.0, 0.0, -3.0)},
-    ]
-    return meet(bodies, num_substeps=5, planes=[((0.0, 0.0, 1.0), -0.11, 0.5)], scatter="runs", control_dt=0.005)
+    return meet(three_boxes, num_substeps=5, planes=[((0.0, 0.0, 1.0), -0.11, 0.5)], scatter="runs", control_dt=0.005)
 
 
 def test_bits_are_nodes_where_others_have_mass(heap):

@@ -38,19 +38,14 @@ def test_parts_share_no_field_and_are_alike(groups, expected):
 
 
 @pytest.fixture
-def clash(meet, device):
+def clash(meet, three_boxes, device):
     """Three boxes that come together on a floor in two worlds, added up by groups, in steps with new marks."""
     if device == "cpu":
         pytest.skip("groups are a GPU's")
 
     def build(**kwargs):
-        bodies = [
-            {"box": ((-0.23, -0.1, -0.1), (-0.03, 0.1, 0.1)), "velocity": (2.0, 0.2, -0.3)},
-            {"box": ((0.0, -0.08, -0.1), (0.2, 0.12, 0.1)), "velocity": (-1.5, 0.0, -0.3), "density": 600.0},
-            {"box": ((-0.1, -0.1, 0.13), (0.1, 0.1, 0.23)), "velocity": (0.0, 0.0, -3.0)},
-        ]
         world = {"num_substeps": MARKS_OF_GROUPS + 4, "num_envs": 2, "control_dt": 0.015, "scatter": "runs"}
-        sim = meet(bodies, friction=0.4, planes=[((0.0, 0.0, 1.0), -0.11, 0.5)], **(world | kwargs))
+        sim = meet(three_boxes, friction=0.4, planes=[((0.0, 0.0, 1.0), -0.11, 0.5)], **(world | kwargs))
         rng = np.random.default_rng(8)
         shape = (2, len(sim.rest), 3)
         return sim.set(u=sim.state.u.numpy() + rng.normal(0.0, 0.1, shape), vk=rng.normal(0.0, 0.1, shape))

@@ -191,19 +191,14 @@ def test_what_relays_are_for(drop, simulate, meet):
 
 
 @pytest.fixture
-def clash(meet, device):
+def clash(meet, three_boxes, device):
     """Boxes of three subjects that come together in two worlds, one of them on a floor, all driven besides."""
     if device == "cpu":
         pytest.skip("relays are a GPU's")
 
     def build(num_substeps=12, num_envs=2, planes=FLOOR, **kwargs):
-        bodies = [
-            {"box": ((-0.23, -0.1, -0.1), (-0.03, 0.1, 0.1)), "velocity": (2.0, 0.2, -0.3)},
-            {"box": ((0.0, -0.08, -0.1), (0.2, 0.12, 0.1)), "velocity": (-1.5, 0.0, -0.3), "density": 600.0},
-            {"box": ((-0.1, -0.1, 0.13), (0.1, 0.1, 0.23)), "velocity": (0.0, 0.0, -3.0)},
-        ]
         world = {"planes": planes, "scatter": "singles", "friction": 0.4, "num_envs": num_envs, "control_dt": 0.012}
-        sim = meet(bodies, num_substeps=num_substeps, **(world | kwargs))
+        sim = meet(three_boxes, num_substeps=num_substeps, **(world | kwargs))
         rng = np.random.default_rng(8)
         shape = (num_envs, len(sim.rest), 3)
         return sim.set(
