@@ -87,8 +87,8 @@ class Program:
     def fork(self, *branches: Program) -> None:
         """Append what some programs launch, beside each other; what is appended later waits for all of them.
 
-        Where a GPU has no room for all of their threads, it takes those of the first program first. A CPU runs one
-        program after the other.
+        Where a GPU has no room for all of their threads, it takes those first whose launch could begin first. (Graphs
+        that Warp captures have no priorities.) A CPU runs one program after the other.
 
         Raises:
             RuntimeError: the program has already run.
@@ -205,7 +205,7 @@ class Program:
             wp.capture_if(self._condition, launch_all)
 
     def _launch_fork(self, launches: list[tuple[Launch, Callable[[], None]]]) -> None:
-        """Launch branches, on a GPU on streams, whose priorities a graph keeps; the last one on the program's own."""
+        """Launch branches, on a GPU on streams; the last one on the program's own."""
         branches = [list(each) for _, each in groupby(launches, key=lambda pair: pair[0].branch)]
         own = self._streams_for(len(branches) - 1)
         for stream in own:
@@ -218,9 +218,9 @@ class Program:
             self.device.stream.wait_stream(stream)
 
     def _streams_for(self, count: int) -> list[wp.Stream]:
-        """That many streams, of which the first is urgent; none on a CPU."""
+        """That many streams; none on a CPU."""
         while self.device.is_cuda and len(self._streams) < count:
-            self._streams.append(wp.Stream(self.device, priority=0 if self._streams else -1))
+            self._streams.append(wp.Stream(self.device))
         return self._streams[:count]
 
 
