@@ -114,13 +114,16 @@ def clear_masked_sensors(mask: wp.array(dtype=wp.bool), sensors: Sensors):
 
 @wp.kernel
 def read_impulses(sensors: Sensors):
-    """Write the impulses that have been added up since the sensors were cleared."""
-    e = wp.tid()
-    for s in range(sensors.boundary_impulse.shape[1]):
-        sensors.boundary_impulse[e, s] = impulse_at(sensors, e, boundary_entry(sensors, s))
-        sensors.boundary_moment[e, s] = impulse_at(sensors, e, moment_entry(sensors, s))
-    for s in range(sensors.pair_impulse.shape[1]):
-        sensors.pair_impulse[e, s] = impulse_at(sensors, e, pair_entry(sensors, s))
-    for i in range(sensors.part_impulse.shape[1]):
-        for s in range(sensors.part_impulse.shape[2]):
-            sensors.part_impulse[e, i, s] = impulse_at(sensors, e, part_entry(sensors, i, s))
+    """Write the impulses that have been added up since the sensors were cleared; a thread has an entry."""
+    e, entry = wp.tid()
+    subjects = sensors.boundary_impulse.shape[1]
+    J = impulse_at(sensors, e, entry)
+    if entry < pair_entry(sensors, 0):
+        sensors.boundary_impulse[e, entry - boundary_entry(sensors, 0)] = J
+    elif entry < part_entry(sensors, 0, 0):
+        sensors.pair_impulse[e, entry - pair_entry(sensors, 0)] = J
+    elif entry < moment_entry(sensors, 0):
+        n = entry - part_entry(sensors, 0, 0)
+        sensors.part_impulse[e, n // subjects, n % subjects] = J
+    else:
+        sensors.boundary_moment[e, entry - moment_entry(sensors, 0)] = J

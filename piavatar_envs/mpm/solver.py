@@ -230,7 +230,8 @@ def _record_new_marks(program: Program, model: Model, state: State, scratch: Scr
 def record_end(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append what comes after the last substep of a control step: what is sensed once a step."""
     m, impulses, depths = model, Program(program.device), Program(program.device)
-    impulses.launch(read_impulses, m.num_envs, [], [scratch.sensors])
+    entries = scratch.sensors.sums.shape[1] // 3
+    impulses.launch(read_impulses, (m.num_envs, entries), [], [scratch.sensors])
     if m.contact.num_subjects > 1:
         depths.launch(
             sense_penetration,
