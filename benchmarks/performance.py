@@ -31,7 +31,7 @@ MATTER = frozenset(
     {"substep_in_small_room", "substep_in_large_room", "nodes_in_small_room", "nodes_in_large_room", "forget_speeds"}
     | {"particles_to_grid", "runs_to_grid", "singles_to_grid", "update_grid", "find_facing", "solve_contact"}
     | {"grid_to_particles", "mark_particles", "forget_blocks", "free_slots", "freeze"}
-    | {"carry_on", "begin_turns", "sweep_sums"}
+    | {"carry_on", "begin_turns", "sweep_sums", "grid_to_momenta", "momenta_to_grid"}
 )
 Report = dict[str, Any]
 

@@ -42,7 +42,7 @@ from piavatar_envs.mpm.team_clear import clear_share
 from piavatar_envs.mpm.team_gather import gather_by_team
 from piavatar_envs.mpm.team_sense import sense_by_team, slots_touched
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.transfer import admitted, impulse_of_stress, placed, with_momentum
+from piavatar_envs.mpm.transfer import admitted, affine_momentum, impulse_of_stress, placed, with_momentum
 from piavatar_envs.mpm.types import (
     NO_STRESS,
     SPLIT,
@@ -151,7 +151,8 @@ def momentum_of_team(team: int, grid: Grid, step: Step, read: vec6, s: Gathered)
     if step.decoupling != NO_STRESS:
         tau = kirchhoff_stress(made_of.material, s.F, made_of.mu, made_of.lam)
         stress = impulse_of_stress(grid, step, made_of.volume, tau)
-    return with_momentum(grid, placed(grid, s.x), made_of.mass, s.u, wp.vec3(), s.C, stress)
+    A = affine_momentum(grid, made_of.mass, s.C, stress)
+    return with_momentum(placed(grid, s.x), made_of.mass, s.u, wp.vec3(), A)
 
 
 @wp.func

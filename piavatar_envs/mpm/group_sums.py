@@ -40,7 +40,6 @@ auto put_bricks = [&](auto which, auto add) {{
 #pragma unroll 1
     for (int n = RECORDS + warp; n < RECORDS + bricks; n += warps, from += BRICK_WORDS * warps) {{
         const int sum = *from, record = room[n] + within;
-        *from = 0;
         int& massive = room[n - RECORDS + MASSIVE];
         if (decltype(which)::IS) massive = __ballot_sync(ALL, sum != 0);  // written by all threads, the same
         if (sum != 0 && (massive & mass_of_node)) add(record, sum);  // who adds no mass adds nothing
@@ -88,7 +87,7 @@ if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 """)
 )
 def put_down(grid: Grid, sums: Sums, failure: wp.array(dtype=int), e: int, kind: int):
-    """Add what the nodes have got of a ``kind`` to the sums outside, and forget it; sums that are too large are not.
+    """Add what the nodes have got of a ``kind`` to the sums outside; sums that are too large are not.
 
     Four threads a node. Masses come first; slots whose nodes are told places are noted.
     """

@@ -77,8 +77,15 @@ def particle_of_thread(first: int) -> int:
 
 
 @wp.func
-def begin_group(sums: Sums, e: int, field: int, driven: bool):
-    """Nothing has been added yet; units are not smaller than those of the sums. All threads meet later."""
+def begin_group(particles: Particles, sums: Sums, those: wp.vec2i, driven: bool):
+    """The group of a CUDA block, one of ``those``: environment, particle of the thread, field, particle after the last.
+
+    Nothing has been added yet; units are not smaller than those of the sums. All threads meet later.
+    """
+    at_group = environment_of(block_of_launch(), those[1])
+    e = at_group[0]
+    begins = particles.groups[those[0] + at_group[1]]
+    field = begins[1]
     if thread_of_block() == 0:
         mass = sums.mass_unit[row(e, sums.mass_unit.shape[0]), field]
         momentum = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
@@ -89,6 +96,18 @@ def begin_group(sums: Sums, e: int, field: int, driven: bool):
         set_number(DRIVEN, UNITS * momentum)
     begin_turn(driven)
     clear_nodes()
+    return wp.vec4i(e, particle_of_thread(begins[0]), field, particles.groups[those[0] + at_group[1] + 1][0])
+
+
+@wp.func
+def begins_again(driven: bool):
+    """Whether particles are left for another turn, which begins then; all threads come here."""
+    goes_on = word(LEFT) != 0
+    if goes_on:
+        meet()
+        begin_turn(driven)
+        clear_nodes()
+    return goes_on
 
 
 @wp.func
@@ -131,7 +150,7 @@ def scatter_more(
     moving: Moving,
     failure: wp.array(dtype=int),
     sums: Sums,
-    at: wp.vec3i,
+    at: wp.vec4i,
     ours: bool,
     tells: bool,
     box: wp.vec3i,
@@ -141,6 +160,7 @@ def scatter_more(
     p = wp.min(at[1], moving.x.shape[1] - 1)
     for kind in range(int(KINEMATIC), int(PLACE) + 1):
         # the paper's variant needs the gradient of kinematic momentum everywhere
+        clear_nodes()
         adds = ours and (tells or (step.decoupling == PAPER and kind == KINEMATIC))
         s = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], kind)
         if kind == KINEMATIC:  # those of places are no momenta, and as sound as the masses were
@@ -164,17 +184,15 @@ def scatter_turn(
     failure: wp.array(dtype=int),
     sums: Sums,
     num_fields: int,
-    at: wp.vec3i,
+    at: wp.vec4i,
     left: bool,
+    s: Scattered,
 ):
     """Scatter those of the particles that are ``left`` whose turn it is; returns whether this one is left then.
 
-    All threads come here.
+    ``s`` is what a particle scatters that is left. All threads come here.
     """
     e = at[0]
-    s = Scattered()
-    if left:
-        s = prepare(grid, step, particles, moving, e, at[1], False)
     meet()  # not before memory has been asked for what particles have; a turn has begun then
     takes = raised(s, left, MOMENTUM, failure, e)
     widen_box(takes, s.base)
@@ -198,6 +216,27 @@ def scatter_turn(
     return takes and not ours
 
 
+@wp.func
+def scatter_left(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    moving: Moving,
+    boundaries: Boundaries,
+    blocks: Blocks,
+    failure: wp.array(dtype=int),
+    sums: Sums,
+    num_fields: int,
+    at: wp.vec4i,
+    left: bool,
+):
+    """:func:`scatter_turn` of what particles have."""
+    s = Scattered()
+    if left:
+        s = prepare(grid, step, particles, moving, at[0], at[1], False)
+    return scatter_turn(grid, step, particles, moving, boundaries, blocks, failure, sums, num_fields, at, left, s)
+
+
 # that leaves a thread 80 registers, all but a few of those that it asks for
 @wp.kernel(launch_bounds=(THREADS, 6))
 def runs_to_grid(
@@ -218,31 +257,24 @@ def runs_to_grid(
     A CUDA block takes one of ``those`` groups of an environment, the first and how many there are, a thread a particle;
     all of its threads come to what they do together.
     """
-    at_group = environment_of(block_of_launch(), those[1])
-    e = at_group[0]
-    group = those[0] + at_group[1]
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
-    begins = particles.groups[group]
-    p = particle_of_thread(begins[0])
     driven = step.decoupling == PAPER
-    begin_group(sums, e, begins[1], driven)
+    at = begin_group(particles, sums, those, driven)
     left = bool(False)
-    if p < particles.groups[group + 1][0]:
-        left = scatters(blocks, moving, e, p, failure)
-    at = wp.vec3i(e, p, begins[1])
+    if at[1] < at[3]:
+        left = scatters(blocks, moving, at[0], at[1], failure)
     goes_on = bool(True)
     while goes_on:
-        left = scatter_turn(
+        left = scatter_left(
             grid, step, particles, moving, boundaries, blocks, failure, sums, contact.num_fields, at, left
         )  # fmt: skip
-        goes_on = word(LEFT) != 0
-        if goes_on:
-            meet()
-            begin_turn(driven)
+        goes_on = begins_again(driven)
 
 
-def record_runs(program: Program, inputs: list[Any], per_env: int, part: Part, failure: wp.array, sums: Sums) -> None:
-    """Append :func:`runs_to_grid` for a part of all environments of ``per_env`` particles: no CUDA block has two."""
+def record_groups(
+    program: Program, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any], per_env: int, part: Part
+) -> None:
+    """Append a scatter of a part of all environments of ``per_env`` particles: no CUDA block has two."""
     share = share_of(per_env)
-    threads = failure.shape[0] * part.groups[1] * share
-    program.launch(runs_to_grid, threads, [*inputs, part.groups], [failure, sums], block_dim=share)
+    threads = outputs[0].shape[0] * part.groups[1] * share
+    program.launch(kernel, threads, [*inputs, part.groups], outputs, block_dim=share)

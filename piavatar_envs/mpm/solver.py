@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import warp as wp
+
 from piavatar_envs.mpm import runs
+from piavatar_envs.mpm.ahead import grid_to_momenta, momenta_to_grid
 from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.contact_pass import solve_contact
 from piavatar_envs.mpm.gather import grid_to_particles
 from piavatar_envs.mpm.grid import update_grid
-from piavatar_envs.mpm.groups import record_runs
+from piavatar_envs.mpm.groups import record_groups, runs_to_grid
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
+from piavatar_envs.mpm.matrices import allocate_matrices
 from piavatar_envs.mpm.memory import allocate_sums
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.others import begin_others, notes_others
@@ -49,25 +53,22 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     _record_grid(program, model, state, scratch)
     if m.contact.num_fields > 1 or m.scatter != "shared":
         _record_gather(program, model, state, scratch)
-    if m.moving_boundaries:
-        program.launch(move_colliders, m.boundaries.position.shape, [m.step.dt], [m.boundaries])
+    _record_colliders(program, m)
 
 
 def record_substeps(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """Append all substeps of a control step between which nothing acts, see :func:`record_substep`.
 
-    Where that suits them, each is one launch, see :mod:`piavatar_envs.mpm.relay`, or parts of the world are scattered
-    again while others are still gathered, see :mod:`piavatar_envs.mpm.parts`.
+    Where that suits them, each is one launch, see :mod:`piavatar_envs.mpm.relay`, or what is gathered says what is
+    scattered next, see :mod:`piavatar_envs.mpm.ahead`.
     """
     if has_turns(model):
         _record_turns(program, model, state, scratch)
-        return
-    parts = parts_of_world(model)
-    if len(parts) > 1 and not model.moving_boundaries:
-        _record_parts(program, model, state, scratch, parts)
-        return
-    for index in range(model.num_substeps):
-        record_substep(program, model, state, scratch, index)
+    elif has_groups(model):
+        _record_ahead(program, model, state, scratch)
+    else:
+        for index in range(model.num_substeps):
+            record_substep(program, model, state, scratch, index)
 
 
 def _record_turns(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -84,25 +85,35 @@ def _record_turns(program: Program, model: Model, state: State, scratch: Scratch
         record_substep(program, model, state, scratch, model.num_substeps - 1)
 
 
-def _record_parts(program: Program, model: Model, state: State, scratch: Scratch, parts: list[Part]) -> None:
-    """:func:`record_substeps` in which each of the ``parts`` goes from gather to scatter by itself."""
-    world = (model, state, scratch)
+def _record_ahead(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+    """:func:`record_substeps` of gathers that find what is scattered next; the last one leaves the state.
+
+    Parts of the world, see :mod:`piavatar_envs.mpm.parts`, go from gather to scatter by themselves, where all blocks
+    have their marks and no boundary is to move in between.
+    """
+    if scratch.affine is None:
+        scratch.affine = allocate_matrices(model.num_envs, model.num_particles, model.device)
+    world, parts = (model, state, scratch), parts_of_world(model)
 
     def gather_and_scatter(part: Part, branch: Program) -> None:
-        _record_gather(branch, *world, part)
-        record_scatter(branch, *world, part)
+        _record_gather(branch, *world, part, scratch.affine)
+        record_scatter(branch, *world, part, scratch.affine)
 
     record_scatter(program, *world)
-    for index in range(1, model.num_substeps + 1):
+    for index in range(1, model.num_substeps):
         _record_grid(program, *world)
-        if index == model.num_substeps:
-            _record_gather(program, *world)
-        elif _marks_before(model, index):
-            _record_gather(program, *world)
-            _record_new_marks(program, *world)
-            record_scatter(program, *world)
-        else:
+        marks = _marks_before(model, index)
+        if not marks and not model.moving_boundaries:
             program.fork_each(parts, gather_and_scatter)
+            continue
+        _record_gather(program, *world, affine=scratch.affine)
+        _record_colliders(program, model)
+        if marks:
+            _record_new_marks(program, *world)
+        record_scatter(program, *world, affine=scratch.affine)
+    _record_grid(program, *world)
+    _record_gather(program, *world)
+    _record_colliders(program, model)
 
 
 def _marks_before(model: Model, index: int) -> bool:
@@ -110,18 +121,38 @@ def _marks_before(model: Model, index: int) -> bool:
     return index % (MARKS_OF_GROUPS if has_groups(model) else MARKS_EVERY) == 0
 
 
-def _record_gather(program: Program, model: Model, state: State, scratch: Scratch, part: Part | None = None) -> None:
-    """Append the transfer of nodes to particles, of a ``part`` or of all, and what their contact sensors feel."""
+def _record_colliders(program: Program, model: Model) -> None:
+    """Append how boundaries go on, where any may."""
+    if model.moving_boundaries:
+        program.launch(move_colliders, model.boundaries.position.shape, [model.step.dt], [model.boundaries])
+
+
+def _record_gather(
+    program: Program,
+    model: Model,
+    state: State,
+    scratch: Scratch,
+    part: Part | None = None,
+    affine: wp.array | None = None,
+) -> None:
+    """Append the transfer of nodes to particles, of a ``part`` or of all, and what their contact sensors feel.
+
+    What is scattered next is left in ``affine``, if given, instead of the affine velocity in the state.
+    """
     m, s = model, state
     inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
-    outputs = [scratch.blocks, _moving(s), s.failure]
+    moved = [scratch.blocks, _moving(s)]
     if m.scatter == "plain":
-        program.launch(grid_to_particles, s.x.shape, inputs, outputs, block_dim=runs.THREADS)
+        program.launch(grid_to_particles, s.x.shape, inputs, [*moved, s.failure], block_dim=runs.THREADS)
         return
     those = (part or whole_world(m)).particles
     inputs += [int(senses_in_gather(m)), those]
-    outputs.append(scratch.sensors)
-    program.launch(runs.grid_to_particles, m.num_envs * those[1], inputs, outputs, block_dim=runs.THREADS)
+    kernel = runs.grid_to_particles
+    if affine is not None:
+        kernel = grid_to_momenta
+        moved.append(affine)
+    outputs = [*moved, s.failure, scratch.sensors]
+    program.launch(kernel, m.num_envs * those[1], inputs, outputs, block_dim=runs.THREADS)
 
 
 def _record_grid(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -173,10 +204,18 @@ def _record_contact(program: Program, model: Model, state: State, scratch: Scrat
     )
 
 
-def record_scatter(program: Program, model: Model, state: State, scratch: Scratch, part: Part | None = None) -> None:
+def record_scatter(
+    program: Program,
+    model: Model,
+    state: State,
+    scratch: Scratch,
+    part: Part | None = None,
+    affine: wp.array | None = None,
+) -> None:
     """Append the transfer of particles to nodes, in the way of ``model.scatter``; if shared, what goes with it.
 
-    Of all particles, or of a ``part`` of those that groups scatter.
+    Of all particles, or of a ``part`` of those that groups scatter; of these, from what a gather has left in
+    ``affine``, if given.
     """
     m, s = model, state
     if m.scatter == "shared":
@@ -188,7 +227,12 @@ def record_scatter(program: Program, model: Model, state: State, scratch: Scratc
     elif m.scatter in ("singles", "singles_float"):
         record_singles(program, inputs, s.x.shape, s.failure, scratch.sums)
     else:
-        record_runs(program, inputs, m.num_particles, part or whole_world(m), s.failure, scratch.sums)
+        outputs = [s.failure, scratch.sums]
+        part = part or whole_world(m)
+        if affine is None:
+            record_groups(program, runs_to_grid, inputs, outputs, m.num_particles, part)
+        else:
+            record_groups(program, momenta_to_grid, [*inputs, affine], outputs, m.num_particles, part)
 
 
 def _scattering(m: Model, s: State, scratch: Scratch) -> list[Any]:

@@ -66,13 +66,30 @@ def impulse_of_stress(grid: Grid, step: Step, volume: float, tau: wp.mat33):
 
 
 @wp.func
-def with_momentum(grid: Grid, s: Scattered, m: float, u: wp.vec3, k: wp.vec3, C: wp.mat33, stress: wp.mat33):
-    """``s`` with mass, physical momentum less the impulse of its ``stress``, and kinematic momentum of a particle."""
-    affine = m * C - stress
-    s.A = grid.dx * affine
-    q = m * u - s.A * s.f
+def affine_momentum(grid: Grid, m: float, C: wp.mat33, stress: wp.mat33):
+    """Change of a particle's momentum from node to node, that of its affine velocity less the impulse of ``stress``."""
+    return grid.dx * (m * C - stress)
+
+
+@wp.func
+def with_momentum(s: Scattered, m: float, u: wp.vec3, k: wp.vec3, A: wp.mat33):
+    """``s`` with mass, physical momentum, which changes by ``A`` from node to node, and kinematic momentum."""
+    s.A = A
+    q = m * u - A * s.f
     s.at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
     return s
+
+
+@wp.func
+def stressed(grid: Grid, step: Step, particles: Particles, e: int, p: int, F: wp.mat33):
+    """:func:`impulse_of_stress` of particle ``p`` with deformation ``F``."""
+    tau = kirchhoff_stress(
+        particles.material[row(e, particles.material.shape[0]), p],
+        F,
+        particles.mu[row(e, particles.mu.shape[0]), p],
+        particles.lam[row(e, particles.lam.shape[0]), p],
+    )
+    return impulse_of_stress(grid, step, particles.volume[row(e, particles.volume.shape[0]), p], tau)
 
 
 @wp.func
@@ -88,18 +105,11 @@ def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int
     C = matrix_at(moving.C, e, p)  # first used after the stress: its parameters are asked for before this has come
     stress = wp.mat33()
     if step.decoupling != NO_STRESS:
-        volume = particles.volume[row(e, particles.volume.shape[0]), p]
-        tau = kirchhoff_stress(
-            particles.material[row(e, particles.material.shape[0]), p],
-            matrix_at(moving.F, e, p),
-            particles.mu[row(e, particles.mu.shape[0]), p],
-            particles.lam[row(e, particles.lam.shape[0]), p],
-        )
-        stress = impulse_of_stress(grid, step, volume, tau)
+        stress = stressed(grid, step, particles, e, p, matrix_at(moving.F, e, p))
     k = wp.vec3()
     if tells or step.decoupling == PAPER:
         k = m * moving.vk[e, p]
-    return with_momentum(grid, s, m, moving.u[e, p], k, C, stress)
+    return with_momentum(s, m, moving.u[e, p], k, affine_momentum(grid, m, C, stress))
 
 
 @wp.func

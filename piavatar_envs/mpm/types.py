@@ -316,6 +316,7 @@ class Scratch:
         sensors: what contact did in this control step.
         room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
         turns: sets of sums in turns, of ``TURNS * S`` slots, where :mod:`piavatar_envs.mpm.relay` has been recorded.
+        affine: what particles' momenta change by from node to node [kg m/s], where :mod:`piavatar_envs.mpm.ahead` has.
     """
 
     blocks: Blocks
@@ -326,3 +327,4 @@ class Scratch:
     room: Room
     large_room: bool
     turns: Sums | None = None
+    affine: wp.array | None = None

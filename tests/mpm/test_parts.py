@@ -1,18 +1,20 @@
-"""Parts of a world that go from gather to scatter by themselves."""
+"""Gathers that find what is scattered next, and parts of a world that go from one to the other by themselves."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from piavatar_envs.mpm.parts import first_groups, parts_of_world
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import MARKS_OF_GROUPS, record_begin, record_end, record_substep, record_substeps
-from piavatar_envs.mpm.types import FAILURE_BLOCKS
+from piavatar_envs.mpm.solver import MARKS_OF_GROUPS, record_begin, record_substeps
+from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL
 
 ARRAYS = ("x", "u", "C", "F")
+SCATTERS = ("runs_to_grid", "momenta_to_grid")
 SENSED = ("boundary_impulse", "pair_impulse", "part_impulse", "penetration")
 
 
@@ -38,75 +40,92 @@ def test_parts_share_no_field_and_are_alike(groups, expected):
 
 
 @pytest.fixture
-def clash(meet, three_boxes, device):
+def groups_clash(clash):
     """Three boxes that come together on a floor in two worlds, added up by groups, in steps with new marks."""
-    if device == "cpu":
-        pytest.skip("groups are a GPU's")
-
-    def build(**kwargs):
-        world = {"num_substeps": MARKS_OF_GROUPS + 4, "num_envs": 2, "control_dt": 0.015, "scatter": "runs"}
-        sim = meet(three_boxes, friction=0.4, planes=[((0.0, 0.0, 1.0), -0.11, 0.5)], **(world | kwargs))
-        rng = np.random.default_rng(8)
-        shape = (2, len(sim.rest), 3)
-        return sim.set(u=sim.state.u.numpy() + rng.normal(0.0, 0.1, shape), vk=rng.normal(0.0, 0.1, shape))
-
-    return build
+    return partial(clash, **{"num_substeps": MARKS_OF_GROUPS + 4, "control_dt": 0.015, "scatter": "runs"})
 
 
-def recorded(sim, in_parts: bool):
-    """A world whose substeps are recorded ``in_parts``, or begin when those before have ended; sensors forget."""
-    sim.program, world = Program(sim.model.device), (sim.model, sim.state, sim.scratch)
-    record_begin(sim.program, *world)
-    if in_parts:
-        record_substeps(sim.program, *world)
-    else:
-        for index in range(sim.model.num_substeps):
-            record_substep(sim.program, *world, index)
-    record_end(sim.program, *world)
-    return sim
+def same(first, second, arrays=ARRAYS):
+    """Whether the particles of two worlds have become the same, bit for bit, and what sensors say of them."""
+    for array in arrays:
+        np.testing.assert_array_equal(first.get(array, 1), second.get(array, 1), err_msg=array)
+        np.testing.assert_array_equal(first.get(array), second.get(array), err_msg=array)
+    for name in SENSED:
+        found, expected = (getattr(sim.scratch.sensors, name).numpy() for sim in (first, second))
+        np.testing.assert_array_equal(found, expected, err_msg=name)
 
 
 @pytest.mark.parametrize("num_substeps", [1, 2, MARKS_OF_GROUPS, MARKS_OF_GROUPS + 4])
-def test_parts_are_the_same_substeps_bit_for_bit(clash, num_substeps):
+def test_parts_are_the_same_substeps_bit_for_bit(groups_clash, one_by_one, num_substeps):
     """Of three bodies in two parts, which collide; what sensors say, too."""
     settings = {"num_substeps": num_substeps, "control_dt": 75e-5 * num_substeps}
-    parts, apart = recorded(clash(**settings), True), recorded(clash(**settings), False)
+    parts, apart = groups_clash(**settings), one_by_one(groups_clash(**settings))
     both = parts_of_world(parts.model)
     assert len(both) == 2 and sum(part.particles[1] for part in both) == parts.model.num_particles
-    scatters = [launch.branch for launch in parts.program._launches if launch.kernel.key == "runs_to_grid"]
+    scatters = [launch.branch for launch in parts.program._launches if launch.kernel.key in SCATTERS]
     marked = (num_substeps - 1) // MARKS_OF_GROUPS
     assert len(scatters) == 2 * num_substeps - 1 - marked and set(scatters) == ({0, 1} if num_substeps > 1 else {0})
     assert parts.program.names.count("mark_particles") == 1 + marked
     for _ in range(2 if num_substeps > 2 else 20 // num_substeps):
         parts.run(), apart.run()
         assert parts.failures == apart.failures == [0, 0]
-        for array in ARRAYS:
-            np.testing.assert_array_equal(parts.get(array, 1), apart.get(array, 1), err_msg=array)
-            np.testing.assert_array_equal(parts.get(array), apart.get(array), err_msg=array)
-        for name in SENSED:
-            found, expected = (getattr(sim.scratch.sensors, name).numpy() for sim in (parts, apart))
-            np.testing.assert_array_equal(found, expected, err_msg=name)
+        same(parts, apart)
     assert all(np.abs(getattr(apart.scratch.sensors, name).numpy()).max() > 0.0 for name in SENSED)
 
 
-def test_parts_where_slots_run_out(clash):
+@pytest.mark.parametrize(("max_slots", "failures"), [(44, [FAILURE_BLOCKS] * 2), (50, [FAILURE_BLOCKS, 0])])
+def test_parts_where_slots_run_out(groups_clash, one_by_one, max_slots, failures):
     """Particles of one part find no room, while others are scattered: nobody moves, and sensors say what they did."""
-    parts, apart = (recorded(clash(max_slots=50), in_parts).run(2) for in_parts in (True, False))
-    assert parts.failures == apart.failures == [FAILURE_BLOCKS] * 2
-    for array in ARRAYS:
-        np.testing.assert_array_equal(parts.get(array, 1), apart.get(array, 1), err_msg=array)
-    for name in SENSED:
-        found, expected = (getattr(sim.scratch.sensors, name).numpy() for sim in (parts, apart))
-        np.testing.assert_array_equal(found, expected, err_msg=name)
+    parts, apart = groups_clash(max_slots=max_slots).run(2), one_by_one(groups_clash(max_slots=max_slots)).run(2)
+    assert parts.failures == apart.failures == failures
+    same(parts, apart, ("x", "u", "F"))  # only a gather that is the last of a step leaves affine velocities
     assert parts.sums_are_clear and apart.sums_are_clear
 
 
-def test_boundaries_that_move_do_so_in_every_substep(clash):
+@pytest.mark.parametrize("decoupling", ["split", "paper", "none", "no_stress"])
+@pytest.mark.parametrize("material", ["neo_hookean", "fixed_corotated"])
+def test_what_gathers_find_ahead_is_what_scatters_find(drop, one_by_one, decoupling, material):
+    """Of one body, which goes in one part; bit for bit."""
+    settings = {"scatter": "runs", "decoupling": decoupling, "material": material, "num_substeps": 18}
+    ahead, apart = drop(**settings), one_by_one(drop(**settings))
+    scatters = [ahead.program.names.count(name) for name in SCATTERS]
+    assert scatters == [1, 17] and "momenta_to_grid" not in apart.program.names
+    start = ahead.get("F")
+    ahead.run(2), apart.run(2)
+    assert ahead.failures == apart.failures == [0] * 3 and np.abs(ahead.get("F") - start).max() > 1e-3
+    for array in ARRAYS:
+        np.testing.assert_array_equal(ahead.state.numpy()[array], apart.state.numpy()[array], err_msg=array)
+
+
+def test_who_fails_ahead_fails_alone(drop):
+    """A particle that goes too fast fails in the first gather, and scatters on what it had; others do as without it."""
+    sound, broken = drop(scatter="runs"), drop(scatter="runs")
+    vk = broken.state.vk.numpy()
+    vk[1, 7] = [60.0, 0.0, 0.0]
+    broken.set(vk=vk)
+    sound.run(), broken.run()
+    assert broken.failures == [0, FAILURE_CFL, 0] and broken.sums_are_clear
+    assert all(np.isfinite(broken.state.numpy()[array]).all() for array in ARRAYS)
+    for array in ARRAYS:
+        np.testing.assert_array_equal(broken.get(array), sound.get(array), err_msg=array)
+        np.testing.assert_array_equal(broken.get(array, 2), sound.get(array, 2), err_msg=array)
+
+
+def test_boundaries_that_move_do_so_in_every_substep(groups_clash):
     """Such worlds do not go in parts."""
-    sim = clash()
+    sim = groups_clash()
     sim.model = replace(sim.model, moving_boundaries=True)
-    names = recorded(sim, True).program.names
-    assert names.count("move_colliders") == names.count("runs_to_grid") == sim.model.num_substeps
+    sim.program, world = Program(sim.model.device), (sim.model, sim.state, sim.scratch)
+    record_begin(sim.program, *world)
+    record_substeps(sim.program, *world)
+    names = sim.program.names
+    gathers, order = ("grid_to_momenta", "grid_to_particles"), [n for n in names if n in (*SCATTERS, "move_colliders")]
+    assert sum(map(names.count, gathers)) == sim.model.num_substeps
+    assert order == [
+        "runs_to_grid",
+        *["move_colliders", "momenta_to_grid"] * (sim.model.num_substeps - 1),
+        "move_colliders",
+    ]
 
 
 def test_what_goes_in_parts(clash, meet):

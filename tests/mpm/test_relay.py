@@ -9,49 +9,12 @@ import pytest
 import warp as wp
 
 from piavatar_envs.mpm.build import MaterialPoints
-from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay import PORTION, portions
 from piavatar_envs.mpm.relay_contact import meets_others
-from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
 from piavatar_envs.mpm.turns import has_turns
 from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, FAILURE_NONFINITE, FAILURE_OUT_OF_GRID
 
 ARRAYS = ("x", "u", "C", "F")
-FLOOR = [((0.0, 0.0, 1.0), -0.11, 0.5)]
-
-
-@pytest.fixture
-def drop(simulate, device):
-    """A box that slides on a floor, in three worlds, for a control step of ``num_substeps``."""
-    if device == "cpu":
-        pytest.skip("relays are a GPU's")
-
-    def build(num_substeps=12, num_envs=3, **kwargs):
-        world = {"planes": FLOOR, "gravity": (0.0, 0.0, -9.81), "margin": 0.6} | kwargs
-        world.setdefault("scatter", "singles")
-        sim = simulate(num_substeps=num_substeps, num_envs=num_envs, **world)
-        rng = np.random.default_rng(4)
-        shape = (num_envs, len(sim.rest), 3)
-        return sim.set(
-            u=rng.normal(0.0, 0.2, shape) + [1.5, 0.3, -1.0],
-            C=rng.normal(0.0, 1.0, (*shape, 3)),
-            vk=rng.normal(0.0, 0.3, shape),
-            spin=rng.normal(0.0, 0.3, shape),
-        )
-
-    return build
-
-
-def one_by_one(sim):
-    """The same world, whose substeps are launches of their own."""
-    program = Program(sim.model.device)
-    several = sim.model.contact.num_fields > 1  # whose sensors forget
-    (record_begin if several else record_marks)(program, sim.model, sim.state, sim.scratch)
-    for index in range(sim.model.num_substeps):
-        record_substep(program, sim.model, sim.state, sim.scratch, index)
-    record_end(program, sim.model, sim.state, sim.scratch)
-    sim.program = program
-    return sim
 
 
 def same(a, b, atol=(1e-6, 1e-4, 1e-2, 1e-5)):
@@ -61,7 +24,7 @@ def same(a, b, atol=(1e-6, 1e-4, 1e-2, 1e-5)):
 
 
 @pytest.mark.parametrize("decoupling", ["split", "none", "no_stress"])
-def test_relays_are_substeps(drop, decoupling):
+def test_relays_are_substeps(drop, one_by_one, decoupling):
     """With a floor that the body slides on, kinematic velocities, and what the sensors say of it."""
     relay, apart = drop(decoupling=decoupling), one_by_one(drop(decoupling=decoupling))
     assert "carry_on" in relay.program.names and "carry_on" not in apart.program.names
@@ -83,13 +46,13 @@ def test_portions_are_equal(count):
     assert sum(parts) == count and max(parts) <= PORTION and max(parts) - min(parts) <= 1
 
 
-def test_a_single_substep_is_one_too(drop):
+def test_a_single_substep_is_one_too(drop, one_by_one):
     relay, apart = drop(num_substeps=1, control_dt=1e-3), one_by_one(drop(num_substeps=1, control_dt=1e-3))
     same(relay.run(3), apart.run(3))
     assert relay.sums_are_clear
 
 
-def test_bodies_that_go_far(drop):
+def test_bodies_that_go_far(drop, one_by_one):
     """Through blocks that they mark themselves, over several portions, turned by nothing."""
     settings = {"num_substeps": PORTION + 10, "num_envs": 1, "planes": (), "gravity": (0.0, 0.0, 0.0)}
     relay, apart = drop(**settings), one_by_one(drop(**settings))
@@ -103,7 +66,7 @@ def test_bodies_that_go_far(drop):
     assert relay.sums_are_clear
 
 
-def test_more_blocks_than_warps(drop):
+def test_more_blocks_than_warps(drop, one_by_one):
     """Each particle is in blocks of its own, and a warp of four clears dozens."""
     rest = np.random.default_rng(6).uniform(-0.5, 0.5, (60, 3))
     settings = {"rest": rest, "num_envs": 2, "planes": [((0.0, 0.0, 1.0), -0.51, 0.5)]}
@@ -131,7 +94,7 @@ def test_relays_repeat_bit_for_bit(drop):
         ("x", 3.0, FAILURE_OUT_OF_GRID),
     ],
 )
-def test_who_fails_fails_alone(drop, array, value, failure):
+def test_who_fails_fails_alone(drop, one_by_one, array, value, failure):
     """As without relays: the others go on bit for bit, and the failed environment stands still for good."""
     well, ill = drop(), drop()
     values = ill.state.numpy()[array]
@@ -169,10 +132,10 @@ def test_slots_that_run_out(drop, extra, way):
 
 
 @pytest.mark.parametrize("count", [401, 402, 403])
-def test_warps_that_are_not_full(drop, count):
+def test_warps_that_are_not_full(drop, one_by_one, count):
     """Two oblique walls besides, and particles of several masses that differ from world to world."""
     rest = np.random.default_rng(9).uniform(-0.1, 0.1, (count, 3))
-    planes = [*FLOOR, ((0.6, 0.0, 0.8), -0.13, 0.3), ((0.0, 1.0, 1.0), -0.16, 0.0)]
+    planes = [((0.0, 0.0, 1.0), -0.11, 0.5), ((0.6, 0.0, 0.8), -0.13, 0.3), ((0.0, 1.0, 1.0), -0.16, 0.0)]
     density = np.random.default_rng(1).uniform(900.0, 1100.0, (3, count))
     points = replace(MaterialPoints.uniform(np.full(count, 2e-5)), density=density)
     relay, apart = (drop(rest=rest, planes=planes, points=points) for _ in range(2))
@@ -190,30 +153,10 @@ def test_what_relays_are_for(drop, simulate, meet):
     assert not has_turns(meet(balls, scatter="singles", normals="own").model)
 
 
-@pytest.fixture
-def clash(meet, three_boxes, device):
-    """Boxes of three subjects that come together in two worlds, one of them on a floor, all driven besides."""
-    if device == "cpu":
-        pytest.skip("relays are a GPU's")
-
-    def build(num_substeps=12, num_envs=2, planes=FLOOR, **kwargs):
-        world = {"planes": planes, "scatter": "singles", "friction": 0.4, "num_envs": num_envs, "control_dt": 0.012}
-        sim = meet(three_boxes, num_substeps=num_substeps, **(world | kwargs))
-        rng = np.random.default_rng(8)
-        shape = (num_envs, len(sim.rest), 3)
-        return sim.set(
-            u=sim.state.u.numpy() + rng.normal(0.0, 0.1, shape),
-            vk=rng.normal(0.0, 0.1, shape) + [0.0, 0.2, 0.0],
-            spin=rng.normal(0.0, 0.1, shape),
-        )
-
-    return build
-
-
 SENSED = ("boundary_impulse", "boundary_moment", "pair_impulse", "part_impulse", "penetration")
 
 
-def test_relays_of_several_fields_are_substeps(clash):
+def test_relays_of_several_fields_are_substeps(clash, one_by_one):
     """Three subjects that meet each other and a floor, and what sensors say of all that."""
     relay, apart = clash(), one_by_one(clash())
     assert "carry_fields_on" in relay.program.names and "carry_fields_on" not in apart.program.names
@@ -229,7 +172,7 @@ def test_relays_of_several_fields_are_substeps(clash):
 
 
 @pytest.mark.parametrize("num_substeps", [1, 2])
-def test_few_substeps_of_several_fields(clash, num_substeps):
+def test_few_substeps_of_several_fields(clash, one_by_one, num_substeps):
     """The last is always launched apart: with one, nothing is left for a relay."""
     settings = {"num_substeps": num_substeps, "control_dt": 1e-3 * num_substeps}
     relay, apart = clash(**settings).run(3), one_by_one(clash(**settings)).run(3)
