@@ -27,7 +27,7 @@ from piavatar_envs.avatar.substeps import record_drive
 from piavatar_envs.mpm.boundaries import Collider
 from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.fields import Fields
-from piavatar_envs.mpm.memory import SLOT_MARGIN, allocate, estimate_slots
+from piavatar_envs.mpm.memory import LARGE_MARGIN, allocate, estimate_slots
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substeps
 from piavatar_envs.mpm.types import Grid, failure_name
@@ -178,7 +178,7 @@ def _one_a_cell(positions: np.ndarray, dx: float) -> np.ndarray:
 def _slots(rest: np.ndarray, dx: float) -> int:
     """Slots of a body of particles ``rest`` ``(P, 3)`` [m]; a skin leaves blocks behind for longer than others."""
     cells = _one_a_cell(rest, dx)
-    margin = SKIN_MARGIN if 2 * len(cells) > len(rest) else SLOT_MARGIN
+    margin = SKIN_MARGIN if 2 * len(cells) > len(rest) else LARGE_MARGIN
     return estimate_slots(cells, None, dx, margin)
 
 

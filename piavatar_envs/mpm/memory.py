@@ -11,7 +11,7 @@ from piavatar_envs.mpm.blocks import NOBODY
 from piavatar_envs.mpm.matrices import allocate_matrices, components_of, whole_lines
 from piavatar_envs.mpm.others import notes_others
 from piavatar_envs.mpm.sensing import senses_in_gather
-from piavatar_envs.mpm.shared_room import plan_room
+from piavatar_envs.mpm.shared_room import MOST_PARTICLES, plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.sums import units
 from piavatar_envs.mpm.sweep import most_shared
@@ -31,6 +31,8 @@ from piavatar_envs.mpm.types import (
 #: Blocks with matter that a body may come to need, over those that it needs at rest. Random full-scale actions, also of
 #: random shapes, made it 1.2 times as many at most.
 SLOT_MARGIN = 1.7
+#: The same over those of a body with more particles than fit into shared memory: its blocks are marked anew less often.
+LARGE_MARGIN = 2.2
 #: Warp's strides are 32-bit: the records of an environment, of 64 bytes at most, take less than 2^31.
 MOST_SLOTS = 2**31 // (64 * BLOCK**3)
 
@@ -52,25 +54,28 @@ def bound_slots(max_slots: int | None, field: np.ndarray, grid: Grid, num_fields
     return slots
 
 
-def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin: float = SLOT_MARGIN) -> int:
+def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin: float | None = None) -> int:
     """Slots that bodies will need, from how many they take where they are at rest.
 
     Args:
         rest: positions of the particles [m], shape ``(num_particles, 3)``; how bodies lie to each other is immaterial.
         field: their velocity fields, shape ``(num_particles,)``; the first for all if not given.
         dx: grid spacing [m].
-        margin: how many times as many slots a body may come to need, in another pose or shape.
+        margin: how many times as many slots a body may come to need, in another pose or shape, and while it goes on;
+            ``SLOT_MARGIN`` if not given, or ``LARGE_MARGIN``.
     """
     field = np.zeros(len(rest), int) if field is None else field
     corners = np.array(np.meshgrid([0, 2], [0, 2], [0, 2])).reshape(3, -1).T
     needed = 0
     for index in np.unique(field):
-        base = np.floor(rest[field == index] / dx - 0.5).astype(int)
+        own = rest[field == index]
+        times = margin or (LARGE_MARGIN if len(own) > MOST_PARTICLES else SLOT_MARGIN)
+        base = np.floor(own / dx - 0.5).astype(int)
         counts = []
         for shift in np.ndindex(2, 2, 2):  # the grid may lie to the body as it likes
             touched = (base[:, None] + 2 * np.array(shift) + corners) // BLOCK
             counts.append(len(np.unique(touched.reshape(-1, 3), axis=0)))
-        needed += math.ceil(margin * max(counts)) + 8
+        needed += math.ceil(times * max(counts)) + 8
     return needed
 
 
@@ -80,7 +85,7 @@ def estimate_bytes(
     """Device memory of state and scratch [bytes].
 
     120 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 32 more
-    where there are several fields; the map of blocks. Sums in turns are made by who records them.
+    where there are several fields; the map of blocks. What relays and gathers ahead need is made by who records them.
     """
     sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter])
     node = sums + 32 + (16 + 16 if num_fields > 1 else 0)

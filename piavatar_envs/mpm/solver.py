@@ -34,8 +34,8 @@ from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 #: substeps nothing moves further than two blocks.
 MARKS_EVERY = 8
 #: The same for large bodies, of which marking takes longer. A body of 2,300 blocks that goes a grid spacing a substep
-#: leaves some 1,600 behind in 16 of them: there is room for 1.7 times its blocks.
-MARKS_OF_GROUPS = 16
+#: leaves some 2,500 behind in 25 of them: there is room for 2.2 times its blocks.
+MARKS_OF_GROUPS = 25
 
 
 def record_substep(program: Program, model: Model, state: State, scratch: Scratch, index: int) -> None:

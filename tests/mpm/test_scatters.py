@@ -10,13 +10,13 @@ import warp as wp
 
 from piavatar_envs.mpm import group_plan
 from piavatar_envs.mpm.build import MaterialPoints, choose_scatter
-from piavatar_envs.mpm.memory import estimate_slots
+from piavatar_envs.mpm.memory import LARGE_MARGIN, SLOT_MARGIN, estimate_slots
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import MOST_COUNTED
-from piavatar_envs.mpm.shared_room import parts_of, suits_shared
+from piavatar_envs.mpm.shared_room import MOST_PARTICLES, parts_of, suits_shared
 from piavatar_envs.mpm.solver import record_marks, record_scatter
 from piavatar_envs.mpm.sums import units
-from piavatar_envs.mpm.types import FAILURE_CFL, SCATTERS
+from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, SCATTERS
 
 ARRAYS = ("x", "u", "C", "F")
 CUBES = [
@@ -354,6 +354,20 @@ def test_fast_bodies_leave_their_slots_behind(simulate):
     sim = simulate(num_substeps=80, control_dt=0.1, margin=2.5, max_slots=slots).set(u=(20.0, 0.0, 0.0)).run()
     assert sim.failures == [0]
     np.testing.assert_allclose(sim.get("x") - sim.rest, np.tile([2.0, 0.0, 0.0], (len(sim.rest), 1)), atol=1e-3)
+
+
+def test_large_bodies_have_more_slots_to_leave_behind(simulate, device):
+    """Groups of particles are marked anew every 25 substeps, in which these go 13 grid spacings."""
+    points = np.random.default_rng(2).uniform(-0.5, 0.5, (MOST_PARTICLES + 1, 3))
+    assert estimate_slots(points, None, 0.05) == estimate_slots(points, None, 0.05, LARGE_MARGIN)
+    assert estimate_slots(points[1:], None, 0.05) == estimate_slots(points[1:], None, 0.05, SLOT_MARGIN)
+    if device == "cpu":
+        pytest.skip("groups are a GPU's")
+    world = {"num_substeps": 80, "control_dt": 0.1, "margin": 2.5, "scatter": "runs"}
+    slots = estimate_slots(simulate().rest, None, 0.05, LARGE_MARGIN)
+    sim = simulate(**world, max_slots=slots).set(u=(20.0, 0.0, 0.0)).run()
+    assert sim.failures == [0]
+    assert simulate(**world, max_slots=slots - 20).set(u=(20.0, 0.0, 0.0)).run().failures == [FAILURE_BLOCKS]
 
 
 def test_slots_do_not_grow_with_the_grid(simulate):
