@@ -118,6 +118,20 @@ def sense_gathered(grid: Grid, particles: Particles, blocks: Blocks, sensors: Se
         sense_particle(grid, particles, blocks, sensors, e, p, xg)
 
 
+@wp.func
+def is_alone(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i):
+    """Whether the grid pass has noted that a stencil of field ``f`` lies in no block of another one.
+
+    It has noted nothing of blocks that have been marked since, nor where a gather does not ask for it.
+    """
+    if blocks.beside.shape[1] == 1:
+        return False
+    r = first_record(grid, blocks, e, f, block_index(grid, base[0], base[1], base[2]))
+    if r >= BLOCK_NODES * blocks.swept[e]:
+        return False
+    return blocks.beside[e, r // BLOCK_NODES] == 0
+
+
 def senses_in_gather(model: Model) -> bool:
     """Whether particles sense contact in the gather, that of large bodies on a GPU, and not in a launch of its own."""
     senses = model.contact.num_fields > 1 and model.num_sensors > 0
@@ -169,6 +183,8 @@ def sense_penetration(
     stencil = stencil_at(xg)
     base = stencil.base
     if not stencil_inside(grid, base):
+        return
+    if is_alone(grid, blocks, e, particles.field[p], base):
         return
     own = contact.subject[particles.field[p]]
     around = fields_around(grid, blocks, base, e)

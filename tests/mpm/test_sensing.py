@@ -38,15 +38,32 @@ def test_impulses_are_the_changes_of_momentum(meet, normals):
 
 @pytest.mark.parametrize("overlap", [-0.5, 0.1, 0.4, 0.8])
 @pytest.mark.parametrize("density", [500.0, 2000.0])
-def test_penetration_of_a_known_overlap(meet, overlap, density):
+@pytest.mark.parametrize("scatter", [None, "runs", "singles"])
+def test_penetration_of_a_known_overlap(meet, device, overlap, density, scatter):
     """The centre of the deepest particle, a quarter of a spacing inside its body; the bodies are at rest."""
+    if device == "cpu" and scatter:
+        pytest.skip("a CPU has but one way to scatter")
     into = {"box": ((-overlap * DX, -0.1, -0.1), (0.2 - overlap * DX, 0.1, 0.1)), "density": density}
-    sim = meet([CUBE, into], num_substeps=1, control_dt=1e-4).run()
+    sim = meet([CUBE, into], num_substeps=1, control_dt=1e-4, scatter=scatter).run()
     expected = max(0.0, overlap - 0.25) * DX
     found = sim.scratch.sensors.penetration.numpy()[0]
     np.testing.assert_allclose(found, expected, atol=0.15 * DX)
     assert overlap > 0.0 or not found.any()
     assert overlap < 0.2 or found.all()
+
+
+@pytest.mark.parametrize("scatter", ["runs", "singles"])
+def test_penetration_of_bodies_that_go_on(meet, device, scatter):
+    """Into blocks that the last gather has marked, of which a grid pass knows nothing yet."""
+    if device == "cpu":
+        pytest.skip("a CPU has but one way to scatter")
+    for substeps in (1, 2, 5, 9):
+        settings = {"num_substeps": substeps, "control_dt": 1e-3 * substeps}
+        sims = [meet([BLOCK, BALL], scatter=way, **settings) for way in ("plain", scatter)]
+        for _ in range(36 // substeps):
+            plain, found = (sim.run().scratch.sensors.penetration.numpy() for sim in sims)
+            np.testing.assert_allclose(found, plain, atol=1e-4)
+        assert plain.max() > 0.002
 
 
 def test_sensors_forget(meet):
