@@ -160,9 +160,9 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
         "update_grid": 2 * sums // (2 if SCATTERS[model.scatter] else 1) + nodes * NODE_BYTES // 2,
         # x, F, vk, spin and physical velocities in; x, u, C, F out
         "grid_to_particles": particles * (72 + WRITTEN_BYTES) + nodes * NODE_BYTES // 2,
-        # the same with constants in, and momenta instead of C out; those with x and u in
+        # the same with constants in, and momenta instead of C out; those with x, u and masses in
         "grid_to_momenta": particles * (72 + constants + WRITTEN_BYTES) + nodes * NODE_BYTES // 2,
-        "momenta_to_grid": particles * 60 + 2 * sums,
+        "momenta_to_grid": particles * (60 + (4 if constants else 0)) + 2 * sums,
         # a body's grid stays in shared memory: what the scatter reads, and x, F, vk and spin once more; x, u, C, F out
         **dict.fromkeys(SUBSTEPS, particles * (STATE_BYTES + constants + 72 + WRITTEN_BYTES)),
         # velocities or sums out

@@ -58,21 +58,16 @@ def grid_to_momenta(
     at = environment_of(wp.tid(), those[1])
     e = at[0]
     p = (those[0] + at[1]) & 0x7FFFFFFF  # tells the compiler that it is not negative
-    goes_on = blocks.frozen[e] == 0
     s = Gathered()
     moves = bool(False)
-    if goes_on:
+    if blocks.frozen[e] == 0:
         if senses != 0:
             sense_gathered(grid, particles, blocks, sensors, e, p, grid_position(grid, moved.x[e, p]))
         s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
         moves = s.fault == 0
     store_vectors(moved, e, p, s, moves)
-    if goes_on:
-        if moves:
-            store_matrix(moved.F, e, p, s.F)
-        else:  # its environment has failed; it scatters once more what it has
-            s.C = matrix_at(moved.C, e, p)
-            s.F = matrix_at(moved.F, e, p)
+    if moves:  # else its environment has failed, and goes on with what there is until the grid pass
+        store_matrix(moved.F, e, p, s.F)
         m = particles.mass[row(e, particles.mass.shape[0]), p]
         stress = wp.mat33()
         if step.decoupling != NO_STRESS:

@@ -14,7 +14,7 @@ from piavatar_envs.mpm.cfl import CFL_STABLE
 from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.group_plan import begin_groups
 from piavatar_envs.mpm.materials import lame_parameters, material_index
-from piavatar_envs.mpm.memory import bound_slots, check_memory
+from piavatar_envs.mpm.memory import bound_slots, check_memory, choose_marks
 from piavatar_envs.mpm.shared_room import MOST_LISTED, MOST_PARTICLES, most_particles, suits_shared
 from piavatar_envs.mpm.stencil import BLOCK
 from piavatar_envs.mpm.types import (
@@ -27,7 +27,7 @@ from piavatar_envs.mpm.types import (
 )
 
 #: Particles for every slot up to which a large body's are added to the nodes one by one: a skin has some three
-#: particles a slot, of which a body at rest fills three of five, and an interior more than thirty.
+#: particles a slot, of which a body at rest fills less than half, and an interior more than thirty.
 SPARSE = 8
 
 
@@ -212,6 +212,7 @@ def build_model(
         moving_boundaries=any(collider.moves or collider.kinematic for collider in colliders),
         num_sensors=fields.num_sensors,
         max_slots=max_slots,
+        marks_every=choose_marks(scatter, points.fields),
         scatter=scatter,
     )
 

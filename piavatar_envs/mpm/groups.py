@@ -58,6 +58,7 @@ from piavatar_envs.mpm.types import (
     Boundaries,
     Contact,
     Grid,
+    Model,
     Moving,
     Particles,
     Step,
@@ -272,9 +273,9 @@ def runs_to_grid(
 
 
 def record_groups(
-    program: Program, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any], per_env: int, part: Part
+    program: Program, kernel: wp.Kernel, model: Model, part: Part, inputs: list[Any], outputs: list[Any]
 ) -> None:
-    """Append a scatter of a part of all environments of ``per_env`` particles: no CUDA block has two."""
-    share = share_of(per_env)
-    threads = outputs[0].shape[0] * part.groups[1] * share
+    """Append a scatter of a part of all environments: no CUDA block has two."""
+    share = share_of(model.num_particles)
+    threads = model.num_envs * part.groups[1] * share
     program.launch(kernel, threads, [*inputs, part.groups], outputs, block_dim=share)

@@ -10,6 +10,7 @@ import warp as wp
 from piavatar_envs.mpm.blocks import NOBODY
 from piavatar_envs.mpm.matrices import allocate_matrices, components_of, whole_lines
 from piavatar_envs.mpm.others import notes_others
+from piavatar_envs.mpm.parts import GROUPED
 from piavatar_envs.mpm.sensing import senses_in_gather
 from piavatar_envs.mpm.shared_room import MOST_PARTICLES, plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
@@ -31,8 +32,14 @@ from piavatar_envs.mpm.types import (
 #: Blocks with matter that a body may come to need, over those that it needs at rest. Random full-scale actions, also of
 #: random shapes, made it 1.2 times as many at most.
 SLOT_MARGIN = 1.7
-#: The same over those of a body with more particles than fit into shared memory: its blocks are marked anew less often.
+#: The same of a body with more particles than fit into shared memory.
 LARGE_MARGIN = 2.2
+#: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In eight
+#: substeps nothing moves further than two blocks.
+MARKS_EVERY = 8
+#: The same where groups scatter, whose marks take longer; and where one of their bodies is large. One of 2,300 blocks
+#: that goes a grid spacing a substep leaves some 1,600 behind in 16 of them, 2,500 in 25: there is room for that.
+MARKS_OF_GROUPS, MARKS_OF_LARGE = 16, 25
 #: Warp's strides are 32-bit: the records of an environment, of 64 bytes at most, take less than 2^31.
 MOST_SLOTS = 2**31 // (64 * BLOCK**3)
 
@@ -77,6 +84,13 @@ def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin
             counts.append(len(np.unique(touched.reshape(-1, 3), axis=0)))
         needed += math.ceil(times * max(counts)) + 8
     return needed
+
+
+def choose_marks(scatter: str, field: np.ndarray) -> int:
+    """Substeps after which the blocks of particles of velocity fields ``field`` are marked anew."""
+    if scatter not in GROUPED:
+        return MARKS_EVERY
+    return MARKS_OF_LARGE if np.bincount(field).max() > MOST_PARTICLES else MARKS_OF_GROUPS
 
 
 def estimate_bytes(

@@ -17,6 +17,8 @@ from piavatar_envs.mpm.types import Model
 
 #: As many as are worth it: where two parts take 289 us a substep, four take 292 and one takes 292.
 MOST_PARTS = 2
+#: Scatters by groups of particles.
+GROUPED = ("runs", "runs_float")
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Part:
 
 def has_groups(model: Model) -> bool:
     """Whether particles are scattered by groups, see :mod:`piavatar_envs.mpm.groups`."""
-    return model.scatter in ("runs", "runs_float")
+    return model.scatter in GROUPED
 
 
 def whole_world(model: Model) -> Part:

@@ -30,13 +30,6 @@ from piavatar_envs.mpm.transfer import particles_to_grid
 from piavatar_envs.mpm.turns import TURNS, has_turns
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
-#: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In eight
-#: substeps nothing moves further than two blocks.
-MARKS_EVERY = 8
-#: The same for large bodies, of which marking takes longer. A body of 2,300 blocks that goes a grid spacing a substep
-#: leaves some 2,500 behind in 25 of them: there is room for 2.2 times its blocks.
-MARKS_OF_GROUPS = 25
-
 
 def record_substep(program: Program, model: Model, state: State, scratch: Scratch, index: int) -> None:
     """Append substep ``index`` of a control step to ``program``.
@@ -60,7 +53,8 @@ def record_substeps(program: Program, model: Model, state: State, scratch: Scrat
     """Append all substeps of a control step between which nothing acts, see :func:`record_substep`.
 
     Where that suits them, each is one launch, see :mod:`piavatar_envs.mpm.relay`, or what is gathered says what is
-    scattered next, see :mod:`piavatar_envs.mpm.ahead`.
+    scattered next, see :mod:`piavatar_envs.mpm.ahead`. An environment that fails meanwhile keeps the affine velocities
+    that it had before.
     """
     if has_turns(model):
         _record_turns(program, model, state, scratch)
@@ -118,7 +112,7 @@ def _record_ahead(program: Program, model: Model, state: State, scratch: Scratch
 
 def _marks_before(model: Model, index: int) -> bool:
     """Whether blocks are marked anew before substep ``index`` of a control step, which is not the first."""
-    return index % (MARKS_OF_GROUPS if has_groups(model) else MARKS_EVERY) == 0
+    return index % model.marks_every == 0
 
 
 def _record_colliders(program: Program, model: Model) -> None:
@@ -230,9 +224,9 @@ def record_scatter(
         outputs = [s.failure, scratch.sums]
         part = part or whole_world(m)
         if affine is None:
-            record_groups(program, runs_to_grid, inputs, outputs, m.num_particles, part)
+            record_groups(program, runs_to_grid, m, part, inputs, outputs)
         else:
-            record_groups(program, momenta_to_grid, [*inputs, affine], outputs, m.num_particles, part)
+            record_groups(program, momenta_to_grid, m, part, [*inputs, affine], outputs)
 
 
 def _scattering(m: Model, s: State, scratch: Scratch) -> list[Any]:

@@ -44,9 +44,8 @@ FAILURE_NAMES: dict[int, str] = {
 
 #: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.decouple`).
 DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
-#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, :mod:`piavatar_envs.mpm.groups`,
-#: :mod:`piavatar_envs.mpm.singles` and :mod:`piavatar_envs.mpm.shared_substep`), and whether the nodes have sums in
-#: fixed point.
+#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, ``groups``, ``singles`` and
+#: ``shared_substep``), and whether the nodes have sums in fixed point.
 SCATTERS: dict[str, bool] = {
     "plain": False,
     "runs": True,
@@ -246,8 +245,8 @@ class Model:
     """Everything that does not change: grid, step, particle constants and boundaries.
 
     ``sound_speed`` is the fastest elastic wave of any particle [m/s]; ``moving_boundaries`` says whether any boundary
-    may have a velocity; ``num_sensors`` counts the rows of the contact sensor; ``max_slots`` how many blocks with
-    matter an environment can hold, each field's counted; ``scatter`` is a key of :data:`SCATTERS`.
+    may have a velocity; ``num_sensors`` counts the rows of the contact sensor; ``max_slots`` the blocks with matter an
+    environment can hold, by fields, marked anew after ``marks_every`` substeps; ``scatter`` is one of :data:`SCATTERS`.
     """
 
     num_envs: int
@@ -264,6 +263,7 @@ class Model:
     moving_boundaries: bool
     num_sensors: int
     max_slots: int
+    marks_every: int
     scatter: str
 
     @property

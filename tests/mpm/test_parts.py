@@ -8,9 +8,11 @@ from functools import partial
 import numpy as np
 import pytest
 
+from piavatar_envs.mpm.build import MaterialPoints
+from piavatar_envs.mpm.memory import MARKS_OF_GROUPS
 from piavatar_envs.mpm.parts import first_groups, parts_of_world
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import MARKS_OF_GROUPS, record_begin, record_substeps
+from piavatar_envs.mpm.solver import record_begin, record_end, record_substeps
 from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL
 
 ARRAYS = ("x", "u", "C", "F")
@@ -82,23 +84,45 @@ def test_parts_where_slots_run_out(groups_clash, one_by_one, max_slots, failures
     assert parts.sums_are_clear and apart.sums_are_clear
 
 
-@pytest.mark.parametrize("decoupling", ["split", "paper", "none", "no_stress"])
-@pytest.mark.parametrize("material", ["neo_hookean", "fixed_corotated"])
-def test_what_gathers_find_ahead_is_what_scatters_find(drop, one_by_one, decoupling, material):
-    """Of one body, which goes in one part; bit for bit."""
-    settings = {"scatter": "runs", "decoupling": decoupling, "material": material, "num_substeps": 18}
-    ahead, apart = drop(**settings), one_by_one(drop(**settings))
-    scatters = [ahead.program.names.count(name) for name in SCATTERS]
-    assert scatters == [1, 17] and "momenta_to_grid" not in apart.program.names
+def same_everywhere(ahead, apart):
+    """Whether all particles of two worlds are the same, bit for bit, and have gone on."""
     start = ahead.get("F")
     ahead.run(2), apart.run(2)
-    assert ahead.failures == apart.failures == [0] * 3 and np.abs(ahead.get("F") - start).max() > 1e-3
+    assert ahead.failures == apart.failures == [0] * ahead.model.num_envs
+    assert np.abs(ahead.get("F") - start).max() > 1e-3 and ahead.sums_are_clear
     for array in ARRAYS:
         np.testing.assert_array_equal(ahead.state.numpy()[array], apart.state.numpy()[array], err_msg=array)
 
 
+@pytest.mark.parametrize("decoupling", ["split", "paper", "none", "no_stress"])
+@pytest.mark.parametrize("material", ["neo_hookean", "fixed_corotated"])
+def test_what_gathers_find_ahead_is_what_scatters_find(drop, one_by_one, decoupling, material):
+    """Of one body, which goes in one part."""
+    settings = {"scatter": "runs", "decoupling": decoupling, "material": material, "num_substeps": 18}
+    ahead, apart = drop(**settings), one_by_one(drop(**settings))
+    assert [ahead.program.names.count(name) for name in SCATTERS] == [1, 17]
+    assert "momenta_to_grid" not in apart.program.names
+    same_everywhere(ahead, apart)
+
+
+def test_constants_of_each_environment_ahead(drop, one_by_one):
+    """Environments whose particles are made of different matter."""
+    density = np.random.default_rng(3).uniform(900.0, 1100.0, (3, 512))
+    points = replace(MaterialPoints.uniform(np.full(512, 0.025**3)), density=density)
+    same_everywhere(*(record(drop(points=points, scatter="runs")) for record in (lambda sim: sim, one_by_one)))
+
+
+@pytest.mark.parametrize("decoupling", ["split", "paper"])
+def test_particles_far_apart_go_in_turns_ahead(drop, one_by_one, decoupling):
+    """Groups of theirs have no room for all of their nodes at once."""
+    far = np.random.default_rng(5).uniform(-0.5, 0.5, (300, 3))
+    settings = {"rest": far, "planes": [((0.0, 0.0, 1.0), -0.3, 0.5)], "num_substeps": 6, "control_dt": 0.006}
+    settings |= {"scatter": "runs", "decoupling": decoupling}
+    same_everywhere(drop(**settings), one_by_one(drop(**settings)))
+
+
 def test_who_fails_ahead_fails_alone(drop):
-    """A particle that goes too fast fails in the first gather, and scatters on what it had; others do as without it."""
+    """A particle that goes too fast fails in the first gather; other environments do as without it."""
     sound, broken = drop(scatter="runs"), drop(scatter="runs")
     vk = broken.state.vk.numpy()
     vk[1, 7] = [60.0, 0.0, 0.0]
@@ -111,21 +135,22 @@ def test_who_fails_ahead_fails_alone(drop):
         np.testing.assert_array_equal(broken.get(array, 2), sound.get(array, 2), err_msg=array)
 
 
-def test_boundaries_that_move_do_so_in_every_substep(groups_clash):
+def test_boundaries_that_move_do_so_in_every_substep(groups_clash, one_by_one):
     """Such worlds do not go in parts."""
-    sim = groups_clash()
-    sim.model = replace(sim.model, moving_boundaries=True)
-    sim.program, world = Program(sim.model.device), (sim.model, sim.state, sim.scratch)
-    record_begin(sim.program, *world)
-    record_substeps(sim.program, *world)
-    names = sim.program.names
-    gathers, order = ("grid_to_momenta", "grid_to_particles"), [n for n in names if n in (*SCATTERS, "move_colliders")]
-    assert sum(map(names.count, gathers)) == sim.model.num_substeps
-    assert order == [
-        "runs_to_grid",
-        *["move_colliders", "momenta_to_grid"] * (sim.model.num_substeps - 1),
-        "move_colliders",
-    ]
+    sims = [groups_clash(), groups_clash()]
+    for sim in sims:
+        sim.model = replace(sim.model, moving_boundaries=True)
+        velocity = sim.model.boundaries.velocity
+        velocity.assign(np.broadcast_to(np.array([0.2, 0.0, 0.5], np.float32), (*velocity.shape, 3)).copy())
+    ahead, apart = sims[0], one_by_one(sims[1])
+    ahead.program, world = Program(ahead.model.device), (ahead.model, ahead.state, ahead.scratch)
+    record_begin(ahead.program, *world)
+    record_substeps(ahead.program, *world)
+    record_end(ahead.program, *world)
+    rounds = ["grid_to_momenta", "move_colliders", "momenta_to_grid"] * (ahead.model.num_substeps - 1)
+    order = [name for name in ahead.program.names if name in {"runs_to_grid", "grid_to_particles", *rounds}]
+    assert order == ["runs_to_grid", *rounds, "grid_to_particles", "move_colliders"]
+    same(ahead.run(), apart.run())
 
 
 def test_what_goes_in_parts(clash, meet):

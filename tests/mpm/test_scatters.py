@@ -10,7 +10,7 @@ import warp as wp
 
 from piavatar_envs.mpm import group_plan
 from piavatar_envs.mpm.build import MaterialPoints, choose_scatter
-from piavatar_envs.mpm.memory import LARGE_MARGIN, SLOT_MARGIN, estimate_slots
+from piavatar_envs.mpm.memory import LARGE_MARGIN, SLOT_MARGIN, choose_marks, estimate_slots
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import MOST_COUNTED
 from piavatar_envs.mpm.shared_room import MOST_PARTICLES, parts_of, suits_shared
@@ -265,8 +265,8 @@ def test_what_shared_memory_holds(monkeypatch, bodies, particles, slots, suits):
     [
         (2_900, 200, 90, "shared"),
         (10_475, 3_600, 90, "singles"),
-        (19_757, 530, 90, "runs"),
-        (300_000, 4_000, 90, "runs"),
+        (19_757, 680, 90, "runs"),
+        (300_000, 5_000, 90, "runs"),
         (10_475, 3_600, 60, "plain"),
     ],
 )
@@ -357,17 +357,33 @@ def test_fast_bodies_leave_their_slots_behind(simulate):
 
 
 def test_large_bodies_have_more_slots_to_leave_behind(simulate, device):
-    """Groups of particles are marked anew every 25 substeps, in which these go 13 grid spacings."""
-    points = np.random.default_rng(2).uniform(-0.5, 0.5, (MOST_PARTICLES + 1, 3))
-    assert estimate_slots(points, None, 0.05) == estimate_slots(points, None, 0.05, LARGE_MARGIN)
-    assert estimate_slots(points[1:], None, 0.05) == estimate_slots(points[1:], None, 0.05, SLOT_MARGIN)
+    """Their groups are marked anew every 25 substeps, in which this one goes 13 grid spacings."""
+    box = {"lower": (-0.3, -0.675, -0.675), "upper": (0.3, 0.675, 0.675), "spacing": 0.05}
+    rest = simulate(**box).rest
+    assert len(rest) > MOST_PARTICLES
+    few, enough = (estimate_slots(rest, None, 0.05, margin) for margin in (SLOT_MARGIN, LARGE_MARGIN))
+    assert estimate_slots(rest, None, 0.05) == enough
+    assert estimate_slots(rest[:MOST_PARTICLES], None, 0.05) <= few
     if device == "cpu":
         pytest.skip("groups are a GPU's")
-    world = {"num_substeps": 80, "control_dt": 0.1, "margin": 2.5, "scatter": "runs"}
-    slots = estimate_slots(simulate().rest, None, 0.05, LARGE_MARGIN)
-    sim = simulate(**world, max_slots=slots).set(u=(20.0, 0.0, 0.0)).run()
-    assert sim.failures == [0]
-    assert simulate(**world, max_slots=slots - 20).set(u=(20.0, 0.0, 0.0)).run().failures == [FAILURE_BLOCKS]
+    world = {"num_substeps": 26, "control_dt": 26 * 1.75e-3, "margin": 1.2, "scatter": "runs"} | box
+    for slots, failures in ((few, [FAILURE_BLOCKS]), (enough, [0])):
+        sim = simulate(**world, max_slots=slots).set(u=(15.0, 0.0, 0.0))
+        assert sim.model.marks_every == 25 and sim.run().failures == failures
+
+
+@pytest.mark.parametrize(
+    ("scatter", "counts", "marks"),
+    [
+        ("plain", [9_000], 8),
+        ("singles", [9_000], 8),
+        ("runs", [8_192, 8_192], 16),
+        ("runs", [100, 8_193], 25),
+        ("runs_float", [9_000], 25),
+    ],
+)
+def test_marks_are_as_rare_as_there_is_room_for(scatter, counts, marks):
+    assert choose_marks(scatter, np.repeat(np.arange(len(counts)), counts)) == marks
 
 
 def test_slots_do_not_grow_with_the_grid(simulate):
