@@ -8,7 +8,7 @@ captured program, which is timed as a whole. The bodies move and touch, and a ru
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from benchmarks import roofline, runner, timing
 from benchmarks.crowd import SMALL, Crowd, Scale, interior_body, skin_body
+from piavatar_envs.avatar.body import BodyPoints
 from piavatar_envs.mpm.program import Program
 
 AVATARS = (1, 4)
@@ -59,13 +60,13 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
         ValueError: ``only`` names a case that there is not.
     """
     scale = SMALL if options.small else Scale()
-    jobs = {f"{points}x{count}": (points, count) for points in (scale.skin, scale.interior) for count in AVATARS}
+    names = [name for name in worlds(scale) if name in (options.only or worlds(scale))]
     for name in options.only:
-        if name not in jobs:
-            raise ValueError(f"only={name!r}: the cases are {', '.join(jobs)}")
-    for name in runner.progress([name for name in jobs if name in (options.only or jobs)], "substep"):
-        points, count = jobs[name]
-        body, volume = (skin_body if points == scale.skin else interior_body)(points)
+        if name not in names:
+            raise ValueError(f"only={name!r}: the cases are {', '.join(worlds(scale))}")
+    for name in runner.progress(names, "substep"):
+        make_body, points, count = worlds(scale)[name]
+        body, volume = make_body(points)
         gc.collect()  # what the case before has left
         before = timing.array_bytes(options.device)
         crowd = Crowd(body, volume, count, scale, options.device)
@@ -78,6 +79,12 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
             row["ms_per_substep_float"] = None if any(failures) else float(np.median(times))
             del crowd  # or the next case would find its memory in use
         yield row
+
+
+def worlds(scale: Scale) -> dict[str, tuple[Callable[[int], tuple[BodyPoints, np.ndarray]], int, int]]:
+    """The cases by name: what makes the body, its particles, and how many of them there are."""
+    bodies = ((skin_body, scale.skin), (interior_body, scale.interior))
+    return {f"{points}x{count}": (make, points, count) for make, points in bodies for count in AVATARS}
 
 
 def references(case: str) -> dict[str, float | None]:
