@@ -60,12 +60,12 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
         ValueError: ``only`` names a case that there is not.
     """
     scale = SMALL if options.small else Scale()
-    names = [name for name in worlds(scale) if name in (options.only or worlds(scale))]
+    jobs = worlds(scale)
     for name in options.only:
-        if name not in names:
-            raise ValueError(f"only={name!r}: the cases are {', '.join(worlds(scale))}")
-    for name in runner.progress(names, "substep"):
-        make_body, points, count = worlds(scale)[name]
+        if name not in jobs:
+            raise ValueError(f"only={name!r}: the cases are {', '.join(jobs)}")
+    for name in runner.progress([name for name in jobs if name in (options.only or jobs)], "substep"):
+        make_body, points, count = jobs[name]
         body, volume = make_body(points)
         gc.collect()  # what the case before has left
         before = timing.array_bytes(options.device)

@@ -16,7 +16,8 @@ from piavatar_envs.mpm.program import Program
 
 wp.set_module_options({"enable_backward": False})
 
-_HASH = re.compile(r"_[0-9a-f]{8}$")  # Warp's, at the end of a kernel's name
+#: Warp's, at the end of a kernel's name.
+HASH = re.compile(r"_[0-9a-f]{8}$")
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def _launch_times(program: Program) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for result in wp.timing_end():
         name = result.name.removeprefix("forward kernel ").removeprefix("builtin kernel ")
-        found.setdefault(_HASH.sub("", name), []).append(result.elapsed)
+        found.setdefault(HASH.sub("", name), []).append(result.elapsed)
     return found
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +17,12 @@ from typing import Any
 
 import warp as wp
 
-from benchmarks import runner, substep
+from benchmarks import runner, substep, timing
 from benchmarks.crowd import SMALL, Crowd, Scale
 from piavatar_envs.mpm.program import Program
 
 STEP = "control step"  # the first row
 WARM_UP = 4  # control steps before the one that is traced
-#: What Warp appends to the name of a kernel.
-SUFFIX = re.compile(r"(_[0-9a-f]{8})?_cuda_kernel_forward.*$")
 
 
 @dataclass(frozen=True)
@@ -99,12 +96,13 @@ def spans_of(events: Sequence[dict[str, Any]]) -> list[Span]:
     if not kernels:
         raise ValueError("the trace has no kernels: has another profiler taken CUPTI? Close it and run again")
     first = kernels[0]["ts"]
-    return [Span(SUFFIX.sub("", e["name"]), e["ts"] - first, e["ts"] + e["dur"] - first) for e in kernels]
+    names = [timing.HASH.sub("", e["name"].partition("_cuda_kernel_")[0]) for e in kernels]
+    return [Span(n, e["ts"] - first, e["ts"] + e["dur"] - first) for n, e in zip(names, kernels, strict=True)]
 
 
 def rows_of(spans: Sequence[Span], case: str) -> list[dict[str, Any]]:
     """The row of the control step, then those of its kernels."""
-    names = {span.kernel for span in spans}
+    names = dict.fromkeys(span.kernel for span in spans)
     kernels = [
         {
             "case": name,

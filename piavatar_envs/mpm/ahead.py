@@ -1,14 +1,15 @@
 """A gather and a scatter of large bodies, the first of which finds what the second adds up.
 
 Where nothing acts between them, the gather has at hand what a particle will scatter: its stress is that of the
-deformation which it has just found. The scatter reads momenta alone then, asks for fewer registers, and its stress is
-not in a program that mostly adds; see :mod:`piavatar_envs.mpm.runs` and :mod:`piavatar_envs.mpm.groups`.
+deformation which it has just found. The scatter reads momenta alone then, and the stress is not in a program that
+mostly adds; see :mod:`piavatar_envs.mpm.runs` and :mod:`piavatar_envs.mpm.groups`.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.mpm import runs
 from piavatar_envs.mpm.gather import Gathered, gather
 from piavatar_envs.mpm.group_bricks import WORDS
 from piavatar_envs.mpm.group_plan import THREADS
@@ -38,7 +39,7 @@ from piavatar_envs.mpm.types import (
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 
-@wp.kernel(launch_bounds=(128, 6))
+@wp.kernel(launch_bounds=(runs.THREADS, 6))
 def grid_to_momenta(
     grid: Grid,
     step: Step,
@@ -61,6 +62,7 @@ def grid_to_momenta(
     s = Gathered()
     moves = bool(False)
     if blocks.frozen[e] == 0:
+        # as that kernel; a function for both would have a compiler spill twice as many registers
         if senses != 0:
             sense_gathered(grid, particles, blocks, sensors, e, p, grid_position(grid, moved.x[e, p]))
         s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)

@@ -76,7 +76,9 @@ def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin
     needed = 0
     for index in np.unique(field):
         own = rest[field == index]
-        times = margin or (LARGE_MARGIN if len(own) > MOST_PARTICLES else SLOT_MARGIN)
+        times = margin
+        if times is None:
+            times = LARGE_MARGIN if len(own) > MOST_PARTICLES else SLOT_MARGIN
         base = np.floor(own / dx - 0.5).astype(int)
         counts = []
         for shift in np.ndindex(2, 2, 2):  # the grid may lie to the body as it likes

@@ -90,7 +90,7 @@ def bounded(s: Scattered, unit: float, failure: wp.array(dtype=int), e: int):
     return wp.max(bounds)
 
 
-@wp.kernel(launch_bounds=(128, 6))
+@wp.kernel(launch_bounds=(THREADS, 6))
 def grid_to_particles(
     grid: Grid,
     step: Step,

@@ -40,7 +40,7 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     m = model
     if index == 0 and m.scatter == "shared":
         program.launch(forget_speeds, scratch.room.speed.shape, [scratch.room])
-    if index > 0 and _marks_before(m, index):
+    if index > 0 and index % m.marks_every == 0:
         _record_new_marks(program, model, state, scratch)
     record_scatter(program, model, state, scratch)
     _record_grid(program, model, state, scratch)
@@ -96,7 +96,7 @@ def _record_ahead(program: Program, model: Model, state: State, scratch: Scratch
     record_scatter(program, *world)
     for index in range(1, model.num_substeps):
         _record_grid(program, *world)
-        marks = _marks_before(model, index)
+        marks = index % model.marks_every == 0
         if not marks and not model.moving_boundaries:
             program.fork_each(parts, gather_and_scatter)
             continue
@@ -108,11 +108,6 @@ def _record_ahead(program: Program, model: Model, state: State, scratch: Scratch
     _record_grid(program, *world)
     _record_gather(program, *world)
     _record_colliders(program, model)
-
-
-def _marks_before(model: Model, index: int) -> bool:
-    """Whether blocks are marked anew before substep ``index`` of a control step, which is not the first."""
-    return index % model.marks_every == 0
 
 
 def _record_colliders(program: Program, model: Model) -> None:
