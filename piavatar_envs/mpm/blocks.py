@@ -132,21 +132,26 @@ def noted_around(blocks: Blocks, e: int, p: int) -> int:
 
 
 @wp.func
-def fields_at_corner(grid: Grid, blocks: Blocks, corner: wp.vec3i, e: int, n: int):
-    """Fields with matter in the ``n``-th of the eight blocks of :func:`fields_beyond`."""
-    x = wp.min(corner[0] + 4 * (n >> 2), 4 * (grid.blocks[0] - 1))
-    y = wp.min(corner[1] + 4 * ((n >> 1) & 1), 4 * (grid.blocks[1] - 1))
-    z = wp.min(corner[2] + 4 * (n & 1), 4 * (grid.blocks[2] - 1))
-    return blocks.fields[e, block_index(grid, x, y, z)]
-
-
-@wp.func
 def fields_beyond(grid: Grid, blocks: Blocks, corner: wp.vec3i, e: int):
     """Fields with matter in any block that a stencil may lie in whose lowest node is in the block at ``corner``."""
     mask = int(0)
     for n in range(8):
-        mask = mask | fields_at_corner(grid, blocks, corner, e, n)
+        x = wp.min(corner[0] + 4 * (n >> 2), 4 * (grid.blocks[0] - 1))
+        y = wp.min(corner[1] + 4 * ((n >> 1) & 1), 4 * (grid.blocks[1] - 1))
+        z = wp.min(corner[2] + 4 * (n & 1), 4 * (grid.blocks[2] - 1))
+        mask = mask | blocks.fields[e, block_index(grid, x, y, z)]
     return mask
+
+
+@wp.func
+def fields_next(grid: Grid, blocks: Blocks, block: int, e: int, n: int):
+    """Fields with matter in the ``n``-th of the eight blocks that a stencil may lie in which begins in a ``block``.
+
+    Where the grid ends, in another block instead: no stencil begins there, and to look for neither row nor column takes
+    no division.
+    """
+    beyond = block + ((n >> 2) * grid.blocks[1] + ((n >> 1) & 1)) * grid.blocks[2] + (n & 1)
+    return blocks.fields[e, wp.min(beyond, grid.num_blocks - 1)]
 
 
 @wp.func

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.blocks import fields_at_corner, held_by, lacks_slots, slots_used
+from piavatar_envs.mpm.blocks import fields_next, held_by, lacks_slots, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, GATED_SLAB, NEAR_BLOCK, boundary_contact, nearest_boundary
 from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.normals import MASS_MIN
@@ -208,7 +208,7 @@ def note_beside(grid: Grid, blocks: Blocks, e: int, slot: int, held: wp.vec2i):
     """
     if blocks.beside.shape[1] == 1:
         return
-    around = fields_at_corner(grid, blocks, block_corner(grid, held[1]), e, lane_of_thread() & 7)
+    around = fields_next(grid, blocks, held[1], e, lane_of_thread() & 7)
     others = any_lane((around & ~(1 << held[0])) != 0)
     if lane_of_thread() == 0:
         blocks.beside[e, slot] = int(others)
