@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 
-from piavatar_envs.mpm.types import FAILURE_OUT_OF_GRID
+from piavatar_envs.mpm.blocks import fields_next
+from piavatar_envs.mpm.types import FAILURE_OUT_OF_GRID, Blocks, Grid
 
 DX = 0.05
 ARRAYS = ("x", "u", "C", "F")
@@ -149,3 +151,27 @@ def test_contacts_leave_nothing_behind(meet, equal):
         assert equal(used.get(array), fresh.get(array)), array
     found, expected = sensed(used), sensed(fresh)
     assert all(equal(found[name], expected[name]) for name in expected)
+
+
+@wp.kernel
+def ask_next(grid: Grid, blocks: Blocks, found: wp.array2d(dtype=int)):
+    block, n = wp.tid()
+    found[block, n] = fields_next(grid, blocks, block, 0, n)
+
+
+def test_blocks_that_a_stencil_may_lie_in(meet, device):
+    """They are the block and those next to it; where the grid ends, any that there is."""
+    sim = meet([BLOCK])
+    grid, blocks = sim.model.grid, sim.scratch.blocks
+    shape = tuple(grid.blocks)
+    assert len(set(shape)) > 1
+    blocks.fields.assign(np.broadcast_to(np.arange(grid.num_blocks, dtype=np.int32), blocks.fields.shape).copy())
+    found = wp.full((grid.num_blocks, 8), -1, dtype=int, device=device)
+    wp.launch(ask_next, found.shape, [grid, blocks], [found], device=device, block_dim=64)
+    offsets = np.array(list(np.ndindex(2, 2, 2)))
+    places = np.array(list(np.ndindex(shape)))[:, None] + offsets
+    exists = (places < shape).all(-1)
+    assert exists.any() and not exists.all()
+    expected = np.ravel_multi_index(np.moveaxis(np.minimum(places, np.array(shape) - 1), -1, 0), shape)
+    np.testing.assert_array_equal(found.numpy()[exists], expected[exists])
+    assert (found.numpy() >= 0).all() and (found.numpy() < grid.num_blocks).all()
