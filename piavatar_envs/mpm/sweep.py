@@ -30,9 +30,8 @@ LANES = 32
 #: Slots for which a large GPU has threads at once, and the fewest for which an environment gets them.
 SLOTS_AT_ONCE = 132 * 28
 FEWEST_SLOTS = 8
-#: The same for blocks that have several fields: as many as have room at once with all registers that a thread may have.
-#: CUDA blocks that find nothing to do would wait for as much room as others.
-SHARED_AT_ONCE = 132 * 4
+#: The same for blocks that have several fields.
+SHARED_AT_ONCE = 132 * 6
 FEWEST_SHARED = 2
 
 
