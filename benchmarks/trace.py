@@ -73,7 +73,11 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 
 def traced(program: Program) -> list[Span]:
-    """The launches of one run of a program on a GPU, in the order in which they begin."""
+    """The launches of one run of a program on a GPU, in the order in which they begin.
+
+    Should be the last that a process does there: closing CUPTI and CUDA graphs do not always go together, as torch says
+    of its ``TEARDOWN_CUPTI``.
+    """
     import torch
 
     wp.synchronize_device(program.device)
