@@ -92,7 +92,7 @@ def scatter_momenta(
     at: wp.vec4i,
     left: bool,
 ):
-    """:func:`scatter_turn` of what the gather has found."""
+    """:func:`scatter_turn` of what the gather has found; as :func:`piavatar_envs.mpm.groups.scatter_left`."""
     e = at[0]
     p = at[1]
     s = Scattered()

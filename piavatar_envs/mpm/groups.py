@@ -231,7 +231,10 @@ def scatter_left(
     at: wp.vec4i,
     left: bool,
 ):
-    """:func:`scatter_turn` of what particles have."""
+    """:func:`scatter_turn` of what particles have.
+
+    Written into a kernel's loop, ``s`` would be kept from turn to turn, and four times as many registers be spilled.
+    """
     s = Scattered()
     if left:
         s = prepare(grid, step, particles, moving, at[0], at[1], False)
