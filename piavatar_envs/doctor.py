@@ -113,6 +113,8 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
         ValueError: Warp has no such device.
     """
     wp = quiet_warp()
+    from piavatar_envs.mpm.program import acquire
+
     try:
         target = wp.get_device(device)
     except Exception:
@@ -124,6 +126,7 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
         package = importlib.import_module(f"piavatar_envs.{room}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
+    acquire(target)
     wp.force_load(target, max_workers=compiling_threads())
     for env_id, spec in sorted(gymnasium.registry.items()):
         if environments and spec.namespace == "PIAvatar":

@@ -224,6 +224,16 @@ class Program:
         return self._streams[:count]
 
 
+def acquire(device: wp.Device) -> None:
+    """Have Warp begin with a device, before several threads come to it.
+
+    The first to come to a GPU at the same time would each make its streams, and a process ends in a segmentation fault
+    when those of the others are given back.
+    """
+    if device.is_cuda:
+        wp.get_stream(device)
+
+
 def compile_programs(programs: Iterable[Program]) -> None:
     """Compile what programs launch and is not in Warp's cache, modules side by side, then bind all arguments.
 
@@ -231,6 +241,8 @@ def compile_programs(programs: Iterable[Program]) -> None:
         Exception: a kernel that does not compile, or a launch with arguments that are not its kernel's, as Warp has it.
     """
     programs = list(programs)
+    for program in programs:
+        acquire(program.device)
     with ThreadPoolExecutor(compiling_threads()) as pool:
         modules = {
             (new.kernel.module, each.device.alias, new.block_dim): None for each in programs for new in each.unbound

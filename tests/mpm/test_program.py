@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import warp as wp
@@ -101,3 +104,31 @@ def test_forks_are_refused(device):
     forked.program.run()
     with pytest.raises(RuntimeError, match="build a new one"):
         forked.program.fork(Program(device), Program(device))
+
+
+@pytest.mark.parametrize(
+    "compiles",
+    [
+        "from piavatar_envs.doctor import compile_kernels; compile_kernels(DEVICE)",
+        "from piavatar_envs.mpm import program, blocks; p = program.Program(DEVICE); "
+        "p.launch(blocks.free_slots, 1, [None], []); p.compile()",
+    ],
+)
+def test_a_device_is_acquired_before_threads_compile_for_it(device, compiles):
+    """Else each of them would, at once, and some processes would end in a segmentation fault."""
+    if "cuda" not in device:
+        pytest.skip("nothing has to be acquired of a CPU")
+    begin = f"""
+import warp as wp
+
+DEVICE = {device!r}
+
+def compiled(*args, **options):
+    print("acquired" if wp.get_device(DEVICE).has_context else "not yet")
+    raise SystemExit
+
+wp.load_module = wp.force_load = compiled
+assert not wp.get_device(DEVICE).has_context
+"""
+    done = subprocess.run([sys.executable, "-c", begin + compiles], capture_output=True, text=True, timeout=600)
+    assert done.stdout.splitlines()[-1:] == ["acquired"], done.stdout + done.stderr
