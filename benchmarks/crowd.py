@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.asset import AvatarAsset, dense_weights, load_body, mesh_volume, top_weights
 from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
+from piavatar_envs.avatar.drive import AvatarDrive, record_control_step, record_end_of_step
 from piavatar_envs.avatar.ordering import order_along_curve, order_in_boxes
 from piavatar_envs.avatar.sampling import sample_particles
 from piavatar_envs.avatar.settings import DriveSettings
@@ -29,7 +29,7 @@ from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.memory import LARGE_MARGIN, allocate, estimate_slots
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_begin, record_end, record_substeps
+from piavatar_envs.mpm.solver import record_begin, record_substeps
 from piavatar_envs.mpm.types import Grid, failure_name
 
 DENSITY = 1000.0
@@ -239,19 +239,12 @@ class Crowd:
     def _record(self) -> None:
         self.once, self.each = Program(self.model.device), Program(self.model.device)
         world = (self.model, self.state, self.scratch)
-
-        def begin(avatar: AvatarDrive, own: Program) -> None:
-            avatar.record_begin(own)
-            record_drive(avatar, own, self.state, 0)
-
-        record_begin(self.once, *world)
-        self.once.fork_each(self.avatars, begin)
+        begins = self.once.branches(self.avatars, lambda avatar, own: avatar.record_begin(own))
+        record_begin(self.once, *world, begins)
+        self.once.fork_each(self.avatars, lambda avatar, own: record_drive(avatar, own, self.state, 0))
         record_substeps(self.once, *world)
-        record_end(self.once, *world)
-        self.once.fork_each(self.avatars, lambda avatar, own: avatar.record_end(own, self.state))
+        record_end_of_step(self.once, self.avatars, *world)
         record_control_step(self.each, self.avatars, *world)
-        for program in (self.once, self.each):
-            program.fork_each(self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
 
     def _place(self, points: BodyPoints) -> None:
         step = queue_step(points.rest[0], TOUCH * self.scale.dx) if self.count > 1 else 0.0

@@ -103,7 +103,6 @@ class Rig:
         self.avatar.record_reset(self._reset, self.state, self._placed)
         self.avatar.record_tracking(self._reset, self.state)
         record_control_step(self._step, [self.avatar], self.model, self.state, self.scratch)
-        self.avatar.record_tracking(self._step, self.state)
         self._strike.launch(
             apply_impulse,
             (n, self.points.num_points),

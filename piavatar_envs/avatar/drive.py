@@ -192,16 +192,12 @@ class AvatarDrive:
 def record_control_step(
     program: Program, avatars: Sequence[AvatarDrive], model: Model, state: State, scratch: Scratch
 ) -> None:
-    """Append one control step of all ``avatars`` of a world through all substeps.
+    """Append one control step of all ``avatars`` of a world through all substeps, after which they are tracked.
 
     They go beside each other: what one does between substeps has nothing to do with another.
     """
+    world = (model, state, scratch)
     injected = model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"])
-
-    def begin(avatar: AvatarDrive, own: Program) -> None:
-        avatar.record_begin(own)
-        if injected:
-            record_injection(avatar, own, state)
 
     def drive(avatar: AvatarDrive, own: Program, step: int) -> None:
         if avatar.joints:
@@ -209,14 +205,30 @@ def record_control_step(
         else:
             record_drive(avatar, own, state, step)
 
-    record_begin(program, model, state, scratch)
-    program.fork_each(avatars, begin)
+    record_begin(program, *world, program.branches(avatars, lambda avatar, own: avatar.record_begin(own)))
+    if injected:
+        program.fork_each(avatars, lambda avatar, own: record_injection(avatar, own, state))
     for step in range(model.num_substeps):
         if not injected:
             program.fork_each(avatars, partial(drive, step=step))
-        record_substep(program, model, state, scratch, step)
-    record_end(program, model, state, scratch)
-    program.fork_each(avatars, lambda avatar, own: avatar.record_end(own, state))
+        record_substep(program, *world, step)
+    record_end_of_step(program, avatars, *world)
+
+
+def record_end_of_step(
+    program: Program, avatars: Sequence[AvatarDrive], model: Model, state: State, scratch: Scratch
+) -> None:
+    """Append what ends a control step, when all substeps have been taken: it is sensed, and ``avatars`` are tracked."""
+
+    def end(avatar: AvatarDrive, own: Program) -> None:
+        avatar.record_end(own, state)
+        avatar.record_tracking(own, state)
+
+    ends = program.branches(avatars, end)
+    moves = any(avatar.joints for avatar in avatars)  # these put particles in their places, and sensors ask for those
+    record_end(program, model, state, scratch, () if moves else ends)
+    if moves:
+        program.fork(*ends)
 
 
 @wp.kernel

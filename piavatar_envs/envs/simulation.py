@@ -209,15 +209,12 @@ class Simulation:
         if self.model.moving_boundaries:
             boundaries = self.model.boundaries
             program.launch(place_colliders, boundaries.position.shape, [mask, self.collider_spawn], [boundaries])
-        self._record_tracking(program)
+        program.fork_each(self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
+        self.props.record_tracking(program, self.state)
 
     def record_control_step(self, program: Program) -> None:
         """Append: one control step towards the avatars' goals, then track."""
         record_control_step(program, self.avatars, self.model, self.state, self.scratch)
-        self._record_tracking(program)
-
-    def _record_tracking(self, program: Program) -> None:
-        program.fork_each(self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
         self.props.record_tracking(program, self.state)
 
     def arrays(self) -> dict[str, wp.array]:

@@ -112,11 +112,15 @@ class Program:
 
     def fork_each(self, things: Iterable[T], record: Callable[[T, Program], None]) -> None:
         """:meth:`fork` into what ``record`` appends for each of some ``things`` to a program of its own."""
-        branches = []
+        self.fork(*self.branches(things, record))
+
+    def branches(self, things: Iterable[T], record: Callable[[T, Program], None]) -> list[Program]:
+        """Programs to :meth:`fork` into: what ``record`` appends for each of some ``things``."""
+        programs = []
         for each in things:
-            branches.append(Program(self.device))
-            record(each, branches[-1])
-        self.fork(*branches)
+            programs.append(Program(self.device))
+            record(each, programs[-1])
+        return programs
 
     def __len__(self) -> int:
         return len(self._launches)

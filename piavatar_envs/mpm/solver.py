@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import warp as wp
@@ -232,12 +233,17 @@ def _moving(s: State) -> Moving:
     return group(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk, spin=s.spin)
 
 
-def record_begin(program: Program, model: Model, state: State, scratch: Scratch) -> None:
-    """Append what comes before the first substep of a control step: sensors forget, blocks with matter are marked."""
+def record_begin(
+    program: Program, model: Model, state: State, scratch: Scratch, beside: Sequence[Program] = ()
+) -> None:
+    """Append what comes before the first substep of a control step: sensors forget, blocks with matter are marked.
+
+    What goes on ``beside`` that must not move particles, nor ask which environments have failed: marks find that out.
+    """
     sensors, marks = Program(program.device), Program(program.device)
     sensors.launch(clear_sensors, model.num_envs, [], [scratch.sensors])
     record_marks(marks, model, state, scratch)
-    program.fork(sensors, marks)
+    program.fork(sensors, marks, *beside)
 
 
 def record_marks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -260,8 +266,11 @@ def _record_new_marks(program: Program, model: Model, state: State, scratch: Scr
         program.launch(begin_others, (m.num_envs, m.max_slots), [], [blocks])
 
 
-def record_end(program: Program, model: Model, state: State, scratch: Scratch) -> None:
-    """Append what comes after the last substep of a control step: what is sensed once a step."""
+def record_end(program: Program, model: Model, state: State, scratch: Scratch, beside: Sequence[Program] = ()) -> None:
+    """Append what comes after the last substep of a control step: what is sensed once a step.
+
+    What goes on ``beside`` that must not move particles.
+    """
     m, impulses, depths = model, Program(program.device), Program(program.device)
     entries = scratch.sensors.sums.shape[1] // 3
     impulses.launch(read_impulses, (m.num_envs, entries), [], [scratch.sensors])
@@ -272,4 +281,4 @@ def record_end(program: Program, model: Model, state: State, scratch: Scratch) -
             [m.grid, m.particles, m.contact, state.x, scratch.blocks, scratch.velocity, state.failure],
             [scratch.sensors.penetration],
         )
-    program.fork(impulses, depths)
+    program.fork(impulses, depths, *beside)

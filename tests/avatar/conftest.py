@@ -284,7 +284,6 @@ def build_rig(
     drive.record_reset(reset_program, state, mask)
     drive.record_tracking(reset_program, state)
     record_control_step(step_program, [drive], model, state, scratch)
-    drive.record_tracking(step_program, state)
     return Rig(model, state, scratch, points, drive, mask, reset_program, step_program).reset()
 
 

@@ -160,3 +160,14 @@ def test_the_programs_are_recorded_once(make_batch, env_id):
     batch.step()
     with pytest.raises(RuntimeError, match="has run"):
         batch.step_program.launch(clear_vectors, 3, [batch.simulation.avatar.state.wrench_force])
+
+
+@pytest.mark.parametrize(("task", "moves"), [("PIAvatar/KickBall-v0", False), ("PIAvatar/Stand-v0", True)])
+def test_what_goes_beside_marks_and_sensors(make_env, task, moves):
+    """Avatars begin while blocks are marked, and are tracked while sensors are read; not those that move particles."""
+    launches = make_env(task).unwrapped.batch.step_program._launches
+    forks = {launch.kernel.key: launch.fork for launch in reversed(launches)}  # of the first launch of each
+    begins = "set_springs" if moves else "begin_control"
+    assert forks[begins] == forks["mark_particles"] == forks["clear_sensors"] > 0
+    assert (forks["track_bones"] == forks["read_impulses"] > 0) != moves
+    assert ("put_in_place" in forks) == moves and forks.get("put_in_place", 0) in (0, forks["track_bones"])
