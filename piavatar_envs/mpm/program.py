@@ -228,14 +228,13 @@ class Program:
         return self._streams[:count]
 
 
-def acquire(device: wp.Device) -> None:
-    """Have Warp begin with a device, before several threads come to it.
+def acquire(device: wp.Device) -> wp.Stream | None:
+    """Have Warp begin with a device, before several threads come to it; returns a GPU's stream.
 
     The first to come to a GPU at the same time would each make its streams, and a process ends in a segmentation fault
     when those of the others are given back.
     """
-    if device.is_cuda:
-        wp.get_stream(device)
+    return device.stream if device.is_cuda else None
 
 
 def compile_programs(programs: Iterable[Program]) -> None:
