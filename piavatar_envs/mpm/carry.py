@@ -16,7 +16,6 @@ from piavatar_envs.mpm.relay_contact import meets_others
 from piavatar_envs.mpm.singles import (
     TEAM,
     THREADS,
-    add_single,
     any_of_team,
     block_of_thread,
     fits,
@@ -38,6 +37,7 @@ from piavatar_envs.mpm.team import (
     vec6,
     vector_of_team,
 )
+from piavatar_envs.mpm.team_add import add_single
 from piavatar_envs.mpm.team_clear import clear_share
 from piavatar_envs.mpm.team_gather import gather_by_team
 from piavatar_envs.mpm.team_sense import sense_by_team, slots_touched
