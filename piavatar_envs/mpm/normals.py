@@ -21,7 +21,7 @@ from piavatar_envs.mpm.others import has_told
 from piavatar_envs.mpm.records import mass_of, read_record, write_record
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_index, node_in_block
 from piavatar_envs.mpm.sums import move_offset, offset_at, take_sum
-from piavatar_envs.mpm.sweep import THREADS, Sweep
+from piavatar_envs.mpm.sweep import LANES, THREADS, Sweep, lane_of_thread, vector_sum_of_team
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums, row, vec8, vec8i
 
@@ -199,6 +199,26 @@ def in_grid(grid: Grid, node: wp.vec3i):
 
 
 @wp.func
+def share_of_normal(c: float, of_a: wp.vec4, of_b: wp.vec4):
+    """What a node adds to a normal, times ``c`` for its distance, from what both its fields say."""
+    reduced = of_a[3] * of_b[3] / wp.max(of_a[3] + of_b[3], EMPTY)
+    return (c * reduced * reduced) * (of_a - of_b)
+
+
+@wp.func
+def normal_along(facing: wp.vec4):
+    """Unit vector along a sum of :func:`share_of_normal`; zero if there is no telling.
+
+    Summands of nearly empty nodes are so small that their squares are not.
+    """
+    n_ab = wp.vec3(facing[0], facing[1], facing[2])
+    largest = wp.max(wp.abs(n_ab))
+    if largest <= 0.0:
+        return wp.vec3()
+    return wp.normalize(n_ab / largest)
+
+
+@wp.func
 def normal_from(
     grid: Grid, e: int, node: wp.vec3i, first_a: vec8i, first_b: vec8i, node_facing: wp.array2d(dtype=wp.vec4)
 ):
@@ -228,14 +248,31 @@ def normal_from(
                 # what does not count is the node itself, times 0: all are read before the first has come
                 of_a = read_change(node_facing, e, wp.where(counts, to_a + n, ra))
                 of_b = read_change(node_facing, e, wp.where(counts, to_b + n, rb))
-                reduced = of_a[3] * of_b[3] / wp.max(of_a[3] + of_b[3], EMPTY)
-                facing += (wp.where(counts, c, 0.0) * reduced * reduced) * (of_a - of_b)
-    # summands of nearly empty nodes are so small that their squares are not
-    n_ab = wp.vec3(facing[0], facing[1], facing[2])
-    largest = wp.max(wp.abs(n_ab))
-    if largest <= 0.0:
-        return wp.vec3()
-    return wp.normalize(n_ab / largest)
+                facing += share_of_normal(wp.where(counts, c, 0.0), of_a, of_b)
+    return normal_along(facing)
+
+
+@wp.func
+def normal_of_warp(
+    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, node_facing: wp.array2d(dtype=wp.vec4)
+):
+    """:func:`shared_normal` for a node that a warp of a GPU has: its threads share the 27 around. All come here."""
+    n = lane_of_thread()
+    to = wp.vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
+    at = node + to
+    share = wp.vec4()
+    if n < 27 and in_grid(grid, at):
+        block = block_index(grid, at[0], at[1], at[2])
+        local = node_in_block(at[0], at[1], at[2])
+        both = (1 << a) | (1 << b)
+        # asked for before it is known whether the block has both fields: else that was not written in this substep
+        of_a = read_change(node_facing, e, first_record(grid, blocks, e, a, block) + local)
+        of_b = read_change(node_facing, e, first_record(grid, blocks, e, b, block) + local)
+        if (blocks.fields[e, block] & both) == both:
+            c = 1.0 / (1.0 + float(to[0] * to[0] + to[1] * to[1] + to[2] * to[2]))
+            share = share_of_normal(c, of_a, of_b)
+    total = vector_sum_of_team(LANES, wp.vec3(share[0], share[1], share[2]))
+    return normal_along(wp.vec4(total[0], total[1], total[2], 0.0))
 
 
 @wp.func

@@ -64,7 +64,7 @@ def record_relay(
     team = int(TEAM_OF_FIELDS if several else TEAM)
     share = LANES // team
     per_env = -(-m.num_particles // share) * share
-    others = record_contact(program, m, scratch) if several else None
+    others, meeting = record_contact(program, m, scratch) if several else (None, None)
     for index in range(count):
         turn = Turn()
         turn.substep, turn.stops = index, stops
@@ -74,7 +74,7 @@ def record_relay(
         if index == 0:
             turn.swept = -1
         if several:
-            record_meeting(program, m, scratch, others, stops, index, turn.gathered)
+            record_meeting(program, m, scratch, others, meeting, stops, index, turn.gathered)
         program.launch(
             carry_fields_on if several else carry_on,
             m.num_envs * per_env * team,

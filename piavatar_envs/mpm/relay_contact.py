@@ -24,14 +24,23 @@ from piavatar_envs.mpm.blocks import (
 )
 from piavatar_envs.mpm.contact import book_contact, book_pair, impulse_between
 from piavatar_envs.mpm.grid import total_velocity
-from piavatar_envs.mpm.impulses import write_change
-from piavatar_envs.mpm.normals import MASS_MIN, facing_of, normal_from, records_around
+from piavatar_envs.mpm.impulses import read_change, write_change
+from piavatar_envs.mpm.meeting import (
+    Meeting,
+    begin_list,
+    begin_meeting,
+    node_meeting,
+    nodes_meeting,
+    note_meeting,
+    warps_of_meeting,
+)
+from piavatar_envs.mpm.normals import facing_of, normal_of_warp
 from piavatar_envs.mpm.others import has_bit, note_bits, told_at_first
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.singles import place_of_block
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
 from piavatar_envs.mpm.sums import begin_sum, counted, give_momentum, offset_at, physical_sum, sum_of, units_of
-from piavatar_envs.mpm.sweep import THREADS, Sweep, plan_sweep
+from piavatar_envs.mpm.sweep import LANES, THREADS, Sweep, lane_of_thread, plan_sweep
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Contact, Grid, Model, Scratch, Sensors, Step, Sums
 
@@ -90,9 +99,12 @@ def has_others(others: wp.array2d(dtype=int), slots: int, e: int, substep: int, 
 
 
 @wp.kernel
-def begin_contact(blocks: Blocks, others: wp.array2d(dtype=int), sensors: Sensors):
+def begin_contact(blocks: Blocks, others: wp.array2d(dtype=int), sensors: Sensors, meeting: Meeting):
     """All have told where blocks have several fields, and nothing has been touched."""
     e, slot = wp.tid()
+    if slot == 0:
+        meeting.count[e, 0] = 0
+        meeting.count[e, 1] = 0
     slots = blocks.held.shape[1]
     told = told_at_first(blocks, e, slot)
     for half in range(2):
@@ -114,10 +126,17 @@ def face_fields(
     others: wp.array2d(dtype=int),
     # out
     node_facing: wp.array2d(dtype=wp.vec4),
+    meeting: Meeting,
+    sensors: Sensors,
 ):
-    """What every node of a block with several fields says about the normals around it, and who is there."""
+    """What every node of a block with several fields says about the normals around it, who is there, and who may touch.
+
+    Fields may where all particles of two or more have told the node where they are.
+    """
     at = environment_of(wp.tid(), sweep.threads)
     e = at[0]
+    if at[1] == 0:
+        begin_meeting(meeting, e, substep)
     slots = blocks.held.shape[1]
     end = nodes_shared(blocks, e)
     for turn in range(sweep.turns):
@@ -130,6 +149,7 @@ def face_fields(
         first = lowest_field(mask, contact.num_fields)
         last = end_of_fields(mask)
         present = int(0)
+        told = int(0)
         for f in range(first, last):
             if has_field(mask, f):
                 r = first_record(grid, blocks, e, f, block) + local
@@ -139,7 +159,10 @@ def face_fields(
                     present = present | (1 << f)
                     if had_others(others, slots, e, substep + 1, r):
                         facing = facing_of(grid, contact, sums, e, f, BLOCK_NODES * gathered + r, m)
+                told += wp.where(facing[3] > 0.0, 1, 0)
                 write_change(node_facing, e, r, facing)
+                write_change(sensors.node, e, r, wp.vec4())
+        note_meeting(meeting, e, substep, BLOCK_NODES * block + local, told > 1)
         for f in range(first, last):
             if has_field(mask, f):
                 r = first_record(grid, blocks, e, f, block) + local
@@ -156,7 +179,6 @@ def meet_pair(
     sums: Sums,
     sensors: Sensors,
     node_facing: wp.array2d(dtype=wp.vec4),
-    others: wp.array2d(dtype=int),
     substep: int,
     gathered: int,
     e: int,
@@ -165,23 +187,24 @@ def meet_pair(
     a: int,
     b: int,
 ):
-    """Contact of the fields ``a < b`` at a node that both have told where they are, added to their sums."""
+    """Contact of the fields ``a < b`` at a node, if both have told it where they are, added to their sums; by a warp.
+
+    Its threads share the nodes around, which say what the normal is; the first does the rest.
+    """
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     ra = first_record(grid, blocks, e, a, block) + local
     rb = first_record(grid, blocks, e, b, block) + local
     sa = BLOCK_NODES * gathered + ra
     sb = BLOCK_NODES * gathered + rb
     node = node_of_block(block_corner(grid, block), local)
-    around_a, around_b = records_around(grid, blocks, e, node, a, b)  # asked for before it is known who needs them
     va = total_velocity(step, split, sum_of(sums, e, units_of(sums, e, a), sa, begin_sum(sums, e, sa)))
     vb = total_velocity(step, split, sum_of(sums, e, units_of(sums, e, b), sb, begin_sum(sums, e, sb)))
-    slots = blocks.held.shape[1]
-    told = had_others(others, slots, e, substep + 1, ra) and had_others(others, slots, e, substep + 1, rb)
-    if va[0] <= MASS_MIN or vb[0] <= MASS_MIN or not told:
-        return
-    n_ab = normal_from(grid, e, node, around_a, around_b, node_facing)
     offset_a = offset_at(grid, sums, e, a, sa)
     offset_b = offset_at(grid, sums, e, b, sb)
+    told = read_change(node_facing, e, ra)[3] > 0.0 and read_change(node_facing, e, rb)[3] > 0.0
+    n_ab = normal_of_warp(grid, blocks, e, node, a, b, node_facing)
+    if lane_of_thread() != 0 or not told:
+        return
     J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
     if wp.length_sq(J) <= 0.0:
         return
@@ -192,55 +215,54 @@ def meet_pair(
     book_pair(contact, e, a, b, J, sensors)
 
 
-@wp.kernel(launch_bounds=(THREADS, 2))
+@wp.kernel(launch_bounds=(THREADS, 4))
 def meet_fields(
     grid: Grid,
     step: Step,
     contact: Contact,
-    sweep: Sweep,
+    warps: int,
     substep: int,
     gathered: int,
     stops: wp.array(dtype=int),
+    meeting: Meeting,
     blocks: Blocks,
     node_facing: wp.array2d(dtype=wp.vec4),
-    others: wp.array2d(dtype=int),
     # in and out
     sums: Sums,
     sensors: Sensors,
 ):
-    """Contact of all fields at every node of a block that has several, in pairs; what follows reads the sums."""
-    at = environment_of(wp.tid(), sweep.threads)
+    """Contact of all fields, in pairs, at every node where they may touch, by a warp; what follows reads the sums."""
+    at = environment_of(wp.tid() // LANES, warps)
     e = at[0]
-    end = nodes_shared(blocks, e)
-    for turn in range(sweep.turns):
-        n = at[1] + turn * sweep.stride
-        block = shared_block(blocks, e, n)
-        if n >= end or stops[e] <= substep:
-            break
-        local = n % BLOCK_NODES
-        mask = blocks.fields[e, block]
+    n = at[1]
+    node = node_meeting(meeting, e, n)
+    end = nodes_meeting(meeting, e, substep)
+    while n < end and stops[e] > substep:
+        mask = blocks.fields[e, node[0]]
         first = lowest_field(mask, contact.num_fields)
         last = end_of_fields(mask)
-        for f in range(first, last):
-            if has_field(mask, f):
-                write_change(sensors.node, e, first_record(grid, blocks, e, f, block) + local, wp.vec4())
         for a in range(first, last - 1):
             for b in range(a + 1, last):
                 if has_field(mask, a) and has_field(mask, b):
                     meet_pair(
-                        grid, step, contact, blocks, sums, sensors, node_facing, others, substep, gathered, e, block,
-                        local, a, b,
+                        grid, step, contact, blocks, sums, sensors, node_facing, substep, gathered, e, node[0], node[1],
+                        a, b,
                     )  # fmt: skip
+        n += warps
+        node = node_meeting(meeting, e, n)
 
 
-def record_contact(program: Program, model: Model, scratch: Scratch) -> wp.array:
-    """Append what comes before the first contact, blocks having been marked; returns where other fields are.
+def record_contact(program: Program, model: Model, scratch: Scratch) -> tuple[wp.array, Meeting]:
+    """Append what comes before the first contact, blocks having been marked.
 
-    Bits of a field's slots, in turns: see :func:`had_others`.
+    Returns:
+        where other fields are, bits of a field's slots, in turns: see :func:`had_others`; and who may touch where.
     """
     others = wp.zeros((model.num_envs, 4 * model.max_slots), dtype=int, device=model.device)
-    program.launch(begin_contact, (model.num_envs, model.max_slots), [scratch.blocks], [others, scratch.sensors])
-    return others
+    meeting = begin_list(model)
+    outputs = [others, scratch.sensors, meeting]
+    program.launch(begin_contact, (model.num_envs, model.max_slots), [scratch.blocks], outputs)
+    return others, meeting
 
 
 def record_meeting(
@@ -248,24 +270,24 @@ def record_meeting(
     model: Model,
     scratch: Scratch,
     others: wp.array,
+    meeting: Meeting,
     stops: wp.array,
     substep: int,
     gathered: int,
 ) -> None:
     """Append the contact of a substep, the set of sums whose first slot is ``gathered`` being complete."""
-    m, sweep, turn = model, plan_sweep(model), [substep, gathered]
-    threads = m.num_envs * sweep.threads
+    m, sweep, turn, warps = model, plan_sweep(model), [substep, gathered], warps_of_meeting(model)
     program.launch(
         face_fields,
-        threads,
+        m.num_envs * sweep.threads,
         [m.grid, m.contact, sweep, *turn, scratch.blocks, scratch.turns],
-        [others, scratch.facing],
+        [others, scratch.facing, meeting, scratch.sensors],
         block_dim=THREADS,
     )
     program.launch(
         meet_fields,
-        threads,
-        [m.grid, m.step, m.contact, sweep, *turn, stops, scratch.blocks, scratch.facing, others],
+        m.num_envs * warps * LANES,
+        [m.grid, m.step, m.contact, warps, *turn, stops, meeting, scratch.blocks, scratch.facing],
         [scratch.turns, scratch.sensors],
         block_dim=THREADS,
     )

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.stencil import BLOCK_NODES
 from piavatar_envs.mpm.types import Model
 
@@ -90,6 +91,25 @@ return 1;
 """)
 def lanes_of_warp() -> int:
     """Threads of a warp; 1 on a CPU."""
+    ...
+
+
+@wp.func_native(
+    native(
+        """
+wp::vec_t<3, wp::float32> sum = own;
+#pragma unroll
+for (int distance = 1; distance < 32; distance *= 2)
+    if (distance < team)
+#pragma unroll
+        for (int c = 0; c < 3; ++c) sum[c] += __shfl_xor_sync(0xffffffffu, sum[c], distance);
+return sum;
+""",
+        "return own;",
+    )
+)
+def vector_sum_of_team(team: int, own: wp.vec3) -> wp.vec3:
+    """Sum over the threads of a particle, or of a warp if that is the ``team``; all threads of a warp come here."""
     ...
 
 

@@ -96,25 +96,6 @@ def sum_of_team(team: int, own: wp.mat44) -> wp.mat44:
 
 
 @wp.func_native(
-    native(
-        """
-wp::vec_t<3, wp::float32> sum = own;
-#pragma unroll
-for (int distance = 1; distance < 32; distance *= 2)
-    if (distance < team)
-#pragma unroll
-        for (int c = 0; c < 3; ++c) sum[c] += __shfl_xor_sync(0xffffffffu, sum[c], distance);
-return sum;
-""",
-        "return own;",
-    )
-)
-def vector_sum_of_team(team: int, own: wp.vec3) -> wp.vec3:
-    """Sum over the threads of a particle, or of a warp if that is the ``team``; all threads of a warp come here."""
-    ...
-
-
-@wp.func_native(
     native("""
 int4* const first = reinterpret_cast<int4*>(&wp::index(sums.fixed, e, 2 * record)) + (threadIdx.x & 31);
 const int4 zero = make_int4(0, 0, 0, 0);  // two for each of the 64 physical halves, then as many kinematic ones

@@ -14,12 +14,11 @@ from piavatar_envs.mpm.impulses import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.records import half_of
 from piavatar_envs.mpm.stencil import Stencil, node_position
 from piavatar_envs.mpm.sums import begin_sum, counted, numbers_at, physical_sum
-from piavatar_envs.mpm.sweep import LANES, any_lane, lane_of_thread
+from piavatar_envs.mpm.sweep import LANES, any_lane, lane_of_thread, vector_sum_of_team
 from piavatar_envs.mpm.team import (
     node_of_thread,
     record_in_team,
     sum_of_team,
-    vector_sum_of_team,
     weight_at,
 )
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Boundaries, Contact, Grid, Sensors, Step, Sums, vec4l

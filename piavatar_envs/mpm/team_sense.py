@@ -7,8 +7,8 @@ import warp as wp
 from piavatar_envs.mpm.impulses import read_change
 from piavatar_envs.mpm.sensing import give, take_share
 from piavatar_envs.mpm.stencil import BLOCK_NODES, Stencil
-from piavatar_envs.mpm.sweep import any_lane, lane_of_thread
-from piavatar_envs.mpm.team import node_of_thread, record_in_team, vector_sum_of_team
+from piavatar_envs.mpm.sweep import any_lane, lane_of_thread, vector_sum_of_team
+from piavatar_envs.mpm.team import node_of_thread, record_in_team
 from piavatar_envs.mpm.team_gather import weight_of
 from piavatar_envs.mpm.types import Particles, Sensors
 
