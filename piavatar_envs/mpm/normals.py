@@ -91,13 +91,19 @@ def weighted_gradient(grid: Grid, V: float, m: float, offset: wp.vec4):
 
 
 @wp.func
+def facing_from(grid: Grid, V: float, m: float, offset: wp.vec4):
+    """Weighted outward gradient and volume [cells] of a field of volume ``V`` and mass ``m`` with that ``offset``."""
+    outward = weighted_gradient(grid, V, m, offset)
+    return wp.vec4(outward[0], outward[1], outward[2], V)
+
+
+@wp.func
 def facing_of(grid: Grid, contact: Contact, sums: Sums, e: int, f: int, r: int, m: float):
-    """Weighted outward gradient and volume [cells] of field ``f`` of mass ``m`` at the node of record ``r``."""
+    """:func:`facing_from` of field ``f`` of mass ``m`` at the node of record ``r``; nothing if there is none of it."""
     V = volume_at(grid, contact, e, f, m)
     facing = wp.vec4()
     if V > 0.0:
-        outward = weighted_gradient(grid, V, m, offset_at(grid, sums, e, f, r))
-        facing = wp.vec4(outward[0], outward[1], outward[2], V)
+        facing = facing_from(grid, V, m, offset_at(grid, sums, e, f, r))
     return facing
 
 
@@ -260,17 +266,19 @@ def normal_of_warp(
     n = lane_of_thread()
     to = wp.vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
     at = node + to
-    share = wp.vec4()
-    if n < 27 and in_grid(grid, at):
-        block = block_index(grid, at[0], at[1], at[2])
-        local = node_in_block(at[0], at[1], at[2])
-        both = (1 << a) | (1 << b)
-        # asked for before it is known whether the block has both fields: else that was not written in this substep
-        of_a = read_change(node_facing, e, first_record(grid, blocks, e, a, block) + local)
-        of_b = read_change(node_facing, e, first_record(grid, blocks, e, b, block) + local)
-        if (blocks.fields[e, block] & both) == both:
-            c = 1.0 / (1.0 + float(to[0] * to[0] + to[1] * to[1] + to[2] * to[2]))
-            share = share_of_normal(c, of_a, of_b)
+    last = grid.nodes - wp.vec3i(1)
+    near = wp.max(wp.min(at, last), wp.vec3i(0))
+    block = block_index(grid, near[0], near[1], near[2])
+    local = node_in_block(near[0], near[1], near[2])
+    both = (1 << a) | (1 << b)
+    # what does not count is times 0: all are asked for before it is known which do
+    mask = blocks.fields[e, block]
+    of_a = read_change(node_facing, e, first_record(grid, blocks, e, a, block) + local)
+    of_b = read_change(node_facing, e, first_record(grid, blocks, e, b, block) + local)
+    c = float(0.0)
+    if n < 27 and in_grid(grid, at) and (mask & both) == both:  # else that was not written in this substep
+        c = 1.0 / (1.0 + float(to[0] * to[0] + to[1] * to[1] + to[2] * to[2]))
+    share = share_of_normal(c, of_a, of_b)
     total = vector_sum_of_team(LANES, wp.vec3(share[0], share[1], share[2]))
     return normal_along(wp.vec4(total[0], total[1], total[2], 0.0))
 

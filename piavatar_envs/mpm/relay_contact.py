@@ -34,12 +34,22 @@ from piavatar_envs.mpm.meeting import (
     note_meeting,
     warps_of_meeting,
 )
-from piavatar_envs.mpm.normals import facing_of, normal_of_warp
+from piavatar_envs.mpm.normals import facing_from, normal_of_warp, volume_at
 from piavatar_envs.mpm.others import has_bit, note_bits, told_at_first
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.singles import place_of_block
 from piavatar_envs.mpm.stencil import BLOCK_NODES, block_corner, node_of_block
-from piavatar_envs.mpm.sums import begin_sum, counted, give_momentum, offset_at, physical_sum, sum_of, units_of
+from piavatar_envs.mpm.sums import (
+    begin_sum,
+    counted,
+    give_momentum,
+    kinematic_numbers,
+    numbers_at,
+    offset_from,
+    physical_sum,
+    sum_from,
+    units_of,
+)
 from piavatar_envs.mpm.sweep import LANES, THREADS, Sweep, lane_of_thread, plan_sweep
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Contact, Grid, Model, Scratch, Sensors, Step, Sums
@@ -153,12 +163,17 @@ def face_fields(
         for f in range(first, last):
             if has_field(mask, f):
                 r = first_record(grid, blocks, e, f, block) + local
-                m = physical_sum(units_of(sums, e, f), counted(begin_sum(sums, e, BLOCK_NODES * gathered + r)))[0]
+                at_node = BLOCK_NODES * gathered + r
+                begun = begin_sum(sums, e, at_node)  # all is asked for before it is known what for
+                off = numbers_at(sums.offset_fixed, e, at_node)
+                has_told = had_others(others, slots, e, substep + 1, r)
+                m = physical_sum(units_of(sums, e, f), counted(begun))[0]
+                V = volume_at(grid, contact, e, f, m)
                 facing = wp.vec4()
                 if m > 0.0:
                     present = present | (1 << f)
-                    if had_others(others, slots, e, substep + 1, r):
-                        facing = facing_of(grid, contact, sums, e, f, BLOCK_NODES * gathered + r, m)
+                if has_told and V > 0.0:
+                    facing = facing_from(grid, V, m, offset_from(grid, sums, e, f, off))
                 told += wp.where(facing[3] > 0.0, 1, 0)
                 write_change(node_facing, e, r, facing)
                 write_change(sensors.node, e, r, wp.vec4())
@@ -197,14 +212,24 @@ def meet_pair(
     sa = BLOCK_NODES * gathered + ra
     sb = BLOCK_NODES * gathered + rb
     node = node_of_block(block_corner(grid, block), local)
-    va = total_velocity(step, split, sum_of(sums, e, units_of(sums, e, a), sa, begin_sum(sums, e, sa)))
-    vb = total_velocity(step, split, sum_of(sums, e, units_of(sums, e, b), sb, begin_sum(sums, e, sb)))
-    offset_a = offset_at(grid, sums, e, a, sa)
-    offset_b = offset_at(grid, sums, e, b, sb)
-    told = read_change(node_facing, e, ra)[3] > 0.0 and read_change(node_facing, e, rb)[3] > 0.0
+    # all is asked for before the first has answered
+    units_a = units_of(sums, e, a)
+    units_b = units_of(sums, e, b)
+    begun_a = begin_sum(sums, e, sa)
+    begun_b = begin_sum(sums, e, sb)
+    driven_a = kinematic_numbers(sums, e, sa)
+    driven_b = kinematic_numbers(sums, e, sb)
+    off_a = numbers_at(sums.offset_fixed, e, sa)
+    off_b = numbers_at(sums.offset_fixed, e, sb)
+    facing_a = read_change(node_facing, e, ra)
+    facing_b = read_change(node_facing, e, rb)
     n_ab = normal_of_warp(grid, blocks, e, node, a, b, node_facing)
-    if lane_of_thread() != 0 or not told:
+    if lane_of_thread() != 0 or facing_a[3] <= 0.0 or facing_b[3] <= 0.0:
         return
+    va = total_velocity(step, split, sum_from(units_a, begun_a, driven_a))
+    vb = total_velocity(step, split, sum_from(units_b, begun_b, driven_b))
+    offset_a = offset_from(grid, sums, e, a, off_a)
+    offset_b = offset_from(grid, sums, e, b, off_b)
     J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
     if wp.length_sq(J) <= 0.0:
         return

@@ -117,11 +117,23 @@ def take_sum(sums: Sums, e: int, f: int, r: int):
 
 
 @wp.func
-def sum_of(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l):
-    """Mass, physical and kinematic momentum in fixed point, of what has ``begun``; nothing is cleared."""
-    b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
+def kinematic_numbers(sums: Sums, e: int, r: int):
+    """Kinematic momentum in fixed point of record ``r``."""
+    return numbers_at(sums.fixed, e, half_of(r, 1))
+
+
+@wp.func
+def sum_from(units: wp.vec2, begun: vec4l, kinematic: vec4l):
+    """Mass, physical and kinematic momentum, from both in fixed point."""
+    b = counted(kinematic)
     p = units[1]
     return physical_sum(units, counted(begun)) + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
+
+
+@wp.func
+def sum_of(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l):
+    """Mass, physical and kinematic momentum in fixed point, of what has ``begun``; nothing is cleared."""
+    return sum_from(units, begun, kinematic_numbers(sums, e, r))
 
 
 @wp.func
@@ -166,12 +178,18 @@ def offset_unit(grid: Grid, sums: Sums, e: int, f: int):
 
 
 @wp.func
+def offset_from(grid: Grid, sums: Sums, e: int, f: int, n: vec4l):
+    """:func:`offset_at`, from what is in fixed point."""
+    s = offset_unit(grid, sums, e, f) * counted(n)
+    return wp.vec4(s[0], s[1], s[2], s[3] / grid.dx)
+
+
+@wp.func
 def offset_at(grid: Grid, sums: Sums, e: int, f: int, r: int):
     """Sum of ``w m (x_i - x_p)`` [kg m] and of the mass of seam particles [kg] at record ``r`` of field ``f``."""
     if sums.is_fixed == 0:
         return sums.offset[e, r]
-    s = offset_unit(grid, sums, e, f) * counted(numbers_at(sums.offset_fixed, e, r))
-    return wp.vec4(s[0], s[1], s[2], s[3] / grid.dx)
+    return offset_from(grid, sums, e, f, numbers_at(sums.offset_fixed, e, r))
 
 
 @wp.func
