@@ -1,6 +1,7 @@
 """Contact between velocity fields where substeps are one launch each: see :mod:`piavatar_envs.mpm.relay`.
 
-Between two such launches, two short ones go over the nodes of blocks with several fields, before anybody gathers. What
+Between two such launches there are two short ones, before anybody gathers. The first goes over all nodes of blocks with
+several fields and lists those where fields may touch, the second over these, see :mod:`piavatar_envs.mpm.meeting`. What
 a pair gives each other there is added to its sums: who gathers makes velocities out of these, and need not know which
 nodes have been in contact. In integers, what one loses the other gains exactly.
 
