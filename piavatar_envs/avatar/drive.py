@@ -1,7 +1,7 @@
 """The drive of an avatar: records tracking, control steps and resets as launches of a program.
 
-A control step tracks nothing itself; it starts from the pose tracked at the end of the one before. An avatar whose
-joints move under torques has a :class:`~piavatar_envs.avatar.joint_drive.JointDrive` to do that instead.
+A control step starts from the pose tracked at the end of the one before. An avatar whose joints move under torques has
+a :class:`~piavatar_envs.avatar.joint_drive.JointDrive` to do that instead.
 """
 
 from __future__ import annotations

@@ -17,7 +17,8 @@ from piavatar_envs.mpm.types import Model, group
 
 wp.set_module_options({"enable_backward": False})
 
-#: Nodes for which a large GPU has warps at once, and the fewest for which an environment gets them.
+#: Nodes for which warps are launched where there are few environments, more than a large GPU has room for: a warp that
+#: comes back for a second one takes longer than others to begin. And the fewest for which an environment gets them.
 NODES_AT_ONCE, FEWEST_NODES = 132 * 40, 4
 
 

@@ -271,7 +271,7 @@ def normal_of_warp(
     block = block_index(grid, near[0], near[1], near[2])
     local = node_in_block(near[0], near[1], near[2])
     both = (1 << a) | (1 << b)
-    # what does not count is times 0: all are asked for before it is known which do
+    # what does not count is times 0, and finite whenever it was written; all are asked for before it is known which do
     mask = blocks.fields[e, block]
     of_a = read_change(node_facing, e, first_record(grid, blocks, e, a, block) + local)
     of_b = read_change(node_facing, e, first_record(grid, blocks, e, b, block) + local)

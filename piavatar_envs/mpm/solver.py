@@ -238,7 +238,8 @@ def record_begin(
 ) -> None:
     """Append what comes before the first substep of a control step: sensors forget, blocks with matter are marked.
 
-    What goes on ``beside`` that must not move particles, nor ask which environments have failed: marks find that out.
+    What goes on ``beside`` that has to do with neither sensors nor blocks, moves no particles, and does not ask which
+    environments have failed: marks find that out.
     """
     sensors, marks = Program(program.device), Program(program.device)
     sensors.launch(clear_sensors, model.num_envs, [], [scratch.sensors])
@@ -269,7 +270,7 @@ def _record_new_marks(program: Program, model: Model, state: State, scratch: Scr
 def record_end(program: Program, model: Model, state: State, scratch: Scratch, beside: Sequence[Program] = ()) -> None:
     """Append what comes after the last substep of a control step: what is sensed once a step.
 
-    What goes on ``beside`` that must not move particles.
+    What goes on ``beside`` that has to do with no sensors, moves no particles, and lets no environment fail.
     """
     m, impulses, depths = model, Program(program.device), Program(program.device)
     entries = scratch.sensors.sums.shape[1] // 3

@@ -18,7 +18,7 @@ from piavatar_envs.mpm.sweep import any_lane
 from piavatar_envs.mpm.transfer import Scattered
 from piavatar_envs.mpm.types import PAPER, Grid, Particles, Step, Sums
 
-# divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
+# roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 
@@ -153,7 +153,8 @@ def add_single(
     """Add to the nodes what particle ``p`` scatters, if it ``takes`` part: its mass and ``momentum``, what it tells.
 
     All threads of a warp come here, ``record`` and ``units`` as for :func:`add_to_nodes`: all threads of a particle
-    take part or none, and their records exist even where they do not.
+    take part or none, and their records exist even where they do not. A ``team`` of four is for sums in fixed point,
+    and not for the paper's variant, as relays are.
     """
     mass = momentum.at_base[0]
     told = takes and tells
@@ -162,7 +163,7 @@ def add_single(
         if team == 4:
             sums.told[e, record[1] // BLOCK_NODES] = 1
     # momentum comes last: what a thread reads after its additions waits for them
-    if team == 4:  # and is none of the paper's variant
+    if team == 4:
         kind = wp.where(any_lane(told), int(KINEMATIC), int(MOMENTUM))
         goes_on = bool(True)
         while goes_on:

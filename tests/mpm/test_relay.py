@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from piavatar_envs.mpm import relay_contact
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.relay import PORTION, portions
 from piavatar_envs.mpm.relay_contact import meets_others
@@ -260,6 +261,22 @@ def test_relays_of_several_fields_repeat_bit_for_bit(clash):
     for name in SENSED:
         found = getattr(first.scratch.sensors, name).numpy()
         np.testing.assert_array_equal(found, getattr(second.scratch.sensors, name).numpy(), err_msg=name)
+
+
+def test_warps_that_have_several_nodes(clash, monkeypatch):
+    """Where there are many environments, a warp comes back for more of the nodes at which fields may touch."""
+    many = clash(planes=(), num_substeps=30, control_dt=0.03)
+    monkeypatch.setattr(relay_contact, "warps_of_meeting", lambda model: 2)
+    two = clash(planes=(), num_substeps=30, control_dt=0.03)
+    dims = [launch.dim for launch in two.program._launches if launch.kernel.key == "meet_fields"]
+    assert set(dims) == {2 * 32 * two.model.num_envs}
+    many.run(), two.run()
+    assert np.abs(two.scratch.sensors.part_impulse.numpy()).max() > 0.1
+    for array in ARRAYS:
+        np.testing.assert_array_equal(many.get(array), two.get(array), err_msg=array)
+    for name in SENSED:
+        found, expected = (getattr(sim.scratch.sensors, name).numpy() for sim in (two, many))
+        np.testing.assert_array_equal(found, expected, err_msg=name)
 
 
 def test_fields_that_fail_fail_alone(clash):
