@@ -37,8 +37,8 @@ from piavatar_envs.mpm.types import (
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: Threads of a particle in the scatter alone. Teams of eight and of four are known, see :mod:`piavatar_envs.mpm.team`;
-#: here four, eight of which add the particles of both in turn, need fewer instructions and more time.
+#: Threads of a particle in the scatter alone. Teams of four are for some relays only, see
+#: :mod:`piavatar_envs.mpm.team_add`; four here, as tried before, need fewer instructions and more time.
 TEAM = wp.constant(8)
 #: Particles of a warp.
 SHARE = wp.constant(32 // int(TEAM))
