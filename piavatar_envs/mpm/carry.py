@@ -12,7 +12,6 @@ from piavatar_envs.mpm.blocks import NOBODY, awaited_slot, mark_block, slots_use
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.gather import Gathered, Gradients, begun, own_velocity, settled
 from piavatar_envs.mpm.materials import kirchhoff_stress
-from piavatar_envs.mpm.relay_contact import meets_others
 from piavatar_envs.mpm.singles import (
     TEAM,
     THREADS,
@@ -40,6 +39,7 @@ from piavatar_envs.mpm.team import (
 from piavatar_envs.mpm.team_add import add_single
 from piavatar_envs.mpm.team_clear import clear_share
 from piavatar_envs.mpm.team_gather import gather_by_team
+from piavatar_envs.mpm.team_others import meets_others
 from piavatar_envs.mpm.team_sense import sense_by_team, slots_touched
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.transfer import admitted, affine_momentum, impulse_of_stress, placed, with_momentum
@@ -224,7 +224,7 @@ def carry(
     tells = distance - wp.length(s.x - x) * grid.inv_dx < NEAR_PARTICLE
     if several:
         to = base_node(grid_position(grid, s.x))
-        tells = meets_others(team, others, blocks.held.shape[1], e, turn.substep, wp.max(slot, wp.vec2i()), to) or tells
+        tells = meets_others(team, others, e, wp.max(slot, wp.vec2i()), to) or tells
     momentum = momentum_of_team(team, grid, step, read, s)
     if several:
         tells = any_of_team(team, tells)

@@ -258,11 +258,18 @@ def normal_from(
     return normal_along(facing)
 
 
+@wp.struct
+class Neighbour:
+    """The node that a thread looks at, of the 27 around one that a warp has."""
+
+    c: float  # for its distance; 0 if it does not count
+    a: int  # record of one field there, and of the other: any that exist if it does not count
+    b: int
+
+
 @wp.func
-def normal_of_warp(
-    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, node_facing: wp.array2d(dtype=wp.vec4)
-):
-    """:func:`shared_normal` for a node that a warp of a GPU has: its threads share the 27 around. All come here."""
+def neighbour_of_lane(grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int):
+    """The :class:`Neighbour` of ``node`` that a thread has, for the fields ``a`` and ``b``."""
     n = lane_of_thread()
     to = wp.vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
     at = node + to
@@ -271,13 +278,21 @@ def normal_of_warp(
     block = block_index(grid, near[0], near[1], near[2])
     local = node_in_block(near[0], near[1], near[2])
     both = (1 << a) | (1 << b)
-    # what does not count is times 0, and finite whenever it was written; all are asked for before it is known which do
-    mask = blocks.fields[e, block]
-    of_a = read_change(node_facing, e, first_record(grid, blocks, e, a, block) + local)
-    of_b = read_change(node_facing, e, first_record(grid, blocks, e, b, block) + local)
-    c = float(0.0)
-    if n < 27 and in_grid(grid, at) and (mask & both) == both:  # else that was not written in this substep
-        c = 1.0 / (1.0 + float(to[0] * to[0] + to[1] * to[1] + to[2] * to[2]))
+    found = Neighbour()
+    found.a = wp.max(first_record(grid, blocks, e, a, block), 0) + local
+    found.b = wp.max(first_record(grid, blocks, e, b, block), 0) + local
+    if n < 27 and in_grid(grid, at) and (blocks.fields[e, block] & both) == both:  # else nobody has written there
+        found.c = 1.0 / (1.0 + float(to[0] * to[0] + to[1] * to[1] + to[2] * to[2]))
+    return found
+
+
+@wp.func
+def normal_of_warp(c: float, of_a: wp.vec4, of_b: wp.vec4):
+    """:func:`shared_normal` for a node that a warp of a GPU has, from what its threads have found around.
+
+    Each has the :class:`Neighbour` that it looks at, with this ``c``, and what that says of both fields; all come here.
+    What does not count is times 0, so it must be finite.
+    """
     share = share_of_normal(c, of_a, of_b)
     total = vector_sum_of_team(LANES, wp.vec3(share[0], share[1], share[2]))
     return normal_along(wp.vec4(total[0], total[1], total[2], 0.0))

@@ -1,13 +1,13 @@
 """At which nodes of a field another one has been: there its particles tell their nodes where they are.
 
 Contact acts at nodes to which all particles of both fields have told that. Which these are must be known before the
-particles are scattered, and is known of the substep before: a field tells a node if another one was there then, and
-only fields that have told a node touch there. That is a substep after the second has come to it, with little weight
-unless it moves nearly a grid spacing in a time step. When blocks are marked anew, their slots are others, and fields
-tell all nodes of blocks that have several: who comes then touches at once.
+particles are scattered, whatever the order in which they are: it is known of the substep before. A field tells a node
+if another one was there then, and only fields that have told a node touch there. That is a substep after the second has
+come to it, with little weight unless it moves nearly a grid spacing in a time step. When blocks are marked anew, their
+slots are others, and fields tell all nodes of blocks that have several: who comes then touches at once.
 
-For :mod:`piavatar_envs.mpm.groups`, where a group takes three times as long if one of its particles tells; other
-scatters tell all nodes of blocks with several fields in every substep.
+For :mod:`piavatar_envs.mpm.groups`, where a group takes three times as long if one of its particles tells, and for
+:mod:`piavatar_envs.mpm.relay`; other scatters tell all nodes of blocks with several fields in every substep.
 """
 
 from __future__ import annotations
@@ -63,6 +63,15 @@ def note_bits(words: wp.array2d(dtype=int), e: int, first: int, local: int, here
 
 
 @wp.func
+def had_others(others: wp.array2d(dtype=int), e: int, r: int):
+    """Whether the node of a field's record ``r`` had another field in the substep whose bits these are.
+
+    In the next, all particles of its own field have told it where they are.
+    """
+    return has_bit(others, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES)
+
+
+@wp.func
 def has_told(blocks: Blocks, e: int, r: int):
     """Whether all particles have told the node of a field's record ``r``, in a block that has several, where they are.
 
@@ -70,7 +79,7 @@ def has_told(blocks: Blocks, e: int, r: int):
     """
     if blocks.others.shape[1] == 1:
         return True
-    return has_bit(blocks.others, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES)
+    return had_others(blocks.others, e, r)
 
 
 @wp.func

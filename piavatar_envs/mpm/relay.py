@@ -1,7 +1,7 @@
 """One launch a substep: G2P and the next substep's P2G together, and no grid pass.
 
 For bodies of few particles a cell on a GPU, see :mod:`piavatar_envs.mpm.singles`, and for substeps between which
-nothing else acts. Where there are several fields, their contact takes two short launches more, see
+nothing else acts. Where there are several fields, their contact takes a short launch more, see
 :mod:`piavatar_envs.mpm.relay_contact`. A launch is mostly waiting there: for what it reads, and for the last of its
 threads. What it does for a particle is in :mod:`piavatar_envs.mpm.carry`.
 
@@ -19,6 +19,7 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import slots_used
 from piavatar_envs.mpm.carry import TEAM_OF_FIELDS, Turn, carry_fields_on, carry_on
+from piavatar_envs.mpm.meeting import meetings_of
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay_contact import record_contact, record_meeting
 from piavatar_envs.mpm.singles import TEAM, THREADS, record_singles
@@ -64,7 +65,8 @@ def record_relay(
     team = int(TEAM_OF_FIELDS if several else TEAM)
     share = LANES // team
     per_env = -(-m.num_particles // share) * share
-    others, meeting = record_contact(program, m, scratch) if several else (None, None)
+    if several:
+        record_contact(program, m, scratch)
     for index in range(count):
         turn = Turn()
         turn.substep, turn.stops = index, stops
@@ -74,11 +76,12 @@ def record_relay(
         if index == 0:
             turn.swept = -1
         if several:
-            record_meeting(program, m, scratch, others, meeting, stops, index, turn.gathered)
+            record_meeting(program, m, scratch, stops, index, turn.gathered)
+        last = meetings_of(m, scratch).others[index & 1] if several else per_env
         program.launch(
             carry_fields_on if several else carry_on,
             m.num_envs * per_env * team,
-            [m.grid, m.step, m.particles, m.boundaries, m.contact, turn, others if several else per_env],
+            [m.grid, m.step, m.particles, m.boundaries, m.contact, turn, last],
             [scratch.blocks, moving, s.failure, sums, scratch.sensors],
             block_dim=THREADS,
         )

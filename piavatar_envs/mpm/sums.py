@@ -110,6 +110,18 @@ def begin_sum(sums: Sums, e: int, r: int):
     return s
 
 
+@wp.func_native("return *reinterpret_cast<const wp::int64*>(&wp::index(sums.fixed, e, at));")
+def first_number(sums: Sums, e: int, at: int) -> wp.int64:
+    """The first of the numbers of ``sums.fixed[e, at]``, alone."""
+    ...
+
+
+@wp.func
+def mass_counted(sums: Sums, e: int, r: int):
+    """How many units of mass there are in fixed point at record ``r``."""
+    return first_number(sums, e, half_of(r, 0))
+
+
 @wp.func
 def take_sum(sums: Sums, e: int, f: int, r: int):
     """Mass, physical and kinematic momentum of record ``r`` of field ``f``, which is cleared."""

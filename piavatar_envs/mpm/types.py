@@ -309,14 +309,13 @@ class Scratch:
         blocks: which blocks hold matter in this control step, and their slots.
         sums: what particles have added up.
         velocity: vec4: halves of records, see :mod:`piavatar_envs.mpm.records`: mass and physical velocity, kinematic
-            velocity and nothing; the latter means nothing where no contact is at hand, but in the paper's variant. In
-            blocks with several fields the sums stand here until they have become velocities.
-        facing: vec4: what a node says about the normals around it, outward gradient and volume, see
-            :mod:`piavatar_envs.mpm.normals`; of blocks with several fields only.
+            velocity and nothing; the latter means nothing where no contact is at hand, but in the paper's variant.
+        facing: vec4: what nodes of blocks with several fields say of normals, see :mod:`piavatar_envs.mpm.normals`.
         sensors: what contact did in this control step.
         room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
         turns: sets of sums in turns, of ``TURNS * S`` slots, where :mod:`piavatar_envs.mpm.relay` has been recorded.
         affine: what particles' momenta change by from node to node [kg m/s], where :mod:`piavatar_envs.mpm.ahead` has.
+        meetings: who may touch where, see :mod:`piavatar_envs.mpm.meeting`.
     """
 
     blocks: Blocks
@@ -328,3 +327,4 @@ class Scratch:
     large_room: bool
     turns: Sums | None = None
     affine: wp.array | None = None
+    meetings: object | None = None

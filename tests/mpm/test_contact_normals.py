@@ -8,7 +8,15 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.mpm.blocks import held_by, record_of
-from piavatar_envs.mpm.normals import find_facing, normal_of_warp, shared_normal, surface_gap, volume_at
+from piavatar_envs.mpm.impulses import read_change
+from piavatar_envs.mpm.normals import (
+    find_facing,
+    neighbour_of_lane,
+    normal_of_warp,
+    shared_normal,
+    surface_gap,
+    volume_at,
+)
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.records import mass_of
 from piavatar_envs.mpm.solver import record_marks, record_scatter
@@ -81,7 +89,8 @@ def look_by_warps(
         held = held_by(grid, blocks.held[0, slot])
     if held[0] == 0 and (blocks.fields[0, held[1]] & 3) == 3:  # so for all threads of a warp
         node = node_of_block(block_corner(grid, held[1]), n % 64)
-        n_ab = normal_of_warp(grid, blocks, 0, node, 0, 1, node_facing)
+        near = neighbour_of_lane(grid, blocks, 0, node, 0, 1)
+        n_ab = normal_of_warp(near.c, read_change(node_facing, 0, near.a), read_change(node_facing, 0, near.b))
         if wp.tid() % 32 == 0:
             normal[n] = n_ab
 

@@ -12,7 +12,7 @@ from piavatar_envs.mpm.meeting import (
     FEWEST_NODES,
     NODES_AT_ONCE,
     Meeting,
-    begin_list,
+    begin_lists,
     begin_meeting,
     node_meeting,
     nodes_meeting,
@@ -38,7 +38,7 @@ def read_list(substep: int, meeting: Meeting, count: wp.array(dtype=int), node: 
     """Also beyond its end."""
     e, n = wp.tid()
     count[e] = nodes_meeting(meeting, e, substep)
-    node[e, n] = node_meeting(meeting, e, n)
+    node[e, n] = node_meeting(meeting, e, substep, n)
 
 
 def model_of(device: str, num_envs: int, blocks: int) -> SimpleNamespace:
@@ -48,22 +48,27 @@ def model_of(device: str, num_envs: int, blocks: int) -> SimpleNamespace:
 
 
 def test_every_node_is_listed_once(device):
-    """Of each environment, in one substep after the other: what is listed in one is gone in the next but one."""
+    """Of each environment, in one substep for the next, which reads that list while it writes another."""
     if device == "cpu":
         pytest.skip("relays are a GPU's")
     rng = np.random.default_rng(4)
-    meeting = begin_list(model_of(device, 3, NODES // 64))
+    meeting = begin_lists(model_of(device, 3, NODES // 64))
     count = wp.zeros(3, dtype=int, device=device)
     node = wp.zeros((3, NODES + 7), dtype=wp.vec2i, device=device)
-    for substep, share in enumerate((0.1, 1.0, 0.0, 0.5, 0.02)):
+    listed = np.zeros((3, NODES), bool)
+    for substep, share in enumerate((0.1, 1.0, 0.0, 0.5, 0.02, 0.0, 0.3), start=-1):
         here = rng.random((3, NODES)) < share
         here[1, :40] = False  # a warp has none, the next some
         inputs = [wp.array(here, dtype=bool, device=device), substep]
         wp.launch(list_nodes, 3 * NODES, inputs, [meeting], device=device, block_dim=128)
-        wp.launch(read_list, node.shape, [substep, meeting], [count, node], device=device)
-        assert count.numpy().tolist() == here.sum(1).tolist()
-        for listed, own, number in zip(node.numpy(), here, count.numpy(), strict=True):
-            assert np.array_equal(np.sort(listed[:number] @ [64, 1]), np.flatnonzero(own))
+        for at, expected in ((substep, listed), (substep + 1, here)):
+            if at < 0:
+                continue
+            wp.launch(read_list, node.shape, [at, meeting], [count, node], device=device)
+            assert count.numpy().tolist() == expected.sum(1).tolist()
+            for found, own, number in zip(node.numpy(), expected, count.numpy(), strict=True):
+                assert np.array_equal(np.sort(found[:number] @ [64, 1]), np.flatnonzero(own))
+        listed = here
 
 
 @pytest.mark.parametrize("num_envs", [1, 64, 4096])
