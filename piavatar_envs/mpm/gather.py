@@ -83,12 +83,15 @@ def gradient_of(grid: Grid, g: Gradients, f: wp.vec3):
 
 
 @wp.func
-def asks_kinematic(grid: Grid, step: Step, boundaries: Boundaries, e: int, x: wp.vec3):
-    """Whether a particle must know the grid's kinematic velocity: a boundary is at hand, or the variant wants it."""
+def asks_kinematic(grid: Grid, step: Step, distance: float):
+    """Whether a particle must know the grid's kinematic velocity: the variant wants it, or a boundary is at hand.
+
+    ``distance`` is how far the particle is from any [m].
+    """
     if step.decoupling == PAPER:
         return True
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    return split and nearest_boundary(boundaries, e, x) < CONTACT_GATE * grid.dx
+    return split and distance < CONTACT_GATE * grid.dx
 
 
 @wp.func
@@ -253,7 +256,7 @@ def gather(
 ):
     """Particle ``p`` from the nodes: velocities and gradients, and with them position and deformation.
 
-    The blocks that it comes to are marked for the next substep. For a GPU; see :func:`gather_by_lines`.
+    Also, how far it was from any boundary [m]. The blocks that it comes to are marked for the next substep.
     """
     x = moved.x[e, p]
     stencil = stencil_at(grid_position(grid, x))
@@ -261,12 +264,14 @@ def gather(
     nodes = first_of_halves(node_velocity, e)
     physical = gather_physical(grid, blocks, nodes, e, field, stencil)
     kinematic = Gradients()
-    asked = asks_kinematic(grid, step, boundaries, e, x)
+    distance = nearest_boundary(boundaries, e, x)
+    asked = asks_kinematic(grid, step, distance)
     if asked:
         kinematic = gather_kinematic(grid, blocks, nodes, e, field, stencil)
-    return finish_gather(
+    s = finish_gather(
         grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, stencil
     )  # fmt: skip
+    return s, distance
 
 
 @wp.func
@@ -293,7 +298,7 @@ def gather_by_lines(
     kinematic = Gradients()
     asked = bool(False)
     if step.decoupling == PAPER or (noted_around(blocks, e, p) & TELLS) != 0:
-        asked = asks_kinematic(grid, step, boundaries, e, x)
+        asked = asks_kinematic(grid, step, nearest_boundary(boundaries, e, x))
     if asked:
         kinematic = gather_kinematic(grid, blocks, nodes, e, field, stencil)
     return finish_gather(

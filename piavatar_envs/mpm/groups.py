@@ -174,24 +174,29 @@ def scatter_more(
         meet()
 
 
+@wp.struct
+class Turn:
+    """A particle while its group scatters."""
+
+    takes: bool  # whether it takes part,
+    ours: bool  # now
+    base: wp.vec3i  # lowest node of its stencil,
+    box: wp.vec3i  # and the bricks around
+
+
 @wp.func
-def scatter_turn(
+def add_turn(
     grid: Grid,
-    step: Step,
-    particles: Particles,
-    moving: Moving,
-    boundaries: Boundaries,
     blocks: Blocks,
     failure: wp.array(dtype=int),
-    sums: Sums,
     num_fields: int,
     at: wp.vec4i,
     left: bool,
     s: Scattered,
 ):
-    """Scatter those of the particles that are ``left`` whose turn it is; returns whether this one is left then.
+    """Add up those of the particles that are ``left`` whose turn it is; ``s`` is what one scatters that is left.
 
-    ``s`` is what a particle scatters that is left. All threads come here.
+    All threads come here, and to :func:`put_turn` then.
     """
     e = at[0]
     meet()  # not before memory has been asked for what particles have; a turn has begun then
@@ -204,17 +209,34 @@ def scatter_turn(
     if ours:
         add_momentum(box, s)
     note_records(blocks, e)  # nobody needs them before
-    meet()
-    # not before: the less a thread keeps while it waits for what particles have, the earlier it asks for it
-    near = near_boundary(grid, boundaries, e, moving.x[e, wp.min(at[1], moving.x.shape[1] - 1)])
-    tells = ours and (near or (num_fields > 1 and has_others(box, s.base)))
+    return Turn(takes, ours, s.base, box)
+
+
+@wp.func
+def put_turn(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    moving: Moving,
+    failure: wp.array(dtype=int),
+    sums: Sums,
+    num_fields: int,
+    at: wp.vec4i,
+    turn: Turn,
+    near: bool,
+):
+    """Put down what has been added up; returns whether this particle is left then.
+
+    A boundary may be ``near`` it. All threads have met since they added.
+    """
+    tells = turn.ours and (near or (num_fields > 1 and has_others(turn.box, turn.base)))
     if tells:
         or_word(MORE, 1)
-    put_down(grid, sums, failure, e, MOMENTUM)
+    put_down(grid, sums, failure, at[0], MOMENTUM)
     meet()
     if word(MORE) != 0:
-        scatter_more(grid, step, particles, moving, failure, sums, at, ours, tells, box)
-    return takes and not ours
+        scatter_more(grid, step, particles, moving, failure, sums, at, turn.ours, tells, turn.box)
+    return turn.takes and not turn.ours
 
 
 @wp.func
@@ -231,14 +253,19 @@ def scatter_left(
     at: wp.vec4i,
     left: bool,
 ):
-    """:func:`scatter_turn` of what particles have.
+    """Scatter those of the particles that are ``left`` whose turn it is; returns whether this one is left then.
 
     Written into a kernel's loop, ``s`` would be kept from turn to turn, and four times as many registers be spilled.
     """
+    e = at[0]
     s = Scattered()
     if left:
-        s = prepare(grid, step, particles, moving, at[0], at[1], False)
-    return scatter_turn(grid, step, particles, moving, boundaries, blocks, failure, sums, num_fields, at, left, s)
+        s = prepare(grid, step, particles, moving, e, at[1], False)
+    turn = add_turn(grid, blocks, failure, num_fields, at, left, s)
+    meet()
+    # not before: the less a thread keeps while it waits for what particles have, the earlier it asks for it
+    near = near_boundary(grid, boundaries, e, moving.x[e, wp.min(at[1], moving.x.shape[1] - 1)])
+    return put_turn(grid, step, particles, moving, failure, sums, num_fields, at, turn, near)
 
 
 # that leaves a thread 80 registers, all but a few of those that it asks for

@@ -119,6 +119,6 @@ def grid_to_particles(
     if not stays:
         if senses != 0:
             sense_gathered(grid, particles, blocks, sensors, e, p, grid_position(grid, moved.x[e, p]))
-        s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+        s, _ = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
         stays = s.fault != 0
     store_particle(moved, e, p, s, not stays)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.mpm.colliders import nearest_boundary
 from piavatar_envs.mpm.gather import Gathered, Gradients, asks_kinematic, finish_gather, gather
 from piavatar_envs.mpm.shared_grid import (
     bricks_around,
@@ -94,7 +95,7 @@ def gather_from_bricks(
     kinematic = Gradients()
     asked = bool(False)
     if has_bit(room.told, p):  # who is that near a boundary tells its place
-        asked = asks_kinematic(grid, step, boundaries, e, x)
+        asked = asks_kinematic(grid, step, nearest_boundary(boundaries, e, x))
     if asked:
         kinematic.mean = kinematic_from_bricks(room, bricks, stencil)
     physical = physical_from_bricks(bricks, stencil)
@@ -127,7 +128,7 @@ def gather_all(
             s = Gathered()
             stays = fails or p < start + t
             if not stays:
-                s = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+                s, _ = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
             meet_warp()
             store_particle(moved, e, p, s, not stays and s.fault == 0)
     else:

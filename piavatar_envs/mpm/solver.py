@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import warp as wp
-
 from piavatar_envs.mpm import runs
-from piavatar_envs.mpm.ahead import grid_to_momenta, momenta_to_grid
+from piavatar_envs.mpm.ahead import Ahead, allocate_ahead, grid_to_momenta, momenta_to_grid
 from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.contact_pass import solve_contact
@@ -16,7 +14,6 @@ from piavatar_envs.mpm.gather import grid_to_particles
 from piavatar_envs.mpm.grid import update_grid
 from piavatar_envs.mpm.groups import record_groups, runs_to_grid
 from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
-from piavatar_envs.mpm.matrices import allocate_matrices
 from piavatar_envs.mpm.memory import allocate_sums
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.others import begin_others, notes_others
@@ -47,7 +44,8 @@ def record_substep(program: Program, model: Model, state: State, scratch: Scratc
     _record_grid(program, model, state, scratch)
     if m.contact.num_fields > 1 or m.scatter != "shared":
         _record_gather(program, model, state, scratch)
-    _record_colliders(program, m)
+    if m.moving_boundaries:
+        program.launch(move_colliders, m.boundaries.position.shape, [m.step.dt], [m.boundaries])
 
 
 def record_substeps(program: Program, model: Model, state: State, scratch: Scratch) -> None:
@@ -59,7 +57,7 @@ def record_substeps(program: Program, model: Model, state: State, scratch: Scrat
     """
     if has_turns(model):
         _record_turns(program, model, state, scratch)
-    elif has_groups(model):
+    elif has_groups(model) and not model.moving_boundaries:  # else who is near one is not known ahead
         _record_ahead(program, model, state, scratch)
     else:
         for index in range(model.num_substeps):
@@ -84,37 +82,27 @@ def _record_ahead(program: Program, model: Model, state: State, scratch: Scratch
     """:func:`record_substeps` of gathers that find what is scattered next; the last one leaves the state.
 
     Parts of the world, see :mod:`piavatar_envs.mpm.parts`, go from gather to scatter by themselves, where all blocks
-    have their marks and no boundary is to move in between.
+    have their marks.
     """
-    if scratch.affine is None:
-        scratch.affine = allocate_matrices(model.num_envs, model.num_particles, model.device)
+    if scratch.ahead is None:
+        scratch.ahead = allocate_ahead(model)
     world, parts = (model, state, scratch), parts_of_world(model)
 
     def gather_and_scatter(part: Part, branch: Program) -> None:
-        _record_gather(branch, *world, part, scratch.affine)
-        record_scatter(branch, *world, part, scratch.affine)
+        _record_gather(branch, *world, part, scratch.ahead)
+        record_scatter(branch, *world, part, scratch.ahead)
 
     record_scatter(program, *world)
     for index in range(1, model.num_substeps):
         _record_grid(program, *world)
-        marks = index % model.marks_every == 0
-        if not marks and not model.moving_boundaries:
+        if index % model.marks_every != 0:
             program.fork_each(parts, gather_and_scatter)
             continue
-        _record_gather(program, *world, affine=scratch.affine)
-        _record_colliders(program, model)
-        if marks:
-            _record_new_marks(program, *world)
-        record_scatter(program, *world, affine=scratch.affine)
+        _record_gather(program, *world, ahead=scratch.ahead)
+        _record_new_marks(program, *world)
+        record_scatter(program, *world, ahead=scratch.ahead)
     _record_grid(program, *world)
     _record_gather(program, *world)
-    _record_colliders(program, model)
-
-
-def _record_colliders(program: Program, model: Model) -> None:
-    """Append how boundaries go on, where any may."""
-    if model.moving_boundaries:
-        program.launch(move_colliders, model.boundaries.position.shape, [model.step.dt], [model.boundaries])
 
 
 def _record_gather(
@@ -123,11 +111,11 @@ def _record_gather(
     state: State,
     scratch: Scratch,
     part: Part | None = None,
-    affine: wp.array | None = None,
+    ahead: Ahead | None = None,
 ) -> None:
     """Append the transfer of nodes to particles, of a ``part`` or of all, and what their contact sensors feel.
 
-    What is scattered next is left in ``affine``, if given, instead of the affine velocity in the state.
+    What is scattered next is left ``ahead``, if given, instead of the affine velocity in the state.
     """
     m, s = model, state
     inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
@@ -138,9 +126,9 @@ def _record_gather(
     those = (part or whole_world(m)).particles
     inputs += [int(senses_in_gather(m)), those]
     kernel = runs.grid_to_particles
-    if affine is not None:
+    if ahead is not None:
         kernel = grid_to_momenta
-        moved.append(affine)
+        moved.append(ahead)
     outputs = [*moved, s.failure, scratch.sensors]
     program.launch(kernel, m.num_envs * those[1], inputs, outputs, block_dim=runs.THREADS)
 
@@ -200,12 +188,12 @@ def record_scatter(
     state: State,
     scratch: Scratch,
     part: Part | None = None,
-    affine: wp.array | None = None,
+    ahead: Ahead | None = None,
 ) -> None:
     """Append the transfer of particles to nodes, in the way of ``model.scatter``; if shared, what goes with it.
 
     Of all particles, or of a ``part`` of those that groups scatter; of these, from what a gather has left in
-    ``affine``, if given.
+    ``ahead``, if given.
     """
     m, s = model, state
     if m.scatter == "shared":
@@ -219,10 +207,11 @@ def record_scatter(
     else:
         outputs = [s.failure, scratch.sums]
         part = part or whole_world(m)
-        if affine is None:
+        if ahead is None:
             record_groups(program, runs_to_grid, m, part, inputs, outputs)
         else:
-            record_groups(program, momenta_to_grid, m, part, [*inputs, affine], outputs)
+            inputs = [m.grid, m.step, m.particles, m.contact, _moving(s), scratch.blocks, ahead]
+            record_groups(program, momenta_to_grid, m, part, inputs, outputs)
 
 
 def _scattering(m: Model, s: State, scratch: Scratch) -> list[Any]:

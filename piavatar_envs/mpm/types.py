@@ -314,7 +314,7 @@ class Scratch:
         sensors: what contact did in this control step.
         room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
         turns: sets of sums in turns, of ``TURNS * S`` slots, where :mod:`piavatar_envs.mpm.relay` has been recorded.
-        affine: what particles' momenta change by from node to node [kg m/s], where :mod:`piavatar_envs.mpm.ahead` has.
+        ahead: what gathers leave for scatters, where :mod:`piavatar_envs.mpm.ahead` has been recorded.
         meetings: who may touch where, see :mod:`piavatar_envs.mpm.meeting`.
     """
 
@@ -326,5 +326,5 @@ class Scratch:
     room: Room
     large_room: bool
     turns: Sums | None = None
-    affine: wp.array | None = None
+    ahead: object | None = None
     meetings: object | None = None
