@@ -154,8 +154,7 @@ def momenta_to_grid(
 ):
     """:func:`piavatar_envs.mpm.groups.runs_to_grid` of what :func:`grid_to_momenta` has found."""
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
-    driven = step.decoupling == PAPER
-    at = begin_group(particles, sums, those, driven)
+    at = begin_group(particles, sums, those)
     left = bool(False)
     if at[1] < at[3]:
         left = takes_part(blocks, at[0], failure)
@@ -164,7 +163,7 @@ def momenta_to_grid(
         left = scatter_momenta(
             grid, step, particles, moving, ahead, blocks, failure, sums, contact.num_fields, at, left
         )  # fmt: skip
-        goes_on = begins_again(driven)
+        goes_on = begins_again()
 
 
 def allocate_ahead(model: Model) -> Ahead:

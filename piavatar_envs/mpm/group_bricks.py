@@ -5,8 +5,8 @@ where it is on the grid. A group whose box has too many bricks goes in turns: ea
 first of those that are left, and a box around that one. Whose turn comes when depends on the particles' places only.
 
 Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; of every brick its record, which nodes have got
-mass, and where it is in its block; four sums of every node, one brick after the other. A brick has a word in each of
-the 32 banks, as in :mod:`piavatar_envs.mpm.shared_grid`.
+mass, and where it is in its block; whose particles tell their nodes more than momentum; four sums of every node, one
+brick after the other. A brick has a word in each of the 32 banks, as in :mod:`piavatar_envs.mpm.shared_grid`.
 """
 
 from __future__ import annotations
@@ -15,16 +15,18 @@ import warp as wp
 
 from piavatar_envs.mpm.runs import KINEMATIC, PLACE
 from piavatar_envs.mpm.shared_grid import BRICK_WORDS
-from piavatar_envs.mpm.shared_memory import native
+from piavatar_envs.mpm.shared_memory import APPEND, native
 from piavatar_envs.mpm.types import Blocks, Grid
 
 wp.set_module_options({"enable_backward": False})
 
+#: Particles of a group, at most, a thread each.
+THREADS = 128
 #: Bricks that there is room for, enough for a box of ``REACH`` grid spacings to each side of a particle.
 CAPACITY = wp.constant(128)
 REACH = wp.constant(3)
-#: Words of the header: whether more than momentum is added up; whether some are left for another turn; the first of
-#: these; the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units;
+#: Words of the header: how many tell their nodes more than momentum; whether some are left for another turn; the first
+#: of these; the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units;
 #: the least and the greatest lowest node of a stencil, along three axes, and whether any of the nodes has others.
 MORE, LEFT, FIRST = (wp.constant(n) for n in range(3))
 HEAVIEST, FASTEST, DRIVEN = (wp.constant(n) for n in range(3, 6))
@@ -33,7 +35,8 @@ LOWEST, BESIDE, HIGHEST = (wp.constant(n) for n in (8, 11, 12))
 RECORDS = wp.constant(16)
 MASSIVE = wp.constant(int(RECORDS) + int(CAPACITY))
 WITHIN = wp.constant(int(MASSIVE) + int(CAPACITY))
-NODES = wp.constant(-(-(int(WITHIN) + int(CAPACITY)) // 32) * 32)
+TELLERS = wp.constant(int(WITHIN) + int(CAPACITY))
+NODES = wp.constant(-(-(int(TELLERS) + THREADS) // 32) * 32)
 #: Words of a room.
 WORDS = wp.constant(int(NODES) + int(BRICK_WORDS) * int(CAPACITY))
 #: Units of the most that a particle has.
@@ -57,7 +60,7 @@ for (int c = 0; c < 3; ++c) {
 def in_group(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
     names = "CAPACITY REACH MORE LEFT FIRST HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT LOWEST HIGHEST RECORDS"
-    names += " BESIDE MASSIVE WITHIN NODES BRICK_WORDS SHARED OTHERS"
+    names += " BESIDE MASSIVE WITHIN TELLERS NODES BRICK_WORDS SHARED OTHERS"
     values = {name: globals()[name] for name in names.split()} | {"KINEMATIC": KINEMATIC, "PLACE": PLACE}
     known = ", ".join(f"{name} = {int(value)}" for name, value in values.items())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
@@ -81,13 +84,12 @@ def clear_nodes():
 @wp.func_native(
     in_group("""
 if (threadIdx.x != 0) return;
-room[LEFT] = 0, room[BESIDE] = 0, room[FIRST] = 0x7fffffff;
-room[MORE] = driven;
+room[MORE] = 0, room[LEFT] = 0, room[BESIDE] = 0, room[FIRST] = 0x7fffffff;
 for (int c = 0; c < 3; ++c) room[LOWEST + c] = 0x7fffffff, room[HIGHEST + c] = -1;
 """)
 )
-def begin_turn(driven: bool):
-    """Nobody is in the box; kinematic momentum is added up everywhere where bodies are ``driven`` by its gradient."""
+def begin_turn():
+    """Nobody is in the box, and nobody tells anything."""
     ...
 
 
@@ -258,6 +260,35 @@ return all != 0;
 )
 def has_others(box: wp.vec3i, base: wp.vec3i) -> bool:
     """Whether any node of the stencil at ``base`` had another field, its bricks :func:`bricks_around` it."""
+    ...
+
+
+@wp.func_native(
+    in_group(
+        APPEND
+        + """
+const int place = append(room + MORE, __ballot_sync(ALL, tells), threadIdx.x & 31);
+if (tells) room[TELLERS + place] = threadIdx.x;
+"""
+    )
+)
+def note_teller(tells: bool):
+    """List the thread, if its particle ``tells`` its nodes more than momentum, in any order; all threads come here."""
+    ...
+
+
+@wp.func_native(
+    in_group(
+        SIZE
+        + """
+const int bricks = size[0] * size[1] * size[2];
+return 2 * bricks <= CAPACITY ? BRICK_WORDS * bricks : 0;
+""",
+        "return 0;",
+    )
+)
+def beyond_box() -> int:
+    """Words from a node's to as many more for it, beyond those of the box; 0 where there is no room for these."""
     ...
 
 

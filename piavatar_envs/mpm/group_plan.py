@@ -7,10 +7,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.mpm.group_bricks import CAPACITY
+from piavatar_envs.mpm.group_bricks import CAPACITY, THREADS
 
-#: Particles of a group, at most, a thread each.
-THREADS = 128
 #: Up to how many particles of an environment a group has so many: smaller worlds fill a GPU with small groups only. The
 #: numbers must not depend on the batch: units do on the group.
 SHARES = ((16384, 32), (65536, 64), (2**31, THREADS))

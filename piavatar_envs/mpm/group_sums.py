@@ -36,7 +36,7 @@ const int shift = __float_as_int(unit) - room[of_mass ? MASS_UNIT : MOMENTUM_UNI
 struct First {{ enum {{ IS = 1 }}; }};
 struct Later {{ enum {{ IS = 0 }}; }};
 auto put_bricks = [&](auto which, auto add) {{
-    int* from = room + NODES + BRICK_WORDS * warp + lane;
+    int* from = room + NODES + start + BRICK_WORDS * warp + lane;
 #pragma unroll 1
     for (int n = RECORDS + warp; n < RECORDS + bricks; n += warps, from += BRICK_WORDS * warps) {{
         const int sum = *from, record = room[n] + within;
@@ -86,9 +86,10 @@ if (sums.is_fixed != 0 && !is_place && __all_sync(ALL, shift < 18)) {{
 if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 """)
 )
-def put_down(grid: Grid, sums: Sums, failure: wp.array(dtype=int), e: int, kind: int):
+def put_down(grid: Grid, sums: Sums, failure: wp.array(dtype=int), e: int, kind: int, start: int):
     """Add what the nodes have got of a ``kind`` to the sums outside; sums that are too large are not.
 
-    Four threads a node. Masses come first; slots whose nodes are told places are noted.
+    It begins ``start`` words after the nodes' first. Four threads a node. Masses come first; slots whose nodes are told
+    places are noted.
     """
     ...

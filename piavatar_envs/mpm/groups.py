@@ -20,15 +20,18 @@ from piavatar_envs.mpm.group_bricks import (
     MASS_UNIT,
     MOMENTUM_UNIT,
     MORE,
+    TELLERS,
     UNITS,
     WORDS,
     begin_turn,
+    beyond_box,
     bricks_around,
     clear_nodes,
     fetch_slots,
     has_others,
     has_turn,
     note_records,
+    note_teller,
     per_unit_of,
     raise_most,
     widen_box,
@@ -38,13 +41,12 @@ from piavatar_envs.mpm.group_sums import put_down
 from piavatar_envs.mpm.parts import Part
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, told_by
-from piavatar_envs.mpm.shared_add import add_to_box, few_add_to_box
+from piavatar_envs.mpm.shared_add import add_to_box, tell_box
 from piavatar_envs.mpm.shared_memory import (
     block_of_launch,
     meet,
     native,
     number,
-    or_word,
     set_number,
     thread_of_block,
     word,
@@ -78,7 +80,7 @@ def particle_of_thread(first: int) -> int:
 
 
 @wp.func
-def begin_group(particles: Particles, sums: Sums, those: wp.vec2i, driven: bool):
+def begin_group(particles: Particles, sums: Sums, those: wp.vec2i):
     """The group of a CUDA block, one of ``those``: environment, particle of the thread, field, particle after the last.
 
     Nothing has been added yet; units are not smaller than those of the sums. All threads meet later.
@@ -95,18 +97,18 @@ def begin_group(particles: Particles, sums: Sums, those: wp.vec2i, driven: bool)
         set_number(HEAVIEST, UNITS * mass)
         set_number(FASTEST, UNITS * momentum)
         set_number(DRIVEN, UNITS * momentum)
-    begin_turn(driven)
+    begin_turn()
     clear_nodes()
     return wp.vec4i(e, particle_of_thread(begins[0]), field, particles.groups[those[0] + at_group[1] + 1][0])
 
 
 @wp.func
-def begins_again(driven: bool):
+def begins_again():
     """Whether particles are left for another turn, which begins then; all threads come here."""
     goes_on = word(LEFT) != 0
     if goes_on:
         meet()
-        begin_turn(driven)
+        begin_turn()
         clear_nodes()
     return goes_on
 
@@ -132,45 +134,49 @@ def add_momentum(box: wp.vec3i, s: Scattered):
 
 
 @wp.func
-def add_more(kind: int, box: wp.vec3i, s: Scattered):
-    """Add how a particle is driven, or its place, to the group's nodes."""
-    per_scalar = per_unit_of(HEAVIEST)
-    per_vector = 0.5 * per_scalar  # of places, up to 1.5 masses
-    if kind != PLACE:
-        per_vector = per_unit_of(DRIVEN)
-    few_add_to_box(
-        box, thread_of_block(), s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_scalar, per_vector
+def add_told(t: int, driven: Scattered, place: Scattered, drives: bool, to_place: int):
+    """:func:`tell_box` of how a particle is ``driven`` and of its ``place``."""
+    per_mass = per_unit_of(HEAVIEST)
+    per_way = 0.5 * per_mass  # up to 1.5 masses
+    k = per_unit_of(DRIVEN) * wp.vec3(driven.at_base[1], driven.at_base[2], driven.at_base[3])
+    at_base = wp.vec4(
+        per_mass * place.at_base[0], per_way * place.at_base[1], per_way * place.at_base[2], per_way * place.at_base[3]
+    )
+    tell_box(
+        bricks_around(place.base), t, place.base, spline(place.f[0]), spline(place.f[1]), spline(place.f[2]), k,
+        at_base, per_way * place.A[0, 0], drives, to_place,
     )  # fmt: skip
 
 
 @wp.func
-def scatter_more(
-    grid: Grid,
-    step: Step,
-    particles: Particles,
-    moving: Moving,
-    failure: wp.array(dtype=int),
-    sums: Sums,
-    at: wp.vec4i,
-    ours: bool,
-    tells: bool,
-    box: wp.vec3i,
+def tell_nodes(
+    grid: Grid, particles: Particles, moving: Moving, failure: wp.array(dtype=int), sums: Sums, at: wp.vec4i
 ):
-    """Scatter what those of ``ours`` that tell have besides momentum; all threads come here, few groups do."""
+    """Scatter what particles that tell their nodes have besides momentum; all threads come here, few groups do.
+
+    The first threads have those particles. How they are driven and where they are is added up at once, if there is room
+    for both.
+    """
     e = at[0]
-    p = wp.min(at[1], moving.x.shape[1] - 1)
-    for kind in range(int(KINEMATIC), int(PLACE) + 1):
-        # the paper's variant needs the gradient of kinematic momentum everywhere
+    t = thread_of_block()
+    tells = t < word(MORE)
+    p = at[1] - t + word(TELLERS + wp.where(tells, t, 0))
+    driven = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], KINEMATIC)
+    place = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], PLACE)
+    beyond = beyond_box()
+    kinds = int(2)
+    rounds = wp.where(beyond > 0, 1, kinds)
+    for n in range(rounds):
         clear_nodes()
-        adds = ours and (tells or (step.decoupling == PAPER and kind == KINEMATIC))
-        s = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], kind)
-        if kind == KINEMATIC:  # those of places are no momenta, and as sound as the masses were
-            adds = raised(s, adds, kind, failure, e)
+        if n == 0:  # what is added of places is no momentum, and as sound as the masses were
+            tells = raised(driven, tells, KINEMATIC, failure, e)
         meet()
-        if adds:
-            add_more(kind, box, s)
+        if tells:
+            add_told(t, driven, place, n == 0, wp.where(n == rounds - 1, beyond, -1))
         meet()
-        put_down(grid, sums, failure, e, kind)
+        for k in range(kinds):
+            if rounds == 1 or k == n:
+                put_down(grid, sums, failure, e, KINEMATIC + k, k * beyond)
         meet()
 
 
@@ -229,13 +235,13 @@ def put_turn(
 
     A boundary may be ``near`` it. All threads have met since they added.
     """
-    tells = turn.ours and (near or (num_fields > 1 and has_others(turn.box, turn.base)))
-    if tells:
-        or_word(MORE, 1)
-    put_down(grid, sums, failure, at[0], MOMENTUM)
+    tells = near or step.decoupling == PAPER  # which needs the gradient of kinematic momentum everywhere
+    # others are asked for only of who has a box
+    note_teller(turn.ours and (tells or (num_fields > 1 and has_others(turn.box, turn.base))))
+    put_down(grid, sums, failure, at[0], MOMENTUM, 0)
     meet()
     if word(MORE) != 0:
-        scatter_more(grid, step, particles, moving, failure, sums, at, turn.ours, tells, turn.box)
+        tell_nodes(grid, particles, moving, failure, sums, at)
     return turn.takes and not turn.ours
 
 
@@ -289,8 +295,7 @@ def runs_to_grid(
     all of its threads come to what they do together.
     """
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
-    driven = step.decoupling == PAPER
-    at = begin_group(particles, sums, those, driven)
+    at = begin_group(particles, sums, those)
     left = bool(False)
     if at[1] < at[3]:
         left = scatters(blocks, moving, at[0], at[1], failure)
@@ -299,7 +304,7 @@ def runs_to_grid(
         left = scatter_left(
             grid, step, particles, moving, boundaries, blocks, failure, sums, contact.num_fields, at, left
         )  # fmt: skip
-        goes_on = begins_again(driven)
+        goes_on = begins_again()
 
 
 def record_groups(

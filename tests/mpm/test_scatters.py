@@ -10,6 +10,7 @@ import warp as wp
 
 from piavatar_envs.mpm import group_plan
 from piavatar_envs.mpm.build import MaterialPoints, choose_scatter
+from piavatar_envs.mpm.group_bricks import CAPACITY
 from piavatar_envs.mpm.memory import LARGE_MARGIN, SLOT_MARGIN, choose_marks, estimate_slots
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import MOST_COUNTED
@@ -56,24 +57,29 @@ def collide(meet):
 
 
 def node_sums(sim):
-    """Mass and momenta of every node that has a slot, by field and block: ``{(env, field and block): (64, 7)}``."""
+    """Mass, momenta and offsets of every node that has a slot, by field and block: ``{(env, of both): (64, 10)}``."""
     model, scratch, program = sim.model, sim.scratch, Program(sim.model.device)
     record_marks(program, model, sim.state, scratch)
     record_scatter(program, model, sim.state, scratch)
     program.run()
     count, held = scratch.blocks.count.numpy(), scratch.blocks.held.numpy()
-    own = scratch.sums.fixed if scratch.sums.is_fixed else scratch.sums.value
-    halves = own.numpy().astype(float).reshape(model.num_envs, -1, 2, 64, 4)
-    sums = np.concatenate([halves[:, :, 0], halves[:, :, 1, :, :3]], axis=-1)
+    own, places = scratch.sums.value, scratch.sums.offset
     if scratch.sums.is_fixed:
-        sums[..., 0] *= scratch.sums.mass_unit.numpy()[0, 0]
-        sums[..., 1:] *= scratch.sums.momentum_unit.numpy()[0, 0]
-    records = sums.reshape(model.num_envs, model.max_slots, 64, 7)
+        own, places = scratch.sums.fixed, scratch.sums.offset_fixed
+    halves = own.numpy().astype(float).reshape(model.num_envs, -1, 2, 64, 4)
+    offsets = places.numpy().astype(float).reshape(model.num_envs, -1, 64, 4)
+    sums = np.concatenate([halves[:, :, 0], halves[:, :, 1, :, :3], offsets[..., :3]], axis=-1)
+    if scratch.sums.is_fixed:
+        mass = scratch.sums.mass_unit.numpy()[0, 0]
+        sums[..., 0] *= mass
+        sums[..., 1:7] *= scratch.sums.momentum_unit.numpy()[0, 0]
+        sums[..., 7:] *= mass * float(model.grid.dx)
+    records = sums.reshape(model.num_envs, model.max_slots, 64, 10)
     return {(e, held[e, s]): records[e, s] for e in range(model.num_envs) for s in range(count[e])}
 
 
 def nodes_by_hand(sim):
-    """The same in double precision, from the equations: mass, momentum with the stress impulse, kinematic momentum."""
+    """The same in double precision, from the equations, of unstrained bodies: ``w m`` times 1, velocities and ways."""
     model, grid = sim.model, sim.model.grid
     origin, dx = np.asarray(grid.origin, float), float(grid.dx)
     blocks, num_blocks = np.asarray(grid.blocks), model.num_blocks
@@ -88,12 +94,12 @@ def nodes_by_hand(sim):
             node = base + offset
             weight = mass * np.prod([w[:, o, axis] for axis, o in enumerate(offset)], axis=0)
             d = (np.array(offset) - f) * dx
-            share = np.column_stack([np.ones(len(x)), u + np.einsum("pij,pj->pi", C, d), vk]) * weight[:, None]
+            share = np.column_stack([np.ones(len(x)), u + np.einsum("pij,pj->pi", C, d), vk, d]) * weight[:, None]
             b = node // 4
             block = field * num_blocks + (b[:, 0] * blocks[1] + b[:, 1]) * blocks[2] + b[:, 2]
             local = ((node[:, 0] & 3) * 4 + (node[:, 1] & 3)) * 4 + (node[:, 2] & 3)
             for p in range(len(x)):
-                found.setdefault((e, block[p]), np.zeros((64, 7)))[local[p]] += share[p]
+                found.setdefault((e, block[p]), np.zeros((64, 10)))[local[p]] += share[p]
     return found
 
 
@@ -101,7 +107,8 @@ def nodes_by_hand(sim):
 def test_sums_are_those_of_the_equations(collide, scatter):
     """Of unstrained bodies; what stress adds is held by the momentum and energy tests.
 
-    Kinematic momentum is for contact: nodes have it whole that two bodies are at, or matter that is at the plane.
+    Kinematic momentum and offsets are for contact: nodes have them whole that two bodies are at, or matter that is at
+    the plane.
     """
     sim = collide(scatter=scatter)
     rng = np.random.default_rng(5)
@@ -110,7 +117,7 @@ def test_sums_are_those_of_the_equations(collide, scatter):
     assert set(found) >= set(expected)
     compared = 0
     for key, sums in found.items():
-        scale, by_hand = 0.125, expected.get(key, np.zeros((64, 7)))  # a cell of matter [kg], at 1 m/s
+        scale, by_hand = 0.125, expected.get(key, np.zeros((64, 10)))  # a cell of matter [kg], at 1 m/s
         np.testing.assert_allclose(sums[:, :4], by_hand[:, :4], atol=3e-6 * scale, err_msg=str(key))
         shared = sum((key[0], key[1] % sim.model.num_blocks + f * sim.model.num_blocks) in found for f in range(2)) > 1
         known = shared | (heights(sim, key[1]) < PLANE[0][1] + 2.0 * float(sim.model.grid.dx))
@@ -140,6 +147,26 @@ def test_slots_whose_nodes_are_told_something_are_noted(meet, scatter):
 
 
 @pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "shared"], indirect=True)
+@pytest.mark.parametrize("edges", [(4.0, 4.0, 2.4), (7.0, 5.0, 2.4)])
+def test_what_particles_tell_in_boxes_of_any_size(simulate, scatter, edges):
+    """How they are driven and where they are is added up by groups at once, or, where bricks are many, in turns."""
+    rng = np.random.default_rng(7)
+    sim = simulate(rest=rng.uniform(0.3, 1.0, (30, 3)), planes=[((0.0, 0.0, 1.0), 0.0, 0.5)], scatter=scatter)
+    dx = float(sim.model.grid.dx)
+    x = dx * rng.uniform(0.0, edges, (30, 3))
+    x[:2] = [[0.0, 0.0, 0.0], dx * np.array(edges)]
+    sim.set(x=x + [0.0, 0.0, 0.3 * dx], vk=rng.normal(0.0, 0.3, (30, 3)))
+    base = np.floor((sim.get("x") - np.array(sim.model.grid.origin)) / dx - 0.5).astype(int)
+    bricks = np.prod((base.max(0) + 2) // 2 - base.min(0) // 2 + 1)  # of 2 x 2 x 2 nodes, around all particles
+    assert (bricks > CAPACITY // 2) == (edges[0] > 4.0) and bricks <= CAPACITY
+    found, expected = node_sums(sim), nodes_by_hand(sim)
+    assert set(found) >= set(expected)
+    for key, sums in found.items():
+        by_hand = expected.get(key, np.zeros((64, 10)))
+        np.testing.assert_allclose(sums, by_hand, atol=2e-7, err_msg=str(key))
+
+
+@pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "shared"], indirect=True)
 def test_particles_far_apart(simulate, scatter):
     """They touch more bricks of nodes than a group has room for, and go in turns."""
     rng = np.random.default_rng(6)
@@ -148,7 +175,7 @@ def test_particles_far_apart(simulate, scatter):
     found, expected = node_sums(sim), nodes_by_hand(sim)
     assert set(found) >= set(expected)
     for key, sums in found.items():
-        by_hand = expected.get(key, np.zeros((64, 7)))
+        by_hand = expected.get(key, np.zeros((64, 10)))
         np.testing.assert_allclose(sums[:, :4], by_hand[:, :4], atol=2e-7, err_msg=str(key))  # of 0.016 kg
 
 
