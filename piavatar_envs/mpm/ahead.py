@@ -126,19 +126,21 @@ def scatter_momenta(
     e = at[0]
     p = at[1]
     s = Scattered()
+    near = bool(False)
     if left:
+        near = ahead.near[e, p] != wp.uint8(0)
         m = particles.mass[row(e, particles.mass.shape[0]), p]
         k = wp.vec3()
         if step.decoupling == PAPER:
             k = m * moving.vk[e, p]
         s = with_momentum(placed(grid, moving.x[e, p]), m, moving.u[e, p], k, matrix_at(ahead.affine, e, p))
     turn = add_turn(grid, blocks, failure, num_fields, at, left, s)
-    near = ahead.near[e, wp.min(p, moving.x.shape[1] - 1)] != wp.uint8(0)
     meet()
     return put_turn(grid, step, particles, moving, failure, sums, num_fields, at, turn, near)
 
 
-@wp.kernel(launch_bounds=(THREADS, 6))
+# it has less to keep than that kernel, so that there is room for another CUDA block
+@wp.kernel(launch_bounds=(THREADS, 7))
 def momenta_to_grid(
     grid: Grid,
     step: Step,
