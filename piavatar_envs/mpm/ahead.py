@@ -52,7 +52,8 @@ from piavatar_envs.mpm.types import (
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 
-#: Who is further from a boundary [grid spacings], by how far it was before it moved, is not near it, however rounded.
+#: Who is further from a boundary [grid spacings], by how far it was before it moved, is not near it: distances that are
+#: measured from up to 10^4 grid spacings away are rounded by less.
 SURELY_FAR = wp.constant(1.001 * float(NEAR_PARTICLE))
 
 
@@ -63,6 +64,14 @@ class Ahead:
     affine: wp.array3d(dtype=float)  # what momenta change by from node to node [kg m/s]
     # (num_envs, num_particles) whether a boundary is so near that nodes must know: scatters would wait for that
     near: wp.array2d(dtype=wp.uint8)
+
+
+@wp.kernel
+def forget_ahead(ahead: Ahead):
+    """Nothing has been found: who fails in the first gather is scattered once more, whatever has been before."""
+    e, p = wp.tid()
+    store_matrix(ahead.affine, e, p, wp.mat33())
+    ahead.near[e, p] = wp.uint8(0)
 
 
 @wp.kernel(launch_bounds=(runs.THREADS, 6))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from piavatar_envs.mpm import runs
-from piavatar_envs.mpm.ahead import Ahead, allocate_ahead, grid_to_momenta, momenta_to_grid
+from piavatar_envs.mpm.ahead import Ahead, allocate_ahead, forget_ahead, grid_to_momenta, momenta_to_grid
 from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.contact_pass import solve_contact
@@ -92,6 +92,7 @@ def _record_ahead(program: Program, model: Model, state: State, scratch: Scratch
         _record_gather(branch, *world, part, scratch.ahead)
         record_scatter(branch, *world, part, scratch.ahead)
 
+    program.launch(forget_ahead, state.x.shape, [], [scratch.ahead])
     record_scatter(program, *world)
     for index in range(1, model.num_substeps):
         _record_grid(program, *world)

@@ -135,6 +135,21 @@ def test_who_fails_ahead_fails_alone(drop):
         np.testing.assert_array_equal(broken.get(array, 2), sound.get(array, 2), err_msg=array)
 
 
+def test_what_who_fails_ahead_has_felt_does_not_depend_on_the_past(drop):
+    """A particle at the floor that fails in the first gather is scattered once more, in new worlds as in old ones."""
+    old, new = drop(scatter="runs").run(3), drop(scatter="runs")
+    old.scratch.sensors.sums.zero_()
+    new.set(**{array: old.state.numpy()[array] for array in (*ARRAYS, "vk", "spin")})
+    for sim in (old, new):
+        vk = sim.state.vk.numpy()
+        vk[1, sim.get("x", 1)[:, 2].argmin()] = [60.0, 0.0, 0.0]
+        sim.set(vk=vk).run()
+    assert old.failures == new.failures == [0, FAILURE_CFL, 0]
+    found, expected = (sim.scratch.sensors.boundary_impulse.numpy() for sim in (old, new))
+    assert np.abs(expected[1]).max() > 0.0
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_worlds_whose_boundaries_move_do_not_go_ahead(groups_clash):
     """Their gather does not know which particles will be near a boundary."""
     sim = groups_clash()
