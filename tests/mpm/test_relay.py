@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm import relay_contact
+from piavatar_envs.mpm import relay_contact, solver
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.relay import PORTION, portions
 from piavatar_envs.mpm.team_others import meets_others
@@ -172,6 +172,34 @@ def test_relays_of_several_fields_are_substeps(clash, one_by_one):
     assert relay.sums_are_clear and apart.sums_are_clear
 
 
+def test_portions_of_several_fields_are_substeps(clash, one_by_one, monkeypatch):
+    """Who is where, which nodes are listed and what has been touched are forgotten where blocks are marked anew."""
+    monkeypatch.setattr(solver, "portions", lambda count: [3] * (count // 3))
+    settings = {"num_substeps": 37, "control_dt": 0.037}
+    relay, apart = clash(**settings), one_by_one(clash(**settings))
+    assert relay.program.names.count("begin_contact") == 12
+    relay.run(), apart.run()
+    assert relay.failures == [0, 0] and relay.sums_are_clear
+    same(relay, apart, (1e-4, 3e-2, 3.0, 1e-3))
+    for name in SENSED:
+        found, expected = (getattr(sim.scratch.sensors, name).numpy() for sim in (relay, apart))
+        np.testing.assert_allclose(found, expected, rtol=5e-3, atol=5e-3, err_msg=name)
+
+
+@pytest.mark.parametrize("extra", [1, 4, 7])
+def test_slots_that_run_out_of_several_fields(clash, extra):
+    """In flight, while fields meet: what is left does not depend on who came first, nothing stays on the grid."""
+    used = clash(num_substeps=2, control_dt=0.002).run().scratch.blocks.count.numpy().max()
+    first, second = (clash(num_substeps=20, control_dt=0.03, max_slots=used + extra).run() for _ in range(2))
+    assert any(failure & FAILURE_BLOCKS for failure in first.failures) and first.failures == second.failures
+    assert first.sums_are_clear and second.sums_are_clear
+    for name in ARRAYS:
+        np.testing.assert_array_equal(first.state.numpy()[name], second.state.numpy()[name], err_msg=name)
+    for name in SENSED:
+        found, again = (getattr(sim.scratch.sensors, name).numpy() for sim in (first, second))
+        np.testing.assert_array_equal(found, again, err_msg=name)
+
+
 @pytest.mark.parametrize("num_substeps", [1, 2])
 def test_few_substeps_of_several_fields(clash, one_by_one, num_substeps):
     """The last is always launched apart: with one, nothing is left for a relay."""
@@ -279,12 +307,16 @@ def test_warps_that_have_several_nodes(clash, monkeypatch):
         np.testing.assert_array_equal(found, expected, err_msg=name)
 
 
-def test_fields_that_fail_fail_alone(clash):
-    """The others go on bit for bit, and nothing is left on the grid."""
-    well, ill = clash().run(2), clash()
-    u = ill.state.u.numpy()
-    u[1, 5] = 400.0
-    ill.set(u=u).run(2)
+def test_fields_that_fail_fail_alone(clash, one_by_one):
+    """The others go on bit for bit, who fails feels nothing from then on, and nothing is left on the grid."""
+    well, ill, apart = clash().run(2), clash().run(), one_by_one(clash()).run()
+    for sim in (ill, apart):
+        u = sim.state.u.numpy()
+        u[1, 5] = 400.0
+        sim.set(u=u).run()
+    for name in SENSED[:4]:
+        found, expected = (getattr(sim.scratch.sensors, name).numpy()[1] for sim in (ill, apart))
+        np.testing.assert_allclose(found, expected, rtol=5e-3, atol=5e-3, err_msg=name)
     assert ill.failures[0] == 0 and ill.failures[1] & FAILURE_CFL
     for name in ARRAYS:
         np.testing.assert_array_equal(ill.state.numpy()[name][0], well.state.numpy()[name][0], err_msg=name)
