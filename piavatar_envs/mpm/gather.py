@@ -256,7 +256,7 @@ def gather(
 ):
     """Particle ``p`` from the nodes: velocities and gradients, and with them position and deformation.
 
-    Also, how far it was from any boundary [m]. The blocks that it comes to are marked for the next substep.
+    Also, how far it was from any boundary [m]. Blocks that it comes to are marked. See also :func:`gather_by_lines`.
     """
     x = moved.x[e, p]
     stencil = stencil_at(grid_position(grid, x))

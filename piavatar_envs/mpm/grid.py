@@ -234,9 +234,10 @@ def update_grid(
     Contact acts on the total velocity ``v = u + vk``; the rest is physical. Blocks with several fields are seen to by
     :mod:`piavatar_envs.mpm.contact_pass`, maybe at the same time.
 
-    Nodes have offsets and, but for the paper's variant, kinematic momentum only from particles that tell their place,
-    see :func:`piavatar_envs.mpm.transfer.tells_place`, and who scatters those notes in which slots. Matter within the
-    gate of a boundary is of such particles only, so elsewhere nobody asks for boundaries.
+    Nodes have offsets and kinematic momentum only from particles that tell their place, see
+    :func:`piavatar_envs.mpm.transfer.tells_place`, and who scatters those notes in which slots. (Of the paper's variant
+    all have the latter, and groups scatter both.) Matter within the gate of a boundary is of such particles only, so
+    elsewhere nobody asks for boundaries.
 
     Where slots have run out, sums are forgotten: a part of the world may have been scattered that did not know of it.
     """

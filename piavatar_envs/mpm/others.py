@@ -6,7 +6,7 @@ if another one was there then, and only fields that have told a node touch there
 come to it, with little weight unless it moves nearly a grid spacing in a time step. When blocks are marked anew, their
 slots are others, and fields tell all nodes of blocks that have several: who comes then touches at once.
 
-For :mod:`piavatar_envs.mpm.groups`, where a group takes three times as long if one of its particles tells, and for
+For :mod:`piavatar_envs.mpm.groups`, where a group takes much longer if one of its particles tells, and for
 :mod:`piavatar_envs.mpm.relay`; other scatters tell all nodes of blocks with several fields in every substep.
 """
 

@@ -32,8 +32,8 @@ from piavatar_envs.mpm.types import Blocks, Model, Moving, Scratch, State, Sums
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: At most so many substeps between two marks of all blocks: each costs six launches. Blocks that a body leaves behind
-#: keep their slots until then, so that a fast one needs more of them than where blocks are marked every eight substeps.
+#: At most so many substeps between two marks of all blocks, which cost six launches or more. Blocks that a body leaves
+#: behind keep their slots until then, so that a fast one needs more of them than where they are marked every eight.
 PORTION = 50
 
 

@@ -198,7 +198,7 @@ def meet_fields(
     """Contact of a substep, and who may be in contact in the next; what follows reads the sums.
 
     Of every environment, the first warps see to nodes where fields may touch, by what was noted in the last substep,
-    the others to who is where: neither reads what the others write. Before the first substep there are only the latter.
+    the others to who is where: neither asks what the others change. Before the first substep there are only the latter.
     """
     at = environment_of(wp.tid(), LANES * now.warps + sweep.threads)
     thread = at[1] - LANES * now.warps

@@ -50,7 +50,8 @@ def note_fields(
 ):
     """Note who is at the nodes of blocks with several fields, a ``thread`` each, and where they may touch next.
 
-    Fields may where all particles of two or more will have told the node where they are: those that others are with.
+    Fields may where all particles of two or more will have told the node where they are: those that others are with,
+    also fields that are not at the node, but in its block, and may come.
     """
     if thread == 0:
         begin_meeting(meeting, e, now.substep)
