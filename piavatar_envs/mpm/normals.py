@@ -225,6 +225,12 @@ def normal_along(facing: wp.vec4):
 
 
 @wp.func
+def say_of(distance_sq: float):
+    """How much a node around another says of its normal, by the square of their distance [grid spacings squared]."""
+    return 1.0 / (1.0 + distance_sq)
+
+
+@wp.func
 def normal_from(
     grid: Grid, e: int, node: wp.vec3i, first_a: vec8i, first_b: vec8i, node_facing: wp.array2d(dtype=wp.vec4)
 ):
@@ -250,7 +256,7 @@ def normal_from(
                 to_b = component(first_b, bx, by, bz)
                 counts = to_a >= 0 and in_grid(grid, at)
                 across = float((j - 1) * (j - 1) + (k - 1) * (k - 1))
-                c = wp.where(i == 1, 1.0 / (1.0 + across), 1.0 / (2.0 + across))
+                c = wp.where(i == 1, say_of(across), say_of(1.0 + across))
                 # what does not count is the node itself, times 0: all are read before the first has come
                 of_a = read_change(node_facing, e, wp.where(counts, to_a + n, ra))
                 of_b = read_change(node_facing, e, wp.where(counts, to_b + n, rb))
@@ -282,7 +288,7 @@ def neighbour_of_lane(grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int
     found.a = wp.max(first_record(grid, blocks, e, a, block), 0) + local
     found.b = wp.max(first_record(grid, blocks, e, b, block), 0) + local
     if n < 27 and in_grid(grid, at) and (blocks.fields[e, block] & both) == both:  # else nobody has written there
-        found.c = 1.0 / (1.0 + float(to[0] * to[0] + to[1] * to[1] + to[2] * to[2]))
+        found.c = say_of(float(to[0] * to[0] + to[1] * to[1] + to[2] * to[2]))
     return found
 
 
