@@ -22,7 +22,7 @@ from piavatar_envs.mpm.carry import TEAM_OF_FIELDS, Turn, carry_fields_on, carry
 from piavatar_envs.mpm.meeting import meetings_of
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.relay_contact import record_contact, record_meeting
-from piavatar_envs.mpm.singles import TEAM, THREADS, record_singles
+from piavatar_envs.mpm.singles import TEAM, THREADS, in_whole_warps, record_singles
 from piavatar_envs.mpm.sweep import LANES, lanes_of_warp
 from piavatar_envs.mpm.team_clear import clear_slot
 from piavatar_envs.mpm.threads import environment_of
@@ -63,8 +63,7 @@ def record_relay(
     program.launch(begin_turns, m.num_envs, [s.failure], [stops])
     several = m.contact.num_fields > 1
     team = int(TEAM_OF_FIELDS if several else TEAM)
-    share = LANES // team
-    per_env = -(-m.num_particles // share) * share
+    per_env = in_whole_warps(m.num_particles, team)
     if several:
         record_contact(program, m, scratch)
     for index in range(count):

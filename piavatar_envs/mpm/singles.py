@@ -17,7 +17,7 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import KINEMATIC, bounded, told_by
 from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_index, grid_position
-from piavatar_envs.mpm.sweep import lane_of_thread
+from piavatar_envs.mpm.sweep import LANES, lane_of_thread
 from piavatar_envs.mpm.team_add import add_single
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.transfer import Scattered, admitted, moves_finitely, near_boundary, prepare, takes_part
@@ -40,8 +40,6 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 #: Threads of a particle in the scatter alone. Teams of four are for some relays only, see
 #: :mod:`piavatar_envs.mpm.team_add`; four here, as tried before, need fewer instructions and more time.
 TEAM = wp.constant(8)
-#: Particles of a warp.
-SHARE = wp.constant(32 // int(TEAM))
 #: Threads of a CUDA block.
 THREADS = 128
 
@@ -156,8 +154,14 @@ def singles_to_grid(
     )  # fmt: skip
 
 
+def in_whole_warps(count: int, team: int) -> int:
+    """``count`` particles of ``team`` threads each, and as many more as fill the last warp."""
+    share = LANES // team
+    return -(-count // share) * share
+
+
 def record_singles(program: Program, inputs: list[Any], shape: tuple[int, int], failure: Any, sums: Sums) -> None:
     """Append :func:`singles_to_grid` for particles of ``shape``; no warp has two environments."""
-    per_env = -(-shape[1] // int(SHARE)) * int(SHARE)
+    per_env = in_whole_warps(shape[1], int(TEAM))
     threads = shape[0] * per_env * int(TEAM)
     program.launch(singles_to_grid, threads, [*inputs, per_env], [failure, sums], block_dim=THREADS)
