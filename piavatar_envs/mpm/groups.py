@@ -184,10 +184,10 @@ def tell_nodes(
 class Turn:
     """A particle while its group scatters."""
 
-    takes: bool  # whether it takes part,
-    ours: bool  # now
-    base: wp.vec3i  # lowest node of its stencil,
-    box: wp.vec3i  # and the bricks around
+    takes: bool  # whether it takes part
+    ours: bool  # whether it has its turn
+    base: wp.vec3i  # lowest node of its stencil
+    box: wp.vec3i  # where the bricks around that are, see :func:`bricks_around`
 
 
 @wp.func
