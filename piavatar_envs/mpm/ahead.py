@@ -51,7 +51,6 @@ from piavatar_envs.mpm.types import (
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-
 #: Who is further from a boundary [grid spacings], by how far it was before it moved, is not near it: distances that are
 #: measured from up to 10^4 grid spacings away are rounded by less.
 SURELY_FAR = wp.constant(1.001 * float(NEAR_PARTICLE))
@@ -148,7 +147,7 @@ def scatter_momenta(
     return put_turn(grid, step, particles, moving, failure, sums, num_fields, at, turn, near)
 
 
-# it has less to keep than that kernel, so that there is room for another CUDA block
+# it has less to keep than the kernel for what particles have, so that there is room for another CUDA block
 @wp.kernel(launch_bounds=(THREADS, 7))
 def momenta_to_grid(
     grid: Grid,

@@ -15,7 +15,7 @@ import warp as wp
 
 from piavatar_envs.mpm.runs import KINEMATIC, PLACE
 from piavatar_envs.mpm.shared_grid import BRICK_WORDS
-from piavatar_envs.mpm.shared_memory import APPEND, native
+from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.types import Blocks, Grid
 
 wp.set_module_options({"enable_backward": False})
@@ -260,35 +260,6 @@ return all != 0;
 )
 def has_others(box: wp.vec3i, base: wp.vec3i) -> bool:
     """Whether any node of the stencil at ``base`` had another field, its bricks :func:`bricks_around` it."""
-    ...
-
-
-@wp.func_native(
-    in_group(
-        APPEND
-        + """
-const int place = append(room + MORE, __ballot_sync(ALL, tells), threadIdx.x & 31);
-if (tells) room[TELLERS + place] = threadIdx.x;
-"""
-    )
-)
-def note_teller(tells: bool):
-    """List the thread, if its particle ``tells`` its nodes more than momentum, in any order; all threads come here."""
-    ...
-
-
-@wp.func_native(
-    in_group(
-        SIZE
-        + """
-const int bricks = size[0] * size[1] * size[2];
-return 2 * bricks <= CAPACITY ? BRICK_WORDS * bricks : 0;
-""",
-        "return 0;",
-    )
-)
-def beyond_box() -> int:
-    """Words from a node's to as many more for it, beyond those of the box; 0 where there is no room for these."""
     ...
 
 

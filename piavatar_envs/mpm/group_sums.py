@@ -11,10 +11,24 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.group_bricks import POWER, SIZE, in_group
+from piavatar_envs.mpm.group_bricks import MOMENTUM_UNIT, POWER, SIZE, in_group, raise_most
+from piavatar_envs.mpm.runs import bounded
+from piavatar_envs.mpm.shared_memory import number
+from piavatar_envs.mpm.transfer import Scattered
 from piavatar_envs.mpm.types import FAILURE_CFL, Grid, Sums
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def raised(s: Scattered, takes: bool, kind: int, failure: wp.array(dtype=int), e: int):
+    """Whether a particle can be added up; if so, the group's units are raised to its momenta. All threads come here."""
+    momentum = float(0.0)
+    if takes:
+        momentum = bounded(s, number(MOMENTUM_UNIT), failure, e)
+        takes = momentum >= 0.0
+    raise_most(takes, kind, s.at_base[0], momentum)
+    return takes
 
 
 @wp.func_native(

@@ -3,7 +3,8 @@
 A group is of neighbours in memory, which should be neighbours in the body: the fewer bricks of nodes there are in the
 box around them, the less there is to put down. It has a CUDA block of its own, see
 :mod:`piavatar_envs.mpm.group_bricks` and :mod:`piavatar_envs.mpm.group_sums`. What it adds up depends on its own
-particles only, and integers are added: runs repeat bit for bit, and an environment does the same in any batch.
+particles only, and integers are added: runs repeat bit for bit, and an environment does the same in any batch. What few
+particles have besides is in :mod:`piavatar_envs.mpm.group_tellers`.
 """
 
 from __future__ import annotations
@@ -20,33 +21,29 @@ from piavatar_envs.mpm.group_bricks import (
     MASS_UNIT,
     MOMENTUM_UNIT,
     MORE,
-    TELLERS,
     UNITS,
     WORDS,
     begin_turn,
-    beyond_box,
     bricks_around,
     clear_nodes,
     fetch_slots,
     has_others,
     has_turn,
     note_records,
-    note_teller,
     per_unit_of,
-    raise_most,
     widen_box,
 )
 from piavatar_envs.mpm.group_plan import THREADS, share_of
-from piavatar_envs.mpm.group_sums import put_down
+from piavatar_envs.mpm.group_sums import put_down, raised
+from piavatar_envs.mpm.group_tellers import note_teller, tell_nodes
 from piavatar_envs.mpm.parts import Part
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, bounded, told_by
-from piavatar_envs.mpm.shared_add import add_to_box, tell_box
+from piavatar_envs.mpm.runs import MOMENTUM
+from piavatar_envs.mpm.shared_add import add_to_box
 from piavatar_envs.mpm.shared_memory import (
     block_of_launch,
     meet,
     native,
-    number,
     set_number,
     thread_of_block,
     word,
@@ -114,70 +111,12 @@ def begins_again():
 
 
 @wp.func
-def raised(s: Scattered, takes: bool, kind: int, failure: wp.array(dtype=int), e: int):
-    """Whether a particle can be added up; if so, the group's units are raised to its momenta. All threads come here."""
-    momentum = float(0.0)
-    if takes:
-        momentum = bounded(s, number(MOMENTUM_UNIT), failure, e)
-        takes = momentum >= 0.0
-    raise_most(takes, kind, s.at_base[0], momentum)
-    return takes
-
-
-@wp.func
 def add_momentum(box: wp.vec3i, s: Scattered):
     """Add mass and momentum of a particle to the group's nodes."""
     add_to_box(
         box, thread_of_block(), s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_unit_of(HEAVIEST),
         per_unit_of(FASTEST),
     )  # fmt: skip
-
-
-@wp.func
-def add_told(t: int, driven: Scattered, place: Scattered, drives: bool, to_place: int):
-    """:func:`tell_box` of how a particle is ``driven`` and of its ``place``."""
-    per_mass = per_unit_of(HEAVIEST)
-    per_way = 0.5 * per_mass  # up to 1.5 masses
-    k = per_unit_of(DRIVEN) * wp.vec3(driven.at_base[1], driven.at_base[2], driven.at_base[3])
-    at_base = wp.vec4(
-        per_mass * place.at_base[0], per_way * place.at_base[1], per_way * place.at_base[2], per_way * place.at_base[3]
-    )
-    tell_box(
-        bricks_around(place.base), t, place.base, spline(place.f[0]), spline(place.f[1]), spline(place.f[2]), k,
-        at_base, per_way * place.A[0, 0], drives, to_place,
-    )  # fmt: skip
-
-
-@wp.func
-def tell_nodes(
-    grid: Grid, particles: Particles, moving: Moving, failure: wp.array(dtype=int), sums: Sums, at: wp.vec4i
-):
-    """Scatter what particles that tell their nodes have besides momentum; all threads come here, few groups do.
-
-    The first threads have those particles. How they are driven and where they are is added up at once, if there is room
-    for both.
-    """
-    e = at[0]
-    t = thread_of_block()
-    tells = t < word(MORE)
-    p = at[1] - t + word(TELLERS + wp.where(tells, t, 0))
-    driven = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], KINEMATIC)
-    place = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], PLACE)
-    beyond = beyond_box()
-    kinds = int(2)
-    rounds = wp.where(beyond > 0, 1, kinds)
-    for n in range(rounds):
-        clear_nodes()
-        if n == 0:  # what is added of places is no momentum, and as sound as the masses were
-            tells = raised(driven, tells, KINEMATIC, failure, e)
-        meet()
-        if tells:
-            add_told(t, driven, place, n == 0, wp.where(n == rounds - 1, beyond, -1))
-        meet()
-        for k in range(kinds):
-            if rounds == 1 or k == n:
-                put_down(grid, sums, failure, e, KINEMATIC + k, k * beyond)
-        meet()
 
 
 @wp.struct
