@@ -12,7 +12,7 @@ from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.memory import MARKS_OF_GROUPS
 from piavatar_envs.mpm.parts import first_groups, parts_of_world
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_substeps
+from piavatar_envs.mpm.solver import record_begin, record_end, record_substeps
 from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL
 
 ARRAYS = ("x", "u", "C", "F")
@@ -150,14 +150,22 @@ def test_what_who_fails_ahead_has_felt_does_not_depend_on_the_past(drop):
     np.testing.assert_array_equal(found, expected)
 
 
-def test_worlds_whose_boundaries_move_do_not_go_ahead(groups_clash):
-    """Their gather does not know which particles will be near a boundary."""
-    sim = groups_clash()
-    sim.model = replace(sim.model, moving_boundaries=True)
-    program = Program(sim.model.device)
-    record_substeps(program, sim.model, sim.state, sim.scratch)
-    order = [n for n in program.names if n in {*SCATTERS, "grid_to_particles", "grid_to_momenta", "move_colliders"}]
-    assert order == ["runs_to_grid", "grid_to_particles", "move_colliders"] * sim.model.num_substeps
+def test_worlds_whose_boundaries_move_do_not_go_ahead(groups_clash, one_by_one):
+    """Their gather does not know which particles will be near a boundary; these move in every substep."""
+    sims = [groups_clash(), groups_clash()]
+    for sim in sims:
+        sim.model = replace(sim.model, moving_boundaries=True)
+        velocity = sim.model.boundaries.velocity
+        velocity.assign(np.broadcast_to(np.array([0.2, 0.0, 0.5], np.float32), (*velocity.shape, 3)).copy())
+    ahead, apart = sims[0], one_by_one(sims[1])
+    ahead.program, world = Program(ahead.model.device), (ahead.model, ahead.state, ahead.scratch)
+    record_begin(ahead.program, *world)
+    record_substeps(ahead.program, *world)
+    record_end(ahead.program, *world)
+    known = {*SCATTERS, "grid_to_particles", "grid_to_momenta", "move_colliders"}
+    order = [name for name in ahead.program.names if name in known]
+    assert order == ["runs_to_grid", "grid_to_particles", "move_colliders"] * ahead.model.num_substeps
+    same(ahead.run(), apart.run())
 
 
 def test_what_goes_in_parts(clash, meet):

@@ -56,6 +56,11 @@ def collide(meet):
     return build
 
 
+def records_of(sums):
+    """Masses and momenta, and offsets, in fixed point or not."""
+    return (sums.fixed, sums.offset_fixed) if sums.is_fixed else (sums.value, sums.offset)
+
+
 def node_sums(sim):
     """Mass, momenta and offsets of every node that has a slot, by field and block: ``{(env, of both): (64, 10)}``."""
     model, scratch, program = sim.model, sim.scratch, Program(sim.model.device)
@@ -63,9 +68,7 @@ def node_sums(sim):
     record_scatter(program, model, sim.state, scratch)
     program.run()
     count, held = scratch.blocks.count.numpy(), scratch.blocks.held.numpy()
-    own, places = scratch.sums.value, scratch.sums.offset
-    if scratch.sums.is_fixed:
-        own, places = scratch.sums.fixed, scratch.sums.offset_fixed
+    own, places = records_of(scratch.sums)
     halves = own.numpy().astype(float).reshape(model.num_envs, -1, 2, 64, 4)
     offsets = places.numpy().astype(float).reshape(model.num_envs, -1, 64, 4)
     sums = np.concatenate([halves[:, :, 0], halves[:, :, 1, :, :3], offsets[..., :3]], axis=-1)
@@ -136,7 +139,7 @@ def test_slots_whose_nodes_are_told_something_are_noted(meet, scatter):
     node_sums(sim)
     model, sums = sim.model, sim.scratch.sums
     shape = (model.num_envs, model.max_slots, -1)
-    own, places = (sums.fixed, sums.offset_fixed) if sums.is_fixed else (sums.value, sums.offset)
+    own, places = records_of(sums)
     driven = own.numpy().reshape(model.num_envs, -1, 2, 64, 4)[:, :, 1].reshape(shape).any(2)
     told = sums.told.numpy() != 0
     assert told[places.numpy().reshape(shape).any(2) | driven].all()
