@@ -60,6 +60,8 @@ WARP = wp.constant(32)
 #: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
 MASS_BLOCK = wp.constant(128)
 _ROOM = wp.constant(ROOM)
+#: How often joints are solved for anew, at most, with more muscles at their limits: who gives less changes the others.
+MOST_CUTS = wp.constant(4)
 #: Share of what the pose is off the particles that one fit takes away. Those of a fast, light joint (a head, a hand)
 #: are not where it has them for other reasons, too: to follow them at once throws it about.
 FIT_SHARE = 0.2
@@ -139,17 +141,18 @@ def limit_joints(
     strength: Strength,
     driven: int,
     own: int,
+    again: bool,
     e: int,
     thread: int,
     threads: int,
     w: JointBench,
 ) -> float:
-    """Let muscles give no more than they have by share ``own``, and tell all threads how many would."""
+    """Let muscles give no more than they have by share ``own``, and tell all threads how many would, or ``again``."""
     limited = float(0.0)
     for k in range(thread, PARTS, threads):
         rest = w.diagonals[driven, 3 * k]
         limited += limit_torque(
-            body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, e, k, w.impulse, w.left
+            body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, again, e, k, w.impulse, w.left
         )  # fmt: skip
     meet_threads(threads)
     return sum_threads(limited, threads)
@@ -184,13 +187,15 @@ def turn_joints(
     fetch_factor(w.factors, driven, room)
     factor = int(driven)
     met = vec8()
+    cuts = int(0)
     while factor >= 0:  # once more where muscles reach their limits, by the same piece of the program
         solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, room, w.shares)
         met = stop_bones(body, ground, dt, own, factor, e, thread, threads, room, w)
-        if factor != driven:
+        if cuts == MOST_CUTS:
             break
-        if limit_joints(body, dt, springs, strength, driven, own, e, thread, threads, w) == 0.0:
+        if limit_joints(body, dt, springs, strength, driven, own, cuts > 0, e, thread, threads, w) == 0.0:
             break
+        cuts += 1
         factor = w.factors.shape[0] - 1
         factorize(w.pattern, w.matrix, w.left, e, e, room, factor, w.factors)
     find_given(w.left, w.shares, own, e, thread, threads, w.impulse)

@@ -24,7 +24,7 @@ import warp as wp
 
 from piavatar_envs.avatar.joint_motion import part_of, set_part
 from piavatar_envs.avatar.mass_matrix import NUM_DOF
-from piavatar_envs.avatar.rotation import quat_log, short_of_pi
+from piavatar_envs.avatar.rotation import quat_log, short_of_pi, torque_of_vector
 from piavatar_envs.avatar.types import Body, Pose
 from piavatar_envs.mpm.types import group, row
 
@@ -144,6 +144,15 @@ def beyond(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
 
 
 @wp.func
+def stopping_torque(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
+    """Torque of the end of the range, over its stiffness, in the frame of what the joint hangs on [rad].
+
+    What it takes from a joint, it gives back: it is the gradient of half the square of :func:`beyond`.
+    """
+    return torque_of_vector(quat_log(local), beyond(local, lower, upper))
+
+
+@wp.func
 def implicit_diagonal(
     body: Body,
     dt: float,
@@ -207,7 +216,7 @@ def joint_impulse(
         if b > 0:
             push += target.factor[row(e, target.factor.shape[0])] * target.torque[e, b]
             stiff = stop[e, b]
-            passive = dt * stiff * wp.quat_rotate(frame, beyond(local, tissue.lower[b], tissue.upper[b]))
+            passive = dt * stiff * wp.quat_rotate(frame, stopping_torque(local, tissue.lower[b], tissue.upper[b]))
             passive -= implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) * v
         active = dt * wp.quat_rotate(frame, push)
     active -= implicit_inertia(dt, K, springs.damping[r, n]) * v
@@ -226,20 +235,23 @@ def limit_torque(
     rest: float,
     change: wp.array2d(dtype=float),
     row_of_change: int,
+    again: bool,
     e: int,
     n: int,
     # in and out
     impulse: wp.array2d(dtype=float),
-    # out
     left: wp.array2d(dtype=float),
 ) -> float:
     """Where a muscle would give more than it has, let it give that, whatever moves: then the answer is 1, else 0.
 
-    ``left`` is ``A``, of which all is ``rest``, without the spring that was cut.
+    ``left`` is ``A``, of which all is ``rest``, without the spring that was cut. Who asks ``again`` leaves those as
+    they are that have been.
     """
     limited = float(0.0)
     r = row(e, springs.stiffness.shape[0])
     A = implicit_inertia(dt, springs.stiffness[r, n], springs.damping[r, n])
+    if again and (left[e, 3 * n] != rest or A == 0.0):
+        return limited
     if n > 1:
         before = part_of(muscle, e, 3 * n)
         frame = above(body, pose.rotation, e, n - 1)

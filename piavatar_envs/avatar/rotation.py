@@ -54,6 +54,21 @@ def short_of_pi(v: wp.vec3):
 
 
 @wp.func
+def torque_of_vector(v: wp.vec3, pull: wp.vec3):
+    """Torque that does the work of ``pull`` on a rotation vector ``v``: ``J_l(v)^-T pull``.
+
+    A rotation by ``dt w``, after that of ``v``, changes ``v`` by ``dt J_l(v)^-1 w``, with the left Jacobian of SO(3)
+    (Barfoot, "State Estimation for Robotics", 2017, eq. 7.77). Along ``v`` both are the same.
+    """
+    half = 0.5 * wp.length(v)
+    c = 1.0 / 12.0 + half * half / 180.0
+    if half > 0.05:
+        c = (1.0 - half * wp.cos(half) / wp.sin(half)) / (4.0 * half * half)
+    turned = wp.cross(v, pull)
+    return pull + 0.5 * turned + c * wp.cross(v, turned)
+
+
+@wp.func
 def turn_about_z(q: wp.quat):
     """The part of ``q`` that turns about the vertical (its twist); the identity where that is undefined."""
     n = wp.sqrt(q[2] * q[2] + q[3] * q[3])

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.articulated import ArticulatedBody
 from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.joint_torques import UNBOUNDED
+from piavatar_envs.avatar.joint_torques import UNBOUNDED, stopping_torque
 from piavatar_envs.avatar.muscles import attachment_rates, firmness, joint_torques, make_muscles
 from piavatar_envs.avatar.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
@@ -116,6 +117,59 @@ def test_muscles_give_no_more_than_they_have(make_rig, limit):
     assert most == pytest.approx(limit, rel=0.02)  # read in the frame of a moment later
     # 15 N m hold an arm of 3 kg out in front; 2 N m do not
     assert (held.local()[0, 0] < -0.8) == (limit > 10.0)
+
+
+def test_no_muscle_gives_more_where_others_have_been_cut(make_rig):
+    """All joints are pulled to where they cannot get: what one does not give any more, its neighbours would have to."""
+    rng = np.random.default_rng(2)
+    moving = [b for b in range(1, NUM_JOINTS) if b not in TOES]
+    held = Held(make_rig(cells=16), moving, 300.0, 3.0)
+    limit = rng.uniform(2.0, 40.0, (NUM_JOINTS, 1)) * np.ones(3)
+    held.body.set_strength(-limit, limit, 1)
+    program, excess, cut = held.start().substep(0), [], []
+    for _ in range(60):
+        held.pose(np.zeros((NUM_JOINTS, 3))).aim(rng.uniform(-0.3, 0.3, (len(moving), 3)))
+        held.state.u.zero_(), held.state.vk.zero_()
+        program.run()
+        # where a substep begins all frames are the world's
+        torque = held.body.impulse.numpy()[0].reshape(-1, 3)[1:] / held.model.step.dt
+        share = np.abs(torque[moving]) / limit[moving]
+        excess.append(share.max())
+        cut.append((share > 0.97).any(1).sum())
+    assert held.state.failure.numpy().sum() == 0
+    assert 4 <= np.median(cut) <= len(moving) - 4  # some are, and some are not
+    assert max(excess) < 1.001
+
+
+@wp.kernel
+def stop_at(local: wp.array(dtype=wp.quat), lower: wp.vec3, upper: wp.vec3, torque: wp.array(dtype=wp.vec3)):
+    i = wp.tid()
+    torque[i] = stopping_torque(local[i], lower, upper)
+
+
+def test_the_end_of_a_range_gives_back_what_it_takes(device):
+    """Its torque is the gradient of half the square of how far a joint is beyond, however it is bent."""
+    rng = np.random.default_rng(5)
+    lower, upper = np.array([-0.2, -0.3, -0.1]), np.array([2.2, 0.2, 0.3])
+    vectors = rng.uniform([-0.6, -0.8, -0.8], [2.4, 0.8, 0.8], (200, 3))
+    vectors[:3] = [[0.1, 0.0, 0.1], [1e-4, -0.3 - 1e-4, 0.0], [2.3, 0.27, 0.0]]
+    local = Rotation.from_rotvec(vectors)
+
+    def energy(rotations):
+        v = rotations.as_rotvec()
+        return 0.5 * ((np.clip(v, lower, upper) - v) ** 2).sum(1)
+
+    turn = 1e-5
+    by_axis = [
+        (energy(Rotation.from_rotvec(-turn * axis) * local) - energy(Rotation.from_rotvec(turn * axis) * local))
+        for axis in np.eye(3)
+    ]
+    expected = np.stack(by_axis, 1) / (2.0 * turn)
+    torque = wp.zeros(len(vectors), dtype=wp.vec3, device=device)
+    at = wp.array(local.as_quat().astype(np.float32), dtype=wp.quat, device=device)
+    wp.launch(stop_at, len(vectors), [at, wp.vec3(*lower), wp.vec3(*upper)], [torque], device=device)
+    assert (np.abs(expected).max(1) > 0.1).sum() > 100 and not expected[0].any()
+    np.testing.assert_allclose(torque.numpy(), expected, atol=2e-5)
 
 
 def test_a_joint_is_stopped_at_the_end_of_its_range(make_rig):
