@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -29,7 +30,7 @@ class ActionMap:
     lower: wp.array(dtype=wp.vec3)  # (22,) bounds of the rotation vectors [rad]
     upper: wp.array(dtype=wp.vec3)
     root_offset: int  # first of three components x, y, yaw; -1 if the root does not act
-    root_step: float  # root translation at action 1 [m]
+    root_step: float  # root translation at action 1 [m], along x and along y
     root_turn: float  # root turn at action 1 [rad]
 
 
@@ -41,7 +42,7 @@ class ActionSpec:
         joints: names of the acting joints.
         root: whether x, y and yaw of the root follow.
         joint_speed: rotation speed at action 1 [rad/s].
-        root_speed: speed of the root at action 1 [m/s].
+        root_speed: speed of the root at action 1 [m/s], along x and along y.
         root_turn_speed: turning speed of the root at action 1 [rad/s].
     """
 
@@ -50,6 +51,11 @@ class ActionSpec:
     joint_speed: float = 4.0
     root_speed: float = 1.5
     root_turn_speed: float = 2.0
+
+    @property
+    def greatest_speed(self) -> float:
+        """How fast an action can move the root horizontally [m/s]: along x and y at once."""
+        return math.sqrt(2.0) * self.root_speed
 
     @property
     def size(self) -> int:

@@ -65,8 +65,10 @@ class BoxingConfig(EnvConfig):
     start_distance: float = Field(1.0, ge=0.6, le=5.0, description="between neighbours at the start [m]")
     joints: tuple[str, ...] | None = Field(JOINTS, description="joints that act, besides the root; null for all 21")
     root_speed: float = Field(1.0, gt=0.0, le=5.0, description="speed of the root at action 1 [m/s]")
-    leash: float = Field(0.08, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body [m]")
-    leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning [rad]")
+    leash: float = Field(
+        0.08, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body before an action [m]"
+    )
+    leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning before an action [rad]")
     blow_impulse: Margin = Field(
         1.0,
         description="impulse on a target up to which a blow counts for nothing; twice that is a full blow [N s]",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -40,8 +41,10 @@ class PassBallConfig(EnvConfig):
     joints: tuple[str, ...] | None = Field(JOINTS, description="joints that act, besides the root; null for all 21")
     root_speed: float = Field(1.5, gt=0.0, le=5.0, description="speed of the root at action 1 [m/s]")
     roam: float = Field(0.4, ge=0.0, le=1.0, description="how far the root may be steered from its place [m]")
-    leash: float = Field(0.12, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body [m]")
-    leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning [rad]")
+    leash: float = Field(
+        0.12, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body before an action [m]"
+    )
+    leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning before an action [rad]")
     ball_mass: MassRange = Field((0.4, 2.0), description="range of the ball's mass, uniform in its log [kg]")
     ball_radius: float = Field(0.11, ge=0.06, le=0.3, description="radius of the ball [m]")
     serve_speed: SpeedRange = Field((1.0, 1.6), description="range of the ball's speed at the start [m/s]")
@@ -136,8 +139,10 @@ than `roam` from its place. All are paid alike, but for the cost of their action
         return (Drawn(env.simulation.props.density[:, self.index], self.rule.ball_volume),)
 
     def action_spec(self) -> ActionSpec:
-        speed = self.config.drive.joint_speed_limit
-        return ActionSpec(self.joints, root=True, joint_speed=speed, root_speed=self.config.root_speed)
+        config = self.config
+        # one step stays within reach, also along x and y at once
+        speed = min(config.root_speed, config.roam / (math.sqrt(2.0) * config.physics.control_dt))
+        return ActionSpec(self.joints, root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
 
     def domain(self) -> Domain:
         side = self.rim - RIM + ROOM
@@ -183,9 +188,11 @@ than `roam` from its place. All are paid alike, but for the cost of their action
 
     def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
         references = record_leash(env, program, self.config.leash, self.config.leash_turn)
+        # the action comes on top of what is kept within reach
+        reach = self.config.roam - self.action_spec().greatest_speed * self.config.physics.control_dt
         kept = []
         for (rotation, root), own, avatar in zip(references, self.reference_root, self.scene.avatars, strict=True):
-            program.launch(keep_near, env.num_envs, [wp.vec3(*avatar.position, 0.0), self.config.roam, root], [own])
+            program.launch(keep_near, env.num_envs, [wp.vec3(*avatar.position, 0.0), reach, root], [own])
             kept.append((rotation, own))
         return kept
 

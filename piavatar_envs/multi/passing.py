@@ -104,14 +104,14 @@ def serve_ball(
 @wp.kernel
 def keep_near(
     place: wp.vec3,
-    roam: float,
+    reach: float,
     command_root: wp.array(dtype=wp.vec3),
     # out
     reference_root: wp.array(dtype=wp.vec3),
 ):
-    """The commanded root, no farther from its place than it may go."""
+    """The commanded root, no farther from its place than it may be before it acts."""
     e = wp.tid()
-    reference_root[e] = held_back(command_root[e], place, roam)
+    reference_root[e] = held_back(command_root[e], place, reach)
 
 
 @wp.func

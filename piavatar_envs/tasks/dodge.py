@@ -128,7 +128,8 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
 
     def action_spec(self) -> ActionSpec:
         config = self.config
-        speed = min(ROOT_SPEED, config.root_range / config.physics.control_dt)  # one step stays within the range
+        # one step stays within the range, also along x and y at once
+        speed = min(ROOT_SPEED, config.root_range / (math.sqrt(2.0) * config.physics.control_dt))
         return ActionSpec(self.joints, root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
 
     def domain(self) -> Domain:
@@ -139,7 +140,8 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
         self.throws, self.rule = make_throws(config, self.place, self.waiting, env), PlaceRule()
         rule = self.rule
         # the action comes on top of what is kept within the range
-        rule.place, rule.range = wp.vec3(*self.place), config.root_range - env.action_map.root_step
+        step = self.action_spec().greatest_speed * config.physics.control_dt
+        rule.place, rule.range = wp.vec3(*self.place), config.root_range - step
         rule.pose_margin, rule.place_margin = config.pose_margin, config.place_margin
         rule.control_cost = config.control_cost
         self.reference_root = wp.zeros(n, dtype=wp.vec3, device=device)

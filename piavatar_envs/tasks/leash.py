@@ -29,7 +29,7 @@ def record_leash(env: BatchEnv, program: Program, length: float, turn: float) ->
     Args:
         env: the batch.
         program: records.
-        length: greatest horizontal distance of the command from the tracked pelvis [m].
+        length: greatest horizontal distance of the command from the tracked pelvis, before an action is added [m].
         turn: greatest turn of the command about the vertical from the tracked pelvis [rad].
 
     Returns:

@@ -86,7 +86,7 @@ class PushBoxTask(Task):
 is marked: the box shall stand there. The avatar walks as root actions say, up to 1 m/s and 1.5 rad/s, its legs carried
 along; trunk and arms act. It has to get behind the box, bend over it, push it with hands and body in the right
 direction, and stop in time: the box slides on with friction `box_friction`. What blocks the body holds back the command
-of the root, too, which is never more than 0.1 m and 0.3 rad ahead of it."""
+of the root, too: before each action it is brought back to within 0.1 m and 0.3 rad of the body."""
     reward_docs: ClassVar[Mapping[str, str]] = {
         "push": "0.8 while `distance` is at most `target_radius`; beyond it a Gaussian that has fallen to 0.08 at the "
         "distance where the box started",

@@ -33,7 +33,9 @@ class ReachConfig(EnvConfig):
     """Settings of Reach."""
 
     radius: float = Field(0.45, gt=0.0, le=1.0, description="radius of the target's sphere about the chest [m]")
-    target_speed: float = Field(0.3, ge=0.0, le=5.0, description="greatest speed of the target [m/s]")
+    target_speed: float = Field(
+        0.3, ge=0.0, le=5.0, description="bound of the target's speed, of which it has 0.7 at most [m/s]"
+    )
     target_radius: float = Field(0.08, gt=0.0, le=0.5, description="distance that counts as reached [m]")
     margin: Margin = Field(0.4, description="distance beyond it at which the reward has fallen to 0.1 [m]")
     control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
@@ -196,7 +198,9 @@ middle of either hand to the target and stay with it."""
         return (
             Parameter("target_azimuth", "rad", -SIDE, SIDE, "middle of the target's swing, from the front"),
             Parameter("target_elevation", "rad", BELOW, ABOVE, "the same upwards"),
-            Parameter("target_pace", "-", SLOWEST, 1.0, "greatest speed of the target over target_speed"),
+            Parameter(
+                "target_pace", "-", SLOWEST, 1.0, "how fast the target swings: bound of its speed over target_speed"
+            ),
             Parameter("target_tilt", "rad", 0.0, TURN, "direction of the swing: its parts in azimuth and elevation"),
             Parameter("target_phase_azimuth", "rad", 0.0, TURN, "where the swing in azimuth begins"),
             Parameter("target_phase_elevation", "rad", 0.0, TURN, "where the swing in elevation begins"),

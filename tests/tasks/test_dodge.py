@@ -99,9 +99,15 @@ def test_the_root_is_steered_to_its_range_and_no_farther(make_env):
         action = still(env)
         at = env.action_names.index("root.x")
         action[at : at + 2] = way
-        errors = [env.step(action)[4]["root_error"] for _ in range(20)]
-        # over the corner of a step the diagonal is longer
+        errors, commanded = [], []
+        for _ in range(20):
+            errors.append(env.step(action)[4]["root_error"])
+            goal = env.batch.simulation.avatar.state.goal_root.numpy()[0]
+            commanded.append(np.hypot(*(goal[:2] - env.batch.task.place[:2])))
         assert errors[-1] == pytest.approx(env.config.root_range, abs=0.03) and max(errors) < errors[-1] + 0.01
+        assert max(commanded) <= env.config.root_range + 1e-6
+        if abs(way).sum() == 2.0:  # a step along both axes is the longest
+            assert max(commanded) == pytest.approx(env.config.root_range, abs=1e-4)
 
 
 @pytest.mark.parametrize("name", ["ball_mass", "throw_speed", "throw_distance"])
