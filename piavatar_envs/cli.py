@@ -43,10 +43,11 @@ def doctor_command(
     Args:
         json: machine-readable output.
         compile: build the kernels of all environments for the device, so that nothing later waits for them.
-        device: the device to compile for.
+        device: the device to compile for; it must be there.
     """
     from piavatar_envs import doctor
 
+    doctor.find_device(device)
     seconds = doctor.compile_kernels(device) if compile else None
     report = doctor.examine()
     if seconds is not None:

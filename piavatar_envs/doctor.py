@@ -102,6 +102,18 @@ def memory_estimate() -> dict[str, Any]:
     return {**size, "bytes": estimate_bytes(1, model.num_particles, model.max_slots, num_blocks=model.num_blocks)}
 
 
+def find_device(device: str) -> str:
+    """Name of a Warp device; Warp says nothing meanwhile.
+
+    Raises:
+        ValueError: there is no such device.
+    """
+    quiet_warp()
+    from piavatar_envs.envs.simulation import check_device
+
+    return check_device(device)
+
+
 def compile_kernels(device: str, *, environments: bool = True) -> float:
     """Compile all kernels for ``device``; returns the seconds it took.
 
@@ -115,11 +127,7 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
     wp = quiet_warp()
     from piavatar_envs.mpm.program import acquire
 
-    try:
-        target = wp.get_device(device)
-    except Exception:
-        names = ", ".join(entry.alias for entry in wp.get_devices())
-        raise ValueError(f"no device {device!r} on this machine; there are {names}") from None
+    target = wp.get_device(find_device(device))
     start = time.perf_counter()
     rooms = ("mpm", "avatar", "props", "envs", "tasks", "render") + (("multi",) if _found("pettingzoo") else ())
     for room in rooms:

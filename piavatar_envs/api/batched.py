@@ -14,6 +14,7 @@ from gymnasium.utils import seeding
 from piavatar_envs.api import spaces
 from piavatar_envs.api.arrays import Array, find_array_api
 from piavatar_envs.api.copies import check_state
+from piavatar_envs.api.seeds import checked_seed
 from piavatar_envs.avatar.joint_drive import checked_assist
 from piavatar_envs.envs.batch_env import BatchEnv, check_count
 from piavatar_envs.envs.draws import NUM_SEEDS, check_seeds
@@ -129,11 +130,11 @@ class BatchedEpisodes:
         elif isinstance(seeds, (Set, Mapping)):  # in an order of its own
             raise ValueError(f"seed is a {type(seeds).__name__}; use a whole number, or a list of one an environment")
         elif isinstance(seeds, (str, bytes)) or not np.iterable(seeds):
-            first = _checked_seed(seeds)
+            first = checked_seed(seeds)
             check_seeds(first, n)
             seeds = [first + env for env in range(n)]
         else:
-            seeds = [None if seed is None else _checked_seed(seed) for seed in seeds]
+            seeds = [None if seed is None else checked_seed(seed) for seed in seeds]
         if len(seeds) != n:
             raise ValueError(f"there are {len(seeds)} seeds for num_envs={n} environments")
         if not self.ready:
@@ -278,16 +279,3 @@ class BatchedEpisodes:
         if self._pool is not None:
             self._pool.shutdown()
             self._pool = None
-
-
-def _checked_seed(seed: Any) -> int:
-    """A seed as Gymnasium takes it, and below 2^32.
-
-    Raises:
-        ValueError: a seed outside [0, 2^32).
-        gymnasium.error.Error: what is no seed.
-    """
-    seed = int(seed) if isinstance(seed, np.integer) else seed
-    seeding.np_random(seed)
-    check_seeds(seed)
-    return seed

@@ -16,6 +16,7 @@ from piavatar_envs.api.arrays import NumpyArrays
 from piavatar_envs.api.copies import check_state
 from piavatar_envs.api.infos import failure_names, outcome, standing
 from piavatar_envs.api.picture import Pictures
+from piavatar_envs.api.seeds import checked_seed
 from piavatar_envs.envs.actions import check_actions
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.config import EnvConfig
@@ -89,9 +90,10 @@ class Episode:
             ValueError: a seed outside [0, 2^32).
             gymnasium.error.Error: what is no seed.
         """
-        rng, _ = seeding.np_random(seed)
-        if seed is None and not self.ready:
-            seed = int(rng.integers(NUM_SEEDS))
+        if seed is not None:
+            seed = checked_seed(seed)
+        elif not self.ready:
+            seed = int(seeding.np_random(None)[0].integers(NUM_SEEDS))
         self.batch.reset(seeds=None if seed is None else [seed])
         self.ready = True
         if self._live:

@@ -11,6 +11,7 @@ import numpy as np
 
 from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
+from piavatar_envs.api.seeds import checked_seed
 from piavatar_envs.api.view import EpisodeView
 from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_registered
@@ -60,7 +61,7 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
         self._build = partial(AvatarEnv.__init__, **made)
         self._episode = Episode(task_class(settings).alone(), render_mode, device)
         self.batch, self.config = self._episode.batch, settings
-        self.render_mode = render_mode
+        self.render_mode, self._over = render_mode, False
         self.metadata = {**self.metadata, "render_fps": self._episode.frame_rate}
         self.action_names: tuple[str, ...] = self._episode.action_names
         self.action_space = self._episode.action_space()
@@ -78,12 +79,15 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
         """
         if options:
             raise ValueError(f"unknown reset options {sorted(options)}; there are none")
+        if seed is not None:
+            seed = checked_seed(seed)  # before it changes the generator
         super().reset(seed=seed)
         self._episode.begin(seed)
+        self._over = False
         return self._episode.observation(0), self._episode.info(0)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Advance by one control step.
+        """Advance by one control step; warns if the episode has ended before.
 
         Raises:
             ValueError: an action of the wrong shape, or one that is not finite; nothing has changed then.
@@ -91,8 +95,11 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
         """
         episode = self._episode
         episode.check_ready("step")
+        if self._over:
+            gym.logger.warn("step() after the end of the episode, which goes on as it was; call reset() before")
         episode.advance(episode.check_action(action)[None])
         outcome = episode.reward(0), episode.terminated(0), episode.truncated()
+        self._over = outcome[1] or outcome[2]
         return episode.observation(0), *outcome, episode.step_info(0)
 
     def set_state(self, state: dict[str, np.ndarray]) -> Any:
@@ -102,4 +109,5 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
             ValueError: the state is of another environment, of other settings or not finite; nothing has changed then.
         """
         self._episode.restore(state)
+        self._over = False
         return self._episode.observation(0)

@@ -127,8 +127,11 @@ class AvatarRslEnv(Copied, BatchedView, VecEnv):
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps: torch.Tensor) -> None:
+        steps = torch.as_tensor(steps)
         if tuple(steps.shape) != (self.num_envs,):
             raise ValueError(f"episode_length_buf has shape {tuple(steps.shape)}, expected {(self.num_envs,)}")
+        if steps.is_floating_point() and not bool((steps == steps.round()).all()):
+            raise ValueError(f"episode_length_buf={steps.tolist()} must be whole numbers of control steps")
         clocks = steps.to(self.device).clamp(0, self.max_episode_length - 1)
         ahead = clocks - self.episodes.read(lambda group: group.step_count)
         self.episodes.api.write(ahead, [group.head_start for group in self.episodes.groups])

@@ -168,9 +168,10 @@ class SB3VecEnv(VecEnv):
             AttributeError: the environments of a batch have no such method of their own.
             IndexError: there is no such environment.
         """
+        envs = self._some(indices)
         if method_name == "reset" and not self.vector.episodes.ready:
             self.reset()  # those that are not meant, by their seeds
-        return self.vector.call_some(self._some(indices), method_name, *method_args, **method_kwargs)
+        return self.vector.call_some(envs, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
         """Whether environments are wrapped: environments of a batch never are."""

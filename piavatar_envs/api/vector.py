@@ -122,19 +122,23 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
             Observations of all environments, and infos of those that were reset.
 
         Raises:
-            TypeError: a mask that is not a NumPy array of bool.
+            TypeError: options that are no dict, or a mask that is not a NumPy array of bool.
             ValueError: a mask of the wrong shape or without any True, an unknown option, a wrong number of seeds, or a
                 seed outside [0, 2^32); nothing has changed then.
             gymnasium.error.Error: what is no seed, or a first reset with a mask that leaves environments out.
         """
         mask = self._reset_mask(options)
         self.episodes.reset(seed, mask)
+        if mask is not None:
+            del options["reset_mask"]  # not before: who is refused may try again
         super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
         held = None if mask is None else self.episodes.api.from_host(mask)
         return self._observation(), self._in_vector_format(self._standing(), held)
 
     def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray | None:
-        """The mask in ``options``, taken out of it."""
+        """The mask in ``options``."""
+        if options is not None and not isinstance(options, dict):
+            raise TypeError(f"options are of type {type(options).__name__}; use a dict")
         strange = sorted(set(options or {}) - {"reset_mask"})
         if strange:
             raise ValueError(f"unknown reset options {strange}; there is only 'reset_mask'")
@@ -148,7 +152,7 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
             raise ValueError(f"options['reset_mask'] has shape {mask.shape}, expected ({self.num_envs},)")
         if not mask.any():
             raise ValueError("options['reset_mask'] has no True: there is nothing to reset")
-        return options.pop("reset_mask")
+        return mask
 
     def step(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Advance all environments by one control step.

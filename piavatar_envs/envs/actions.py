@@ -121,11 +121,19 @@ def check_actions(action: np.ndarray, shape: tuple[int, ...], names: Sequence[st
     """The action as float32, refused before anything changes.
 
     Raises:
-        ValueError: complex numbers, a wrong shape, or a component that is not finite; its index and name are given.
+        ValueError: what is no array of real numbers, a wrong shape, or a component that is not finite, whose index and
+            name are given.
     """
-    if np.iscomplexobj(action):
+    try:
+        is_complex = np.iscomplexobj(action)
+        with np.errstate(over="ignore"):  # what is too large for float32 is infinite there, and refused
+            real = action if is_complex else np.asarray(action, dtype=np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:
+        kind = type(action).__name__
+        raise ValueError(f"action is a {kind} ({error}); use an array of shape {shape} of real numbers") from None
+    if is_complex:
         raise ValueError("action is of complex numbers; actions must be real, in [-1, 1]: give action.real")
-    action = np.asarray(action, dtype=np.float32)
+    action = real
     if action.shape != shape:
         raise ValueError(f"action has shape {action.shape}, expected {shape}")
     if not np.isfinite(action).all():

@@ -65,7 +65,7 @@ def load_config(
             is wrong.
     """
     path = source if isinstance(source, (str, Path)) else None
-    base = _expand(cls, _read_yaml(Path(path)) if path is not None else _settings("config", source))
+    base = _expand(cls, _read_settings(cls, Path(path)) if path is not None else _settings("config", source))
     above = _expand(cls, _settings("overrides", overrides))
     merged = _merge(base, above)
     merged = _merge(_own_defaults(cls, merged), merged)
@@ -127,6 +127,14 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     except ValueError:  # an alias (*name) within its own anchor (&name)
         raise ConfigError(f"{path} has a value that holds itself; write it out instead of by an alias") from None
     return content or {}
+
+
+def _read_settings(cls: type[BaseModel], path: Path) -> Mapping[str, Any]:
+    """What a YAML file holds; that of a training is refused where settings of an environment are asked for."""
+    content = _read_yaml(path)
+    if "env_id" in content and "env_id" not in cls.model_fields:
+        raise ConfigError(f"{path} is the file of a training; settings of its environment are those under its key env")
+    return content
 
 
 def _settings(what: str, given: Any) -> Mapping[str, Any] | BaseModel:

@@ -7,6 +7,7 @@ import importlib
 import pkgutil
 import re
 from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -114,6 +115,10 @@ def load_task(task: str | type[Task]) -> type[Task]:
     if full in modules:
         return importlib.import_module(f"{__name__}.{modules[full]}").TASK
     if full not in _added:
+        if not module and name.isidentifier() and find_spec(f"piavatar_envs.multi.{name}"):
+            raise ValueError(
+                f"task={task!r} has several agents: use piavatar_envs.multi.{name}.parallel_env(), or its TASK"
+            )
         raise ValueError(f"unknown task {task!r}; {instead_of(task, [*modules, *_added])}")
     return load_task(_added[full])
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
 
 from piavatar_envs.api.gymnasium import AvatarEnv
 from piavatar_envs.envs.config import ConfigError
+
+ROOT = Path(__file__).parents[2]
 
 
 def refusal(env_id: str, settings: dict) -> str:
@@ -85,10 +90,60 @@ def test_every_seed_of_gymnasium_and_stable_baselines3_is_taken(make_env, env_id
     assert np.abs(env.reset(seed=(seed + 1) % 2**32)[0] - first).max() > 1e-4
 
 
-@pytest.mark.parametrize("seed", [-1, 2**32, "one"])
-def test_other_seeds_are_refused(make_env, env_id, seed):
-    with pytest.raises((ValueError, gymnasium.error.Error)):
-        make_env(env_id).reset(seed=seed)
+@pytest.mark.parametrize(("seed", "error"), [(-1, ValueError), (2**32, ValueError), ("one", gymnasium.error.Error)])
+def test_other_seeds_are_refused_before_anything_changes(make_env, env_id, seed, error):
+    env = make_env(env_id)
+    env.reset(seed=4)
+    generator, before = env.np_random, env.get_state()
+    with pytest.raises(error, match=r"seed=|Seed must be"):
+        env.reset(seed=seed)
+    after = env.get_state()
+    assert env.np_random is generator and env.np_random_seed == 4
+    assert all(before[name].tobytes() == after[name].tobytes() for name in before)
+
+
+def test_a_step_after_the_end_warns(device, env_id):
+    env = AvatarEnv(env_id, device=device, fidelity="tiny", episode_seconds=0.05)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        while not any(env.step(action)[2:4]):
+            pass
+        state = env.get_state()
+    with pytest.warns(UserWarning, match="call reset"):
+        env.step(action)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env.reset()
+        env.step(action)
+        env.set_state(state)
+        env.step(action)
+
+
+@pytest.mark.parametrize("action", [{"a": 1}, [[0.0], [0.0, 1.0]], "left"])
+def test_what_is_no_action_is_refused(make_env, env_id, action):
+    env = make_env(env_id)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action is a (dict|list|str).*array of shape"):
+        env.step(action)
+
+
+def test_a_torch_device_is_taken(device, env_id):
+    torch = pytest.importorskip("torch")
+    if device == "cpu":
+        assert AvatarEnv(env_id, device=torch.device("cpu"), fidelity="tiny").batch.device == "cpu"
+
+
+def test_what_is_no_task_of_one_agent_says_where_it_is(device):
+    with pytest.raises(ValueError, match=r"sumo_v0.*several agents.*piavatar_envs.multi.sumo_v0.parallel_env"):
+        AvatarEnv("sumo_v0", device=device)
+
+
+def test_files_of_trainings_are_refused_in_one_sentence(device, env_id):
+    with pytest.raises(ConfigError, match=r"reach_sb3.yaml is the file of a training.*under its key env") as caught:
+        AvatarEnv(env_id, device=device, config=ROOT / "configs" / "sb3" / "reach_sb3.yaml")
+    assert len(str(caught.value)) < 250
 
 
 def test_dictionary_is_the_flat_vector_by_name(make_env, env_id, equal):

@@ -117,6 +117,9 @@ def test_clocks_can_be_set_and_end_the_episodes(env):
     assert env.episode_length_buf.dtype == torch.int64
     with pytest.raises(ValueError, match=r"shape \(3,\), expected \(2,\)"):
         env.episode_length_buf = torch.zeros(3)
+    for length in (torch.nan, 0.5):  # one that is no number would never end
+        with pytest.raises(ValueError, match="whole numbers"):
+            env.episode_length_buf = torch.tensor([length, 1.0])
 
 
 def test_clocks_that_are_set_leave_the_world_alone(device):

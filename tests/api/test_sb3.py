@@ -112,7 +112,10 @@ def test_attributes_are_shared_and_methods_are_few(make_sb3, make_env, equal):
         with pytest.raises(IndexError, match=r"indices=\[2\]: there are num_envs=2; use 0 to 1"):
             call("action_names", indices=[1, 2])
     vector.seed(5)
+    with pytest.raises(IndexError):
+        vector.env_method("reset", indices=99)  # begins nothing
     observation = vector.reset()
+    assert equal(observation[0], single.reset(seed=5)[0])
     assert equal(single.set_state(vector.env_method("get_state", indices=1)[0]), observation[1])
     others = vector.vector.get_state()["particles.x"][0]
     [(started, info)] = vector.env_method("reset", seed=9, indices=1)

@@ -163,13 +163,29 @@ def test_bad_settings_are_refused(device, settings, told):
     assert all(part in str(caught.value) for part in told), caught.value
 
 
-@pytest.mark.parametrize("seed", ["3", np.array(3), 1.5, -1, [1, "2"]])
+@pytest.mark.parametrize("seed", ["3", np.array(3), 1.5, [1, "2"]])
 def test_what_is_no_seed_is_refused(make_vec, seed):
     vector = make_vec("PIAvatar/Reach-v0", 2)
     with pytest.raises(gymnasium.error.Error, match="Seed must be"):
         vector.reset(seed=seed)
+    for negative in (-1, [1, -1]):
+        with pytest.raises(ValueError, match="seed=-1 must be >= 0"):
+            vector.reset(seed=negative)
     with pytest.raises(ValueError, match="seed=4294967295 must be >= 0 and <= 4294967294"):
         vector.reset(seed=2**32 - 1)  # of the second environment it would be 2^32
+
+
+def test_a_refused_reset_leaves_its_mask(make_vec):
+    """Who tries again with the same options resets the same environments, not all of them."""
+    vector = make_vec("PIAvatar/Reach-v0", 2)
+    vector.reset(seed=5)
+    options = {"reset_mask": np.array([False, True])}
+    with pytest.raises(ValueError, match="3 seeds"):
+        vector.reset(seed=[1, 2, 3], options=options)
+    vector.reset(seed=[1, 2], options=options)
+    assert options == {} and vector.get_attr("np_random_seed") == (5, 2)
+    with pytest.raises(TypeError, match="list"):
+        vector.reset(options=["reset_mask"])
 
 
 def test_a_closed_vector_goes_on(device, equal):
