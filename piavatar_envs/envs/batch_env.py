@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.envs.actions import apply_actions, refuse_nonfinite
 from piavatar_envs.envs.draws import NUM_SEEDS
 from piavatar_envs.envs.episodes import begin_episode, count_episodes, end_agent, end_step, find_ended, retire
+from piavatar_envs.envs.idle import idle_settings
 from piavatar_envs.envs.joint_actions import apply_targets, apply_torques, follow_reference
 from piavatar_envs.envs.observer import Observer
 from piavatar_envs.envs.props import check_places
@@ -55,13 +57,15 @@ class BatchEnv:
     """
 
     def __init__(self, task: Task, num_envs: int = 1, device: str = "cpu", seed: int = 0) -> None:
-        """Build everything; call :meth:`reset` before :meth:`step`.
+        """Build everything; call :meth:`reset` before :meth:`step`. Warns of settings that have no effect.
 
         Raises:
             ConfigError: the task would place a prop outside the domain.
             ValueError: a bad device, batch or time step; see :class:`Simulation`.
         """
         check_count("num_envs", num_envs)
+        for told in idle_settings(task.config):
+            warnings.warn(told, stacklevel=2)
         self.task, self.config, self.num_envs = task, task.config, num_envs
         self.simulation = Simulation(
             task.config,

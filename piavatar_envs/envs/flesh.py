@@ -16,7 +16,7 @@ from piavatar_envs.avatar.settings import DriveSettings
 from piavatar_envs.avatar.skeleton import BODY_PARTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.soft_tissue import bone_distance, inert_share, softness
 from piavatar_envs.envs.bodies import BodyPool
-from piavatar_envs.envs.config import AvatarConfig, ConfigError, DriveConfig, EnvConfig, RegionConfig
+from piavatar_envs.envs.config import AvatarConfig, ConfigError, DriveConfig, EnvConfig, RegionConfig, ShapeConfig
 from piavatar_envs.envs.config import replace as changed
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.mpm.build import MaterialPoints
@@ -42,6 +42,18 @@ def drive_settings(d: DriveConfig) -> DriveSettings:
     )
 
 
+def shape_parameters(asset: AvatarAsset, shape: ShapeConfig) -> np.ndarray:
+    """Those of the body as it is configured, shape ``(S,)``.
+
+    Raises:
+        ConfigError: there is no shape parameter of that name.
+    """
+    try:
+        return asset.parameters(**shape.parameters)
+    except ValueError as error:
+        raise ConfigError(f"shape.parameters: {error}") from None
+
+
 class Flesh:
     """One avatar's matter in every environment of a batch.
 
@@ -58,13 +70,13 @@ class Flesh:
         """Shape the body.
 
         Raises:
-            ConfigError: a region holds nothing.
+            ConfigError: a region holds nothing, or there is no shape parameter of that name.
         """
         self.physics = changed(config.physics, avatar.physics)
         self.drive = changed(config.drive, avatar.drive)
         self.shape = changed(config.shape, avatar.shape)
         self.avatar, self.asset, self.sampled, self.num_envs = avatar, asset, sampled, num_envs
-        self.base_parameters = asset.parameters(**self.shape.parameters)
+        self.base_parameters = shape_parameters(asset, self.shape)
         self._shape_parameters = np.tile(self.base_parameters, (num_envs, 1))
         for region in avatar.regions:
             self.in_region(region)

@@ -17,6 +17,7 @@ from piavatar_envs.avatar.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
 from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.config import ConfigError, EnvConfig
 from piavatar_envs.envs.domain import Domain
+from piavatar_envs.envs.flesh import shape_parameters
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_rotation, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.tasks.base import Task
@@ -152,7 +153,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         super().__init__(config)
         dt = config.physics.control_dt
         asset = load_body()
-        body = asset.shape(asset.parameters(**config.shape.parameters))
+        body = asset.shape(shape_parameters(asset, config.shape))
         self.pelvis_height = float(body.joints[0, 2])
         try:
             motion = load_motion(config.motion, asset, body)

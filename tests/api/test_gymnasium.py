@@ -36,7 +36,7 @@ def refusal(env_id: str, settings: dict) -> str:
         ({"device": "cuda:99"}, ["device='cuda:99'", "cpu"]),
         ({"device": "tpu"}, ["device='tpu'", "cpu"]),
         ({"task": "Fly-v0"}, ["'Fly-v0'", "PIAvatar/Reach-v0", "PIAvatar/TrackMotion-v0"]),
-        ({"shape.parameters": {"tallness": 0.5}}, ["'tallness'", "height"]),
+        ({"shape.parameters": {"tallness": 0.5}}, ["shape.parameters", "'tallness'", "height"]),
         ({"young_modulus": 1e9, "num_substeps": 4, "control": "pose"}, ["CFL limit", "num_substeps >= "]),
     ],
 )
@@ -127,6 +127,23 @@ def test_what_is_no_action_is_refused(make_env, env_id, action):
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"action is a (dict|list|str).*array of shape"):
         env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "idle"),
+    [
+        ("Stand-v0", {"tone": 0.0, "strength": 0.5}, ["drive.tone=0.0"]),
+        ("Reach-v0", {"root_assist": 1.0, "tone": 0.5}, ["drive.root_assist=1.0"]),
+        ("Reach-v0", {"control": "pd", "alpha": 0.1, "firm_bones": False}, ["drive.alpha=0.1"]),
+        ("Stand-v0", {"tone": 1.0, "root_assist": 0.5}, []),
+    ],
+)
+def test_settings_that_have_no_effect_warn(device, task, settings, idle):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        AvatarEnv(task, device=device, fidelity="tiny", **settings)
+    told = [str(one.message) for one in caught if "no effect" in str(one.message)]
+    assert [one.split(" has")[0] for one in told] == idle
 
 
 def test_a_torch_device_is_taken(device, env_id):
