@@ -9,6 +9,8 @@ import numpy as np
 
 #: What is not finite here a step finds, and ends the episode with the failure that says so.
 _FOUND_BY_STEPS = ("particles.x", "particles.u", "particles.C", "particles.F")
+#: How the names of shares of help for the pelvis end.
+_HELP = ".assist"
 
 
 class Host(Protocol):
@@ -61,7 +63,7 @@ def check_state(state: Any, num_envs: int) -> None:
 
     Raises:
         ValueError: no mapping, an array of another number of environments, or a number that is not finite, unless a
-            step would find it or its environment has failed.
+            step would find it or its environment has failed; what resets leave as it is must be in range even then.
     """
     if not isinstance(state, Mapping):
         raise ValueError(f"the state is a {type(state).__name__} without any arrays; use what get_state() returned")
@@ -76,7 +78,26 @@ def check_state(state: Any, num_envs: int) -> None:
         failed = failure.reshape(num_envs, -1).any(1)
     for name, value in arrays.items():
         if value.dtype.kind == "f" and name not in _FOUND_BY_STEPS:
-            _check_finite(name, value, failed)
+            stays = _stays(name)
+            _check_finite(name, value, failed & (not stays))
+            if stays:
+                _check_range(name, value, 1.0 if name.endswith(_HELP) else np.inf)
+
+
+def _stays(name: str) -> bool:
+    """Whether resets leave an array as it is, or parts of it: what bodies are made of, and help from outside."""
+    return name.startswith(("matter.", "contact.")) or name.endswith(_HELP)
+
+
+def _check_range(name: str, value: np.ndarray, most: float) -> None:
+    """Refuse numbers that are negative or above ``most``."""
+    strange = (value < 0.0) | (value > most)
+    if strange.any():
+        first = tuple(np.argwhere(strange)[0].tolist())
+        limit = f" and <= {most:g}" if np.isfinite(most) else ""
+        raise ValueError(
+            f"state[{name!r}]{list(first)}={value[first]} must be >= 0{limit}; use what get_state() returned"
+        )
 
 
 def _check_finite(name: str, value: np.ndarray, failed: np.ndarray) -> None:

@@ -165,6 +165,30 @@ def test_malformed_states_are_refused_and_change_nothing(make_env, env_id, how, 
     assert np.array_equal(env.batch.observation.numpy(), observed)
 
 
+@pytest.mark.parametrize(
+    ("task", "name", "value", "told"),
+    [
+        ("Stand-v0", "joints_0.assist", 1e30, r"must be >= 0 and <= 1"),
+        ("Stand-v0", "joints_0.assist", np.nan, "not finite"),
+        ("KickBall-v0", "matter.mass", np.nan, "not finite"),
+        ("KickBall-v0", "matter.mass", -1.0, r"matter.mass.*=-1.0 must be >= 0;"),
+    ],
+)
+def test_what_no_reset_would_mend_is_refused_even_of_a_failed_run(make_env, task, name, value, told):
+    env = make_env(f"PIAvatar/{task}")
+    env.reset(seed=0)
+    state = env.get_state()
+    state["particles.failure"][:] = 1
+    state[name].flat[0] = value
+    with pytest.raises(ValueError, match=told):
+        env.set_state(state)
+    state[name] = env.get_state()[name]
+    state["particles.u"][:] = np.nan  # of a failed run
+    env.set_state(state)
+    env.reset(seed=0)
+    assert run_on(env, 1, seed=0)[0][4]["failure"] is None
+
+
 @pytest.mark.parametrize(("state", "told"), [(None, "is a NoneType"), ([1, 2], "is a list")])
 def test_what_is_no_state_is_refused(make_env, state, told):
     env = make_env("PIAvatar/Reach-v0")
