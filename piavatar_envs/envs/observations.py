@@ -11,6 +11,7 @@ import warp as wp
 
 from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_ACTUATED, NUM_JOINTS
 from piavatar_envs.avatar.types import Body, Tracked
+from piavatar_envs.envs.config_errors import ConfigError
 from piavatar_envs.mpm.materials import kirchhoff_stress, von_mises_stress
 from piavatar_envs.mpm.matrices import matrix_at
 from piavatar_envs.mpm.threads import environment_of
@@ -108,7 +109,9 @@ class ObservationLayout(dict[str, PlacedTerm]):
         start = 0
         for term in terms:
             if term.name in self:
-                raise ValueError(f"observation term {term.name!r} occurs twice")
+                raise ConfigError(
+                    f"observation term {term.name!r} occurs twice; name props (scene.props) and terms of a task otherwise"
+                )
             self[term.name] = PlacedTerm(**vars(term), slice=slice(start, start + term.size))
             start += term.size
         self.size = start
