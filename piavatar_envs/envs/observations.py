@@ -110,7 +110,7 @@ class ObservationLayout(dict[str, PlacedTerm]):
         for term in terms:
             if term.name in self:
                 raise ConfigError(
-                    f"observation term {term.name!r} occurs twice; name props (scene.props) and terms of a task otherwise"
+                    f"observation term {term.name!r} occurs twice; name props (scene.props) or the task's terms anew"
                 )
             self[term.name] = PlacedTerm(**vars(term), slice=slice(start, start + term.size))
             start += term.size

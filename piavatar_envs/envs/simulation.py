@@ -244,7 +244,7 @@ def check_device(device: str) -> str:
     """
     device = str(device)  # of torch, too
     if device.startswith("cuda") and not wp.get_cuda_device_count():
-        raise ValueError(f"device={device!r} is not available: there is no CUDA device, or no driver; use 'cpu'")
+        raise ValueError(f"device={device!r} is not available (no CUDA device, or no driver for one); use one of cpu")
     try:
         return str(wp.get_device(device).alias)
     except (ValueError, RuntimeError) as error:
