@@ -58,7 +58,7 @@ def torque_of_vector(v: wp.vec3, pull: wp.vec3):
     """Torque that does the work of ``pull`` on a rotation vector ``v``: ``J_l(v)^-T pull``.
 
     A rotation by ``dt w``, after that of ``v``, changes ``v`` by ``dt J_l(v)^-1 w``, with the left Jacobian of SO(3)
-    (Barfoot, "State Estimation for Robotics", 2017, eq. 7.77). Along ``v`` both are the same.
+    (Barfoot, "State Estimation for Robotics", 2017, section 7.1). Along ``v`` both are the same.
     """
     half = 0.5 * wp.length(v)
     c = 1.0 / 12.0 + half * half / 180.0
