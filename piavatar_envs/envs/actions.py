@@ -34,6 +34,15 @@ class ActionMap:
     root_turn: float  # root turn at action 1 [rad]
 
 
+#: How much farther than along one axis an action moves the root along both.
+_DIAGONAL = math.sqrt(2.0)
+
+
+def speed_within(reach: float, most: float, control_dt: float) -> float:
+    """``root_speed`` [m/s], ``most`` or less, by which no step of ``control_dt`` [s] goes beyond ``reach`` [m]."""
+    return min(most, reach / (_DIAGONAL * control_dt))
+
+
 @dataclass(frozen=True)
 class ActionSpec:
     """Meaning of an action vector, in order: three rotation increments a joint, then the root's.
@@ -55,7 +64,7 @@ class ActionSpec:
     @property
     def greatest_speed(self) -> float:
         """How fast an action can move the root horizontally [m/s]: along x and y at once."""
-        return math.sqrt(2.0) * self.root_speed
+        return _DIAGONAL * self.root_speed
 
     @property
     def size(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -11,7 +10,7 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.api.pettingzoo import AECEnv, AvatarParallelEnv, parallel_to_aec
-from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.envs.actions import ActionSpec, select_joints, speed_within
 from piavatar_envs.envs.config import EnvConfig, SceneConfig, replace
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
@@ -140,8 +139,7 @@ than `roam` from its place. All are paid alike, but for the cost of their action
 
     def action_spec(self) -> ActionSpec:
         config = self.config
-        # one step stays within reach, also along x and y at once
-        speed = min(config.root_speed, config.roam / (math.sqrt(2.0) * config.physics.control_dt))
+        speed = speed_within(config.roam, config.root_speed, config.physics.control_dt)
         return ActionSpec(self.joints, root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
 
     def domain(self) -> Domain:

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.envs.actions import ActionSpec
+from piavatar_envs.envs.actions import ActionSpec, speed_within
 from piavatar_envs.envs.config import EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
@@ -128,8 +128,7 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
 
     def action_spec(self) -> ActionSpec:
         config = self.config
-        # one step stays within the range, also along x and y at once
-        speed = min(ROOT_SPEED, config.root_range / (math.sqrt(2.0) * config.physics.control_dt))
+        speed = speed_within(config.root_range, ROOT_SPEED, config.physics.control_dt)
         return ActionSpec(self.joints, root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
 
     def domain(self) -> Domain:
