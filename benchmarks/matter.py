@@ -83,9 +83,11 @@ class Matter:
     @property
     def sums_are_clear(self) -> bool:
         """Whether no node holds anything that a later substep would add to."""
-        sums = self.scratch.sums
-        sets = [sums] if self.scratch.turns is None else [sums, self.scratch.turns]
-        arrays = [each for s in sets for each in (s.fixed, s.offset, s.offset_fixed, s.told)]
+        sums, turns = self.scratch.sums, self.scratch.turns
+        arrays = [sums.fixed, sums.offset, sums.offset_fixed, sums.told]
+        if turns is not None:
+            counts, ranks = turns
+            arrays += [counts.sum, counts.offset, counts.told, counts.fastest, ranks.rank, ranks.count]
         if self.model.scatter != "shared":  # whose sums are written, not added up
             arrays.append(sums.value)
         return not any(array.numpy().any() for array in arrays)

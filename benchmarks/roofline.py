@@ -154,8 +154,8 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
         "particles_to_grid": scatter,
         "runs_to_grid": scatter,
         "singles_to_grid": scatter,
-        # x, F, vk, spin in; x, u, C, F out; physical halves of sums in, added to, and cleared
-        "carry_on": particles * (72 + constants + WRITTEN_BYTES) + 2 * sums,
+        # x, F, vk, spin in; x, u, C, F out; physical halves of sums in, added to, and cleared, in 32 bits
+        "carry_on": particles * (72 + constants + WRITTEN_BYTES) + 2 * nodes * NODE_BYTES,
         # mass and physical momentum in and cleared, physical velocities out; more where contact is at hand
         "update_grid": 2 * sums // (2 if SCATTERS[model.scatter] else 1) + nodes * NODE_BYTES // 2,
         # x, F, vk, spin and physical velocities in; x, u, C, F out

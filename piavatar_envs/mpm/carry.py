@@ -10,14 +10,15 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import NOBODY, awaited_slot, mark_block, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_PARTICLE, nearest_boundary
+from piavatar_envs.mpm.counts import MOST_MASS, Counts, pass_speeds, speeds_of_launch
 from piavatar_envs.mpm.gather import Gathered, Gradients, begun, own_velocity, settled
 from piavatar_envs.mpm.materials import kirchhoff_stress
+from piavatar_envs.mpm.ranks import PART
 from piavatar_envs.mpm.singles import (
     TEAM,
     THREADS,
     any_of_team,
     block_of_thread,
-    fits,
     slots_of_thread,
 )
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, grid_position, in_same_brick, stencil_at
@@ -25,6 +26,7 @@ from piavatar_envs.mpm.sweep import LANES
 from piavatar_envs.mpm.team import (
     KINEMATIC_VELOCITY,
     MASS,
+    MASS_UNIT,
     SPIN,
     deformation_of_team,
     field_of,
@@ -32,18 +34,18 @@ from piavatar_envs.mpm.team import (
     read_by_team,
     store_by_team,
     substance_of_team,
-    units_of_team,
     vec6,
     vector_of_team,
 )
-from piavatar_envs.mpm.team_add import add_single
-from piavatar_envs.mpm.team_clear import clear_share
+from piavatar_envs.mpm.team_clear import clear_share, told_in_slot
+from piavatar_envs.mpm.team_count import count_single, speed_of
 from piavatar_envs.mpm.team_gather import gather_by_team
 from piavatar_envs.mpm.team_others import meets_others
 from piavatar_envs.mpm.team_sense import sense_by_team, slots_touched
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.transfer import admitted, affine_momentum, impulse_of_stress, placed, with_momentum
 from piavatar_envs.mpm.types import (
+    FAILURE_CFL,
     NO_STRESS,
     SPLIT,
     Blocks,
@@ -54,12 +56,12 @@ from piavatar_envs.mpm.types import (
     Particles,
     Sensors,
     Step,
-    Sums,
 )
 
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
+_CFL = wp.constant(FAILURE_CFL)
 #: Threads of a particle where there are several fields. Much is the same for all of them, so half as many do less.
 TEAM_OF_FIELDS = wp.constant(4)
 
@@ -75,6 +77,14 @@ class Turn:
     # (num_envs,) the first substep in which an environment takes no part: what threads of a launch find out must not
     # stop others of it, or what a failed environment is left with would depend on their order
     stops: wp.array(dtype=int)
+    order: wp.array2d(dtype=int)  # (num_envs, parts) see :mod:`piavatar_envs.mpm.ranks`
+
+
+@wp.func
+def particle_of_thread(team: int, thread: int, order: wp.array2d(dtype=int)):
+    """Environment and place of the particle that a thread is for; there may be none any more."""
+    at = environment_of(thread // (PART * team), order.shape[1])
+    return wp.vec2i(at[0], PART * order[at[0], at[1]] + thread % (PART * team) // team)
 
 
 @wp.func
@@ -172,55 +182,51 @@ def carry(
     boundaries: Boundaries,
     contact: Contact,
     turn: Turn,
-    per_env: int,
     others: wp.array2d(dtype=int),
     blocks: Blocks,
     moved: Moving,
     failure: wp.array(dtype=int),
-    sums: Sums,
+    counts: Counts,
     sensors: Sensors,
 ):
     """What :func:`carry_on` and, if there are ``several`` fields, :func:`carry_fields_on` do, by a ``team`` each."""
-    at = environment_of(thread // team, per_env)
+    at = particle_of_thread(team, thread, turn.order)
     e = at[0]
     p = wp.min(at[1], moved.x.shape[1] - 1)
     takes = at[1] < moved.x.shape[1] and turn.stops[e] > turn.substep
     x = moved.x[e, p]  # all is asked for at once, before it is known who takes part
     field = field_of(several, particles, p)
     used = slots_used(blocks, e)
-    share = LANES // team  # particles of a warp
-    mine = at[1] // share
-    told = bool(False)
-    if turn.swept >= 0:
-        told = sums.told[e, turn.swept + wp.min(mine, blocks.held.shape[1] - 1)] != 0
-    read = read_by_team(team, particles, moved, sums, e, p, field)
+    mine = at[1] * team // LANES  # a warp's number
+    told = told_in_slot(several, counts, e, turn.swept, wp.min(mine, blocks.held.shape[1] - 1))
+    speeds = speeds_of_launch(counts, e, turn.substep)
+    read = read_by_team(team, particles, moved, counts, e, p, field)
     stencil = stencil_at(grid_position(grid, x))
     slot = slots_of_thread(team, grid, blocks, e, field, stencil.base)
-    touched = wp.vec2i()
-    if several:
-        touched = slots_touched(sensors, e, slot, turn.substep + 1)
+    touched = slots_touched(several, sensors, e, slot, turn.substep + 1)
     distance = nearest_boundary(boundaries, e, x) * grid.inv_dx
-    units = units_of_team(team, read)
+    unit = number_of_team(team, read, MASS_UNIT)
     m = wp.where(takes, number_of_team(team, read, MASS), 0.0)
-    physical, kinematic = gather_by_team(
-        team, several, grid, step, boundaries, contact, sums, e, field, units, stencil,
+    physical, kinematic, crowd = gather_by_team(
+        team, several, grid, step, boundaries, contact, counts, e, field, unit * wp.vec2(1.0, speeds.gathered), stencil,
         records_of(turn.gathered, slot), distance, m, sensors,
     )  # fmt: skip
     if several:
         sense_by_team(team, particles, sensors, e, p, m, stencil, slot, touched)
-    if turn.swept >= 0:  # not before: who reads waits for what has been written
-        clear_share(sums, e, turn.swept, mine, used, per_env // share, told)
+    if not several and turn.swept >= 0:  # not before: who reads waits for what has been written
+        clear_share(counts, e, turn.swept, mine, used, PART * team // LANES * turn.order.shape[1], told)
     vk = vector_of_team(team, read, KINEMATIC_VELOCITY)
     s = settled_by_team(
         team, grid, step, boundaries, e, x, read, vk, physical, kinematic, stencil.f, distance < CONTACT_GATE
     )  # fmt: skip
-    adds = takes and s.fault == 0
+    fault = s.fault | wp.where(any_of_team(team, crowd > wp.uint32(MOST_MASS)), _CFL, 0)
+    adds = takes and fault == 0
     comes = bool(False)
     if adds:
         store_by_team(team, moved, e, p, s)
         slot, comes = come_to(team, grid, blocks, e, field, s.x, stencil.base, slot, failure)
     elif takes:
-        wp.atomic_or(failure, e, s.fault)
+        wp.atomic_or(failure, e, fault)
     tells = distance - wp.length(s.x - x) * grid.inv_dx < NEAR_PARTICLE
     if several:
         to = base_node(grid_position(grid, s.x))
@@ -231,12 +237,14 @@ def carry(
     if turn.scattered >= 0:
         homeless = any_of_team(team, wp.min(slot[0], slot[1]) == NOBODY)  # all threads of a particle add it up, or none
         adds = admitted(adds and not homeless, wp.isfinite(wp.length_sq(s.u) + wp.length_sq(vk)), e, failure)
-        adds = fits(grid, particles, e, p, s.x, vk, adds, tells, momentum, units[1], failure)
+        own = speed_of(momentum, m, vk, unit)
+        adds = pass_speeds(counts, e, turn.substep, speeds, at[1] == 0, adds, own, failure)
     if takes and (comes or not adds) and wp.atomic_or(failure, e, 0) != 0:  # nobody fails without coming here
         wp.atomic_min(turn.stops, e, turn.substep + 1)
     if turn.scattered >= 0:  # comes last: what a thread reads after its additions waits for them
         record = records_of(turn.scattered, wp.max(slot, wp.vec2i()))
-        add_single(team, grid, step, particles, sums, e, p, s.x, vk, adds, tells, record, units, momentum)
+        units = unit * wp.vec2(1.0, speeds.added)
+        count_single(team, grid, particles, counts, e, p, s.x, vk, adds, tells, record, units, momentum)
 
 
 @wp.kernel(launch_bounds=(THREADS, 4))
@@ -247,21 +255,17 @@ def carry_on(
     boundaries: Boundaries,
     contact: Contact,
     turn: Turn,
-    per_env: int,
     # in and out; vk is read
     blocks: Blocks,
     moved: Moving,
     failure: wp.array(dtype=int),
-    sums: Sums,
+    counts: Counts,
     sensors: Sensors,
 ):
-    """Move every particle with the nodes of one set of sums, add it to another, clear a third.
-
-    ``per_env`` particles fill whole warps; all are of one field.
-    """
+    """Move every particle, all of one field, with the nodes of one set of sums, add it to another, clear a third."""
     carry(
-        TEAM, False, wp.tid(), grid, step, particles, boundaries, contact, turn, per_env, blocks.fields, blocks, moved,
-        failure, sums, sensors,
+        TEAM, False, wp.tid(), grid, step, particles, boundaries, contact, turn, blocks.fields, blocks, moved, failure,
+        counts, sensors,
     )  # fmt: skip
 
 
@@ -278,7 +282,7 @@ def carry_fields_on(
     blocks: Blocks,
     moved: Moving,
     failure: wp.array(dtype=int),
-    sums: Sums,
+    counts: Counts,
     sensors: Sensors,
 ):
     """As :func:`carry_on`, of several fields, which have been in contact.
@@ -286,9 +290,7 @@ def carry_fields_on(
     A particle tells its nodes where it is if there was another field at any of them before the launch: that does not
     depend on the order in which others of it come to theirs.
     """
-    share = LANES // TEAM_OF_FIELDS
-    per_env = (moved.x.shape[1] + share - 1) // share * share
     carry(
-        TEAM_OF_FIELDS, True, wp.tid(), grid, step, particles, boundaries, contact, turn, per_env, others, blocks,
-        moved, failure, sums, sensors,
+        TEAM_OF_FIELDS, True, wp.tid(), grid, step, particles, boundaries, contact, turn, others, blocks, moved,
+        failure, counts, sensors,
     )  # fmt: skip

@@ -23,6 +23,8 @@ wp.set_module_options({"enable_backward": False})
 #: Nodes for which warps are launched at once where there are few environments: a large GPU has hardly room for more.
 #: And the fewest for which an environment gets them.
 NODES_AT_ONCE, FEWEST_NODES = 132 * 16, 4
+#: Slots for which warps are launched at once that clear what is not needed any longer, and the fewest as well.
+CLEARED_AT_ONCE, FEWEST_CLEARED = 132 * 16, 4
 #: Lists, and their lengths.
 LISTS, LENGTHS = wp.constant(2), wp.constant(3)
 
@@ -42,6 +44,8 @@ class Encounter:
     substep: int  # since blocks were marked; -1 before the first
     gathered: int  # the first slot of the set of sums that it is about
     warps: int  # of an environment that see to nodes where fields may touch
+    swept: int  # the first slot of a set of sums that nobody needs any longer
+    clearing: int  # warps of an environment that clear it
     stops: wp.array(dtype=int)  # (num_envs,) the first substep in which an environment takes no part
 
 
@@ -79,6 +83,11 @@ def meetings_of(model: Model, scratch: Scratch) -> Meetings:
 def warps_of_meeting(model: Model) -> int:
     """Warps of an environment, each with every so-many-th node."""
     return min(int(BLOCK_NODES) * most_shared(model), max(FEWEST_NODES, -(-NODES_AT_ONCE // model.num_envs)))
+
+
+def warps_that_clear(model: Model) -> int:
+    """Warps of an environment, each with every so-many-th slot."""
+    return min(model.max_slots, max(FEWEST_CLEARED, -(-CLEARED_AT_ONCE // model.num_envs)))
 
 
 @wp.func

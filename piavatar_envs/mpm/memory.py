@@ -189,13 +189,9 @@ def allocate_blocks(model: Model) -> Blocks:
     )
 
 
-def allocate_sums(model: Model, velocity: wp.array, sets: int = 1) -> Sums:
-    """Zeroed sums of the nodes, and their units; ``sets`` of them, one after the other.
-
-    Sums from shared memory come to the records of the ``velocity``.
-    """
-    slots = model.max_slots * sets
-    fixed, records = SCATTERS[model.scatter], (model.num_envs, int(BLOCK_NODES) * slots)
+def allocate_sums(model: Model, velocity: wp.array) -> Sums:
+    """Zeroed sums of the nodes, and their units. Sums from shared memory come to the records of the ``velocity``."""
+    fixed, records = SCATTERS[model.scatter], (model.num_envs, int(BLOCK_NODES) * model.max_slots)
     mass, momentum = units(model.contact.density.numpy(), model.grid, model.step)
     floats, integers = ((1, 1), records) if fixed else (records, (1, 1))
     return group(
@@ -207,7 +203,7 @@ def allocate_sums(model: Model, velocity: wp.array, sets: int = 1) -> Sums:
         offset_fixed=_zeros(model, integers, vec4l),
         mass_unit=wp.array(mass.astype(np.float32), dtype=float, device=model.device),
         momentum_unit=wp.array(momentum.astype(np.float32), dtype=float, device=model.device),
-        told=_zeros(model, (1, 1) if model.scatter == "shared" else (model.num_envs, slots), int),
+        told=_zeros(model, (1, 1) if model.scatter == "shared" else (model.num_envs, model.max_slots), int),
     )
 
 

@@ -19,15 +19,17 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import slots_used
 from piavatar_envs.mpm.carry import TEAM_OF_FIELDS, Turn, carry_fields_on, carry_on
+from piavatar_envs.mpm.counts import Counts, forget_all_speeds
 from piavatar_envs.mpm.meeting import meetings_of
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.ranks import PART, Ranks, forget_ranks
 from piavatar_envs.mpm.relay_contact import record_contact, record_meeting
-from piavatar_envs.mpm.singles import TEAM, THREADS, in_whole_warps, record_singles
+from piavatar_envs.mpm.singles import TEAM, THREADS, record_first
 from piavatar_envs.mpm.sweep import LANES, lanes_of_warp
 from piavatar_envs.mpm.team_clear import clear_slot
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.turns import TURNS
-from piavatar_envs.mpm.types import Blocks, Model, Moving, Scratch, State, Sums
+from piavatar_envs.mpm.turns import sets_of_sums
+from piavatar_envs.mpm.types import Blocks, Model, Moving, Scratch, State
 
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
@@ -45,50 +47,53 @@ def begin_turns(failure: wp.array(dtype=int), stops: wp.array(dtype=int)):
 
 
 @wp.kernel
-def sweep_sums(blocks: Blocks, swept: int, slots: int, sums: Sums):
-    """:func:`clear_slot` of all ``slots`` that an environment may have, a warp each."""
+def sweep_sums(blocks: Blocks, swept: int, slots: int, counts: Counts, ranks: Ranks):
+    """:func:`clear_slot` of all ``slots`` that an environment may have, a warp each; the first forgets the rest."""
     at = environment_of(wp.tid() // lanes_of_warp(), slots)
-    told = sums.told[at[0], swept + at[1]] != 0
+    told = counts.told[at[0], swept + at[1]] != 0
     if at[1] < slots_used(blocks, at[0]):
-        clear_slot(sums, at[0], swept + at[1], told)
+        clear_slot(counts, at[0], swept + at[1], told)
+    if at[1] == 0:
+        forget_all_speeds(counts, at[0])
+        forget_ranks(ranks, at[0])
 
 
 def record_relay(
     program: Program, model: Model, state: State, scratch: Scratch, moving: Moving, inputs: list[Any], count: int
 ) -> None:
-    """Append ``count`` substeps whose blocks have just been marked; ``inputs`` are those of :func:`record_singles`."""
-    m, s, sums = model, state, scratch.turns
+    """Append ``count`` substeps whose blocks have just been marked; ``inputs`` are those of :func:`record_first`."""
+    m, s, (counts, ranks) = model, state, scratch.turns
     stops = wp.zeros(m.num_envs, dtype=int, device=m.device)
-    record_singles(program, inputs, s.x.shape, s.failure, sums)
+    record_first(program, inputs, s.x.shape, s.failure, counts, ranks)
     program.launch(begin_turns, m.num_envs, [s.failure], [stops])
-    several = m.contact.num_fields > 1
+    several, sets = m.contact.num_fields > 1, sets_of_sums(m)
     team = int(TEAM_OF_FIELDS if several else TEAM)
-    per_env = in_whole_warps(m.num_particles, team)
     if several:
         record_contact(program, m, scratch)
     for index in range(count):
         turn = Turn()
-        turn.substep, turn.stops = index, stops
-        turn.gathered, turn.scattered, turn.swept = (m.max_slots * ((index + n) % TURNS) for n in (0, 1, 2))
+        turn.substep, turn.stops, turn.order = index, stops, ranks.order
+        turn.gathered, turn.scattered, turn.swept = (m.max_slots * ((index + n) % sets) for n in (0, 1, sets - 1))
         if index == count - 1:
             turn.scattered = -1
         if index == 0:
             turn.swept = -1
         if several:
-            record_meeting(program, m, scratch, stops, index, turn.gathered)
-        last = meetings_of(m, scratch).others[index & 1] if several else per_env
+            record_meeting(program, m, scratch, stops, index, turn.gathered, turn.swept)
+            turn.swept = -1
+        others = [meetings_of(m, scratch).others[index & 1]] if several else []
         program.launch(
             carry_fields_on if several else carry_on,
-            m.num_envs * per_env * team,
-            [m.grid, m.step, m.particles, m.boundaries, m.contact, turn, last],
-            [scratch.blocks, moving, s.failure, sums, scratch.sensors],
+            m.num_envs * ranks.order.shape[1] * int(PART) * team,
+            [m.grid, m.step, m.particles, m.boundaries, m.contact, turn, *others],
+            [scratch.blocks, moving, s.failure, counts, scratch.sensors],
             block_dim=THREADS,
         )
     program.launch(
         sweep_sums,
         m.num_envs * m.max_slots * LANES,
         [scratch.blocks, turn.gathered, m.max_slots],
-        [sums],
+        [counts, ranks],
         block_dim=THREADS,
     )
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.blocks import end_of_fields, first_record, has_field, lowest_field, nodes_shared, shared_block
+from piavatar_envs.mpm.counts import Counts, mass_counted
 from piavatar_envs.mpm.impulses import write_change
 from piavatar_envs.mpm.meeting import LENGTHS, Encounter, Meeting, begin_meeting, note_meeting
 from piavatar_envs.mpm.others import had_others, note_bits
 from piavatar_envs.mpm.stencil import BLOCK_NODES
-from piavatar_envs.mpm.sums import mass_counted
 from piavatar_envs.mpm.sweep import Sweep
-from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,7 +43,7 @@ def note_fields(
     e: int,
     blocks: Blocks,
     had: wp.array2d(dtype=int),
-    sums: Sums,
+    counts: Counts,
     others: wp.array2d(dtype=int),
     meeting: Meeting,
     sensors: Sensors,
@@ -70,9 +70,9 @@ def note_fields(
         for f in range(first, last):
             if has_field(mask, f):
                 r = first_record(grid, blocks, e, f, block) + local
-                m = mass_counted(sums, e, BLOCK_NODES * now.gathered + r)
+                m = mass_counted(counts, e, BLOCK_NODES * now.gathered + r)
                 told += wp.where(had_others(had, e, r), 1, 0)
-                present = present | wp.where(m > wp.int64(0), 1 << f, 0)
+                present = present | wp.where(m > 0, 1 << f, 0)
         tell = int(0)
         for f in range(first, last):
             if has_field(mask, f):

@@ -3,8 +3,8 @@
 Groups of particles, see :mod:`piavatar_envs.mpm.groups`, take time to find out which nodes they have in common. Where
 these are few, memory is faster asked for all additions. A particle has eight threads here, four in some relays (see
 :mod:`piavatar_envs.mpm.carry`), all of which know what it scatters. Each looks one or two of the eight blocks up that
-its stencil may lie in, and all of them add, see :mod:`piavatar_envs.mpm.team_add`. What is added are integers: runs
-repeat bit for bit.
+its stencil may lie in, and all of them add, see :mod:`piavatar_envs.mpm.team_add`, or where a relay begins
+:mod:`piavatar_envs.mpm.team_count`. What is added are integers: runs repeat bit for bit.
 """
 
 from __future__ import annotations
@@ -13,12 +13,24 @@ from typing import Any
 
 import warp as wp
 
+from piavatar_envs.mpm.counts import (
+    Counts,
+    countable,
+    forget_speeds,
+    known_speed,
+    mass_unit_of,
+    measure_speed,
+    speed_of_counts,
+)
 from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.ranks import NEAR, TELLS, Ranks, raise_rank, record_order
 from piavatar_envs.mpm.runs import KINEMATIC, bounded, told_by
 from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_index, grid_position
+from piavatar_envs.mpm.sums import units_of
 from piavatar_envs.mpm.sweep import LANES, lane_of_thread
 from piavatar_envs.mpm.team_add import add_single
+from piavatar_envs.mpm.team_count import count_single, speed_of
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.transfer import Scattered, admitted, moves_finitely, near_boundary, prepare, takes_part
 from piavatar_envs.mpm.types import (
@@ -31,14 +43,13 @@ from piavatar_envs.mpm.types import (
     Particles,
     Step,
     Sums,
-    row,
 )
 
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: Threads of a particle in the scatter alone. Teams of four are for some relays only, see
-#: :mod:`piavatar_envs.mpm.team_add`; four here, as tried before, need fewer instructions and more time.
+#: Threads of a particle in the scatter alone. Teams of four are for some relays only; four here, as tried before, need
+#: fewer instructions and more time.
 TEAM = wp.constant(8)
 #: Threads of a CUDA block.
 THREADS = 128
@@ -105,6 +116,56 @@ def fits(
     return adds
 
 
+@wp.struct
+class Single:
+    """A particle that is scattered, as all of its threads know it."""
+
+    p: int  # one that exists, also where there are no more
+    x: wp.vec3
+    vk: wp.vec3
+    field: int
+    record: int  # the first of the block that the thread has looked up
+    takes: bool
+    near: bool  # a boundary
+    tells: bool
+    scattered: Scattered
+
+
+@wp.func
+def single_of(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    moving: Moving,
+    blocks: Blocks,
+    at: wp.vec2i,
+    failure: wp.array(dtype=int),
+):
+    """Environment and place ``at`` which a team is say who it scatters; all threads of a warp come here."""
+    s = Single()
+    e = at[0]
+    s.p = wp.min(at[1], moving.x.shape[1] - 1)
+    if at[1] < moving.x.shape[1]:
+        # all is asked for at once, before it is known who takes part: a warp with few particles has little else to do
+        s.x = moving.x[e, s.p]
+        s.vk = moving.vk[e, s.p]
+        s.field = particles.field[s.p]
+        moves = moves_finitely(moving, e, s.p)
+        here = takes_part(blocks, e, failure)
+        block = block_of_thread(TEAM, grid, base_node(grid_position(grid, s.x)), 0)
+        s.record = BLOCK_NODES * blocks.slot[e, s.field * grid.num_blocks + block]
+        if contact.num_fields > 1:
+            s.tells = blocks.fields[e, block] != (1 << s.field)
+        s.scattered = prepare(grid, step, particles, moving, e, s.p, False)
+        s.near = near_boundary(grid, boundaries, e, s.x)
+        s.tells = s.tells or s.near
+        s.takes = admitted(here, moves, e, failure)
+    s.tells = any_of_team(TEAM, s.tells)
+    return s
+
+
 @wp.kernel(launch_bounds=(THREADS, 5))
 def singles_to_grid(
     grid: Grid,
@@ -122,35 +183,65 @@ def singles_to_grid(
     """The same sums as :func:`piavatar_envs.mpm.transfer.particles_to_grid`; ``per_env`` particles fill whole warps."""
     at = environment_of(wp.tid() // TEAM, per_env)
     e = at[0]
-    p = at[1]
-    takes = bool(False)
-    tells = bool(False)
-    record = wp.vec2i()
-    units = wp.vec2()
-    s = Scattered()
-    x = wp.vec3()
-    vk = wp.vec3()
-    if p < moving.x.shape[1]:
-        # all is asked for at once, before it is known who takes part: a warp with few particles has little else to do
-        x = moving.x[e, p]
-        vk = moving.vk[e, p]
-        field = particles.field[p]
-        moves = moves_finitely(moving, e, p)
-        here = takes_part(blocks, e, failure)
-        block = block_of_thread(TEAM, grid, base_node(grid_position(grid, x)), 0)
-        record[0] = BLOCK_NODES * blocks.slot[e, field * grid.num_blocks + block]
-        units[0] = sums.mass_unit[row(e, sums.mass_unit.shape[0]), field]
-        units[1] = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
-        if contact.num_fields > 1:
-            tells = blocks.fields[e, block] != (1 << field)
-        s = prepare(grid, step, particles, moving, e, p, False)
-        tells = tells or near_boundary(grid, boundaries, e, x)
-        takes = admitted(here, moves, e, failure)
-    tells = any_of_team(TEAM, tells)
-    driven = tells or step.decoupling == PAPER
-    takes = fits(grid, particles, e, p, x, vk, takes, driven, s, units[1], failure)
+    s = single_of(grid, step, particles, boundaries, contact, moving, blocks, at, failure)
+    units = units_of(sums, e, s.field)
+    driven = s.tells or step.decoupling == PAPER
+    takes = fits(grid, particles, e, s.p, s.x, s.vk, s.takes, driven, s.scattered, units[1], failure)
     add_single(
-        TEAM, grid, step, particles, sums, e, wp.min(p, moving.x.shape[1] - 1), x, vk, takes, tells, record, units, s
+        grid, step, particles, sums, e, s.p, s.x, s.vk, takes, s.tells, s.record, units, s.scattered
+    )  # fmt: skip
+
+
+@wp.kernel
+def measure_singles(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    moving: Moving,
+    per_env: int,
+    # in and out
+    counts: Counts,
+):
+    """Find the speeds at which the first two sums of a relay count momenta; ``per_env`` particles fill whole warps."""
+    at = environment_of(wp.tid(), per_env)
+    e = at[0]
+    p = wp.min(at[1], moving.x.shape[1] - 1)
+    s = prepare(grid, step, particles, moving, e, p, False)
+    unit = mass_unit_of(counts, e, particles.field[p])
+    speed = speed_of(s, s.at_base[0], moving.vk[e, p], unit)
+    # who does not move finitely is seen to by who adds up
+    measure_speed(counts, e, 0, known_speed(counts, e, 0), wp.where(wp.isfinite(speed), speed, 0.0))
+
+
+@wp.kernel(launch_bounds=(THREADS, 5))
+def singles_to_counts(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    moving: Moving,
+    blocks: Blocks,
+    per_env: int,
+    # in and out
+    failure: wp.array(dtype=int),
+    counts: Counts,
+    ranks: Ranks,
+):
+    """As :func:`singles_to_grid`, the first sums of a relay, which have been measured; also, find ranks."""
+    at = environment_of(wp.tid() // TEAM, per_env)
+    e = at[0]
+    s = single_of(grid, step, particles, boundaries, contact, moving, blocks, at, failure)
+    unit = mass_unit_of(counts, e, s.field)
+    counted = speed_of_counts(counts, e, 0)
+    takes = countable(s.takes, speed_of(s.scattered, s.scattered.at_base[0], s.vk, unit), counted, e, failure)
+    if at[1] == 0:
+        forget_speeds(counts, e, 0)
+    if s.tells:
+        raise_rank(ranks, e, s.p, wp.where(s.near, NEAR, TELLS))
+    record, units = wp.vec2i(s.record), unit * wp.vec2(1.0, counted)
+    count_single(
+        TEAM, grid, particles, counts, e, s.p, s.x, s.vk, takes, s.tells, record, units, s.scattered
     )  # fmt: skip
 
 
@@ -165,3 +256,17 @@ def record_singles(program: Program, inputs: list[Any], shape: tuple[int, int], 
     per_env = in_whole_warps(shape[1], int(TEAM))
     threads = shape[0] * per_env * int(TEAM)
     program.launch(singles_to_grid, threads, [*inputs, per_env], [failure, sums], block_dim=THREADS)
+
+
+def record_first(
+    program: Program, inputs: list[Any], shape: tuple[int, int], failure: Any, counts: Counts, ranks: Ranks
+) -> None:
+    """Append :func:`singles_to_counts`, as :func:`record_singles`, where nobody has been measured or has a rank yet."""
+    grid, step, particles, _, _, moving, _ = inputs
+    per_env = in_whole_warps(shape[1], int(TEAM))
+    particles_of_warps = in_whole_warps(shape[1], 1)
+    measured = [grid, step, particles, moving, particles_of_warps]
+    program.launch(measure_singles, shape[0] * particles_of_warps, measured, [counts], block_dim=THREADS)
+    threads = shape[0] * per_env * int(TEAM)
+    program.launch(singles_to_counts, threads, [*inputs, per_env], [failure, counts, ranks], block_dim=THREADS)
+    record_order(program, ranks)

@@ -110,18 +110,6 @@ def begin_sum(sums: Sums, e: int, r: int):
     return s
 
 
-@wp.func_native("return *reinterpret_cast<const wp::int64*>(&wp::index(sums.fixed, e, at));")
-def first_number(sums: Sums, e: int, at: int) -> wp.int64:
-    """The first of the numbers of ``sums.fixed[e, at]``, alone."""
-    ...
-
-
-@wp.func
-def mass_counted(sums: Sums, e: int, r: int):
-    """How many units of mass there are in fixed point at record ``r``."""
-    return first_number(sums, e, half_of(r, 0))
-
-
 @wp.func
 def take_sum(sums: Sums, e: int, f: int, r: int):
     """Mass, physical and kinematic momentum of record ``r`` of field ``f``, which is cleared."""
@@ -129,34 +117,11 @@ def take_sum(sums: Sums, e: int, f: int, r: int):
 
 
 @wp.func
-def kinematic_numbers(sums: Sums, e: int, r: int):
-    """Kinematic momentum in fixed point of record ``r``."""
-    return numbers_at(sums.fixed, e, half_of(r, 1))
-
-
-@wp.func
-def sum_from(units: wp.vec2, begun: vec4l, kinematic: vec4l):
-    """Mass, physical and kinematic momentum, from both in fixed point."""
-    b = counted(kinematic)
-    p = units[1]
-    return physical_sum(units, counted(begun)) + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
-
-
-@wp.func
 def sum_of(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l):
     """Mass, physical and kinematic momentum in fixed point, of what has ``begun``; nothing is cleared."""
-    return sum_from(units, begun, kinematic_numbers(sums, e, r))
-
-
-@wp.func
-def give_momentum(sums: Sums, e: int, f: int, r: int, J: wp.vec3):
-    """Add an impulse [N s] to record ``r`` of field ``f``, in fixed point, where nobody else adds."""
-    unit = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
-    J = J / unit
-    at = half_of(r, 0)
-    sums.fixed[e, at] = sums.fixed[e, at] + vec4l(
-        wp.int64(0), wp.int64(wp.rint(J[0])), wp.int64(wp.rint(J[1])), wp.int64(wp.rint(J[2]))
-    )
+    b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
+    p = units[1]
+    return physical_sum(units, counted(begun)) + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
 
 
 @wp.func
@@ -190,18 +155,12 @@ def offset_unit(grid: Grid, sums: Sums, e: int, f: int):
 
 
 @wp.func
-def offset_from(grid: Grid, sums: Sums, e: int, f: int, n: vec4l):
-    """:func:`offset_at`, from what is in fixed point."""
-    s = offset_unit(grid, sums, e, f) * counted(n)
-    return wp.vec4(s[0], s[1], s[2], s[3] / grid.dx)
-
-
-@wp.func
 def offset_at(grid: Grid, sums: Sums, e: int, f: int, r: int):
     """Sum of ``w m (x_i - x_p)`` [kg m] and of the mass of seam particles [kg] at record ``r`` of field ``f``."""
     if sums.is_fixed == 0:
         return sums.offset[e, r]
-    return offset_from(grid, sums, e, f, numbers_at(sums.offset_fixed, e, r))
+    s = offset_unit(grid, sums, e, f) * counted(numbers_at(sums.offset_fixed, e, r))
+    return wp.vec4(s[0], s[1], s[2], s[3] / grid.dx)
 
 
 @wp.func

@@ -1,9 +1,7 @@
 """What the threads that a particle has, its team, do together: they share its stencil's nodes, and what it becomes.
 
 A ``team`` is of eight threads or of four. Kernels say which by a literal, so that their compiler knows what each thread
-has. Thread ``t`` has the nodes ``t``, ``t + team``, ``t + 2 team`` and so on of the 27, in order of x, y and z; only
-the first three threads have the last of them. What they find is added up by exchanges, after which all of them know it.
-Each has looked one of eight blocks up, or two: see :func:`piavatar_envs.mpm.singles.slots_of_thread`.
+has: see :mod:`piavatar_envs.mpm.team_nodes`. What they find is added up by exchanges, after which all of them know it.
 """
 
 from __future__ import annotations
@@ -12,66 +10,20 @@ import re
 
 import warp as wp
 
+from piavatar_envs.mpm.counts import Counts
 from piavatar_envs.mpm.gather import Gathered
 from piavatar_envs.mpm.shared_memory import native
-from piavatar_envs.mpm.types import Moving, Particles, Sums
+from piavatar_envs.mpm.types import Moving, Particles
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 #: Where the numbers of a particle begin among those that its threads have read: see :func:`read_by_team`.
-_F, _VK, _SPIN, _MASS, _VOLUME, _MU, _LAM, _MATERIAL, _UNITS = (
+_F, _VK, _SPIN, _MASS, _VOLUME, _MU, _LAM, _MATERIAL, _UNIT = (
     wp.constant(n) for n in (0, 9, 12, 15, 16, 17, 18, 19, 20)
 )
-KINEMATIC_VELOCITY, SPIN, MASS = _VK, _SPIN, _MASS
+KINEMATIC_VELOCITY, SPIN, MASS, MASS_UNIT = _VK, _SPIN, _MASS, _UNIT
 #: Those that a thread has read, of which one of eight has three.
 vec6 = wp.types.vector(6, float)
-
-
-@wp.func_native(
-    native(
-        """
-const int node = (threadIdx.x & team - 1) + team * n;
-if (node > 26) return wp::vec_t<3, wp::int32>(-1, 0, 0);
-const int line = node * 11 >> 5;  // a third
-const int plane = node * 57 >> 9;  // a ninth
-return wp::vec_t<3, wp::int32>(plane, line - 3 * plane, node - 3 * line);
-""",
-        "return wp::vec_t<3, wp::int32>(-1, 0, 0);",
-    )
-)
-def node_of_thread(team: int, n: int) -> wp.vec3i:
-    """Place in the stencil of the ``n``-th node that a thread has; -1 along x if it has none."""
-    ...
-
-
-@wp.func_native(
-    native(
-        """
-const int i = (base[0] & 3) + node[0], j = (base[1] & 3) + node[1], k = (base[2] & 3) + node[2];
-const int block = (i & 4) | (j >> 1 & 2) | (k >> 2 & 1), from = (threadIdx.x & 32 - team) | (block & team - 1);
-int first = __shfl_sync(0xffffffffu, record[0], from);
-if (team == 4) {
-    const int second = __shfl_sync(0xffffffffu, record[1], from);
-    if (block & 4) first = second;
-}
-return first + 16 * (i & 3) + 4 * (j & 3) + (k & 3);
-""",
-        "return record[0];",
-    )
-)
-def record_in_team(team: int, base: wp.vec3i, node: wp.vec3i, record: wp.vec2i) -> int:
-    """Record of a ``node`` of the stencil at ``base``.
-
-    ``record`` are the first of the blocks that the thread has looked up, see
-    :func:`piavatar_envs.mpm.singles.slots_of_thread`. All threads of a warp come here.
-    """
-    ...
-
-
-@wp.func_native("return n == 0 ? w[0] : n == 1 ? w[1] : w[2];")
-def weight_at(w: wp.vec3, n: int) -> float:
-    """``w[n]`` out of registers."""
-    ...
 
 
 @wp.func_native(
@@ -92,22 +44,6 @@ return sums;
 )
 def sum_of_team(team: int, own: wp.mat44) -> wp.mat44:
     """Sum of the last three columns over the threads of a particle; all threads of a warp come here."""
-    ...
-
-
-@wp.func_native(
-    native("""
-int4* const first = reinterpret_cast<int4*>(&wp::index(sums.fixed, e, 2 * record)) + (threadIdx.x & 31);
-const int4 zero = make_int4(0, 0, 0, 0);  // two for each of the 64 physical halves, then as many kinematic ones
-#pragma unroll
-for (int n = 0; n < 128; n += 32) first[n] = zero;
-if (driven)
-#pragma unroll 1
-    for (int n = 128; n < 256; n += 32) first[n] = zero;
-""")
-)
-def clear_halves(sums: Sums, e: int, record: int, driven: bool):
-    """Zero the sums of a slot's nodes, from its first ``record``, the kinematic ones only if any were ``driven``."""
     ...
 
 
@@ -160,8 +96,7 @@ _READ = {
     _MU: "constant(particles.mu, p)",
     _LAM: "constant(particles.lam, p)",
     _MATERIAL: "constant(particles.material, p)",
-    _UNITS: "constant(sums.mass_unit, field)",
-    _UNITS + 1: "constant(sums.momentum_unit, field)",
+    _UNIT: "constant(counts.mass_unit, field)",
 }
 
 
@@ -206,11 +141,11 @@ return read;
         "return wp::vec_t<6, wp::float32>();",
     )
 )
-def read_by_team(team: int, particles: Particles, moved: Moving, sums: Sums, e: int, p: int, field: int) -> vec6:
+def read_by_team(team: int, particles: Particles, moved: Moving, counts: Counts, e: int, p: int, field: int) -> vec6:
     """A thread's three or six of the numbers of a particle of a ``field``.
 
-    Those are its deformation, kinematic velocity, spin and substance, and the units of its sums: they would take many
-    registers of every thread until it needs them, and as many loads.
+    Those are its deformation, kinematic velocity, spin and substance, and the unit of its field's mass: they would take
+    many registers of every thread until it needs them, and as many loads.
     """
     ...
 
@@ -273,12 +208,6 @@ def substance_of_team(team: int, read: vec6):
     s.lam = number_of_team(team, read, _LAM)
     s.material = material_of_team(team, read)
     return s
-
-
-@wp.func
-def units_of_team(team: int, read: vec6):
-    """Units of mass [kg] and of momentum [kg m/s]."""
-    return wp.vec2(number_of_team(team, read, _UNITS), number_of_team(team, read, _UNITS + 1))
 
 
 @wp.func

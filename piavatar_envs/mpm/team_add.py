@@ -1,10 +1,7 @@
 """The additions of a particle's threads, its team, to the nodes of its stencil; see :mod:`piavatar_envs.mpm.singles`.
 
-To every node four threads add together, one of four numbers each: 32 bytes, which memory takes at a time. A team of
-eight does that for two nodes at a time.
-
-A team of four is of a relay of several fields, see :mod:`piavatar_envs.mpm.carry`: its sums are in fixed point, and its
-warps wait for their program more than others, so one piece of it adds all that they have.
+To every node four threads add together, one of four numbers each: 32 bytes, which memory takes at a time. Eight do that
+for two nodes at a time. Relays, whose sums are others, have :mod:`piavatar_envs.mpm.team_count`.
 """
 
 from __future__ import annotations
@@ -27,8 +24,8 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 constexpr unsigned ALL = 0xffffffffu;
 if (!__any_sync(ALL, takes)) return;
 const int lane = threadIdx.x & 31, c = lane & 3;  // of the four numbers
-const bool is_second = lane & team - 1 & 4;  // of two who add up one number, on every other line of nodes
-const bool is_place = kind == {int(PLACE)}, is_fixed = team == 4 || sums.is_fixed != 0;
+const bool is_second = lane & 4;  // of two who add up one number, on every other line of nodes
+const bool is_place = kind == {int(PLACE)}, is_fixed = sums.is_fixed != 0;
 // units are powers of two: one over them is exact, however the module divides
 auto per = [](float unit) {{ return __int_as_float(0x7f000000 - __float_as_int(unit)); }};
 float scale = is_place && c > 0 ? grid.dx : 1.0f, massive = 1.0f;
@@ -50,20 +47,12 @@ const int size = is_fixed ? 32 : 16;  // from a node to the next of a block [byt
 const int blocks_apart = is_place ? 1 : 2;  // the halves of records lie apart
 struct Fixed {{ enum {{ FIXED = 1 }}; }};
 struct Floating {{ enum {{ FIXED = 0 }}; }};
-int bx = base[0] & 3;
-const int by = base[1] & 3, bz = base[2] & 3;
-wp::vec_t<3, wp::float32> x = wx;
-if (team == 4) {{  // or a compiler keeps the nodes and weights of all kinds, for which there are too few registers
-    asm volatile("" : "+r"(bx));
-    asm volatile("" : "+f"(x[0]));
-    asm volatile("" : "+f"(x[1]));
-    asm volatile("" : "+f"(x[2]));
-}}
+const int bx = base[0] & 3, by = base[1] & 3, bz = base[2] & 3;
 int lower[4], upper[4];  // of the threads that have looked them up
 #pragma unroll
 for (int n = 0; n < 4; ++n) {{
-    lower[n] = blocks_apart * __shfl_sync(ALL, record[0], lane & 32 - team | n);
-    upper[n] = blocks_apart * __shfl_sync(ALL, team == 4 ? record[1] : record[0], lane & 32 - team | team - 1 & 4 | n);
+    lower[n] = blocks_apart * __shfl_sync(ALL, record, lane & 24 | n);
+    upper[n] = blocks_apart * __shfl_sync(ALL, record, lane & 24 | 4 | n);
 }}
 auto add = [&](auto sum) {{
     constexpr bool FIXED = decltype(sum)::FIXED;
@@ -87,21 +76,12 @@ auto add = [&](auto sum) {{
                 asm volatile("red.global.add.f32 [%0], %1;" :: "l"(node), "f"(number) : "memory");
         }}
     }};
-    if (team == 4) {{
-#pragma unroll 1  // warps wait for their program
-        for (int i = 0; i < 3; ++i) {{
-            const float wi = i == 0 ? x[0] : i == 1 ? x[1] : x[2];
-#pragma unroll
-            for (int j = 0; j < 3; ++j) add_line(i, j, wi * wy[j]);
-        }}
-        return;
-    }}
 #pragma unroll
     for (int first = 0; first < 9; first += 2) {{  // the second of two threads has the lines between
         if (first == 8 && is_second) break;
         const int second = first < 8 ? first + 1 : first;
         const int i = is_second ? second / 3 : first / 3, j = is_second ? second % 3 : first % 3;
-        add_line(i, j, is_second ? x[second / 3] * wy[second % 3] : x[first / 3] * wy[first % 3]);
+        add_line(i, j, is_second ? wx[second / 3] * wy[second % 3] : wx[first / 3] * wy[first % 3]);
     }}
 }};
 if (is_fixed) add(Fixed());
@@ -109,7 +89,6 @@ else add(Floating());
 """)
 )
 def add_to_nodes(
-    team: int,
     grid: Grid,
     sums: Sums,
     e: int,
@@ -122,12 +101,12 @@ def add_to_nodes(
     s: wp.vec4,
     A: wp.mat33,
     mass: float,
-    record: wp.vec2i,
+    record: int,
     units: wp.vec2,
 ):
     """Add a scalar and a vector to the 27 nodes of a stencil, ``s`` at the lowest node, the latter changing by ``A``.
 
-    ``record`` are the first of :func:`piavatar_envs.mpm.singles.slots_of_thread`, ``units`` are of mass and of
+    ``record`` is the first of :func:`piavatar_envs.mpm.singles.slots_of_thread`, ``units`` are of mass and of
     momentum. All threads of a warp come here.
     """
     ...
@@ -135,7 +114,6 @@ def add_to_nodes(
 
 @wp.func
 def add_single(
-    team: int,
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -146,48 +124,31 @@ def add_single(
     vk: wp.vec3,
     takes: bool,
     tells: bool,
-    record: wp.vec2i,
+    record: int,
     units: wp.vec2,
     momentum: Scattered,
 ):
     """Add to the nodes what particle ``p`` scatters, if it ``takes`` part: its mass and ``momentum``, what it tells.
 
     All threads of a warp come here, ``record`` and ``units`` as for :func:`add_to_nodes`: all threads of a particle
-    take part or none, and their records exist even where they do not. A ``team`` of four is for sums in fixed point,
-    and not for the paper's variant, as relays are.
+    take part or none, and their records exist even where they do not.
     """
     mass = momentum.at_base[0]
     told = takes and tells
     if told:
-        sums.told[e, record[0] // BLOCK_NODES] = 1
-        if team == 4:
-            sums.told[e, record[1] // BLOCK_NODES] = 1
+        sums.told[e, record // BLOCK_NODES] = 1
     # momentum comes last: what a thread reads after its additions waits for them
-    if team == 4:
-        kind = wp.where(any_lane(told), int(KINEMATIC), int(MOMENTUM))
-        goes_on = bool(True)
-        while goes_on:
-            s = momentum
-            adds = takes
-            if kind != MOMENTUM:
-                s = told_by(grid, particles, e, p, x, vk, kind)
-                adds = told
-            add_one(team, grid, sums, e, adds, kind, s, mass, record, units)
-            goes_on = kind != MOMENTUM
-            kind = wp.where(kind == KINEMATIC, int(PLACE), int(MOMENTUM))
-        return
     kind = int(KINEMATIC)
     adds = takes and (tells or step.decoupling == PAPER)  # which needs that gradient everywhere
     while any_lane(adds):
-        add_one(team, grid, sums, e, adds, kind, told_by(grid, particles, e, p, x, vk, kind), mass, record, units)
+        add_one(grid, sums, e, adds, kind, told_by(grid, particles, e, p, x, vk, kind), mass, record, units)
         kind += 1
         adds = told and kind <= PLACE
-    add_one(team, grid, sums, e, takes, MOMENTUM, momentum, mass, record, units)
+    add_one(grid, sums, e, takes, MOMENTUM, momentum, mass, record, units)
 
 
 @wp.func
 def add_one(
-    team: int,
     grid: Grid,
     sums: Sums,
     e: int,
@@ -195,12 +156,12 @@ def add_one(
     kind: int,
     s: Scattered,
     mass: float,
-    record: wp.vec2i,
+    record: int,
     units: wp.vec2,
 ):
     """:func:`add_to_nodes` of what a particle scatters of a ``kind``."""
     at_base = wp.vec4(s.at_base[0], s.at_base[1], s.at_base[2], s.at_base[3])
     add_to_nodes(
-        team, grid, sums, e, takes, kind, s.base, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), at_base, s.A, mass,
-        record, units,
+        grid, sums, e, takes, kind, s.base, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), at_base, s.A, mass, record,
+        units,
     )  # fmt: skip

@@ -8,19 +8,25 @@ from piavatar_envs.mpm.impulses import read_change
 from piavatar_envs.mpm.sensing import give, take_share
 from piavatar_envs.mpm.stencil import BLOCK_NODES, Stencil
 from piavatar_envs.mpm.sweep import any_lane, lane_of_thread, vector_sum_of_team
-from piavatar_envs.mpm.team import node_of_thread, record_in_team
 from piavatar_envs.mpm.team_gather import weight_of
+from piavatar_envs.mpm.team_nodes import node_of_thread, record_in_team
 from piavatar_envs.mpm.types import Particles, Sensors
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 
 @wp.func
-def slots_touched(sensors: Sensors, e: int, slot: wp.vec2i, mark: int):
-    """Which of the blocks that a thread has looked up contact has given a ``mark``: 0 if it has not."""
-    first = sensors.touched[e, slot[0]]
-    second = sensors.touched[e, slot[1]]
-    return wp.vec2i(int(first == mark), int(second == mark))
+def slots_touched(several: bool, sensors: Sensors, e: int, slot: wp.vec2i, mark: int):
+    """Which of the blocks that a thread has looked up contact has given a ``mark``: 0 if it has not.
+
+    It has not where there are not ``several`` fields.
+    """
+    touched = wp.vec2i()
+    if several:
+        first = sensors.touched[e, slot[0]]
+        second = sensors.touched[e, slot[1]]
+        touched = wp.vec2i(int(first == mark), int(second == mark))
+    return touched
 
 
 @wp.func
@@ -51,7 +57,7 @@ def sense_by_team(
     sensor = particles.sensor[p]
     nodes = (26 + team) // team  # not a constant: what few particles come to is as short as can be
     for n in range(nodes):
-        node = node_of_thread(team, n)
+        node = node_of_thread(team, stencil.base, n)
         r = record_in_team(team, stencil.base, node, record)
         if sensor >= 0 and node[0] >= 0 and r >= 0:
             taken = take_share(sensors, e, sensor, taken, read_change(sensors.node, e, r), m * weight_of(stencil, node))

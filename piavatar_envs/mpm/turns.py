@@ -5,8 +5,13 @@ from __future__ import annotations
 from piavatar_envs.mpm.memory import MOST_SLOTS
 from piavatar_envs.mpm.types import PAPER, Model
 
-#: Sets of sums that those worlds have.
+#: Sets of sums that those worlds have at most.
 TURNS = 3
+
+
+def sets_of_sums(model: Model) -> int:
+    """One is gathered, one is added to; and one is cleared, unless contact comes between and does that."""
+    return TURNS if model.contact.num_fields == 1 else TURNS - 1
 
 
 def has_turns(model: Model) -> bool:

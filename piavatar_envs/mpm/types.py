@@ -313,7 +313,7 @@ class Scratch:
         facing: vec4: what nodes of blocks with several fields say of normals, see :mod:`piavatar_envs.mpm.normals`.
         sensors: what contact did in this control step.
         room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
-        turns: sets of sums in turns, of ``TURNS * S`` slots, where :mod:`piavatar_envs.mpm.relay` has been recorded.
+        turns: sums and ranks of relays (``counts``, ``ranks``), where :mod:`piavatar_envs.mpm.relay` has been recorded.
         ahead: what gathers leave for scatters, where :mod:`piavatar_envs.mpm.ahead` has been recorded.
         meetings: who may touch where, see :mod:`piavatar_envs.mpm.meeting`.
     """
@@ -325,6 +325,6 @@ class Scratch:
     sensors: Sensors
     room: Room
     large_room: bool
-    turns: Sums | None = None
+    turns: tuple | None = None
     ahead: object | None = None
     meetings: object | None = None

@@ -292,12 +292,14 @@ def test_relays_of_several_fields_repeat_bit_for_bit(clash):
 
 
 def test_warps_that_have_several_nodes(clash, monkeypatch):
-    """Where there are many environments, a warp comes back for more of the nodes at which fields may touch."""
+    """Where there are many environments, a warp comes back for more nodes at which fields may touch, and slots."""
     many = clash(planes=(), num_substeps=30, control_dt=0.03)
     monkeypatch.setattr(relay_contact, "warps_of_meeting", lambda model: 2)
+    monkeypatch.setattr(relay_contact, "warps_that_clear", lambda model: 3)
     two = clash(planes=(), num_substeps=30, control_dt=0.03)
     dims = {launch.dim for launch in two.program._launches if launch.kernel.key == "meet_fields"}
-    assert max(dims) - min(dims) == 2 * 32 * two.model.num_envs  # the first has nobody to see to
+    # the first has nobody to see to, the second nothing to clear
+    assert sorted(dim - min(dims) for dim in dims) == [n * 32 * two.model.num_envs for n in (0, 2, 5)]
     many.run(), two.run()
     assert np.abs(two.scratch.sensors.part_impulse.numpy()).max() > 0.1
     for array in ARRAYS:
@@ -305,6 +307,7 @@ def test_warps_that_have_several_nodes(clash, monkeypatch):
     for name in SENSED:
         found, expected = (getattr(sim.scratch.sensors, name).numpy() for sim in (two, many))
         np.testing.assert_array_equal(found, expected, err_msg=name)
+    assert many.sums_are_clear and two.sums_are_clear
 
 
 def test_fields_that_fail_fail_alone(clash, one_by_one):

@@ -1,0 +1,151 @@
+"""Sums of 32 bits, two a word: what they hold, at which speeds they count, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from piavatar_envs.mpm.counts import (
+    MOST_MASS,
+    UNITS,
+    Counts,
+    countable,
+    forget_all_speeds,
+    forget_speeds,
+    give_numbers,
+    known_speed,
+    measure_speed,
+    numbers_at,
+    speed_of_counts,
+    vec2l,
+    vec4i,
+)
+from piavatar_envs.mpm.types import FAILURE_CFL, FAILURE_NONFINITE, group
+
+wp.set_module_options({"enable_backward": False, "block_dim": 32})
+
+
+@pytest.fixture(autouse=True)
+def _on_a_gpu(device):
+    if device == "cpu":
+        pytest.skip("relays are a GPU's")
+
+
+@wp.kernel
+def give_and_read(given: wp.array2d(dtype=vec4i), words: wp.array2d(dtype=vec2l), found: wp.array(dtype=vec4i)):
+    at = wp.tid()
+    for n in range(given.shape[0]):
+        give_numbers(words, 0, at, given[n, at])
+    found[at] = numbers_at(words, 0, at)
+
+
+def test_numbers_of_a_word_do_not_mix(device):
+    """Of any sign, one after the other, up to all that 32 bits hold."""
+    rng = np.random.default_rng(3)
+    given = rng.integers(-(2**27), 2**27, (15, 64, 4)).astype(np.int32)
+    given[0, :4] = [[0, 0, 0, 0], [-1, 0, -1, 0], [-1, -1, 1, -1], [1, -1, -1, 1]]
+    given[1:, :4] = 0
+    given[:, 4] = 0
+    given[0, 4] = [2**31 - 1, -(2**31), -(2**31), 2**31 - 1]
+    words = wp.zeros((1, 64), dtype=vec2l, device=device)
+    found = wp.zeros(64, dtype=vec4i, device=device)
+    inputs = [wp.array(given, dtype=vec4i, device=device)]
+    wp.launch(give_and_read, 64, inputs, [words, found], device=device, block_dim=32)
+    assert np.array_equal(found.numpy(), given.sum(0, dtype=np.int64))
+
+
+@wp.kernel
+def carry_speeds(index: int, speed: wp.array2d(dtype=float), counts: Counts, counted: wp.array2d(dtype=float)):
+    """A warp an environment: at what speed the sums of a number count, and who is measured for those after the next."""
+    e = wp.tid() // 32
+    counted[e, index] = speed_of_counts(counts, e, index)
+    known = known_speed(counts, e, index + 1)
+    measure_speed(counts, e, index + 1, known, speed[e, wp.tid() % 32])
+    if wp.tid() % 32 == 0:
+        forget_speeds(counts, e, index)
+
+
+@wp.kernel
+def measure_first(speed: wp.array2d(dtype=float), counts: Counts):
+    e = wp.tid() // 32
+    measure_speed(counts, e, 0, known_speed(counts, e, 0), speed[e, wp.tid() % 32])
+
+
+@wp.kernel
+def forget_all(counts: Counts):
+    forget_all_speeds(counts, wp.tid())
+
+
+def test_speeds_are_those_of_the_fastest(device):
+    """A power of two from four to eight times what the fastest had two substeps before, or half of that before."""
+    num_envs, steps, slowest = 3, 40, 0.25
+    rng = np.random.default_rng(5)
+    speed = rng.uniform(0.0, 1.0, (steps, num_envs, 32)) * np.exp2(rng.integers(-6, 6, (steps, num_envs, 1)))
+    speed = speed.astype(np.float32)
+    speed[10:20, 1] = 0.0
+    counts = group(Counts, fastest=wp.zeros((num_envs, 4), dtype=int, device=device), slowest=slowest)
+    counted = wp.zeros((num_envs, steps), dtype=float, device=device)
+
+    def launch(kernel, threads, inputs, outputs):
+        wp.launch(kernel, threads, inputs, outputs, device=device, block_dim=32)
+
+    launch(measure_first, 32 * num_envs, [wp.array(speed[0], device=device)], [counts])
+    for index in range(steps):  # as a relay: launch ``index - 1`` adds the sums of that number
+        inputs = [index, wp.array(speed[max(index, 1)], device=device)]
+        launch(carry_speeds, 32 * num_envs, inputs, [counts, counted])
+    most = speed.max(2).T
+    known = np.zeros((num_envs, steps + 2))
+    known[:, 0] = known[:, 1] = most[:, 0]
+    for index in range(steps):
+        if index > 0:
+            known[:, index + 1] = np.maximum(known[:, index - 1] / 2, most[:, index])
+    expected = np.exp2(np.ceil(np.log2(4.0 * np.maximum(slowest, known[:, :steps]))))
+    np.testing.assert_array_equal(counted.numpy()[:, 2:], expected[:, 2:])
+    assert np.all(counted.numpy()[:, 2:] >= 4.0 * most[:, 1 : steps - 1])
+    launch(forget_all, num_envs, [], [counts])
+    assert not counts.fastest.numpy().any()
+
+
+@wp.kernel
+def admit(
+    speed: wp.array(dtype=float), takes: wp.array(dtype=bool), failure: wp.array(dtype=int), found: wp.array(dtype=bool)
+):
+    n = wp.tid()
+    found[n] = countable(takes[n], speed[n], 8.0, n, failure)
+
+
+def test_who_is_too_fast_or_no_number_fails(device):
+    speed = [0.0, 8.0, 8.1, np.inf, np.nan, np.nan]
+    takes = [True, True, True, True, True, False]
+    failure, found = wp.zeros(6, dtype=int, device=device), wp.zeros(6, dtype=bool, device=device)
+    inputs = [wp.array(speed, dtype=float, device=device), wp.array(takes, dtype=bool, device=device)]
+    wp.launch(admit, 6, inputs, [failure, found], device=device)
+    assert found.numpy().tolist() == [True, True, False, False, False, False]
+    assert failure.numpy().tolist() == [0, 0, FAILURE_CFL, FAILURE_NONFINITE, FAILURE_NONFINITE, 0]
+
+
+def test_momentum_is_kept_by_what_is_rounded(drop):
+    """Shares of a unit are rounded to none more often than to one: the middle node gets what is left."""
+    sim = drop(num_substeps=60, control_dt=0.06, num_envs=1, planes=(), gravity=(0.0, 0.0, 0.0))
+    u = sim.state.u.numpy()
+    sim.set(u=u - u.mean(1, keepdims=True) + np.float32([1.0, 0.0, -0.5]))
+    before = sim.totals()
+    after = sim.run(3).totals()
+    assert "carry_on" in sim.program.names and sim.failures == [0]
+    assert np.abs(after.momentum - before.momentum).max() < 1e-7 * before.momentum_scale
+    assert np.abs(after.angular_momentum - before.angular_momentum).max() < 1e-6 * before.momentum_scale
+
+
+def test_too_many_at_a_node_are_a_failure(drop):
+    """Who fails does not run over: all particles of one world at a place, those of another twice as dense."""
+    sim = drop(num_substeps=4, control_dt=4e-3, num_envs=3, planes=(), decoupling="no_stress")
+    x = sim.state.x.numpy()
+    x[1] = x[1].mean(0) + 1e-3 * x[1]
+    x[2] = x[2].mean(0) + 0.8 * (x[2] - x[2].mean(0))
+    sim.set(x=x, u=0.0 * x, C=np.zeros((*x.shape, 3), np.float32), vk=0.0 * x).run()
+    assert sim.failures[0] == sim.failures[2] == 0 and sim.failures[1] & FAILURE_CFL
+    assert sim.sums_are_clear
+    counts, _ = sim.scratch.turns
+    heaviest = float(UNITS) * counts.mass_unit.numpy()
+    assert np.all((heaviest >= sim.model.particles.mass.numpy().max()) & (float(MOST_MASS) / float(UNITS) == 24.0))
