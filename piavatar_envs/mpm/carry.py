@@ -10,7 +10,7 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import NOBODY, awaited_slot, mark_block, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_PARTICLE, nearest_boundary
-from piavatar_envs.mpm.counts import MOST_MASS, Counts, pass_speeds, speeds_of_launch
+from piavatar_envs.mpm.counts import MOST_MASS, Counts, pass_speeds, speeds_of_launch, unit_of_mass
 from piavatar_envs.mpm.gather import Gathered, Gradients, begun, own_velocity, settled
 from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.ranks import PART
@@ -24,9 +24,9 @@ from piavatar_envs.mpm.singles import (
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, grid_position, in_same_brick, stencil_at
 from piavatar_envs.mpm.sweep import LANES
 from piavatar_envs.mpm.team import (
+    HEAVIEST,
     KINEMATIC_VELOCITY,
     MASS,
-    MASS_UNIT,
     SPIN,
     deformation_of_team,
     field_of,
@@ -38,7 +38,7 @@ from piavatar_envs.mpm.team import (
     vector_of_team,
 )
 from piavatar_envs.mpm.team_clear import clear_share, told_in_slot
-from piavatar_envs.mpm.team_count import count_single, speed_of
+from piavatar_envs.mpm.team_count import count_single, most_of
 from piavatar_envs.mpm.team_gather import gather_by_team
 from piavatar_envs.mpm.team_others import meets_others
 from piavatar_envs.mpm.team_sense import sense_by_team, slots_touched
@@ -205,7 +205,7 @@ def carry(
     slot = slots_of_thread(team, grid, blocks, e, field, stencil.base)
     touched = slots_touched(several, sensors, e, slot, turn.substep + 1)
     distance = nearest_boundary(boundaries, e, x) * grid.inv_dx
-    unit = number_of_team(team, read, MASS_UNIT)
+    unit = unit_of_mass(number_of_team(team, read, HEAVIEST))
     m = wp.where(takes, number_of_team(team, read, MASS), 0.0)
     physical, kinematic, crowd = gather_by_team(
         team, several, grid, step, boundaries, contact, counts, e, field, unit * wp.vec2(1.0, speeds.gathered), stencil,
@@ -237,8 +237,8 @@ def carry(
     if turn.scattered >= 0:
         homeless = any_of_team(team, wp.min(slot[0], slot[1]) == NOBODY)  # all threads of a particle add it up, or none
         adds = admitted(adds and not homeless, wp.isfinite(wp.length_sq(s.u) + wp.length_sq(vk)), e, failure)
-        own = speed_of(momentum, m, vk, unit)
-        adds = pass_speeds(counts, e, turn.substep, speeds, at[1] == 0, adds, own, failure)
+        most = most_of(momentum, m, vk)
+        adds = pass_speeds(counts, e, turn.substep, speeds, at[1] == 0, adds, most, m, unit, failure)
     if takes and (comes or not adds) and wp.atomic_or(failure, e, 0) != 0:  # nobody fails without coming here
         wp.atomic_min(turn.stops, e, turn.substep + 1)
     if turn.scattered >= 0:  # comes last: what a thread reads after its additions waits for them

@@ -3,10 +3,10 @@
 As in :mod:`piavatar_envs.mpm.sums`, sums of whole numbers do not depend on the order of their summands. Those of 64
 bits are as fine as anybody could wish, and so large that they do not fit into the second-level cache of a GPU where
 several sets of them are in use in turns. 32 bits are fine enough where they count what is there: 2^26 units are the
-mass of a field's heaviest particle, or its momentum at a speed that the fastest does not reach. That speed is a power
-of two, four times what the fastest had two substeps before, at least. It is measured by all that a particle adds to
-its nodes, also by what its stress does. Who is faster has gained as much in two substeps as no stable one gains: it
-fails.
+mass of a field's heaviest particle, rounded up to a power of two, or its momentum at a speed that the fastest does not
+reach. That speed is a power of two, four times what the fastest had two substeps before, at least: by all that it adds
+to its nodes, also by what its stress does, and its own mass. Who has gained more since fails. Both are measured anew
+whenever blocks are marked: masses may have changed.
 
 A word has two numbers, the higher one less by one where the lower one is negative: what is added to it is added to
 both. Four numbers are 16 bytes, and two nodes in a row a sector of memory, for which a GPU takes the time of one.
@@ -21,19 +21,22 @@ from piavatar_envs.mpm.records import half_of
 from piavatar_envs.mpm.shared_memory import native, power_of_two
 from piavatar_envs.mpm.stencil import BLOCK_NODES
 from piavatar_envs.mpm.sweep import lane_of_thread
-from piavatar_envs.mpm.types import FAILURE_CFL, FAILURE_NONFINITE, Grid, Model, group, row
+from piavatar_envs.mpm.types import FAILURE_CFL, FAILURE_NONFINITE, Grid, Model, group
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 #: Units in a field's heaviest particle, and in its momentum at the speed at which that is counted.
 UNITS = wp.constant(2.0**26)
-#: More mass at a node is too much, that of 24 of the heaviest particles: there is room for a third more, and momenta
-#: are a quarter of what there is room for. Bodies of relays have less than one particle a node.
+#: More mass at a node is too much, that of 24 of the heaviest particles at least: there is room for a third more, and
+#: momenta are a quarter of what there is room for. (Of more than 64 the first substep may not know.)
 MOST_MASS = wp.constant(3 * 2**29)
+#: So many of a field's largest particles in a cell at rest leave room for matter to be compressed to half.
+MOST_AT_REST = 12.0
 #: Speeds that are kept: for the sums that are gathered, for those that are added to, and for two that are to come.
 SPEEDS = wp.constant(4)
-#: Who is slower than this, in grid spacings a time step, may gain as much as who is not.
-SLOWEST = 2.0**-9
+#: Who is slower than this, in grid spacings a time step, may gain as much as who is not; or than gravity makes it in
+#: this many time steps.
+SLOWEST, FALLS = 2.0**-9, 4.0
 _CFL, _NONFINITE = wp.constant(FAILURE_CFL), wp.constant(FAILURE_NONFINITE)
 
 #: Two words, of two numbers each.
@@ -52,7 +55,7 @@ class Counts:
     sum: wp.array2d(dtype=vec2l)  # (num_envs, 128 S) halves of records: mass, physical momentum; kinematic momentum
     offset: wp.array2d(dtype=vec2l)  # (num_envs, 64 S) of w m (x_i - x_p) / dx, and of w m of seam particles
     told: wp.array2d(dtype=int)  # (num_envs, S) not 0: nodes of this slot were told where particles are and go
-    mass_unit: wp.array2d(dtype=float)  # (rows, F) [kg]
+    heaviest: wp.array2d(dtype=int)  # (num_envs, F) bits of the greatest mass of a particle [kg]
     # (num_envs, SPEEDS) bits of the greatest speed of a particle, momenta are counted at four times that [m/s]
     fastest: wp.array2d(dtype=int)
     slowest: float  # [m/s]
@@ -65,17 +68,15 @@ def allocate_counts(model: Model, sets: int) -> Counts:
     def zeros(count: int, dtype: type) -> wp.array:
         return wp.zeros((n, count), dtype=dtype, device=model.device)
 
-    mass, field = model.particles.mass.numpy(), model.particles.field.numpy()
-    heaviest = [mass[:, field == f].max(1, initial=0.0) for f in range(model.contact.num_fields)]
-    heaviest = np.exp2(np.ceil(np.log2(np.maximum(np.stack(heaviest, 1), np.finfo(np.float32).tiny))))
+    slowest = max(SLOWEST * model.grid.dx / model.step.dt, FALLS * model.step.dt * np.linalg.norm(model.step.gravity))
     return group(
         Counts,
         sum=zeros(2 * nodes * slots, vec2l),
         offset=zeros(nodes * slots, vec2l),
         told=zeros(slots, int),
-        mass_unit=wp.array(heaviest / UNITS, dtype=float, device=model.device),
+        heaviest=zeros(model.contact.num_fields, int),
         fastest=zeros(int(SPEEDS), int),
-        slowest=float(np.exp2(np.round(np.log2(SLOWEST * model.grid.dx / model.step.dt)))),
+        slowest=float(slowest),
     )
 
 
@@ -111,11 +112,32 @@ def give_numbers(words: wp.array2d(dtype=vec2l), e: int, at: int, n: vec4i):
     ...
 
 
+def is_sparse(model: Model) -> bool:
+    """Whether cells of matter at rest are few enough of their field's largest particles for these numbers."""
+    volume, field = model.particles.volume.numpy(), model.particles.field.numpy()
+    largest = min(volume[:, field == f].max(1).min() for f in np.unique(field))
+    return bool(model.grid.dx**3 <= MOST_AT_REST * largest)
+
+
 @wp.func
-def forget_all_speeds(counts: Counts, e: int):
+def forget_measures(counts: Counts, e: int):
     """Nobody has been measured, before the first sums of a relay."""
     for n in range(SPEEDS):
         counts.fastest[e, n] = 0
+    for f in range(counts.heaviest.shape[1]):
+        counts.heaviest[e, f] = 0
+
+
+@wp.func
+def measure_mass(counts: Counts, e: int, f: int, mass: float):
+    """Let field ``f`` count masses in units that suit a particle of this ``mass`` [kg].
+
+    All threads of a warp come here, of one environment; some may have none, which is 0.
+    """
+    for field in range(counts.heaviest.shape[1]):
+        bits = most_of_warp(wp.where(f == field, wp.cast(mass, int), 0))
+        if bits > counts.heaviest[e, field] and lane_of_thread() == 0:
+            wp.atomic_max(counts.heaviest, e, field, bits)
 
 
 @wp.func
@@ -189,24 +211,40 @@ def speeds_of_launch(counts: Counts, e: int, substep: int):
 
 @wp.func
 def pass_speeds(
-    counts: Counts, e: int, substep: int, speeds: Speeds, first: bool, takes: bool, speed: float,
+    counts: Counts,
+    e: int,
+    substep: int,
+    speeds: Speeds,
+    first: bool,
+    takes: bool,
+    most: float,
+    mass: float,
+    unit: float,
     failure: wp.array(dtype=int),
-):  # fmt: skip
-    """Whether a particle that ``takes`` part with a ``speed`` is :func:`countable`; those that are, are measured.
+):
+    """Whether a particle that ``takes`` part is :func:`countable`; those that are, are measured.
 
-    All threads of a warp come here; the ``first`` of an environment sees to speeds that are to come.
+    ``most`` is the greatest momentum that it adds, ``unit`` that of mass. All threads of a warp come here; the
+    ``first`` of an environment sees to speeds that are to come.
     """
-    takes = countable(takes, speed, speeds.added, e, failure)
-    measure_speed(counts, e, substep + 2, speeds.known, wp.where(takes, speed, 0.0))
+    takes = countable(takes, most / (UNITS * unit), speeds.added, e, failure)
+    # who is light may be fast, and what it hits will be, too
+    measure_speed(counts, e, substep + 2, speeds.known, wp.where(takes, most / mass, 0.0))
     if first:
         forget_speeds(counts, e, substep + 1)
     return takes
 
 
 @wp.func
+def unit_of_mass(heaviest: float):
+    """Unit of mass [kg] of a field whose heaviest particle is this [kg]."""
+    return power_of_two(heaviest) / UNITS
+
+
+@wp.func
 def mass_unit_of(counts: Counts, e: int, f: int):
-    """Unit of mass [kg] of field ``f``."""
-    return counts.mass_unit[row(e, counts.mass_unit.shape[0]), f]
+    """:func:`unit_of_mass` of field ``f``."""
+    return unit_of_mass(wp.cast(counts.heaviest[e, f], float))
 
 
 @wp.func
@@ -238,6 +276,12 @@ def place_counted(grid: Grid, unit: float, n: vec4i):
     """Sum of ``w m (x_i - x_p)`` [kg m] and of the mass of seam particles [kg], ``unit`` being that of mass."""
     s = unit * counted(n)
     return wp.vec4(grid.dx * s[0], grid.dx * s[1], grid.dx * s[2], s[3])
+
+
+@wp.func
+def in_units(J: wp.vec3, unit: float):
+    """The nearest multiple of a ``unit``, which is one of any smaller unit, too: all units are powers of two."""
+    return unit * wp.vec3(wp.rint(J[0] / unit), wp.rint(J[1] / unit), wp.rint(J[2] / unit))
 
 
 @wp.func

@@ -6,7 +6,7 @@ nothing else acts. Where there are several fields, their contact takes a short l
 threads. What it does for a particle is in :mod:`piavatar_envs.mpm.carry`.
 
 There are three sets of sums, in turns: a launch gathers what the last one has added up, adds to the next set, and
-clears the one that the last launch has gathered.
+clears the one that the last launch has gathered. With contact between there are two, one of which the contact clears.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import slots_used
 from piavatar_envs.mpm.carry import TEAM_OF_FIELDS, Turn, carry_fields_on, carry_on
-from piavatar_envs.mpm.counts import Counts, forget_all_speeds
+from piavatar_envs.mpm.counts import Counts, forget_measures
 from piavatar_envs.mpm.meeting import meetings_of
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.ranks import PART, Ranks, forget_ranks
@@ -54,7 +54,7 @@ def sweep_sums(blocks: Blocks, swept: int, slots: int, counts: Counts, ranks: Ra
     if at[1] < slots_used(blocks, at[0]):
         clear_slot(counts, at[0], swept + at[1], told)
     if at[1] == 0:
-        forget_all_speeds(counts, at[0])
+        forget_measures(counts, at[0])
         forget_ranks(ranks, at[0])
 
 

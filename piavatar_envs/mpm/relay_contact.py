@@ -23,6 +23,7 @@ from piavatar_envs.mpm.counts import (
     Counts,
     counted,
     give_momentum,
+    in_units,
     kinematic_numbers,
     mass_counted,
     mass_unit_of,
@@ -152,6 +153,7 @@ def meet_pair(
     offset_a = place_counted(grid, unit_a, place_a)
     offset_b = place_counted(grid, unit_b, place_b)
     J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
+    J = in_units(J, wp.max(unit_a, unit_b) * speed)
     if wp.length_sq(J) <= 0.0:
         return
     give_momentum(counts, e, unit_a * speed, sa, -J)

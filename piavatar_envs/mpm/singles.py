@@ -14,11 +14,13 @@ from typing import Any
 import warp as wp
 
 from piavatar_envs.mpm.counts import (
+    UNITS,
     Counts,
     countable,
     forget_speeds,
     known_speed,
     mass_unit_of,
+    measure_mass,
     measure_speed,
     speed_of_counts,
 )
@@ -30,7 +32,7 @@ from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_index, grid_
 from piavatar_envs.mpm.sums import units_of
 from piavatar_envs.mpm.sweep import LANES, lane_of_thread
 from piavatar_envs.mpm.team_add import add_single
-from piavatar_envs.mpm.team_count import count_single, speed_of
+from piavatar_envs.mpm.team_count import count_single, most_of
 from piavatar_envs.mpm.threads import environment_of
 from piavatar_envs.mpm.transfer import Scattered, admitted, moves_finitely, near_boundary, prepare, takes_part
 from piavatar_envs.mpm.types import (
@@ -202,15 +204,16 @@ def measure_singles(
     # in and out
     counts: Counts,
 ):
-    """Find the speeds at which the first two sums of a relay count momenta; ``per_env`` particles fill whole warps."""
+    """Find the units of a relay's sums, those of momentum for the first two; ``per_env`` particles fill whole warps."""
     at = environment_of(wp.tid(), per_env)
     e = at[0]
     p = wp.min(at[1], moving.x.shape[1] - 1)
     s = prepare(grid, step, particles, moving, e, p, False)
-    unit = mass_unit_of(counts, e, particles.field[p])
-    speed = speed_of(s, s.at_base[0], moving.vk[e, p], unit)
+    mass = s.at_base[0]
+    speed = most_of(s, mass, moving.vk[e, p]) / mass
     # who does not move finitely is seen to by who adds up
     measure_speed(counts, e, 0, known_speed(counts, e, 0), wp.where(wp.isfinite(speed), speed, 0.0))
+    measure_mass(counts, e, particles.field[p], mass)
 
 
 @wp.kernel(launch_bounds=(THREADS, 5))
@@ -234,7 +237,8 @@ def singles_to_counts(
     s = single_of(grid, step, particles, boundaries, contact, moving, blocks, at, failure)
     unit = mass_unit_of(counts, e, s.field)
     counted = speed_of_counts(counts, e, 0)
-    takes = countable(s.takes, speed_of(s.scattered, s.scattered.at_base[0], s.vk, unit), counted, e, failure)
+    most = most_of(s.scattered, s.scattered.at_base[0], s.vk)
+    takes = countable(s.takes, most / (UNITS * unit), counted, e, failure)
     if at[1] == 0:
         forget_speeds(counts, e, 0)
     if s.tells:

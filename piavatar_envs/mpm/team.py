@@ -18,10 +18,10 @@ from piavatar_envs.mpm.types import Moving, Particles
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 #: Where the numbers of a particle begin among those that its threads have read: see :func:`read_by_team`.
-_F, _VK, _SPIN, _MASS, _VOLUME, _MU, _LAM, _MATERIAL, _UNIT = (
+_F, _VK, _SPIN, _MASS, _VOLUME, _MU, _LAM, _MATERIAL, _HEAVIEST = (
     wp.constant(n) for n in (0, 9, 12, 15, 16, 17, 18, 19, 20)
 )
-KINEMATIC_VELOCITY, SPIN, MASS, MASS_UNIT = _VK, _SPIN, _MASS, _UNIT
+KINEMATIC_VELOCITY, SPIN, MASS, HEAVIEST = _VK, _SPIN, _MASS, _HEAVIEST
 #: Those that a thread has read, of which one of eight has three.
 vec6 = wp.types.vector(6, float)
 
@@ -96,7 +96,7 @@ _READ = {
     _MU: "constant(particles.mu, p)",
     _LAM: "constant(particles.lam, p)",
     _MATERIAL: "constant(particles.material, p)",
-    _UNIT: "constant(counts.mass_unit, field)",
+    _HEAVIEST: "constant(counts.heaviest, field)",
 }
 
 
@@ -144,8 +144,8 @@ return read;
 def read_by_team(team: int, particles: Particles, moved: Moving, counts: Counts, e: int, p: int, field: int) -> vec6:
     """A thread's three or six of the numbers of a particle of a ``field``.
 
-    Those are its deformation, kinematic velocity, spin and substance, and the unit of its field's mass: they would take
-    many registers of every thread until it needs them, and as many loads.
+    Those are its deformation, kinematic velocity, spin and substance, and the mass of its field's heaviest one: they
+    would take many registers of every thread until it needs them, and as many loads.
     """
     ...
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.counts import UNITS, Counts
+from piavatar_envs.mpm.counts import Counts
 from piavatar_envs.mpm.runs import KINEMATIC, MOMENTUM, PLACE, told_by
 from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.stencil import BLOCK_NODES, spline
@@ -159,10 +159,12 @@ def add_to_nodes(
 
 
 @wp.func
-def speed_of(momentum: Scattered, mass: float, vk: wp.vec3, unit: float):
-    """The greatest momentum of any kind that a particle adds, by the heaviest one's mass [m/s]; ``unit`` is of mass."""
-    most = wp.max(wp.max(momentum_bounds(momentum)), mass * wp.max(wp.abs(vk)))
-    return most / (UNITS * unit)
+def most_of(momentum: Scattered, mass: float, vk: wp.vec3):
+    """The greatest momentum of any kind that a particle adds [kg m/s]; not finite if any of it is not."""
+    bounds = momentum_bounds(momentum)
+    k = mass * wp.abs(vk)
+    total = bounds[0] + bounds[1] + bounds[2] + k[0] + k[1] + k[2]  # of what is no number, max would be another
+    return wp.where(wp.isfinite(total), wp.max(wp.max(bounds), wp.max(k)), total)
 
 
 @wp.func

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from piavatar_envs.mpm.counts import is_sparse
 from piavatar_envs.mpm.memory import MOST_SLOTS
 from piavatar_envs.mpm.types import PAPER, Model
 
@@ -18,9 +19,9 @@ def has_turns(model: Model) -> bool:
     """Whether substeps between which nothing acts are one launch each, see :mod:`piavatar_envs.mpm.relay`.
 
     Few particles a cell, a field a subject, normals that are a pair's, boundaries that rest, no need of kinematic
-    gradients, and sums that strides of 32 bits can count.
+    gradients, sums that strides of 32 bits can count, and nowhere so many particles that theirs cannot be counted.
     """
-    if TURNS * model.max_slots >= MOST_SLOTS:
+    if TURNS * model.max_slots >= MOST_SLOTS or not is_sparse(model):
         return False
     contact = model.contact
     plain = contact.num_fields == contact.num_subjects and contact.own_normals == 0 and not model.moving_boundaries

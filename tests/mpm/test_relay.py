@@ -149,6 +149,7 @@ def test_what_relays_are_for(drop, simulate, meet):
     assert has_turns(drop().model)
     assert not has_turns(drop(decoupling="paper").model)
     assert not has_turns(simulate(scatter="runs").model)
+    assert not has_turns(drop(spacing=0.0125).model)  # 64 particles a cell: too many to count
     balls = [{"ball": ((x, 0.0, 0.0), 0.1)} for x in (-0.2, 0.2)]
     assert has_turns(meet(balls, scatter="singles").model)
     assert not has_turns(meet(balls, scatter="singles", normals="own").model)
