@@ -15,6 +15,13 @@ from pydantic import BaseModel
 
 #: Most characters of a value in a message.
 MOST_SHOWN = 120
+#: What users of Gymnasium may give with settings, and where it belongs.
+_ELSEWHERE = {
+    "num_envs": "gym.make_vec(..., num_envs=...) makes several environments",
+    "autoreset_mode": "gym.make_vec(..., autoreset_mode=...) takes it, of several environments",
+    "seed": "reset(seed=...) takes it",
+    "options": "reset(options=...) takes them",
+}
 
 
 class ConfigError(ValueError):
@@ -137,9 +144,11 @@ def _unknown_key(cls: type[BaseModel], loc: Sequence[str | int]) -> str:
     key = ".".join(str(part) for part in loc[depth:])
     names = setting_keys(held)
     section, _, leaf = key.rpartition(".")
+    if loc[0] in _ELSEWHERE and len(loc) == 1:
+        return f"{key} is no setting of {held.__name__}; {_ELSEWHERE[key]}"
     leaves = {name.rpartition(".")[2]: name for name in reversed(names)}
     close = difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.6)
-    sections = [name for name in held.model_fields if name not in names]
+    sections = [name for name in held.model_fields if name not in names and name != section]
     near = leaves[close[0]] if close else next(iter(difflib.get_close_matches(leaf, sections, n=1)), None)
     if near:
         return f"{entry}{key} is no setting of {held.__name__}; did you mean {entry}{near}?"

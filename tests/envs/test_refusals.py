@@ -61,6 +61,18 @@ def test_refusals_within_lists_say_which_entry(scene, told):
     assert told.replace("X", f"scene.{place[0]}" if place else "") in refusal(None, {"scene": scene})
 
 
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"num_envs": 4}, "num_envs is no setting of EnvConfig; gym.make_vec(..., num_envs=...) makes several"),
+        ({"seed": 3}, "seed is no setting of EnvConfig; reset(seed=...) takes it"),
+        ({"scene": {"seed": 3}}, "scene.seed is no setting of EnvConfig; there are scene."),
+    ],
+)
+def test_what_belongs_elsewhere_is_sent_there(given, told):
+    assert told in refusal(None, given)
+
+
 def test_an_entry_of_a_file_is_the_files_fault_and_one_of_a_keyword_is_not(tmp_path):
     path = tmp_path / "bad.yaml"
     path.write_text("scene:\n  avatars:\n  - yaw: left\n")
