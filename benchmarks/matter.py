@@ -86,8 +86,8 @@ class Matter:
         sums, turns = self.scratch.sums, self.scratch.turns
         arrays = [sums.fixed, sums.offset, sums.offset_fixed, sums.told]
         if turns is not None:
-            counts, ranks = turns
-            arrays += [counts.sum, counts.offset, counts.told, counts.fastest, ranks.rank, ranks.count]
+            counts, ranks = turns.counts, turns.ranks
+            arrays += [counts.sum, counts.offset, counts.told, counts.fastest, counts.heaviest, ranks.rank, ranks.count]
         if self.model.scatter != "shared":  # whose sums are written, not added up
             arrays.append(sums.value)
         return not any(array.numpy().any() for array in arrays)

@@ -121,7 +121,7 @@ def come_to(
         if team == 4:
             slot[1] = slot_marked(team, grid, blocks, e, f, to, 1, failure)
     # changes nothing, but sees to it that the threads of a warp meet here: or a compiler lets those that had to wait do
-    # all that follows after the others, and one skin takes 19.7 instead of 17.8 us a substep
+    # all that follows after the others, and one skin takes a tenth more time a substep
     return wp.max(slot, wp.vec2i(NOBODY)), comes
 
 

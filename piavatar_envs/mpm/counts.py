@@ -4,12 +4,18 @@ As in :mod:`piavatar_envs.mpm.sums`, sums of whole numbers do not depend on the 
 bits are as fine as anybody could wish, and so large that they do not fit into the second-level cache of a GPU where
 several sets of them are in use in turns. 32 bits are fine enough where they count what is there: 2^26 units are the
 mass of a field's heaviest particle, rounded up to a power of two, or its momentum at a speed that the fastest does not
-reach. That speed is a power of two, four times what the fastest had two substeps before, at least: by all that it adds
-to its nodes, also by what its stress does, and its own mass. Who has gained more since fails. Both are measured anew
-whenever blocks are marked: masses may have changed.
+reach. That speed is a power of two, four times what the fastest had a substep before, at least: by all that it adds to
+its nodes, also by what its stress does, and its own mass. Who has gained more since fails. Both are measured anew
+whenever blocks are marked: masses may have changed. A launch adds while it measures, so sums are counted by what was
+measured when those before them were added. With sums in the order in which they are added, launch ``s`` of a relay
 
-A word has two numbers, the higher one less by one where the lower one is negative: what is added to it is added to
-both. Four numbers are 16 bytes, and two nodes in a row a sector of memory, for which a GPU takes the time of one.
+- gathers sums ``s``, the first of which a scatter has added, and adds sums ``s + 1``;
+- measures those, for sums ``s + 2``;
+- prepares the speed of sums ``s + 3``: half of what sums ``s + 1`` are counted by, until somebody is faster.
+
+A word has two numbers: it is the higher one times 2^32, plus the lower one. So one addition adds to both; where the
+lower one is negative, the higher half of the word is less by one. Four numbers are 16 bytes, and two nodes in a row a
+sector of memory, for which a GPU takes the time of one.
 """
 
 from __future__ import annotations
@@ -34,8 +40,8 @@ MOST_MASS = wp.constant(3 * 2**29)
 MOST_AT_REST = 12.0
 #: Speeds that are kept: for the sums that are gathered, for those that are added to, and for two that are to come.
 SPEEDS = wp.constant(4)
-#: Who is slower than this, in grid spacings a time step, may gain as much as who is not; or than gravity makes it in
-#: this many time steps.
+#: Momenta are counted as if somebody had this speed, in grid spacings a time step, at least, and at least what gravity
+#: makes it in so many time steps: who is at rest may begin to move.
 SLOWEST, FALLS = 2.0**-9, 4.0
 _CFL, _NONFINITE = wp.constant(FAILURE_CFL), wp.constant(FAILURE_NONFINITE)
 
@@ -47,9 +53,9 @@ vec4i = wp.types.vector(length=4, dtype=wp.int32)
 
 @wp.struct
 class Counts:
-    """Sets of sums, one after the other, zero between control steps; records as in :mod:`piavatar_envs.mpm.records`.
+    """Sets of sums, one after the other, records as in :mod:`piavatar_envs.mpm.records`, and what they are counted by.
 
-    Slots of all sets: ``S``.
+    Slots of all sets: ``S``. All but ``slowest`` is zero between the portions of a control step that are relays.
     """
 
     sum: wp.array2d(dtype=vec2l)  # (num_envs, 128 S) halves of records: mass, physical momentum; kinematic momentum
@@ -121,7 +127,7 @@ def is_sparse(model: Model) -> bool:
 
 @wp.func
 def forget_measures(counts: Counts, e: int):
-    """Nobody has been measured, before the first sums of a relay."""
+    """Nobody has been measured, when a relay has ended."""
     for n in range(SPEEDS):
         counts.fastest[e, n] = 0
     for f in range(counts.heaviest.shape[1]):
@@ -141,11 +147,11 @@ def measure_mass(counts: Counts, e: int, f: int, mass: float):
 
 
 @wp.func
-def forget_speeds(counts: Counts, e: int, index: int):
-    """Who adds the sums of number ``index`` lets those two after them begin with half of what his count by.
+def prepare_speeds(counts: Counts, e: int, index: int):
+    """Let the sums after the next of number ``index`` begin with half of what those are counted by.
 
-    And the first sums the second ones with the same. One thread of an environment sees to that, before anybody measures
-    for them.
+    And the second sums with what the first are counted by. The threads of an environment's first particle see to that,
+    before anybody measures for them.
     """
     bits = counts.fastest[e, index % SPEEDS]
     if index == 0:
@@ -159,7 +165,19 @@ def speed_of_counts(counts: Counts, e: int, index: int):
     return power_of_two(4.0 * wp.max(counts.slowest, wp.cast(counts.fastest[e, index % SPEEDS], float)))
 
 
-@wp.func_native(native("return __reduce_max_sync(0xffffffffu, value);", "return value;"))
+@wp.func_native(
+    native(
+        """
+#if __CUDA_ARCH__ >= 800
+return __reduce_max_sync(0xffffffffu, value);
+#else
+for (int distance = 16; distance > 0; distance /= 2) value = max(value, __shfl_xor_sync(0xffffffffu, value, distance));
+return value;
+#endif
+""",
+        "return value;",
+    )
+)
 def most_of_warp(value: int) -> int:
     """The greatest of a warp's values; all of its threads come here."""
     ...
@@ -231,7 +249,7 @@ def pass_speeds(
     # who is light may be fast, and what it hits will be, too
     measure_speed(counts, e, substep + 2, speeds.known, wp.where(takes, most / mass, 0.0))
     if first:
-        forget_speeds(counts, e, substep + 1)
+        prepare_speeds(counts, e, substep + 1)
     return takes
 
 

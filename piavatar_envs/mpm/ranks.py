@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 PART = wp.constant(32)
 #: Ranks of parts, from those that are nothing but momentum to those near a boundary.
 RANKS = wp.constant(3)
-TELLS, NEAR = wp.constant(1), wp.constant(2)
+TELLING, NEAR_BOUNDARY = wp.constant(1), wp.constant(2)
 
 
 @wp.struct
@@ -27,8 +27,9 @@ class Ranks:
     """Parts of every environment's particles, in the order in which they are carried on."""
 
     order: wp.array2d(dtype=int)  # (num_envs, parts)
-    rank: wp.array2d(dtype=int)  # (num_envs, parts) zero between relays, as is
-    count: wp.array2d(dtype=int)  # (num_envs, 2 RANKS) how many parts there are of each rank, and how many have a place
+    rank: wp.array2d(dtype=int)  # (num_envs, parts) zero between relays
+    # (num_envs, 2 RANKS) how many parts there are of each rank, and how many have a place; zero between relays
+    count: wp.array2d(dtype=int)
 
 
 def allocate_ranks(num_envs: int, num_particles: int, device: str) -> Ranks:

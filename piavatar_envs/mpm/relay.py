@@ -28,13 +28,13 @@ from piavatar_envs.mpm.singles import TEAM, THREADS, record_first
 from piavatar_envs.mpm.sweep import LANES, lanes_of_warp
 from piavatar_envs.mpm.team_clear import clear_slot
 from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.turns import sets_of_sums
+from piavatar_envs.mpm.turns import sets_of_sums, turns_of
 from piavatar_envs.mpm.types import Blocks, Model, Moving, Scratch, State
 
 # divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: At most so many substeps between two marks of all blocks, which cost six launches or more. Blocks that a body leaves
+#: At most so many substeps between two marks of all blocks, which cost nine launches or more. Blocks that a body leaves
 #: behind keep their slots until then, so that a fast one needs more of them than where they are marked every eight.
 PORTION = 50
 
@@ -62,7 +62,8 @@ def record_relay(
     program: Program, model: Model, state: State, scratch: Scratch, moving: Moving, inputs: list[Any], count: int
 ) -> None:
     """Append ``count`` substeps whose blocks have just been marked; ``inputs`` are those of :func:`record_first`."""
-    m, s, (counts, ranks) = model, state, scratch.turns
+    m, s, turns = model, state, turns_of(model, scratch)
+    counts, ranks = turns.counts, turns.ranks
     stops = wp.zeros(m.num_envs, dtype=int, device=m.device)
     record_first(program, inputs, s.x.shape, s.failure, counts, ranks)
     program.launch(begin_turns, m.num_envs, [s.failure], [stops])

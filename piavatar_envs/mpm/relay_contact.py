@@ -53,6 +53,7 @@ from piavatar_envs.mpm.sums import physical_sum
 from piavatar_envs.mpm.sweep import LANES, THREADS, Sweep, lane_of_thread, plan_sweep
 from piavatar_envs.mpm.team_clear import clear_share
 from piavatar_envs.mpm.threads import environment_of
+from piavatar_envs.mpm.turns import turns_of
 from piavatar_envs.mpm.types import (
     NO_STRESS,
     SPLIT,
@@ -255,6 +256,6 @@ def record_meeting(
             meet_fields,
             m.num_envs * (LANES * (warps + clearing) + sweep.threads),
             [m.grid, m.step, m.contact, sweep, now, scratch.blocks, its.others[(at - 1) & 1]],
-            [scratch.turns[0], its.others[at & 1], its.lists, scratch.sensors],
+            [turns_of(m, scratch).counts, its.others[at & 1], its.lists, scratch.sensors],
             block_dim=THREADS,
         )

@@ -17,15 +17,15 @@ from piavatar_envs.mpm.counts import (
     UNITS,
     Counts,
     countable,
-    forget_speeds,
     known_speed,
     mass_unit_of,
     measure_mass,
     measure_speed,
+    prepare_speeds,
     speed_of_counts,
 )
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.ranks import NEAR, TELLS, Ranks, raise_rank, record_order
+from piavatar_envs.mpm.ranks import NEAR_BOUNDARY, TELLING, Ranks, raise_rank, record_order
 from piavatar_envs.mpm.runs import KINEMATIC, bounded, told_by
 from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.stencil import BLOCK_NODES, base_node, block_index, grid_position
@@ -120,7 +120,7 @@ def fits(
 
 @wp.struct
 class Single:
-    """A particle that is scattered, as all of its threads know it."""
+    """A particle that is scattered; its threads know the same of it, but for their own ``record``."""
 
     p: int  # one that exists, also where there are no more
     x: wp.vec3
@@ -240,9 +240,9 @@ def singles_to_counts(
     most = most_of(s.scattered, s.scattered.at_base[0], s.vk)
     takes = countable(s.takes, most / (UNITS * unit), counted, e, failure)
     if at[1] == 0:
-        forget_speeds(counts, e, 0)
+        prepare_speeds(counts, e, 0)
     if s.tells:
-        raise_rank(ranks, e, s.p, wp.where(s.near, NEAR, TELLS))
+        raise_rank(ranks, e, s.p, wp.where(s.near, NEAR_BOUNDARY, TELLING))
     record, units = wp.vec2i(s.record), unit * wp.vec2(1.0, counted)
     count_single(
         TEAM, grid, particles, counts, e, s.p, s.x, s.vk, takes, s.tells, record, units, s.scattered

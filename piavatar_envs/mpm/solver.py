@@ -10,7 +10,6 @@ from piavatar_envs.mpm.ahead import Ahead, allocate_ahead, forget_ahead, grid_to
 from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
 from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.contact_pass import solve_contact
-from piavatar_envs.mpm.counts import allocate_counts
 from piavatar_envs.mpm.gather import grid_to_particles
 from piavatar_envs.mpm.grid import update_grid
 from piavatar_envs.mpm.groups import record_groups, runs_to_grid
@@ -19,14 +18,13 @@ from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.others import begin_others, notes_others
 from piavatar_envs.mpm.parts import Part, has_groups, parts_of_world, whole_world
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.ranks import allocate_ranks
 from piavatar_envs.mpm.relay import portions, record_relay
 from piavatar_envs.mpm.sensing import sense_contact, sense_penetration, senses_in_gather
 from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
 from piavatar_envs.mpm.singles import record_singles
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep, slot_threads, slots_at_once
 from piavatar_envs.mpm.transfer import particles_to_grid
-from piavatar_envs.mpm.turns import has_turns, sets_of_sums
+from piavatar_envs.mpm.turns import has_turns
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 
@@ -67,9 +65,6 @@ def record_substeps(program: Program, model: Model, state: State, scratch: Scrat
 
 def _record_turns(program: Program, model: Model, state: State, scratch: Scratch) -> None:
     """:func:`record_substeps` of one launch each."""
-    if scratch.turns is None:
-        ranks = allocate_ranks(model.num_envs, model.num_particles, model.device)
-        scratch.turns = (allocate_counts(model, sets_of_sums(model)), ranks)
     # what is sensed once a step of several fields asks for the nodes' velocities of the last substep
     apart = int(model.contact.num_fields > 1)
     for index, count in enumerate(portions(model.num_substeps - apart)):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from piavatar_envs.mpm.counts import is_sparse
+from dataclasses import dataclass
+
+from piavatar_envs.mpm.counts import Counts, allocate_counts, is_sparse
 from piavatar_envs.mpm.memory import MOST_SLOTS
-from piavatar_envs.mpm.types import PAPER, Model
+from piavatar_envs.mpm.ranks import Ranks, allocate_ranks
+from piavatar_envs.mpm.types import PAPER, Model, Scratch
 
 #: Sets of sums that those worlds have at most.
 TURNS = 3
@@ -26,3 +29,19 @@ def has_turns(model: Model) -> bool:
     contact = model.contact
     plain = contact.num_fields == contact.num_subjects and contact.own_normals == 0 and not model.moving_boundaries
     return model.scatter == "singles" and plain and model.step.decoupling != int(PAPER)
+
+
+@dataclass(frozen=True)
+class Turns:
+    """What relays add up, and in which order they carry particles on."""
+
+    counts: Counts
+    ranks: Ranks
+
+
+def turns_of(model: Model, scratch: Scratch) -> Turns:
+    """Those of a world, allocated when they are first asked for."""
+    if scratch.turns is None:
+        ranks = allocate_ranks(model.num_envs, model.num_particles, model.device)
+        scratch.turns = Turns(allocate_counts(model, sets_of_sums(model)), ranks)
+    return scratch.turns

@@ -25,13 +25,13 @@ wp.set_module_options({"enable_backward": False})
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 #: Half of a record in fixed point, or an offset, see :mod:`piavatar_envs.mpm.sums`.
 vec4l = wp.types.vector(length=4, dtype=wp.int64)
-#: What eight bricks or blocks around a particle have.
+#: What eight bricks, blocks or nodes around a particle have.
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
 # Why an environment failed: bits of ``State.failure``.
 FAILURE_NONFINITE = 1
 FAILURE_OUT_OF_GRID = 2
-FAILURE_CFL = 4
+FAILURE_CFL = 4  # too fast for the time step; in relays also too fast, or too much at a node, to be counted
 FAILURE_ACTION = 8
 FAILURE_BLOCKS = 16
 FAILURE_NAMES: dict[int, str] = {
@@ -325,6 +325,6 @@ class Scratch:
     sensors: Sensors
     room: Room
     large_room: bool
-    turns: tuple | None = None
+    turns: object | None = None
     ahead: object | None = None
     meetings: object | None = None

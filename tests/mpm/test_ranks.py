@@ -7,7 +7,16 @@ import pytest
 import warp as wp
 
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.ranks import NEAR, PART, TELLS, Ranks, allocate_ranks, forget_ranks, raise_rank, record_order
+from piavatar_envs.mpm.ranks import (
+    NEAR_BOUNDARY,
+    PART,
+    TELLING,
+    Ranks,
+    allocate_ranks,
+    forget_ranks,
+    raise_rank,
+    record_order,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -33,8 +42,10 @@ def test_parts_are_in_order_of_their_highest_rank(device, num_particles):
     program = Program(device)
     record_order(program, ranks)
     for share in (0.05, 0.0, 0.01):
-        rank = rng.choice([0, int(TELLS), int(NEAR)], (3, num_particles), p=[1 - share, 0.6 * share, 0.4 * share])
-        rank[:, 0] = [0, int(TELLS), int(NEAR)]
+        rank = rng.choice(
+            [0, int(TELLING), int(NEAR_BOUNDARY)], (3, num_particles), p=[1 - share, 0.6 * share, 0.4 * share]
+        )
+        rank[:, 0] = [0, int(TELLING), int(NEAR_BOUNDARY)]
         padded = np.pad(rank, ((0, 0), (0, parts * int(PART) - num_particles)))
         highest = padded.reshape(3, parts, -1).max(2)
         wp.launch(raise_ranks, rank.shape, [wp.array(rank, dtype=int, device=device)], [ranks], device=device)
