@@ -10,9 +10,10 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import NOBODY, awaited_slot, mark_block, slots_used
 from piavatar_envs.mpm.colliders import CONTACT_GATE, NEAR_PARTICLE, nearest_boundary
-from piavatar_envs.mpm.counts import MOST_MASS, Counts, pass_speeds, speeds_of_launch, unit_of_mass
+from piavatar_envs.mpm.counts import MOST_MASS, Counts
 from piavatar_envs.mpm.gather import Gathered, Gradients, begun, own_velocity, settled
 from piavatar_envs.mpm.materials import kirchhoff_stress
+from piavatar_envs.mpm.measures import pass_speeds, speeds_of_launch, unit_of_mass, units_at
 from piavatar_envs.mpm.ranks import PART
 from piavatar_envs.mpm.singles import (
     TEAM,
@@ -208,7 +209,7 @@ def carry(
     unit = unit_of_mass(number_of_team(team, read, HEAVIEST))
     m = wp.where(takes, number_of_team(team, read, MASS), 0.0)
     physical, kinematic, crowd = gather_by_team(
-        team, several, grid, step, boundaries, contact, counts, e, field, unit * wp.vec2(1.0, speeds.gathered), stencil,
+        team, several, grid, step, boundaries, contact, counts, e, field, units_at(unit, speeds.gathered), stencil,
         records_of(turn.gathered, slot), distance, m, sensors,
     )  # fmt: skip
     if several:
@@ -243,7 +244,7 @@ def carry(
         wp.atomic_min(turn.stops, e, turn.substep + 1)
     if turn.scattered >= 0:  # comes last: what a thread reads after its additions waits for them
         record = records_of(turn.scattered, wp.max(slot, wp.vec2i()))
-        units = unit * wp.vec2(1.0, speeds.added)
+        units = units_at(unit, speeds.added)
         count_single(team, grid, particles, counts, e, p, s.x, vk, adds, tells, record, units, momentum)
 
 

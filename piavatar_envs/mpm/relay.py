@@ -19,7 +19,8 @@ import warp as wp
 
 from piavatar_envs.mpm.blocks import slots_used
 from piavatar_envs.mpm.carry import TEAM_OF_FIELDS, Turn, carry_fields_on, carry_on
-from piavatar_envs.mpm.counts import Counts, forget_measures
+from piavatar_envs.mpm.counts import Counts
+from piavatar_envs.mpm.measures import forget_measures
 from piavatar_envs.mpm.meeting import meetings_of
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.ranks import PART, Ranks, forget_ranks

@@ -26,15 +26,14 @@ from piavatar_envs.mpm.counts import (
     in_units,
     kinematic_numbers,
     mass_counted,
-    mass_unit_of,
     numbers_at,
     physical_numbers,
     place_counted,
-    speed_of_counts,
     vec4i,
 )
 from piavatar_envs.mpm.grid import total_velocity
 from piavatar_envs.mpm.impulses import write_change
+from piavatar_envs.mpm.measures import mass_unit_of, speed_of_counts, units_at
 from piavatar_envs.mpm.meeting import (
     Encounter,
     Meeting,
@@ -147,8 +146,8 @@ def meet_pair(
     of_a = facing_at(grid, contact, counts, had, now, e, a, unit_a, near.a)
     of_b = facing_at(grid, contact, counts, had, now, e, b, unit_b, near.b)
     n_ab = normal_of_warp(near.c, of_a, of_b)
-    va = total_velocity(step, split, sum_counted(unit_a * wp.vec2(1.0, speed), physical_a, driven_a))
-    vb = total_velocity(step, split, sum_counted(unit_b * wp.vec2(1.0, speed), physical_b, driven_b))
+    va = total_velocity(step, split, sum_counted(units_at(unit_a, speed), physical_a, driven_a))
+    vb = total_velocity(step, split, sum_counted(units_at(unit_b, speed), physical_b, driven_b))
     if lane_of_thread() != 0 or not told or va[0] <= MASS_MIN or vb[0] <= MASS_MIN:
         return
     offset_a = place_counted(grid, unit_a, place_a)

@@ -13,16 +13,17 @@ from typing import Any
 
 import warp as wp
 
-from piavatar_envs.mpm.counts import (
-    UNITS,
-    Counts,
+from piavatar_envs.mpm.counts import Counts
+from piavatar_envs.mpm.measures import (
     countable,
     known_speed,
     mass_unit_of,
     measure_mass,
     measure_speed,
     prepare_speeds,
+    speed_counted,
     speed_of_counts,
+    units_at,
 )
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.ranks import NEAR_BOUNDARY, TELLING, Ranks, raise_rank, record_order
@@ -238,12 +239,12 @@ def singles_to_counts(
     unit = mass_unit_of(counts, e, s.field)
     counted = speed_of_counts(counts, e, 0)
     most = most_of(s.scattered, s.scattered.at_base[0], s.vk)
-    takes = countable(s.takes, most / (UNITS * unit), counted, e, failure)
+    takes = countable(s.takes, speed_counted(most, unit), counted, e, failure)
     if at[1] == 0:
         prepare_speeds(counts, e, 0)
     if s.tells:
         raise_rank(ranks, e, s.p, wp.where(s.near, NEAR_BOUNDARY, TELLING))
-    record, units = wp.vec2i(s.record), unit * wp.vec2(1.0, counted)
+    record, units = wp.vec2i(s.record), units_at(unit, counted)
     count_single(
         TEAM, grid, particles, counts, e, s.p, s.x, s.vk, takes, s.tells, record, units, s.scattered
     )  # fmt: skip

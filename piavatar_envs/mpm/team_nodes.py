@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.counts import Counts
+from piavatar_envs.mpm.counts import NUMBERS_OF, Counts
 from piavatar_envs.mpm.shared_memory import native
 from piavatar_envs.mpm.types import vec8, vec8i
 
@@ -150,15 +150,15 @@ def weights_of_thread(team: int, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: w
 
 @wp.func_native(
     native(
-        """
+        NUMBERS_OF
+        + """
 wp::mat_t<8, 4, wp::int32> numbers;
 #pragma unroll
 for (int n = 0; n < 7; ++n) {
     if (n * team >= 27) break;
     const int r = records[n];
-    const int4 two = *reinterpret_cast<const int4*>(&wp::index(counts.sum, e, r + (r & ~63)));
-    numbers.data[n][0] = two.x, numbers.data[n][1] = two.y - (two.x >> 31);
-    numbers.data[n][2] = two.z, numbers.data[n][3] = two.w - (two.z >> 31);
+    const int4 four = numbers_of(&wp::index(counts.sum, e, r + (r & ~63)));
+    numbers.data[n][0] = four.x, numbers.data[n][1] = four.y, numbers.data[n][2] = four.z, numbers.data[n][3] = four.w;
 }
 return numbers;
 """,

@@ -6,20 +6,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm.counts import (
-    MOST_MASS,
-    UNITS,
-    Counts,
+from piavatar_envs.mpm.counts import MOST_MASS, UNITS, Counts, give_numbers, numbers_at, vec2l, vec4i
+from piavatar_envs.mpm.measures import (
     countable,
     forget_measures,
-    give_numbers,
     known_speed,
     measure_speed,
-    numbers_at,
     prepare_speeds,
     speed_of_counts,
-    vec2l,
-    vec4i,
 )
 from piavatar_envs.mpm.types import FAILURE_CFL, FAILURE_NONFINITE, group
 
