@@ -14,7 +14,7 @@ from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.matrices import components_of, matrix_at, store_matrix
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep, record_substeps
+from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
 
 wp.set_module_options({"enable_backward": False})
@@ -83,11 +83,8 @@ class Matter:
     @property
     def sums_are_clear(self) -> bool:
         """Whether no node holds anything that a later substep would add to."""
-        sums, turns = self.scratch.sums, self.scratch.turns
+        sums = self.scratch.sums
         arrays = [sums.fixed, sums.offset, sums.offset_fixed, sums.told]
-        if turns is not None:
-            counts, ranks = turns.counts, turns.ranks
-            arrays += [counts.sum, counts.offset, counts.told, counts.fastest, counts.heaviest, ranks.rank, ranks.count]
         if self.model.scatter != "shared":  # whose sums are written, not added up
             arrays.append(sums.value)
         return not any(array.numpy().any() for array in arrays)
@@ -168,11 +165,9 @@ def build_matter(
         record_begin(program, model, state, scratch)
     else:  # sensors add up over control steps
         record_marks(program, model, state, scratch)
-    if pushed:
-        for index in range(model.num_substeps):
-            record_substep(program, model, state, scratch, index)
+    for index in range(model.num_substeps):
+        record_substep(program, model, state, scratch, index)
+        if pushed:
             program.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
-    else:
-        record_substeps(program, model, state, scratch)
     record_end(program, model, state, scratch)
     return Matter(model, state, scratch, program, rest, keep, kick).set(x=rest)

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from piavatar_envs.mpm.types import SCATTERS, Model, State
+from piavatar_envs.mpm.types import Model, State
 
 #: x, u, vk, spin (3 floats each), C, F (9 each); x, u, C, F are written; mass, volume, mu, lam, material, field, seam.
 STATE_BYTES, WRITTEN_BYTES, CONSTANT_BYTES = 120, 96, 28
@@ -147,22 +147,16 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
     """
     particles, nodes = counts.particles, counts.nodes
     constants = CONSTANT_BYTES if model.particles.mass.shape[0] > 1 else 0
-    sums = nodes * NODE_BYTES * (2 if SCATTERS[model.scatter] else 1)  # in fixed point a number has two words
+    sums = nodes * NODE_BYTES * (2 if model.scatter == "runs" else 1)  # in fixed point a number has two words
     # state and constants in; sums read and written where particles are
     scatter = particles * (STATE_BYTES + constants) + 2 * sums
     formulas = {
         "particles_to_grid": scatter,
         "runs_to_grid": scatter,
-        "singles_to_grid": scatter,
-        # x, F, vk, spin in; x, u, C, F out; physical halves of sums in, added to, and cleared, in 32 bits
-        "carry_on": particles * (72 + constants + WRITTEN_BYTES) + 2 * nodes * NODE_BYTES,
         # mass and physical momentum in and cleared, physical velocities out; more where contact is at hand
-        "update_grid": 2 * sums // (2 if SCATTERS[model.scatter] else 1) + nodes * NODE_BYTES // 2,
+        "update_grid": 2 * sums // (2 if model.scatter == "runs" else 1) + nodes * NODE_BYTES // 2,
         # x, F, vk, spin and physical velocities in; x, u, C, F out
         "grid_to_particles": particles * (72 + WRITTEN_BYTES) + nodes * NODE_BYTES // 2,
-        # the same with constants in, and momenta instead of C out; those with x, u and masses in
-        "grid_to_momenta": particles * (72 + constants + WRITTEN_BYTES) + nodes * NODE_BYTES // 2,
-        "momenta_to_grid": particles * (60 + (4 if constants else 0)) + 2 * sums,
         # a body's grid stays in shared memory: what the scatter reads, and x, F, vk and spin once more; x, u, C, F out
         **dict.fromkeys(SUBSTEPS, particles * (STATE_BYTES + constants + 72 + WRITTEN_BYTES)),
         # velocities or sums out
@@ -180,6 +174,6 @@ def kernel_bytes(kernel: str, model: Model, counts: Counts) -> int | None:
 
 def kernel_additions(kernel: str, counts: Counts) -> int | None:
     """Records that one launch of a kernel adds to nodes if it adds each particle's by itself; None for others."""
-    scatters = ("particles_to_grid", "runs_to_grid", "momenta_to_grid", "singles_to_grid", "carry_on")
+    scatters = ("particles_to_grid", "runs_to_grid")
     scatters += (*SUBSTEPS, *NODE_PASSES)
     return counts.particles * STENCIL if kernel in scatters else None

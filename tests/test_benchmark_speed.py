@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from benchmarks import crowd, performance, profile, roofline, runner, soak, substep, timing, vector
-from piavatar_envs.avatar.asset import load_body, mesh_volume
-from piavatar_envs.avatar.surface import ClosedSurface
+from benchmarks import profile, roofline, runner, soak, timing, vector
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.fields import Fields
@@ -23,7 +20,6 @@ from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.types import FAILURE_CFL
 
 RUNS = {
-    "substep.json": (substep, ["--small", "--repeats", "2", "--warm-up", "1"]),
     "vector.json": (vector, ["--fidelity", "tiny", "--num-envs", "1", "3", "--seconds", "0.01", "--repeats", "2"]),
     "profile_reach.json": (profile, ["--fidelity", "tiny", "--num-envs", "2", "--repeats", "2"]),
     "profile_stand.json": (
@@ -55,56 +51,6 @@ def results(tmp_path_factory, device: str) -> Path:
 
 def rows_of(results: Path, file: str) -> list[dict]:
     return json.loads((results / file).read_text())["results"]
-
-
-# --- bodies ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def skin() -> tuple[ClosedSurface, float]:
-    body = load_body().mean_body()
-    return ClosedSurface(body.vertices, load_body().faces), mesh_volume(body.vertices, load_body().faces)
-
-
-def test_particles_on_the_skin_lie_on_it_evenly_and_weigh_what_the_body_weighs(skin):
-    points, volume = crowd.skin_body(3000)
-    surface, total = skin
-    assert points.num_points == len(volume) == 3000
-    assert np.abs(surface.distance(points.rest[0])).max() < 1e-4
-    assert volume.sum() == pytest.approx(total, rel=1e-4) and np.ptp(volume) == 0.0
-    assert points.mass.sum() == pytest.approx(1000.0 * total, rel=1e-4)
-    np.testing.assert_allclose(points.skin_weights.sum(1), 1.0, atol=1e-5)
-    body = load_body().mean_body()
-    corners = body.vertices[load_body().faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    for axis in range(3):
-        # as much of the skin's area as of the particles is below any height; triangles are small
-        for cut in np.quantile(points.rest[0, :, axis], [0.1, 0.5, 0.9]):
-            share = area[corners[:, :, axis].mean(1) < cut].sum() / area.sum()
-            assert (points.rest[0, :, axis] < cut).mean() == pytest.approx(share, abs=0.015)
-
-
-def test_particles_inside_are_as_many_as_asked_for_and_fill_the_body(skin):
-    points, volume = crowd.interior_body(700)
-    surface, total = skin
-    assert points.num_points == 700 and surface.distance(points.rest[0]).max() < 0.0
-    assert volume.sum() == pytest.approx(total, rel=1e-4)
-    with pytest.raises(ValueError, match="440 bone particles"):
-        crowd.interior_body(440)
-
-
-@pytest.mark.parametrize("body", [crowd.skin_body, crowd.interior_body])
-def test_every_bone_is_tracked_by_particles_that_spread(body):
-    points, _ = body(1000)
-    for bone in range(22):
-        own = points.rest[0][points.bone == bone]
-        assert len(own) == crowd.TRACKERS
-        assert np.linalg.matrix_rank(own - own.mean(0), tol=1e-4) == 3
-
-
-def test_a_queue_stands_as_close_as_it_should():
-    lattice = np.stack(np.meshgrid(*[np.arange(4) * 0.1] * 3, indexing="ij"), -1).reshape(-1, 3)
-    assert crowd.queue_step(lattice, 0.02) == pytest.approx(0.32, abs=0.002)
 
 
 # --- the bound -------------------------------------------------------------------------------------------------------
@@ -169,79 +115,6 @@ def test_memory_in_use_grows_by_what_is_allocated(device: str):
 
 
 # --- a substep -------------------------------------------------------------------------------------------------------
-
-
-def test_substep_as_a_smoke_run(results: Path):
-    rows = rows_of(results, "substep.json")
-    small = crowd.SMALL
-    assert [row["case"] for row in rows] == [f"{n}x{count}" for n in (small.skin, small.interior) for count in (1, 4)]
-    for row in rows:
-        assert row["failed"] is None and row["ms_per_substep"] > 0.0 and row["ms_per_substep_full_drive"] > 0.0
-        assert row["particles"] == int(row["case"].split("x")[0]) * row["avatars"]
-        assert row["velocity_fields"] == row["avatars"] and row["touching_pairs"] == row["avatars"] - 1
-        assert row["mean_way_mm"] > 1.0 and row["cfl"] < 0.5 and row["memory_gb"] > 0.0
-        assert row["stages_sum_ms"] == pytest.approx(sum(row["stages_ms"].values()))
-        assert row["roofline"]["shared_nodes"] > 0 or row["avatars"] == 1
-        assert row["expected_ms"] is None
-
-
-def test_the_papers_scale_is_the_papers():
-    scale, grid = crowd.Scale(), crowd.Scale().grid()
-    assert tuple(grid.nodes) == (200, 200, 200) and grid.dx == pytest.approx(0.01)
-    cases = [f"{points}x{count}" for points in (scale.skin, scale.interior) for count in substep.AVATARS]
-    for case in cases:
-        found = substep.references(case)
-        assert all(value > 0.0 for value in found.values())
-        assert found["expected_ms"] < found["rebuilt_ms"] < found["paper_ms"]
-    assert substep.references("300000x4")["paper_memory_gb"] == pytest.approx(5.4 + 4 * 0.122)
-
-
-def small_crowd(device: str) -> crowd.Crowd:
-    return crowd.Crowd(*crowd.interior_body(crowd.SMALL.interior), 1, crowd.SMALL, device)
-
-
-def test_a_run_that_fails_or_stands_still_has_no_time(device: str, monkeypatch):
-    options = substep.Options(repeats=1, warm_up=0, device=device, full_drive=False)
-    world = small_crowd(device)
-    world.state.failure.assign(np.array([FAILURE_CFL], np.int32))
-    row = substep.measure(world, options, 0)
-    assert row["failed"] == "cfl" and row["ms_per_substep"] is None
-    monkeypatch.setattr(crowd, "SWAY", 0.0)
-    monkeypatch.setattr(crowd, "TURN", 0.0)
-    row = substep.measure(small_crowd(device), options, 0)
-    assert "moved" in row["failed"] and row["ms_per_substep"] is None
-
-
-@pytest.mark.parametrize("when", [2, 3])  # commands: before the steps that are timed, of either program
-def test_a_failure_in_the_timed_steps_is_not_forgiven(when: int, device: str, monkeypatch):
-    command, calls = crowd.Crowd.command, []
-
-    def fail(world: crowd.Crowd, sign: int) -> None:
-        command(world, sign)
-        calls.append(sign)
-        world.state.failure.assign(np.array([FAILURE_CFL if len(calls) == when else 0], np.int32))
-
-    monkeypatch.setattr(crowd.Crowd, "command", fail)
-    options = substep.Options(repeats=1, warm_up=0, device=device, full_drive=True)
-    row = substep.measure(small_crowd(device), options, 0)
-    assert len(calls) == 3 and row["failed"] == "cfl" and row["ms_per_substep"] is None
-
-
-def test_a_reset_puts_the_bodies_back(device: str):
-    world = small_crowd(device)
-    start = world.state.x.numpy().copy()
-    for sign in (1, -1):
-        world.command(sign)
-        world.once.run()
-    assert np.abs(world.state.x.numpy() - start).max() > 1e-3
-    world.reset()
-    np.testing.assert_allclose(world.state.x.numpy(), start, atol=1e-6)
-    assert not world.state.u.numpy().any()
-
-
-def test_unknown_cases_are_refused():
-    with pytest.raises(ValueError, match="10475x4"):
-        next(substep.cases(substep.Options(only=("10475x5",))))
 
 
 # --- batches ---------------------------------------------------------------------------------------------------------
@@ -372,64 +245,3 @@ def test_profile_as_a_smoke_run(results: Path):
     assert known, "no kernel has a formula in roofline.kernel_bytes; kernels were renamed"
     assert all(row["gb_per_s"] * row["ms_per_step"] == pytest.approx(row["bytes_per_step"] / 1e6) for row in known)
     assert (results / "profile_reach.png").stat().st_size > 10_000
-
-
-def test_every_kernel_of_a_step_under_torques_is_known(results: Path):
-    """What joints take beside the Material Point Method is told by names: no kernel of either may be missing."""
-    names = {row["case"] for row in rows_of(results, "profile_stand.json")}
-    assert names >= performance.JOINTS
-    of_matter = {name for module in kernels_by_module("piavatar_envs.mpm.") for name in module} & names
-    assert of_matter - performance.MATTER <= {"clear_sensors", "read_impulses"}  # which only tell what has been
-    of_joints = {name for module in kernels_by_module("piavatar_envs.avatar.joint_") for name in module} & names
-    assert of_joints - performance.JOINTS <= {"set_springs"}  # once a step
-
-
-def kernels_by_module(prefix: str) -> list[set[str]]:
-    """Names of the kernels of all modules that have been imported, whose names begin so."""
-    modules = [module for name, module in sys.modules.items() if name.startswith(prefix)]
-    return [{value.key for value in vars(module).values() if isinstance(value, wp.Kernel)} for module in modules]
-
-
-def test_tables_are_those_of_the_results(results: Path):
-    text = performance.fill(performance.DOCUMENT.read_text(encoding="utf-8"), results)
-    assert "not measured yet" not in text and performance.fill(text, results) == text
-    row = rows_of(results, "substep.json")[1]
-    assert f"| {row['case']} | {performance.number(row['ms_per_substep'])} |" in text
-    verdict = rows_of(results, "soak.json")[-1]
-    assert f"50 steps: **{verdict['verdict']}**" in text
-    for table in performance.TABLES:
-        assert f"<!-- table: {table} -->" in text
-
-
-def test_tables_refuse_what_is_missing_or_unfinished(results: Path, tmp_path: Path):
-    text = "<!-- table: substep -->\n<!-- end -->\n<!-- table: soak -->\n<!-- end -->\n"
-    with pytest.raises(FileNotFoundError, match=r"soak\.json, substep\.json .*benchmarks\.soak --device cuda --out"):
-        performance.fill(text, tmp_path)
-    report = json.loads((results / "substep.json").read_text())
-    runner.write_json(tmp_path / "substep.json", report | {"complete": False})
-    with pytest.raises(FileNotFoundError, match=r"no soak\.json"):
-        performance.fill(text, tmp_path)
-    shutil.copy(results / "soak.json", tmp_path)
-    with pytest.raises(ValueError, match=r"substep\.json .*stopped"):
-        performance.fill(text, tmp_path)
-    filled = performance.fill(text, tmp_path, only=["soak"])  # the other one stays as it was
-    assert filled.startswith("<!-- table: substep -->\n<!-- end -->\n") and "verdict" in filled
-    with pytest.raises(ValueError, match="sonnet"):
-        performance.fill(text, tmp_path, only=["sonnet"])
-    with pytest.raises(ValueError, match="sonnet"):
-        performance.fill("<!-- table: sonnet -->\n<!-- end -->\n", results)
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(None, "-"), (0.0, "0"), (0.01234, "0.0123"), (75_432.0, "75,400"), (1.5e-6, "1.5e-06")]
-)
-def test_numbers_in_tables(value: float | None, text: str):
-    assert performance.number(value) == text
-
-
-def test_committed_tables_follow_the_committed_results():
-    """A result that is committed without its table, or a table typed by hand, shows here."""
-    text = performance.DOCUMENT.read_text(encoding="utf-8")
-    for match in performance.MARKED.finditer(text):
-        if (performance.RESULTS / performance.TABLES[match["name"]].file).exists():
-            assert performance.fill(match[0]) == match[0], match["name"]

@@ -17,9 +17,6 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 FLOORS = {"mpm": 0, "data": 0, "avatar": 1, "props": 2, "render": 2, "tasks": 3, "envs": 3, "api": 4, "multi": 5}
 TOP = 6
 
-#: A house rule says about 300 lines and about 50; these are where "about" ends.
-MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_KERNEL_ARGUMENTS = 330, 75, 12
-
 
 def floor(module: str) -> int:
     """Floor of a dotted module of the package; the package itself only registers ids and is the ground."""
@@ -75,20 +72,6 @@ def test_the_direction_test_can_fail(tmp_path, monkeypatch):
         assert len(upward(folder / "bad.py")) == 1, line
     (folder / "good.py").write_text("import numpy\nfrom piavatar_envs.mpm import stencil\nfrom . import grid\n")
     assert not upward(folder / "good.py")
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_files_functions_and_kernels_stay_small(path):
-    text = path.read_text(encoding="utf-8")
-    assert path.name not in ("utils.py", "helpers.py", "manager.py"), "a file is named after what it knows"
-    assert text.count("\n") <= MAX_FILE_LINES
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            lines = node.end_lineno - node.lineno + 1
-            assert lines <= MAX_FUNCTION_LINES, f"{path.name}: {node.name} has {lines} lines"
-            kernel = any("kernel" in ast.unparse(decorator) for decorator in node.decorator_list)
-            count = len(node.args.args)
-            assert not kernel or count <= MAX_KERNEL_ARGUMENTS, f"{path.name}: kernel {node.name} has {count} arguments"
 
 
 def run_python(code: str) -> str:

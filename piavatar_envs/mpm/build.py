@@ -26,10 +26,6 @@ from piavatar_envs.mpm.types import (
     Step,
 )
 
-#: Particles for every slot up to which a large body's are added to the nodes one by one: a skin has some three
-#: particles a slot, of which a body at rest fills less than half, and an interior more than thirty.
-SPARSE = 8
-
 
 @dataclass(frozen=True)
 class MaterialPoints:
@@ -173,8 +169,7 @@ def build_model(
     environment, each field's counted; if not given, no state can exceed it. ``rest``, shape ``(P, 3)``, is where
     particles are when their body is at rest [m]; on a GPU, those of large bodies are added up by compact groups then.
     ``scatter`` is a key of ``SCATTERS``; if not given, ``"shared"`` on a GPU whose shared memory holds an environment's
-    grid; on another one that can match within a warp, ``"singles"`` where ``max_slots`` says that few particles share a
-    block of nodes, else ``"runs"``; else ``"plain"``.
+    grid; ``"runs"`` on another one that can match within a warp; else ``"plain"``.
 
     Raises:
         ValueError: bad material, unstable time step, a scatter that the device does not know, or more memory than it
@@ -189,9 +184,8 @@ def build_model(
         num_substeps = choose_num_substeps(control_dt, grid.dx, sound_speed, cfl)
     check_num_substeps(num_substeps, control_dt, grid.dx, sound_speed)
     mu, lam = lame_parameters(points.young_modulus, points.poisson_ratio)
-    estimated = max_slots is not None
     max_slots = bound_slots(max_slots, points.fields, grid, fields.num_fields)
-    scatter = choose_scatter(scatter, device, points.fields, max_slots, decoupling, estimated)
+    scatter = choose_scatter(scatter, device, points.fields, max_slots, decoupling)
     check_memory(num_envs, points.num_particles, max_slots, device, fields.num_fields, grid.num_blocks, scatter)
     step = Step()
     step.dt = control_dt / num_substeps
@@ -217,12 +211,8 @@ def build_model(
     )
 
 
-def choose_scatter(
-    scatter: str | None, device: str, field: np.ndarray, max_slots: int, decoupling: str, estimated: bool
-) -> str:
+def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slots: int, decoupling: str) -> str:
     """How particles of velocity fields ``field`` reach the nodes, on a device.
-
-    If slots are ``estimated``, not what could be needed at most, they say how dense the particles are.
 
     Raises:
         ValueError: there is no such way, or not on this device or for that size.
@@ -231,9 +221,8 @@ def choose_scatter(
     matches = target.is_cuda and target.arch >= 70
     # in shared memory nobody asks for the gradient of the kinematic velocity
     shared = decoupling != "paper" and suits_shared(device, field, max_slots)
-    large = "singles" if estimated and len(field) <= SPARSE * max_slots else "runs"
     if scatter is None:
-        return "shared" if shared else large if matches else "plain"
+        return "shared" if shared else "runs" if matches else "plain"
     if scatter not in SCATTERS:
         raise ValueError(f"unknown scatter {scatter!r}; use one of {', '.join(SCATTERS)}")
     if scatter != "plain" and not matches:
@@ -243,7 +232,7 @@ def choose_scatter(
             f"scatter='shared' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
             f"particles a body (here {most_particles(field)}), {MOST_LISTED} in all ({len(field)}), few slots "
             f"({max_slots}) and another decoupling than 'paper' ({decoupling!r}); {target} takes "
-            f"{(large if matches else 'plain')!r}"
+            f"{('runs' if matches else 'plain')!r}"
         )
     return scatter
 

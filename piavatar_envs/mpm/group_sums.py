@@ -76,7 +76,7 @@ if (is_place)
         if (room[MASSIVE + n]) wp::index(sums.told, e, room[RECORDS + n] >> 7) = 1;
 bool too_much = false;
 // sums have 31 bits, so most of them cannot be too large
-if (sums.is_fixed != 0 && !is_place && __all_sync(ALL, shift < 18)) {{
+if (!is_place && __all_sync(ALL, shift < 18)) {{
     const size_t to = __cvta_generic_to_global(&wp::index(sums.fixed, e, 0)) + 8 * word;
     const int factor = 1 << shift;
     put([&](int record, int sum) {{
@@ -84,7 +84,7 @@ if (sums.is_fixed != 0 && !is_place && __all_sync(ALL, shift < 18)) {{
         asm("mul.wide.s32 %0, %1, %2;" : "=l"(added) : "r"(sum), "r"(factor));
         red(to, record, added);
     }});
-}} else if (sums.is_fixed != 0) {{
+}} else {{
     void* const records = is_place ? (void*)&wp::index(sums.offset_fixed, e, 0) : &wp::index(sums.fixed, e, 0);
     const size_t to = __cvta_generic_to_global(records) + 8 * word;
     const int most_counted = shift > 48 ? 0 : shift < 18 ? 0x7fffffff : 1 << (48 - shift);
@@ -92,10 +92,6 @@ if (sums.is_fixed != 0 && !is_place && __all_sync(ALL, shift < 18)) {{
         if (abs(sum) <= most_counted) red(to, own(record), (long long)sum << shift);
         else too_much = true;
     }});
-}} else {{
-    float* const to = (float*)(is_place ? &wp::index(sums.offset, e, 0) : &wp::index(sums.value, e, 0)) + word;
-    if (is_place && c > 0) unit *= grid.dx;
-    put([&](int record, int sum) {{ atomicAdd(to + 4 * (size_t)own(record), sum * unit); }});
 }}
 if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 """)

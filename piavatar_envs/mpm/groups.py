@@ -36,7 +36,6 @@ from piavatar_envs.mpm.group_bricks import (
 from piavatar_envs.mpm.group_plan import THREADS, share_of
 from piavatar_envs.mpm.group_sums import put_down, raised
 from piavatar_envs.mpm.group_tellers import note_teller, tell_nodes
-from piavatar_envs.mpm.parts import Part
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import MOMENTUM
 from piavatar_envs.mpm.shared_add import add_to_box
@@ -77,14 +76,14 @@ def particle_of_thread(first: int) -> int:
 
 
 @wp.func
-def begin_group(particles: Particles, sums: Sums, those: wp.vec2i):
-    """The group of a CUDA block, one of ``those``: environment, particle of the thread, field, particle after the last.
+def begin_group(particles: Particles, sums: Sums):
+    """The group of a CUDA block: environment, particle of the thread, field, particle after the last.
 
     Nothing has been added yet; units are not smaller than those of the sums. All threads meet later.
     """
-    at_group = environment_of(block_of_launch(), those[1])
+    at_group = environment_of(block_of_launch(), particles.groups.shape[0] - 1)
     e = at_group[0]
-    begins = particles.groups[those[0] + at_group[1]]
+    begins = particles.groups[at_group[1]]
     field = begins[1]
     if thread_of_block() == 0:
         mass = sums.mass_unit[row(e, sums.mass_unit.shape[0]), field]
@@ -96,7 +95,7 @@ def begin_group(particles: Particles, sums: Sums, those: wp.vec2i):
         set_number(DRIVEN, UNITS * momentum)
     begin_turn()
     clear_nodes()
-    return wp.vec4i(e, particle_of_thread(begins[0]), field, particles.groups[those[0] + at_group[1] + 1][0])
+    return wp.vec4i(e, particle_of_thread(begins[0]), field, particles.groups[at_group[1] + 1][0])
 
 
 @wp.func
@@ -223,18 +222,17 @@ def runs_to_grid(
     contact: Contact,
     moving: Moving,
     blocks: Blocks,
-    those: wp.vec2i,
     # in and out
     failure: wp.array(dtype=int),
     sums: Sums,
 ):
     """The same sums as :func:`piavatar_envs.mpm.transfer.particles_to_grid`.
 
-    A CUDA block takes one of ``those`` groups of an environment, the first and how many there are, a thread a particle;
-    all of its threads come to what they do together.
+    A CUDA block takes one group of an environment, a thread a particle; all of its threads come to what they do
+    together.
     """
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
-    at = begin_group(particles, sums, those)
+    at = begin_group(particles, sums)
     left = bool(False)
     if at[1] < at[3]:
         left = scatters(blocks, moving, at[0], at[1], failure)
@@ -246,10 +244,8 @@ def runs_to_grid(
         goes_on = begins_again()
 
 
-def record_groups(
-    program: Program, kernel: wp.Kernel, model: Model, part: Part, inputs: list[Any], outputs: list[Any]
-) -> None:
-    """Append a scatter of a part of all environments: no CUDA block has two."""
+def record_groups(program: Program, model: Model, inputs: list[Any], outputs: list[Any]) -> None:
+    """Append the P2G of all groups of all environments; no CUDA block has two."""
     share = share_of(model.num_particles)
-    threads = model.num_envs * part.groups[1] * share
-    program.launch(kernel, threads, [*inputs, part.groups], outputs, block_dim=share)
+    threads = model.num_envs * (model.particles.groups.shape[0] - 1) * share
+    program.launch(runs_to_grid, threads, inputs, outputs, block_dim=share)

@@ -10,14 +10,12 @@ import warp as wp
 from piavatar_envs.mpm.blocks import NOBODY
 from piavatar_envs.mpm.matrices import allocate_matrices, components_of, whole_lines
 from piavatar_envs.mpm.others import notes_others
-from piavatar_envs.mpm.parts import GROUPED
 from piavatar_envs.mpm.sensing import senses_in_gather
 from piavatar_envs.mpm.shared_room import MOST_PARTICLES, plan_room
 from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.sums import units
 from piavatar_envs.mpm.sweep import most_shared
 from piavatar_envs.mpm.types import (
-    SCATTERS,
     Blocks,
     Grid,
     Model,
@@ -90,7 +88,7 @@ def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin
 
 def choose_marks(scatter: str, field: np.ndarray) -> int:
     """Substeps after which the blocks of particles of velocity fields ``field`` are marked anew."""
-    if scatter not in GROUPED:
+    if scatter != "runs":
         return MARKS_EVERY
     return MARKS_OF_LARGE if np.bincount(field).max() > MOST_PARTICLES else MARKS_OF_GROUPS
 
@@ -101,9 +99,9 @@ def estimate_bytes(
     """Device memory of state and scratch [bytes].
 
     120 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 32 more
-    where there are several fields; the map of blocks. What relays and gathers ahead need is made by who records them.
+    where there are several fields; the map of blocks.
     """
-    sums = 16 if scatter == "shared" else (32 + 16) * (1 + SCATTERS[scatter])
+    sums = 16 if scatter == "shared" else (32 + 16) * (2 if scatter == "runs" else 1)
     node = sums + 32 + (16 + 16 if num_fields > 1 else 0)
     slots = max_slots * (BLOCK**3 * node + (10 if num_fields > 1 else 4) + (0 if scatter == "shared" else 4))
     particles = 48 * num_particles + 72 * whole_lines(num_particles)  # four vectors and two matrices
@@ -191,7 +189,7 @@ def allocate_blocks(model: Model) -> Blocks:
 
 def allocate_sums(model: Model, velocity: wp.array) -> Sums:
     """Zeroed sums of the nodes, and their units. Sums from shared memory come to the records of the ``velocity``."""
-    fixed, records = SCATTERS[model.scatter], (model.num_envs, int(BLOCK_NODES) * model.max_slots)
+    fixed, records = model.scatter == "runs", (model.num_envs, int(BLOCK_NODES) * model.max_slots)
     mass, momentum = units(model.contact.density.numpy(), model.grid, model.step)
     floats, integers = ((1, 1), records) if fixed else (records, (1, 1))
     return group(

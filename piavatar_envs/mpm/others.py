@@ -6,8 +6,8 @@ if another one was there then, and only fields that have told a node touch there
 come to it, with little weight unless it moves nearly a grid spacing in a time step. When blocks are marked anew, their
 slots are others, and fields tell all nodes of blocks that have several: who comes then touches at once.
 
-For :mod:`piavatar_envs.mpm.groups`, where a group takes much longer if one of its particles tells, and for
-:mod:`piavatar_envs.mpm.relay`; other scatters tell all nodes of blocks with several fields in every substep.
+For :mod:`piavatar_envs.mpm.groups`, where a group takes much longer if one of its particles tells; other scatters tell
+all nodes of blocks with several fields in every substep.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.mpm.blocks import slots_used
-from piavatar_envs.mpm.parts import has_groups
 from piavatar_envs.mpm.stencil import BLOCK_NODES
 from piavatar_envs.mpm.sweep import lane_of_thread, lanes_with
 from piavatar_envs.mpm.types import Blocks, Model
@@ -25,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 
 def notes_others(model: Model) -> bool:
     """Whether that is noted, and not told everywhere."""
-    return has_groups(model) and model.contact.num_fields > 1
+    return model.scatter == "runs" and model.contact.num_fields > 1
 
 
 @wp.func

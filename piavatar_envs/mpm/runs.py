@@ -1,7 +1,4 @@
-"""The gather of a GPU for large bodies, and what its two scatters add up and what not.
-
-These are :mod:`piavatar_envs.mpm.groups` and, where particles are far apart, :mod:`piavatar_envs.mpm.singles`.
-"""
+"""The gather of a GPU for large bodies, and what their P2G (:mod:`piavatar_envs.mpm.groups`) adds up and what not."""
 
 from __future__ import annotations
 
@@ -98,7 +95,6 @@ def grid_to_particles(
     boundaries: Boundaries,
     node_velocity: wp.array2d(dtype=wp.vec4),
     senses: int,
-    those: wp.vec2i,
     # in and out; vk is read
     blocks: Blocks,
     moved: Moving,
@@ -107,13 +103,12 @@ def grid_to_particles(
 ):
     """Move every particle with the grid, see :func:`piavatar_envs.mpm.gather.gather`.
 
-    It moves ``those`` of every environment: the first, and how many there are. Unlike the gather of a CPU it has its
-    loops unrolled, and its threads store together. If it ``senses``, it does the work of
-    :func:`piavatar_envs.mpm.sensing.sense_contact` first, for the same particles.
+    Unlike the gather of a CPU it has its loops unrolled, and its threads store together. If it ``senses``, it does the
+    work of :func:`piavatar_envs.mpm.sensing.sense_contact` first.
     """
-    at = environment_of(wp.tid(), those[1])
+    at = environment_of(wp.tid(), particles.field.shape[0])
     e = at[0]
-    p = (those[0] + at[1]) & 0x7FFFFFFF  # tells the compiler that it is not negative
+    p = at[1]
     stays = blocks.frozen[e] != 0
     s = Gathered()
     if not stays:

@@ -1,8 +1,8 @@
 """What particles add up on the nodes, in floating or in fixed point.
 
 Floating-point sums depend on the order of their summands, which on a GPU is another one every time. In fixed point
-they do not, and a run can be repeated bit for bit. 32 bits are too few where all momenta are counted in one unit: they
-leave an affine velocity right to 1e-4 only (:mod:`piavatar_envs.mpm.counts` has others). 64 count units of 2^-36 of
+they do not, and a run can be repeated bit for bit. 32 bits are too few: they leave an affine velocity right to 1e-4
+only. 64 count units of 2^-36 of
 what a full cell of matter has, at rest or at a grid spacing a time step; a summand may be of 4,000 such cells, and
 there is room for thousands of them. Summands are rounded to the nearest unit, which is unbiased: rounding masses up
 would slow all motion down.

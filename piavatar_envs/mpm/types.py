@@ -31,7 +31,7 @@ vec8i = wp.types.vector(length=8, dtype=wp.int32)
 # Why an environment failed: bits of ``State.failure``.
 FAILURE_NONFINITE = 1
 FAILURE_OUT_OF_GRID = 2
-FAILURE_CFL = 4  # too fast for the time step; in relays also too fast, or too much at a node, to be counted
+FAILURE_CFL = 4  # too fast for the time step
 FAILURE_ACTION = 8
 FAILURE_BLOCKS = 16
 FAILURE_NAMES: dict[int, str] = {
@@ -44,16 +44,8 @@ FAILURE_NAMES: dict[int, str] = {
 
 #: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.decouple`).
 DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
-#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, ``groups``, ``singles`` and
-#: ``shared_substep``), and whether the nodes have sums in fixed point.
-SCATTERS: dict[str, bool] = {
-    "plain": False,
-    "runs": True,
-    "runs_float": False,
-    "singles": True,
-    "singles_float": False,
-    "shared": False,
-}
+#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, ``groups`` and ``shared_substep``).
+SCATTERS = ("plain", "runs", "shared")
 #: What is around a particle: perhaps a boundary or another field, so that it tells its nodes where it is; the latter.
 TELLS, BESIDE = wp.constant(1), wp.constant(2)
 SPLIT = wp.constant(0)
@@ -313,9 +305,6 @@ class Scratch:
         facing: vec4: what nodes of blocks with several fields say of normals, see :mod:`piavatar_envs.mpm.normals`.
         sensors: what contact did in this control step.
         room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
-        turns: sums and ranks of relays (``counts``, ``ranks``), where :mod:`piavatar_envs.mpm.relay` has been recorded.
-        ahead: what gathers leave for scatters, where :mod:`piavatar_envs.mpm.ahead` has been recorded.
-        meetings: who may touch where, see :mod:`piavatar_envs.mpm.meeting`.
     """
 
     blocks: Blocks
@@ -325,6 +314,3 @@ class Scratch:
     sensors: Sensors
     room: Room
     large_room: bool
-    turns: object | None = None
-    ahead: object | None = None
-    meetings: object | None = None

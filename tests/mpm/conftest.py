@@ -12,8 +12,6 @@ import pytest
 from benchmarks.matter import Matter, ball, build_matter, lattice
 from piavatar_envs.mpm.build import MaterialPoints
 from piavatar_envs.mpm.fields import CONTACT_GATE, Fields
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
 
 FLOOR = [((0.0, 0.0, 1.0), -0.11, 0.5)]
 
@@ -70,61 +68,3 @@ def meet(simulate) -> Callable[..., Matter]:
         return sim.set(u=velocity[field])
 
     return build
-
-
-@pytest.fixture
-def drop(simulate, device) -> Callable[..., Matter]:
-    """A box that slides on a floor, in three worlds, for a control step of ``num_substeps``; for a GPU's scatters."""
-    if device == "cpu":
-        pytest.skip("a CPU has but one way to scatter")
-
-    def build(num_substeps: int = 12, num_envs: int = 3, **kwargs) -> Matter:
-        world = {"planes": FLOOR, "gravity": (0.0, 0.0, -9.81), "margin": 0.6, "scatter": "singles"} | kwargs
-        sim = simulate(num_substeps=num_substeps, num_envs=num_envs, **world)
-        rng = np.random.default_rng(4)
-        shape = (num_envs, len(sim.rest), 3)
-        return sim.set(
-            u=rng.normal(0.0, 0.2, shape) + [1.5, 0.3, -1.0],
-            C=rng.normal(0.0, 1.0, (*shape, 3)),
-            vk=rng.normal(0.0, 0.3, shape),
-            spin=rng.normal(0.0, 0.3, shape),
-        )
-
-    return build
-
-
-@pytest.fixture
-def clash(meet, three_boxes, device) -> Callable[..., Matter]:
-    """Boxes of three subjects that come together in two worlds, one of them on a floor, all driven besides."""
-    if device == "cpu":
-        pytest.skip("a CPU has but one way to scatter")
-
-    def build(num_substeps: int = 12, num_envs: int = 2, **kwargs) -> Matter:
-        world = {"planes": FLOOR, "scatter": "singles", "friction": 0.4, "num_envs": num_envs, "control_dt": 0.012}
-        sim = meet(three_boxes, num_substeps=num_substeps, **(world | kwargs))
-        rng = np.random.default_rng(8)
-        shape = (num_envs, len(sim.rest), 3)
-        return sim.set(
-            u=sim.state.u.numpy() + rng.normal(0.0, 0.1, shape),
-            vk=rng.normal(0.0, 0.1, shape) + [0.0, 0.2, 0.0],
-            spin=rng.normal(0.0, 0.1, shape),
-        )
-
-    return build
-
-
-@pytest.fixture(scope="session")
-def one_by_one() -> Callable[[Matter], Matter]:
-    """Makes of a world the same one, whose substeps each begin when the one before has ended, with its state."""
-
-    def record(sim: Matter) -> Matter:
-        program, world = Program(sim.model.device), (sim.model, sim.state, sim.scratch)
-        several = sim.model.contact.num_fields > 1  # whose sensors forget
-        (record_begin if several else record_marks)(program, *world)
-        for index in range(sim.model.num_substeps):
-            record_substep(program, *world, index)
-        record_end(program, *world)
-        sim.program = program
-        return sim
-
-    return record

@@ -107,7 +107,7 @@ def test_timed_reports_every_kernel(simulate):
     sim = simulate(**SCENE)
     seconds = sim.program.timed(1)
     once = {"forget_blocks", "free_slots", "mark_particles", "freeze", "read_impulses"}
-    scatters = {"plain": "particles_to_grid", "runs": "runs_to_grid", "singles": "singles_to_grid"}
+    scatters = {"plain": "particles_to_grid", "runs": "runs_to_grid"}
     each = {scatters.get(sim.model.scatter), "update_grid", "grid_to_particles"}
     if sim.model.scatter == "shared":
         once |= {"forget_speeds"}

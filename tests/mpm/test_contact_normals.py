@@ -19,7 +19,7 @@ from piavatar_envs.mpm.normals import (
 )
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.records import mass_of
-from piavatar_envs.mpm.solver import record_marks, record_scatter
+from piavatar_envs.mpm.solver import record_marks, record_p2g
 from piavatar_envs.mpm.stencil import block_corner, node_of_block, node_position
 from piavatar_envs.mpm.sums import offset_at
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep
@@ -102,7 +102,7 @@ class Look:
         model, state, scratch = sim.model, sim.state, sim.scratch
         program = Program(model.device)
         record_marks(program, model, state, scratch)
-        record_scatter(program, model, state, scratch)
+        record_p2g(program, model, state, scratch)
         sweep = plan_sweep(model)
         found = [scratch.sums, scratch.velocity, scratch.facing, scratch.sensors]
         program.launch(

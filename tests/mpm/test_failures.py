@@ -31,7 +31,7 @@ FAULTS = {
 }
 
 
-@pytest.fixture(scope="module", params=[None, "runs", "singles"])
+@pytest.fixture(scope="module", params=[None, "runs"])
 def three(simulate, device, request):
     """Three environments in free fall onto the ground, each with another velocity; a fresh start each call.
 

@@ -9,7 +9,7 @@ from piavatar_envs.mpm.contact_pass import solve_contact
 from piavatar_envs.mpm.normals import find_facing
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.records import TO_KINEMATIC
-from piavatar_envs.mpm.solver import record_marks, record_scatter
+from piavatar_envs.mpm.solver import record_marks, record_p2g
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep
 
 
@@ -51,7 +51,7 @@ def told_by_scatter(sim) -> tuple[np.ndarray, np.ndarray]:
     """Offsets and kinematic momentum [units] of all slots' nodes, scattered as bits are now; no sums are left."""
     model, sums = sim.model, sim.scratch.sums
     program = Program(model.device)
-    record_scatter(program, model, sim.state, sim.scratch)
+    record_p2g(program, model, sim.state, sim.scratch)
     program.run()
     offsets = sums.offset_fixed.numpy()[0].reshape(model.max_slots, 64, -1).astype(float)
     kinematic = sums.fixed.numpy()[0].reshape(model.max_slots, 2, 64, -1)[:, 1].astype(float)
@@ -87,7 +87,7 @@ def test_contact_acts_only_where_fields_have_told(heap, told):
     model, scratch = heap.model, heap.scratch
     marks, contact, sweep = Program(model.device), Program(model.device), plan_sweep(model)
     record_marks(marks, model, heap.state, scratch)
-    record_scatter(marks, model, heap.state, scratch)
+    record_p2g(marks, model, heap.state, scratch)
     marks.run()
     assert (scratch.blocks.others.numpy()[0].reshape(-1, 2)[shared_slots(scratch.blocks)] == -1).all()
     if not told:

@@ -15,7 +15,7 @@ from piavatar_envs.mpm.memory import LARGE_MARGIN, SLOT_MARGIN, choose_marks, es
 from piavatar_envs.mpm.program import Program
 from piavatar_envs.mpm.runs import MOST_COUNTED
 from piavatar_envs.mpm.shared_room import MOST_PARTICLES, parts_of, suits_shared
-from piavatar_envs.mpm.solver import record_marks, record_scatter
+from piavatar_envs.mpm.solver import record_marks, record_p2g
 from piavatar_envs.mpm.sums import units
 from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, SCATTERS
 
@@ -65,7 +65,7 @@ def node_sums(sim):
     """Mass, momenta and offsets of every node that has a slot, by field and block: ``{(env, of both): (64, 10)}``."""
     model, scratch, program = sim.model, sim.scratch, Program(sim.model.device)
     record_marks(program, model, sim.state, scratch)
-    record_scatter(program, model, sim.state, scratch)
+    record_p2g(program, model, sim.state, scratch)
     program.run()
     count, held = scratch.blocks.count.numpy(), scratch.blocks.held.numpy()
     own, places = records_of(scratch.sums)
@@ -182,7 +182,7 @@ def test_particles_far_apart(simulate, scatter):
         np.testing.assert_allclose(sums[:, :4], by_hand[:, :4], atol=2e-7, err_msg=str(key))  # of 0.016 kg
 
 
-@pytest.mark.parametrize("scatter", ["runs", "singles"], indirect=True)
+@pytest.mark.parametrize("scatter", ["runs"], indirect=True)
 def test_who_adds_no_mass_adds_nothing(simulate, scatter):
     """Light particles are fast: their momentum counts, their mass is less than a unit.
 
@@ -294,19 +294,15 @@ def test_what_shared_memory_holds(monkeypatch, bodies, particles, slots, suits):
     ("particles", "slots", "arch", "chosen"),
     [
         (2_900, 200, 90, "shared"),
-        (10_475, 3_600, 90, "singles"),
         (19_757, 680, 90, "runs"),
         (300_000, 5_000, 90, "runs"),
         (10_475, 3_600, 60, "plain"),
     ],
 )
-def test_the_density_of_particles_chooses_the_scatter(monkeypatch, particles, slots, arch, chosen):
-    """A skin's particles share hardly a node; in an interior they are worth adding up first."""
+def test_device_and_size_choose_the_path(monkeypatch, particles, slots, arch, chosen):
     gpu = SimpleNamespace(is_cuda=True, arch=arch, max_shared_memory_per_block=227 * 1024)
     monkeypatch.setattr(wp, "get_device", lambda name: gpu)
-    assert choose_scatter(None, "cuda:0", np.zeros(particles, int), slots, "split", True) == chosen
-    at_most = choose_scatter(None, "cuda:0", np.zeros(particles, int), slots, "split", False)
-    assert at_most == ("runs" if chosen == "singles" else chosen)  # slots that could be needed tell nothing
+    assert choose_scatter(None, "cuda:0", np.zeros(particles, int), slots, "split") == chosen
 
 
 @pytest.mark.parametrize("copies", [60, 80, 100, 140, 300])
@@ -330,7 +326,7 @@ def test_a_crowd_is_counted_in_larger_units(simulate, device, copies):
     np.testing.assert_array_equal(*moved[1:])  # one round's gather is another kernel
 
 
-@pytest.mark.parametrize("scatter", ["shared", "runs", "singles"], indirect=True)
+@pytest.mark.parametrize("scatter", ["shared", "runs"], indirect=True)
 def test_runs_repeat_bit_for_bit(collide, scatter):
     """With contact, sensors and all; a CPU adds in one order only."""
     first, second = (collide(scatter=scatter, max_slots=SLOTS).run(3) for _ in range(2))
@@ -406,10 +402,8 @@ def test_large_bodies_have_more_slots_to_leave_behind(simulate, device):
     ("scatter", "counts", "marks"),
     [
         ("plain", [9_000], 8),
-        ("singles", [9_000], 8),
         ("runs", [8_192, 8_192], 16),
         ("runs", [100, 8_193], 25),
-        ("runs_float", [9_000], 25),
     ],
 )
 def test_marks_are_as_rare_as_there_is_room_for(scatter, counts, marks):

@@ -40,7 +40,7 @@ def test_impulses_are_the_changes_of_momentum(meet, normals):
 
 @pytest.mark.parametrize("overlap", [-0.5, 0.1, 0.4, 0.8])
 @pytest.mark.parametrize("density", [500.0, 2000.0])
-@pytest.mark.parametrize("scatter", [None, "runs", "singles"])
+@pytest.mark.parametrize("scatter", [None, "runs"])
 def test_penetration_of_a_known_overlap(meet, device, overlap, density, scatter):
     """The centre of the deepest particle, a quarter of a spacing inside its body; the bodies are at rest."""
     if device == "cpu" and scatter:
@@ -54,7 +54,7 @@ def test_penetration_of_a_known_overlap(meet, device, overlap, density, scatter)
     assert overlap < 0.2 or found.all()
 
 
-@pytest.mark.parametrize("scatter", ["runs", "singles"])
+@pytest.mark.parametrize("scatter", ["runs"])
 def test_penetration_of_bodies_that_go_on(meet, device, scatter):
     """Into blocks that the last gather has marked, of which a grid pass knows nothing yet."""
     if device == "cpu":
