@@ -19,8 +19,10 @@ from agents.evaluate import Agent, policy_agent
 from agents.workers import components
 from piavatar_envs.envs.observations import ObservationLayout
 
-#: The policy's parameters within ``policy.zip``.
+#: Name of the policy's parameters within ``policy.zip``.
 PARAMETERS = "policy.pth"
+#: Prefixes of the critics' parameters, which no action needs; kept runs leave them out (``scripts.keep_run``).
+CRITICS = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.", "critic.", "critic_target.")
 
 
 def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, action_size: int) -> Agent:
@@ -41,7 +43,10 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
     policy = _untrained(config, layout, action_size)
     try:
         with zipfile.ZipFile(path) as content, content.open(PARAMETERS) as file:
-            policy.load_state_dict(torch.load(file, map_location="cpu", weights_only=True))
+            loaded = policy.load_state_dict(torch.load(file, map_location="cpu", weights_only=True), strict=False)
+        unlike = [name for name in loaded.missing_keys if not name.startswith(CRITICS)] + loaded.unexpected_keys
+        if unlike:
+            raise KeyError(f"missing or unknown parameters: {', '.join(unlike)}")
     except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError, TypeError) as error:
         raise no_policy(path, len(components(layout, config.observe)), action_size, error) from None
     return policy_agent(policy.eval())

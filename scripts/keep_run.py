@@ -1,10 +1,9 @@
-"""Keep what a training has left beside the other results, and no more than is needed there.
+"""Copy finished trainings to the committed results: ``python -m scripts.keep_run runs/walk_rsl_*``.
 
-python -m scripts.keep_run runs/walk_sb3_1 --to benchmarks/results/ppo
-
-Settings, scores, pictures and a ``policy.pt`` are kept as they are. Of a ``policy.zip`` of stable-baselines3 that is
-the parameters of the policy, a quarter of it and all that ``agents.play`` reads; ``PPO.load`` wants the rest, too. Of
-the curve of returns, an episode a row, rows are averaged until there are at most :data:`ROWS`.
+The runs of one call are seeds of one training. The scores of all of them are kept (``results.json``,
+``evaluation.json``), and of the seed with the median return also the policy with its ``config.yaml``: an ordinary
+one, which is what a reader should play. A ``policy.pt`` is copied as it is. Of a ``policy.zip`` of stable-baselines3
+only the actor's parameters are kept, an eighth of the file: enough for ``agents.play``, not for ``PPO.load``.
 """
 
 from __future__ import annotations
@@ -15,43 +14,43 @@ import zipfile
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
+import torch
 import tyro
 import yaml
 
-from agents.checkpoint import differences
-from agents.curve import Curve
+from agents.checkpoint import UNREADABLE, differences
 from agents.folders import read_json
-from agents.sb3_policy import PARAMETERS
+from agents.sb3_policy import CRITICS, PARAMETERS
 
-#: Rows of a curve, at most.
-ROWS = 1000
-#: What must be there, and what may.
-NEEDED, WELCOME = ("config.yaml", "results.json"), ("policy.pt", "curve.png", "evaluation.json")
+#: Files of every run, and files of the one whose policy is kept.
+NEEDED, SCORES, POLICY = ("config.yaml", "results.json"), ("results.json", "evaluation.json"), "policy.pt"
 
 
 def main(
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional],
     to: Annotated[Path, tyro.conf.arg(help="folder of the results")] = Path("benchmarks/results/ppo"),
 ) -> int:
-    """Copy runs into a folder, each under its own name.
+    """Copy the seeds of a training into a folder, each under its own name.
 
     Args:
-        runs: folders of trainings that have ended.
-        to: where to.
+        runs: folders of finished trainings that differ in their seed.
+        to: destination.
 
     Raises:
-        ValueError: no runs, or two of one name; a folder holds no training that has ended, or something unreadable; or
-            its name is taken there. Nothing is written then.
+        ValueError: there are no runs, or two of one name; a folder holds no finished training, or an unreadable file;
+            or its name is taken at the destination. Nothing is written then.
     """
     if not runs:
         raise ValueError("no runs; name their folders")
+    for run in runs:
+        check_ended(run)
+    median = runs[0] if len(runs) == 1 else sorted(runs, key=returned)[len(runs) // 2]  # a PID agent is a run alone
     found: dict[Path, dict[str, bytes]] = {}
     for run in runs:
         folder = to / run.resolve().name
         if folder in found or folder.exists():
-            raise ValueError(f"{folder} is there already; remove it first, or name {run} otherwise")
-        found[folder] = kept(run)
+            raise ValueError(f"{folder} exists; remove it first, or rename {run}")
+        found[folder] = kept(run, run == median)
     for folder, files in found.items():
         folder.mkdir(parents=True)
         for name, content in files.items():
@@ -60,64 +59,67 @@ def main(
     return 0
 
 
-def kept(run: Path) -> dict[str, bytes]:
-    """What is kept of a run, by the names of files.
+def returned(run: Path) -> float:
+    """Return the policy's mean return, from the last evaluation of the run.
 
     Raises:
-        ValueError: it has not ended, or not as its configuration says; or something in it cannot be read.
+        ValueError: the scores have no row of a policy.
     """
-    missing = [name for name in NEEDED if not (run / name).is_file()]
-    if missing:
-        raise ValueError(f"{run} has no {missing[0]}: has the training ended?")
-    files = {name: (run / name).read_bytes() for name in (*NEEDED, *WELCOME) if (run / name).is_file()}
-    check_ended(run)
+    path = next(path for path in (run / "evaluation.json", run / "results.json") if path.is_file())
     try:
-        if (run / "curve.csv").is_file():
-            files["curve.csv"] = shortened((run / "curve.csv").read_text(encoding="utf-8")).encode()
-        if (run / "policy.zip").is_file():
-            files["policy.zip"] = parameters_of((run / "policy.zip").read_bytes())
-    except (ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{run} has something else than a training leaves: {error}") from error
+        (row,) = (row for row in read_json(path)["results"] if row["case"] == "trained")
+        return float(row["return_mean"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} holds no score of a policy: {error}") from error
+
+
+def kept(run: Path, with_policy: bool) -> dict[str, bytes]:
+    """Return the contents of the files to keep, by name.
+
+    Raises:
+        ValueError: a policy cannot be read.
+    """
+    names = (*SCORES, "config.yaml", POLICY) if with_policy else SCORES
+    files = {name: (run / name).read_bytes() for name in names if (run / name).is_file()}
+    if with_policy and (run / "policy.zip").is_file():
+        try:
+            files["policy.zip"] = actor_of((run / "policy.zip").read_bytes())
+        except UNREADABLE as error:
+            raise ValueError(f"{run / 'policy.zip'} holds no policy: {error}") from error
     return files
 
 
 def check_ended(run: Path) -> None:
-    """Refuse a run that goes on, in which scores are left that it has had before.
+    """Refuse a run without scores, or with scores of other settings than its configuration (it was continued).
 
     Raises:
-        ValueError: the scores are of other settings than the configuration, or one of them cannot be read.
+        ValueError: as said, or one of the two files cannot be read.
     """
+    missing = [name for name in NEEDED if not (run / name).is_file()]
+    if missing:
+        raise ValueError(f"{run} has no {missing[0]}: has the training ended?")
     try:
         had = read_json(run / "results.json")["config"]
         asked = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
         unlike = differences(had["env"] if "design" in had else had, asked)  # the PID agent's are its environment's
     except (ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
-        raise ValueError(f"{run} has something else than a training leaves: {error}") from error
+        raise ValueError(f"{run} has unreadable settings or scores: {error}") from error
     for name, then, now in unlike:
         raise ValueError(
-            f"{run / 'results.json'} is of {name}={then}, and config.yaml says {now}: go on with the training "
+            f"{run / 'results.json'} is of {name}={then}, and config.yaml says {now}: continue the training "
             "(--resume), and keep it when it has ended"
         )
 
 
-def parameters_of(policy: bytes) -> bytes:
-    """A ``policy.zip`` with the policy's parameters only, as bytes."""
-    left = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(policy)) as whole, zipfile.ZipFile(left, "w") as file:
-        file.writestr(zipfile.ZipInfo(PARAMETERS), whole.read(PARAMETERS), zipfile.ZIP_DEFLATED)
+def actor_of(policy: bytes) -> bytes:
+    """Return a ``policy.zip`` that holds the actor's parameters only."""
+    with zipfile.ZipFile(io.BytesIO(policy)) as whole:
+        parameters = torch.load(io.BytesIO(whole.read(PARAMETERS)), map_location="cpu", weights_only=True)
+    held, left = io.BytesIO(), io.BytesIO()
+    torch.save({name: value for name, value in parameters.items() if not name.startswith(CRITICS)}, held)
+    with zipfile.ZipFile(left, "w") as file:
+        file.writestr(zipfile.ZipInfo(PARAMETERS), held.getvalue(), zipfile.ZIP_DEFLATED)
     return left.getvalue()
-
-
-def shortened(curve: str) -> str:
-    """A curve as CSV, with rows averaged evenly: the last step of each, and the mean return of its episodes."""
-    if not curve.split():
-        raise ValueError("curve.csv is empty")
-    _, *rows = curve.split()
-    values = np.array([[float(number) for number in row.split(",")] for row in rows]).reshape(len(rows), 2)
-    if len(rows) <= ROWS:
-        return curve
-    parts = np.array_split(values, ROWS)
-    return Curve([int(part[-1, 0]) for part in parts], [part[:, 1].mean() for part in parts]).csv()
 
 
 if __name__ == "__main__":

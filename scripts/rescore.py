@@ -1,13 +1,15 @@
-"""Score all kept agents anew, in the engine as it is: ``python -m scripts.rescore --device cuda --jobs 8``.
+"""Score all committed agents with the present engine: ``python -m scripts.rescore --device cuda --jobs 8``.
 
-Policies play the episodes of their evaluations (``ppo/*/evaluation.json``), the PID agent and streams of random actions
-those that are recorded (``pid/*``, ``random/*``), each with the settings that it was recorded with; then comes the
-table of all (``torque_baselines.json``, ``.md``). On an H200 that is some nine minutes, on a CPU many hours.
+Policies (``ppo/*/policy.*``) play the episodes of their last evaluation, the PID agent and streams of random actions
+those of their record (``pid/*``, ``random/*``), each with its recorded settings. The new scores go to a folder of their
+own (``--out``, by default ``runs/rescored``), with one table of all: compare it with the committed
+``torque_baselines.md``. This takes minutes on an H200 and many hours on a CPU.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -29,31 +31,40 @@ TABLE = "torque_baselines.json"
 
 @dataclass(frozen=True)
 class Job:
-    """What scores one agent: a module and its arguments."""
+    """The command that scores one agent.
 
+    Attributes:
+        source: folder of the agent among the results.
+        folder: of its new scores.
+        command: a module and its arguments.
+    """
+
+    source: Path
     folder: Path
     command: tuple[str, ...]
 
     def run(self) -> str:
-        """Score it; returns the end of what it said if it failed, else nothing."""
+        """Score the agent; return the end of the output if that failed, else nothing."""
+        shutil.copytree(self.source, self.folder, dirs_exist_ok=True)
         done = subprocess.run([sys.executable, "-m", *self.command], capture_output=True, text=True)
         return "" if done.returncode == 0 else (done.stderr or done.stdout)[-2000:] or f"exit {done.returncode}"
 
 
 def main(
     results: Annotated[Path, tyro.conf.arg(help="folder with ppo, pid and random")] = Path("benchmarks/results"),
+    out: Annotated[Path, tyro.conf.arg(help="folder of the new scores")] = Path("runs/rescored"),
     device: Annotated[str, tyro.conf.arg(help="where to simulate")] = "cpu",
     jobs: Annotated[int, tyro.conf.arg(help="agents that play at a time")] = 1,
     bone_contact: Annotated[
-        bool | None, tyro.conf.arg(help="score policies on bones that stop, or do not; else as each was scored last")
+        bool | None, tyro.conf.arg(help="override drive.bone_contact of the policies; else as in their last evaluation")
     ] = None,
 ) -> int:
-    """Score what is kept, and draw up the table.
+    """Score the committed agents, and write the table.
 
     Raises:
-        ValueError: there is nothing, or ``jobs`` is no number of jobs.
+        ValueError: there is no agent, or ``jobs`` is less than 1.
     """
-    todo = find_jobs(results, device, bone_contact)
+    todo = find_jobs(results, out, device, bone_contact)
     if not todo or jobs < 1:
         raise ValueError(f"{results} has {len(todo)} agents and jobs={jobs}; both must be >= 1")
     with ThreadPoolExecutor(jobs) as pool:
@@ -62,46 +73,46 @@ def main(
     for folder, words in failed:
         print(f"{folder}:\n{words}", file=sys.stderr)
     if failed:
-        print(f"{len(failed)} of {len(todo)} failed; the table is as it was", file=sys.stderr)
+        print(f"{len(failed)} of {len(todo)} failed; there is no new table", file=sys.stderr)
         return 1
     folders = map(str, sorted({job.folder for job in todo}))
-    return subprocess.run([sys.executable, "-m", "agents.scores", *folders, "--out", str(results / TABLE)]).returncode
+    return subprocess.run([sys.executable, "-m", "agents.scores", *folders, "--out", str(out / TABLE)]).returncode
 
 
-def find_jobs(results: Path, device: str, bone_contact: bool | None = None) -> list[Job]:
-    """A job for every agent that is kept, the longest first; policies on bones that stop or do not, if that is said."""
+def find_jobs(results: Path, out: Path, device: str, bone_contact: bool | None = None) -> list[Job]:
+    """Return a job for every committed agent, the longest first; arguments as for :func:`main`."""
     jobs = []
     for folder in sorted(path.parent for path in results.glob("pid/*/results.json")):
-        jobs.append(Job(folder, ("agents.score_pid", *pid_arguments(folder), *written(folder, device))))
+        new = out / folder.relative_to(results)
+        jobs.append(Job(folder, new, ("agents.score_pid", *pid_arguments(folder), *written(folder, new, device))))
     for folder in sorted(path.parent for path in results.glob("random/*/results.json")):
-        count = read_json(folder / "results.json")["results"][0]["seeds"]
-        command = ("agents.score_random", str(folder), "--seeds", str(count), *written(folder, device))
-        jobs.append(Job(folder, command))
-    for folder in sorted(path.parent for path in results.glob("ppo/*/config.yaml")):
-        out = ("--device", device, "--out", str(folder / "evaluation.json"))
-        bones = scored_on(folder) if bone_contact is None else bone_contact
-        said = () if bones is None else (f"drive.bone_contact={str(bones).lower()}",)
-        command = ("agents.play", str(folder), *said, *out)
-        jobs.append(Job(folder, command))
+        new, count = out / folder.relative_to(results), read_json(folder / "results.json")["results"][0]["seeds"]
+        command = ("agents.score_random", str(folder), "--seeds", str(count), *written(folder, new, device))
+        jobs.append(Job(folder, new, command))
+    for folder in sorted(path.parent for path in results.glob("ppo/*/policy.*")):
+        new, bones = out / folder.relative_to(results), scored_on(folder) if bone_contact is None else bone_contact
+        settings = () if bones is None else (f"drive.bone_contact={str(bones).lower()}",)
+        where = ("--device", device, "--out", str(new / "evaluation.json"))
+        jobs.append(Job(folder, new, ("agents.play", str(folder), *settings, *where)))
     return jobs
 
 
 def scored_on(folder: Path) -> bool | None:
-    """Whether bones stopped where a policy was scored last; None if nothing says so."""
+    """Return ``drive.bone_contact`` of a policy's last evaluation; None if it does not say."""
     path = folder / "evaluation.json"
     env = read_json(path).get("env", {}) if path.is_file() else {}
     return env.get("drive", {}).get("bone_contact")
 
 
-def written(folder: Path, device: str) -> tuple[str, ...]:
-    """Arguments for the same episodes in the same place."""
+def written(folder: Path, new: Path, device: str) -> tuple[str, ...]:
+    """Return arguments for the episodes that ``folder`` records, with results in ``new``."""
     row = read_json(folder / "results.json")["results"][0]
     episodes = ("--evaluation.episodes", str(row["episodes"]), "--evaluation.first-seed", str(row["first_seed"]))
-    return (*episodes, "--device", device, "--out", str(folder))
+    return (*episodes, "--device", device, "--out", str(new))
 
 
 def pid_arguments(folder: Path) -> list[str]:
-    """The task, its settings and the controller's numbers, as far as they are not the defaults."""
+    """Return the task, and the settings and numbers of the controller that differ from the defaults."""
     config = read_json(folder / "results.json")["config"]
     default = load_config(load_task(config["env_id"]).Config, {"control": "torque"}).model_dump(mode="json")
     settings = [f"{name}={json.dumps(value)}" for name, value in differences(config["env"], default)]
@@ -112,7 +123,7 @@ def pid_arguments(folder: Path) -> list[str]:
 
 
 def differences(recorded: Mapping[str, Any], default: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Dotted names and values of what is not the default's."""
+    """Yield dotted names and values of the settings that differ from the defaults."""
     for name, value in recorded.items():
         other = default.get(name)
         if isinstance(value, Mapping) and isinstance(other, Mapping):

@@ -2,8 +2,8 @@
 
 Every training is a process of its own, some at a time on each GPU, and leaves ``runs/<configuration>_<seed>``. Those
 that have ended are left alone and those that were stopped, or were to be shorter, go on from their last checkpoint, so
-the same command goes on after whatever has ended it. ``scripts.keep_run`` keeps what is worth it, ``agents.scores``
-draws up the table.
+the same command goes on after whatever has ended it. ``scripts.keep_run`` copies scores and the median policy to the
+committed results, ``agents.scores`` writes the table.
 """
 
 from __future__ import annotations
