@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from benchmarks import limbs, performance, runner, stability, torque, wear
+from benchmarks import limbs, runner, stability, torque, wear
 from benchmarks.limbs import Options
 from benchmarks.rig import joint_gaps
 from piavatar_envs.avatar.asset import load_body
@@ -99,11 +99,6 @@ def test_feet_bear_a_standing_body_and_bones_stay_above_the_floor():
 def test_joints_took_less_than_three_tenths_of_the_rest_when_that_was_measured():
     rows = {row["case"]: row for row in json.loads(RESULTS.read_text(encoding="utf-8"))["results"]}
     assert max(rows[f"cost{hold}"]["joints_over_mpm"] for hold in HOLDS) < 0.3
-    for name, settings, share in (("projection", ["drive.bone_contact=false"], 0.3), ("stand", [], 0.4)):
-        report = json.loads((RESULTS.parent / f"profile_{name}.json").read_text(encoding="utf-8"))
-        joints, matter = performance.joints_and_matter(report)
-        assert report["options"]["num_envs"] == 2048 and report["options"]["settings"] == settings
-        assert joints < share * matter, "0.3 for the projection; the rest is what stops bones at surfaces"
 
 
 def test_no_bone_comes_below_the_floor_or_gapes(rows):
