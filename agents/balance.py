@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, joint_index
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 
 GRAVITY = 9.81
 #: Planes, the last dimension of all arrays here.

@@ -26,8 +26,7 @@ from agents.evaluate import Agent, Episode, Evaluation, baselines, begin_round, 
 from agents.folders import made
 from agents.report import conclude, draw_curve, versions
 from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.doctor import quiet_warp
-from piavatar_envs.envs.config import (
+from piavatar_envs.config import (
     FROZEN,
     ConfigError,
     EnvConfig,
@@ -35,10 +34,11 @@ from piavatar_envs.envs.config import (
     load_config,
     parse_assignments,
 )
-from piavatar_envs.envs.simulation import check_device
+from piavatar_envs.doctor import quiet_warp
+from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import failure_name
+from piavatar_envs.sim.world import check_device
 from piavatar_envs.tasks import listed_name
-from piavatar_envs.tasks.base import Task
 
 #: Metrics of tasks that evaluations sum up.
 TOLD = ("distance", "strongest_push")

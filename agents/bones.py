@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics
+from piavatar_envs.avatar.body.device import BodyPoints
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics
 
 NUM_DOF = 3 + 3 * NUM_JOINTS
 

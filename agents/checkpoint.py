@@ -23,8 +23,8 @@ from pydantic import BaseModel
 
 from agents.folders import CHECKPOINT, POLICIES, RESULTS, hold, write_whole
 from benchmarks.runner import git_commit
+from piavatar_envs.config import ConfigError
 from piavatar_envs.doctor import package_version
-from piavatar_envs.envs.config import ConfigError
 
 #: Of the file's content; rises with every change.
 FORMAT = 4

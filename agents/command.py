@@ -14,7 +14,7 @@ import yaml
 from pydantic import BaseModel
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
-from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.config import ConfigError, load_config
 
 Options = TypeVar("Options")
 

@@ -14,7 +14,7 @@ from agents.ppo import PPOSettings
 from agents.sac import SACSettings
 from agents.seeds import FIRST_TRAINED, MOST_RUNS
 from agents.selfplay import SelfPlaySettings
-from piavatar_envs.envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
+from piavatar_envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
 from piavatar_envs.multi import load_world
 from piavatar_envs.tasks import listed_name, load_task
 

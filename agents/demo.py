@@ -26,8 +26,8 @@ from agents.ik import ReachIK
 from agents.report import draw_curve, show_table, versions, write_results
 from agents.train import train
 from agents.workers import EnvFacts, components, factory, prepare, start_workers
-from piavatar_envs.envs.config import ConfigError, parse_assignments
-from piavatar_envs.envs.simulation import check_device
+from piavatar_envs.config import ConfigError, parse_assignments
+from piavatar_envs.sim.world import check_device
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "reach_ppo.yaml"
 FILM_EPISODES = 2

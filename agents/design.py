@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from piavatar_envs.avatar.skeleton import JOINT_NAMES
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
+from piavatar_envs.config import ConfigError
 
 #: Joints above the legs: chains whose ends are free, so that their integrals can undo their errors.
 ABOVE_LEGS = tuple(name for name in JOINT_NAMES[1:] if name.partition("_")[2] not in ("hip", "knee", "ankle", "foot"))

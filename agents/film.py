@@ -14,7 +14,7 @@ from tqdm import tqdm
 from agents.evaluate import Agent, begin_round
 from agents.folders import check_writable
 from agents.workers import EnvFactory, start_workers
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.config import ConfigError
 from piavatar_envs.render import label, side_by_side, write_video
 from piavatar_envs.render.video import check_suffix
 

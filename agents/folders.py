@@ -12,7 +12,7 @@ from typing import IO, Any
 
 from pydantic import BaseModel
 
-from piavatar_envs.envs.config import ConfigError, dump_yaml
+from piavatar_envs.config import ConfigError, dump_yaml
 
 try:
     import fcntl

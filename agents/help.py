@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field, model_validator
 from tensordict import TensorDict
 
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
-from piavatar_envs.envs.config import FROZEN
+from piavatar_envs.config import FROZEN
 
 
 class HelpSettings(BaseModel):

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.limits import joint_limits
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index, joint_limits
 from piavatar_envs.envs.observations import ObservationLayout
 
 HANDS = ("left", "right")

@@ -28,7 +28,7 @@ from agents.folders import write_config, write_whole
 from agents.parallel import WAITING
 from agents.rollouts import MarkPlayed
 from agents.workers import EnvFacts, components
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.config import ConfigError
 
 
 class Events(TensorBoardOutputFormat):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
-from piavatar_envs.tasks.base import Task
+from piavatar_envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.envs.task import Task
 
 
 def interface(task: Task, observe: Collection[str] | None = None) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
+from piavatar_envs.config import ConfigError
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.observations import ObservationTerm

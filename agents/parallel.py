@@ -15,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from piavatar_envs.config import ConfigError, EnvConfig
 from piavatar_envs.doctor import quiet_warp
-from piavatar_envs.envs.config import ConfigError, EnvConfig
 from piavatar_envs.envs.observations import ObservationLayout
 
 if TYPE_CHECKING:

@@ -29,10 +29,10 @@ from agents.bones import NUM_DOF, Bones, Posture, answered, force_moments, in_bo
 from agents.design import DEFAULT, Design
 from agents.gains import LoadSchedule, gains_by_strength
 from agents.pid import PID, PosePID, difference, follow
-from piavatar_envs.avatar.muscles import REFERENCE_HEIGHT, REFERENCE_MASS, make_muscles
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_ACTUATED, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.body.muscles import REFERENCE_HEIGHT, REFERENCE_MASS, make_muscles
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_ACTUATED, NUM_JOINTS, joint_index
+from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 SIDES = ("left", "right")

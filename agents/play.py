@@ -26,12 +26,12 @@ from agents.lessons import changed
 from agents.report import show_table, versions, write_results
 from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.doctor import quiet_warp
-from piavatar_envs.envs.config import ConfigError, load_config, parse_assignments
-from piavatar_envs.envs.draws import check_seeds
 from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.envs.rng import check_seeds
+from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
-from piavatar_envs.tasks.base import Task
 
 
 @dataclass(frozen=True)

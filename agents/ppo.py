@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.rollouts import PlayedBuffer
 from agents.seeds import first_seed
-from piavatar_envs.envs.config import FROZEN
+from piavatar_envs.config import FROZEN
 
 #: Of the hidden layers of a network.
 Widths = tuple[Annotated[int, Field(ge=1)], ...]

@@ -18,7 +18,7 @@ from agents.evaluate import Agent
 from agents.help import HelpSettings
 from agents.ppo import Widths
 from agents.workers import components
-from piavatar_envs.envs.config import FROZEN, FrozenDict
+from piavatar_envs.config import FROZEN, FrozenDict
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.tasks import load_task
 

@@ -30,9 +30,9 @@ from agents.rsl_algorithm import ScaledPPO
 from agents.rsl_policy import RslTraining, actor_settings, mean_agent, network_settings
 from agents.workers import components
 from piavatar_envs.api.rsl_rl import AvatarRslEnv
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.config import ConfigError
+from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
-from piavatar_envs.tasks.base import Task
 
 
 class CurveWriter(LogWriter):

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.ppo import Widths, networks
 from agents.seeds import first_seed
-from piavatar_envs.envs.config import FROZEN
+from piavatar_envs.config import FROZEN
 
 
 class SACSettings(BaseModel):

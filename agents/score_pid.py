@@ -21,8 +21,8 @@ from agents.pid_agent import make_pid_agent
 from agents.report import conclude, versions
 from agents.workers import EnvFactory
 from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.config import load_config, parse_assignments
 from piavatar_envs.doctor import quiet_warp
-from piavatar_envs.envs.config import load_config, parse_assignments
 from piavatar_envs.tasks import listed_name, load_task
 
 

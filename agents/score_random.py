@@ -24,8 +24,8 @@ from agents.folders import RESULTS, claim, read_json
 from agents.report import versions
 from benchmarks.runner import plain, write_json
 from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.doctor import quiet_warp
-from piavatar_envs.envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.tasks import load_task
 
 

@@ -33,7 +33,7 @@ from agents.command import in_a_line
 from agents.folders import RESULTS, check_figures, check_writable, read_json, write_whole
 from agents.score_table import markdown
 from benchmarks.runner import describe_run, plain, write_json
-from piavatar_envs.envs.config import load_config
+from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 #: Script of runs that are random actions of several streams.

@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from agents.checkpoint import load_whole
 from agents.folders import write_whole
 from agents.parallel import AgentVecEnv
-from piavatar_envs.envs.config import FROZEN, ConfigError
+from piavatar_envs.config import FROZEN, ConfigError
 
 _NAME = re.compile(r"snapshot_(\d+)_steps\.pt")
 

@@ -31,7 +31,7 @@ from agents.folders import write_config, write_whole
 from agents.skrl_networks import ActedMemory, Critic, MAPPOSettings, Policy
 from agents.workers import components
 from piavatar_envs.api.skrl import AvatarSkrlMultiEnv
-from piavatar_envs.tasks.base import Task
+from piavatar_envs.envs.task import Task
 
 #: Parts of skrl's MAPPO that are not used.
 _OPTIONAL = ("learning_rate_scheduler", "observation_preprocessor", "state_preprocessor", "value_preprocessor")

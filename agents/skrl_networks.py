@@ -13,7 +13,7 @@ from skrl.memories.torch import RandomMemory
 from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
 
 from agents.ppo import Widths
-from piavatar_envs.envs.config import FROZEN
+from piavatar_envs.config import FROZEN
 
 
 class MAPPOSettings(BaseModel):

@@ -29,9 +29,9 @@ from agents.learning import begin, learn
 from agents.parallel import AgentVecEnv
 from agents.report import conclude, draw_curve, versions
 from agents.workers import EnvFacts, components, factory, prepare, start
+from piavatar_envs.config import ConfigError, parse_assignments
 from piavatar_envs.doctor import quiet_warp
-from piavatar_envs.envs.config import ConfigError, parse_assignments
-from piavatar_envs.envs.simulation import check_device
+from piavatar_envs.sim.world import check_device
 
 Results = Sequence[Evaluation] | Sequence[matches.Match]
 

@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from agents.config import TrainingConfig, multi_module
 from agents.parallel import World, WorldFactory
 from piavatar_envs.api.sb3 import SB3VecEnv
+from piavatar_envs.config import ConfigError
 from piavatar_envs.doctor import quiet_warp
-from piavatar_envs.envs.config import ConfigError
 from piavatar_envs.envs.observations import ObservationLayout
 
 

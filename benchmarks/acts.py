@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.stage import Act, Script, View, keyed, played
-from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.motion import list_motions, load_motion
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key, animate
-from piavatar_envs.envs.config import AvatarConfig, PropConfig, RegionConfig, SceneConfig
-from piavatar_envs.envs.domain import Domain
+from piavatar_envs.config import AvatarConfig, PropConfig, RegionConfig, SceneConfig
+from piavatar_envs.sim.scene import Domain
 
 BALL_RADIUS = 0.11
 CAN_SPEED = 3.0  # [m/s], a fall of 46 cm

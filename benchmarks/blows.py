@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from benchmarks.acts import BALL_RADIUS, CHEST, ball
 from benchmarks.limbs import Options, critical_damping, widest
 from benchmarks.stage import Act, Stage, keyed
-from piavatar_envs.avatar.muscles import spring_rows
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
-from piavatar_envs.envs.config import PhysicsConfig, PropConfig, SceneConfig
-from piavatar_envs.envs.domain import Domain
+from piavatar_envs.avatar.body.muscles import spring_rows
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.config import PhysicsConfig, PropConfig, SceneConfig
 from piavatar_envs.mpm.diagnostics import Totals, totals
+from piavatar_envs.sim.scene import Domain
 
 BALLS = (0.45, 1.5, 8.0)  # [kg]
 SPEED, DISTANCE = 5.0, 0.1  # of a ball that is thrown at the chest [m/s], and its way there [m]

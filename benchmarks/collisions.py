@@ -11,17 +11,15 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from benchmarks.matter import push_particles
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.sampling import sample_particles, spacing_for
-from piavatar_envs.envs.simulation import GRID_PER_HEIGHT
-from piavatar_envs.mpm.boundaries import Collider
-from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.diagnostics import Totals, totals
-from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.model import Collider, Fields, MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
-from piavatar_envs.props import geometry
+from piavatar_envs.sim import prop_geometry as geometry
+from piavatar_envs.sim.world import GRID_PER_HEIGHT
 
 #: Half the edge of a block [m].
 BLOCK = (0.2, 0.2, 0.1)
@@ -80,12 +78,12 @@ class Collision:
     scratch: object
     owner: np.ndarray
     dx: float
-    programs: dict[str, Program] = field(default_factory=dict)
+    graphs: dict[str, LaunchGraph] = field(default_factory=dict)
 
     def run(self, steps: int, damped: bool = False) -> None:
         """Advance by control steps; ``damped`` for loading slowly."""
         for _ in range(steps):
-            self.programs["damped" if damped else "free"].run()
+            self.graphs["damped" if damped else "free"].run()
 
     def totals(self, thing: int | None = None, about: Sequence[float] = (0.0, 0.0, 0.0)) -> Totals:
         """Momentum and energy of one thing or all."""
@@ -180,11 +178,11 @@ def collide(
     keep = wp.array([np.exp(-50.0 * model.step.dt)], dtype=float, device=device)
     kick = wp.zeros(len(x), dtype=wp.vec3, device=device)
     for name in ("free", "damped"):
-        program = world.programs[name] = Program(device)
-        record_begin(program, model, state, scratch)
+        graph = world.graphs[name] = LaunchGraph(device)
+        record_begin(graph, model, state, scratch)
         for index in range(model.num_substeps):
-            record_substep(program, model, state, scratch, index)
+            record_substep(graph, model, state, scratch, index)
             if name == "damped":
-                program.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
-        record_end(program, model, state, scratch)
+                graph.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
+        record_end(graph, model, state, scratch)
     return world

@@ -141,7 +141,7 @@ def stages(name: str, steps: int, core: int | None) -> list[dict[str, Any]]:
     seconds: dict[str, list[float]] = {}
     for _ in range(steps):
         batch.action.assign(env.action_space.sample().reshape(1, 1, -1))
-        for kernel, time_taken in batch.step_program.timed().items():
+        for kernel, time_taken in batch.step_graph.timed().items():
             seconds.setdefault(kernel, []).append(time_taken)
         if batch.terminated.numpy()[0] or batch.truncated.numpy()[0]:
             env.reset()
@@ -166,7 +166,7 @@ def stages(name: str, steps: int, core: int | None) -> list[dict[str, Any]]:
             "substeps": known["substeps"],
             "peak_memory_mb": None,
             "stages_ms": ordered,
-            "launches": len(batch.step_program),
+            "launches": len(batch.step_graph),
         }
     ]
 
@@ -176,7 +176,7 @@ def prepare(name: str) -> None:
     if name.startswith("PIAvatar/"):
         import warp as wp
 
-        import piavatar_envs.api.gymnasium  # noqa: F401
+        import piavatar_envs.api.gym_env  # noqa: F401
 
         wp.config.quiet = True
     else:

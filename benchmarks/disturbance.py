@@ -13,9 +13,9 @@ import numpy as np
 
 from benchmarks.poses import random_directions, random_poses, random_shapes
 from benchmarks.rig import Rig, World
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.settings import DriveSettings
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, joint_index
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
+from piavatar_envs.avatar.types import DriveSettings
 from piavatar_envs.mpm.diagnostics import Totals, totals
 
 CONTROL_STEPS = 45  # one and a half seconds

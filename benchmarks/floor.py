@@ -17,7 +17,7 @@ from benchmarks.blows import HOLDS
 from benchmarks.limbs import Options, widest
 from benchmarks.rig import joint_gaps
 from benchmarks.wear import homes, make
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.envs.batch_env import BatchEnv
 
 #: From observations ``(1, size)`` to actions ``(1, action_size)``.

@@ -10,8 +10,7 @@ import numpy as np
 
 from benchmarks.matter import ball, build_matter, lattice
 from benchmarks.textbook import BarImpact, HertzImpact
-from piavatar_envs.mpm.build import MaterialPoints
-from piavatar_envs.mpm.fields import Fields
+from piavatar_envs.mpm.model import Fields, MaterialPoints
 
 YOUNG_MODULUS, DENSITY = 1.0e5, 1000.0
 #: Control steps in which an impact is looked at, in a duration of contact by theory.

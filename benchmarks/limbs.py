@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import runner
 from benchmarks.rig import Rig, World, joint_gaps
-from piavatar_envs.avatar.articulated import ArticulatedBody
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.settings import DriveSettings
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, forward_kinematics, joint_index
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
+from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 
 HOLD = 1e5, 1e4  # spring and damper of a held pelvis, of its place and of its turn [SI units]
@@ -43,7 +43,7 @@ class Limbs:
     Attributes:
         rig: the world; its own drive does not act.
         body: the joints.
-        program: a control step.
+        graph: a control step.
     """
 
     def __init__(
@@ -80,25 +80,25 @@ class Limbs:
         self.aim(rotations)
         self.body.mass.refresh = options.refresh
         self._build_mass()
-        self.program = self.record()
+        self.graph = self.record()
 
     def _build_mass(self) -> None:
-        program = Program(self.rig.model.device)
-        self.body.record_mass(program, self.rig.state)
-        program.run()
+        graph = LaunchGraph(self.rig.model.device)
+        self.body.record_mass(graph, self.rig.state)
+        graph.run()
 
-    def record(self, joints: bool = True) -> Program:
+    def record(self, joints: bool = True) -> LaunchGraph:
         """A control step, with ``joints`` or the Material Point Method alone."""
-        rig, program = self.rig, Program(self.rig.model.device)
-        record_begin(program, rig.model, rig.state, rig.scratch)
+        rig, graph = self.rig, LaunchGraph(self.rig.model.device)
+        record_begin(graph, rig.model, rig.state, rig.scratch)
         for step in range(rig.model.num_substeps):
             if joints:
-                self.body.record_substep(program, rig.state, rig.scratch, step)
-            record_substep(program, rig.model, rig.state, rig.scratch, step)
-        record_end(program, rig.model, rig.state, rig.scratch)
+                self.body.record_substep(graph, rig.state, rig.scratch, step)
+            record_substep(graph, rig.model, rig.state, rig.scratch, step)
+        record_end(graph, rig.model, rig.state, rig.scratch)
         if joints:
-            self.body.record_end(program, rig.state)
-        return program
+            self.body.record_end(graph, rig.state)
+        return graph
 
     def set_springs(self, stiffness: np.ndarray | float, damping: np.ndarray | float, held: bool = False) -> None:
         """Springs and dampers of all joints but the pelvis, of one or ``(21,)``; the pelvis' hold it, or are none."""
@@ -119,9 +119,9 @@ class Limbs:
 
     def gaps(self) -> np.ndarray:
         """How far joints are from where their parents have them, as the particles are now [m], shape ``(21,)``."""
-        program = Program(self.rig.model.device)
-        self.rig.avatar.record_tracking(program, self.rig.state)
-        program.run()
+        graph = LaunchGraph(self.rig.model.device)
+        self.rig.avatar.record_tracking(graph, self.rig.state)
+        graph.run()
         return joint_gaps(self.rig.avatar.tracked, self.rig.points.joints)[0]
 
 

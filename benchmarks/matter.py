@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.boundaries import Collider
-from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.diagnostics import Totals, totals
-from piavatar_envs.mpm.matrices import components_of, matrix_at, store_matrix
 from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.model import Collider, MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
-from piavatar_envs.mpm.types import Model, Scratch, State
+from piavatar_envs.mpm.types import Model, Scratch, State, components_of, matrix_at, store_matrix
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,12 +34,12 @@ def push_particles(
 
 @dataclass
 class Matter:
-    """A body on a lattice, with the program of one control step; built by :func:`build_matter`."""
+    """A body on a lattice, with the graph of one control step; built by :func:`build_matter`."""
 
     model: Model
     state: State
     scratch: Scratch
-    program: Program
+    graph: LaunchGraph
     rest: np.ndarray  # (num_particles, 3) [m]
     keep: wp.array  # (1,) see push()
     kick: wp.array  # (num_particles, 3)
@@ -49,7 +47,7 @@ class Matter:
     def run(self, control_steps: int = 1) -> Matter:
         """Advance by control steps."""
         for _ in range(control_steps):
-            self.program.run()
+            self.graph.run()
         return self
 
     def set(self, **arrays: np.ndarray) -> Matter:
@@ -160,14 +158,14 @@ def build_matter(
     state, scratch = allocate(model)
     keep = wp.full(1, 1.0, dtype=float, device=device)
     kick = wp.zeros(len(rest), dtype=wp.vec3, device=device)
-    program = Program(device)
+    graph = LaunchGraph(device)
     if "fields" in kwargs:
-        record_begin(program, model, state, scratch)
+        record_begin(graph, model, state, scratch)
     else:  # sensors add up over control steps
-        record_marks(program, model, state, scratch)
+        record_marks(graph, model, state, scratch)
     for index in range(model.num_substeps):
-        record_substep(program, model, state, scratch, index)
+        record_substep(graph, model, state, scratch, index)
         if pushed:
-            program.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
-    record_end(program, model, state, scratch)
-    return Matter(model, state, scratch, program, rest, keep, kick).set(x=rest)
+            graph.launch(push_particles, state.x.shape, [keep, kick], [state.u, state.C])
+    record_end(graph, model, state, scratch)
+    return Matter(model, state, scratch, graph, rest, keep, kick).set(x=rest)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.asset import AvatarAsset
-from piavatar_envs.avatar.limits import joint_limits
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.body.asset import AvatarAsset
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_limits
 
 #: Share of every joint's range that random poses use. The paper does not say how large its poses are; half the range
 #: is a large pose in every joint at once, and limbs seldom pass through each other.

@@ -52,7 +52,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
     captured = 1e3 * timing.wall_times(options.device, batch.step, options.repeats)
     model = batch.simulation.model
     counts = roofline.count(model, batch.simulation.state)
-    kernels = timing.kernel_times(batch.step_program, options.repeats)
+    kernels = timing.kernel_times(batch.step_graph, options.repeats)
     total = sum(kernel.ms for kernel in kernels.values())
     rows = [
         {
@@ -63,9 +63,9 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
             "substeps": model.num_substeps,
             "ms_per_step": float(np.median(captured)),
             "kernels_sum_ms": total,
-            "launches_per_step": len(batch.step_program),
+            "launches_per_step": len(batch.step_graph),
             "failed_envs": int((batch.failure.numpy() != 0).sum()),
-            "roofline_of_a_substep": roofline.bound(counts, len(batch.step_program) / model.num_substeps),
+            "roofline_of_a_substep": roofline.bound(counts, len(batch.step_graph) / model.num_substeps),
         }
     ]
     for name, kernel in sorted(kernels.items(), key=lambda item: -item[1].ms):

@@ -20,7 +20,7 @@ from agents.report import draw_curve
 from agents.train import Curve, train
 from agents.workers import factory, prepare, start_workers
 from benchmarks import runner
-from piavatar_envs.envs.config import parse_assignments
+from piavatar_envs.config import parse_assignments
 
 _BINS = 18  # points of a learning curve in the JSON
 

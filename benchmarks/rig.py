@@ -10,20 +10,18 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
-from piavatar_envs.avatar.sampling import morph, sample_particles, spacing_for
-from piavatar_envs.avatar.settings import DriveSettings
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
-from piavatar_envs.avatar.types import Tracked
-from piavatar_envs.envs.simulation import GRID_PER_HEIGHT
-from piavatar_envs.mpm.boundaries import Collider
-from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
-from piavatar_envs.mpm.matrices import matrices_of
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.device import BodyPoints
+from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_for
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
+from piavatar_envs.avatar.pose_control.controller import AvatarDrive, record_control_step
+from piavatar_envs.avatar.types import DriveSettings, Tracked
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.tasks.disturb import apply_impulse
+from piavatar_envs.mpm.model import Collider, MaterialPoints, build_model, make_grid
+from piavatar_envs.mpm.types import matrices_of
+from piavatar_envs.sim.world import GRID_PER_HEIGHT
+from piavatar_envs.tasks.common.disturb import apply_impulse
 
 DENSITY = 1000.0
 LOWER, UPPER = (-1.6, -1.6, -0.7), (1.6, 1.6, 2.6)  # room enough for bodies that come apart
@@ -35,7 +33,7 @@ class World:
 
     Attributes:
         fidelity: resolution, as in the environments.
-        decoupling: one of the four variants of :mod:`piavatar_envs.mpm.decouple`.
+        decoupling: one of the four variants of :mod:`piavatar_envs.mpm.g2p`.
         num_substeps: a control step; None chooses them from the CFL limit.
         gravity: along -z [m/s^2].
         ground: a floor at z = 0.
@@ -99,7 +97,7 @@ class Rig:
         self._placed = wp.zeros(n, dtype=wp.bool, device=device)
         self._impulse = wp.zeros(n, dtype=wp.vec3, device=device)
         self._struck = wp.zeros(n, dtype=int, device=device)
-        self._reset, self._step, self._strike = Program(device), Program(device), Program(device)
+        self._reset, self._step, self._strike = LaunchGraph(device), LaunchGraph(device), LaunchGraph(device)
         self.avatar.record_reset(self._reset, self.state, self._placed)
         self.avatar.record_tracking(self._reset, self.state)
         record_control_step(self._step, [self.avatar], self.model, self.state, self.scratch)

@@ -135,7 +135,7 @@ def bound(counts: Counts, launches: float, peaks: Peaks = H200) -> dict[str, Any
     }
 
 
-#: Kernels of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_substep`.
+#: Kernels of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.cuda.block_substep`.
 SUBSTEPS = ("substep_in_small_room", "substep_in_large_room")
 NODE_PASSES = ("nodes_in_small_room", "nodes_in_large_room")
 

@@ -37,7 +37,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from piavatar_envs import doctor
-from piavatar_envs.mpm.cores import available_cores
+from piavatar_envs.core.launch_graph import available_cores
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("numpy", "scipy", "warp-lang", "gymnasium", "stable-baselines3", "torch", "mujoco")

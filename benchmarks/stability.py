@@ -20,12 +20,12 @@ from benchmarks.blows import SPACE
 from benchmarks.limbs import Options
 from benchmarks.poses import JOINT_RANGE, random_pose
 from benchmarks.stage import Act, Stage, standing
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
-from piavatar_envs.envs import simulation
-from piavatar_envs.envs.config import SceneConfig
-from piavatar_envs.mpm import build
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
+from piavatar_envs.config import SceneConfig
+from piavatar_envs.mpm import model as build
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.types import failure_name
+from piavatar_envs.sim import world as simulation
 
 SECONDS, CALM = 1.0, 1.0  # how long a body is watched [s], and what it may have left [J]
 GRAVITY = 9.81
@@ -144,7 +144,7 @@ def first_fault(trials: Iterable[Trial], options: Options) -> str | None:
 
 @contextmanager
 def unrefused() -> Iterator[None]:
-    """Time steps are built that :func:`~piavatar_envs.mpm.build.check_num_substeps` or torques would refuse."""
+    """Time steps are built that :func:`~piavatar_envs.mpm.model.check_num_substeps` or torques would refuse."""
     with mock.patch.object(build, "CFL_STABLE", np.inf), mock.patch.object(simulation, "LONGEST_SUBSTEP", np.inf):
         yield
 

@@ -12,14 +12,14 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from benchmarks.rig import joint_gaps
-from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index, skin
 from piavatar_envs.avatar.motion import Motion
 from piavatar_envs.avatar.motion.interpolation import ease
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index, skin
-from piavatar_envs.envs.config import DriveConfig, EnvConfig, PhysicsConfig, RenderConfig, SceneConfig
-from piavatar_envs.envs.domain import Domain
-from piavatar_envs.envs.simulation import Simulation
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.config import DriveConfig, EnvConfig, PhysicsConfig, RenderConfig, SceneConfig
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.sim.scene import Domain
+from piavatar_envs.sim.world import Simulation
 
 #: A pose: rotation vectors of the joints relative to their parents (22, 3) [rad], and the pelvis joint (3,) [m].
 Pose = tuple[np.ndarray, np.ndarray]
@@ -142,7 +142,7 @@ class Stage:
         self.simulation = Simulation(config, 1, device, act.domain)
         self.task = _Backdrop(act.view.eye, act.view.target)
         self.dt, self.steps_done = config.physics.control_dt, 0
-        self._reset, self._step = Program(self.simulation.device), Program(self.simulation.device)
+        self._reset, self._step = LaunchGraph(self.simulation.device), LaunchGraph(self.simulation.device)
         everyone = wp.array([True], dtype=wp.bool, device=self.simulation.device)
         self.simulation.record_reset(self._reset, everyone)
         self.simulation.record_control_step(self._step)

@@ -1,4 +1,4 @@
-"""Clocks and memory of a device: programs as a whole, their kernels one by one, bytes in use."""
+"""Clocks and memory of a device: graphs as a whole, their kernels one by one, bytes in use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.core.launch_graph import LaunchGraph
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,7 +22,7 @@ HASH = re.compile(r"_[0-9a-f]{8}$")
 
 @dataclass(frozen=True)
 class KernelTime:
-    """What a kernel took in one run of a program.
+    """What a kernel took in one run of a graph.
 
     Attributes:
         ms: time on the device in all of its launches [ms].
@@ -45,25 +45,25 @@ def wall_times(device: str, action: Callable[[], object], repeats: int) -> np.nd
     return seconds
 
 
-def kernel_times(program: Program, repeats: int = 1) -> dict[str, KernelTime]:
+def kernel_times(graph: LaunchGraph, repeats: int = 1) -> dict[str, KernelTime]:
     """Time of each kernel in one run, launched one by one; the state advances by ``repeats`` runs.
 
     On a GPU the times come from events around each launch. What events around a kernel that does nothing measure is
     taken off, so launches and the gaps between kernels are not in these times. On a CPU they are times of the calls,
     the median of the runs, because one thread that is interrupted says nothing about a kernel; elsewhere the mean.
     """
-    device = program.device
+    device = graph.device
     if not device.is_cuda:
-        runs = [program.timed() for _ in range(repeats)]
+        runs = [graph.timed() for _ in range(repeats)]
         return {name: KernelTime(1e3 * float(np.median([run[name] for run in runs])), None) for name in runs[0]}
-    nothing = Program(device.alias)
+    nothing = LaunchGraph(device.alias)
     for _ in range(200):
         nothing.launch(do_nothing, 1, [], [])
     nothing.compile()  # outside of what is timed
     floor = float(np.median(_launch_times(nothing)["do_nothing"]))
     events: dict[str, list[float]] = {}
     for _ in range(repeats):
-        for name, launches in _launch_times(program).items():
+        for name, launches in _launch_times(graph).items():
             events.setdefault(name, []).extend(launches)
     return {
         name: KernelTime(float(np.maximum(np.array(ms) - floor, 0.0).sum()) / repeats, len(ms) // repeats)
@@ -71,11 +71,11 @@ def kernel_times(program: Program, repeats: int = 1) -> dict[str, KernelTime]:
     }
 
 
-def _launch_times(program: Program) -> dict[str, list[float]]:
+def _launch_times(graph: LaunchGraph) -> dict[str, list[float]]:
     """Milliseconds of every launch of a run on a GPU, one after the other, by kernel; no condition is asked for."""
-    launches = program.launches
+    launches = graph.launches
     wp.timing_begin(wp.TIMING_ALL)
-    with wp.ScopedDevice(program.device):
+    with wp.ScopedDevice(graph.device):
         for _, launch in launches:  # not beside each other, as in forks
             launch()
     found: dict[str, list[float]] = {}

@@ -1,4 +1,4 @@
-"""Bodies whose joints move under torques (:mod:`piavatar_envs.avatar.articulated`): momentum, sag, gaps and cost.
+"""Bodies whose joints move under torques: momentum, sag, gaps and cost.
 
 ``python -m benchmarks.torque --out FILE.json``. A body that flails in empty space, one whose pelvis is held while it
 stretches its arms out or presses its toes on the floor, and one that is asked for the rest pose (``control="pd"``, zero
@@ -23,11 +23,14 @@ from benchmarks.limbs import Limbs, Options, critical_damping, widest
 from benchmarks.poses import random_pose
 from benchmarks.rig import joint_gaps
 from benchmarks.stage import Pose, Stage, standing
-from piavatar_envs.avatar import attachment, joint_motion, joint_stages, mass_pairs
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.torque_control import dynamics as joint_motion
+from piavatar_envs.avatar.torque_control import flesh_coupling as attachment
+from piavatar_envs.avatar.torque_control import mass_matrix as mass_pairs
+from piavatar_envs.avatar.torque_control import stages as joint_stages
+from piavatar_envs.config import PhysicsConfig, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import PhysicsConfig, load_config
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.types import Model, State
 from piavatar_envs.tasks import load_task
@@ -55,7 +58,7 @@ def flail(options: Options, rate: float, hold: str) -> dict[str, Any]:
 
     def step(index: int) -> None:
         limbs.aim(poses[index // FLAIL_EVERY])
-        limbs.program.run()
+        limbs.graph.run()
 
     row = {"case": f"free_float_{'attached' if rate > 0.0 else 'loose'}{hold}"}
     return row | drift(options, limbs.rig.model, limbs.rig.state, step, limbs.gaps)
@@ -120,7 +123,7 @@ def stretch_arms(options: Options, stiffness: float, hold: str) -> dict[str, Any
     limbs.set_springs(springs, critical_damping(limbs.body, springs), held=True)
     before = {side: limbs.arm(side) for side in ("left", "right")}
     for _ in range(options.steps):
-        limbs.program.run()
+        limbs.graph.run()
     sag = [_angle(before[side], limbs.arm(side)) for side in before]
     return {
         "case": f"t_pose_kp_{stiffness:g}{hold}",
@@ -145,7 +148,7 @@ def press(options: Options, damping: float, hold: str) -> dict[str, Any]:
     rotations[ankles, 0] = 0.3
     limbs.aim(rotations)
     for _ in range(3 * options.steps):
-        limbs.program.run()
+        limbs.graph.run()
     world = Rotation.from_quat(limbs.body.state.rotation.numpy()[0].astype(float))
     impulse = limbs.body.impulse.numpy()[0].astype(float).reshape(-1, 3)[1:] / limbs.rig.model.step.dt
     turned = np.array([(world[PARENTS[b]].inv() * world[b]).as_rotvec()[0] for b in ankles])
@@ -197,11 +200,11 @@ def cost(options: Options, hold: str) -> dict[str, Any]:
     """
     limbs = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), RATE, **HOLDS[hold])
     limbs.set_springs(*FLAILING, held=True)
-    programs = limbs.program, limbs.record(joints=False)
-    times = [[timing.wall_times(options.device, program.run, 1)[0] for program in programs] for _ in range(REPLAYS)]
+    graphs = limbs.graph, limbs.record(joints=False)
+    times = [[timing.wall_times(options.device, graph.run, 1)[0] for graph in graphs] for _ in range(REPLAYS)]
     whole, alone = 1e3 * np.min(times, axis=0)
     kernels = {kernel for module in MODULES for kernel in vars(module) if hasattr(vars(module)[kernel], "adj")}
-    launched = timing.kernel_times(limbs.program, repeats=5)
+    launched = timing.kernel_times(limbs.graph, repeats=5)
     joints = sum(time.ms for name, time in launched.items() if name in kernels)
     return {
         "case": f"cost{hold}",

@@ -16,10 +16,10 @@ from benchmarks import disturbance, paper, runner
 from benchmarks.metrics import distance_metrics, pose_metrics, spread
 from benchmarks.poses import passing_through, random_directions, random_poses, random_shapes
 from benchmarks.rig import Rig, World
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.settings import DriveSettings
-from piavatar_envs.avatar.skeleton import joint_index
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.core.launch_graph import LaunchGraph
 
 VARIANTS = ("split", "paper", "none")
 FRAMES = 4  # poses of a sequence of Table 1
@@ -254,12 +254,12 @@ def bone_particles(options: Options, world: World) -> Iterator[dict[str, Any]]:
 
 def time_tracking(rig: Rig, repeats: int = 20) -> float:
     """Median time of one Kabsch tracking of all bones of one body [s]."""
-    program = Program(rig.model.device)
-    rig.avatar.record_tracking(program, rig.state)
+    graph = LaunchGraph(rig.model.device)
+    rig.avatar.record_tracking(graph, rig.state)
     runs = []
     for _ in range(repeats):
         start = time.perf_counter()
-        program.run()
+        graph.run()
         rig.avatar.tracked.position.numpy()  # waits for a GPU
         runs.append(time.perf_counter() - start)
     return float(np.median(runs))

@@ -26,12 +26,11 @@ import warp as wp
 from benchmarks import runner, timing
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.api.same_step import step_and_reset
+from piavatar_envs.config import load_config, parse_assignments
+from piavatar_envs.core.launch_graph import LaunchGraph, available_cores
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import load_config, parse_assignments
-from piavatar_envs.mpm.cores import available_cores
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
-from piavatar_envs.tasks.base import Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -97,11 +96,11 @@ class Stepper:
         self.batch = batch
         device = batch.simulation.device
         self.failed, self._clock = wp.zeros(1, dtype=int, device=device), wp.zeros(1, dtype=int, device=device)
-        self._note, self._act = Program(device), Program(device)
+        self._note, self._act = LaunchGraph(device), LaunchGraph(device)
         self._note.launch(count_failures, batch.num_envs, [batch.mask, batch.failure], [self.failed])
-        for program in (self._note, self._act):
-            program.launch(draw_actions, batch.action.shape, [self._clock], [batch.action])
-            program.launch(advance_clock, 1, [], [self._clock])
+        for graph in (self._note, self._act):
+            graph.launch(draw_actions, batch.action.shape, [self._clock], [batch.action])
+            graph.launch(advance_clock, 1, [], [self._clock])
 
     def step(self) -> None:
         """New episodes where one has ended, random actions, one control step."""
@@ -191,7 +190,7 @@ def measure(world: str, num_envs: int, options: Options) -> dict[str, Any]:
         "particles": model.num_particles,
         "substeps": model.num_substeps,
         "cfl": model.sound_speed * model.step.dt / model.grid.dx,
-        "launches_per_step": len(batch.step_program),
+        "launches_per_step": len(batch.step_graph),
         "failed_envs": failed,
     }
 

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.blows import HOLDS
 from benchmarks.limbs import Options
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, skin
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, skin
+from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 SECONDS = 10.0

@@ -12,21 +12,21 @@ from gymnasium.envs.registration import register, registry
 from piavatar_envs.tasks import add_task, place_of, task_modules
 
 if TYPE_CHECKING:
-    from piavatar_envs.api.check import check_task
-    from piavatar_envs.tasks.base import Task
+    from piavatar_envs.api.conformance import check_task
+    from piavatar_envs.envs.task import Task
 
 __all__ = ["check_task", "register_task"]
 __version__ = "0.1.0"
 
 #: What Gymnasium calls for every id.
-ENTRY_POINT = "piavatar_envs.api.gymnasium:AvatarEnv"
+ENTRY_POINT = "piavatar_envs.api.gym_env:AvatarEnv"
 
 
 def _register(env_id: str, task: str) -> None:
     register(
         id=env_id,
         entry_point=ENTRY_POINT,
-        vector_entry_point="piavatar_envs.api.vector:AvatarVectorEnv",
+        vector_entry_point="piavatar_envs.api.vector_env:AvatarVectorEnv",
         # the time limit lives inside, so that a saved state holds it
         max_episode_steps=None,
         # the task a second time, where nobody who makes the id can replace it
@@ -39,7 +39,7 @@ def register_task(env_id: str, task: type[Task] | str) -> None:
 
     Args:
         env_id: a namespace of your own, a name and a version: ``"Mine/Hop-v0"``. Registering it again replaces it.
-        task: a subclass of :class:`piavatar_envs.tasks.base.Task`, or ``"module:Class"``, imported when it is made.
+        task: a subclass of :class:`piavatar_envs.envs.task.Task`, or ``"module:Class"``, imported when it is made.
 
     Raises:
         TypeError: the task is neither.
@@ -55,7 +55,7 @@ def __getattr__(name: str) -> Any:
     """``check_task``, whose imports are heavy, when it is first asked for."""
     if name != "check_task":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from piavatar_envs.api.check import check_task
+    from piavatar_envs.api.conformance import check_task
 
     return check_task
 

@@ -116,7 +116,7 @@ def prepare(env_id: str, config: tuple[str, ...]) -> dict[str, Any]:
         ValueError: there is no such environment, or what should be a setting is none.
     """
     from piavatar_envs import doctor
-    from piavatar_envs.envs.config import parse_assignments
+    from piavatar_envs.config import parse_assignments
 
     check_id(env_id)
     overrides = parse_assignments(config)
@@ -153,7 +153,7 @@ def registered_ids() -> list[str]:
 def describe(env_id: str) -> str:
     """First line of the docstring of the task's file, read without importing it; empty if there is none.
 
-    ``PIAvatar/TrackMotion-v0`` is described by ``tasks/track_motion.py``, ``sumo_v0`` by ``multi/sumo_v0.py``.
+    ``PIAvatar/TrackMotion-v0`` is described by ``tasks/track_motion.py``, ``sumo_v0`` by ``tasks/games/sumo.py``.
     """
     namespace, _, _ = env_id.rpartition("/")
     if namespace not in ("", NAMESPACE):

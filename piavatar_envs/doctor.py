@@ -15,7 +15,7 @@ from typing import Any
 
 import gymnasium
 
-from piavatar_envs.mpm.cores import compiling_threads
+from piavatar_envs.core.launch_graph import compiling_threads
 
 PACKAGES = ("piavatar-envs", "warp-lang", "numpy", "scipy", "gymnasium", "pydantic", "stable-baselines3", "torch")
 
@@ -91,10 +91,10 @@ def kernel_cache() -> dict[str, Any]:
 
 def memory_estimate() -> dict[str, Any]:
     """One environment with default settings: particles, grid nodes, substeps a step, bytes of state and grid."""
-    from piavatar_envs.envs.config import EnvConfig
-    from piavatar_envs.envs.simulation import Simulation
+    from piavatar_envs.config import EnvConfig
+    from piavatar_envs.mpm.bspline import BLOCK_NODES
     from piavatar_envs.mpm.memory import estimate_bytes
-    from piavatar_envs.mpm.stencil import BLOCK_NODES
+    from piavatar_envs.sim.world import Simulation
 
     model = Simulation(EnvConfig(), num_envs=1, device="cpu").model
     nodes = int(BLOCK_NODES) * model.max_slots
@@ -109,7 +109,7 @@ def find_device(device: str) -> str:
         ValueError: there is no such device.
     """
     quiet_warp()
-    from piavatar_envs.envs.simulation import check_device
+    from piavatar_envs.sim.world import check_device
 
     return check_device(device)
 
@@ -125,7 +125,7 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
         ValueError: Warp has no such device.
     """
     wp = quiet_warp()
-    from piavatar_envs.mpm.program import acquire
+    from piavatar_envs.core.launch_graph import acquire
 
     target = wp.get_device(find_device(device))
     start = time.perf_counter()

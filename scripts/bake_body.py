@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS
 
 DECIMETRE = 0.1  # unit of the base mesh and of the targets [m]
 DELTA_STEP = 5e-5  # quantisation of the displacements [m]: far below what a picture or a particle can show

@@ -23,7 +23,7 @@ from rich.progress import track
 
 from agents.design import Design
 from agents.folders import read_json
-from piavatar_envs.envs.config import load_config
+from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 TABLE = "torque_baselines.json"

@@ -29,7 +29,7 @@ from rich.progress import track
 from agents.checkpoint import LENGTHS, learned_otherwise
 from agents.config import load_training
 from agents.folders import read_json
-from piavatar_envs.envs.config import parse_assignments
+from piavatar_envs.config import parse_assignments
 
 
 def _load_rsl(source: Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> BaseModel:

@@ -93,8 +93,8 @@ def make_env(device: str):
 @pytest.fixture(scope="session")
 def make_batch(device: str):
     """A maker of batches, ``make_batch(env_id, num_envs, **settings)``; the same settings give the same object."""
+    from piavatar_envs.config import load_config
     from piavatar_envs.envs.batch_env import BatchEnv
-    from piavatar_envs.envs.config import load_config
     from piavatar_envs.tasks import load_task
 
     made: dict[tuple, BatchEnv] = {}

@@ -12,11 +12,10 @@ import pytest
 import warp as wp
 
 from benchmarks import profile, roofline, runner, soak, timing, vector
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
-from piavatar_envs.mpm.fields import Fields
 from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.model import Fields, MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.types import FAILURE_CFL
 
 RUNS = {
@@ -95,12 +94,12 @@ def test_the_bound_is_the_largest_of_four_times():
 
 
 def test_times_of_kernels_name_every_kernel(device: str):
-    program = Program(device)
+    graph = LaunchGraph(device)
     clock, action = wp.zeros(1, dtype=int, device=device), wp.zeros((4, 1, 3), dtype=float, device=device)
     for _ in range(3):
-        program.launch(vector.draw_actions, action.shape, [clock], [action])
-    program.launch(vector.advance_clock, 1, [], [clock])
-    found = timing.kernel_times(program, repeats=2)
+        graph.launch(vector.draw_actions, action.shape, [clock], [action])
+    graph.launch(vector.advance_clock, 1, [], [clock])
+    found = timing.kernel_times(graph, repeats=2)
     assert set(found) == {"draw_actions", "advance_clock"} and all(kernel.ms >= 0.0 for kernel in found.values())
     assert found["draw_actions"].launches in (3, None)
     assert clock.numpy()[0] == 2

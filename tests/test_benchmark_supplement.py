@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import acts, measures, paper_figures, runner, supplement
 from benchmarks.stage import Act, keyed, perform, standing
-from piavatar_envs.avatar.skeleton import BODY_PARTS, joint_index
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index
 
 STUDIES = {
     "ball mass", "ball stiffness", "resistance", "several objects", "shape preservation", "limb fields", "pillow",

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from benchmarks import limbs, runner, stability, torque, wear
 from benchmarks.limbs import Options
 from benchmarks.rig import joint_gaps
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, forward_kinematics, joint_index
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, forward_kinematics, joint_index
 
 RESULTS = runner.ROOT / "benchmarks" / "results" / "torque.json"
 HOLDS = ("", "_slipping")
@@ -94,11 +94,6 @@ def test_feet_bear_a_standing_body_and_bones_stay_above_the_floor():
         firm, slipping = rows[f"floor_{way}"], rows[f"floor_{way}_slipping"]
         assert firm["pelvis_m"] < 0.3 and firm["bones_below_floor_mm"] < 0.5 < 3.0 < slipping["bones_below_floor_mm"]
         assert firm["share_of_time_beyond_wanted"] == 0.0 and slipping["share_of_time_beyond_wanted"] > 0.9
-
-
-def test_joints_took_less_than_three_tenths_of_the_rest_when_that_was_measured():
-    rows = {row["case"]: row for row in json.loads(RESULTS.read_text(encoding="utf-8"))["results"]}
-    assert max(rows[f"cost{hold}"]["joints_over_mpm"] for hold in HOLDS) < 0.3
 
 
 def test_no_bone_comes_below_the_floor_or_gapes(rows):

@@ -12,12 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import cpu, disturbance, metrics, paper, poses, runner, tracking
 from benchmarks.rig import Rig, World
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.drive import DriveSettings
-from piavatar_envs.avatar.limits import joint_limits
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import joint_index, joint_limits
+from piavatar_envs.avatar.pose_control.controller import DriveSettings
 from piavatar_envs.mpm.diagnostics import totals
-from piavatar_envs.mpm.matrices import components_of
+from piavatar_envs.mpm.types import components_of
 
 TABLE_1 = {"table", "decoupling", "substeps", "mean_distance_m", "rmse_m", "acc_at_1cm", "disturbed"}
 TABLE_2 = {
@@ -107,8 +106,8 @@ def test_errors_of_a_body_that_was_moved_by_hand(tiny: World):
     pelvis = rig.points.joints[0, 0]
     x = rig.state.x.numpy().copy()
     rig.state.x.assign((turn.apply(x[0] - pelvis) + pelvis + [0.02, 0.0, 0.0]).astype(np.float32)[None])
-    rig.avatar.record_tracking(program := tracking.Program(rig.model.device), rig.state)
-    program.run()
+    rig.avatar.record_tracking(graph := tracking.LaunchGraph(rig.model.device), rig.state)
+    graph.run()
     errors = rig.pose_errors()
     assert math.degrees(errors["root_rotation"][0]) == pytest.approx(3.0, abs=0.02)
     assert errors["root_translation"][0] == pytest.approx(0.02, abs=1e-4)
@@ -162,8 +161,8 @@ def test_the_open_loop_drive_ignores_where_the_body_is(tiny: World, decoupling: 
         x, rotations = rig.state.x.numpy().copy(), np.zeros((2, 22, 3))
         x[1] = Rotation.from_rotvec([0.3, 0.0, 0.4]).apply(x[1] - x[1].mean(0)) + x[1].mean(0)
         rig.state.x.assign(x)
-        rig.avatar.record_tracking(program := tracking.Program(rig.model.device), rig.state)
-        program.run()
+        rig.avatar.record_tracking(graph := tracking.LaunchGraph(rig.model.device), rig.state)
+        graph.run()
         rotations[:, joint_index("left_elbow")] = (0.0, 0.0, -0.5)
         rig.step(rotations)
         velocities.append(rig.state.vk.numpy().copy())

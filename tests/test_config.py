@@ -10,7 +10,7 @@ import pytest
 import yaml
 from pydantic import BaseModel, Field, ValidationError
 
-from piavatar_envs.envs.config import (
+from piavatar_envs.config import (
     ConfigError,
     DriveConfig,
     EnvConfig,
@@ -19,7 +19,7 @@ from piavatar_envs.envs.config import (
     parse_assignments,
     replace,
 )
-from piavatar_envs.envs.config_io import setting_keys
+from piavatar_envs.config.load import setting_keys
 
 
 class Task(EnvConfig):

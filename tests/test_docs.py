@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.config import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, Field
 
-from piavatar_envs.avatar.skeleton import JOINT_NAMES
-from piavatar_envs.envs.config import FROZEN, DriveConfig, EnvConfig
-from piavatar_envs.envs.config_io import setting_keys
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
+from piavatar_envs.config import FROZEN, DriveConfig, EnvConfig
+from piavatar_envs.config.load import setting_keys
+from piavatar_envs.config.schema import AvatarConfig, ColliderConfig, PropConfig, SceneConfig
 from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
-from piavatar_envs.envs.scene import AvatarConfig, ColliderConfig, PropConfig, SceneConfig
+from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import FAILURE_NAMES
-from piavatar_envs.tasks.base import Task
 from scripts.pages import markdown, pictures
 from scripts.pages.entries import ROOT, Entry, Facts, entries, gather
 from scripts.pages.gaps import gaps

@@ -21,7 +21,7 @@ SOURCES = ("pyproject.toml", "README.md", "LICENSE", "piavatar_envs")
 PROBE = """
 import importlib.resources, json, sys
 import gymnasium, piavatar_envs
-from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.motion import list_motions, load_motion
 
 env = gymnasium.make("PIAvatar/Reach-v0", device="cpu", fidelity="tiny")

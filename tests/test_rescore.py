@@ -11,7 +11,7 @@ pytest.importorskip("torch", reason="needs the extra train")
 
 from agents import score_pid, score_random
 from agents.design import Design
-from piavatar_envs.envs.config import load_config, parse_assignments
+from piavatar_envs.config import load_config, parse_assignments
 from piavatar_envs.tasks import load_task
 from scripts import rescore
 

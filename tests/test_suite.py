@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.skeleton import NUM_ACTUATED
+from piavatar_envs.avatar.body.skeleton import NUM_ACTUATED
 from piavatar_envs.tasks import NAMESPACE, task_modules
 
 #: The one complaint of Gymnasium's checker that is wanted: these observations have no honest limits.

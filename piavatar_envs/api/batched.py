@@ -15,13 +15,13 @@ from piavatar_envs.api import spaces
 from piavatar_envs.api.arrays import Array, find_array_api
 from piavatar_envs.api.copies import check_state
 from piavatar_envs.api.seeds import checked_seed
-from piavatar_envs.avatar.joint_drive import checked_assist
+from piavatar_envs.avatar.torque_control.controller import checked_assist
+from piavatar_envs.core.launch_graph import available_cores
 from piavatar_envs.envs.batch_env import BatchEnv, check_count
-from piavatar_envs.envs.draws import NUM_SEEDS, check_seeds
-from piavatar_envs.envs.simulation import check_device
-from piavatar_envs.envs.states import check_settings
-from piavatar_envs.mpm.cores import available_cores
-from piavatar_envs.tasks.base import Task
+from piavatar_envs.envs.rng import NUM_SEEDS, check_seeds
+from piavatar_envs.envs.state import check_settings
+from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.world import check_device
 
 
 class BatchedEpisodes:
@@ -187,17 +187,17 @@ class BatchedEpisodes:
         """
         self._run(BatchEnv.reset_masked)
 
-    def _run(self, program: Callable[[BatchEnv], Any]) -> None:
+    def _run(self, graph: Callable[[BatchEnv], Any]) -> None:
         """Run something of every group, each in its own thread."""
         self.api.begin()
-        if self._pool is None or program not in self._captured:
+        if self._pool is None or graph not in self._captured:
             # Warp records one graph at a time: the first runs are not at once
             for group in self.groups:
-                program(group)
-            self._captured.add(program)
+                graph(group)
+            self._captured.add(graph)
         else:
-            running = [self._pool.submit(program, group) for group in self.groups[1:]]
-            program(self.groups[0])
+            running = [self._pool.submit(graph, group) for group in self.groups[1:]]
+            graph(self.groups[0])
             for result in running:
                 result.result()
         self.api.end()

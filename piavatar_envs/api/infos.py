@@ -10,8 +10,8 @@ import warp as wp
 
 from piavatar_envs.api.arrays import Array, ArrayApi
 from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import failure_name
-from piavatar_envs.tasks.base import Task
 
 #: Reads an array of all environments, given which one it is of a batch.
 Reader = Callable[[Callable[[BatchEnv], wp.array]], Array]

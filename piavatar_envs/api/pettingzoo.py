@@ -12,10 +12,10 @@ import numpy as np
 from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
 from piavatar_envs.api.view import EpisodeView
+from piavatar_envs.config import load_config, replace
 from piavatar_envs.envs.batch_env import check_count
-from piavatar_envs.envs.config import load_config, replace
+from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
-from piavatar_envs.tasks.base import Task
 
 try:
     from pettingzoo import AECEnv, ParallelEnv
@@ -30,7 +30,7 @@ __all__ = ["AECEnv", "AvatarParallelEnv", "parallel_to_aec"]
 class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
     """Several soft avatars and a task; each avatar is an agent.
 
-    Observations and actions are as those of :class:`~piavatar_envs.api.gymnasium.AvatarEnv`, by agent, and so is
+    Observations and actions are as those of :class:`~piavatar_envs.api.gym_env.AvatarEnv`, by agent, and so is
     ``info``. An agent that is terminated leaves ``agents``; its avatar stays in the world as a passive body. All leave
     when the clock has run out, and when the simulation gave up (``failure``).
 
@@ -51,6 +51,7 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
         device: str = "cpu",
         config: Settings = None,
         max_cycles: int | None = None,
+        name: str | None = None,
         **overrides: Any,
     ) -> None:
         """Build the environment.
@@ -61,6 +62,7 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
             max_cycles: control steps until truncation; wins over ``episode_seconds``.
+            name: of the environment in its ``metadata``; that of the task's module if not given.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
@@ -73,12 +75,12 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
         if max_cycles is not None:
             check_count("max_cycles", max_cycles, ", or None for episode_seconds")
             self.config = replace(self.config, episode_seconds=max_cycles * self.config.physics.control_dt)
-        made = {"task": task_class, "render_mode": render_mode, "device": device, "config": self.config}
+        made = {"task": task_class, "render_mode": render_mode, "device": device, "config": self.config, "name": name}
         self._build = partial(AvatarParallelEnv.__init__, **made)
         self._episode = Episode(task_class(self.config), render_mode, device)
         self.batch, self.render_mode = self._episode.batch, render_mode
         self.metadata: dict[str, Any] = {
-            "name": task_class.__module__.rpartition(".")[2],
+            "name": name or task_class.__module__.rpartition(".")[2],
             "render_modes": list(RENDER_MODES),
             "render_fps": self._episode.frame_rate,
             "is_parallelizable": True,

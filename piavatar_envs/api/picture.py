@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from piavatar_envs.api.scenery import Progress, Scenery
+from piavatar_envs.config import RenderConfig
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import RenderConfig
 
 
 class Picture:

@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from piavatar_envs.api.infos import single_infos
-from piavatar_envs.api.vector import AvatarVectorEnv
-from piavatar_envs.tasks.base import Task
+from piavatar_envs.api.vector_env import AvatarVectorEnv
+from piavatar_envs.envs.task import Task
 
 try:
     from stable_baselines3.common.vec_env import VecEnv

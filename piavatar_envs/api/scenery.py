@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.flesh import Flesh
-from piavatar_envs.mpm.matrices import matrices_of
+from piavatar_envs.mpm.types import matrices_of
+from piavatar_envs.sim.bodies import Flesh
 
 if TYPE_CHECKING:
     from piavatar_envs.render import Body, Marker, Scene, Skin

@@ -27,9 +27,9 @@ from piavatar_envs.api.copies import Copied
 from piavatar_envs.api.episode import Settings
 from piavatar_envs.api.same_step import Transition, means, step_and_reset
 from piavatar_envs.api.view import BatchedView
-from piavatar_envs.envs.config import load_config
+from piavatar_envs.config import load_config
+from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
-from piavatar_envs.tasks.base import Task
 
 
 class AvatarSkrlEnv(Copied, BatchedView):

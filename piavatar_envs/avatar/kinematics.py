@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.lanes import meet_threads, over_ancestors
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.cuda_intrinsics import meet_threads, over_ancestors
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})

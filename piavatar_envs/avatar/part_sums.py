@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.body import BodyPoints, bone_lists, set_lists
-from piavatar_envs.avatar.bone_sums import moments_of
-from piavatar_envs.avatar.quarters import share_chunks, store_both
+from piavatar_envs.avatar.body.device import BodyPoints, bone_lists, set_lists
+from piavatar_envs.avatar.segment_sums import moments_of, share_chunks, store_both
 from piavatar_envs.avatar.types import Body, vec12, vec16
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -35,7 +34,7 @@ class Parts:
 
     size: int
     start: wp.array(dtype=int)  # (parts + 1,) chunks of part i are those of quarters[start[i] : start[i + 1]]
-    quarters: wp.array(dtype=wp.vec4i)  # of warps, see piavatar_envs.avatar.quarters
+    quarters: wp.array(dtype=wp.vec4i)  # of warps, see piavatar_envs.avatar.segment_sums
     entry: wp.array(dtype=wp.vec2i)  # as the body's: which particle of its part, bits of the weight
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.blending import skinned_place
+from piavatar_envs.avatar.skinning import skinned_place
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.mpm.matrices import store_matrix
-from piavatar_envs.mpm.threads import environment_of
-from piavatar_envs.mpm.types import Kinematic
+from piavatar_envs.core.cuda_intrinsics import environment_of
+from piavatar_envs.mpm.types import Kinematic, store_matrix
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 

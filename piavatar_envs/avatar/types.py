@@ -1,4 +1,6 @@
-"""Data structures of a driven body: constants, parameters, checkpointed state, scratch.
+"""Parameters of a drive: in user terms, and as a kernel argument.
+
+Data structures of a driven body: constants, parameters, checkpointed state, scratch.
 
 Symbols in kernels: ``b`` bone, ``c`` chunk of a bone's particle list, ``q`` rotation, ``G`` the motion by which contact
 has carried a bone within this control step. A body occupies particles ``first ... first + count`` of each environment.
@@ -6,17 +8,82 @@ has carried a bone within this control step. A body occupies particles ``first .
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import warp as wp
 
+from piavatar_envs.mpm.types import Model
+
 wp.set_module_options({"enable_backward": False})
+
+
+#: Tone 1 pulls bones to the commanded pose at this natural frequency [1/s].
+TONE_RATE = 30.0
+#: Natural frequency of the root wrench [1/s].
+ROOT_RATE = 10.0
+#: Decay of motion between bones at any tone [1/s]; without it a limp body rings like rubber.
+DAMPING = 3.0
+STANDARD_GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class DriveSettings:
+    """Parameters of a drive in user terms.
+
+    Attributes:
+        mode: ``"increment"``, or ``"target"``: velocity from the tracked pose to the goal itself, the protocol of the
+            paper's Table 2, for undisturbed reproduction only (on a disturbed body it fights the physical velocity);
+            or ``"reference"``: velocity from the last commanded pose to the next, whatever the body did (open loop).
+        tone: how firmly bones return to the commanded pose, 0 to 1.
+        alpha: share of a shape error that shape preservation may undo in a control step, 0 to 1.
+        shape_preservation: ``"physical"`` (keeps momentum) or ``"kinematic"`` (the paper's term in ``vk``).
+        root: ``"wrench"`` holds the commanded root, ``"free"`` lets the body fly.
+        free_motion: take the rigid part out of commanded motion, so that it carries no unreacted momentum. A body
+            whose root has let go moves so in any case.
+        max_force: limit of the root force, in units of mass times standard gravity.
+        max_torque: limit of the root torque, in units of mass times standard gravity times one metre.
+        max_tilt: tilt error at which the root lets go [rad].
+        max_horizontal_error: horizontal root error at which it lets go [m].
+        max_height_error: height error at which it lets go [m].
+    """
+
+    mode: str = "increment"
+    tone: float = 1.0
+    alpha: float = 0.3
+    shape_preservation: str = "physical"
+    root: str = "wrench"
+    free_motion: bool = False
+    max_force: float = 2.0
+    max_torque: float = 0.7
+    max_tilt: float = math.radians(45.0)
+    max_horizontal_error: float = 0.5
+    max_height_error: float = 0.4
+
+    def kernel_parameters(self, model: Model) -> Drive:
+        """The same as a kernel argument."""
+        drive = Drive()
+        drive.dt, drive.control_dt, drive.num_substeps = model.step.dt, model.control_dt, model.num_substeps
+        drive.mode = {"increment": 0, "target": 1, "reference": 2}[self.mode]
+        rate = self.alpha / model.control_dt
+        drive.shape_rate = rate if self.shape_preservation == "physical" else 0.0
+        drive.kinematic_shape_rate = rate if self.shape_preservation == "kinematic" else 0.0
+        drive.tone_rate, drive.damping = TONE_RATE * self.tone, DAMPING
+        drive.free_motion = int(self.free_motion)
+        drive.gravity = model.step.gravity
+        drive.root_rate = ROOT_RATE if self.root == "wrench" else 0.0
+        drive.max_force = self.max_force * STANDARD_GRAVITY
+        drive.max_torque = self.max_torque * STANDARD_GRAVITY
+        drive.max_tilt_cos = math.cos(self.max_tilt)
+        drive.max_horizontal_error, drive.max_height_error = self.max_horizontal_error, self.max_height_error
+        return drive
+
 
 #: Partial sums of a chunk: m, m x (3), m u (3), m x x^T (6), m x cross u (3).
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
 #: Partial sums of a chunk's corrections: momentum and angular momentum of the pulls (6), those of the lean alone (6).
 vec12 = wp.types.vector(length=12, dtype=wp.float32)
-#: All that a particle blends over its bones, and what it has blended, see :mod:`piavatar_envs.avatar.blending`.
+#: All that a particle blends over its bones, and what it has blended, see :mod:`piavatar_envs.avatar.skinning`.
 vec44 = wp.types.vector(length=44, dtype=wp.float32)
 vec24 = wp.types.vector(length=24, dtype=wp.float32)
 #: Change of a bone's rigid motion: velocity where the pelvis' centre is (3), spin (3), padding to 32 bytes.
@@ -34,7 +101,7 @@ class Body:
     first: int
     count: int
     rest: wp.array2d(dtype=wp.vec3)  # (rows, count) rest positions [m]
-    skin: wp.array(dtype=wp.vec4)  # (count,) bones that move a particle, see piavatar_envs.avatar.influences
+    skin: wp.array(dtype=wp.vec4)  # (count,) bones that move a particle, see piavatar_envs.avatar.skinning
     alone: int  # the first so many particles are moved by one bone each
     inert: wp.array2d(dtype=float)  # (rows, count) share of a change of commanded motion that a particle misses
     rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
@@ -51,7 +118,7 @@ class Body:
     # particles moved by bone b, in chunks: bone b owns chunks chunk_start[b] : chunk_start[b + 1]
     chunk_start: wp.array(dtype=int)
     chunk_bone: wp.array(dtype=int)
-    quarters: wp.array(dtype=wp.vec4i)  # of warps that share chunks, see piavatar_envs.avatar.quarters
+    quarters: wp.array(dtype=wp.vec4i)  # of warps that share chunks, see piavatar_envs.avatar.segment_sums
     entry: wp.array(dtype=int)
     entry_weight: wp.array(dtype=float)
 

@@ -9,20 +9,19 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.drive import AvatarDrive
-from piavatar_envs.avatar.joint_drive import checked_assist
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
-from piavatar_envs.envs.actions import apply_actions, refuse_nonfinite
-from piavatar_envs.envs.draws import NUM_SEEDS
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
+from piavatar_envs.avatar.pose_control.controller import AvatarDrive
+from piavatar_envs.avatar.torque_control.controller import checked_assist
+from piavatar_envs.config.idle import idle_settings
+from piavatar_envs.core.launch_graph import LaunchGraph, compile_graphs
+from piavatar_envs.envs.actions import apply_actions, apply_targets, apply_torques, follow_reference, refuse_nonfinite
 from piavatar_envs.envs.episodes import begin_episode, count_episodes, end_agent, end_step, find_ended, retire
-from piavatar_envs.envs.idle import idle_settings
-from piavatar_envs.envs.joint_actions import apply_targets, apply_torques, follow_reference
 from piavatar_envs.envs.observer import Observer
-from piavatar_envs.envs.props import check_places
-from piavatar_envs.envs.simulation import Simulation
-from piavatar_envs.envs.states import SETTINGS, check_settings, settings_rows
-from piavatar_envs.mpm.program import Program, compile_programs
-from piavatar_envs.tasks.base import Task
+from piavatar_envs.envs.rng import NUM_SEEDS
+from piavatar_envs.envs.state import SETTINGS, check_settings, settings_rows
+from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.props import check_places
+from piavatar_envs.sim.world import Simulation
 
 
 def check_count(name: str, count: Any, otherwise: str = "") -> None:
@@ -90,13 +89,11 @@ class BatchEnv:
         self._allocate(seed)
         task.allocate(self)
         self.observer.connect(self)
-        self.reset_program = Program(self.device, condition=self._begins)
-        self.step_program, self.observe_program = Program(self.device), Program(self.device)
-        self.count_program, self.ended_program = Program(self.device), Program(self.device)
+        self.reset_graph = LaunchGraph(self.device, condition=self._begins)
+        self.step_graph, self.observe_graph = LaunchGraph(self.device), LaunchGraph(self.device)
+        self.count_graph, self.ended_graph = LaunchGraph(self.device), LaunchGraph(self.device)
         self._record()
-        compile_programs(
-            (self.reset_program, self.step_program, self.observe_program, self.count_program, self.ended_program)
-        )
+        compile_graphs((self.reset_graph, self.step_graph, self.observe_graph, self.count_graph, self.ended_graph))
 
     @property
     def failure(self) -> wp.array:
@@ -129,67 +126,65 @@ class BatchEnv:
     def _record(self) -> None:
         n, sim = self.num_envs, self.simulation
         agents = (n, self.num_agents)
-        self.ended_program.launch(find_ended, n, [self.terminated, self.truncated], [self.mask])
+        self.ended_graph.launch(find_ended, n, [self.terminated, self.truncated], [self.mask])
         counters = [self._seeded, self.seed, self.episode, self._begins]
-        self.count_program.launch(count_episodes, n, [self.mask, self._new_seed], counters)
+        self.count_graph.launch(count_episodes, n, [self.mask, self._new_seed], counters)
 
-        program = self.reset_program
+        graph = self.reset_graph
         clocks, flags = [self.step_count, self.head_start], [self.terminated, self.truncated, self.success, self.alive]
-        program.launch(begin_episode, agents, [self.mask], [*clocks, *flags, self._begins])
-        sim.record_draws(program, self.mask, self.seed, self.episode)
-        self.task.record_reset(self, program)
-        sim.record_reset(program, self.mask)
-        self.observer.record_reset(program, self.mask)
-        self._record_observation(program, self.mask)
-        self._record_observation(self.observe_program)
+        graph.launch(begin_episode, agents, [self.mask], [*clocks, *flags, self._begins])
+        sim.record_draws(graph, self.mask, self.seed, self.episode)
+        self.task.record_reset(self, graph)
+        sim.record_reset(graph, self.mask)
+        self.observer.record_reset(graph, self.mask)
+        self._record_observation(graph, self.mask)
+        self._record_observation(self.observe_graph)
 
-        program = self.step_program
-        references = self.task.record_references(self, program)
+        graph = self.step_graph
+        references = self.task.record_references(self, graph)
         for agent, (avatar, reference) in enumerate(zip(sim.avatars, references, strict=True)):
-            program.launch(
-                refuse_nonfinite, (n, self.action_spec.size), [self.action, agent, self.alive], [self.failure]
-            )
-            self._record_actions(program, agent, avatar, reference)
+            graph.launch(refuse_nonfinite, (n, self.action_spec.size), [self.action, agent, self.alive], [self.failure])
+            self._record_actions(graph, agent, avatar, reference)
             if self.num_agents > 1:
-                program.launch(retire, n, [agent, self.alive], [avatar.state.let_go])
-        sim.record_control_step(program)
-        self.task.record_outcome(self, program)
+                graph.launch(retire, n, [agent, self.alive], [avatar.state.let_go])
+        sim.record_control_step(graph)
+        self.task.record_outcome(self, graph)
         for agent, avatar in enumerate(sim.avatars):
-            program.launch(
+            graph.launch(
                 end_agent,
                 n,
                 [agent, self.num_agents, self.failure, avatar.state.let_go, self.terms, self.cost_terms],
                 [self.reward, self.cost, self.terminated, self.alive],
             )
         ends = [self.max_steps, self.terminated, self.head_start]
-        program.launch(end_step, n, ends, [self.step_count, self.truncated])
-        self._record_observation(program)
+        graph.launch(end_step, n, ends, [self.step_count, self.truncated])
+        self._record_observation(graph)
 
-    def _record_actions(self, program: Program, agent: int, avatar: AvatarDrive, reference: tuple) -> None:
+    def _record_actions(self, graph: LaunchGraph, agent: int, avatar: AvatarDrive, reference: tuple) -> None:
         """Append what an agent's action makes of its goal, counted from the reference pose."""
         bones, goal = (self.num_envs, NUM_JOINTS), [avatar.state.goal_rotation, avatar.state.goal_root]
         acting = [self.action_map, self.action, agent, self.alive]
         if self.control == "pose":
-            program.launch(apply_actions, bones, [*acting, *reference, avatar.tracked.rotation], goal)
+            graph.launch(apply_actions, bones, [*acting, *reference, avatar.tracked.rotation], goal)
             return
         command = [avatar.state.command_rotation, avatar.state.command_root]
         inputs = [int(not self.task.targets_about_reference), *reference, self.failure]
-        program.launch(follow_reference, bones, inputs, [*command, *goal])
+        graph.launch(follow_reference, bones, inputs, [*command, *goal])
         if self.control == "pd":
-            program.launch(apply_targets, bones, acting, goal[:1])
+            graph.launch(apply_targets, bones, acting, goal[:1])
         else:
             joints = avatar.joints
-            program.launch(apply_torques, bones, [*acting, joints.body.strength], [joints.state.torque])
+            graph.launch(apply_torques, bones, [*acting, joints.body.strength], [joints.state.torque])
 
-    def _record_observation(self, program: Program, mask: wp.array | None = None) -> None:
+    def _record_observation(self, graph: LaunchGraph, mask: wp.array | None = None) -> None:
         """Append what writes the observation; it changes nothing else. A reset has changed that of the ``mask``."""
-        self.observer.record_settings(program)
+        self.observer.record_settings(graph)
         for agent in range(self.num_agents):
-            self.observer.record(program, agent, self.observation, mask)
+            self.observer.record(graph, agent, self.observation, mask)
             if self.task.terms():
-                self.task.record_observe(self, program, agent, self.observer.task_start)
-            self.observer.record_parameters(program, self, agent)
-        self.observer.record_clean(program, self.observation)
+                self.task.record_observe(self, graph, agent, self.observer.task_start)
+            self.observer.record_parameters(graph, self, agent)
+        self.observer.record_clean(graph, self.observation)
 
     def reset(
         self, env_mask: np.ndarray | None = None, seeds: Sequence[int | None] | np.ndarray | None = None
@@ -228,7 +223,7 @@ class BatchEnv:
 
         Nothing leaves the device.
         """
-        self.ended_program.run()
+        self.ended_graph.run()
         return self.mask
 
     def reset_masked(self) -> wp.array:
@@ -239,9 +234,9 @@ class BatchEnv:
         return self._begin()
 
     def _begin(self) -> wp.array:
-        self.count_program.run()
+        self.count_graph.run()
         self.simulation.shapes.draw(self.mask, self.seed, self.episode)
-        self.reset_program.run()
+        self.reset_graph.run()
         self.simulation.shapes.fall_behind()
         return self.observation
 
@@ -262,7 +257,7 @@ class BatchEnv:
 
     def step(self) -> None:
         """Advance every environment by one control step under :attr:`action`."""
-        self.step_program.run()
+        self.step_graph.run()
 
     def arrays(self) -> dict[str, wp.array]:
         """Every array a checkpoint holds, by name."""
@@ -307,7 +302,7 @@ class BatchEnv:
             self.simulation.shapes.adopt(avatar, state[f"shape.{avatar}"])
         self.simulation.shapes.fall_behind()
         self.restarts += 1
-        self.observe_program.run()
+        self.observe_graph.run()
 
 
 def _as_int32(seeds: np.ndarray) -> np.ndarray:

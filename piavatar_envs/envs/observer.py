@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_JOINTS
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, NUM_JOINTS
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.observations import (
     CONTACT_TERMS,
     JOINT_TERMS,
@@ -17,17 +18,19 @@ from piavatar_envs.envs.observations import (
     observe_body,
     observe_contact,
     observe_joints,
+    observe_other,
+    observe_prop,
     observe_stress,
+    other_terms,
+    prop_terms,
     tracked_arrays,
 )
-from piavatar_envs.envs.others import observe_other, observe_prop, other_terms, prop_terms
 from piavatar_envs.envs.parameters import Parameters
-from piavatar_envs.envs.simulation import Simulation
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.sim.world import Simulation
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
-    from piavatar_envs.tasks.base import Task
+    from piavatar_envs.envs.task import Task
 
 
 class Observer:
@@ -67,7 +70,7 @@ class Observer:
         self.everybody = wp.full(simulation.num_envs, True, dtype=wp.bool, device=device)
         self._part = [wp.array(flesh.part, dtype=int, device=device) for flesh in simulation.flesh]
 
-    def record(self, program: Program, agent: int, observation: wp.array, mask: wp.array | None = None) -> None:
+    def record(self, graph: LaunchGraph, agent: int, observation: wp.array, mask: wp.array | None = None) -> None:
         """Append: write all but the task's terms of ``agent``. Changes nothing else.
 
         What takes a pass over the particles is written where there is no ``mask``, or where it is set.
@@ -76,10 +79,10 @@ class Observer:
         sim = self.simulation
         n, avatar = sim.num_envs, sim.avatars[agent]
         start = self.layout["stress"].slice.start
-        program.launch(observe_body, (n, NUM_JOINTS), [agent, *tracked_arrays(avatar.tracked)], [observation])
-        program.launch(clear_stress, (n, len(BODY_PARTS)), [mask, agent, start], [observation])
+        graph.launch(observe_body, (n, NUM_JOINTS), [agent, *tracked_arrays(avatar.tracked)], [observation])
+        graph.launch(clear_stress, (n, len(BODY_PARTS)), [mask, agent, start], [observation])
         modulus = 1.0 / sim.flesh[agent].physics.young_modulus
-        program.launch(
+        graph.launch(
             observe_stress,
             n * avatar.num_points,
             [mask, avatar.body, sim.model.particles, sim.state.F, self._part[agent], agent, start, modulus],
@@ -87,21 +90,21 @@ class Observer:
         )
         if self.task.observes_contact:
             at = self.layout[CONTACT_TERMS[0].name].slice.start
-            program.launch(
+            graph.launch(
                 observe_contact, (n, len(BODY_PARTS)), [agent, at, avatar.tracked.rotation, sim.sensors], [observation]
             )
         if avatar.joints:
             at, joints = self.layout[JOINT_TERMS[0].name].slice.start, avatar.joints.state
             inputs = [agent, at, avatar.body, joints.rotation, joints.velocity, sim.sensors]
-            program.launch(observe_joints, (n, NUM_JOINTS), inputs, [observation])
-        self._record_others(program, agent, observation)
+            graph.launch(observe_joints, (n, NUM_JOINTS), inputs, [observation])
+        self._record_others(graph, agent, observation)
 
-    def _record_others(self, program: Program, agent: int, observation: wp.array) -> None:
+    def _record_others(self, graph: LaunchGraph, agent: int, observation: wp.array) -> None:
         sim = self.simulation
         tracked, state = sim.avatars[agent].tracked, sim.props.state
         at, size = self._first_prop, sum(term.size for term in prop_terms("a prop"))
         for name in self.task.observed_props():
-            program.launch(
+            graph.launch(
                 observe_prop,
                 sim.num_envs,
                 [
@@ -114,7 +117,7 @@ class Observer:
         at, size = self._first_other, sum(term.size for term in other_terms(0))
         for index in range(self._num_others):
             other = sim.avatars[(agent + 1 + index) % len(sim.avatars)].tracked
-            program.launch(
+            graph.launch(
                 observe_other,
                 sim.num_envs,
                 [agent, at, tracked.rotation, tracked.position, other.rotation, other.position, other.velocity],
@@ -127,25 +130,25 @@ class Observer:
         if self.parameters:
             self.parameters.connect(env)
 
-    def record_reset(self, program: Program, mask: wp.array) -> None:
+    def record_reset(self, graph: LaunchGraph, mask: wp.array) -> None:
         """Append, when all has been drawn: keep what the masked environments have drawn."""
         if self.parameters:
-            self.parameters.record_reset(program, mask)
+            self.parameters.record_reset(graph, mask)
 
-    def record_settings(self, program: Program) -> None:
+    def record_settings(self, graph: LaunchGraph) -> None:
         """Append, before anybody observes: look at what may have been changed since."""
         if self.parameters:
-            self.parameters.record_settings(program)
+            self.parameters.record_settings(graph)
 
-    def record_parameters(self, program: Program, env: BatchEnv, agent: int) -> None:
+    def record_parameters(self, graph: LaunchGraph, env: BatchEnv, agent: int) -> None:
         """Append: write what the episode has drawn for ``agent``. Changes nothing else."""
         if self.parameters:
-            self.parameters.record_observe(program, env, agent)
+            self.parameters.record_observe(graph, env, agent)
 
     def arrays(self) -> dict[str, wp.array]:
         """Arrays of a checkpoint, by name."""
         return self.parameters.arrays() if self.parameters else {}
 
-    def record_clean(self, program: Program, observation: wp.array) -> None:
+    def record_clean(self, graph: LaunchGraph, observation: wp.array) -> None:
         """Append: numbers that are not finite, of an environment that has failed, become zero."""
-        program.launch(clean_observation, observation.shape, [], [observation])
+        graph.launch(clean_observation, observation.shape, [], [observation])

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import warp as wp
 
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
-from piavatar_envs.envs.simulation import Simulation
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.sim.world import Simulation
 
 if TYPE_CHECKING:
     from piavatar_envs.envs.batch_env import BatchEnv
-    from piavatar_envs.tasks.base import Task
+    from piavatar_envs.envs.task import Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -106,30 +106,30 @@ class Parameters:
         bodies = [world + (agent + index) % count * own + np.arange(own) for index in range(count)]
         return np.concatenate([np.arange(world), *bodies, world + count * own + np.arange(task)]).astype(np.int32)
 
-    def record_reset(self, program: Program, mask: wp.array) -> None:
+    def record_reset(self, graph: LaunchGraph, mask: wp.array) -> None:
         """Append, when all has been drawn: normalise the parameters of the masked environments."""
         for column, (parameter, _) in enumerate(self._sources):
             if parameter != ASSIST:
-                self._record(program, mask, column)
+                self._record(graph, mask, column)
 
-    def record_settings(self, program: Program) -> None:
+    def record_settings(self, graph: LaunchGraph) -> None:
         """Append, before anybody observes: normalise what may have been changed in any environment."""
         for column, (parameter, _) in enumerate(self._sources):
             if parameter == ASSIST:
-                self._record(program, self._everywhere, column)
+                self._record(graph, self._everywhere, column)
 
-    def _record(self, program: Program, mask: wp.array, column: int) -> None:
+    def _record(self, graph: LaunchGraph, mask: wp.array, column: int) -> None:
         parameter, drawn = self._sources[column]
-        program.launch(
+        graph.launch(
             normalize if drawn.values.dtype is wp.float32 else normalize_count,
             len(mask),
             [mask, drawn.values, drawn.scale, parameter.low, parameter.high, int(parameter.log), column],
             [self.values],
         )
 
-    def record_observe(self, program: Program, env: BatchEnv, agent: int) -> None:
+    def record_observe(self, graph: LaunchGraph, env: BatchEnv, agent: int) -> None:
         """Append: write the term for ``agent``. Changes nothing else."""
-        program.launch(
+        graph.launch(
             observe_parameters,
             (env.num_envs, self.term.size),
             [

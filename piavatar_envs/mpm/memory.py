@@ -7,13 +7,11 @@ import math
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.blocks import NOBODY
-from piavatar_envs.mpm.matrices import allocate_matrices, components_of, whole_lines
-from piavatar_envs.mpm.others import notes_others
-from piavatar_envs.mpm.sensing import senses_in_gather
-from piavatar_envs.mpm.shared_room import MOST_PARTICLES, plan_room
-from piavatar_envs.mpm.stencil import BLOCK, BLOCK_NODES
-from piavatar_envs.mpm.sums import units
+from piavatar_envs.mpm.bspline import BLOCK, BLOCK_NODES
+from piavatar_envs.mpm.contact_sensors import senses_in_gather
+from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, plan_room
+from piavatar_envs.mpm.grid_arrays import units
+from piavatar_envs.mpm.sparse_grid import NOBODY, notes_others
 from piavatar_envs.mpm.sweep import most_shared
 from piavatar_envs.mpm.types import (
     Blocks,
@@ -23,8 +21,11 @@ from piavatar_envs.mpm.types import (
     Sensors,
     State,
     Sums,
+    allocate_matrices,
+    components_of,
     group,
     vec4l,
+    whole_lines,
 )
 
 #: Blocks with matter that a body may come to need, over those that it needs at rest. Random full-scale actions, also of

@@ -13,77 +13,81 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from piavatar_envs.mpm import runs
-from piavatar_envs.mpm.blocks import forget_blocks, free_slots, freeze, mark_particles
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import move_colliders
-from piavatar_envs.mpm.contact_pass import solve_contact
-from piavatar_envs.mpm.gather import grid_to_particles
-from piavatar_envs.mpm.grid import update_grid
-from piavatar_envs.mpm.groups import record_groups
-from piavatar_envs.mpm.impulses import clear_sensors, read_impulses
-from piavatar_envs.mpm.normals import find_facing
-from piavatar_envs.mpm.others import begin_others, notes_others
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.sensing import sense_contact, sense_penetration, senses_in_gather
-from piavatar_envs.mpm.shared_substep import forget_speeds, record_in_block
+from piavatar_envs.mpm.contact import solve_contact
+from piavatar_envs.mpm.contact_normals import find_facing
+from piavatar_envs.mpm.contact_sensors import (
+    clear_sensors,
+    read_impulses,
+    sense_contact,
+    sense_penetration,
+    senses_in_gather,
+)
+from piavatar_envs.mpm.cuda import tiled_g2p as runs
+from piavatar_envs.mpm.cuda.block_substep import forget_speeds, record_in_block
+from piavatar_envs.mpm.cuda.tiled_p2g import record_groups
+from piavatar_envs.mpm.g2p import grid_to_particles
+from piavatar_envs.mpm.grid_update import update_grid
+from piavatar_envs.mpm.p2g import particles_to_grid
+from piavatar_envs.mpm.sparse_grid import begin_others, forget_blocks, free_slots, freeze, mark_particles, notes_others
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep, slot_threads, slots_at_once
-from piavatar_envs.mpm.transfer import particles_to_grid
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
 
 
-def record_substep(program: Program, model: Model, state: State, scratch: Scratch, index: int) -> None:
-    """Append substep ``index`` of a control step to ``program``.
+def record_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scratch, index: int) -> None:
+    """Append substep ``index`` of a control step to ``graph``.
 
     The physical velocity, position and deformation in ``state`` advance by ``model.step.dt`` under the kinematic
     velocity ``state.vk``; contact is added to the sensors.
     """
     world = (model, state, scratch)
     if index == 0 and model.scatter == "shared":
-        program.launch(forget_speeds, scratch.room.speed.shape, [scratch.room])
+        graph.launch(forget_speeds, scratch.room.speed.shape, [scratch.room])
     if index > 0 and index % model.marks_every == 0:
-        activate_blocks(program, *world)
-    record_p2g(program, *world)
-    record_grid_update(program, *world)
-    record_g2p(program, *world)
+        activate_blocks(graph, *world)
+    record_p2g(graph, *world)
+    record_grid_update(graph, *world)
+    record_g2p(graph, *world)
     if model.moving_boundaries:
-        program.launch(move_colliders, model.boundaries.position.shape, [model.step.dt], [model.boundaries])
+        graph.launch(move_colliders, model.boundaries.position.shape, [model.step.dt], [model.boundaries])
 
 
-def activate_blocks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+def activate_blocks(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append: release all blocks, and activate those that particles touch.
 
     Between activations G2P adds the blocks that particles reach. A block that stays active without need costs time.
     """
     blocks = scratch.blocks
-    program.launch(forget_blocks, (model.num_envs, model.max_slots), [model.grid], [blocks])
-    program.launch(free_slots, model.num_envs, [state.failure], [blocks])
-    program.launch(mark_particles, state.x.shape, [model.grid, model.particles, state.x], [blocks, state.failure])
+    graph.launch(forget_blocks, (model.num_envs, model.max_slots), [model.grid], [blocks])
+    graph.launch(free_slots, model.num_envs, [state.failure], [blocks])
+    graph.launch(mark_particles, state.x.shape, [model.grid, model.particles, state.x], [blocks, state.failure])
     if notes_others(model):
-        program.launch(begin_others, (model.num_envs, model.max_slots), [], [blocks])
+        graph.launch(begin_others, (model.num_envs, model.max_slots), [], [blocks])
 
 
-def record_p2g(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+def record_p2g(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append P2G: particles add mass, physical and kinematic momentum to the nodes around them."""
     m, moving = model, _moving(state)
     if m.scatter == "shared":  # with the grid update, and G2P where there is one field
-        record_in_block(program, model, state, scratch, moving)
+        record_in_block(graph, model, state, scratch, moving)
         return
     inputs = [m.grid, m.step, m.particles, m.boundaries, m.contact, moving, scratch.blocks]
     outputs = [state.failure, scratch.sums]
     if m.scatter == "plain":
-        program.launch(particles_to_grid, state.x.shape, inputs, outputs)
+        graph.launch(particles_to_grid, state.x.shape, inputs, outputs)
     else:
-        record_groups(program, m, inputs, outputs)
+        record_groups(graph, m, inputs, outputs)
 
 
-def record_grid_update(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+def record_grid_update(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append the grid update: momentum becomes velocity, gravity and contact act, sensors add up impulses.
 
     Blocks with several velocity fields are few, and contact there mostly waits for memory: the update of all other
     blocks runs in parallel.
     """
     m = model
-    contact, update = Program(program.device), Program(program.device)
+    contact, update = LaunchGraph(graph.device), LaunchGraph(graph.device)
     if m.contact.num_fields > 1:
         _record_contact(contact, model, state, scratch)
     if m.scatter != "shared":  # else done in shared memory, with P2G
@@ -95,9 +99,9 @@ def record_grid_update(program: Program, model: Model, state: State, scratch: Sc
             [scratch.blocks, scratch.sums, scratch.velocity, scratch.sensors],
             block_dim=THREADS,
         )
-    program.fork(contact, update)
+    graph.parallel(contact, update)
     if m.contact.num_fields > 1 and m.num_sensors > 0 and not senses_in_gather(m):
-        program.launch(
+        graph.launch(
             sense_contact,
             state.x.shape,
             [m.grid, m.particles, state.x, scratch.blocks, state.failure],
@@ -106,18 +110,18 @@ def record_grid_update(program: Program, model: Model, state: State, scratch: Sc
         )
 
 
-def _record_contact(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+def _record_contact(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append contact in the blocks with several fields: first the normals, then the impulses."""
     m, blocks, sums = model, scratch.blocks, scratch.sums
     sweep = plan_sweep(m)
-    program.launch(
+    graph.launch(
         find_facing,
         m.num_envs * sweep.threads,
         [m.grid, m.contact, sweep, blocks, state.failure],
         [sums, scratch.velocity, scratch.facing, scratch.sensors],
         block_dim=THREADS,
     )
-    program.launch(
+    graph.launch(
         solve_contact,
         m.num_envs * sweep.threads,
         [m.grid, m.step, m.boundaries, m.contact, sweep, blocks, state.failure, scratch.facing],
@@ -126,7 +130,7 @@ def _record_contact(program: Program, model: Model, state: State, scratch: Scrat
     )
 
 
-def record_g2p(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+def record_g2p(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append G2P: particles take velocity and its gradient from the nodes, move, and update ``F``."""
     m = model
     if m.scatter == "shared" and m.contact.num_fields == 1:
@@ -134,9 +138,9 @@ def record_g2p(program: Program, model: Model, state: State, scratch: Scratch) -
     inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
     outputs = [scratch.blocks, _moving(state), state.failure]
     if m.scatter == "plain":
-        program.launch(grid_to_particles, state.x.shape, inputs, outputs, block_dim=runs.THREADS)
+        graph.launch(grid_to_particles, state.x.shape, inputs, outputs, block_dim=runs.THREADS)
     else:
-        program.launch(
+        graph.launch(
             runs.grid_to_particles,
             m.num_envs * m.num_particles,
             [*inputs, int(senses_in_gather(m))],
@@ -151,44 +155,46 @@ def _moving(state: State) -> Moving:
 
 
 def record_begin(
-    program: Program, model: Model, state: State, scratch: Scratch, beside: Sequence[Program] = ()
+    graph: LaunchGraph, model: Model, state: State, scratch: Scratch, beside: Sequence[LaunchGraph] = ()
 ) -> None:
     """Append what precedes the first substep of a control step: clear the sensors, activate blocks.
 
     Args:
-        program: the launch graph to append to.
+        graph: the launch graph to append to.
         model: the constants.
         state: the particles.
         scratch: the grid.
         beside: branches that may run in parallel: they use neither sensors nor blocks, move no particles, and do not
             read which environments have failed, because activation sets that.
     """
-    sensors, marks = Program(program.device), Program(program.device)
+    sensors, marks = LaunchGraph(graph.device), LaunchGraph(graph.device)
     sensors.launch(clear_sensors, model.num_envs, [], [scratch.sensors])
     record_marks(marks, model, state, scratch)
-    program.fork(sensors, marks, *beside)
+    graph.parallel(sensors, marks, *beside)
 
 
-def record_marks(program: Program, model: Model, state: State, scratch: Scratch) -> None:
+def record_marks(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append: activate the blocks of all particles, and freeze the environments that have failed.
 
     Required at the start of a control step, because a reset may have moved the particles.
     """
-    activate_blocks(program, model, state, scratch)
-    program.launch(freeze, model.num_envs, [state.failure], [scratch.blocks])
+    activate_blocks(graph, model, state, scratch)
+    graph.launch(freeze, model.num_envs, [state.failure], [scratch.blocks])
 
 
-def record_end(program: Program, model: Model, state: State, scratch: Scratch, beside: Sequence[Program] = ()) -> None:
+def record_end(
+    graph: LaunchGraph, model: Model, state: State, scratch: Scratch, beside: Sequence[LaunchGraph] = ()
+) -> None:
     """Append what follows the last substep of a control step: sensors that are read once a control step.
 
     Args:
-        program: the launch graph to append to.
+        graph: the launch graph to append to.
         model: the constants.
         state: the particles.
         scratch: the grid.
         beside: branches that may run in parallel: they use no sensors, move no particles, and set no failure.
     """
-    m, impulses, depths = model, Program(program.device), Program(program.device)
+    m, impulses, depths = model, LaunchGraph(graph.device), LaunchGraph(graph.device)
     entries = scratch.sensors.sums.shape[1] // 3
     impulses.launch(read_impulses, (m.num_envs, entries), [], [scratch.sensors])
     if m.contact.num_subjects > 1:
@@ -198,4 +204,4 @@ def record_end(program: Program, model: Model, state: State, scratch: Scratch, b
             [m.grid, m.particles, m.contact, state.x, scratch.blocks, scratch.velocity, state.failure],
             [scratch.sensors.penetration],
         )
-    program.fork(impulses, depths, *beside)
+    graph.parallel(impulses, depths, *beside)

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.gather import Gathered
-from piavatar_envs.mpm.matrices import store_matrix
-from piavatar_envs.mpm.types import Kinematic, Moving
+from piavatar_envs.mpm.g2p import Gathered
+from piavatar_envs.mpm.types import Kinematic, Moving, store_matrix
 
 wp.set_module_options({"enable_backward": False})
 

@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.mpm.shared_memory import native
-from piavatar_envs.mpm.stencil import BLOCK_NODES
+from piavatar_envs.core.cuda_intrinsics import native
+from piavatar_envs.mpm.bspline import BLOCK_NODES
 from piavatar_envs.mpm.types import Model
 
 wp.set_module_options({"enable_backward": False})

@@ -1,4 +1,10 @@
-"""Data structures of the material point method (MPM).
+"""Matrices of particles, an array a component: ``(num_envs, 9, num_particles)``, row by row.
+
+Of matrices that lie one after the other, 36 bytes each, the threads of a warp read nine words, and touch nine lines of
+the cache with each of them. Component by component, neighbouring threads read and write neighbouring words. Each
+component begins where a line does, or what a warp writes would begin and end amid the sectors that memory takes.
+
+Data structures of the material point method (MPM).
 
 ``Model`` is constant, ``State`` is all that a checkpoint holds, ``Control`` is what a controller writes before a
 substep and ``Scratch`` is rebuilt every substep. Arrays are batched: the leading dimension is the environment.
@@ -16,14 +22,67 @@ from dataclasses import dataclass, fields
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.matrices import matrices_of
-
 wp.set_module_options({"enable_backward": False})
 
+
+#: Components begin at multiples of so many numbers: a line of a GPU's cache.
+LINE = 32
+
+_COMPONENTS = """
+char* const first = reinterpret_cast<char*>(rows.data) + wp::int64(rows.strides[0]) * e;
+wp::float32* const at = reinterpret_cast<wp::float32*>(first) + p;
+const int n = rows.strides[1] / 4;
+"""
+
+
+@wp.func_native(
+    _COMPONENTS
+    + "return wp::mat33(at[0], at[n], at[2 * n], at[3 * n], at[4 * n], at[5 * n], at[6 * n], at[7 * n], at[8 * n]);"
+)
+def matrix_at(rows: wp.array3d(dtype=float), e: int, p: int) -> wp.mat33:
+    """Matrix of particle ``p`` in environment ``e``."""
+    ...
+
+
+@wp.func_native(
+    _COMPONENTS
+    + """
+#pragma unroll
+for (int c = 0; c < 9; ++c) at[c * n] = value.data[c / 3][c % 3];
+"""
+)
+def store_matrix(rows: wp.array3d(dtype=float), e: int, p: int, value: wp.mat33):
+    """Write the matrix of particle ``p`` in environment ``e``."""
+    ...
+
+
+def whole_lines(num_particles: int) -> int:
+    """Numbers that a component of so many particles takes."""
+    return -(-num_particles // LINE) * LINE
+
+
+def allocate_matrices(num_envs: int, num_particles: int, device: str) -> wp.array:
+    """Zeros."""
+    return wp.zeros((num_envs, 9, whole_lines(num_particles)), dtype=float, device=device)[:, :, :num_particles]
+
+
+def matrices_of(components: wp.array | np.ndarray) -> np.ndarray:
+    """A copy as matrices, ``(..., 9, num_particles)`` to ``(..., num_particles, 3, 3)``."""
+    values = components if isinstance(components, np.ndarray) else components.numpy()
+    matrices = np.ascontiguousarray(np.moveaxis(values, -2, -1))  # on a CPU the values are the array's own memory
+    return matrices.reshape(*values.shape[:-2], values.shape[-1], 3, 3)
+
+
+def components_of(matrices: np.ndarray) -> np.ndarray:
+    """The inverse of :func:`matrices_of`, in single precision."""
+    values = np.asarray(matrices, np.float32)
+    return np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-2], 9), -1, -2))
+
+
 #: What a grid node has: mass [kg], physical momentum (3), kinematic momentum (3), nothing. How it lies in memory is in
-#: :mod:`piavatar_envs.mpm.records`.
+#: :mod:`piavatar_envs.mpm.grid_arrays`.
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
-#: Half of a record in fixed point, or an offset, see :mod:`piavatar_envs.mpm.sums`.
+#: Half of a record in fixed point, or an offset, see :mod:`piavatar_envs.mpm.grid_arrays`.
 vec4l = wp.types.vector(length=4, dtype=wp.int64)
 #: What eight bricks, blocks or nodes around a particle have.
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
@@ -42,9 +101,9 @@ FAILURE_NAMES: dict[int, str] = {
     FAILURE_BLOCKS: "blocks",
 }
 
-#: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.decouple`).
+#: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.g2p`).
 DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
-#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.transfer`, ``groups`` and ``shared_substep``).
+#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.p2g`, ``groups`` and ``shared_substep``).
 SCATTERS = ("plain", "runs", "shared")
 #: What is around a particle: perhaps a boundary or another field, so that it tells its nodes where it is; the latter.
 TELLS, BESIDE = wp.constant(1), wp.constant(2)
@@ -92,7 +151,7 @@ class Particles:
     field: wp.array(dtype=int)  # (num_particles,) velocity field
     seam: wp.array(dtype=float)  # (num_particles,) 1 where two fields of a subject grow together, else 0
     sensor: wp.array(dtype=int)  # (num_particles,) row of the contact sensor, -1 for none
-    groups: wp.array(dtype=wp.vec2i)  # (G + 1,) :func:`piavatar_envs.mpm.group_plan.begin_groups`
+    groups: wp.array(dtype=wp.vec2i)  # (G + 1,) :func:`piavatar_envs.mpm.cuda.tiled_p2g.begin_groups`
 
 
 @wp.struct
@@ -113,7 +172,7 @@ class Contact:
 class Sensors:
     """What contact did in this control step, and at the nodes in this substep."""
 
-    sums: wp.array2d(dtype=wp.int64)  # (num_envs, 3 * entries) see :mod:`piavatar_envs.mpm.impulses`
+    sums: wp.array2d(dtype=wp.int64)  # (num_envs, 3 * entries) see :mod:`piavatar_envs.mpm.contact_sensors`
     boundary_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S) impulse of the colliders on a subject [N s]
     boundary_moment: wp.array2d(dtype=wp.vec3)  # (num_envs, S) moment of that about the world's origin [N m s]
     pair_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S * S) on a by b, only a < b [N s]
@@ -159,14 +218,16 @@ class Blocks:
     frozen: wp.array(dtype=int)  # (num_envs,) not 0: had failed when this was last looked at, see :func:`freeze`
     # (num_envs, S) not 0: a stencil that begins in this slot's block may lie in one of another field; of large bodies
     beside: wp.array2d(dtype=int)
-    others: wp.array2d(dtype=int)  # (num_envs, 2 S) bits of nodes, see :mod:`piavatar_envs.mpm.others`; of those, too
+    others: wp.array2d(
+        dtype=int
+    )  # (num_envs, 2 S) bits of nodes, see :mod:`piavatar_envs.mpm.sparse_grid`; of those, too
     # (num_envs, num_particles) TELLS and BESIDE, as the scatter has found them in this substep; of a CPU
     around: wp.array2d(dtype=wp.uint8)
 
 
 @wp.struct
 class Sums:
-    """What particles add up on nodes, zero between substeps; see :mod:`piavatar_envs.mpm.sums`.
+    """What particles add up on nodes, zero between substeps; see :mod:`piavatar_envs.mpm.grid_arrays`.
 
     ``(num_envs, 64 S)``; ``value`` and ``fixed``, of halves of records, ``(num_envs, 128 S)``.
 
@@ -185,11 +246,11 @@ class Sums:
 
 @wp.struct
 class Room:
-    """What lies where in the shared memory of a CUDA block, in words; see :mod:`piavatar_envs.mpm.shared_grid`."""
+    """What lies where in the shared memory of a CUDA block, in words; see :mod:`piavatar_envs.mpm.cuda.block_grid`."""
 
     numbers: int  # of the bricks, two a word
     told: int  # bits of particles that tell their place
-    near: int  # bytes of slots: what is near, see :mod:`piavatar_envs.mpm.shared_layout`
+    near: int  # bytes of slots: what is near, see :mod:`piavatar_envs.mpm.cuda.block_grid`
     places: int  # of the bricks: 8 slot + brick in block, and bits of planes near boundaries, two a word
     bricks: int
     kinematic: int  # of kinematic momenta, three a node
@@ -268,7 +329,7 @@ class Model:
 class State:
     """What evolves: a checkpoint holds exactly this. Shapes ``(num_envs, num_particles)`` and ``(num_envs,)``.
 
-    Matrices are arrays of their components, ``(num_envs, 9, num_particles)``; see :mod:`piavatar_envs.mpm.matrices`.
+    Matrices are arrays of their components, ``(num_envs, 9, num_particles)``; see :mod:`piavatar_envs.mpm.types`.
     """
 
     x: wp.array  # position [m]
@@ -300,11 +361,13 @@ class Scratch:
     Attributes:
         blocks: which blocks hold matter in this control step, and their slots.
         sums: what particles have added up.
-        velocity: vec4: halves of records, see :mod:`piavatar_envs.mpm.records`: mass and physical velocity, kinematic
+        velocity: vec4: halves of records, see :mod:`piavatar_envs.mpm.grid_arrays`: mass and physical velocity,
+        kinematic
             velocity and nothing; the latter means nothing where no contact is at hand, but in the paper's variant.
-        facing: vec4: what nodes of blocks with several fields say of normals, see :mod:`piavatar_envs.mpm.normals`.
-        sensors: what contact did in this control step.
-        room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.shared_room`; a large one or not.
+        facing: vec4: what nodes of blocks with several fields say of normals, see
+        :mod:`piavatar_envs.mpm.contact_normals`. sensors: what contact did in this control step.
+        room: of bodies whose grid is in shared memory, see :mod:`piavatar_envs.mpm.cuda.block_grid`; a large one or
+        not.
     """
 
     blocks: Blocks

@@ -1,4 +1,4 @@
-"""Worlds of several agents: one PettingZoo module each, such as ``piavatar_envs.multi.sumo_v0`` (extra ``multi``).
+"""Worlds of several agents: one PettingZoo module each, such as ``piavatar_envs.tasks.games.sumo`` (extra ``multi``).
 
 A new file ``<name>_v<N>.py`` with a ``TASK``, a ``parallel_env`` and an ``env`` is found and tested without being
 listed anywhere. Importing this package imports none of them.
@@ -18,13 +18,13 @@ _MODULE = re.compile(r"[a-z0-9_]+_v\d+")
 
 
 def multi_modules() -> tuple[str, ...]:
-    """Dotted names of all modules, such as ``piavatar_envs.multi.sumo_v0``. Imports nothing."""
+    """Dotted names of all modules, such as ``piavatar_envs.tasks.games.sumo``. Imports nothing."""
     names = sorted(module.name for module in pkgutil.iter_modules(__path__))
     return tuple(f"{__name__}.{name}" for name in names if _MODULE.fullmatch(name))
 
 
 def listed_worlds() -> dict[str, str]:
-    """Listed name -> dotted name of the module: ``sumo_v0`` for ``piavatar_envs.multi.sumo_v0``. Imports nothing."""
+    """Listed name -> dotted name of the module: ``sumo_v0`` for ``piavatar_envs.tasks.games.sumo``. Imports nothing."""
     return {path.rpartition(".")[2]: path for path in multi_modules()}
 
 

@@ -11,33 +11,8 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from piavatar_envs.tasks.base import Task
+    from piavatar_envs.envs.task import Task
 
-_NOT_TASKS = {
-    "base",
-    "clip",
-    "disturb",
-    "ease",
-    "fall",
-    "gait",
-    "gate",
-    "goal",
-    "ground",
-    "hands",
-    "hits",
-    "leash",
-    "lying",
-    "place",
-    "pushes",
-    "pushing",
-    "ranges",
-    "rewards",
-    "rising",
-    "spawn",
-    "throws",
-    "turns",
-    "upright",
-}
 NAMESPACE = "PIAvatar"
 #: What the module of a world of several agents may be named with.
 _MULTI = "piavatar_envs.multi."
@@ -45,7 +20,7 @@ _MULTI = "piavatar_envs.multi."
 
 def task_modules() -> dict[str, str]:
     """Registered id -> module name: ``PIAvatar/TrackMotion-v0`` for ``track_motion``. Imports nothing."""
-    names = sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name not in _NOT_TASKS)
+    names = sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.ispkg)
     return {f"{NAMESPACE}/{''.join(part.capitalize() for part in name.split('_'))}-v0": name for name in names}
 
 
@@ -108,7 +83,7 @@ def load_task(task: str | type[Task]) -> type[Task]:
     if module and "/" not in name:
         task_class = getattr(found, name, None)
         if not _is_task(task_class):
-            raise ValueError(f"{module} has no task {name!r}: it must be a subclass of piavatar_envs.tasks.base.Task")
+            raise ValueError(f"{module} has no task {name!r}: it must be a subclass of piavatar_envs.envs.task.Task")
         return task_class
     modules = task_modules()
     full = name if "/" in name else f"{NAMESPACE}/{name}"
@@ -176,6 +151,6 @@ def _stem(name: str) -> str:
 def _is_task(task: object) -> bool:
     if not isinstance(task, type):
         return False
-    from piavatar_envs.tasks.base import Task  # whoever has a subclass has imported it
+    from piavatar_envs.envs.task import Task  # whoever has a subclass has imported it
 
     return issubclass(task, Task)

@@ -10,18 +10,18 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
+from piavatar_envs.config import EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.envs.actions import ActionSpec, speed_within
-from piavatar_envs.envs.config import EnvConfig, PropConfig, SceneConfig, replace
-from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.hits import Hits
-from piavatar_envs.tasks.place import PlaceRule, judge_pose, keep_place, observe_home
-from piavatar_envs.tasks.ranges import DistanceRange, Margin, MassRange, SpeedRange, Weight, check_ranges
-from piavatar_envs.tasks.spawn import record_standing
-from piavatar_envs.tasks.throws import make_throws, record_balls, throwing_domain, thrown_speed, waiting_places
-from piavatar_envs.tasks.turns import observe_throws, throw_balls
+from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.scene import Domain
+from piavatar_envs.tasks.common.hits import Hits
+from piavatar_envs.tasks.common.place import PlaceRule, judge_pose, keep_place, observe_home
+from piavatar_envs.tasks.common.ranges import DistanceRange, Margin, MassRange, SpeedRange, Weight, check_ranges
+from piavatar_envs.tasks.common.spawn import record_standing
+from piavatar_envs.tasks.common.throws import make_throws, record_balls, throwing_domain, thrown_speed, waiting_places
+from piavatar_envs.tasks.common.turns import observe_throws, throw_balls
 
 #: Speed of the root at action 1 [m/s].
 ROOT_SPEED = 1.5
@@ -150,20 +150,20 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
     def arrays(self) -> dict[str, wp.array]:
         return self.hits.arrays()
 
-    def record_reset(self, env, program) -> None:
-        record_standing(env, program, self.config.pose_noise)
-        record_balls(env, program, self.throws)
-        self.hits.record_reset(env, program)
+    def record_reset(self, env, graph) -> None:
+        record_standing(env, graph, self.config.pose_noise)
+        record_balls(env, graph, self.throws)
+        self.hits.record_reset(env, graph)
 
-    def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
+    def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         avatar, props = env.simulation.avatar, env.simulation.props
-        program.launch(
+        graph.launch(
             keep_place,
             env.num_envs,
             [self.rule, avatar.body, avatar.state.command_root],
             [self.reference_root],
         )
-        program.launch(
+        graph.launch(
             throw_balls,
             self.placed.shape,
             [
@@ -173,22 +173,22 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
             [self.placed, props.spawn.position, props.spawn.velocity, props.spawn.spin],
         )  # fmt: skip
         for ball in range(self.config.num_balls):
-            props.record_place(program, env.simulation.state, self.placed[:, ball], ball)
+            props.record_place(graph, env.simulation.state, self.placed[:, ball], ball)
         return [(avatar.state.command_rotation, self.reference_root)]
 
-    def record_outcome(self, env, program) -> None:
+    def record_outcome(self, env, graph) -> None:
         avatar = env.simulation.avatar
-        program.launch(
+        graph.launch(
             judge_pose,
             env.num_envs,
             [self.rule, avatar.body, avatar.tracked.local, avatar.tracked.position, env.action],
             [env.terms, env.metrics],
         )
-        self.hits.record_outcome(env, program)
+        self.hits.record_outcome(env, graph)
 
-    def record_observe(self, env, program, agent: int, start: int) -> None:
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
         avatar, balls = env.simulation.avatar, self.config.num_balls
-        program.launch(
+        graph.launch(
             observe_throws,
             self.placed.shape,
             [
@@ -197,7 +197,7 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
             ],
             [env.observation],
         )  # fmt: skip
-        program.launch(
+        graph.launch(
             observe_home,
             env.num_envs,
             [self.rule, avatar.body, agent, start + 2 * balls, avatar.tracked.rotation, avatar.tracked.position],

@@ -8,20 +8,20 @@ from typing import ClassVar
 import warp as wp
 from pydantic import Field
 
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.config import DriveConfig, EnvConfig
-from piavatar_envs.envs.domain import Domain
+from piavatar_envs.config import DriveConfig, EnvConfig
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import Drawn
+from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import row
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.ground import Grounding
-from piavatar_envs.tasks.lying import first_poses, lying_rule, spawn_lying
-from piavatar_envs.tasks.ranges import Margin, Weight
-from piavatar_envs.tasks.rising import RISING_DOCS, RISING_TERMS, record_rising_outcome
-from piavatar_envs.tasks.upright import (
+from piavatar_envs.sim.scene import Domain
+from piavatar_envs.tasks.common.ground import Grounding
+from piavatar_envs.tasks.common.lying import first_poses, lying_rule, spawn_lying
+from piavatar_envs.tasks.common.ranges import Margin, Weight
+from piavatar_envs.tasks.common.rising import RISING_DOCS, RISING_TERMS, record_rising_outcome
+from piavatar_envs.tasks.common.upright import (
     METRIC_DOCS,
     METRICS,
     STANDING_DOC,
@@ -181,11 +181,11 @@ there is nothing to be learnt."""
     def arrays(self) -> dict[str, wp.array]:
         return {"held": self.held}
 
-    def record_reset(self, env, program) -> None:
+    def record_reset(self, env, graph) -> None:
         state, avatar = env.simulation.avatar.state, self.scene.avatars[0]
         limits, config = env.action_map, self.config
         rule = lying_rule(config.face_up, config.halfway, config.pose_noise)
-        program.launch(
+        graph.launch(
             spawn_lying,
             (env.num_envs, NUM_JOINTS),
             [
@@ -194,14 +194,14 @@ there is nothing to be learnt."""
             ],
             [state.command_rotation, state.command_root, self.lies_up],
         )  # fmt: skip
-        self.grounding.record_reset(env, program)
-        program.launch(forget_hold, env.num_envs, [env.mask], [self.held])
+        self.grounding.record_reset(env, graph)
+        graph.launch(forget_hold, env.num_envs, [env.mask], [self.held])
 
-    def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
+    def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         if env.control == "pose":
-            return super().record_references(env, program)
+            return super().record_references(env, graph)
         avatar = env.simulation.avatar
-        program.launch(
+        graph.launch(
             lead_up,
             (env.num_envs, NUM_JOINTS),
             [avatar.body, avatar.tracked.rotation, avatar.tracked.position],
@@ -209,18 +209,18 @@ there is nothing to be learnt."""
         )
         return [(self.reference_rotation, self.reference_root)]
 
-    def record_outcome(self, env, program) -> None:
-        record_rising_outcome(env, program, self.rule, self.still, self.config.feet_margin)
+    def record_outcome(self, env, graph) -> None:
+        record_rising_outcome(env, graph, self.rule, self.still, self.config.feet_margin)
         dt = self.config.physics.control_dt
-        program.launch(
+        graph.launch(
             judge_hold,
             env.num_envs,
             [self.steps, dt, len(METRICS), env.failure],
             [self.held, env.success, env.metrics],
         )
 
-    def record_observe(self, env, program, agent: int, start: int) -> None:
-        record_observe_upright(env, program, agent, start)
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
+        record_observe_upright(env, graph, agent, start)
 
 
 TASK = GetUpTask

@@ -9,30 +9,34 @@ from typing import ClassVar
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.config import DriveConfig, EnvConfig, SceneConfig, replace
-from piavatar_envs.envs.domain import Domain
-from piavatar_envs.envs.draws import STREAM_BALL, generator
+from piavatar_envs.config import DriveConfig, EnvConfig, SceneConfig, replace
+from piavatar_envs.config.schema import Place
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.sections import Place
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.gate import GATE_TERMS, METRICS, REWARD_TERMS, Ball, turn_and_weigh
-from piavatar_envs.tasks.goal import (
+from piavatar_envs.envs.rng import STREAM_BALL, generator
+from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.scene import Domain
+from piavatar_envs.tasks.common.ball_goal import (
+    GATE_TERMS,
     METRIC_DOCS,
+    METRICS,
     REWARD_DOCS,
+    REWARD_TERMS,
     SUCCESS_DOC,
     TERMINATION_DOC,
+    Ball,
     Goal,
     ball_config,
     ball_places,
     drawn_goal,
     gate_domain,
+    turn_and_weigh,
 )
-from piavatar_envs.tasks.hands import flesh_middle
-from piavatar_envs.tasks.ranges import DistanceRange, MassRange, Weight, check_ranges
-from piavatar_envs.tasks.spawn import record_standing
+from piavatar_envs.tasks.common.hands import flesh_middle
+from piavatar_envs.tasks.common.ranges import DistanceRange, MassRange, Weight, check_ranges
+from piavatar_envs.tasks.common.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
 
@@ -215,20 +219,20 @@ that all of them but the control cost add up to at most 1, half of it for the go
     def arrays(self) -> dict[str, wp.array]:
         return self.goal.arrays()
 
-    def record_reset(self, env, program) -> None:
-        record_standing(env, program, self.config.pose_noise)
+    def record_reset(self, env, graph) -> None:
+        record_standing(env, graph, self.config.pose_noise)
         props = env.simulation.props
-        program.launch(
+        graph.launch(
             throw_ball,
             env.num_envs,
             [env.mask, env.seed, env.episode, self.goal.ball, self.fall],
             [props.spawn.position, props.spawn.rotation, props.spawn.velocity, props.density],
         )
-        self.goal.record_reset(program)
+        self.goal.record_reset(graph)
 
-    def _record_find(self, env, program) -> None:
+    def _record_find(self, env, graph) -> None:
         avatar = env.simulation.avatar
-        program.launch(
+        graph.launch(
             find_head,
             env.num_envs,
             [
@@ -238,16 +242,16 @@ that all of them but the control cost add up to at most 1, half of it for the go
             [self.head, self.goal.gap],
         )  # fmt: skip
 
-    def record_outcome(self, env, program) -> None:
-        self._record_find(env, program)
-        self.goal.record_outcome(program)
+    def record_outcome(self, env, graph) -> None:
+        self._record_find(env, graph)
+        self.goal.record_outcome(graph)
 
-    def record_observe(self, env, program, agent: int, start: int) -> None:
-        self.goal.record_observe(program, agent, start)
-        self._record_find(env, program)
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
+        self.goal.record_observe(graph, agent, start)
+        self._record_find(env, graph)
         at = start + sum(term.size for term in GATE_TERMS)
         rotation = env.simulation.avatars[agent].tracked.rotation
-        program.launch(
+        graph.launch(
             observe_head,
             env.num_envs,
             [agent, at, rotation, self.head, self.goal.column("position")],

@@ -10,17 +10,17 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
+from piavatar_envs.config import ConfigError, EnvConfig, PropConfig, SceneConfig, replace
+from piavatar_envs.config.schema import Length
 from piavatar_envs.envs.actions import ActionSpec
-from piavatar_envs.envs.config import ConfigError, EnvConfig, PropConfig, SceneConfig, replace
-from piavatar_envs.envs.domain import Domain
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.scene import Length
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.leash import record_leash
-from piavatar_envs.tasks.pushing import Push, draw_push, find_hands, judge, observe, observe_lead
-from piavatar_envs.tasks.ranges import DistanceRange, Margin, MassRange, Weight, check_ranges
-from piavatar_envs.tasks.spawn import record_standing
+from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.scene import Domain
+from piavatar_envs.tasks.common.leash import record_leash
+from piavatar_envs.tasks.common.pushing import Push, draw_push, find_hands, judge, observe, observe_lead
+from piavatar_envs.tasks.common.ranges import DistanceRange, Margin, MassRange, Weight, check_ranges
+from piavatar_envs.tasks.common.spawn import record_standing
 
 if TYPE_CHECKING:
     from piavatar_envs.render.scene import Marker
@@ -184,28 +184,28 @@ of the root, too: before each action it is brought back to within 0.1 m and 0.3 
     def arrays(self) -> dict[str, wp.array]:
         return {"target": self.target, "way": self.way}
 
-    def record_reset(self, env, program) -> None:
-        record_standing(env, program, self.config.pose_noise)
+    def record_reset(self, env, graph) -> None:
+        record_standing(env, graph, self.config.pose_noise)
         props = env.simulation.props
-        program.launch(
+        graph.launch(
             draw_push,
             env.num_envs,
             [env.mask, env.seed, env.episode, self.push],
             [props.spawn.position, props.spawn.rotation, props.density, self.target, self.way],
         )
 
-    def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
-        return record_leash(env, program, LEASH, LEASH_TURN)
+    def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
+        return record_leash(env, graph, LEASH, LEASH_TURN)
 
-    def _record_hands(self, env, program) -> None:
+    def _record_hands(self, env, graph) -> None:
         avatar = env.simulation.avatar
         inputs = [avatar.body, avatar.tracked.rotation, avatar.tracked.position]
-        program.launch(find_hands, env.num_envs, inputs, [self.hands])
+        graph.launch(find_hands, env.num_envs, inputs, [self.hands])
 
-    def record_outcome(self, env, program) -> None:
-        self._record_hands(env, program)
+    def record_outcome(self, env, graph) -> None:
+        self._record_hands(env, graph)
         box = env.simulation.props.state
-        program.launch(
+        graph.launch(
             judge,
             env.num_envs,
             [
@@ -215,18 +215,18 @@ of the root, too: before each action it is brought back to within 0.1 m and 0.3 
             [env.terms, env.metrics, env.success],
         )  # fmt: skip
 
-    def record_observe(self, env, program, agent: int, start: int) -> None:
-        self._record_hands(env, program)
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
+        self._record_hands(env, graph)
         avatar, props = env.simulation.avatar, env.simulation.props
         here = [avatar.tracked.rotation, avatar.tracked.position]
-        program.launch(
+        graph.launch(
             observe,
             env.num_envs,
             [self.push, agent, start, *here, props.state.position, props.density, self.hands, self.target],
             [env.observation],
         )
         last = start + sum(term.size for term in self.observation_terms[:-1])
-        program.launch(
+        graph.launch(
             observe_lead,
             env.num_envs,
             [agent, last, *here, avatar.state.command_rotation, avatar.state.command_root],

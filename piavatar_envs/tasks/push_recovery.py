@@ -8,17 +8,17 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from piavatar_envs.envs.config import DriveConfig, EnvConfig, PropConfig, SceneConfig, replace
-from piavatar_envs.envs.domain import Domain
+from piavatar_envs.config import DriveConfig, EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.fall import FallConfig
-from piavatar_envs.tasks.ground import Grounding
-from piavatar_envs.tasks.pushes import Pushes
-from piavatar_envs.tasks.ranges import DistanceRange, MassRange, SpeedRange, Weight, check_ranges
-from piavatar_envs.tasks.throws import make_throws, throwing_domain, thrown_speed, waiting_places
-from piavatar_envs.tasks.upright import (
+from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.scene import Domain
+from piavatar_envs.tasks.common.fall import FallConfig
+from piavatar_envs.tasks.common.ground import Grounding
+from piavatar_envs.tasks.common.pushes import Pushes
+from piavatar_envs.tasks.common.ranges import DistanceRange, MassRange, SpeedRange, Weight, check_ranges
+from piavatar_envs.tasks.common.throws import make_throws, throwing_domain, thrown_speed, waiting_places
+from piavatar_envs.tasks.common.upright import (
     FALL_DOC,
     METRIC_DOCS,
     METRICS,
@@ -138,21 +138,21 @@ greatest impulse of the episode so far: of all episodes, the share that lasts ma
     def arrays(self) -> dict:
         return self.pushes.arrays()
 
-    def record_reset(self, env, program) -> None:
-        self.grounding.record_standing(env, program, self.config.pose_noise)
-        self.pushes.record_reset(env, program)
+    def record_reset(self, env, graph) -> None:
+        self.grounding.record_standing(env, graph, self.config.pose_noise)
+        self.pushes.record_reset(env, graph)
 
-    def record_references(self, env, program) -> list:
-        self.pushes.record_throw(env, program)
-        return super().record_references(env, program)
+    def record_references(self, env, graph) -> list:
+        self.pushes.record_throw(env, graph)
+        return super().record_references(env, graph)
 
-    def record_outcome(self, env, program) -> None:
-        record_standing_outcome(env, program, self.rule, self.still)
-        self.pushes.record_outcome(env, program, len(METRICS), self.config.hit_impulse)
-        record_fall(env, program, self.config.fall)
+    def record_outcome(self, env, graph) -> None:
+        record_standing_outcome(env, graph, self.rule, self.still)
+        self.pushes.record_outcome(env, graph, len(METRICS), self.config.hit_impulse)
+        record_fall(env, graph, self.config.fall)
 
-    def record_observe(self, env, program, agent: int, start: int) -> None:
-        self.pushes.record_observe(env, program, agent, record_observe_upright(env, program, agent, start))
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
+        self.pushes.record_observe(env, graph, agent, record_observe_upright(env, graph, agent, start))
 
 
 TASK = PushRecoveryTask

@@ -9,18 +9,18 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.avatar.skeleton import JOINT_NAMES
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.config import EnvConfig
-from piavatar_envs.envs.draws import STREAM_TASK, generator
+from piavatar_envs.config import EnvConfig
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
 from piavatar_envs.envs.parameters import Drawn, component
+from piavatar_envs.envs.rng import STREAM_TASK, generator
+from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import row
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.hands import write_hands
-from piavatar_envs.tasks.ranges import Margin, Weight
-from piavatar_envs.tasks.rewards import mean_square_action, tolerance
-from piavatar_envs.tasks.spawn import record_standing
+from piavatar_envs.tasks.common.hands import write_hands
+from piavatar_envs.tasks.common.ranges import Margin, Weight
+from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance
+from piavatar_envs.tasks.common.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
 
@@ -225,13 +225,13 @@ middle of either hand to the target and stay with it."""
     def arrays(self) -> dict[str, wp.array]:
         return {"course": self.course, "phase": self.phase}
 
-    def record_reset(self, env, program) -> None:
-        record_standing(env, program, self.config.pose_noise)
-        program.launch(draw_target, env.num_envs, [env.mask, env.seed, env.episode], [self.course, self.phase])
+    def record_reset(self, env, graph) -> None:
+        record_standing(env, graph, self.config.pose_noise)
+        graph.launch(draw_target, env.num_envs, [env.mask, env.seed, env.episode], [self.course, self.phase])
 
-    def _record_locate(self, env, program, steps_ahead: int) -> None:
+    def _record_locate(self, env, graph, steps_ahead: int) -> None:
         avatar = env.simulation.avatar
-        program.launch(
+        graph.launch(
             locate,
             env.num_envs,
             [
@@ -241,20 +241,20 @@ middle of either hand to the target and stay with it."""
             [self.goal, self.goal_velocity, self.hands],
         )  # fmt: skip
 
-    def record_outcome(self, env, program) -> None:
+    def record_outcome(self, env, graph) -> None:
         # the step counter has not moved yet: the state that is judged is one step ahead of it
-        self._record_locate(env, program, 1)
-        program.launch(
+        self._record_locate(env, graph, 1)
+        graph.launch(
             judge,
             env.num_envs,
             [self.target, self.goal, self.hands, env.action],
             [env.terms, env.metrics, env.success],
         )
 
-    def record_observe(self, env, program, agent: int, start: int) -> None:
-        self._record_locate(env, program, 0)
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
+        self._record_locate(env, graph, 0)
         tracked = env.simulation.avatar.tracked
-        program.launch(
+        graph.launch(
             observe,
             env.num_envs,
             [agent, start, tracked.rotation, tracked.position, self.goal, self.goal_velocity, self.hands],

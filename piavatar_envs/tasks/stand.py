@@ -7,12 +7,12 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from piavatar_envs.envs.config import DriveConfig, EnvConfig
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.fall import FallConfig
-from piavatar_envs.tasks.ground import Grounding
-from piavatar_envs.tasks.ranges import Weight
-from piavatar_envs.tasks.upright import (
+from piavatar_envs.config import DriveConfig, EnvConfig
+from piavatar_envs.envs.task import Task
+from piavatar_envs.tasks.common.fall import FallConfig
+from piavatar_envs.tasks.common.ground import Grounding
+from piavatar_envs.tasks.common.ranges import Weight
+from piavatar_envs.tasks.common.upright import (
     FALL_DOC,
     METRIC_DOCS,
     METRICS,
@@ -71,15 +71,15 @@ the heels, and hips must give way, before the body's weight has left the soles. 
         self.still = still_rule(self.config.still)
         self.grounding = Grounding(env)
 
-    def record_reset(self, env, program) -> None:
-        self.grounding.record_standing(env, program, self.config.pose_noise)
+    def record_reset(self, env, graph) -> None:
+        self.grounding.record_standing(env, graph, self.config.pose_noise)
 
-    def record_outcome(self, env, program) -> None:
-        record_standing_outcome(env, program, self.rule, self.still)
-        record_fall(env, program, self.config.fall)
+    def record_outcome(self, env, graph) -> None:
+        record_standing_outcome(env, graph, self.rule, self.still)
+        record_fall(env, graph, self.config.fall)
 
-    def record_observe(self, env, program, agent: int, start: int) -> None:
-        record_observe_upright(env, program, agent, start)
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
+        record_observe_upright(env, graph, agent, start)
 
 
 TASK = StandTask

@@ -9,22 +9,22 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.kinematics import pose_body
 from piavatar_envs.avatar.motion import load_motion
 from piavatar_envs.avatar.rotation import quat_log
-from piavatar_envs.avatar.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
+from piavatar_envs.config import ConfigError, EnvConfig
 from piavatar_envs.envs.actions import ActionSpec
-from piavatar_envs.envs.config import ConfigError, EnvConfig
-from piavatar_envs.envs.domain import Domain
-from piavatar_envs.envs.flesh import shape_parameters
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_rotation, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.clip import Clip, advance_reference, draw_start, read_clip
-from piavatar_envs.tasks.disturb import apply_impulse, draw_impulse, draw_offset
-from piavatar_envs.tasks.ranges import Margin, Weight
-from piavatar_envs.tasks.rewards import mean_square_action, tolerance
+from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.bodies import shape_parameters
+from piavatar_envs.sim.scene import Domain
+from piavatar_envs.tasks.common.clip import Clip, advance_reference, draw_start, read_clip
+from piavatar_envs.tasks.common.disturb import apply_impulse, draw_impulse, draw_offset
+from piavatar_envs.tasks.common.ranges import Margin, Weight
+from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance
 
 wp.set_module_options({"enable_backward": False})
 
@@ -224,21 +224,21 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
     def arrays(self) -> dict[str, wp.array]:
         return {"start": self.start, "origin": self.origin}
 
-    def record_reset(self, env, program) -> None:
+    def record_reset(self, env, graph) -> None:
         drive = env.simulation.avatar.state
-        program.launch(
+        graph.launch(
             draw_start,
             (env.num_envs, NUM_JOINTS),
             [env.mask, env.seed, env.episode, self.clip, env.simulation.avatar.body],
             [self.start, self.origin, drive.command_rotation, drive.command_root],
         )
-        program.launch(draw_offset, env.num_envs, [env.mask, env.seed, env.episode, self.interval], [self.offset])
+        graph.launch(draw_offset, env.num_envs, [env.mask, env.seed, env.episode, self.interval], [self.offset])
         if env.simulation.avatar.joints:
-            self._record_next_pose(env, program)
+            self._record_next_pose(env, graph)
 
-    def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
+    def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         drive, config = env.simulation.avatar.state, self.config
-        program.launch(
+        graph.launch(
             advance_reference,
             (env.num_envs, NUM_JOINTS),
             [
@@ -247,14 +247,14 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
             ],
             [self.reference_rotation, self.reference_root],
         )  # fmt: skip
-        program.launch(
+        graph.launch(
             draw_impulse,
             env.num_envs,
             [env.seed, env.episode, env.step_count, self.interval, config.impulse, self.bones],
             [self.impulse, self.struck],
         )
         avatar = env.simulation.avatar
-        program.launch(
+        graph.launch(
             apply_impulse,
             (env.num_envs, avatar.num_points),
             [avatar.body, self.impulse, self.struck, env.failure],
@@ -262,31 +262,31 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         )
         return [(self.reference_rotation, self.reference_root)]
 
-    def _record_next_pose(self, env, program) -> None:
+    def _record_next_pose(self, env, graph) -> None:
         """Append: the clip's pose one step ahead of the counter."""
-        program.launch(
+        graph.launch(
             read_clip,
             (env.num_envs, NUM_JOINTS),
             [self.clip, env.simulation.avatar.body, self.start, self.origin, env.step_count],
             [self.clip_rotation, self.clip_root],
         )
 
-    def _record_clip(self, env, program) -> None:
+    def _record_clip(self, env, graph) -> None:
         """Append: that pose, and where it has the bones in the world."""
         n = env.num_envs
-        self._record_next_pose(env, program)
+        self._record_next_pose(env, graph)
         avatar = env.simulation.avatar
-        program.launch(
+        graph.launch(
             pose_body,
             (n, avatar.threads),
             [avatar.body, 0.0, self.clip_rotation, self.clip_root, self.still, self.still[:, 0], avatar.threads],
             [self.clip_world, self.clip_position],
         )
 
-    def record_outcome(self, env, program) -> None:
-        self._record_clip(env, program)
+    def record_outcome(self, env, graph) -> None:
+        self._record_clip(env, graph)
         tracked = env.simulation.avatar.tracked
-        program.launch(
+        graph.launch(
             judge,
             env.num_envs,
             [
@@ -296,10 +296,10 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
             [env.terms, env.metrics, env.success, env.terminated],
         )  # fmt: skip
 
-    def record_observe(self, env, program, agent: int, start: int) -> None:
-        self._record_clip(env, program)
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
+        self._record_clip(env, graph)
         tracked = env.simulation.avatar.tracked
-        program.launch(
+        graph.launch(
             observe,
             (env.num_envs, NUM_JOINTS),
             [

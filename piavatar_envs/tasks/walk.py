@@ -9,15 +9,15 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.config import DriveConfig, EnvConfig
-from piavatar_envs.envs.domain import Domain
+from piavatar_envs.config import DriveConfig, EnvConfig
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.ease import EASE_DOC, ease_rule, record_ease
-from piavatar_envs.tasks.fall import FallConfig, is_down
-from piavatar_envs.tasks.gait import (
+from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.scene import Domain
+from piavatar_envs.tasks.common.ease import EASE_DOC, ease_rule, record_ease
+from piavatar_envs.tasks.common.fall import FallConfig, is_down
+from piavatar_envs.tasks.common.gait import (
     GAIT_DOC,
     GAIT_TERM,
     Gait,
@@ -31,12 +31,12 @@ from piavatar_envs.tasks.gait import (
     turn_taken,
     weigh_feet,
 )
-from piavatar_envs.tasks.ground import Grounding, forward_of
-from piavatar_envs.tasks.place import PlaceRule, home
-from piavatar_envs.tasks.ranges import Margin, Weight
-from piavatar_envs.tasks.rewards import mean_square_action, tolerance
-from piavatar_envs.tasks.spawn import record_standing
-from piavatar_envs.tasks.upright import (
+from piavatar_envs.tasks.common.ground import Grounding, forward_of
+from piavatar_envs.tasks.common.place import PlaceRule, home
+from piavatar_envs.tasks.common.ranges import Margin, Weight
+from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance
+from piavatar_envs.tasks.common.spawn import record_standing
+from piavatar_envs.tasks.common.upright import (
     FALL_DOC,
     METRIC_DOCS,
     UPRIGHT_TERMS,
@@ -273,28 +273,28 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
         self.left_load = wp.zeros(env.num_envs, dtype=float, device=env.device)
         self.way, self.ease = way, ease_rule(config.ease_cost, env.device)
 
-    def record_reset(self, env, program) -> None:
-        record_standing(env, program, self.config.pose_noise)
+    def record_reset(self, env, graph) -> None:
+        record_standing(env, graph, self.config.pose_noise)
         if self.targets_about_reference:
             command = env.simulation.avatar.state.command_rotation
-            program.launch(hang_arms, command.shape, [env.mask, self.way.gait], [command])
-        self.grounding.record_reset(env, program)
+            graph.launch(hang_arms, command.shape, [env.mask, self.way.gait], [command])
+        self.grounding.record_reset(env, graph)
 
-    def record_references(self, env, program) -> list[tuple[wp.array, wp.array]]:
+    def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         if not self.targets_about_reference:
-            return super().record_references(env, program)
+            return super().record_references(env, graph)
         state, reference = env.simulation.avatar.state, self.reference_rotation
         inputs = [self.way.gait, env.step_count, state.command_rotation]
-        program.launch(swing_arms, reference.shape, inputs, [reference])
+        graph.launch(swing_arms, reference.shape, inputs, [reference])
         return [(reference, state.command_root)]
 
-    def record_outcome(self, env, program) -> None:
+    def record_outcome(self, env, graph) -> None:
         avatar = env.simulation.avatar
         t, sim = avatar.tracked, env.simulation
         if self.clocked:
             inputs = [self.way.gait, avatar.body, t.position, sim.sensors, sim.state.x]
-            program.launch(weigh_feet, env.num_envs, inputs, [self.left_load])
-        program.launch(
+            graph.launch(weigh_feet, env.num_envs, inputs, [self.left_load])
+        graph.launch(
             judge_walk,
             env.num_envs,
             [
@@ -304,19 +304,19 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
             [env.terms, env.metrics, env.success, env.terminated],
         )  # fmt: skip
         if self.config.ease_cost > 0.0:
-            record_ease(env, program, self.ease, self.reward_terms.index("ease"))
+            record_ease(env, graph, self.ease, self.reward_terms.index("ease"))
 
-    def record_observe(self, env, program, agent: int, start: int) -> None:
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
         avatar = env.simulation.avatars[agent]
-        at = record_observe_upright(env, program, agent, start)
-        program.launch(
+        at = record_observe_upright(env, graph, agent, start)
+        graph.launch(
             observe_walk,
             env.num_envs,
             [self.way, avatar.body, agent, at, avatar.tracked.rotation, avatar.tracked.position],
             [env.observation],
         )
         if self.clocked:
-            record_observe_gait(env, program, self.way.gait, agent, at + _WAY_SIZE)
+            record_observe_gait(env, graph, self.way.gait, agent, at + _WAY_SIZE)
 
 
 TASK = WalkTask

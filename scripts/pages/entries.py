@@ -19,11 +19,11 @@ import gymnasium
 import numpy as np
 
 import piavatar_envs  # noqa: F401 - registers the ids
+from piavatar_envs.config import EnvConfig
 from piavatar_envs.envs.actions import ActionSpec
-from piavatar_envs.envs.config import EnvConfig
 from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task, task_modules
-from piavatar_envs.tasks.base import Task
 
 ROOT = Path(__file__).resolve().parents[2]
 MULTI = "piavatar_envs.multi"

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from pydantic import BaseModel
 
-from piavatar_envs.envs.scene import SceneConfig
+from piavatar_envs.config.schema import SceneConfig
 from scripts.pages.markdown import code, page, table
 from scripts.pages.settings import literal
 

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from piavatar_envs.envs.config import EnvConfig
+from piavatar_envs.config import EnvConfig
 from scripts.pages.markdown import code, listed
 
 _SINGULAR = {float: "number", int: "integer", str: "text", bool: "truth value"}

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
 from piavatar_envs.mpm.types import FAILURE_NAMES
 from scripts.pages.actions import actions_section
 from scripts.pages.entries import ROOT, Entry, Facts

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agents.balance import FRONTAL, GRAVITY, SAGITTAL, Balance, Effort, Stance
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
 
 STANCE = Stance(mass=70.0, height=0.9, behind=0.06, ahead=0.18, beside=0.14, foot_width=0.08)
 W = np.sqrt(GRAVITY / 0.9)

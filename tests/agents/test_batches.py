@@ -9,7 +9,7 @@ from pydantic import Field
 from agents.batches import BatchTraining, in_every_seat, load_batched, play, run
 from agents.evaluate import Episode, zero_agent
 from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.tasks import load_task
 
 SETTINGS = {"fidelity": "tiny", "episode_seconds": 0.3}

@@ -9,7 +9,7 @@ import pytest
 
 from agents import compare, train
 from agents.config import load_training
-from piavatar_envs.envs.config import dump_yaml
+from piavatar_envs.config import dump_yaml
 from tests.agents.conftest import TINY
 
 

@@ -9,7 +9,7 @@ import yaml
 
 from agents.config import env_config, load_training
 from agents.workers import components, factory
-from piavatar_envs.envs.config import ConfigError, dump_yaml
+from piavatar_envs.config import ConfigError, dump_yaml
 from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.yaml"))

@@ -15,7 +15,7 @@ from agents.checkpoint import UNREADABLE, Checkpoint, load_whole
 from agents.config import load_training
 from agents.folders import hold
 from agents.rsl_policy import RslTraining
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.config import ConfigError
 from piavatar_envs.tasks import load_task
 from scripts import train_all
 

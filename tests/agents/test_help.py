@@ -13,7 +13,7 @@ from agents import rsl_ppo  # noqa: E402
 from agents.batches import load_batched  # noqa: E402
 from agents.help import HelpedEnv, HelpSettings  # noqa: E402
 from agents.rsl_policy import RslTraining  # noqa: E402
-from piavatar_envs.envs.config import load_config, parse_assignments  # noqa: E402
+from piavatar_envs.config import load_config, parse_assignments  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 
 FEW = (

@@ -8,8 +8,8 @@ torch = pytest.importorskip("torch", reason="needs the extra train")
 
 from agents.mirror import Mirror, other_side  # noqa: E402
 from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
-from piavatar_envs.avatar.skeleton import JOINT_NAMES  # noqa: E402
-from piavatar_envs.envs.config import ConfigError, load_config  # noqa: E402
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES  # noqa: E402
+from piavatar_envs.config import ConfigError, load_config  # noqa: E402
 from piavatar_envs.envs.observations import CONTACT_TERMS, JOINT_TERMS, SELF_TERMS, ObservationTerm  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 

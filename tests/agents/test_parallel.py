@@ -20,7 +20,7 @@ from agents.ppo import PPOSettings
 from agents.rollouts import MarkPlayed, PlayedBuffer
 from agents.train import train
 from agents.workers import factory, prepare, start_workers
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.config import ConfigError
 from tests.agents.games.auction_v0 import Auction
 from tests.agents.games.ledger_v0 import LEAVES, TERMINATED, Ledger
 

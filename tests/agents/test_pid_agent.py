@@ -10,12 +10,11 @@ import agents.pid_agent
 from agents.design import Design
 from agents.pid import motion_poses
 from agents.pid_agent import PIDAgent, make_pid_agent, rest_poses
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.limits import joint_limits
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_limits
 from piavatar_envs.avatar.motion import deepmimic, load_motion
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS
+from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 #: Seeds of Stand whose first pose has the centre of mass 16 and 13 mm behind the ankles, and one 32 mm ahead of them.

@@ -16,7 +16,7 @@ pytest.importorskip("stable_baselines3", reason="needs the extra train")
 from agents import play, scores, train  # noqa: E402
 from agents.play import open_run  # noqa: E402
 from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
-from piavatar_envs.envs.config import ConfigError, load_config  # noqa: E402
+from piavatar_envs.config import ConfigError, load_config  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 
 QUICK = ("env.fidelity=tiny", "env.episode_seconds=0.2", "evaluation.episodes=3")

@@ -15,7 +15,7 @@ from agents.batches import BatchTraining, load_batched, run
 from agents.checkpoint import Checkpoint, learned_otherwise
 from agents.config import load_training
 from agents.lessons import changed
-from piavatar_envs.envs.config import dump_yaml, load_config
+from piavatar_envs.config import dump_yaml, load_config
 from piavatar_envs.tasks import load_task
 from tests.agents.conftest import TINY
 

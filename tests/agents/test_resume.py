@@ -21,7 +21,7 @@ from agents.config import load_training
 from agents.folders import write_whole
 from agents.learning import begin, learn
 from agents.workers import factory, prepare, start_vector, start_workers
-from piavatar_envs.envs.config import ConfigError, dump_yaml
+from piavatar_envs.config import ConfigError, dump_yaml
 from tests.agents.conftest import TINY
 from tests.agents.killing import KillAt, Killed, flat, run_killed
 

@@ -14,7 +14,7 @@ from agents.batches import in_every_seat, play
 from agents.evaluate import over_seeds, random_agent
 from agents.seeds import first_seed
 from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.envs.config import load_config
+from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 

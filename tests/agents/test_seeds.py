@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from agents import ppo, sac, seeds
 from agents.batches import BatchTraining, load_batched, new_task
 from agents.config import EvaluationSettings, load_training
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.config import ConfigError
 from piavatar_envs.tasks import load_task
 
 

@@ -19,7 +19,7 @@ from agents.parallel import AgentVecEnv, WorldFactory
 from agents.seeds import first_seed
 from agents.selfplay import Opponents, Pool, SelfPlaySettings
 from agents.workers import factory, prepare
-from piavatar_envs.envs.config import ConfigError, dump_yaml
+from piavatar_envs.config import ConfigError, dump_yaml
 from tests.agents.killing import KillAt, Killed
 
 AUCTION = {

@@ -19,7 +19,7 @@ from agents import skrl_mappo  # noqa: E402
 from agents.batches import load_batched, new_task  # noqa: E402
 from agents.checkpoint import Checkpoint  # noqa: E402
 from piavatar_envs.api.skrl import AvatarSkrlMultiEnv  # noqa: E402
-from piavatar_envs.envs.config import ConfigError  # noqa: E402
+from piavatar_envs.config import ConfigError  # noqa: E402
 from tests.agents.killing import Killed, flat  # noqa: E402
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "skrl").glob("*.yaml"))

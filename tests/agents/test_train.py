@@ -16,7 +16,7 @@ from agents import demo, train
 from agents.config import load_training
 from agents.evaluate import evaluate, policy_agent
 from agents.workers import factory, prepare, start_vector, start_workers
-from piavatar_envs.envs.config import ConfigError, dump_yaml
+from piavatar_envs.config import ConfigError, dump_yaml
 
 PUBLISHED = sorted((Path(__file__).resolve().parents[2] / "configs" / "sb3").glob("*.yaml"))
 

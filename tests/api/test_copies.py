@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from piavatar_envs.api.gymnasium import AvatarEnv
-from piavatar_envs.api.vector import AvatarVectorEnv
+from piavatar_envs.api.gym_env import AvatarEnv
+from piavatar_envs.api.vector_env import AvatarVectorEnv
 from piavatar_envs.tasks import load_task
 
 #: An episode of six steps.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
 
-from piavatar_envs.api.vector import AvatarVectorEnv
+from piavatar_envs.api.vector_env import AvatarVectorEnv
 
 #: An episode of six steps.
 SHORT = {"episode_seconds": 0.2}

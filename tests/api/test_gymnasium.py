@@ -9,8 +9,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from piavatar_envs.api.gymnasium import AvatarEnv
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.api.gym_env import AvatarEnv
+from piavatar_envs.config import ConfigError
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from piavatar_envs.api.gymnasium import AvatarEnv
+from piavatar_envs.api.gym_env import AvatarEnv
 from piavatar_envs.api.live import Pace
 
 

@@ -13,7 +13,7 @@ from rsl_rl.env import VecEnv  # noqa: E402
 from tensordict import TensorDict  # noqa: E402
 
 from piavatar_envs.api.rsl_rl import AvatarRslEnv  # noqa: E402
-from piavatar_envs.envs.config import ConfigError  # noqa: E402
+from piavatar_envs.config import ConfigError  # noqa: E402
 
 STEPS = 9  # of an episode
 SETTINGS = {"fidelity": "tiny", "episode_seconds": 0.3}

@@ -59,7 +59,7 @@ def test_a_run_taken_up_again_is_the_same(make_env, env_id, equal, tmp_path, set
 
 
 def test_a_restored_environment_needs_no_reset(device, make_env, env_id, equal):
-    from piavatar_envs.api.gymnasium import AvatarEnv
+    from piavatar_envs.api.gym_env import AvatarEnv
 
     env = make_env(env_id)
     observation = env.reset(seed=1)[0]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from piavatar_envs.api.vector import AvatarVectorEnv
+from piavatar_envs.api.vector_env import AvatarVectorEnv
 
 MODES = list(AutoresetMode)
 #: An episode of six steps: several fit into a test.

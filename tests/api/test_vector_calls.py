@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 from gymnasium.vector import AutoresetMode
 
-from piavatar_envs.api.vector import AvatarVectorEnv
+from piavatar_envs.api.vector_env import AvatarVectorEnv
 from piavatar_envs.mpm.types import FAILURE_ACTION
 
 #: An episode of six steps: several fit into a test.
@@ -365,7 +365,7 @@ def test_threads_never_capture_at_once(device):
     fresh.set_state(vector.get_state())
     assert not fresh.episodes.find_ended().any()
     fresh.episodes.reset_ended()
-    assert all(group.reset_program.is_captured for group in fresh.episodes.groups)
+    assert all(group.reset_graph.is_captured for group in fresh.episodes.groups)
     vector.close()
     fresh.close()
 

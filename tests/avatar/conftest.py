@@ -10,17 +10,16 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.body import BodyPoints
-from piavatar_envs.avatar.drive import AvatarDrive, record_control_step
-from piavatar_envs.avatar.sampling import morph, sample_particles, spacing_for
-from piavatar_envs.avatar.settings import DriveSettings
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index, skin
-from piavatar_envs.mpm.boundaries import Collider
-from piavatar_envs.mpm.build import MaterialPoints, build_model, make_grid
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.device import BodyPoints
+from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_for
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index, skin
+from piavatar_envs.avatar.pose_control.controller import AvatarDrive, record_control_step
+from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.mpm.model import Collider, MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.types import Model, Scratch, State
 
 DENSITY = 1000.0
@@ -50,7 +49,7 @@ def blended_rigid_part(weights, mass, x, v):
 
 @dataclass
 class Rig:
-    """One avatar in each environment, with the programs that reset and step it."""
+    """One avatar in each environment, with the graphs that reset and step it."""
 
     model: Model
     state: State
@@ -58,8 +57,8 @@ class Rig:
     points: BodyPoints
     drive: AvatarDrive
     mask: wp.array
-    reset_program: Program
-    step_program: Program
+    reset_graph: LaunchGraph
+    step_graph: LaunchGraph
 
     # ---- running
     def reset(self, rotvec=None, root=None, mask=None) -> Rig:
@@ -73,12 +72,12 @@ class Rig:
         roots[mask] = np.broadcast_to(self.points.joints[:, 0] if root is None else root, (n, 3))[mask]
         d.command_rotation.assign(rotations)
         d.command_root.assign(roots)
-        self.reset_program.run()
+        self.reset_graph.run()
         return self
 
     def run_part_of_step(self, kernel: str, count: int) -> None:
         """Run a control step up to and with the ``count``-th launch of a kernel."""
-        for name, launch in self.step_program.launches:
+        for name, launch in self.step_graph.launches:
             launch()
             count -= name == kernel
             if count == 0:
@@ -91,9 +90,9 @@ class Rig:
 
     def track(self) -> None:
         """Track the particles where they are now."""
-        program = Program(self.model.device)
-        self.drive.record_tracking(program, self.state)
-        program.run()
+        graph = LaunchGraph(self.model.device)
+        self.drive.record_tracking(graph, self.state)
+        graph.run()
 
     def command(self, rotvec=None, root=None) -> None:
         """Set the goal of the next control steps: local rotation vectors ``(22, 3)``, pelvis position."""
@@ -105,7 +104,7 @@ class Rig:
 
     def step(self, count: int = 1) -> None:
         for _ in range(count):
-            self.step_program.run()
+            self.step_graph.run()
 
     def quaternions(self, rotvec) -> np.ndarray:
         """Warp's quaternions of local rotation vectors, one set an environment."""
@@ -280,11 +279,11 @@ def build_rig(
     points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, inert)
     drive = AvatarDrive(points, others, model, DriveSettings(**settings))
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)
-    reset_program, step_program = Program(device), Program(device)
-    drive.record_reset(reset_program, state, mask)
-    drive.record_tracking(reset_program, state)
-    record_control_step(step_program, [drive], model, state, scratch)
-    return Rig(model, state, scratch, points, drive, mask, reset_program, step_program).reset()
+    reset_graph, step_graph = LaunchGraph(device), LaunchGraph(device)
+    drive.record_reset(reset_graph, state, mask)
+    drive.record_tracking(reset_graph, state)
+    record_control_step(step_graph, [drive], model, state, scratch)
+    return Rig(model, state, scratch, points, drive, mask, reset_graph, step_graph).reset()
 
 
 @pytest.fixture(scope="session")

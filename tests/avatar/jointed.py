@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.articulated import ArticulatedBody
-from piavatar_envs.avatar.mass_matrix import NUM_DOF
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics
+from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
+from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 
 #: Springs of the joints, none of the pelvis.
@@ -32,7 +32,7 @@ def momentum_of(J: np.ndarray, m: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 class Joints:
-    """An articulated body beside a rig's particles, and programs of its parts."""
+    """An articulated body beside a rig's particles, and graphs of its parts."""
 
     def __init__(self, rig, stiffness=0.0, damping=0.0, attachment=None, firm=None, solid=False):
         self.rig, self.model, self.state = rig, rig.model, rig.state
@@ -58,30 +58,30 @@ class Joints:
 
     def build_mass(self) -> None:
         """Build the mass matrix where pose and particles are."""
-        program = Program(self.model.device)
-        self.body.record_mass(program, self.state)
-        program.run()
+        graph = LaunchGraph(self.model.device)
+        self.body.record_mass(graph, self.state)
+        graph.run()
 
-    def substep(self, step: int) -> Program:
+    def substep(self, step: int) -> LaunchGraph:
         """The first substep of a control step (0), or one without a mass matrix of its own (1).
 
         Either finds joints wherever they have been put.
         """
-        program, self.body.mass.refresh = Program(self.model.device), 2
+        graph, self.body.mass.refresh = LaunchGraph(self.model.device), 2
         if step > 0:
-            self.body.record_pose(program, self.state)
-        self.body.record_substep(program, self.state, self.rig.scratch, step)
-        return program
+            self.body.record_pose(graph, self.state)
+        self.body.record_substep(graph, self.state, self.rig.scratch, step)
+        return graph
 
-    def control_step(self) -> Program:
+    def control_step(self) -> LaunchGraph:
         """A control step of joints and particles; nothing of it has run."""
-        rig, model, program = self.rig, self.model, Program(self.model.device)
-        record_begin(program, model, rig.state, rig.scratch)
+        rig, model, graph = self.rig, self.model, LaunchGraph(self.model.device)
+        record_begin(graph, model, rig.state, rig.scratch)
         for step in range(model.num_substeps):
-            self.body.record_substep(program, rig.state, rig.scratch, step)
-            record_substep(program, model, rig.state, rig.scratch, step)
-        record_end(program, model, rig.state, rig.scratch)
-        return program
+            self.body.record_substep(graph, rig.state, rig.scratch, step)
+            record_substep(graph, model, rig.state, rig.scratch, step)
+        record_end(graph, model, rig.state, rig.scratch)
+        return graph
 
     @property
     def jacobian(self) -> np.ndarray:

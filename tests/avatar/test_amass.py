@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.motion import load_motion
 from piavatar_envs.avatar.motion.amass import HIP_DROP, LEG_LENGTH, load_file
 from piavatar_envs.avatar.motion.ground import lowest_heights
 from piavatar_envs.avatar.motion.motion import Motion
 from piavatar_envs.avatar.motion.retarget import leg_length
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 
 UPRIGHT = np.array([np.pi / 2, 0.0, 0.0])  # stands SMPL's y-up body up in a z-up world; it then faces -y
 REST = load_body().joints.astype(np.float64)

@@ -8,14 +8,14 @@ import warp as wp
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar import lanes, part_sums
-from piavatar_envs.avatar.articulated import ArticulatedBody
-from piavatar_envs.avatar.joint_mass import LONGEST_REFRESH, MOST_USES
-from piavatar_envs.avatar.joint_stages import FIT_SHARE
-from piavatar_envs.avatar.joint_torques import UNBOUNDED
-from piavatar_envs.avatar.mass_matrix import NUM_DOF
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.avatar import part_sums
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
+from piavatar_envs.avatar.torque_control.dynamics import UNBOUNDED
+from piavatar_envs.avatar.torque_control.mass_matrix import LONGEST_REFRESH, MOST_USES, NUM_DOF
+from piavatar_envs.avatar.torque_control.stages import FIT_SHARE
+from piavatar_envs.core import cuda_intrinsics as lanes
+from piavatar_envs.core.launch_graph import LaunchGraph
 from tests.avatar.jointed import GAINS, Joints, carried_by, momentum_of
 
 TOES = [joint_index("left_foot"), joint_index("right_foot")]
@@ -51,12 +51,12 @@ def test_a_control_step_has_a_mass_matrix_for_every_two_substeps(joints):
     """At most; only its first substep looks where joints have been put, and all go over the particles twice."""
     made = joints()
     assert made.body.mass.refresh * made.model.step.dt <= LONGEST_REFRESH and made.body.mass.refresh <= MOST_USES
-    made.body.mass.refresh, program = 2, Program(made.model.device)
+    made.body.mass.refresh, graph = 2, LaunchGraph(made.model.device)
     for step in range(5):
-        made.body.record_substep(program, made.state, made.rig.scratch, step)
+        made.body.record_substep(graph, made.state, made.rig.scratch, step)
     alone = ["attach_flesh", "act", "take_over"]
     own = ["attach_flesh", "sum_pairs", "build_mass", "act", "take_over"]
-    assert program.names == ["begin_substep", *own, *alone, *own, *alone, *own]
+    assert graph.names == ["begin_substep", *own, *alone, *own, *alone, *own]
 
 
 def test_joints_take_over_what_they_can_and_change_no_velocity(joints):
@@ -154,9 +154,9 @@ def test_the_pose_is_fitted_to_particles_that_rest(joints, wild_pose):
     made = Joints(joints(0).rig).pose(rotvec)
     made.state.u.zero_()
     turned, root = off_their_places(made, rotvec, rng)
-    program = made.substep(0)
+    graph = made.substep(0)
     for _ in range(800):
-        program.run()
+        graph.run()
     world, positions = forward_kinematics(turned, root, made.rig.points.joints[0].astype(float))
     np.testing.assert_allclose(made.body.state.position.numpy()[0], positions, atol=2e-4)
     off = Rotation.from_quat(made.body.state.rotation.numpy()[0].astype(float)) * Rotation.from_matrix(world).inv()
@@ -173,9 +173,9 @@ def test_a_fit_keeps_velocities(joints, wild_pose):
     made.state.u.assign(rng.normal(0.0, 1.0, made.state.x.numpy().shape).astype(np.float32))
     made.body.state.velocity.assign(rng.normal(0.0, 1.0, (1, NUM_DOF)).astype(np.float32))
     off_their_places(made, rotvec, rng)
-    before, program = made.total, made.substep(0)
+    before, graph = made.total, made.substep(0)
     for _ in range(10):
-        program.run()
+        graph.run()
         np.testing.assert_allclose(made.total, before, atol=5e-5)
 
 
@@ -215,10 +215,10 @@ def test_a_mode_swings_at_its_frequency(make_rig):
     dt = made.model.step.dt
     made.body.state.velocity.assign(mode[None].astype(np.float32))
     made.state.vk.assign((made.jacobian @ mode)[None].astype(np.float32))
-    program = made.substep(0)
+    graph = made.substep(0)
     swing, steps = [], round(np.pi / omega / dt)
     for _ in range(steps):
-        program.run()
+        graph.run()
         made.state.x.assign(made.state.x.numpy() + np.float32(dt) * (made.state.u.numpy() + made.state.vk.numpy()))
         swing.append(mode @ M @ made.body.state.velocity.numpy()[0] / (mode @ M @ mode))
     damped = np.exp(-0.5 * omega**2 * dt * dt * np.arange(1, steps + 1))  # of the implicit step
@@ -232,12 +232,12 @@ def test_free_float_keeps_momentum(make_rig, wild_pose):
     rig = make_rig(cells=16)
     made = Joints(rig, stiffness=100.0, damping=3.0).pose(np.zeros((NUM_JOINTS, 3)))
     rng = np.random.default_rng(7)
-    program = made.control_step()
+    graph = made.control_step()
     start = rig.totals()
     largest, worst = 0.0, np.zeros(2)
     for _ in range(6):
         made.body.target.rotation.assign(Rotation.from_rotvec(0.6 * wild_pose(rng)).as_quat()[None].astype(np.float32))
-        program.run()
+        graph.run()
         now = rig.totals()  # with the affine part of the angular momentum
         largest = max(largest, made.momenta()[2])
         changes = now.momentum - start.momentum, now.angular_momentum - start.angular_momentum
@@ -257,9 +257,9 @@ def test_flesh_comes_back_to_the_bones(make_rig):
     rest = made.rig.read("x")
     bump = 0.02 * np.sin(12.0 * rest) * rng.normal(size=3)
     made.state.x.assign((rest + bump)[None].astype(np.float32))
-    program = made.substep(0)
+    graph = made.substep(0)
     for _ in range(round(0.4 / dt)):
-        program.run()
+        graph.run()
         made.state.x.assign(made.state.x.numpy() + np.float32(dt) * (made.state.u.numpy() + made.state.vk.numpy()))
     turned = Rotation.from_quat(made.body.state.rotation.numpy()[0].astype(float)).as_matrix()
     local = np.stack([turned[0], *(turned[PARENTS[b]].T @ turned[b] for b in range(1, NUM_JOINTS))])
@@ -274,9 +274,9 @@ def test_threads_that_have_several_particles_move_as_one_each_does(joints, monke
 
     def moved():
         made = joints(stiffness=300.0, damping=10.0, attachment=attachment)
-        program = made.substep(0)
-        program.run()
-        program.run()
+        graph = made.substep(0)
+        graph.run()
+        graph.run()
         return made
 
     one = moved()
@@ -297,8 +297,8 @@ def test_a_body_in_many_parts_moves_as_in_one(joints, monkeypatch, attachment):
 
     def moved():
         made = joints(stiffness=300.0, damping=10.0, attachment=attachment)
-        program = made.substep(0)
-        program.run()
+        graph = made.substep(0)
+        graph.run()
         return made
 
     whole = moved()
@@ -344,9 +344,9 @@ def test_a_held_pelvis_bears_the_weight(make_rig):
     made.pose(np.zeros((NUM_JOINTS, 3)))
     root = body.state.position.numpy()[0, 0].copy()
     body.target.root.assign(root[None])
-    program = made.control_step()
+    graph = made.control_step()
     for _ in range(30):
-        program.run()
+        graph.run()
     assert rig.state.failure.numpy().sum() == 0
     sunk = root - body.state.position.numpy()[0, 0]
     weight = 9.81 * rig.mass.sum()

@@ -7,8 +7,8 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.asset import dense_weights, load_body, mesh_volume, top_weights
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS, joint_index
+from piavatar_envs.avatar.body.asset import dense_weights, load_body, mesh_volume, top_weights
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index
 
 #: SMPL-H's joints after the 22 of the body, in its order.
 HANDS = [

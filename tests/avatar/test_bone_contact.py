@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.rig import joint_gaps
-from piavatar_envs.avatar.bone_touch import LAYER
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
-from piavatar_envs.mpm.boundaries import Collider
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.torque_control.bone_contact import LAYER
+from piavatar_envs.mpm.model import Collider
 from tests.avatar.jointed import Joints
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -187,9 +187,9 @@ def fall(make_rig):
     pose = np.zeros((NUM_JOINTS, 3))
     pose[0, 0] = 1.9  # from upright to beyond level
     made.pose(pose, rig.points.joints[0, 0] + np.array([0.0, 0.0, 0.3]))
-    program = made.control_step()
-    made.body.record_end(program, rig.state)
-    rig.drive.record_tracking(program, rig.state)
+    graph = made.control_step()
+    made.body.record_end(graph, rig.state)
+    rig.drive.record_tracking(graph, rig.state)
     seen = {name: [] for name in ("momentum", "turn", "center", "impulse", "moment", "gap", "lowest")}
 
     def look() -> None:
@@ -200,7 +200,7 @@ def fall(make_rig):
 
     look()
     for _ in range(30):
-        program.run()
+        graph.run()
         look()
         sensors = rig.scratch.sensors
         seen["impulse"].append(sensors.boundary_impulse.numpy()[0, 0].astype(float))

@@ -7,24 +7,25 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.bone_contact import answer_at, push
-from piavatar_envs.avatar.bone_touch import (
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.torque_control.bone_contact import (
     TOLERANCE,
     Ground,
+    answer_at,
     find_fastest,
     least_speed,
     may_lack,
     measure_bones,
+    push,
     touch_of,
 )
-from piavatar_envs.avatar.cholesky import fetch_factor
-from piavatar_envs.avatar.joint_bench import JointBench, room_of_warp
-from piavatar_envs.avatar.joint_motion import spread_motion
-from piavatar_envs.avatar.lanes import warp_threads
-from piavatar_envs.avatar.mass_matrix import NUM_DOF
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.torque_control.dynamics import spread_motion
+from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
+from piavatar_envs.avatar.torque_control.tree_cholesky import fetch_factor
+from piavatar_envs.avatar.torque_control.workspace import JointBench, room_of_warp
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.mpm.boundaries import Collider
+from piavatar_envs.core.cuda_intrinsics import warp_threads
+from piavatar_envs.mpm.model import Collider
 from tests.avatar.jointed import Joints, carried_by
 
 

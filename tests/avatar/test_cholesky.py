@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.avatar.cholesky import (
+from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
+from piavatar_envs.avatar.torque_control.tree_cholesky import (
     Pattern,
     factor_size,
     factorize,
@@ -17,9 +18,8 @@ from piavatar_envs.avatar.cholesky import (
     pack,
     solve,
 )
-from piavatar_envs.avatar.joint_bench import room_of_warp
-from piavatar_envs.avatar.lanes import warp_threads
-from piavatar_envs.avatar.mass_matrix import NUM_DOF
+from piavatar_envs.avatar.torque_control.workspace import room_of_warp
+from piavatar_envs.core.cuda_intrinsics import warp_threads
 
 
 @wp.kernel(enable_backward=False)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.motion import Motion, deepmimic, list_motions, load_motion
 from piavatar_envs.avatar.motion.ground import lowest_heights
 from piavatar_envs.avatar.motion.retarget import leg_length
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 
 REST = load_body().joints.astype(np.float64)
 CHANNELS = {"root": 4, "chest": 8, "neck": 12, "right_hip": 16, "right_knee": 20, "right_ankle": 21}

@@ -8,8 +8,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar import kinematics
-from piavatar_envs.avatar.skeleton import forward_kinematics, joint_index
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.avatar.body.skeleton import forward_kinematics, joint_index
+from piavatar_envs.core.launch_graph import LaunchGraph
 
 #: Poses this wild, a new one each control step, need many substeps: hands move at 20 m/s.
 WILD, LIVELY = 0.6, 0.12
@@ -31,12 +31,10 @@ def test_kernels_pose_the_body_like_numpy(make_rig, wild_pose, fraction):
     ]
     rotation = wp.zeros((2, 22), dtype=wp.quat, device=rig.model.device)
     position = wp.zeros((2, 22), dtype=wp.vec3, device=rig.model.device)
-    program = Program(rig.model.device)
+    graph = LaunchGraph(rig.model.device)
     threads = rig.drive.threads
-    program.launch(
-        kinematics.pose_body, (2, threads), [rig.drive.body, fraction, *inputs, threads], [rotation, position]
-    )
-    program.run()
+    graph.launch(kinematics.pose_body, (2, threads), [rig.drive.body, fraction, *inputs, threads], [rotation, position])
+    graph.run()
     for env in range(2):
         local = (Rotation.from_rotvec(base[env]) * Rotation.from_rotvec(fraction * turn[env])).as_matrix()
         world, joints = forward_kinematics(

@@ -7,7 +7,10 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar import drive, drive_stages, lanes, substeps
+from piavatar_envs.avatar.pose_control import controller as drive
+from piavatar_envs.avatar.pose_control import controller as substeps
+from piavatar_envs.avatar.pose_control import kernels as drive_stages
+from piavatar_envs.core import cuda_intrinsics as lanes
 from piavatar_envs.mpm.types import FAILURE_NONFINITE
 
 
@@ -103,7 +106,7 @@ def test_running_twice_gives_the_same_bits_and_eager_equals_recorded(make_rig, w
     for _ in range(3):
         runs[0].step()
         runs[1].step()
-        runs[2].step_program.run_eager()
+        runs[2].step_graph.run_eager()
     first = runs[0].everything()
     assert_same(runs[0], first, runs[1].everything())
     assert_same(runs[0], first, runs[2].everything())
@@ -179,12 +182,12 @@ def test_one_launch_drives_a_body_as_many_do(make_rig, wild_pose, monkeypatch, r
         pytest.skip("a GPU drives by passes only")
     record_drive = substeps.record_drive
 
-    def by_passes(avatar, program, state, step):
+    def by_passes(avatar, graph, state, step):
         avatar.in_one = False
-        record_drive(avatar, program, state, step)
+        record_drive(avatar, graph, state, step)
 
     monkeypatch.setattr(drive, "record_drive", by_passes)
     many = disturbed(make_rig, wild_pose, **options)
-    assert "drive_body" in one.step_program.names and "drive_particles" in many.step_program.names
+    assert "drive_body" in one.step_graph.names and "drive_particles" in many.step_graph.names
     for name, value in one.everything().items():
         np.testing.assert_array_equal(value, many.everything()[name], err_msg=name)

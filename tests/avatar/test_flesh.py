@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
 
 
 def run_fit(rig):

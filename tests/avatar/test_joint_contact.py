@@ -7,13 +7,13 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.articulated import ArticulatedBody
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.joint_torques import UNBOUNDED, stopping_torque
-from piavatar_envs.avatar.muscles import attachment_rates, firmness, joint_torques, make_muscles
-from piavatar_envs.avatar.sampling import sample_particles, spacing_for
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
-from piavatar_envs.avatar.soft_tissue import bone_distance
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.muscles import attachment_rates, firmness, joint_torques, make_muscles
+from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.body.soft_tissue import bone_distance
+from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
+from piavatar_envs.avatar.torque_control.dynamics import UNBOUNDED, stopping_torque
 from tests.avatar.jointed import Joints
 
 ANKLES = [joint_index("left_ankle"), joint_index("right_ankle")]
@@ -25,7 +25,7 @@ class Held(Joints):
     """A body whose pelvis is held and whose joints are stiff, but for one pair that a test is about.
 
     Attributes:
-        program: a control step.
+        graph: a control step.
     """
 
     def __init__(self, rig, joints, stiffness: float, damping: float):
@@ -43,7 +43,7 @@ class Held(Joints):
         """In the rest pose, where the pelvis is held."""
         self.pose(np.zeros((NUM_JOINTS, 3)))
         self.body.target.root.assign(self.body.state.position.numpy()[:, 0])
-        self.program = self.control_step()
+        self.graph = self.control_step()
         return self
 
     def aim(self, rotvec) -> None:
@@ -72,7 +72,7 @@ def pressed(make_rig) -> dict[float, dict[str, np.ndarray]]:
         held = Held(make_rig(cells=24, floor=True), ANKLES, 300.0, damping).start()
         held.aim([0.3, 0.0, 0.0])
         for _ in range(60 if damping < 100.0 else 200):  # it creeps to its rest in D / K = 0.67 s
-            held.program.run()
+            held.graph.run()
         assert held.state.failure.numpy().sum() == 0
         found[damping] = {
             "error": 0.3 - held.local()[:, 0],
@@ -111,7 +111,7 @@ def test_muscles_give_no_more_than_they_have(make_rig, limit):
     held.start().aim([-1.0, 0.0, 0.0])
     most = 0.0
     for _ in range(30 if limit > 10.0 else 10):  # arms that nothing damps would swing through the body at last
-        held.program.run()
+        held.graph.run()
         most = max(most, np.abs(held.torque()).max())
     assert held.state.failure.numpy().sum() == 0
     assert most == pytest.approx(limit, rel=0.02)  # read in the frame of a moment later
@@ -126,11 +126,11 @@ def test_no_muscle_gives_more_where_others_have_been_cut(make_rig):
     held = Held(make_rig(cells=16), moving, 300.0, 3.0)
     limit = rng.uniform(2.0, 40.0, (NUM_JOINTS, 1)) * np.ones(3)
     held.body.set_strength(-limit, limit, 1)
-    program, excess, cut = held.start().substep(0), [], []
+    graph, excess, cut = held.start().substep(0), [], []
     for _ in range(60):
         held.pose(np.zeros((NUM_JOINTS, 3))).aim(rng.uniform(-0.3, 0.3, (len(moving), 3)))
         held.state.u.zero_(), held.state.vk.zero_()
-        program.run()
+        graph.run()
         # where a substep begins all frames are the world's
         torque = held.body.impulse.numpy()[0].reshape(-1, 3)[1:] / held.model.step.dt
         share = np.abs(torque[moving]) / limit[moving]
@@ -185,14 +185,14 @@ def test_a_joint_is_stopped_at_the_end_of_its_range(make_rig):
     torque[0, elbows, 0] = 10.0
     held.body.state.torque.assign(torque)
     for _ in range(40):
-        held.program.run()
+        held.graph.run()
     np.testing.assert_allclose(held.local()[:, 0], 0.3 + 10.0 / 200.0, atol=0.01)
     # let go, it creeps back into its range: what stops it damps it, too, by 0.03 s of its stiffness
     held.body.state.torque.zero_()
-    held.program.run()
+    held.graph.run()
     beyond = [held.local()[:, 0] - 0.3]
     for _ in range(3):
-        held.program.run()
+        held.graph.run()
         beyond.append(held.local()[:, 0] - 0.3)
     remains = np.exp(-held.model.control_dt / 0.03)
     np.testing.assert_allclose(np.array(beyond[1:]) / beyond[:-1], remains, rtol=0.25)

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.kabsch import kabsch_rotation
+from piavatar_envs.avatar.tracking import kabsch_rotation
 
 #: What single precision leaves of a rotation fitted to well-spread points [rad].
 ROUND_OFF = 1.0e-6

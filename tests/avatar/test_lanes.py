@@ -6,16 +6,23 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.avatar.blending import blend_changes, blend_places, blend_records, blend_steps, store_record
-from piavatar_envs.avatar.influences import in_order, pack
-from piavatar_envs.avatar.lanes import (
+from piavatar_envs.avatar.segment_sums import own_share, share_chunks, store_both, store_moments, store_one
+from piavatar_envs.avatar.skinning import (
+    blend_changes,
+    blend_places,
+    blend_records,
+    blend_steps,
+    in_order,
+    pack,
+    store_record,
+)
+from piavatar_envs.avatar.types import vec8, vec12, vec16, vec24, vec44
+from piavatar_envs.core.cuda_intrinsics import (
     chunk_threads,
     sum_threads12,
     sum_threads16,
     warp_threads,
 )
-from piavatar_envs.avatar.quarters import own_share, share_chunks, store_both, store_moments, store_one
-from piavatar_envs.avatar.types import vec8, vec12, vec16, vec24, vec44
 
 wp.set_module_options({"enable_backward": False})
 

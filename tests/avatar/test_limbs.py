@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.limbs import LIMB_GROUPS, SEAM_WEIGHT, limb_group_of_joint, limb_groups
-from piavatar_envs.avatar.sampling import LINK_LENGTH, sample_particles, spacing_for
-from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.sampling import (
+    LIMB_GROUPS,
+    LINK_LENGTH,
+    SEAM_WEIGHT,
+    limb_group_of_joint,
+    limb_groups,
+    sample_particles,
+    spacing_for,
+)
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 
 TORSO = LIMB_GROUPS.index("torso")
 

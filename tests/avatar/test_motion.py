@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.motion import Motion, load_motion
 from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights
 from piavatar_envs.avatar.motion.hands import lay_hands_on_ground
 from piavatar_envs.avatar.motion.interpolation import hemisphere_consistent, slerp
 from piavatar_envs.avatar.motion.retarget import align_limbs, retarget
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 

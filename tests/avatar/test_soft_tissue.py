@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.sampling import sample_particles, spacing_for
-from piavatar_envs.avatar.skeleton import BODY_PARTS, joint_index, skin
-from piavatar_envs.avatar.soft_tissue import inert_share, softness
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index, skin
+from piavatar_envs.avatar.body.soft_tissue import inert_share, softness
+from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.limits import joint_limits
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_limits
 from piavatar_envs.envs.actions import ActionSpec, check_actions, select_joints
 from piavatar_envs.mpm.types import FAILURE_ACTION
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.drive import clear_vectors
+from piavatar_envs.avatar.pose_control.controller import clear_vectors
+from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 VARIED = {"shape.randomize": True, "observe_parameters": True}
@@ -159,13 +159,13 @@ def test_the_programs_are_recorded_once(make_batch, env_id):
     batch.reset(seeds=[0, 1, 2])
     batch.step()
     with pytest.raises(RuntimeError, match="has run"):
-        batch.step_program.launch(clear_vectors, 3, [batch.simulation.avatar.state.wrench_force])
+        batch.step_graph.launch(clear_vectors, 3, [batch.simulation.avatar.state.wrench_force])
 
 
 @pytest.mark.parametrize(("task", "moves"), [("PIAvatar/KickBall-v0", False), ("PIAvatar/Stand-v0", True)])
 def test_what_goes_beside_marks_and_sensors(make_env, task, moves):
     """Avatars begin while blocks are marked, and are tracked while sensors are read; not those that move particles."""
-    launches = make_env(task).unwrapped.batch.step_program._launches
+    launches = make_env(task).unwrapped.batch.step_graph._launches
     forks = {launch.kernel.key: launch.fork for launch in reversed(launches)}  # of the first launch of each
     begins = "set_springs" if moves else "begin_control"
     assert forks[begins] == forks["mark_particles"] == forks["clear_sensors"] > 0

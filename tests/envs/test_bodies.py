@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.avatar.body import bone_masses
-from piavatar_envs.envs.bodies import draw_body
-from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.avatar.body.device import bone_masses
+from piavatar_envs.config import ConfigError, load_config
+from piavatar_envs.sim.bodies import draw_body
 from piavatar_envs.tasks import load_task
 
 REACH = "PIAvatar/Reach-v0"
@@ -122,20 +122,20 @@ def test_the_body_drawn_is_told(make_batch):
 
 
 def test_avatars_draw_apart_from_bodies_that_are_shaped_once(device):
-    from piavatar_envs.envs.config import EnvConfig
-    from piavatar_envs.envs.simulation import Simulation
-    from piavatar_envs.mpm.program import Program
+    from piavatar_envs.config import EnvConfig
+    from piavatar_envs.core.launch_graph import LaunchGraph
+    from piavatar_envs.sim.world import Simulation
 
     n = 6
     config = load_config(EnvConfig, None, {"fidelity": "tiny", **POOL, **TWO})
-    simulation, program = Simulation(config, n, device), Program(device)
+    simulation, graph = Simulation(config, n, device), LaunchGraph(device)
     mask = wp.array(np.ones(n, bool), dtype=wp.bool, device=device)
     seed, episode = (
         wp.array(np.arange(n, dtype=np.int32), dtype=int, device=device),
         wp.zeros(n, dtype=int, device=device),
     )
-    simulation.record_draws(program, mask, seed, episode)
-    program.run()
+    simulation.record_draws(graph, mask, seed, episode)
+    graph.run()
     pools = [flesh.pool for flesh in simulation.flesh]
     assert pools[0].bodies is pools[1].bodies
     assert not np.array_equal(pools[0].index.numpy(), pools[1].index.numpy())

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.bone_touch import LAYER
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.torque_control.bone_contact import LAYER
 from piavatar_envs.envs.batch_env import BatchEnv
 
 THRASHING = {"fidelity": "coarse", "control": "torque"}

@@ -7,10 +7,10 @@ import re
 import numpy as np
 import pytest
 
+from piavatar_envs.config import ColliderConfig, ConfigError, PropConfig, load_config, replace
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import ColliderConfig, ConfigError, PropConfig, load_config, replace
-from piavatar_envs.multi.sumo_v0 import SumoTask
 from piavatar_envs.tasks import load_task
+from piavatar_envs.tasks.games.sumo import SumoTask
 
 REACH = "PIAvatar/Reach-v0"
 BALL = {"name": "ball", "mass": 0.5, "size": [0.15]}

@@ -9,10 +9,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.limits import joint_limits
-from piavatar_envs.avatar.muscles import LOCKED_JOINTS, joint_torques
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS, joint_index
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.avatar.body.muscles import LOCKED_JOINTS, joint_torques
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index, joint_limits
+from piavatar_envs.config import ConfigError
 
 CONTROLS = ("pd", "torque")
 REACH = "PIAvatar/Reach-v0"

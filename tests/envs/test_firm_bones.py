@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks.rig import joint_gaps
+from piavatar_envs.config import load_config
+from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import load_config
 from piavatar_envs.mpm.diagnostics import totals
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.multi.sumo_v0 import SumoTask
+from piavatar_envs.tasks.games.sumo import SumoTask
 
 REACH = "PIAvatar/Reach-v0"
 PD = {"control": "pd", "pose_noise": 0.0, "firm_bones": True}
@@ -31,10 +31,10 @@ def swing(batch, steps: int, seed: int = 0) -> np.ndarray:
 def put_in_place(batch) -> None:
     """What ends a control step of the joints, alone, wherever they have been put."""
     simulation = batch.simulation
-    program, joints = Program(simulation.model.device), simulation.avatar.joints
-    joints.body.record_pose(program, simulation.state)
-    joints.record_end(program, simulation.state)
-    program.run()
+    graph, joints = LaunchGraph(simulation.model.device), simulation.avatar.joints
+    joints.body.record_pose(graph, simulation.state)
+    joints.record_end(graph, simulation.state)
+    graph.run()
 
 
 def of_bones(batch) -> np.ndarray:
@@ -110,10 +110,10 @@ def test_the_pull_goes_on_as_if_particles_had_not_been_put_in_place(make_batch):
         state.x.assign(state.x.numpy() + shaken.astype(np.float32))
         put_in_place(batch)
         joints = batch.simulation.avatar.joints
-        program = Program(batch.simulation.model.device)
-        joints.record_substep(program, state, batch.simulation.scratch, 0)
+        graph = LaunchGraph(batch.simulation.model.device)
+        joints.record_substep(graph, state, batch.simulation.scratch, 0)
         before = state.u.numpy() + state.vk.numpy()
-        program.run()
+        graph.run()
         changes[firm] = (state.u.numpy() + state.vk.numpy() - before)[0]
     assert np.abs(changes[False][of_bones(batch)]).max() > 0.5  # [m/s]
     assert np.linalg.norm(changes[True] - changes[False]) < 0.1 * np.linalg.norm(changes[False])  # levers differ

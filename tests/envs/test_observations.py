@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS
 from piavatar_envs.envs.observations import (
     CONTACT_TERMS,
     JOINT_TERMS,
     SELF_TERMS,
     ObservationLayout,
     ObservationTerm,
+    prop_terms,
 )
-from piavatar_envs.envs.others import prop_terms
-from piavatar_envs.mpm.matrices import matrices_of
+from piavatar_envs.mpm.types import matrices_of
 
 
 def kabsch(x: np.ndarray, x0: np.ndarray) -> np.ndarray:
@@ -90,7 +90,7 @@ def test_values_are_those_of_the_particles(make_batch, env_id, settings):
     # commanded motion hardly strains the flesh: this does
     strain = batch.simulation.state.F.numpy() + rng.normal(0.0, 0.05, batch.simulation.state.F.shape)
     batch.simulation.state.F.assign(strain.astype(np.float32))
-    batch.observe_program.run()
+    batch.observe_graph.run()
     for step in range(9):
         for env in range(2):
             vector = batch.observation.numpy()[env, 0]
@@ -112,7 +112,7 @@ def test_stress_is_that_of_the_configured_material(make_batch):
     stretch = np.diag([1.1, 1.0, 0.95])
     F = batch.simulation.state.F
     F.assign(np.broadcast_to(stretch.reshape(9, 1), F.shape).astype(np.float32))
-    batch.observe_program.run()
+    batch.observe_graph.run()
     mu, J = 2.0e4 / 2.8, np.linalg.det(stretch)
     sigma = 2.0 * mu * (stretch - np.eye(3)) @ stretch / J  # the volumetric part has no deviator
     deviator = sigma - np.trace(sigma) / 3.0 * np.eye(3)
@@ -158,6 +158,6 @@ def test_observing_changes_nothing(make_batch, env_id):
     batch.step()
     state, observation = batch.get_state(), batch.observation.numpy().copy()
     batch.observation.fill_(np.nan)  # poisoned: every component must be written
-    batch.observe_program.run()
+    batch.observe_graph.run()
     assert np.array_equal(batch.observation.numpy(), observation)
     assert all(state[name].tobytes() == value.tobytes() for name, value in batch.get_state().items())

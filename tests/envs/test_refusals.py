@@ -9,8 +9,8 @@ from typing import Annotated, Literal, get_args, get_origin
 
 import pytest
 
-from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
-from piavatar_envs.envs.config_errors import entry_of, section_of
+from piavatar_envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.config.errors import entry_of, section_of
 from piavatar_envs.multi import multi_modules
 from piavatar_envs.tasks import load_task, task_modules
 

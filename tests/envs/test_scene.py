@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.limbs import LIMB_GROUPS
-from piavatar_envs.avatar.skeleton import BODY_PARTS, JOINT_NAMES
-from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
-from piavatar_envs.envs.domain import FALL, Domain
-from piavatar_envs.envs.simulation import Simulation
+from piavatar_envs.avatar.body.sampling import LIMB_GROUPS
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
+from piavatar_envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.mpm.materials import MATERIALS
+from piavatar_envs.sim.scene import FALL, Domain
+from piavatar_envs.sim.world import Simulation
 
 BALL = {"name": "ball", "mass": 0.5, "position": [0.0, -1.0, 1.0]}
 

@@ -9,12 +9,12 @@ import math
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
-from piavatar_envs.envs.config import ConfigError, EnvConfig, load_config
-from piavatar_envs.envs.simulation import Simulation
-from piavatar_envs.envs.speeds import STRUCK, lever
-from piavatar_envs.mpm.build import choose_num_substeps
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.config import ConfigError, EnvConfig, load_config
+from piavatar_envs.mpm.model import choose_num_substeps
 from piavatar_envs.multi import multi_modules
+from piavatar_envs.sim.checks import STRUCK, lever
+from piavatar_envs.sim.world import Simulation
 from piavatar_envs.tasks import load_task, task_modules
 
 REACH = "PIAvatar/Reach-v0"
@@ -106,7 +106,7 @@ def test_they_do_not_end_episodes(make_env, task, settings):
 
 def test_a_fast_serve_does_not_end_the_game(device):
     pytest.importorskip("pettingzoo", reason="needs the extra multi")
-    from piavatar_envs.multi.pass_ball_v0 import parallel_env
+    from piavatar_envs.tasks.games.pass_ball import parallel_env
 
     game = parallel_env(device=device, fidelity="tiny", serve_speed=(30.0, 30.0))
     game.reset(seed=0)

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.wear import set_spinning, straight_growth, widths
-from piavatar_envs.avatar.asset import dense_weights
-from piavatar_envs.avatar.joint_mass import GRID_SHARES
-from piavatar_envs.avatar.joint_torques import LOCK
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, PARENTS, joint_index
+from piavatar_envs.avatar.body.asset import dense_weights
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index
+from piavatar_envs.avatar.torque_control.dynamics import LOCK
+from piavatar_envs.avatar.torque_control.mass_matrix import GRID_SHARES
 from piavatar_envs.mpm.diagnostics import totals
 
 REACH = "PIAvatar/Reach-v0"

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.matter import Matter, ball, build_matter, lattice
-from piavatar_envs.mpm.build import MaterialPoints
-from piavatar_envs.mpm.fields import CONTACT_GATE, Fields
+from piavatar_envs.mpm.model import CONTACT_GATE, Fields, MaterialPoints
 
 FLOOR = [((0.0, 0.0, 1.0), -0.11, 0.5)]
 

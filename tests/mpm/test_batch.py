@@ -1,4 +1,4 @@
-"""Many environments equal one, each with its own constants; a replayed program equals launches one by one."""
+"""Many environments equal one, each with its own constants; a replayed graph equals launches one by one."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm.build import MaterialPoints
+from piavatar_envs.core.launch_graph import LaunchGraph, compile_graphs
 from piavatar_envs.mpm.materials import MATERIALS
-from piavatar_envs.mpm.program import Program, compile_programs
+from piavatar_envs.mpm.model import MaterialPoints
 from piavatar_envs.mpm.solver import record_substep
 from tests.gpu_on_cpu import NAME as GPU_ON_CPU
 
@@ -91,12 +91,12 @@ def test_program_equals_eager_launches(simulate):
     replayed = start(simulate(num_envs=2, **SCENE), (1, 2)).run(2)
     eager = start(simulate(num_envs=2, **SCENE), (1, 2))
     for _ in range(2):
-        eager.program.run_eager()
+        eager.graph.run_eager()
     assert_same(replayed.state.numpy(), eager.state.numpy())
 
 
 def test_substeps_equal_control_steps(simulate):
-    """25 substeps in one program equal 25 programs of one, which mark their blocks anew each time."""
+    """25 substeps in one graph equal 25 graphs of one, which mark their blocks anew each time."""
     whole = start(simulate(**SCENE), (1,)).run(2)
     split = start(simulate(**{**SCENE, "num_substeps": 1}, control_dt=whole.model.step.dt), (1,)).run(50)
     for array in ARRAYS:
@@ -105,7 +105,7 @@ def test_substeps_equal_control_steps(simulate):
 
 def test_timed_reports_every_kernel(simulate):
     sim = simulate(**SCENE)
-    seconds = sim.program.timed(1)
+    seconds = sim.graph.timed(1)
     once = {"forget_blocks", "free_slots", "mark_particles", "freeze", "read_impulses"}
     scatters = {"plain": "particles_to_grid", "runs": "runs_to_grid"}
     each = {scatters.get(sim.model.scatter), "update_grid", "grid_to_particles"}
@@ -115,14 +115,14 @@ def test_timed_reports_every_kernel(simulate):
     assert set(seconds) == once | each
     assert all(value > 0.0 for value in seconds.values())
     marks = {"forget_blocks", "free_slots", "mark_particles"}  # at the start, and after 8, 16 and 24 substeps
-    assert len(sim.program) == len(once - marks) + 4 * len(marks) + len(each) * 25
+    assert len(sim.graph) == len(once - marks) + 4 * len(marks) + len(each) * 25
 
 
 def test_a_program_that_has_run_is_closed(simulate, device):
     sim = simulate(**SCENE).run()
     with pytest.raises(RuntimeError, match=r"cannot append .*has run"):
-        record_substep(sim.program, sim.model, sim.state, sim.scratch, 0)
-    assert len(Program(device)) == 0
+        record_substep(sim.graph, sim.model, sim.state, sim.scratch, 0)
+    assert len(LaunchGraph(device)) == 0
 
 
 @wp.kernel
@@ -136,21 +136,21 @@ def forget(condition: wp.array(dtype=int)):
 
 
 def test_a_program_with_a_condition_runs_where_it_holds(device):
-    """The condition is asked once, before the first launch: the program itself may change it."""
+    """The condition is asked once, before the first launch: the graph itself may change it."""
     if wp.get_device(device).is_cuda and device != GPU_ON_CPU and not wp.is_conditional_graph_supported():
         pytest.skip("graphs of this CUDA have no branches")
     condition, runs = wp.zeros(1, dtype=int, device=device), wp.zeros(3, dtype=int, device=device)
-    program = Program(device, condition)
-    program.launch(forget, 1, [], [condition])
-    program.launch(count_runs, 3, [], [runs])
+    graph = LaunchGraph(device, condition)
+    graph.launch(forget, 1, [], [condition])
+    graph.launch(count_runs, 3, [], [runs])
     for holds, expected in ((0, 0), (1, 1), (0, 1), (2, 2), (0, 2)):
         condition.assign(np.array([holds], np.int32))
-        program.run()
+        graph.run()
         assert runs.numpy().tolist() == [expected] * 3
-        program.run()  # it has been forgotten
+        graph.run()  # it has been forgotten
         assert runs.numpy().tolist() == [expected] * 3
     condition.assign(np.array([1], np.int32))
-    program.run_eager()
+    graph.run_eager()
     assert runs.numpy().tolist() == [3] * 3 and condition.numpy()[0] == 0
 
 
@@ -159,13 +159,13 @@ def test_programs_are_compiled_together(device, monkeypatch):
     loaded, load = [], wp.load_module
     monkeypatch.setattr(wp, "load_module", lambda m, *args, **kwargs: loaded.append(m) or load(m, *args, **kwargs))
     runs, condition = wp.zeros(3, dtype=int, device=device), wp.ones(1, dtype=int, device=device)
-    first, second = Program(device), Program(device)
-    for program in (first, second):
-        program.launch(count_runs, 3, [], [runs])
-        program.launch(forget, 1, [], [condition])
-    compile_programs([first, second])
+    first, second = LaunchGraph(device), LaunchGraph(device)
+    for graph in (first, second):
+        graph.launch(count_runs, 3, [], [runs])
+        graph.launch(forget, 1, [], [condition])
+    compile_graphs([first, second])
     assert loaded == [count_runs.module] and not first.unbound and not second.unbound
-    compile_programs([first, second])
+    compile_graphs([first, second])
     assert len(loaded) == 1
     first.launch(count_runs, 3, [], [runs])
     assert len(first.unbound) == 1
@@ -175,15 +175,15 @@ def test_programs_are_compiled_together(device, monkeypatch):
 
 
 def test_a_launch_with_wrong_arguments_is_refused_before_anything_runs(device):
-    runs, program = wp.zeros(3, dtype=int, device=device), Program(device)
-    program.launch(count_runs, 3, [], [runs])
-    program.launch(count_runs, 3, [runs, 1.0])
+    runs, graph = wp.zeros(3, dtype=int, device=device), LaunchGraph(device)
+    graph.launch(count_runs, 3, [], [runs])
+    graph.launch(count_runs, 3, [runs, 1.0])
     with pytest.raises(RuntimeError, match="count_runs"):
-        program.run()
+        graph.run()
     assert runs.numpy().tolist() == [0] * 3
 
 
 @pytest.mark.parametrize("shape, dtype", [((2,), int), ((1,), float), ((1, 1), int)])
 def test_bad_conditions(device, shape, dtype):
     with pytest.raises(ValueError, match=r"use \(1,\) int32"):
-        Program(device, wp.zeros(shape, dtype=dtype, device=device))
+        LaunchGraph(device, wp.zeros(shape, dtype=dtype, device=device))

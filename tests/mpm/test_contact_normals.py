@@ -7,9 +7,9 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.mpm.blocks import held_by, record_of
-from piavatar_envs.mpm.impulses import read_change
-from piavatar_envs.mpm.normals import (
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.mpm.bspline import block_corner, node_of_block, node_position
+from piavatar_envs.mpm.contact_normals import (
     find_facing,
     neighbour_of_lane,
     normal_of_warp,
@@ -17,11 +17,10 @@ from piavatar_envs.mpm.normals import (
     surface_gap,
     volume_at,
 )
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.records import mass_of
+from piavatar_envs.mpm.contact_sensors import read_change
+from piavatar_envs.mpm.grid_arrays import mass_of, offset_at
 from piavatar_envs.mpm.solver import record_marks, record_p2g
-from piavatar_envs.mpm.stencil import block_corner, node_of_block, node_position
-from piavatar_envs.mpm.sums import offset_at
+from piavatar_envs.mpm.sparse_grid import held_by, record_of
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums
 
@@ -100,12 +99,12 @@ class Look:
 
     def __init__(self, sim) -> None:
         model, state, scratch = sim.model, sim.state, sim.scratch
-        program = Program(model.device)
-        record_marks(program, model, state, scratch)
-        record_p2g(program, model, state, scratch)
+        graph = LaunchGraph(model.device)
+        record_marks(graph, model, state, scratch)
+        record_p2g(graph, model, state, scratch)
         sweep = plan_sweep(model)
         found = [scratch.sums, scratch.velocity, scratch.facing, scratch.sensors]
-        program.launch(
+        graph.launch(
             find_facing,
             sweep.threads,
             [model.grid, model.contact, sweep, scratch.blocks, state.failure],
@@ -120,8 +119,8 @@ class Look:
         volume, gap = zeros((2, count), float), zeros(count, float)
         normal, alone, position = (zeros(count, wp.vec3) for _ in range(3))
         inputs = [model.grid, model.contact, scratch.blocks, scratch.sums, scratch.velocity, scratch.facing]
-        program.launch(look_at_nodes, (model.max_slots, 64), inputs, [volume, normal, alone, gap, position])
-        program.run()
+        graph.launch(look_at_nodes, (model.max_slots, 64), inputs, [volume, normal, alone, gap, position])
+        graph.run()
         a, b = volume.numpy()
         shared = self.shared = (a > 1e-4) & (b > 1e-4)
         self.weight = (a * b / np.maximum(a + b, 1e-12))[shared]

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from scipy.linalg import expm
 
-from piavatar_envs.mpm.decouple import cayley
+from piavatar_envs.mpm.g2p import cayley
 
 wp.set_module_options({"enable_backward": False})
 

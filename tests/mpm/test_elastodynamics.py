@@ -7,8 +7,8 @@ import pytest
 
 from benchmarks import elastodynamics, impacts
 from benchmarks.textbook import HertzImpact
-from piavatar_envs.mpm import build
-from piavatar_envs.mpm.build import CFL_STABLE, MaterialPoints
+from piavatar_envs.mpm import model as build
+from piavatar_envs.mpm.model import CFL_STABLE, MaterialPoints
 
 
 @pytest.mark.parametrize("material", ["neo_hookean", "fixed_corotated"])

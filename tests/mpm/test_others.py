@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.mpm.contact_pass import solve_contact
-from piavatar_envs.mpm.normals import find_facing
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.records import TO_KINEMATIC
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.mpm.contact import solve_contact
+from piavatar_envs.mpm.contact_normals import find_facing
+from piavatar_envs.mpm.grid_arrays import TO_KINEMATIC
 from piavatar_envs.mpm.solver import record_marks, record_p2g
 from piavatar_envs.mpm.sweep import THREADS, plan_sweep
 
@@ -50,9 +50,9 @@ def shared_slots(blocks) -> np.ndarray:
 def told_by_scatter(sim) -> tuple[np.ndarray, np.ndarray]:
     """Offsets and kinematic momentum [units] of all slots' nodes, scattered as bits are now; no sums are left."""
     model, sums = sim.model, sim.scratch.sums
-    program = Program(model.device)
-    record_p2g(program, model, sim.state, sim.scratch)
-    program.run()
+    graph = LaunchGraph(model.device)
+    record_p2g(graph, model, sim.state, sim.scratch)
+    graph.run()
     offsets = sums.offset_fixed.numpy()[0].reshape(model.max_slots, 64, -1).astype(float)
     kinematic = sums.fixed.numpy()[0].reshape(model.max_slots, 2, 64, -1)[:, 1].astype(float)
     for array in (sums.fixed, sums.offset_fixed, sums.told):
@@ -63,7 +63,7 @@ def told_by_scatter(sim) -> tuple[np.ndarray, np.ndarray]:
 def test_a_node_with_a_bit_is_told_by_all_around(heap):
     """Bits here and there, few enough for a particle to have one at its nodes and most others to have none."""
     heap.set(vk=np.random.default_rng(3).normal(0.0, 0.3, heap.state.vk.numpy().shape))
-    marks = Program(heap.model.device)
+    marks = LaunchGraph(heap.model.device)
     record_marks(marks, heap.model, heap.state, heap.scratch)
     marks.run()
     whole = told_by_scatter(heap)  # who has just been marked tells all nodes
@@ -85,7 +85,7 @@ def test_contact_acts_only_where_fields_have_told(heap, told):
     """All nodes have offsets; whether they count as told is what bits say."""
     heap.run(2)
     model, scratch = heap.model, heap.scratch
-    marks, contact, sweep = Program(model.device), Program(model.device), plan_sweep(model)
+    marks, contact, sweep = LaunchGraph(model.device), LaunchGraph(model.device), plan_sweep(model)
     record_marks(marks, model, heap.state, scratch)
     record_p2g(marks, model, heap.state, scratch)
     marks.run()

@@ -1,4 +1,4 @@
-"""Programs whose launches go beside each other."""
+"""LaunchGraphs whose launches go beside each other."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.core.launch_graph import LaunchGraph
 
 
 @wp.kernel
@@ -34,13 +34,13 @@ class Forked:
     def __init__(self, device: str, condition: wp.array | None = None) -> None:
         self.a, self.b, self.c = (wp.array(np.full(64, n), dtype=int, device=device) for n in (1, 10, 100))
         self.total = wp.zeros(64, dtype=int, device=device)
-        self.program = Program(device, condition)
+        self.graph = LaunchGraph(device, condition)
         for _ in range(2):
-            self.program.fork(*map(self.branch, (self.a, self.c, self.b), (100_000, 100_000, 0)))
-            self.program.launch(add_up, 64, [self.a, self.b, self.c], [self.total], block_dim=32)
+            self.graph.parallel(*map(self.branch, (self.a, self.c, self.b), (100_000, 100_000, 0)))
+            self.graph.launch(add_up, 64, [self.a, self.b, self.c], [self.total], block_dim=32)
 
-    def branch(self, values: wp.array, turns: int) -> Program:
-        branch = Program(values.device)
+    def branch(self, values: wp.array, turns: int) -> LaunchGraph:
+        branch = LaunchGraph(values.device)
         for _ in range(2):
             branch.launch(double, 64, [values, turns], block_dim=32)
         return branch
@@ -49,8 +49,8 @@ class Forked:
 @pytest.mark.parametrize("run", ["run", "run_eager"])
 def test_what_follows_a_fork_waits_for_its_branches(device, run):
     forked = Forked(device)
-    assert forked.program.names == 2 * (6 * ["double"] + ["add_up"])
-    getattr(forked.program, run)()
+    assert forked.graph.names == 2 * (6 * ["double"] + ["add_up"])
+    getattr(forked.graph, run)()
     after = [4 * n + 3 for n in (1, 10, 100)]
     again = [4 * n + 3 for n in after]
     np.testing.assert_array_equal(forked.total.numpy(), np.full(64, sum(after) + sum(again)))
@@ -60,17 +60,17 @@ def test_what_follows_a_fork_waits_for_its_branches(device, run):
 def test_a_fork_of_a_program_with_a_condition(device, holds):
     condition = wp.array([holds], dtype=int, device=device)
     forked = Forked(device, condition)
-    forked.program.run()
+    forked.graph.run()
     assert (forked.total.numpy()[0] > 0) == (forked.c.numpy()[0] > 100) == bool(holds)
 
 
 def test_a_fork_waits_for_the_one_before(device):
     """Though nothing is launched between them; the branches of the second begin where those of the first had ended."""
-    program, forked = Program(device), Forked(device)
-    program.fork(forked.branch(forked.a, 0), forked.branch(forked.b, 100_000))
-    program.fork(forked.branch(forked.b, 0), forked.branch(forked.a, 0))
-    program.run()
-    assert [(launch.fork, launch.branch) for launch in program._launches] == [
+    graph, forked = LaunchGraph(device), Forked(device)
+    graph.parallel(forked.branch(forked.a, 0), forked.branch(forked.b, 100_000))
+    graph.parallel(forked.branch(forked.b, 0), forked.branch(forked.a, 0))
+    graph.run()
+    assert [(launch.fork, launch.branch) for launch in graph._launches] == [
         (fork, branch) for fork in (1, 2) for branch in (0, 0, 1, 1)
     ]
     np.testing.assert_array_equal(forked.a.numpy(), np.full(64, 16 + 15))
@@ -78,39 +78,39 @@ def test_a_fork_waits_for_the_one_before(device):
 
 
 def test_a_branch_without_launches_is_no_fork(device):
-    program, one, none = Program(device), Program(device), Program(device)
+    graph, one, none = LaunchGraph(device), LaunchGraph(device), LaunchGraph(device)
     values = wp.zeros(4, dtype=int, device=device)
     one.launch(double, 4, [values, 0], block_dim=32)
-    program.fork(none, one)
-    program.fork(one, none)
-    program.fork(none, Program(device))
-    program.launch(double, 4, [values, 0], block_dim=32)
-    program.run()
+    graph.parallel(none, one)
+    graph.parallel(one, none)
+    graph.parallel(none, LaunchGraph(device))
+    graph.launch(double, 4, [values, 0], block_dim=32)
+    graph.run()
     np.testing.assert_array_equal(values.numpy(), [7, 7, 7, 7])
 
 
 def test_forks_are_refused(device):
     forked = Forked(device)
-    conditional = Program(device, condition=wp.zeros(1, dtype=int, device=device))
-    for branches in ((forked.program, Program(device)), (Program(device), conditional)):
-        program = Program(device)
+    conditional = LaunchGraph(device, condition=wp.zeros(1, dtype=int, device=device))
+    for branches in ((forked.graph, LaunchGraph(device)), (LaunchGraph(device), conditional)):
+        graph = LaunchGraph(device)
         with pytest.raises(ValueError, match="a fork or a condition"):
-            program.fork(*branches)
-        assert len(program) == 0
-    program, branch = Program(device), Program(device)
-    for branches in ((branch, branch), (program, branch)):
+            graph.parallel(*branches)
+        assert len(graph) == 0
+    graph, branch = LaunchGraph(device), LaunchGraph(device)
+    for branches in ((branch, branch), (graph, branch)):
         with pytest.raises(ValueError, match="give different ones"):
-            program.fork(*branches)
-    forked.program.run()
+            graph.parallel(*branches)
+    forked.graph.run()
     with pytest.raises(RuntimeError, match="build a new one"):
-        forked.program.fork(Program(device), Program(device))
+        forked.graph.parallel(LaunchGraph(device), LaunchGraph(device))
 
 
 @pytest.mark.parametrize(
     "compiles",
     [
         "from piavatar_envs.doctor import compile_kernels; compile_kernels(DEVICE)",
-        "from piavatar_envs.mpm import program, blocks; p = program.Program(DEVICE); "
+        "from piavatar_envs.mpm import graph, blocks; p = graph.LaunchGraph(DEVICE); "
         "p.launch(blocks.free_slots, 1, [None], []); p.compile()",
     ],
 )

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm import group_plan
-from piavatar_envs.mpm.build import MaterialPoints, choose_scatter
-from piavatar_envs.mpm.group_bricks import CAPACITY
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.mpm.cuda import tiled_p2g as group_plan
+from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, parts_of, suits_shared
+from piavatar_envs.mpm.cuda.tile_grid import CAPACITY
+from piavatar_envs.mpm.cuda.tiled_g2p import MOST_COUNTED
+from piavatar_envs.mpm.grid_arrays import units
 from piavatar_envs.mpm.memory import LARGE_MARGIN, SLOT_MARGIN, choose_marks, estimate_slots
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.mpm.runs import MOST_COUNTED
-from piavatar_envs.mpm.shared_room import MOST_PARTICLES, parts_of, suits_shared
+from piavatar_envs.mpm.model import MaterialPoints, choose_scatter
 from piavatar_envs.mpm.solver import record_marks, record_p2g
-from piavatar_envs.mpm.sums import units
 from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, SCATTERS
 
 ARRAYS = ("x", "u", "C", "F")
@@ -63,10 +63,10 @@ def records_of(sums):
 
 def node_sums(sim):
     """Mass, momenta and offsets of every node that has a slot, by field and block: ``{(env, of both): (64, 10)}``."""
-    model, scratch, program = sim.model, sim.scratch, Program(sim.model.device)
-    record_marks(program, model, sim.state, scratch)
-    record_p2g(program, model, sim.state, scratch)
-    program.run()
+    model, scratch, graph = sim.model, sim.scratch, LaunchGraph(sim.model.device)
+    record_marks(graph, model, sim.state, scratch)
+    record_p2g(graph, model, sim.state, scratch)
+    graph.run()
     count, held = scratch.blocks.count.numpy(), scratch.blocks.held.numpy()
     own, places = records_of(scratch.sums)
     halves = own.numpy().astype(float).reshape(model.num_envs, -1, 2, 64, 4)
@@ -253,7 +253,7 @@ def test_a_large_room_gives_the_same(simulate, equal, device, monkeypatch):
     start = {"u": (0.3, -0.2, 0.1), "C": np.diag([1.0, -2.0, 0.5])}
     large = simulate(scatter="shared", max_slots=SLOTS // 2).set(**start)
     assert large.scratch.large_room
-    monkeypatch.setattr("piavatar_envs.mpm.shared_room.has_large_room", lambda model, parts: False)
+    monkeypatch.setattr("piavatar_envs.mpm.cuda.block_grid.has_large_room", lambda model, parts: False)
     small = simulate(scatter="shared", max_slots=SLOTS // 2, control_dt=large.model.control_dt).set(**start)
     assert not small.scratch.large_room
     for array in ARRAYS:

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from piavatar_envs.mpm.build import MaterialPoints
-from piavatar_envs.mpm.fields import Fields
+from piavatar_envs.mpm.model import Fields, MaterialPoints
 
 DX, SPACING = 0.05, 0.025
 BAR = {"lower": (-0.3, -0.05, -0.05), "upper": (0.3, 0.05, 0.05), "dx": DX, "spacing": SPACING, "margin": 0.4}

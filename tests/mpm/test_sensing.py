@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm.blocks import fields_next
+from piavatar_envs.mpm.sparse_grid import fields_next
 from piavatar_envs.mpm.types import FAILURE_OUT_OF_GRID, Blocks, Grid
 
 DX = 0.05

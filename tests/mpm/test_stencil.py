@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm.build import make_grid
-from piavatar_envs.mpm.stencil import (
+from piavatar_envs.mpm.bspline import (
     BLOCK,
     base_node,
     block_corner,
@@ -20,6 +19,7 @@ from piavatar_envs.mpm.stencil import (
     spline,
     stencil_inside,
 )
+from piavatar_envs.mpm.model import make_grid
 from piavatar_envs.mpm.types import Grid
 
 wp.set_module_options({"enable_backward": False})

@@ -9,8 +9,17 @@ import pytest
 import warp as wp
 
 from piavatar_envs.mpm import sweep
-from piavatar_envs.mpm.records import mass_of, read_record, write_physical, write_record
-from piavatar_envs.mpm.sums import begin_sum, clear_offset, end_sum, offset_at, units_of
+from piavatar_envs.mpm.grid_arrays import (
+    begin_sum,
+    clear_offset,
+    end_sum,
+    mass_of,
+    offset_at,
+    read_record,
+    units_of,
+    write_physical,
+    write_record,
+)
 from piavatar_envs.mpm.types import Grid, Sums, group, vec4l, vec8
 
 RECORDS = 64

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.envs.batch_env import BatchEnv
 
 

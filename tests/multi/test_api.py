@@ -44,7 +44,7 @@ def fresh(worlds, module_name, device):
 
 def test_worlds_are_found():
     assert {"piavatar_envs.multi.sumo_v0", "piavatar_envs.multi.boxing_v0"} <= set(multi_modules())
-    assert "piavatar_envs.multi.versus" not in multi_modules()
+    assert "piavatar_envs.tasks.common.fights" not in multi_modules()
     assert list(listed_worlds().values()) == list(multi_modules())
     assert load_world("sumo_v0").__name__ == listed_worlds()["sumo_v0"] == "piavatar_envs.multi.sumo_v0"
     with pytest.raises(ValueError, match=r"unknown world 'sumo_v9'; did you mean sumo_v0\?"):

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import BODY_PARTS, joint_index
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index
 from piavatar_envs.mpm.types import Sensors
 
 BOXING = "piavatar_envs.multi.boxing_v0"
@@ -22,7 +22,7 @@ class Scorer:
     """The kernel that counts points, over made-up impulses of one environment of ``agents``."""
 
     def __init__(self, device: str, agents: int = 2) -> None:
-        from piavatar_envs.multi.blows import Scale, Tally, count_points
+        from piavatar_envs.tasks.games.boxing import Scale, Tally, count_points
 
         self.device, self.agents, self.kernel = device, agents, count_points
         self.scale, self.tally = Scale(), Tally()
@@ -115,8 +115,8 @@ def test_nobody_scores_who_is_out_or_on_who_is_out(worlds, device):
 def straight_right() -> tuple[np.ndarray, np.ndarray]:
     """Local rotations on guard and at the end of a straight right at the head, wxyz ``(22, 4)``."""
     from piavatar_envs.avatar.motion.keyframes import Arm
-    from piavatar_envs.multi.boxing_v0 import STANCE
-    from piavatar_envs.multi.versus import Stance
+    from piavatar_envs.tasks.common.fights import Stance
+    from piavatar_envs.tasks.games.boxing import STANCE
 
     turns = {**STANCE.turns, "spine2": (5.0, 0.0, 14.0), "spine3": (0.0, 0.0, 14.0)}
     struck = replace(STANCE, turns=turns, right_arm=Arm((-0.15, -0.88, 0.42), (-0.22, -0.88, 0.42)))

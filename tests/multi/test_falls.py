@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.asset import load_body
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.skeleton import joint_index
 
 SUMO, BOXING = "piavatar_envs.multi.sumo_v0", "piavatar_envs.multi.boxing_v0"
 HIGH_FIVE, PASS_BALL = "piavatar_envs.multi.high_five_v0", "piavatar_envs.multi.pass_ball_v0"

@@ -7,12 +7,12 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.limits import joint_limits
-from piavatar_envs.avatar.skeleton import BODY_PARTS, NUM_JOINTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, NUM_JOINTS, forward_kinematics, joint_index, joint_limits
+from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import ConfigError, load_config
 from piavatar_envs.mpm.types import Sensors
-from piavatar_envs.multi import high_five_v0, slap
+from piavatar_envs.multi import high_five_v0
+from piavatar_envs.tasks.games import high_five as slap
 
 FIVE = "piavatar_envs.multi.high_five_v0"
 SIDES = ("left", "right")

@@ -7,11 +7,12 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import ConfigError, load_config
 from piavatar_envs.mpm.types import Sensors
-from piavatar_envs.multi import pass_ball_v0, passing
+from piavatar_envs.multi import pass_ball_v0
+from piavatar_envs.tasks.games import pass_ball as passing
 from tests.multi.kicker import Kicker
 
 PASS = "piavatar_envs.multi.pass_ball_v0"

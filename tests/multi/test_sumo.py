@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
 
 SUMO = "piavatar_envs.multi.sumo_v0"
 STILL = {"pose_noise": 0.0, "place_noise": 0.0}

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.asset import AvatarAsset, ShapedBody, load_body
-from piavatar_envs.avatar.sampling import ParticleSet, morph, sample_particles
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody, load_body
+from piavatar_envs.avatar.body.sampling import ParticleSet, morph, sample_particles
+from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.render import Skin
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar import skeleton
+from piavatar_envs.avatar.body import skeleton
 from piavatar_envs.render import Skin
 
 REST = np.tile(np.eye(3), (22, 1, 1))

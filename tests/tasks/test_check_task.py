@@ -10,12 +10,12 @@ import warp as wp
 
 import piavatar_envs
 from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.api.check import TaskError
-from piavatar_envs.envs.config import ConfigError
-from piavatar_envs.envs.draws import STREAM_TASK, generator
+from piavatar_envs.api.conformance import TaskError
+from piavatar_envs.config import ConfigError
 from piavatar_envs.envs.observations import ObservationTerm
-from piavatar_envs.tasks.base import Task
-from piavatar_envs.tasks.spawn import record_standing
+from piavatar_envs.envs.rng import STREAM_TASK, generator
+from piavatar_envs.envs.task import Task
+from piavatar_envs.tasks.common.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
 
@@ -103,17 +103,17 @@ class Honest(Task):
     def arrays(self):
         return {"goal": self.goal} | ({} if self.fault == FORGOTTEN else {"passed": self.passed})
 
-    def record_reset(self, env, program):
-        record_standing(env, program, noise=0.1)
+    def record_reset(self, env, graph):
+        record_standing(env, graph, noise=0.1)
         inputs = [self.fault, env.mask, env.seed, env.episode]
-        program.launch(draw, env.num_envs, inputs, [self.goal, self.passed])
+        graph.launch(draw, env.num_envs, inputs, [self.goal, self.passed])
 
-    def record_outcome(self, env, program):
-        program.launch(judge, env.num_envs, [self.fault, self.goal, self.passed], [env.terms, env.metrics])
+    def record_outcome(self, env, graph):
+        graph.launch(judge, env.num_envs, [self.fault, self.goal, self.passed], [env.terms, env.metrics])
 
-    def record_observe(self, env, program, agent, start):
+    def record_observe(self, env, graph, agent, start):
         inputs = [self.fault, agent, start, self.goal, self.passed]
-        program.launch(see, env.num_envs, inputs, [env.observation])
+        graph.launch(see, env.num_envs, inputs, [env.observation])
 
 
 def problems_of(fault: int, device: str, steps: int = 6, **options) -> tuple[str, ...]:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.api.check import TaskError, check_task
+from piavatar_envs.api.conformance import TaskError, check_task
+from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import load_config
-from piavatar_envs.envs.finite import FiniteWatch
-from piavatar_envs.tasks.base import NAMES_OF_INFO, Task
-from piavatar_envs.tasks.spawn import record_standing
+from piavatar_envs.envs.episodes import FiniteWatch
+from piavatar_envs.envs.task import NAMES_OF_INFO, Task
+from piavatar_envs.tasks.common.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,11 +46,11 @@ class Plain(Task):
     metrics = ("off",)
     columns = (2, 1, 1)
 
-    def record_reset(self, env, program):
-        record_standing(env, program, noise=0.1)
+    def record_reset(self, env, graph):
+        record_standing(env, graph, noise=0.1)
 
-    def record_outcome(self, env, program):
-        program.launch(write, env.num_envs, [wp.vec3i(*self.columns)], [env.terms, env.cost_terms, env.metrics])
+    def record_outcome(self, env, graph):
+        graph.launch(write, env.num_envs, [wp.vec3i(*self.columns)], [env.terms, env.cost_terms, env.metrics])
 
 
 def made(**declared) -> Task:
@@ -121,8 +121,8 @@ class Flat(Plain):
     def allocate(self, env):
         self.flat = env.terms.flatten(), env.cost_terms.reshape(env.num_envs), env.metrics.reshape((env.num_envs, 1))
 
-    def record_outcome(self, env, program):
-        program.launch(write_flat, env.num_envs, [self.columns[0]], list(self.flat))
+    def record_outcome(self, env, graph):
+        graph.launch(write_flat, env.num_envs, [self.columns[0]], list(self.flat))
 
 
 def test_a_task_may_reshape_its_arrays(device):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
-from piavatar_envs.tasks.disturb import apply_impulse, draw_impulse
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
+from piavatar_envs.tasks.common.disturb import apply_impulse, draw_impulse
 from piavatar_envs.tasks.track_motion import STRUCK
 
 TRACK = "PIAvatar/TrackMotion-v0"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import BODY_PARTS
-from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS
+from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.tasks.dodge import DodgeConfig, DodgeTask
 
 DODGE = "PIAvatar/Dodge-v0"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.motion import load_motion
-from piavatar_envs.avatar.skeleton import joint_index
-from piavatar_envs.tasks.ease import EASY
+from piavatar_envs.tasks.common.ease import EASY
 
 WALK = "PIAvatar/Walk-v0"
 

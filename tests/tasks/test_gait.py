@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from agents.mirror import Mirror
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.config import ConfigError, load_config
 from piavatar_envs.tasks import load_task
 
 WALK = "PIAvatar/Walk-v0"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.envs.config import ConfigError, load_config
-from piavatar_envs.tasks.gate import Course, Gate, closest_pass, draw_gate, judge_ball, passes
+from piavatar_envs.config import ConfigError, load_config
+from piavatar_envs.tasks.common.ball_goal import Course, Gate, closest_pass, draw_gate, judge_ball, passes
 from piavatar_envs.tasks.header import HeaderConfig, HeaderTask
 from piavatar_envs.tasks.kick_ball import KickBallConfig, KickBallTask
 

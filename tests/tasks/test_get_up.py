@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
 
 GET_UP = "PIAvatar/GetUp-v0"
 HEAD, CHEST, ANKLES = (

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import joint_index
-from piavatar_envs.mpm.program import Program
+from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.core.launch_graph import LaunchGraph
 
 KICK = "PIAvatar/KickBall-v0"
 FEET = ("left_foot", "right_foot")
@@ -100,9 +100,9 @@ def test_a_kick_sends_heavier_balls_off_slower(make_batch):
     # balls of other masses than those drawn
     props, density = batch.simulation.props, np.array([[0.3], [1.5], [7.0]]) / batch.task.goal.gate.ball_volume
     props.density.assign(density.astype(np.float32))
-    program = Program(batch.device)
-    props.record_reset(program, batch.simulation.state, batch.mask)
-    program.run()
+    graph = LaunchGraph(batch.device)
+    props.record_reset(graph, batch.simulation.state, batch.mask)
+    graph.run()
     speed = kick(batch)
     assert not batch.failure.numpy().any()
     assert speed[0] > 1.2 * speed[1] > 1.2**2 * speed[2] and speed[2] > 0.8, speed

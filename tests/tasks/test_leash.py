@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.tasks.leash import leash_root
+from piavatar_envs.tasks.common.leash import leash_root
 
 LENGTH, TURN = 0.2, 0.4
 

@@ -12,11 +12,11 @@ import pytest
 
 import piavatar_envs
 from piavatar_envs import cli
-from piavatar_envs.api.gymnasium import AvatarEnv
-from piavatar_envs.api.vector import AvatarVectorEnv
+from piavatar_envs.api.gym_env import AvatarEnv
+from piavatar_envs.api.vector_env import AvatarVectorEnv
 from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task, reach
-from piavatar_envs.tasks.base import Task
 
 MODULE = """
 import piavatar_envs
@@ -117,7 +117,7 @@ def test_a_task_without_hooks_says_which():
     class Empty(Task):
         """Nothing is defined."""
 
-    with pytest.raises(NotImplementedError, match=r"Empty must define record_reset\(env, program\)"):
+    with pytest.raises(NotImplementedError, match=r"Empty must define record_reset\(env, graph\)"):
         AvatarEnv(Empty, fidelity="tiny")
 
 

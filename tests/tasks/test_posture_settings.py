@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.envs.config import ConfigError, load_config
-from piavatar_envs.envs.config_io import setting_keys
+from piavatar_envs.config import ConfigError, load_config
+from piavatar_envs.config.load import setting_keys
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.get_up import GetUpConfig
 from piavatar_envs.tasks.push_recovery import PushRecoveryConfig

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import joint_index
-from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.tasks.push_box import LEASH, WALK, PushBoxConfig, PushBoxTask
 
 PUSH = "PIAvatar/PushBox-v0"

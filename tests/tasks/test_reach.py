@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import joint_index
 
 REACH = "PIAvatar/Reach-v0"
 HANDS = ("left_wrist", "right_wrist")

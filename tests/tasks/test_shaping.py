@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.tasks.rewards import mean_square_action, tolerance
+from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance
 
 
 @wp.kernel

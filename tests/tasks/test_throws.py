@@ -7,9 +7,9 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import joint_index
-from piavatar_envs.mpm.program import Program
-from piavatar_envs.tasks.throws import (
+from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.tasks.common.throws import (
     CLEARANCE,
     HEIGHT,
     Throws,
@@ -161,11 +161,11 @@ def test_placing_a_prop_touches_its_particles_in_the_masked_environments_only(ma
     for name, values in (("position", rng.normal(size=(3, 2, 3))), ("velocity", rng.normal(size=(3, 2, 3)) * 5.0)):
         getattr(props.spawn, name).assign(values.astype(np.float32))
     props.spawn.spin.assign(rng.normal(size=(3, 2, 3)).astype(np.float32))
-    program, before = Program(batch.device), simulation.state.numpy()
+    graph, before = LaunchGraph(batch.device), simulation.state.numpy()
     before = {name: value.copy() for name, value in before.items()}
     mask = np.array([True, False, True])
-    props.record_place(program, simulation.state, wp.array(mask, dtype=wp.bool, device=batch.device), index)
-    program.run()
+    props.record_place(graph, simulation.state, wp.array(mask, dtype=wp.bool, device=batch.device), index)
+    graph.run()
     after, prop = simulation.state.numpy(), props.props[index]
     own = slice(prop.first, prop.first + prop.count)
     for name, value in after.items():

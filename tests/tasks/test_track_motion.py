@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, forward_kinematics, joint_index
 from piavatar_envs.avatar.motion import deepmimic, load_motion
 from piavatar_envs.avatar.motion.library import list_embedded
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, forward_kinematics, joint_index
-from piavatar_envs.envs.config import ConfigError
+from piavatar_envs.config import ConfigError
 
 TRACK = "PIAvatar/TrackMotion-v0"
 

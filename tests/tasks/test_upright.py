@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.skeleton import joint_index
-from piavatar_envs.envs.config import ConfigError, load_config
+from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.tasks.push_recovery import PushRecoveryConfig, PushRecoveryTask
 
 STAND, PUSH, WALK = "PIAvatar/Stand-v0", "PIAvatar/PushRecovery-v0", "PIAvatar/Walk-v0"

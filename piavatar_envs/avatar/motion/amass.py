@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.motion.motion import Motion
 from piavatar_envs.avatar.motion.retarget import LIMB_ENDS, align_limbs, leg_length, retarget, root_path
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, PARENTS, joint_index
 
 #: Width of ``poses`` -> the key that names the frame rate.
 LAYOUTS: dict[int, str] = {156: "mocap_framerate", 165: "mocap_frame_rate"}

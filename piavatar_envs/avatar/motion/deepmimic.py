@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
 from piavatar_envs.avatar.motion.interpolation import ease, hemisphere_consistent, slerp
 from piavatar_envs.avatar.motion.motion import Motion
 from piavatar_envs.avatar.motion.retarget import align_limbs, leg_length, retarget, root_path
-from piavatar_envs.avatar.skeleton import JOINT_NAMES
 
 NUM_CHANNELS = 44
 LEG_LENGTH = 0.8314  # [m] hip to knee to ankle of DeepMimic's humanoid (0.4215 + 0.4099)

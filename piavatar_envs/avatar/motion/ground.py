@@ -8,10 +8,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.sparse import csr_array
 
-from piavatar_envs.avatar.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 
 if TYPE_CHECKING:
-    from piavatar_envs.avatar.asset import AvatarAsset, ShapedBody
+    from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
     from piavatar_envs.avatar.motion.motion import Motion
 
 _CHUNK = 128  # frames skinned at once, bounds the memory of long clips

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights, padded
-from piavatar_envs.avatar.skeleton import joint_index
 
 if TYPE_CHECKING:
-    from piavatar_envs.avatar.asset import AvatarAsset, ShapedBody
+    from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
     from piavatar_envs.avatar.motion.motion import Motion
 
 MAX_BEND = np.radians(85.0)  # of a wrist

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.avatar.motion.interpolation import ease, slerp
 from piavatar_envs.avatar.motion.motion import Motion
 from piavatar_envs.avatar.motion.retarget import leg_length
-from piavatar_envs.avatar.skeleton import NUM_JOINTS, joint_index
 
 FPS = 30.0  # [1/s]
 MAX_REACH = 0.999  # of the straight leg: a knee is never locked

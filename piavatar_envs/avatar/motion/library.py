@@ -10,13 +10,13 @@ import pkgutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from piavatar_envs.avatar.asset import load_body
+from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.motion import amass, clips, deepmimic
 from piavatar_envs.avatar.motion.hands import lay_hands_on_ground
 from piavatar_envs.avatar.motion.motion import Motion
 
 if TYPE_CHECKING:
-    from piavatar_envs.avatar.asset import AvatarAsset, ShapedBody
+    from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
 
 DEEPMIMIC_PREFIX = "deepmimic:"
 GROUND_WINDOW = 0.8  # [s] longer than any flight in DeepMimic's clips, whose skeleton stands otherwise than ours

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, forward_kinematics
 from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights
 from piavatar_envs.avatar.motion.interpolation import ease, hemisphere_consistent, slerp, turned
-from piavatar_envs.avatar.skeleton import JOINT_NAMES, NUM_JOINTS, forward_kinematics
 
 if TYPE_CHECKING:
-    from piavatar_envs.avatar.asset import AvatarAsset, ShapedBody
+    from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
 
 MAX_FPS = 1000.0  # [1/s], beyond any motion capture: a larger figure is a unit mistake
 UNIT_TOLERANCE = 1e-3  # how far a quaternion's norm may be from 1 before it is refused, not normalised

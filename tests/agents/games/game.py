@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from pettingzoo import ParallelEnv
 
-from piavatar_envs.envs.config import EnvConfig, load_config
+from piavatar_envs.config import EnvConfig, load_config
 from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
 
 #: What no game changes while it is played.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from piavatar_envs.envs.config import EnvConfig
+from piavatar_envs.config import EnvConfig
 from tests.agents.games.game import Game
 
 

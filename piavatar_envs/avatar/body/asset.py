@@ -1,0 +1,196 @@
+"""The body an avatar starts from: closed skin mesh, skeleton, skinning weights and shape parameters (NumPy)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+
+import numpy as np
+
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
+
+NUM_SKIN_JOINTS = 4
+SAMPLE_DEVIATION = 0.4  # standard deviation of a sampled shape parameter, before the clip to [-1, 1]
+
+
+@dataclass(frozen=True, eq=False)
+class ShapedBody:
+    """One shape of an asset in its rest pose: soles on z = 0, the pelvis joint above the origin.
+
+    Attributes:
+        vertices: skin vertices [m], shape ``(V, 3)`` float32.
+        joints: joint positions [m], shape ``(22, 3)`` float32.
+    """
+
+    vertices: np.ndarray
+    joints: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class AvatarAsset:
+    """A skinned, shapeable body. Axes: metres, z up, facing -y, its left is +x; joints as in ``skeleton.py``.
+
+    Shape parameters are in [-1, 1], all zero for the mean shape. Each has one displacement field for its negative
+    and one for its positive half, because a thin person is not a heavy one mirrored; different parameters add up.
+
+    Attributes:
+        name: where the body comes from, for messages and metadata.
+        vertices: skin of the mean shape [m], shape ``(V, 3)`` float32.
+        faces: triangles of the closed, outward oriented skin, shape ``(T, 3)`` int32.
+        joints: joint positions of the mean shape [m], shape ``(22, 3)`` float32.
+        skin_joints: joints that move each vertex, shape ``(V, 4)`` int32.
+        skin_weights: their weights, descending, rows sum to one, shape ``(V, 4)`` float32.
+        shape_names: names of the ``S`` shape parameters.
+        shape_deltas: vertex displacements at -1 and at +1 of each parameter [m], shape ``(S, 2, V, 3)`` float32.
+        shape_joints: joint displacements, the same way [m], shape ``(S, 2, 22, 3)`` float32.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    joints: np.ndarray
+    skin_joints: np.ndarray
+    skin_weights: np.ndarray
+    shape_names: tuple[str, ...]
+    shape_deltas: np.ndarray
+    shape_joints: np.ndarray
+
+    def shape(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:
+        """The body of the given shape parameters, shape ``(S,)``, standing on z = 0 with the pelvis over x = y = 0.
+
+        Raises:
+            ValueError: a wrong number of parameters, or one that is not finite or outside [-1, 1].
+        """
+        halves = self._halves(parameters)
+        vertices = self.vertices + np.tensordot(halves, self.shape_deltas, axes=2)
+        joints = self.joints + np.tensordot(halves, self.shape_joints, axes=2)
+        origin = np.array([joints[0, 0], joints[0, 1], vertices[:, 2].min()])
+        return ShapedBody((vertices - origin).astype(np.float32), (joints - origin).astype(np.float32))
+
+    def mean_body(self) -> ShapedBody:
+        """The shape of all parameters zero."""
+        return self.shape(np.zeros(len(self.shape_names)))
+
+    def height(self, parameters: Sequence[float] | np.ndarray) -> float:
+        """Standing height of a shape [m]."""
+        return float(np.ptp(self.shape(parameters).vertices[:, 2]))
+
+    def volume(self, parameters: Sequence[float] | np.ndarray) -> float:
+        """Volume enclosed by the skin of a shape [m^3]."""
+        return mesh_volume(self.shape(parameters).vertices, self.faces)
+
+    def parameters(self, **values: float) -> np.ndarray:
+        """Shape parameters by name, the others zero: ``parameters(sex=-1, weight=0.5)``; shape ``(S,)``.
+
+        Raises:
+            ValueError: an unknown name.
+        """
+        parameters = np.zeros(len(self.shape_names))
+        for name, value in values.items():
+            if name not in self.shape_names:
+                raise ValueError(f"unknown shape parameter {name!r}; use one of {', '.join(self.shape_names)}")
+            parameters[self.shape_names.index(name)] = value
+        return parameters
+
+    def sample_parameters(self, rng: np.random.Generator, size: int | None = None, scale: float = 1.0) -> np.ndarray:
+        """Random people: every parameter normal about the mean, clipped to [-1, 1]; ``sex`` is uniform.
+
+        Args:
+            rng: the only source of randomness.
+            size: number of shapes, or None for one without the leading dimension.
+            scale: 0 gives the mean shape, 1 the population; at most 1.
+
+        Returns:
+            Parameters, shape ``(S,)`` or ``(size, S)`` float64.
+
+        Raises:
+            ValueError: ``scale`` outside [0, 1].
+        """
+        if not 0.0 <= scale <= 1.0:
+            raise ValueError(f"scale={scale} is outside [0, 1]; 1 samples the whole population")
+        rows = 1 if size is None else size
+        parameters = np.clip(SAMPLE_DEVIATION * rng.standard_normal((rows, len(self.shape_names))), -1.0, 1.0)
+        uniform = rng.uniform(-1.0, 1.0, rows)
+        if "sex" in self.shape_names:
+            parameters[:, self.shape_names.index("sex")] = uniform
+        parameters *= scale
+        return parameters[0] if size is None else parameters
+
+    def _halves(self, parameters: Sequence[float] | np.ndarray) -> np.ndarray:
+        """Factors of the negative and positive displacement fields, shape ``(S, 2)``; refuses bad parameters."""
+        values = np.asarray(parameters, dtype=np.float64)
+        if values.shape != (len(self.shape_names),):
+            names = ", ".join(self.shape_names)
+            raise ValueError(f"shape parameters have shape {values.shape}; pass {len(self.shape_names)}: {names}")
+        bad = np.flatnonzero(~(np.abs(values) <= 1.0))  # also catches NaN
+        if bad.size:
+            index = int(bad[0])
+            raise ValueError(
+                f"shape parameter {index} ({self.shape_names[index]}) is {values[index]:g}; keep it within [-1, 1]"
+            )
+        return np.stack([np.maximum(-values, 0.0), np.maximum(values, 0.0)], axis=1)
+
+
+def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Volume of a closed, outward oriented triangle mesh [m^3]: signed tetrahedra to the origin."""
+    a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
+    return float(np.einsum("ti,ti->", a, np.cross(b, c)) / 6.0)
+
+
+def top_weights(weights: np.ndarray, count: int = NUM_SKIN_JOINTS) -> tuple[np.ndarray, np.ndarray]:
+    """The ``count`` largest weights of every row, descending and normalised.
+
+    Args:
+        weights: non-negative weights of every joint, shape ``(N, J)``.
+        count: how many to keep.
+
+    Returns:
+        Joints ``(N, count)`` int32 and weights ``(N, count)`` float32 whose rows sum to one.
+    """
+    joints = np.argsort(-weights, axis=1, kind="stable")[:, :count]
+    kept = np.take_along_axis(weights, joints, axis=1)
+    kept = kept / kept.sum(axis=1, keepdims=True)
+    return joints.astype(np.int32), kept.astype(np.float32)
+
+
+def dense_weights(skin_joints: np.ndarray, skin_weights: np.ndarray, num_joints: int = NUM_JOINTS) -> np.ndarray:
+    """The inverse of :func:`top_weights`: shape ``(N, num_joints)`` float64."""
+    dense = np.zeros((len(skin_joints), num_joints))
+    np.add.at(dense, (np.arange(len(skin_joints))[:, None], skin_joints), skin_weights)
+    return dense
+
+
+def _merged_into_body(parents: np.ndarray) -> np.ndarray:
+    """For each joint of the file the body joint it moves with: fingers follow the wrist."""
+    body = np.arange(len(parents))
+    for joint in range(NUM_JOINTS, len(parents)):
+        body[joint] = body[parents[joint]]  # parents come before children
+    return body
+
+
+@lru_cache(maxsize=1)
+def load_body() -> AvatarAsset:
+    """The embedded body, baked from MakeHuman's CC0 mesh by ``scripts/bake_body.py``; fingers follow the wrists."""
+    file = resources.files("piavatar_envs.data").joinpath("body.npz")
+    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+        data = {key: arrays[key] for key in arrays.files}
+    if tuple(data["parents"][:NUM_JOINTS]) != PARENTS:
+        raise ValueError(f"body.npz has parents {data['parents'][:NUM_JOINTS].tolist()}; bake it again")
+    to_body = _merged_into_body(data["parents"])
+    dense = dense_weights(to_body[data["skin_joints"]], data["skin_weights"].astype(np.float64))
+    skin_joints, skin_weights = top_weights(dense)
+    names = tuple(str(name) for name in data["shape_names"])
+    deltas = data["shape_deltas"].astype(np.float32) * data["shape_step"]
+    return AvatarAsset(
+        name="embedded (MakeHuman, CC0)",
+        vertices=data["vertices"],
+        faces=data["faces"].astype(np.int32),
+        joints=data["joints"][:NUM_JOINTS],
+        skin_joints=skin_joints,
+        skin_weights=skin_weights,
+        shape_names=names,
+        shape_deltas=deltas.reshape(len(names), 2, *deltas.shape[1:]),
+        shape_joints=data["shape_joints"][:, :NUM_JOINTS].reshape(len(names), 2, NUM_JOINTS, 3),
+    )

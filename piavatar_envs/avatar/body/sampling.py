@@ -1,0 +1,471 @@
+"""In which order a body's particles lie in memory: neighbours in the body should be neighbours there.
+
+Threads that work together then ask for the same nodes of the grid, or blend the same bones.
+
+Smooth interpolation inside a body: harmonic functions on the graph of its particles (NumPy).
+
+From a closed skin to the particles of the simulation: positions, volumes, skinning weights and bone particles.
+
+*Flesh* particles sit in the cells of a regular lattice, each at the centroid of the part of its cell that is
+inside the skin, so thin limbs are filled as well as thick ones. *Bone* particles are ordinary particles too, a
+small lattice along every bone, rigidly skinned to it: the Kabsch fit that tracks the pose reads only them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody, dense_weights, mesh_volume, top_weights
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.body.surface import ClosedSurface
+
+SMALL_BODY = 8192  # particles up to which they are in the order of their bones
+BOXES = (128, 64, 32)  # particles that lie together in larger ones, as many as P2G takes together or a warp has
+
+
+def order_of_body(
+    positions: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray
+) -> np.ndarray:
+    """Order ``(P,)`` of the particles of a body: by their bones if it is small, else in compact boxes.
+
+    Args:
+        positions: in the rest pose [m], shape ``(P, 3)``.
+        bone: of which bone a particle is one's own, -1 for flesh, shape ``(P,)``.
+        skin_joints: the bones that move it, shape ``(P, K)``.
+        skin_weights: by which weights, 0 for none, shape ``(P, K)``.
+    """
+    if len(positions) <= SMALL_BODY:
+        return order_by_bones(bone, skin_joints, skin_weights)
+    return order_in_boxes(positions)
+
+
+def order_along_curve(positions: np.ndarray, spacing: float) -> np.ndarray:
+    """Order of the particles along Morton's curve, ``(P,)``: what is close in memory is close in the body.
+
+    Threads and cache lines then share grid nodes and bones.
+    """
+    cells = ((positions - positions.min(axis=0)) / spacing).astype(np.uint64)
+    code = np.zeros(len(cells), np.uint64)
+    for bit, axis in np.ndindex(16, 3):
+        code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+def order_by_bones(bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
+    """Order ``(P,)`` in which bones' own particles come first, then those that one bone moves, two, and so on.
+
+    Of as many bones those of the same ones follow each other, as they did. Threads that work together then blend as
+    many bones, and mostly the same: one that blends four makes 31 others wait. Neighbours of large bodies are alike
+    anyway, see :func:`order_in_boxes`.
+    """
+    moves = np.sort(np.where(skin_weights > 0.0, skin_joints, NUM_JOINTS), axis=1)
+    return np.lexsort((*moves.T[::-1], (skin_weights > 0.0).sum(axis=1), bone < 0))
+
+
+def order_in_boxes(positions: np.ndarray) -> np.ndarray:
+    """Order ``(P,)`` in which each ``BOXES[0]`` particles have a compact box of their own, each ``BOXES[1]`` in it, ...
+
+    Boxes are halved along their longest edge; in the smallest, particles stay as they are. The P2G of large bodies
+    takes so many together and adds up on the nodes of the box around them, which a curve's jumps would make large.
+    """
+
+    def halve(inside: np.ndarray, level: int) -> list[np.ndarray]:
+        while level < len(BOXES) and len(inside) <= BOXES[level]:
+            level += 1
+        if level == len(BOXES):
+            return [np.sort(inside)]
+        along = positions[inside, np.ptp(positions[inside], axis=0).argmax()]
+        order = inside[np.argsort(along, kind="stable")]
+        lower = BOXES[level] * -(-len(order) // (2 * BOXES[level]))
+        return halve(order[:lower], level) + halve(order[lower:], level)
+
+    return np.concatenate(halve(np.arange(len(positions)), 0))
+
+
+TOLERANCE = 1e-6  # of the residual, relative to the right-hand side
+MAX_ITERATIONS = 2000
+
+
+def adjacency(links: np.ndarray, points: np.ndarray) -> sparse.csr_matrix:
+    """Symmetric matrix of link weights 1/length^2, which make it a Laplacian on scattered points.
+
+    Args:
+        links: pairs of linked points, shape ``(L, 2)``.
+        points: positions [m], shape ``(P, 3)``.
+
+    Returns:
+        Matrix of shape ``(P, P)``.
+    """
+    first, second = links.T
+    weight = 1.0 / np.maximum(np.sum((points[first] - points[second]) ** 2, axis=1), 1e-8)
+    rows, columns = np.concatenate([first, second]), np.concatenate([second, first])
+    return sparse.csr_matrix((np.concatenate([weight, weight]), (rows, columns)), shape=(len(points),) * 2)
+
+
+def fill(links: np.ndarray, points: np.ndarray, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Extend ``values`` from the known points to the others by solving Laplace's equation on the graph.
+
+    Weighted averages of neighbours obey a maximum principle: weights stay in [0, 1] and keep their sum. Parts of
+    the graph without a known point keep the values they came with.
+
+    Args:
+        links: pairs of linked points, shape ``(L, 2)``.
+        points: positions [m], shape ``(P, 3)``.
+        values: values at the known points and a first guess elsewhere, shape ``(P, K)``.
+        known: which points are known, shape ``(P,)`` bool.
+
+    Returns:
+        Values, shape ``(P, K)`` float64.
+    """
+    graph = adjacency(links, points)
+    count, part = connected_components(graph, directed=False)
+    anchored = np.zeros(count, dtype=bool)
+    anchored[part[known]] = True
+    free = ~known & anchored[part]
+    filled = np.array(values, dtype=np.float64)
+    if free.any():
+        laplacian = sparse.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph
+        inner = laplacian.tocsr()[free]
+        filled[free] = _conjugate_gradient(inner[:, free], -(inner[:, ~free] @ filled[~free]), filled[free])
+    return filled
+
+
+def _conjugate_gradient(matrix: sparse.csr_matrix, right: np.ndarray, guess: np.ndarray) -> np.ndarray:
+    """Conjugate gradients with a diagonal preconditioner, all columns at once; deterministic."""
+    inverse_diagonal = 1.0 / matrix.diagonal()[:, None]
+    solution = guess.copy()
+    residual = right - matrix @ solution
+    direction = z = inverse_diagonal * residual
+    energy = np.sum(residual * z, axis=0)
+    limit = TOLERANCE * max(np.linalg.norm(right), 1e-12)
+    for _ in range(MAX_ITERATIONS):
+        if np.linalg.norm(residual) <= limit:
+            break
+        image = matrix @ direction
+        # a column that is already solved has a zero direction: leave it where it is
+        step = energy / np.maximum(np.sum(direction * image, axis=0), 1e-300)
+        solution += step * direction
+        residual -= step * image
+        z = inverse_diagonal * residual
+        new_energy = np.sum(residual * z, axis=0)
+        direction = z + (new_energy / np.maximum(energy, 1e-300)) * direction
+        energy = new_energy
+    return solution
+
+
+def volume_ratios(links: np.ndarray, rest: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Local volume change of a smooth map, from the least-squares gradient over each point's links.
+
+    Args:
+        links: pairs of linked points, shape ``(L, 2)``.
+        rest: positions before [m], shape ``(P, 3)``.
+        moved: positions after [m], shape ``(P, 3)``.
+
+    Returns:
+        Determinants of the gradient, kept within [0.1, 10], shape ``(P,)``.
+    """
+    both = np.concatenate([links, links[:, ::-1]])
+    edge = rest[both[:, 1]] - rest[both[:, 0]]
+    change = (moved - rest)[both[:, 1]] - (moved - rest)[both[:, 0]]
+    weight = 1.0 / np.maximum(np.sum(edge**2, axis=1), 1e-8)
+    spread, shear = np.zeros((len(rest), 3, 3)), np.zeros((len(rest), 3, 3))
+    np.add.at(spread, both[:, 0], np.einsum("l,li,lj->lij", weight, edge, edge))
+    np.add.at(shear, both[:, 0], np.einsum("l,li,lj->lij", weight, change, edge))
+    # Regularised, so that a point with few neighbours falls back to no change rather than to noise.
+    gradient = np.eye(3) + shear @ np.linalg.inv(spread + 0.1 * np.eye(3))
+    return np.clip(np.linalg.det(gradient), 0.1, 10.0)
+
+
+SPACING_PER_DX = 0.57  # lattice spacing over grid spacing: about 5 particles a cell
+SUBDIVISIONS = 3  # points per axis and cell that decide how much of it is inside
+MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
+LINK_LENGTH = 1.8  # of a link between neighbouring particles, over the spacing
+SHELL = 0.75  # depth of the particles that simply follow the skin, over the spacing
+INSET = 0.05  # depth of a particle that a change of shape would leave outside, over the spacing
+MIN_WEIGHT = 0.01  # smaller skinning weights are dropped
+BONE_CLEARANCE = 0.45  # flesh particles nearer than this to a bone particle are left out, over the spacing
+BONE_RING = 4  # bone particles on each ring, besides the one on the axis
+BONE_RADIUS = 0.5  # of a ring, over the depth of its centre below the skin
+BONE_RADIUS_LIMITS = (0.003, 0.045)  # [m]
+BONE_RANGE = (0.18, 0.82)  # part of the bone that carries rings
+MIN_BONE_PARTICLES = 18
+#: Where bones with several children point; bones without any point to the middle of their flesh.
+MAIN_CHILD = {"pelvis": "spine1", "spine3": "neck"}
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleSet:
+    """The particles of an asset; their number does not depend on its shape. Arrays are read-only.
+
+    Attributes:
+        spacing: lattice spacing [m].
+        rest_positions: positions in the mean shape's rest pose [m], shape ``(P, 3)`` float32.
+        volumes: volumes [m^3], their sum is the skin's volume, shape ``(P,)`` float32.
+        skin_joints: joints that move each particle, shape ``(P, 4)`` int32.
+        skin_weights: their weights, descending, rows sum to one, shape ``(P, 4)`` float32.
+        bone: the joint a bone particle belongs to, -1 for flesh, shape ``(P,)`` int32.
+        links: pairs of neighbouring particles of the same limb, shape ``(L, 2)`` int32.
+        anchor_vertices: corners of the skin triangle nearest to each particle, shape ``(P, 3)`` int32.
+        anchor_weights: barycentric coordinates of the nearest point in it, shape ``(P, 3)`` float32.
+        shell: particles that follow their nearest skin point when the shape changes, shape ``(P,)`` bool.
+        depth: below the skin of the mean shape [m], shape ``(P,)`` float32.
+    """
+
+    spacing: float
+    rest_positions: np.ndarray
+    volumes: np.ndarray
+    skin_joints: np.ndarray
+    skin_weights: np.ndarray
+    bone: np.ndarray
+    links: np.ndarray
+    anchor_vertices: np.ndarray
+    anchor_weights: np.ndarray
+    shell: np.ndarray
+    depth: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rest_positions)
+
+
+def spacing_for(dx: float) -> float:
+    """Lattice spacing [m] that suits a grid of spacing ``dx`` [m]."""
+    return SPACING_PER_DX * dx
+
+
+@lru_cache(maxsize=16)
+def sample_particles(asset: AvatarAsset, spacing: float, seed: int = 0, bone_rings: int = 4) -> ParticleSet:
+    """Fill the mean shape of an asset with particles; the same on every call and machine.
+
+    Args:
+        asset: the body.
+        spacing: lattice spacing [m]; see :func:`spacing_for`.
+        seed: shifts the lattice in y and z. Not in x, where it stays as symmetric as the body.
+        bone_rings: rings of five bone particles along every bone.
+
+    Raises:
+        ValueError: the spacing is not positive or above 8 cm, too few rings, or a bone outside the skin.
+    """
+    if not 0.0 < spacing <= 0.08:
+        raise ValueError(f"spacing={spacing} m is outside (0, 0.08]; coarser would lose hands and feet")
+    if bone_rings < 4:
+        raise ValueError(f"bone_rings={bone_rings} gives under {MIN_BONE_PARTICLES} particles a bone; use 4 or more")
+    skin = ClosedSurface(asset.vertices, asset.faces)
+    flesh, interior = _flesh_lattice(asset, skin, spacing, seed)
+    bones, bone_of = _bone_lattice(asset, skin, bone_rings)
+    flesh = flesh[cKDTree(bones).query(flesh)[0] > BONE_CLEARANCE * spacing]
+    positions = np.concatenate([bones, flesh]).astype(np.float32)
+    bone = np.concatenate([bone_of, np.full(len(flesh), -1)]).astype(np.int32)
+    order = order_along_curve(positions, spacing)
+    positions, bone = positions[order], bone[order]
+    distance, face, coordinates = skin.query(positions)
+    anchors = asset.faces[face]
+    surface = np.einsum("pc,pcj->pj", coordinates, dense_weights(asset.skin_joints, asset.skin_weights)[anchors])
+    links = _links(positions, -distance, surface, skin, spacing)
+    surface[bone >= 0] = np.eye(NUM_JOINTS)[bone[bone >= 0]]
+    shell = distance > -SHELL * spacing
+    weights = fill(links, positions, surface, shell | (bone >= 0))
+    skin_joints, skin_weights = top_weights(_local(weights))
+    volumes = _volumes(positions, bone, interior, mesh_volume(asset.vertices, asset.faces))
+    depth = np.maximum(-distance, 0.0)
+    order = order_of_body(positions, bone, skin_joints, skin_weights)
+    links = np.argsort(order).astype(np.int32)[links]
+    first = (positions, volumes, skin_joints, skin_weights, bone)
+    rest = (anchors, coordinates, shell, depth)
+    arrays = (*(a[order] for a in first), links, *(a[order] for a in rest))
+    for array in arrays:
+        array.setflags(write=False)
+    return ParticleSet(float(spacing), *arrays)
+
+
+def morph(asset: AvatarAsset, particles: ParticleSet, body: ShapedBody) -> tuple[np.ndarray, np.ndarray]:
+    """Move the particles of the mean shape into another shape of the same asset.
+
+    Particles near the skin follow their nearest skin point; the interior follows smoothly. Volumes change with the
+    local stretch and add up to the shape's volume.
+
+    Args:
+        asset: the body the particles were sampled from.
+        particles: its particles.
+        body: the shape, from :meth:`AvatarAsset.shape`.
+
+    Returns:
+        Rest positions [m] ``(P, 3)`` and volumes [m^3] ``(P,)``, both float32.
+    """
+    corners = particles.anchor_vertices
+    displacement = (body.vertices - asset.vertices).astype(np.float64)[corners]
+    guess = np.einsum("pc,pci->pi", particles.anchor_weights, displacement)
+    rest = particles.rest_positions.astype(np.float64)
+    moved = rest + fill(particles.links, rest, guess, particles.shell)
+    skin = ClosedSurface(body.vertices, asset.faces)
+    moved = _pushed_inside(moved, skin, asset.faces, body, INSET * particles.spacing)
+    volumes = particles.volumes * volume_ratios(particles.links, rest, moved)
+    volumes *= mesh_volume(body.vertices, asset.faces) / volumes.sum()
+    return moved.astype(np.float32), volumes.astype(np.float32)
+
+
+def _flesh_lattice(asset: AvatarAsset, skin: ClosedSurface, spacing: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Flesh particles ``(N, 3)`` and the finer lattice of interior points that measures volumes ``(M, 3)``."""
+    low, high = asset.vertices.min(axis=0), asset.vertices.max(axis=0)
+    shift = np.random.default_rng(seed).uniform(0.0, spacing, 3) * [0.0, 1.0, 1.0]
+    first = np.floor((low - shift) / spacing).astype(int)
+    counts = np.ceil((high - shift) / spacing).astype(int) - first
+    cells = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, 3)
+    centres = (cells + first + 0.5) * spacing + shift
+    distance = skin.distance(centres)
+    near = distance < 0.5 * np.sqrt(3.0) * spacing
+    centres, distance = centres[near], distance[near]
+    steps = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS - 0.5
+    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * spacing
+    fine = centres[:, None, :] + offsets
+    inside = np.repeat(distance[:, None] < 0.0, len(offsets), axis=1)
+    # A point nearer to the centre than the skin is on the centre's side: only the others need a query.
+    unsure = np.abs(distance)[:, None] <= np.linalg.norm(offsets, axis=1)
+    inside[unsure] = skin.distance(fine[unsure]) < 0.0
+    keep = inside.mean(axis=1) >= MIN_FILL
+    share = inside[keep] / inside[keep].sum(axis=1, keepdims=True)
+    flesh = np.einsum("nk,nki->ni", share, fine[keep])
+    # The centroid of a cell that the skin cuts twice may lie in the gap: take the nearest interior point instead.
+    outside = skin.distance(flesh) > -0.02 * spacing
+    gap = np.linalg.norm(fine[keep][outside] - flesh[outside][:, None], axis=-1)
+    gap[~inside[keep][outside]] = np.inf
+    flesh[outside] = fine[keep][outside][np.arange(outside.sum()), gap.argmin(axis=1)]
+    return flesh, fine[inside]
+
+
+def _bone_ends(asset: AvatarAsset, skin: ClosedSurface) -> np.ndarray:
+    """Where every bone points from its joint [m], shape ``(22, 3)``: the next joint, or the middle of its flesh."""
+    ends = np.empty((NUM_JOINTS, 3))
+    for joint, name in enumerate(JOINT_NAMES):
+        children = [child for child in range(NUM_JOINTS) if PARENTS[child] == joint]
+        if children:
+            ends[joint] = asset.joints[joint_index(MAIN_CHILD.get(name, JOINT_NAMES[children[0]]))]
+            continue
+        own = asset.vertices[asset.skin_joints[:, 0] == joint]
+        low, high = own.min(axis=0), own.max(axis=0)
+        steps = np.stack(np.meshgrid(*[np.arange(0.5, 16.0) / 16.0] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        points = low + steps * (high - low)
+        distance, face, _ = skin.query(points)
+        ends[joint] = points[(distance < 0.0) & (asset.skin_joints[asset.faces[face, 0], 0] == joint)].mean(axis=0)
+    return ends
+
+
+def _bone_lattice(asset: AvatarAsset, skin: ClosedSurface, rings: int) -> tuple[np.ndarray, np.ndarray]:
+    """Bone particles ``(B, 3)`` and the joint each belongs to ``(B,)``: rings around every bone's axis."""
+    ends = _bone_ends(asset, skin)
+    points = np.empty((NUM_JOINTS, rings * (BONE_RING + 1), 3))
+    angles = 2.0 * np.pi * np.arange(BONE_RING) / BONE_RING
+    for joint, name in enumerate(JOINT_NAMES):
+        start = asset.joints[joint].astype(np.float64)
+        axis = ends[joint] - start
+        centres = start + np.linspace(*BONE_RANGE, rings)[:, None] * axis
+        depth = -skin.distance(centres)
+        if depth.max() <= 0.0:
+            raise ValueError(f"the bone of {name} lies outside the skin by {-depth.max():.3f} m; move its joint inside")
+        # The reference is in the sagittal plane, so that left and right bones get mirrored rings.
+        side = np.cross(axis, [0.0, 1.0, 0.3])
+        side /= np.linalg.norm(side)
+        up = np.cross(axis / np.linalg.norm(axis), side)
+        radius = np.clip(BONE_RADIUS * depth, *BONE_RADIUS_LIMITS)
+        spokes = np.cos(angles)[:, None] * side + np.sin(angles)[:, None] * up
+        ring = centres[:, None, :] + radius[:, None, None] * spokes
+        lattice = np.concatenate([centres, ring.reshape(-1, 3)])
+        for _ in range(8):  # between toes and the like: towards the deepest centre until inside
+            outside = skin.distance(lattice) > 0.0
+            lattice[outside] += 0.4 * (centres[depth.argmax()] - lattice[outside])
+        points[joint] = lattice
+    return points.reshape(-1, 3), np.repeat(np.arange(NUM_JOINTS), points.shape[1])
+
+
+def _links(
+    positions: np.ndarray, depth: np.ndarray, surface: np.ndarray, skin: ClosedSurface, spacing: float
+) -> np.ndarray:
+    """Neighbouring particles ``(L, 2)`` int32, but not across an air gap or between limbs that merely touch.
+
+    Two limbs that touch have an air gap between their particles (the link's middle is outside) or skin weights
+    without a joint in common.
+    """
+    links = cKDTree(positions).query_pairs(LINK_LENGTH * spacing, output_type="ndarray")
+    links = links[np.lexsort((links[:, 1], links[:, 0]))]
+    shared = np.minimum(surface[links[:, 0]], surface[links[:, 1]]).sum(axis=1)
+    links = links[shared > 0.0]
+    reach = 0.5 * np.linalg.norm(positions[links[:, 0]] - positions[links[:, 1]], axis=1)
+    inside = depth[links].max(axis=1) > reach  # the ball about the deeper end holds the middle
+    inside[~inside] = skin.distance(positions[links[~inside]].mean(axis=1)) < 0.0
+    return links[inside].astype(np.int32)
+
+
+def _local(weights: np.ndarray) -> np.ndarray:
+    """Weights ``(P, 22)`` without the harmonic functions' faint far ends and without the body's other side.
+
+    A particle that a left joint moves most follows no right joint, and the reverse.
+    """
+    side = np.array([name.startswith("left") * 1 - name.startswith("right") * 1 for name in JOINT_NAMES])
+    opposite = side[weights.argmax(axis=1)][:, None] * side[None, :] < 0
+    kept = np.where(opposite | (weights < MIN_WEIGHT), 0.0, weights)
+    return kept / kept.sum(axis=1, keepdims=True)
+
+
+def _volumes(positions: np.ndarray, bone: np.ndarray, interior: np.ndarray, total: float) -> np.ndarray:
+    """Volumes [m^3] ``(P,)`` float32: interior points go to the nearest particle, so nothing is counted twice.
+
+    The particles of one bone share theirs evenly: some are closer together than the interior points.
+    """
+    nearest = cKDTree(positions).query(interior)[1]
+    share = np.bincount(nearest, minlength=len(positions)).astype(np.float64)
+    for joint in range(NUM_JOINTS):
+        share[bone == joint] = share[bone == joint].mean()
+    share = np.maximum(share, 0.25)
+    return (share * (total / share.sum())).astype(np.float32)
+
+
+def _pushed_inside(
+    points: np.ndarray, skin: ClosedSurface, faces: np.ndarray, body: ShapedBody, inset: float
+) -> np.ndarray:
+    """Points ``(P, 3)`` of which none is outside the skin: those that are move to ``inset`` [m] below it."""
+    distance, face, coordinates = skin.query(points)
+    outside = distance > 0.0
+    corners = body.vertices[faces[face[outside]]].astype(np.float64)
+    nearest = np.einsum("pc,pci->pi", coordinates[outside], corners)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    points = points.copy()
+    points[outside] = nearest - inset * normal
+    return points
+
+
+#: The torso, which head, neck and collars belong to, and the limbs that grow out of it.
+LIMB_GROUPS: tuple[str, ...] = ("torso", "left_arm", "right_arm", "left_leg", "right_leg")
+
+#: Skinning weight that each of two groups must have in a particle for it to lie in the seam between them.
+SEAM_WEIGHT = 0.05
+
+
+def limb_group_of_joint() -> np.ndarray:
+    """Index into :data:`LIMB_GROUPS` of every joint, shape ``(22,)`` int32."""
+    group = np.zeros(NUM_JOINTS, dtype=np.int32)
+    for index, name in enumerate(LIMB_GROUPS[1:], start=1):
+        group[[joint_index(joint) for joint in BODY_PARTS[name]]] = index
+    return group
+
+
+def limb_groups(skin_joints: np.ndarray, skin_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The group of every particle, and where two groups grow together.
+
+    Args:
+        skin_joints: joints that move each particle, shape ``(P, K)`` int.
+        skin_weights: their weights, rows sum to one, shape ``(P, K)``.
+
+    Returns:
+        Index into :data:`LIMB_GROUPS` of the group with the largest summed weight (of equals the first), shape
+        ``(P,)`` int32, and the seam, 1 where two groups have :data:`SEAM_WEIGHT` each and else 0, shape ``(P,)``
+        float32.
+    """
+    share = dense_weights(skin_joints, skin_weights) @ np.eye(len(LIMB_GROUPS))[limb_group_of_joint()]
+    second = np.sort(share, axis=1)[:, -2]
+    return share.argmax(axis=1).astype(np.int32), (second >= SEAM_WEIGHT).astype(np.float32)

@@ -1,0 +1,320 @@
+"""Which bones move a particle, and by which weights: its skinning in sixteen bytes.
+
+Weights add up to one, so that of the first nothing is stored. What a body's particles are skinned to is the same in all
+environments, but every pass of every body reads it.
+
+Everything that particles blend over their bones in a substep, in one record a bone.
+
+A particle is moved by up to four bones, of each of which it needs 42 numbers. On a GPU the record of a bone is read in
+eleven loads of 16 bytes, which are what a particle's drive takes its time for: a bone's step is therefore the turn
+about where it is, which is there anyway, and a translation, not a matrix of its own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.types import Body, vec8, vec12, vec24, vec44
+from piavatar_envs.core.cuda_intrinsics import vector_at
+from piavatar_envs.mpm.types import row
+
+wp.set_module_options({"enable_backward": False})
+
+
+#: Snippet that reads what particle ``p`` is skinned to: the ``weights`` of four bones, zeros last, and ``joint(n)``.
+READ = """
+#if defined(__CUDA_ARCH__)
+const float4 packed = *reinterpret_cast<const float4*>(&skin.data[p]);
+const wp::float32 other[4] = {packed.x, packed.y, packed.z, packed.w};
+#else
+const wp::float32* const other = &skin.data[p][0];
+#endif
+const wp::float32 weights[4] = {1.0f - other[0] - other[1] - other[2], other[0], other[1], other[2]};
+unsigned bones;
+memcpy(&bones, &other[3], sizeof(bones));
+const auto joint = [&](int n) { return (int)(bones >> 8 * n & 255u); };
+"""
+
+
+def in_order(joints: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bones and weights, both ``(N, 4)``, that sum to one in single precision; by bones, those without weight last.
+
+    Threads that work together mostly blend the same bones, and so they do it in the same round. Fields blended over
+    bones keep momentum if the sums over these have the same weights.
+    """
+    order = np.argsort(np.where(weights > 0.0, joints, NUM_JOINTS), axis=1, kind="stable")
+    joints, weights = (np.take_along_axis(values, order, axis=1) for values in (joints, weights))
+    weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+    weights[:, 0] = 1.0 - weights[:, 1] - weights[:, 2] - weights[:, 3]
+    return joints, weights
+
+
+def pack(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """What :func:`in_order` returns in records of four numbers, ``(N, 4)`` float32: three weights, a byte a bone."""
+    bones = (joints.astype(np.uint32) << (8 * np.arange(4, dtype=np.uint32))).sum(axis=1, dtype=np.uint32)
+    return np.column_stack([weights[:, 1:], bones.view(np.float32)])
+
+
+@wp.func_native(READ + "return wp::vec_t<4, wp::int32>(joint(0), joint(1), joint(2), joint(3));")
+def bones_of(skin: wp.array(dtype=wp.vec4), p: int) -> wp.vec4i:
+    """The bones that move particle ``p``."""
+    ...
+
+
+@wp.func_native(READ + "return wp::vec_t<4, wp::float32>(weights[0], weights[1], weights[2], weights[3]);")
+def weights_of(skin: wp.array(dtype=wp.vec4), p: int) -> wp.vec4:
+    """Their weights."""
+    ...
+
+
+#: Where in a record the parts begin: rows of two matrices 3 x 4 (place, lean), of the turn's rate, 3 x 3, what is to be
+#: added to that of a place to get its velocity, then the rigid motion of the bone: velocity where the pelvis' centre
+#: is, and spin.
+PLACE, LEAN, TURN = wp.constant(0), wp.constant(12), wp.constant(24)
+STEP, VELOCITY, SPIN = wp.constant(33), wp.constant(36), wp.constant(39)
+#: Where in what a particle has blended the parts begin.
+AT_PLACE, AT_LEAN, AT_STEP = wp.constant(0), wp.constant(3), wp.constant(6)
+AT_VELOCITY, AT_SPIN = wp.constant(18), wp.constant(21)
+
+
+@wp.func_native(
+    READ
+    + """
+wp::vec_t<24, wp::float32> sum;
+const auto add = [&](const wp::float32* bone, wp::float32 w) {
+    wp::float32 at[3];
+#pragma unroll
+    for (int i = 0; i < 6; ++i) {  // place and lean
+        const wp::float32* const row = bone + 4 * i;
+        const wp::float32 value = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3];
+        if (i < 3) at[i] = value;
+        sum[i] += w * value;
+    }
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        const wp::float32* const turn = bone + 24 + 3 * i;
+        sum[6 + i] += w * (turn[0] * at[0] + turn[1] * at[1] + turn[2] * at[2] + bone[33 + i]);
+    }
+#pragma unroll
+    for (int i = 0; i < 9; ++i) sum[9 + i] += w * bone[24 + i];
+#pragma unroll
+    for (int i = 0; i < 6; ++i) sum[18 + i] += w * bone[36 + i];
+};
+#if defined(__CUDA_ARCH__)
+const auto* const own = &wp::index(record, e, 0);
+float4 w4 = make_float4(weights[0], weights[1], weights[2], weights[3]);
+// one bone at a time: a thread that read all of them at once would need so many registers that few threads fit
+#pragma unroll 1
+for (int n = 0; n < 4; ++n) {
+    if (w4.x > 0.0f) {
+        const float4* const from = reinterpret_cast<const float4*>(own + (bones & 255u));
+        float4 bone[11];
+#pragma unroll
+        for (int q = 0; q < 11; ++q) bone[q] = from[q];
+        add(reinterpret_cast<const wp::float32*>(bone), w4.x);
+    }
+    bones >>= 8;
+    w4 = make_float4(w4.y, w4.z, w4.w, 0.0f);
+}
+#else
+for (int n = 0; n < 4 && weights[n] > 0.0f; ++n) add(&wp::index(record, e, joint(n))[0], weights[n]);
+#endif
+return sum;
+"""
+)
+def blend_records(
+    record: wp.array2d(dtype=vec44),
+    e: int,
+    skin: wp.array(dtype=wp.vec4),
+    p: int,
+    rest: wp.vec3,
+) -> vec24:
+    """What particle ``p`` blends of its bones' places and velocities at ``rest``, and of the rest of their records."""
+    ...
+
+
+@wp.func
+def blended_vector(s: vec24, first: int):
+    """The vector that begins at ``first`` of what a particle has blended."""
+    return wp.vec3(s[first], s[first + 1], s[first + 2])
+
+
+@wp.func
+def blended_turn(s: vec24):
+    """The blended rate ``(dR - I) / dt`` of a substep's rotation [1/s]."""
+    return wp.mat33(s[9], s[10], s[11], s[12], s[13], s[14], s[15], s[16], s[17])
+
+
+@wp.func
+def blended_velocity(s: vec24, arm: wp.vec3):
+    """Velocity of the bones' blended rigid motion, ``arm`` from the pelvis' centre [m/s]."""
+    return blended_vector(s, AT_VELOCITY) + wp.cross(blended_vector(s, AT_SPIN), arm)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+float4* const to = reinterpret_cast<float4*>(&wp::index(record, e, b));
+#pragma unroll
+for (int q = 0; q < 11; ++q) to[q] = make_float4(value[4 * q], value[4 * q + 1], value[4 * q + 2], value[4 * q + 3]);
+#else
+wp::index(record, e, b) = value;
+#endif
+""")
+def store_record(record: wp.array2d(dtype=vec44), e: int, b: int, value: vec44):
+    """``record[e, b] = value``, 16 bytes at a time."""
+    ...
+
+
+def _blend(length: int, numbers: int) -> str:
+    """A snippet that blends the first ``numbers`` of bones' records of a ``length``, on a GPU four at a time."""
+    return f"""{READ}
+wp::vec_t<{length}, wp::float32> sum;
+#pragma unroll
+for (int n = 0; n < 4; ++n) {{
+    const wp::float32 w = weights[n];
+    if (w <= 0.0f) continue;
+    const auto& bone = record.data[record.shape[1] * e + joint(n)];
+#if defined(__CUDA_ARCH__)
+#pragma unroll
+    for (int c = 0; c < {numbers}; c += 4) {{
+        const float4 four = reinterpret_cast<const float4*>(&bone)[c / 4];
+        const float part[4] = {{four.x, four.y, four.z, four.w}};
+#pragma unroll
+        for (int k = 0; k < 4; ++k)
+            if (c + k < {numbers}) sum[c + k] += w * part[k];
+    }}
+#else
+    for (int c = 0; c < {numbers}; ++c) sum[c] += w * bone[c];
+#endif
+}}
+return sum;
+"""
+
+
+@wp.func_native(_blend(8, 6))
+def blend_changes(record: wp.array2d(dtype=vec8), e: int, skin: wp.array(dtype=wp.vec4), p: int) -> vec8:
+    """``sum_n weight_n record[e, joint_n]`` of particle ``p``: a rigid motion of each bone."""
+    ...
+
+
+@wp.func_native(_blend(12, 12))
+def blend_steps(record: wp.array2d(dtype=vec12), e: int, skin: wp.array(dtype=wp.vec4), p: int) -> vec12:
+    """:func:`blend_changes` of twelve numbers: two rigid motions of each bone."""
+    ...
+
+
+def _blend_rows(add: str) -> str:
+    """A snippet that adds to a vector what there is of ``row`` ``i`` of a bone's place, which counts by ``w``."""
+    return f"""{READ}
+wp::vec3 sum;
+#pragma unroll
+for (int n = 0; n < 4; ++n) {{
+    const wp::float32 w = weights[n];
+    if (w <= 0.0f) continue;
+    const auto& bone = place.data[place.shape[1] * e + joint(n)];
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {{
+#if defined(__CUDA_ARCH__)
+        const float4 four = reinterpret_cast<const float4*>(&bone)[i];
+        const wp::float32 row[4] = {{four.x, four.y, four.z, four.w}};
+#else
+        const auto& row = bone.data[i];
+#endif
+        {add}
+    }}
+}}
+return sum;
+"""
+
+
+@wp.func_native(_blend_rows("sum[i] += w * (row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3]);"))
+def blend_places(
+    place: wp.array2d(dtype=wp.mat44),
+    e: int,
+    skin: wp.array(dtype=wp.vec4),
+    p: int,
+    rest: wp.vec3,
+) -> wp.vec3:
+    """``sum_n weight_n place[e, joint_n] (rest, 1)`` of particle ``p``: linear blend skinning."""
+    ...
+
+
+@wp.func_native(_blend_rows("for (int c = 0; c < 3; ++c) sum[c] += w * row[c] * way[i];"))
+def blend_back(
+    place: wp.array2d(dtype=wp.mat44),
+    e: int,
+    skin: wp.array(dtype=wp.vec4),
+    p: int,
+    way: wp.vec3,
+) -> wp.vec3:
+    """``sum_n weight_n R_n^T way``, ``R_n`` the turns of ``place[e, joint_n]``: a way in the frame of the rest pose."""
+    ...
+
+
+@wp.func_native(
+    READ
+    + """
+wp::vec_t<12, wp::float32> sum;
+#pragma unroll
+for (int n = 0; n < 4; ++n) {
+    const wp::float32 w = weights[n];
+    if (w <= 0.0f) continue;
+    const auto& bone = place.data[place.shape[1] * e + joint(n)];
+    const auto& own = motion.data[motion.shape[1] * e + joint(n)];
+    wp::float32 image[3];
+#if defined(__CUDA_ARCH__)
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        const float4 row = reinterpret_cast<const float4*>(&bone)[i];
+        image[i] = row.x * rest[0] + row.y * rest[1] + row.z * rest[2] + row.w;
+    }
+    const float4* const from = reinterpret_cast<const float4*>(&own);
+    const float4 a = from[0], b = from[1];
+    const wp::float32 v[3] = {a.x, a.y, a.z}, s[3] = {a.w, b.x, b.y};
+#else
+    for (int i = 0; i < 3; ++i) {
+        const auto& row = bone.data[i];
+        image[i] = row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3];
+    }
+    const wp::float32 v[3] = {own[0], own[1], own[2]}, s[3] = {own[3], own[4], own[5]};
+#endif
+#pragma unroll
+    for (int i = 0; i < 3; ++i) {
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
+        sum[i] += w * v[i];
+        sum[3 + i] += w * s[i];
+        sum[6 + i] += w * image[i];
+        sum[9 + i] += w * (s[j] * image[k] - s[k] * image[j]);
+    }
+}
+return sum;
+"""
+)
+def blend_images(
+    place: wp.array2d(dtype=wp.mat44),
+    motion: wp.array2d(dtype=vec8),
+    e: int,
+    skin: wp.array(dtype=wp.vec4),
+    p: int,
+    rest: wp.vec3,
+) -> vec12:
+    """Of a motion :func:`blend_changes`; :func:`blend_places`; and what the bones' spins do there.
+
+    Each bone's spin turns its own place of the particle about what places are seen from.
+    """
+    ...
+
+
+@wp.func
+def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int):
+    """Where linear blend skinning has a particle [m]; ``place`` takes bones from rest to where they are."""
+    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+    return blend_places(place, e, body.skin, p, rest)
+
+
+@wp.func
+def motion_at(change: vec8, arm: wp.vec3):
+    """Velocity under a bone's change, or under a blend of them, ``arm`` from where the pelvis' velocity is [m/s]."""
+    return wp.vec3(change[0], change[1], change[2]) + wp.cross(wp.vec3(change[3], change[4], change[5]), arm)

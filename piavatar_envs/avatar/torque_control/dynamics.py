@@ -1,0 +1,793 @@
+"""What velocities of the joints do to bones and particles: the skinning Jacobian ``J``, applied and never stored.
+
+A generalised velocity is that of the pelvis and, for every joint, the angular velocity against its parent in the
+world's axes; see :mod:`piavatar_envs.avatar.torque_control.mass_matrix`. Each bone then has a rigid motion, and a
+particle the blend of those of its bones: at the particle, not at its skinned place, or angular momentum would not be
+kept.
+
+What momentum the joints have to do with: that of the particles as they see it, and that which they must not make.
+
+What turns the joints in a substep: springs, muscles with their limits, tissue that resists; implicit in time.
+
+The impulse of a spring ``K`` and a damper ``D`` over a substep depends on the velocity at its end. The joints know what
+they themselves will change, ``d``; what else will (contact, weight, flesh) is not known yet when they act. It is taken
+to be what it was in the last substep, ``c``, and the impulse is
+
+    dt K e - A (v + d),   v = qdot + c,   A = dt D + dt^2 K.
+
+Without this a limb that is blocked transmits ``M / (M + A)`` of its torque only: its damper resists a motion that
+contact will take away, and a light foot under a strong damper could not push. With it the torque of a blocked limb goes
+to ``K e`` as ``(A / (M + A))^n`` goes to zero, and that of a free one is unchanged.
+
+Muscles have limits. Where the solution asks more of a joint than it has, the joint gives what it has, no longer a
+spring then, and all are solved for once more, so that the others know. (Cutting the impulses alone lets light limbs
+blow up.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.rotation import quat_exp, quat_log, short_of_pi, torque_of_vector
+from piavatar_envs.avatar.skinning import blend_steps, motion_at
+from piavatar_envs.avatar.torque_control.mass_matrix import BONES, I3, NUM_DOF
+from piavatar_envs.avatar.tracking import point_inertia, spin_of, symmetric
+from piavatar_envs.avatar.types import Body, Pose, vec8, vec12, vec16
+from piavatar_envs.core.cuda_intrinsics import (
+    BLOCK,
+    first_particle,
+    meet_threads,
+    over_ancestors,
+    sum_threads16,
+    threads_of_environment,
+    vector_at,
+    vector_from,
+)
+from piavatar_envs.mpm.stores import store_velocities
+from piavatar_envs.mpm.types import Kinematic, group, row
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.func
+def part_of(q: wp.array2d(dtype=float), e: int, first: int):
+    """Three components of a generalised vector."""
+    return wp.vec3(q[e, first], q[e, first + 1], q[e, first + 2])
+
+
+@wp.func
+def set_part(q: wp.array2d(dtype=float), e: int, first: int, v: wp.vec3):
+    """Write three components of a generalised vector."""
+    for i in range(3):
+        q[e, first + i] = v[i]
+
+
+@wp.func
+def joint_alone(position: wp.array2d(dtype=wp.vec3), q: wp.array2d(dtype=float), row: int, e: int, b: int):
+    """Rigid motion that joint ``b`` alone gives to what it carries; the pelvis' place moves with the first one."""
+    w = part_of(q, row, 3 + 3 * b)
+    v = wp.vec3()
+    if b == 0:
+        v = part_of(q, row, 0)
+    else:
+        v = wp.cross(w, position[e, 0] - position[e, b])
+    return vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
+
+
+_ADD = "value[k] += up < 0 ? 0.0f : more;"
+
+
+@wp.func_native(over_ancestors(6, _ADD))
+def add_ancestors6(value: vec8, parent: int, levels: int) -> vec8:
+    """Sum of what the lanes of a warp have, of a bone each, over all from the root to a lane's own; six numbers."""
+    ...
+
+
+@wp.func_native(over_ancestors(3, _ADD))
+def add_ancestors3(value: wp.vec3, parent: int, levels: int) -> wp.vec3:
+    """:func:`add_ancestors6` of a vector."""
+    ...
+
+
+@wp.func
+def spread_motion(
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    q: wp.array2d(dtype=float),
+    row: int,
+    e: int,
+    thread: int,
+    threads: int,
+    # out
+    field: wp.array2d(dtype=vec8),
+):
+    """Rigid motion of every bone under generalised velocity ``q[row]``: velocity where the pelvis joint is, and spin.
+
+    A thread that is alone goes through the bones in their order, parents first. Each lane of a warp has a bone.
+    """
+    meet_threads(threads)
+    if threads == 1:
+        for b in range(BONES):
+            motion = joint_alone(position, q, row, e, b)
+            if b > 0:
+                motion = field[e, body.parent[b]] + motion
+            field[e, b] = motion
+    else:
+        own = wp.min(thread, BONES - 1)
+        whole = add_ancestors6(joint_alone(position, q, row, e, own), body.parent[own], body.levels)
+        if thread < BONES:
+            field[e, own] = whole
+    meet_threads(threads)
+
+
+@wp.func
+def motion_apart(b: vec12):
+    """What bones move a particle by besides the blend of their motions at its place [m/s].
+
+    Of :func:`piavatar_envs.avatar.skinning.blend_images`. Linear blend skinning has a particle where its bones have it
+    in the mean. In a bent joint they have it at places that are centimetres apart, and each turns its own: the mean of
+    that is not what their mean motion does to the mean place. Without it particles would leave their places with every
+    turn. Rigid motion has nothing of it.
+    """
+    return wp.vec3(b[9], b[10], b[11]) - wp.cross(wp.vec3(b[3], b[4], b[5]), wp.vec3(b[6], b[7], b[8]))
+
+
+@wp.func
+def blended_motion(b: vec12, arm: wp.vec3):
+    """The blend of the bones' first motions, ``arm`` from where their velocity is [m/s].
+
+    Of :func:`piavatar_envs.avatar.skinning.blend_images`, or of :func:`piavatar_envs.avatar.skinning.blend_steps`.
+    """
+    return wp.vec3(b[0], b[1], b[2]) + wp.cross(wp.vec3(b[3], b[4], b[5]), arm)
+
+
+@wp.kernel(launch_bounds=(BLOCK, 10))
+def take_over(
+    body: Body,
+    dt: float,
+    x: wp.array2d(dtype=wp.vec3),
+    pelvis: wp.array(dtype=wp.vec3),
+    steps: wp.array2d(dtype=vec12),
+    failure: wp.array(dtype=int),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    driven: Kinematic,
+):
+    """Write ``J qdot`` of the middle of the substep, and leave the physical velocity what it is not of the whole one.
+
+    Particle and bones are half a step on there. Moved by ``J qdot`` of its beginning, a straight way, what turns by
+    ``theta`` in a substep would be ``theta^2 / 2`` further from its axis, of which no stress knows: limbs would swell
+    within seconds. The whole velocity is the physical one and what that lacks, the first of the bones' motions in
+    ``steps``, about where the ``pelvis`` joint begins [m]; the second is that of the joints, about where it is
+    half-way. To that comes what ``vk`` has kept where bones are not alone, see
+    :func:`piavatar_envs.avatar.torque_control.flesh_coupling.attach_flesh`.
+    """
+    i, _ = wp.tid()
+    threads = threads_of_environment(x.shape[0])
+    own = first_particle(i, threads)
+    e = own[0]
+    if failure[e] != 0:
+        return
+    p = own[1]
+    center = pelvis[e]
+    root = steps[e, 0]
+    last = body.count - 1
+    together = body.first + body.alone
+    n = body.first + wp.min(p, last)
+    following = vector_at(x, e, n)
+    following_u = vector_at(u, e, n)
+    following_apart = vector_from(driven.vk, together, e, n)
+    while p < body.count:
+        arm = following - center
+        before = following_u
+        apart = following_apart
+        n = body.first + wp.min(p + threads, last)
+        following = vector_at(x, e, n)
+        following_u = vector_at(u, e, n)
+        following_apart = vector_from(driven.vk, together, e, n)
+        s = blend_steps(steps, e, body.skin, p)
+        whole = before + blended_motion(s, arm)
+        spin = wp.vec3(s[9], s[10], s[11])
+        vk = wp.vec3(s[6], s[7], s[8]) + wp.cross(spin, arm)
+        vk += wp.cross(0.5 * dt * spin, vk - wp.vec3(root[6], root[7], root[8]))
+        store_velocities(u, driven, e, body.first + p, whole - vk, vk + apart, spin, True)
+        p += threads
+
+
+@wp.func
+def next_position(
+    body: Body,
+    dt: float,
+    field: wp.array2d(dtype=vec8),
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    r: int,
+    e: int,
+    b: int,
+):
+    """Where a joint will be from its parent's, which has turned already [m]; the pelvis', in the world."""
+    if b == 0:
+        s = field[e, 0]
+        return position[e, 0] + dt * wp.vec3(s[0], s[1], s[2])
+    a = body.parent[b]
+    return wp.quat_rotate(rotation[e, a], body.rest_joint[r, b] - body.rest_joint[r, a])
+
+
+@wp.func
+def move_joints(
+    body: Body,
+    dt: float,
+    field: wp.array2d(dtype=vec8),
+    e: int,
+    thread: int,
+    threads: int,
+    # in and out
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+):
+    """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together. Threads as above."""
+    meet_threads(threads)
+    r = row(e, body.rest_joint.shape[0])
+    for b in range(thread, BONES, threads):
+        s = field[e, b]
+        rotation[e, b] = wp.normalize(quat_exp(dt * wp.vec3(s[3], s[4], s[5])) * rotation[e, b])
+    meet_threads(threads)
+    if threads == 1:
+        for b in range(BONES):
+            position[e, b] = next_position(body, dt, field, rotation, position, r, e, b)
+            if b > 0:
+                position[e, b] = position[e, body.parent[b]] + position[e, b]
+    else:
+        own = wp.min(thread, BONES - 1)
+        step = next_position(body, dt, field, rotation, position, r, e, own)
+        place = add_ancestors3(step, body.parent[own], body.levels)
+        if thread < BONES:
+            position[e, own] = place
+    meet_threads(threads)
+
+
+@wp.func
+def add_change(
+    change: wp.array2d(dtype=float),
+    row: int,
+    e: int,
+    thread: int,
+    threads: int,
+    # in and out
+    q: wp.array2d(dtype=float),
+    outside: wp.array2d(dtype=float),
+):
+    """What the particles did to the joints: it was not the joints' own doing."""
+    meet_threads(threads)
+    for i in range(thread, NUM_DOF, threads):
+        q[e, i] = q[e, i] + change[row, i]
+        outside[e, i] = outside[e, i] + change[row, i]
+
+
+@wp.func
+def go_on(
+    change: wp.array2d(dtype=float),
+    outside: wp.array2d(dtype=float),
+    own: int,
+    row: int,
+    e: int,
+    thread: int,
+    threads: int,
+    # in and out
+    q: wp.array2d(dtype=float),
+    taken: wp.array2d(dtype=float),
+):
+    """The velocity that joints will have if all else does again what it did; what particles lack without it.
+
+    The joints' own ``change`` is in row ``own``; what was ``taken`` of the particles before is in ``row``, where what
+    they lack of their whole velocity comes.
+    """
+    meet_threads(threads)
+    for i in range(thread, NUM_DOF, threads):
+        after = q[e, i] + change[own, i] + outside[e, i]
+        q[e, i] = after
+        taken[row, i] = after - taken[row, i] - outside[e, i]
+
+
+# A lane of a warp has one of the 28 numbers, so that all of a chunk's are asked for at once, of a few chunks ahead.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+const int lane = threadIdx.x & 31;
+constexpr int LANES = 32;
+#else
+constexpr int lane = 0, LANES = 1;
+#endif
+constexpr int AHEAD = 8;
+const int chunks = chunk_bone.shape[0], last = bones.shape[1];
+for (int word = lane; word < 28; word += LANES) {
+    const int vector = word < 16 ? 0 : word < 22 ? 1 : 2, row = vector == 0 ? own : vector == 1 ? taken : off;
+    const int component = word >= 16 ? (word - 16) % 6 : word >= 13 ? word - 10 : word >= 4 && word < 7 ? word - 4 : -1;
+    wp::vec3* const momenta = component < 3 ? &wp::index(linear, row, 0) : &wp::index(angular, row, 0);
+    float* const to = component < 0 ? nullptr : reinterpret_cast<float*>(momenta) + component % 3;
+    const int words = word < 16 ? 16 : 12;
+    const float* const from = word < 16 ? reinterpret_cast<const float*>(&wp::index(moments, e, 0)) + word
+                                        : reinterpret_cast<const float*>(&wp::index(other_moments, e, 0)) + word - 16;
+    float* const whole = reinterpret_cast<float*>(&wp::index(bones, e, 0)) + word;
+    float sum = 0.0f, next[AHEAD];
+    int bone = 0, next_bone[AHEAD];
+    const auto ask = [&](int first) {
+#pragma unroll
+        for (int n = 0; n < AHEAD; ++n) {
+            const int c = first + n;
+            next[n] = c < chunks ? from[words * c] : 0.0f;
+            next_bone[n] = c < chunks ? chunk_bone.data[c] : last;
+        }
+    };
+    ask(0);
+    for (int first = 0; bone < last; first += AHEAD) {
+        float value[AHEAD];
+        int of[AHEAD];
+#pragma unroll
+        for (int n = 0; n < AHEAD; ++n) value[n] = next[n], of[n] = next_bone[n];
+        ask(first + AHEAD);
+#pragma unroll
+        for (int n = 0; n < AHEAD; ++n) {
+            for (; bone < of[n]; ++bone) {
+                if (to) to[3 * bone] = sum;
+                if (word < 16) whole[16 * bone] = sum;
+                sum = 0.0f;
+            }
+            sum += value[n];
+        }
+    }
+}
+""")
+def gather_sums(
+    chunk_bone: wp.array(dtype=int),
+    moments: wp.array2d(dtype=vec16),
+    other_moments: wp.array2d(dtype=vec12),
+    e: int,
+    own: int,
+    taken: int,
+    off: int,
+    bones: wp.array2d(dtype=vec16),
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+):
+    """Moments of the ``bones`` about their joints from those of their chunks, and their momenta of three velocities.
+
+    These are in row ``own`` of the velocity that the moments are of, in ``taken`` and in ``off`` of the other two.
+    """
+    ...
+
+
+@wp.func
+def take_child(
+    position: wp.array2d(dtype=wp.vec3),
+    e: int,
+    row: int,
+    a: int,
+    b: int,
+    # in and out
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+):
+    """Add the momenta of bone ``b`` and all beyond to those of ``a``, which it hangs on."""
+    arm = position[e, b] - position[e, a]
+    angular[row, a] = angular[row, a] + angular[row, b] + wp.cross(arm, linear[row, b])
+    linear[row, a] = linear[row, a] + linear[row, b]
+
+
+# Each lane of a warp has a bone. Level by level, bones take what their children have for them, a child at a time.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+constexpr unsigned ALL = 0xffffffffu;
+constexpr int VECTORS = 3;
+const int bones = parent.shape[0], lane = threadIdx.x & 31, own = min(lane, bones - 1);
+const int above = max(parent.data[own], 0);
+const int depth = lane < bones ? depths.data[own] : -1, below = lane < bones ? children.data[own] : 0;
+const wp::vec3 arm = wp::index(position, e, own) - wp::index(position, e, above);
+float sum[VECTORS][6];
+#pragma unroll
+for (int v = 0; v < VECTORS; ++v)
+#pragma unroll
+    for (int c = 0; c < 3; ++c) {
+        sum[v][c] = wp::index(linear, first + v * step, own)[c];
+        sum[v][3 + c] = wp::index(angular, first + v * step, own)[c];
+    }
+#pragma unroll 1
+for (int level = levels - 2; level >= 0; --level) {
+    float given[VECTORS][6];
+#pragma unroll
+    for (int v = 0; v < VECTORS; ++v)
+#pragma unroll
+        for (int c = 0; c < 3; ++c) {
+            const int i = (c + 1) % 3, j = (c + 2) % 3;
+            given[v][c] = sum[v][c];
+            given[v][3 + c] = sum[v][3 + c] + arm[i] * sum[v][j] - arm[j] * sum[v][i];
+        }
+    int left = depth == level ? below : 0;
+#pragma unroll 1
+    while (__any_sync(ALL, left != 0)) {
+        const int from = left != 0 ? 31 - __clz(left) : lane;
+        const float share = left != 0 ? 1.0f : 0.0f;
+        left &= ~(1 << from);
+#pragma unroll
+        for (int v = 0; v < VECTORS; ++v)
+#pragma unroll
+            for (int c = 0; c < 6; ++c) sum[v][c] += share * __shfl_sync(ALL, given[v][c], from);
+    }
+}
+__syncwarp();
+#pragma unroll
+for (int v = 0; v < VECTORS; ++v)
+#pragma unroll
+    for (int c = 0; c < 3; ++c) {
+        if (lane < bones) wp::index(momentum, first + v * step, 3 + 3 * own + c) = sum[v][3 + c];
+        if (lane == 0) wp::index(momentum, first + v * step, c) = sum[v][c];
+    }
+#endif
+""")
+def pass_down_together(
+    parent: wp.array(dtype=int),
+    depths: wp.array(dtype=int),
+    children: wp.array(dtype=int),
+    levels: int,
+    position: wp.array2d(dtype=wp.vec3),
+    e: int,
+    first: int,
+    step: int,
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+    momentum: wp.array2d(dtype=float),
+):
+    """:func:`pass_down` of three velocities by a warp."""
+    ...
+
+
+@wp.func
+def pass_down(
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    e: int,
+    velocities: int,
+    own: int,
+    step: int,
+    threads: int,
+    # in and out
+    linear: wp.array2d(dtype=wp.vec3),
+    angular: wp.array2d(dtype=wp.vec3),
+    # out
+    momentum: wp.array2d(dtype=float),
+):
+    """``J^T m u`` from the momenta of the bones about their joints: each joint has what all beyond it have.
+
+    Of so many velocities, a warp of three, the first in row ``own``, others ``step`` rows apart.
+    """
+    meet_threads(threads)
+    if threads > 1:
+        pass_down_together(
+            body.parent, body.depth, body.children, body.levels, position, e, own, step, linear, angular, momentum
+        )  # fmt: skip
+    else:
+        for v in range(velocities):
+            row = own + v * step
+            for back in range(BONES - 1):
+                b = BONES - 1 - back  # children come after their parents
+                take_child(position, e, row, body.parent[b], b, linear, angular)
+            for b in range(BONES):
+                set_part(momentum, row, 3 + 3 * b, angular[row, b])
+            set_part(momentum, row, 0, linear[row, 0])
+
+
+@wp.func
+def balance(
+    position: wp.array2d(dtype=wp.vec3),
+    bones: wp.array2d(dtype=vec16),
+    reaction: float,
+    support: wp.vec3,
+    moment: wp.vec3,
+    field: wp.array2d(dtype=vec8),
+    e: int,
+    row: int,
+    thread: int,
+    threads: int,
+    # in and out
+    change: wp.array2d(dtype=float),
+):
+    """Give ``change[row]`` of the joints' velocities, that moves bones as ``field``, the momentum that it must have.
+
+    That is ``support``, an impulse, and its ``moment`` about the pelvis joint, and with ``reaction`` 1 what the bones'
+    sums say. A rigid motion of the body makes up the difference. The blend of the bones' motions has the momenta of the
+    bones' own sums, because weights add up to one.
+    """
+    m = float(0.0)
+    first = wp.vec3()
+    I = wp.mat33()
+    P = wp.vec3()
+    L = wp.vec3()
+    for b in range(thread, BONES, threads):
+        s = bones[e, b]
+        arm = position[e, b] - position[e, 0]
+        d = wp.vec3(s[1], s[2], s[3])  # first moment about the joint, as are the others
+        w = wp.vec3(field[e, b][3], field[e, b][4], field[e, b][5])
+        v = motion_at(field[e, b], arm)  # at the joint
+        second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
+        inertia = wp.diag(wp.vec3(wp.trace(second))) - second
+        p = s[0] * v + wp.cross(w, d) - reaction * wp.vec3(s[4], s[5], s[6])
+        P += p
+        L += wp.cross(d, v) + inertia * w - reaction * wp.vec3(s[13], s[14], s[15]) + wp.cross(arm, p)
+        m += s[0]
+        first += d + s[0] * arm
+        I += inertia + point_inertia(s[0], arm)
+        I += 2.0 * wp.dot(d, arm) * I3 - wp.outer(d, arm) - wp.outer(arm, d)
+    # fmt: off
+    t = sum_threads16(
+        vec16(
+            m, first[0], first[1], first[2], P[0], P[1], P[2], L[0], L[1], L[2],
+            I[0, 0], I[1, 1], I[2, 2], I[1, 2], I[2, 0], I[0, 1],
+        ),
+        threads,
+    )
+    # fmt: on
+    if thread > 0:
+        return
+    center = wp.vec3(t[1], t[2], t[3]) / t[0]
+    P = wp.vec3(t[4], t[5], t[6]) - support
+    L = wp.vec3(t[7], t[8], t[9]) - moment
+    I = symmetric(wp.vec3(t[10], t[11], t[12]), wp.vec3(t[13], t[14], t[15]))
+    W = spin_of(I - point_inertia(t[0], center), L - wp.cross(center, P))
+    V = P / t[0] - wp.cross(W, center)
+    for i in range(3):
+        change[row, i] = change[row, i] - V[i]
+        change[row, 3 + i] = change[row, 3 + i] - W[i]
+
+
+#: What limits nothing.
+UNBOUNDED = 1.0e30
+#: Inertia of a joint that does not move: much more than any body has [kg m^2].
+LOCK = 1.0e6
+#: Damping of a joint at the end of its range, over the stiffness of that end [s].
+STOP_TIME = wp.constant(0.03)
+
+
+@wp.struct
+class Springs:
+    """Springs and dampers: of the pelvis' place, then of all joints, ``(1 or num_envs, 1 + bones)``.
+
+    Those of the pelvis, ``[:, :2]``, act from outside: a body that nobody holds has none. Those of the others are
+    muscles, which have their limits.
+    """
+
+    stiffness: wp.array2d(dtype=float)  # [N/m], then [N m/rad]
+    damping: wp.array2d(dtype=float)  # [N s/m], then [N m s/rad]
+
+
+@wp.struct
+class Target:
+    """Where springs pull to, and torques besides; ``(num_envs, bones)`` and ``(num_envs,)``."""
+
+    rotation: wp.array2d(dtype=wp.quat)  # local; of the pelvis in the world
+    root: wp.array(dtype=wp.vec3)  # of the pelvis joint [m]
+    torque: wp.array2d(dtype=wp.vec3)  # about the axes of the rest pose, as the parent has turned them [N m]
+    factor: wp.array(dtype=float)  # (1 or num_envs,) on the torques [-]
+
+
+@wp.struct
+class Strength:
+    """Greatest torques of the joints about the axes of the rest pose, as the parent has turned them; ``(bones,)``."""
+
+    lower: wp.array(dtype=wp.vec3)  # [N m], not positive
+    upper: wp.array(dtype=wp.vec3)  # [N m], not negative
+    factor: wp.array(dtype=float)  # (1 or num_envs,) on both [-]
+
+
+@wp.struct
+class Tissue:
+    """What resists passively: a little always, much where a joint leaves its range; ``(bones,)``."""
+
+    damping: wp.array(dtype=float)  # [N m s/rad]
+    stop: wp.array(dtype=float)  # stiffness beyond the range [N m/rad]
+    lower: wp.array(dtype=wp.vec3)  # range of the rotation vector relative to the rest pose [rad]
+    upper: wp.array(dtype=wp.vec3)
+    lock: wp.array(dtype=float)  # inertia of what does not move at all, else 0 [kg m^2]
+
+
+def make_strength(lower: np.ndarray, upper: np.ndarray, rows: int, device: str) -> Strength:
+    """Limits of the torques, each ``(22, 3)`` [N m], and a factor of 1 on them in ``rows`` rows."""
+    return group(
+        Strength,
+        lower=wp.array(lower.astype(np.float32), dtype=wp.vec3, device=device),
+        upper=wp.array(upper.astype(np.float32), dtype=wp.vec3, device=device),
+        factor=wp.full(rows, 1.0, dtype=float, device=device),
+    )
+
+
+def make_tissue(
+    damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int], device: str
+) -> Tissue:
+    """What resists passively.
+
+    Args:
+        damping: of all joints, shape ``(22,)`` [N m s/rad].
+        stop: stiffness beyond their ranges, shape ``(22,)`` [N m/rad].
+        lower: of the ranges of the rotation vectors, shape ``(22, 3)`` [rad].
+        upper: likewise.
+        locked: joints that do not move: what they carry belongs to their parents.
+        device: Warp device.
+    """
+    lock = np.zeros(len(damping))
+    lock[list(locked)] = LOCK
+    numbers = {"damping": damping, "stop": stop, "lock": lock}
+    arrays = {name: wp.array(v.astype(np.float32), dtype=float, device=device) for name, v in numbers.items()}
+    for name, bound in (("lower", lower), ("upper", upper)):
+        arrays[name] = wp.array(bound.astype(np.float32), dtype=wp.vec3, device=device)
+    return group(Tissue, **arrays)
+
+
+@wp.func
+def implicit_inertia(dt: float, stiffness: float, damping: float):
+    """``A = dt D + dt^2 K``: what a spring and a damper, implicit in time, add to the mass."""
+    return dt * damping + dt * dt * stiffness
+
+
+@wp.func
+def resistance(tissue: Tissue, stop: float, b: int):
+    """Damping of tissue, with that of the end of the range where the joint is beyond it [N m s/rad]."""
+    return tissue.damping[b] + STOP_TIME * stop
+
+
+@wp.func
+def above(body: Body, rotation: wp.array2d(dtype=wp.quat), e: int, b: int):
+    """Rotation of what a bone hangs on; the pelvis hangs on the world."""
+    if b == 0:
+        return wp.quat(0.0, 0.0, 0.0, 1.0)
+    return rotation[e, body.parent[b]]
+
+
+@wp.func
+def beyond(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
+    """Rotation vector back into the range [rad]; zero within it.
+
+    A corner of the box may be further than half a turn from its middle, where rotation vectors jump and a stop would
+    push on: the range ends before.
+    """
+    v = quat_log(local)
+    return short_of_pi(wp.max(lower, wp.min(v, upper))) - v
+
+
+@wp.func
+def stopping_torque(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
+    """Torque of the end of the range, over its stiffness, in the frame of what the joint hangs on [rad].
+
+    What it takes from a joint, it gives back: it is the gradient of half the square of :func:`beyond`.
+    """
+    return torque_of_vector(quat_log(local), beyond(local, lower, upper))
+
+
+@wp.func
+def implicit_diagonal(
+    body: Body,
+    dt: float,
+    pose: Pose,
+    springs: Springs,
+    tissue: Tissue,
+    e: int,
+    n: int,
+    into: int,
+    # out
+    stop: wp.array2d(dtype=float),
+    diagonal: wp.array2d(dtype=float),
+):
+    """Whether a joint is beyond its range, and ``A`` of muscles and tissue; ``n`` is 0 for the pelvis' place."""
+    r = row(e, springs.stiffness.shape[0])
+    value = implicit_inertia(dt, springs.stiffness[r, n], springs.damping[r, n])
+    if n > 1:
+        b = n - 1
+        local = wp.quat_inverse(pose.rotation[e, body.parent[b]]) * pose.rotation[e, b]
+        stiff = float(0.0)
+        if wp.length(beyond(local, tissue.lower[b], tissue.upper[b])) > 0.0:
+            stiff = tissue.stop[b]
+        stop[e, b] = stiff
+        value += implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) + tissue.lock[b]
+    set_part(diagonal, into, 3 * n, wp.vec3(value))
+
+
+@wp.func
+def joint_impulse(
+    body: Body,
+    dt: float,
+    pose: Pose,
+    target: Target,
+    springs: Springs,
+    tissue: Tissue,
+    stop: wp.array2d(dtype=float),
+    q: wp.array2d(dtype=float),
+    outside: wp.array2d(dtype=float),
+    e: int,
+    n: int,
+    # out
+    muscle: wp.array2d(dtype=float),
+    impulse: wp.array2d(dtype=float),
+):
+    """Impulse of a joint if the joints themselves changed nothing, of muscles and of all.
+
+    A torque of the pelvis, which would come from outside, is not asked for.
+    """
+    r = row(e, springs.stiffness.shape[0])
+    K = springs.stiffness[r, n]
+    v = part_of(q, e, 3 * n) + part_of(outside, e, 3 * n)
+    active = wp.vec3()
+    passive = wp.vec3()
+    if n == 0:
+        active = dt * K * (target.root[e] - pose.position[e, 0])
+    else:
+        b = n - 1
+        frame = above(body, pose.rotation, e, b)
+        local = wp.quat_inverse(frame) * pose.rotation[e, b]
+        push = K * quat_log(target.rotation[e, b] * wp.quat_inverse(local))
+        if b > 0:
+            push += target.factor[row(e, target.factor.shape[0])] * target.torque[e, b]
+            stiff = stop[e, b]
+            passive = dt * stiff * wp.quat_rotate(frame, stopping_torque(local, tissue.lower[b], tissue.upper[b]))
+            passive -= implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) * v
+        active = dt * wp.quat_rotate(frame, push)
+    active -= implicit_inertia(dt, K, springs.damping[r, n]) * v
+    set_part(muscle, e, 3 * n, active)
+    set_part(impulse, e, 3 * n, active + passive)
+
+
+@wp.func
+def limit_torque(
+    body: Body,
+    dt: float,
+    pose: Pose,
+    springs: Springs,
+    strength: Strength,
+    muscle: wp.array2d(dtype=float),
+    rest: float,
+    change: wp.array2d(dtype=float),
+    row_of_change: int,
+    again: bool,
+    e: int,
+    n: int,
+    # in and out
+    impulse: wp.array2d(dtype=float),
+    left: wp.array2d(dtype=float),
+) -> float:
+    """Where a muscle would give more than it has, let it give that, whatever moves: then the answer is 1, else 0.
+
+    ``left`` is ``A``, of which all is ``rest``, without the spring that was cut. Who asks ``again`` leaves those as
+    they are that have been.
+    """
+    limited = float(0.0)
+    r = row(e, springs.stiffness.shape[0])
+    A = implicit_inertia(dt, springs.stiffness[r, n], springs.damping[r, n])
+    if again and (left[e, 3 * n] != rest or A == 0.0):
+        return limited
+    if n > 1:
+        before = part_of(muscle, e, 3 * n)
+        frame = above(body, pose.rotation, e, n - 1)
+        limit = dt * strength.factor[row(e, strength.factor.shape[0])]
+        own = wp.quat_rotate_inv(frame, before - A * part_of(change, row_of_change, 3 * n))
+        cut = wp.max(limit * strength.lower[n - 1], wp.min(own, limit * strength.upper[n - 1]))
+        if wp.length_sq(cut - own) > 0.0:
+            rest -= A
+            limited = 1.0
+            set_part(impulse, e, 3 * n, part_of(impulse, e, 3 * n) - before + wp.quat_rotate(frame, cut))
+    set_part(left, e, 3 * n, wp.vec3(rest))
+    return limited
+
+
+@wp.func
+def find_given(
+    left: wp.array2d(dtype=float),
+    change: wp.array2d(dtype=float),
+    row_of_change: int,
+    e: int,
+    thread: int,
+    threads: int,
+    # in and out
+    impulse: wp.array2d(dtype=float),
+):
+    """The impulses that joints and pelvis really get, implicit as they are."""
+    for i in range(thread, NUM_DOF, threads):
+        impulse[e, i] = impulse[e, i] - left[e, i] * change[row_of_change, i]

@@ -1,0 +1,170 @@
+"""What holds flesh to bones that move under torques; see :mod:`piavatar_envs.avatar.torque_control.controller`."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.critical_damping import implicit_velocity
+from piavatar_envs.avatar.part_sums import (
+    PART_BLOCK,
+    Parts,
+    bring_particle,
+    place_in_parts,
+    room_of_particles,
+    store_second,
+    sum_chunk,
+)
+from piavatar_envs.avatar.segment_sums import quarters_at_once, share_of
+from piavatar_envs.avatar.skinning import blend_back, blend_images, skinned_place
+from piavatar_envs.avatar.torque_control.dynamics import blended_motion, motion_apart
+from piavatar_envs.avatar.torque_control.workspace import JointBench
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.cuda_intrinsics import (
+    ask_ahead,
+    environment_of,
+    int_at,
+    lane_of_warp,
+    meet,
+    number_at,
+    set_vector,
+    threads_of_block,
+    vector_at,
+    warp_of_block,
+)
+from piavatar_envs.mpm.colliders import signed_distance
+from piavatar_envs.mpm.types import Boundaries, Grid, matrix_at, row, store_matrix
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.func
+def pulled_rest(body: Body, e: int, p: int, w: JointBench):
+    """What of the rest pose a particle is pulled to [m]: its own place; a firm one beyond, by what it was put back."""
+    rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
+    if p < w.slip.shape[1]:
+        rest += vector_at(w.slip, e, p)
+    return rest
+
+
+@wp.func
+def sum_part(parts: Parts, room: wp.uint64, pelvis: wp.vec3, e: int, part: int, w: JointBench):
+    """Sums of the chunks of the part in the room, where places are seen from the ``pelvis``."""
+    warp = warp_of_block()
+    lane = lane_of_warp()
+    quarters = quarters_at_once(lane[1])
+    n = int_at(parts.start, part) + quarters * warp[0]
+    end = int_at(parts.start, part + 1)
+    while n < end:
+        share = share_of(parts.quarters, n, lane[0])
+        origin = vector_at(w.pose.position, e, share[1] & 255) - pelvis
+        sum_chunk(parts, room, share, origin, e, w.moments, w.other_moments)
+        n += quarters * warp[1]
+
+
+@wp.kernel(launch_bounds=(PART_BLOCK, 4))
+def attach_flesh(
+    body: Body,
+    parts: Parts,
+    dt: float,
+    mass: wp.array2d(dtype=float),
+    x: wp.array2d(dtype=wp.vec3),
+    rate: wp.array2d(dtype=float),
+    failure: wp.array(dtype=int),
+    scratch: wp.array(dtype=float),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    w: JointBench,
+):
+    """Hand back, and pull every particle to its place on the bones, implicit in time and critically damped.
+
+    What a new pose has changed of ``J qdot`` goes to the physical velocity; what the bones move a particle by besides,
+    :func:`piavatar_envs.avatar.torque_control.dynamics.motion_apart`, stays in ``vk``, as it is now, but where a bone
+    is alone, which has none of it. ``rate`` is the pull's [1/s]; one of 0 leaves a velocity exactly as it is. Of what
+    the pull has taken of the velocity, of what it leaves, and of the way to the particles' places, the bones get the
+    moments.
+
+    Over ``(num_envs, parts, PART_BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
+    """
+    i, j, k = wp.tid()
+    at = place_in_parts(i, j, k, x.shape[0])
+    e = at[0]
+    if failure[e] != 0:
+        return
+    thread = at[2]
+    threads = threads_of_block()
+    room = room_of_particles(scratch)
+    first = at[1] * parts.size
+    last = wp.min(first + parts.size, body.count)
+    r = row(e, mass.shape[0])
+    p = first + thread
+    pelvis = vector_at(w.pose.position, e, 0)
+    ask_ahead(x, e, body.first + first, last - first, thread)
+    ask_ahead(u, e, body.first + first, last - first, thread)
+    ask_ahead(vk, e, body.first + first, last - first, thread)
+    while p < last:
+        n = body.first + p
+        arm = vector_at(x, e, n) - pelvis
+        v = vector_at(u, e, n) + vector_at(vk, e, n)
+        m = number_at(mass, r, n)  # asked for before anything is stored, which it would wait for
+        own_rate = number_at(rate, row(e, rate.shape[0]), p)
+        now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, e, p, w))
+        apart = wp.vec3()
+        if p >= body.alone:
+            apart = motion_apart(now)
+            set_vector(vk, e, n, apart)
+        before = v - blended_motion(now, arm) - apart
+        way = wp.vec3(now[6], now[7], now[8]) - arm
+        after = implicit_velocity(own_rate, dt, way, before)
+        bring_particle(room, parts.size, p - first, m, arm, before - after, after, way)
+        p += threads
+    meet()
+    store_second(room, last - first, thread, threads, e, body.first + first, u)
+    sum_part(parts, room, pelvis, e, at[1], w)
+
+
+@wp.func
+def keep_outside(boundaries: Boundaries, e: int, x: wp.vec3):
+    """The place ``x`` [m], or the nearest one on the surface that it lies beyond, in the order of the boundaries."""
+    for b in range(boundaries.count):
+        d = signed_distance(boundaries, e, b, x)
+        x = x - wp.min(d[3], 0.0) * wp.vec3(d[0], d[1], d[2])
+    return x
+
+
+@wp.kernel
+def put_in_place(
+    body: Body,
+    grid: Grid,
+    boundaries: Boundaries,
+    firm: wp.array(dtype=int),
+    place: wp.array2d(dtype=wp.mat44),
+    position: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    # in and out
+    x: wp.array2d(dtype=wp.vec3),
+    C: wp.array3d(dtype=float),
+    slip: wp.array2d(dtype=wp.vec3),
+):
+    """Put the ``firm`` particles where their bones have them, though not beyond boundaries; over ``E * firm ones``.
+
+    No particle's velocity ``v`` changes. What a way of ``d`` gives of angular momentum, ``m d x v``, the affine
+    velocity takes back: the grid gets ``m (dx^2/4) eps C`` of it (Jiang et al. 2015, quadratic weights). The ``slip``
+    remembers the way, in the frame of the rest pose.
+    """
+    own = environment_of(wp.tid(), firm.shape[0])
+    e = own[0]
+    if failure[e] != 0:
+        return
+    p = firm[own[1]]
+    q = body.first + p
+    at = keep_outside(boundaries, e, vector_at(position, e, 0) + skinned_place(body, place, e, p))
+    way = at - vector_at(x, e, q)
+    spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, vector_at(u, e, q) + vector_at(vk, e, q))
+    affine = matrix_at(C, e, q) - wp.skew(spin)
+    slipped = vector_at(slip, e, p) + blend_back(place, e, body.skin, p, way)
+    set_vector(x, e, q, at)  # not before all has been asked for
+    set_vector(slip, e, p, slipped)
+    store_matrix(C, e, q, affine)

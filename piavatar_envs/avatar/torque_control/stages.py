@@ -1,0 +1,330 @@
+"""What the joints of an environment do between two passes over its particles, in a launch each.
+
+On a GPU an environment has a CUDA block, so that nothing is launched for what one warp does in a few microseconds: four
+warps build the mass matrix, two a factor each; one does all else. On a CPU it is one thread.
+
+There are three of what particles ask of the joints, for flesh that is pulled, for what the joints take over, and for
+how far flesh is from its places, and two factors of the mass matrix, with locked joints alone and with all that is
+implicit. Those of a kind are in one array: the first of all environments, then the second, then the third.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.rotation import rigid_matrix
+from piavatar_envs.avatar.torque_control.bone_contact import PARTS, Ground, measure_bones, stop_bones, tell_sensors
+from piavatar_envs.avatar.torque_control.dynamics import (
+    Springs,
+    Strength,
+    Target,
+    Tissue,
+    add_change,
+    balance,
+    find_given,
+    gather_sums,
+    go_on,
+    implicit_diagonal,
+    joint_impulse,
+    limit_torque,
+    move_joints,
+    part_of,
+    pass_down,
+    spread_motion,
+)
+from piavatar_envs.avatar.torque_control.mass_matrix import BONES, PLACES, Pairs, compose_mass, room_of_records
+from piavatar_envs.avatar.torque_control.tree_cholesky import (
+    ROOM,
+    factorize,
+    factorize_in_room,
+    fetch_factor,
+    keep_factor,
+    place_of_factor,
+    solve,
+    solve_three_in_place,
+    store_room,
+)
+from piavatar_envs.avatar.torque_control.workspace import (
+    JointBench,
+    bring_places,
+    enter_room,
+    keep_motion,
+    leave_room,
+    room_of_warp,
+    row_in_room,
+    see_vectors,
+)
+from piavatar_envs.avatar.types import Body, vec8
+from piavatar_envs.core.cuda_intrinsics import meet, meet_threads, place_in_block, sum_threads
+from piavatar_envs.mpm.types import row
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+WARP = wp.constant(32)
+#: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
+MASS_BLOCK = wp.constant(128)
+_ROOM = wp.constant(ROOM)
+#: How often joints are solved for anew, at most, with more muscles at their limits: who gives less changes the others.
+MOST_CUTS = wp.constant(4)
+#: Share of what the pose is off the particles that one fit takes away. Those of a fast, light joint (a head, a hand)
+#: are not where it has them for other reasons, too: to follow them at once throws it about.
+FIT_SHARE = 0.2
+_FIT_SHARE = wp.constant(FIT_SHARE)
+
+
+@wp.struct
+class Support:
+    """What the springs of the pelvis do to the body, summed over substeps; ``(num_envs,)``."""
+
+    force: wp.array(dtype=wp.vec3)  # [N], if the sum is over a control step that has begun with zero
+    torque: wp.array(dtype=wp.vec3)  # [N m]
+
+
+@wp.func
+def place_bones(body: Body, e: int, thread: int, threads: int, w: JointBench):
+    """Matrices that take the bones from rest to where they are, seen from the pelvis joint."""
+    r = row(e, body.rest_joint.shape[0])
+    pelvis = w.pose.position[e, 0]
+    for b in range(thread, BONES, threads):
+        w.place[e, b] = rigid_matrix(w.pose.rotation[e, b], body.rest_joint[r, b], w.pose.position[e, b] - pelvis)
+
+
+@wp.func
+def begin(body: Body, e: int, thread: int, threads: int, w: JointBench):
+    """Motion and places of the bones, as passes over particles read them."""
+    spread_motion(body, w.pose.position, w.velocity, e, e, thread, threads, w.moving)
+    place_bones(body, e, thread, threads, w)
+
+
+@wp.func
+def find_shares(
+    body: Body, own: int, step: int, rows: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench
+):
+    """The shares ``dq = M^-1 J^T m v`` that the joints can take of so many velocities, from the bones' momenta.
+
+    Of the first they are in row ``own``, of others ``step`` rows apart.
+    """
+    pass_down(body, w.pose.position, e, rows, own, step, threads, w.linear, w.angular, w.shares)
+    fetch_factor(w.factors, e, room)
+    solve_three_in_place(w.pattern, w.factors, e, own, step, threads, room, w.shares)
+
+
+@wp.func
+def move_on(body: Body, dt: float, move: int, off: int, e: int, thread: int, threads: int, w: JointBench):
+    """Move the pose on by half a substep, first and second of the moves; by the third, fit it to the particles.
+
+    That is by a share of ``dq = M^-1 J^T m way``, the way from particles to their places. It is in row ``off``, of the
+    beginning of the substep: on the way from there to here particles have gone on with the joints. One piece of graph
+    for all moves is a third of what must be fetched, instruction by instruction.
+    """
+    time = 0.5 * dt
+    if move < 2:
+        spread_motion(body, w.pose.position, w.velocity, e, e, thread, threads, w.moving)
+    else:
+        time = -_FIT_SHARE
+        spread_motion(body, w.pose.position, w.shares, off, e, thread, threads, w.moving)
+    if move == 1:
+        keep_motion(w.moving, e, 6, thread, threads, w.steps)
+    move_joints(body, time, w.moving, e, thread, threads, w.pose.rotation, w.pose.position)
+
+
+@wp.func
+def pull_bones(body: Body, own: int, e: int, thread: int, threads: int, w: JointBench):
+    """The joints get what the pull of the flesh has taken from the particles, with exactly its momentum."""
+    spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
+    none = wp.vec3(0.0)
+    balance(w.pose.position, w.bones, 1.0, none, none, w.moving, e, own, thread, threads, w.shares)
+    add_change(w.shares, own, e, thread, threads, w.velocity, w.outside)
+
+
+@wp.func
+def limit_joints(
+    body: Body,
+    dt: float,
+    springs: Springs,
+    strength: Strength,
+    driven: int,
+    own: int,
+    again: bool,
+    e: int,
+    thread: int,
+    threads: int,
+    w: JointBench,
+) -> float:
+    """Let muscles give no more than they have by share ``own``, and tell all threads how many would, or ``again``."""
+    limited = float(0.0)
+    for k in range(thread, PARTS, threads):
+        rest = w.diagonals[driven, 3 * k]
+        limited += limit_torque(
+            body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, again, e, k, w.impulse, w.left
+        )  # fmt: skip
+    meet_threads(threads)
+    return sum_threads(limited, threads)
+
+
+@wp.func
+def turn_joints(
+    body: Body,
+    dt: float,
+    target: Target,
+    springs: Springs,
+    tissue: Tissue,
+    strength: Strength,
+    ground: Ground,
+    driven: int,
+    own: int,
+    e: int,
+    thread: int,
+    threads: int,
+    room: wp.uint64,
+    w: JointBench,
+):
+    """Springs, torques, tissue and what bones meet change the velocity of the joints, by share ``own``.
+
+    ``driven`` is the factor of the mass matrix with all that is implicit.
+    """
+    meet_threads(threads)
+    for k in range(thread, PARTS, threads):
+        joint_impulse(
+            body, dt, w.pose, target, springs, tissue, w.stop, w.velocity, w.outside, e, k, w.muscle, w.impulse
+        )
+    fetch_factor(w.factors, driven, room)
+    factor = int(driven)
+    met = vec8()
+    cuts = int(0)
+    while factor >= 0:  # once more where muscles reach their limits, by the same piece of the graph
+        solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, room, w.shares)
+        met = stop_bones(body, ground, dt, own, factor, e, thread, threads, room, w)
+        if cuts == MOST_CUTS:
+            break
+        if limit_joints(body, dt, springs, strength, driven, own, cuts > 0, e, thread, threads, w) == 0.0:
+            break
+        cuts += 1
+        factor = w.factors.shape[0] - 1
+        factorize(w.pattern, w.matrix, w.left, e, e, room, factor, w.factors)
+    find_given(w.left, w.shares, own, e, thread, threads, w.impulse)
+    spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
+    support = part_of(w.impulse, e, 0) + wp.vec3(met[0], met[1], met[2])
+    moment = part_of(w.impulse, e, 3) + wp.vec3(met[3], met[4], met[5])
+    if thread == 0:
+        tell_sensors(body, ground, met, e, w.pose.position[e, 0])
+    balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, own, thread, threads, w.shares)
+
+
+@wp.kernel(launch_bounds=(int(MASS_BLOCK), 8))
+def build_mass(
+    body: Body,
+    pairs: Pairs,
+    dt: float,
+    springs: Springs,
+    tissue: Tissue,
+    failure: wp.array(dtype=int),
+    # in and out
+    w: JointBench,
+):
+    """The mass matrix where the bones' moments are, and its factors.
+
+    Over ``(num_envs, MASS_BLOCK)``; a CUDA block has one.
+    """
+    i, _ = wp.tid()
+    at = place_in_block(i, MASS_BLOCK)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
+    if failure[e] != 0:
+        return
+    n = failure.shape[0]
+    for k in range(thread, PARTS, threads):
+        implicit_diagonal(body, dt, w.pose, springs, tissue, e, k, n + e, w.stop, w.diagonals)
+    records = room_of_records(w.records, 0)
+    bring_places(w.pose.position, e, thread, threads, records, PLACES)
+    position = see_vectors(w.pose.position, records, PLACES, 0)
+    mass = place_of_factor(w.matrix, e, records)
+    compose_mass(body, pairs, w.pair_sums, w.moments, position, w.pattern, records, e, thread, threads, mass)
+    store_room(mass, e, thread, threads, w.matrix)
+    meet()
+    lanes = wp.min(threads, WARP)
+    warp = thread // lanes
+    for which in range(warp, 2, threads // lanes):
+        system = which * n + e
+        room = room_of_records(w.records, which * _ROOM)
+        if threads == 1:
+            factorize(w.pattern, w.matrix, w.diagonals, e, system, room, system, w.factors)
+        else:
+            factorize_in_room(w.pattern, w.diagonals, system, room)
+        keep_factor(room, system, w.factors)
+
+
+@wp.kernel
+def begin_substep(
+    body: Body,
+    failure: wp.array(dtype=int),
+    # in and out
+    w: JointBench,
+):
+    """:func:`begin` where something else has moved the joints, or made them another body's.
+
+    Over ``(num_envs, WARP)``, a CUDA block each.
+    """
+    i, _ = wp.tid()
+    at = place_in_block(i, WARP)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
+    if failure[e] == 0:
+        measure_bones(body, e, thread, threads, w)
+        begin(body, e, thread, threads, w)
+
+
+@wp.kernel(launch_bounds=(int(WARP), 16))
+def act(
+    body: Body,
+    dt: float,
+    per_time: float,
+    moves: int,
+    target: Target,
+    springs: Springs,
+    tissue: Tissue,
+    strength: Strength,
+    failure: wp.array(dtype=int),
+    # in and out
+    ground: Ground,
+    support: Support,
+    w: JointBench,
+):
+    """Take over what joints can of two velocities, that of the pull first; let them turn; move the pose on.
+
+    Of three ``moves`` the last fits the pose; else there are two. The next substep begins with bones where they are
+    then. ``per_time`` is the share of an impulse in the support [1/s]. Launched as :func:`begin_substep`.
+    """
+    i, _ = wp.tid()
+    at = place_in_block(i, WARP)
+    e = at[0]
+    thread = at[1]
+    threads = at[2]
+    if failure[e] != 0:
+        return
+    room = room_of_warp()
+    n = failure.shape[0]
+    own = row_in_room(e, 0)
+    taken = row_in_room(n + e, 1)
+    off = row_in_room(2 * n + e, 2)
+    near = enter_room(w, e)
+    gather_sums(
+        body.chunk_bone, w.moments, w.other_moments, e, own, taken, off, near.bones, near.linear, near.angular
+    )  # fmt: skip
+    find_shares(body, own, taken - own, moves, e, thread, threads, room, near)
+    pull_bones(body, own, e, thread, threads, near)
+    add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)
+    turn_joints(body, dt, target, springs, tissue, strength, ground, n + e, own, e, thread, threads, room, near)
+    go_on(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
+    spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.moving)
+    keep_motion(near.moving, e, 0, thread, threads, w.steps)
+    if thread == 0:
+        w.pelvis[e] = near.pose.position[e, 0]
+        support.force[e] = support.force[e] + per_time * part_of(w.impulse, e, 0)
+        support.torque[e] = support.torque[e] + per_time * part_of(w.impulse, e, 3)
+    for move in range(moves):
+        move_on(body, dt, move, off, e, thread, threads, near)
+    begin(body, e, thread, threads, near)
+    leave_room(w, e, near)

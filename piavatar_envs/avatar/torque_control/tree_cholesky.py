@@ -1,0 +1,581 @@
+"""Cholesky factors of small sparse matrices, one an environment, and what is solved with them.
+
+On a GPU a factor is in the room of a warp, in shared memory: each row needs the one before, and would wait for global
+memory every time. A room has :data:`ROOM` words, a factor's and from :data:`SPARE` on those of vectors that are solved
+for. On a CPU a factor is where it is kept, and vectors are where they are wanted.
+
+The matrix is ``L^T L`` with a lower triangle ``L``: rows are eliminated from the last one up. Where rows are joints
+in an order that has children after their parents, limbs go before what they hang on, and of two limbs neither fills
+the rows of the other (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6.5). Which blocks of 3 x 3, the axes
+of two joints, are not zero is found once, on the host.
+
+Matrices and factors are kept as these blocks alone, one after the other, row by row, in a row the diagonal's last; of a
+matrix that one is whole. In a factor it is its inverse, ``L_kk^-1``, lower, which is all that solutions ask for. On a
+GPU a warp works on a factor in a ``room`` in shared memory, on a CPU one thread does where factors are kept: the same
+graph, :mod:`piavatar_envs.avatar.torque_control.tree_cholesky`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.core.cuda_intrinsics import lane_of_warp, meet_threads
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+#: Rows of the largest matrix that there is room for: as many as an avatar has. 16 warps have room in a multiprocessor,
+#: so that those of 2,048 environments are all at work at once.
+MOST_ROWS = 69
+_JOINTS = MOST_ROWS // 3
+#: Words of shared memory of a warp: all blocks that a factor may have, and three vectors, four words a joint.
+SPARE = 9 * _JOINTS * (_JOINTS + 1) // 2
+ROOM = SPARE + 3 * 4 * _JOINTS
+_ROOM = """
+float* const room = reinterpret_cast<float*>(at);
+#if defined(__CUDA_ARCH__)
+const int lane = threadIdx.x & 31;
+constexpr int LANES = 32;
+const auto meet = [] { __syncwarp(); };
+const auto over_root = [](float x) { return rsqrtf(x); };
+#else
+constexpr int lane = 0, LANES = 1;
+const auto meet = [] {};
+const auto over_root = [](float x) { return 1.0f / sqrtf(x); };
+#endif
+"""
+
+
+# A warp that is alone takes four cycles for an instruction, and hundreds for what it does not find in the first-level
+# cache, of graph or data. Places come in bytes, therefore, what is done in a round is asked for two rounds ahead,
+# from lists that end in two rounds of nothing, and all is read before anything is written, which it might be.
+# Of a row all lanes find the inverse of the diagonal's block, a lane a column of the others. Then a lane has two of its
+# blocks, whose product is to be taken from a third.
+@wp.func_native(
+    _ROOM
+    + """
+#if defined(__CUDA_ARCH__)
+using Step = int4;
+#else
+struct Step { int x, y, z, w; };
+#endif
+struct Block { float number[9]; };
+const Step* const all_steps = reinterpret_cast<const Step*>(steps.data);
+const auto at_byte = [&](int n) { return reinterpret_cast<float*>(reinterpret_cast<char*>(room) + n); };
+const int column = 9 * (lane / 3) + lane % 3;
+const auto block_at = [](const float* from) {
+    Block block;
+#pragma unroll
+    for (int c = 0; c < 9; ++c) block.number[c] = from[c];
+    return block;
+};
+const auto take = [&](const float* row, int word, const Block& before) {
+    const Block first = block_at(row + (word >> 8 & 255)), second = block_at(row + (word & 255));
+    const float* const a = first.number;
+    const float* const b = second.number;
+    float* const to = at_byte(word >> 16);
+#pragma unroll
+    for (int c = 0; c < 9; ++c)
+        to[c] = before.number[c] - a[c / 3] * b[c % 3] - a[3 + c / 3] * b[3 + c % 3] - a[6 + c / 3] * b[6 + c % 3];
+};
+Step now = all_steps[0], next = all_steps[1];
+int word = pair.data[lane], next_word = pair.data[32 + lane];
+#pragma unroll 1
+for (int round = 0; round < steps.shape[0] - 2; ++round) {
+    const Step after = all_steps[round + 2];
+    const int after_word = pair.data[32 * (round + 2) + lane];
+    float* const row = at_byte(now.x);
+#if defined(__CUDA_ARCH__)
+    const Block before = block_at(at_byte(word < 0 ? 0 : word >> 16));  // while the row is found
+#endif
+    if (now.w == 0) {
+        float* const d = at_byte(now.y);
+        const float d0 = d[0], d3 = d[3], d4 = d[4], d6 = d[6], d7 = d[7], d8 = d[8];
+        float* const m = row + column;
+        float m0 = 0.0f, m1 = 0.0f, m2 = 0.0f;
+        if (lane < now.z) m0 = m[0], m1 = m[3], m2 = m[6];
+        const float o2 = over_root(d8), l21 = d7 * o2, l20 = d6 * o2;
+        const float o1 = over_root(d4 - l21 * l21), l10 = (d3 - l21 * l20) * o1;
+        const float o0 = over_root(d0 - l20 * l20 - l10 * l10);
+        const float w10 = -o1 * l10 * o0, w21 = -o2 * l21 * o1, w20 = -o2 * (l20 * o0 + l21 * w10);
+        meet();
+        if (lane == 0) d[0] = o0, d[3] = w10, d[4] = o1, d[6] = w20, d[7] = w21, d[8] = o2;
+        const auto put = [&](float* to, float m0, float m1, float m2) {
+            to[0] = o0 * m0 + w10 * m1 + w20 * m2, to[3] = o1 * m1 + w21 * m2, to[6] = o2 * m2;
+        };
+        if (lane < now.z) put(m, m0, m1, m2);
+#pragma unroll 1
+        for (int n = lane + LANES; n < now.z; n += LANES) {
+            float* const more = row + 9 * (n / 3) + n % 3;
+            put(more, more[0], more[3], more[6]);
+        }
+        meet();
+    }
+#if defined(__CUDA_ARCH__)
+    if (word >= 0) take(row, word, before);
+#else
+    for (const int* own = pair.data + 32 * round; own < pair.data + 32 * (round + 1) && *own >= 0; ++own)
+        take(row, *own, block_at(at_byte(*own >> 16)));
+#endif
+    meet();
+    now = next, next = after, word = next_word, next_word = after_word;
+}
+"""
+)
+def eliminate(steps: wp.array(dtype=wp.vec4i), pair: wp.array(dtype=int), at: wp.uint64):
+    """The factor of the matrix in a room, in its place."""
+    ...
+
+
+@wp.func_native(
+    _ROOM
+    + """
+for (int i = lane; i < diagonal.shape[1]; i += LANES) room[entry.data[i]] += wp::index(diagonal, e, i);
+meet();
+"""
+)
+def add_diagonal(entry: wp.array(dtype=int), diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
+    """Add row ``e`` to the diagonal of the matrix in a room, whose entries are there."""
+    ...
+
+
+@wp.func_native(f"""
+float* const to = reinterpret_cast<float*>(at) + 9 * block;
+if (block < 0) return;
+for (int n = 0; n < 9; ++n) {{
+    to[n] = value.data[n / 3][n % 3];
+#if defined(__CUDA_ARCH__)
+    to[n + {ROOM}] = to[n];
+#endif
+}}
+""")
+def set_in_rooms(at: wp.uint64, block: int, value: wp.mat33):
+    """Write a block, if there is one of that number, to the matrix in a room, and on a GPU to that in the next room."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+float4* const to = reinterpret_cast<float4*>(&wp::index(rows, n, 0));
+for (int k = thread; k < rows.shape[1] / 4; k += threads) to[k] = reinterpret_cast<const float4*>(at)[k];
+#endif
+""")
+def store_room(at: wp.uint64, n: int, thread: int, threads: int, rows: wp.array2d(dtype=float)):
+    """Write what is in a room to row ``n``; on a CPU it is there."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+const float4* const from = reinterpret_cast<const float4*>(&wp::index(rows, n, 0));
+__syncwarp();
+#pragma unroll 10
+for (int k = threadIdx.x & 31; k < rows.shape[1] / 4; k += 32) reinterpret_cast<float4*>(at)[k] = from[k];
+__syncwarp();
+#else
+float* const to = reinterpret_cast<float*>(at);
+if (to != &wp::index(rows, n, 0)) memcpy(to, &wp::index(rows, n, 0), sizeof(float) * rows.shape[1]);
+#endif
+""")
+def load_room(rows: wp.array2d(dtype=float), n: int, at: wp.uint64):
+    """Read row ``n`` into a room."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return room;
+#else
+return reinterpret_cast<wp::uint64>(&wp::index(factor, f, 0));
+#endif
+""")
+def place_of_factor(factor: wp.array2d(dtype=float), f: int, room: wp.uint64) -> wp.uint64:
+    """Where factor ``f`` is worked on: in the room of a warp, or on a CPU in the array itself."""
+    ...
+
+
+# All lanes find the part of a joint, and each takes from one number of another joint what that has of it: on the way
+# down, in the columns of its row, and on the way up, in the rows of its column. What is not in ``wanted`` is passed by.
+_PARTS = (
+    _ROOM
+    + f"""
+constexpr int VECTORS = COUNT, STRIDE = {4 * _JOINTS};
+#if defined(__CUDA_ARCH__)
+float* const spare = room + {SPARE};
+const auto part = [&](int v, int n) {{
+    return reinterpret_cast<float*>(reinterpret_cast<char*>(spare + STRIDE * v) + n);
+}};
+#else
+const auto part = [&](int v, int n) {{ return &wp::index(x, first + v * step, 3 * (n >> 4) + (n >> 2 & 3)); }};
+#endif
+"""
+)
+_SWEEPS = """
+const auto at_byte = [&](int n) { return reinterpret_cast<const float*>(reinterpret_cast<const char*>(room) + n); };
+float y[VECTORS][3];
+const auto take = [&](int word, float m0, float m1, float m2) {
+#pragma unroll
+    for (int v = 0; v < VECTORS; ++v) {
+        float* const other = part(v, word & 1023);
+        *other = *other - m0 * y[v][0] - m1 * y[v][1] - m2 * y[v][2];
+    }
+};
+bool passed = false;
+const auto go = [&](auto way, int& head, int& word, int round) {
+    constexpr int ALONG = decltype(way)::value;
+    if (head >= 0) passed = !(wanted >> (head >> 4 & 63) & 1);
+    if (!passed) {
+#if defined(__CUDA_ARCH__)
+        const float* const m = at_byte(word < 0 ? 0 : word >> 10);  // while the part is found
+        const float m0 = m[0], m1 = m[ALONG], m2 = m[2 * ALONG];
+#endif
+        if (head >= 0) {
+            const float* const w = at_byte(head >> 10);
+            float b[VECTORS][3];
+            const float w0 = w[0], w3 = w[3], w4 = w[4], w6 = w[6], w7 = w[7], w8 = w[8];
+#pragma unroll
+            for (int v = 0; v < VECTORS; ++v)
+                for (int c = 0; c < 3; ++c) b[v][c] = part(v, head & 1023)[c];
+#pragma unroll
+            for (int v = 0; v < VECTORS; ++v) {
+                if (ALONG == 3) {
+                    y[v][0] = w0 * b[v][0] + w3 * b[v][1] + w6 * b[v][2];
+                    y[v][1] = w4 * b[v][1] + w7 * b[v][2];
+                    y[v][2] = w8 * b[v][2];
+                } else {
+                    y[v][0] = w0 * b[v][0];
+                    y[v][1] = w3 * b[v][0] + w4 * b[v][1];
+                    y[v][2] = w6 * b[v][0] + w7 * b[v][1] + w8 * b[v][2];
+                }
+            }
+            meet();
+            if (lane == 0)
+#pragma unroll
+                for (int v = 0; v < VECTORS; ++v)
+                    for (int c = 0; c < 3; ++c) part(v, head & 1023)[c] = y[v][c];
+        }
+#if defined(__CUDA_ARCH__)
+        if (word >= 0) take(word, m0, m1, m2);
+#else
+        for (const int* own = words.data + 32 * round; own < words.data + 32 * (round + 1) && *own >= 0; ++own) {
+            const float* const m = at_byte(*own >> 10);
+            take(*own, m[0], m[ALONG], m[2 * ALONG]);
+        }
+#endif
+    }
+    head = heads.data[round + 2];  // two pieces take turns: a loop that hands such values on would wait for them there
+    word = words.data[32 * (round + 2) + lane];
+    if (!passed) meet();
+};
+const auto sweep = [&](auto way, int begin, int end) {
+    int even = heads.data[begin], odd = heads.data[begin + 1];
+    int even_word = words.data[32 * begin + lane], odd_word = words.data[32 * begin + 32 + lane];
+#pragma unroll 1
+    for (int round = begin; round < end; round += 2) {
+        go(way, even, even_word, round);
+        go(way, odd, odd_word, round + 1);
+    }
+};
+struct Down { enum { value = 3 }; };
+struct Up { enum { value = 1 }; };
+"""
+_DOWN, _UP = "sweep(Down{}, 0, turn);", "sweep(Up{}, turn, heads.shape[0] - 2);"
+_ALL = "constexpr int wanted = -1;"
+_BRING = """
+#if defined(__CUDA_ARCH__)
+const int size = x.shape[1];
+for (int v = 0; v < VECTORS; ++v)
+    for (int n = lane; n < size; n += LANES) spare[STRIDE * v + n + n / 3] = wp::index(x, first + v * step, n);
+meet();
+#endif
+"""
+_KEEP = """
+#if defined(__CUDA_ARCH__)
+for (int v = 0; v < VECTORS; ++v)
+    for (int n = lane; n < size; n += LANES) wp::index(x, first + v * step, n) = spare[STRIDE * v + n + n / 3];
+meet();
+#endif
+"""
+_SOLVE = _ALL + _PARTS + _BRING + _SWEEPS + _DOWN + _UP + _KEEP
+
+
+@wp.func_native(_SOLVE.replace("COUNT", "1"))
+def solve_one(
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
+    x: wp.array2d(dtype=float),
+):  # fmt: skip
+    """Row ``first`` of what is solved with the factor in a room; it has the right-hand side at first."""
+    ...
+
+
+@wp.func_native(_SOLVE.replace("COUNT", "3"))
+def solve_three(
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
+    x: wp.array2d(dtype=float),
+):  # fmt: skip
+    """:func:`solve_one` of three rows, a ``step`` from one to the next."""
+    ...
+
+
+@wp.func_native((_PARTS + _SWEEPS + _DOWN).replace("COUNT", "3"))
+def descend_three(
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
+    wanted: int, x: wp.array2d(dtype=float),
+):  # fmt: skip
+    """``L^-T`` times three vectors that have nothing but in joints whose bits are ``wanted``, as have the answers.
+
+    Of a warp they are in its room, of a thread that is alone in rows of ``x`` as in :func:`solve_three`.
+    """
+    ...
+
+
+@wp.func_native((_ALL + "constexpr int step = 0;" + _PARTS + _SWEEPS + _UP).replace("COUNT", "1"))
+def ascend_one(
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int,
+    x: wp.array2d(dtype=float),
+):  # fmt: skip
+    """``L^-1`` times the first of the vectors of :func:`descend_three`, in its place."""
+    ...
+
+
+@wp.struct
+class Pattern:
+    """Blocks of ``L`` that need not be zero, and what the lanes of a warp do with them, in rounds.
+
+    All rounds of a kind are followed by two of nothing, for they are asked for ahead. A lane's word is -1 where it does
+    nothing.
+    """
+
+    block: wp.array(dtype=int)  # (joints * joints,) of two joints, -1 where there is none
+    entry: wp.array(dtype=int)  # (rows,) numbers of the diagonal's entries
+    # (rounds,) of the elimination of a row: bytes to its first block, bytes to that of the diagonal, columns before
+    # that, and 1 where the round goes on with the row before it
+    step: wp.array(dtype=wp.vec4i)
+    # (rounds * 32,) a block that changes by the product of two of the row: 2^16 times the bytes to it, 2^8 times the
+    # numbers from the row's first block to the first, those to the second
+    pair: wp.array(dtype=int)
+    # (rounds,) of a solution: 2^10 times the bytes to the diagonal's block, and to the joint's part of a vector that
+    # has sixteen a joint; -1 where the round goes on with the joint before it
+    head: wp.array(dtype=int)
+    # (rounds * 32,) which part of the vector changes, in bytes, and 2^10 times those to the first of three numbers
+    word: wp.array(dtype=int)
+    turn: int  # rounds on the way down, an even number; those on the way up are as well
+    reach: wp.array(dtype=int)  # (joints,) bits of the joints to which what is in one comes on the way down
+
+
+#: Lanes of a warp, which a round has work for, and the bytes of a number and of a block.
+LANES, NUMBER, BLOCK = 32, 4, 36
+
+
+def in_rounds(words: np.ndarray) -> np.ndarray:
+    """The same in whole rounds, one at least."""
+    return np.pad(words, (0, max(LANES, -(-len(words) // LANES) * LANES) - len(words)), constant_values=-1)
+
+
+def find_pattern(filled: np.ndarray, device: str) -> Pattern:
+    """Where ``L`` has entries, by elimination, from where the matrix has: ``filled``, shape ``(N, N)`` bool.
+
+    Raises:
+        ValueError: it is not made of filled and empty blocks of 3 x 3, or has too many rows.
+    """
+    filled = filled | filled.T
+    joints = filled[::3, ::3].copy()
+    if len(filled) > MOST_ROWS or not np.array_equal(np.kron(joints, np.ones((3, 3), bool)), filled):
+        raise ValueError(f"filled has shape {filled.shape}, expected at most {MOST_ROWS} rows, in blocks of 3 x 3")
+    for k in reversed(range(len(joints))):
+        found = np.flatnonzero(joints[k, :k])
+        joints[np.ix_(found, found)] = True
+    row, column = np.nonzero(np.tril(joints))
+    block = np.full(joints.shape, -1)
+    block[row, column] = np.arange(len(row))
+    steps, pairs = plan_elimination(block)
+    heads, words, turn = plan_solution(block)
+    entries = 9 * np.diag(block)[:, None] + np.array([0, 4, 8])
+    lists = {"block": block.ravel(), "entry": entries.ravel(), "pair": pairs, "head": heads, "word": words}
+    lists["reach"] = plan_reach(block)
+    pattern = Pattern()
+    for name, numbers in lists.items():
+        setattr(pattern, name, wp.array(numbers.astype(np.int32), dtype=int, device=device))
+    pattern.step, pattern.turn = wp.array(steps.astype(np.int32), dtype=wp.vec4i, device=device), turn
+    return pattern
+
+
+def plan_elimination(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and pairs of :class:`Pattern`, from the ``block`` of every two joints."""
+    steps, pairs = [], []
+    for k in reversed(range(len(block))):
+        own = np.flatnonzero(block[k, :k] >= 0)
+        i, j = np.nonzero(np.tri(len(own), dtype=bool))
+        pairs.append(in_rounds(BLOCK * block[own[i], own[j]] << 16 | 9 * i << 8 | 9 * j))
+        first = BLOCK * (block[k, k] - len(own))
+        steps += [(first, BLOCK * block[k, k], 3 * len(own), n > 0) for n in range(len(pairs[-1]) // LANES)]
+    return np.array(steps + 2 * [(0, 0, 0, 1)]), np.concatenate([*pairs, np.full(2 * LANES, -1)])
+
+
+def plan_solution(block: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Heads, words and turn of :class:`Pattern`, from the ``block`` of every two joints."""
+    count, axis, heads, words, turn = len(block), np.arange(3), [], [], 0
+    for up in (False, True):
+        turn = len(heads)  # even
+        for k in range(count) if up else reversed(range(count)):
+            blocks = block[:, k] if up else block[k]
+            others = np.flatnonzero((blocks >= 0) & (np.arange(count) != k))
+            numbers = BLOCK * blocks[others][:, None] + NUMBER * (3 if up else 1) * axis
+            words.append(in_rounds((numbers << 10 | 16 * others[:, None] + NUMBER * axis).ravel()))
+            heads += [BLOCK * block[k, k] << 10 | 16 * k] + [-1] * (len(words[-1]) // LANES - 1)
+        nothing = (2 if up else 0) + len(heads) % 2
+        heads += nothing * [-1]
+        words.append(np.full(nothing * LANES, -1))
+    return np.array(heads), np.concatenate(words), turn
+
+
+def plan_reach(block: np.ndarray) -> np.ndarray:
+    """``reach`` of :class:`Pattern`, from the ``block`` of every two joints."""
+    reach = 1 << np.arange(len(block))
+    for k, own in enumerate(block):
+        reach[k] |= np.bitwise_or.reduce(reach[:k][own[:k] >= 0], initial=0)
+    return reach
+
+
+def factor_size(pattern: Pattern) -> int:
+    """Numbers of a matrix or a factor, in whole records of four."""
+    return -(-9 * (1 + int(pattern.block.numpy().max())) // 4) * 4
+
+
+def lower_entries(pattern: Pattern) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows and columns of the entries of the lower triangle that are kept, and which numbers they are."""
+    row, column = np.nonzero(np.tril(pattern.block.numpy().reshape(2 * [pattern.entry.shape[0] // 3]) >= 0))
+    axis = np.arange(9)
+    i, j = (3 * row[:, None] + axis // 3).ravel(), (3 * column[:, None] + axis % 3).ravel()
+    return i[i >= j], j[i >= j], np.flatnonzero(i >= j)
+
+
+def pack(pattern: Pattern, matrices: np.ndarray) -> np.ndarray:
+    """Symmetric matrices ``(n, N, N)`` as they are kept, ``(n, factor_size)`` float32."""
+    rows, columns, numbers = lower_entries(pattern)
+    packed = np.zeros((len(matrices), factor_size(pattern)), np.float32)
+    packed[:, numbers] = matrices[:, rows, columns]
+    return packed
+
+
+@wp.func
+def factorize(
+    pattern: Pattern,
+    matrix: wp.array2d(dtype=float),
+    diagonal: wp.array2d(dtype=float),
+    source: int,
+    e: int,
+    room: wp.uint64,
+    f: int,
+    # out
+    factor: wp.array2d(dtype=float),
+):
+    """``L`` of ``L^T L = matrix + diag(diagonal)``, of matrix ``source`` and row ``e`` of the ``diagonal``.
+
+    ``matrix`` is ``(num_envs, factor_size)``. A thread that is alone writes factor ``f`` of as many numbers; a warp has
+    it in its room, from where :func:`keep_factor` writes it.
+    """
+    at = place_of_factor(factor, f, room)
+    load_room(matrix, source, at)
+    factorize_in_room(pattern, diagonal, e, at)
+
+
+@wp.func
+def factorize_in_room(pattern: Pattern, diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
+    """:func:`factorize` of the matrix that is there."""
+    add_diagonal(pattern.entry, diagonal, e, at)
+    eliminate(pattern.step, pattern.pair, at)
+
+
+@wp.func
+def keep_factor(room: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
+    """Write factor ``f``, which :func:`factorize` has just found, where it has not done so itself."""
+    lane = lane_of_warp()
+    store_room(room, f, lane[0], lane[1], factor)
+    meet_threads(lane[1])  # the room is free
+
+
+@wp.func
+def fetch_factor(factor: wp.array2d(dtype=float), f: int, room: wp.uint64):
+    """Let a warp solve with factor ``f`` from here on."""
+    load_room(factor, f, place_of_factor(factor, f, room))
+
+
+@wp.func
+def solve(
+    pattern: Pattern,
+    factor: wp.array2d(dtype=float),
+    f: int,
+    right: wp.array2d(dtype=float),
+    e: int,
+    row: int,
+    thread: int,
+    threads: int,
+    room: wp.uint64,
+    # out
+    x: wp.array2d(dtype=float),
+):
+    """``x[row]`` with ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its room."""
+    meet_threads(threads)
+    for i in range(thread, x.shape[1], threads):
+        x[row, i] = right[e, i]
+    meet_threads(threads)
+    solve_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), row, 0, x)
+
+
+@wp.func
+def solve_three_in_place(
+    pattern: Pattern,
+    factor: wp.array2d(dtype=float),
+    f: int,
+    first: int,
+    step: int,
+    threads: int,
+    room: wp.uint64,
+    # in and out
+    x: wp.array2d(dtype=float),
+):
+    """:func:`solve` of three right-hand sides in ``x``, the ``first`` and others ``step`` rows apart."""
+    meet_threads(threads)
+    solve_three(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), first, step, x)
+
+
+@wp.func
+def begin_solution(
+    pattern: Pattern,
+    factor: wp.array2d(dtype=float),
+    f: int,
+    wanted: int,
+    first: int,
+    step: int,
+    threads: int,
+    room: wp.uint64,
+    # in and out
+    x: wp.array2d(dtype=float),
+):
+    """``Y = L^-T B`` of three right-hand sides ``B`` in ``x``, with which ``B^T M^-1 B = Y^T Y``.
+
+    Both have something in joints whose bits are ``wanted`` alone, which is what ``Pattern.reach`` tells; elsewhere
+    nothing is read or written. A warp has them in its room, see
+    :func:`piavatar_envs.avatar.torque_control.workspace.see_columns`.
+    """
+    meet_threads(threads)
+    at = place_of_factor(factor, f, room)
+    descend_three(pattern.head, pattern.word, pattern.turn, at, first, step, wanted, x)
+
+
+@wp.func
+def end_solution(
+    pattern: Pattern,
+    factor: wp.array2d(dtype=float),
+    f: int,
+    first: int,
+    threads: int,
+    room: wp.uint64,
+    # in and out
+    x: wp.array2d(dtype=float),
+):
+    """``L^-1`` times the first of the columns of :func:`begin_solution`."""
+    meet_threads(threads)
+    ascend_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), first, x)

@@ -1,0 +1,223 @@
+"""What the joints of an environment work on. A warp has in shared memory what goes from bone to bone.
+
+In global memory each bone would wait some hundred cycles for the one before.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.torque_control.tree_cholesky import MOST_ROWS, ROOM, SPARE, Pattern
+from piavatar_envs.avatar.types import Pose, vec8, vec12, vec16
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class JointBench:
+    """What the joints work on in a substep; rows are environments', where there are several of a kind times as many."""
+
+    pose: Pose
+    velocity: wp.array2d(dtype=float)  # (num_envs, 69) as in JointState
+    outside: wp.array2d(dtype=float)
+    # the mass matrix
+    pair_sums: wp.array2d(dtype=vec12)  # (num_envs, chunks of pairs)
+    records: wp.array(dtype=vec16)
+    pattern: Pattern
+    matrix: wp.array2d(dtype=float)  # (num_envs, entries)
+    diagonals: wp.array2d(dtype=float)  # (2 num_envs, 69) what factors have besides
+    # (2 num_envs + 1, entries); the last one, where muscles reach their limits, is a CPU's
+    factors: wp.array2d(dtype=float)
+    stop: wp.array2d(dtype=float)  # (num_envs, bones) stiffness beyond the range [N m/rad]
+    # what particles have
+    moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)
+    # (num_envs, chunks) momenta of what the pull leaves, and of the ways to the particles' places, as velocities
+    other_moments: wp.array2d(dtype=vec12)
+    bones: wp.array2d(dtype=vec16)  # (num_envs, bones)
+    linear: wp.array2d(dtype=wp.vec3)  # (3 num_envs, bones)
+    angular: wp.array2d(dtype=wp.vec3)
+    # (3 num_envs, 69) momenta, then changes of the velocity: the joints' own, what is taken over; and of the pose
+    shares: wp.array2d(dtype=float)
+    # (3 num_envs, 69) moments of an impulse on a bone along each axis, and how far they are solved for; a CPU's
+    touch: wp.array2d(dtype=float)
+    whole: wp.array2d(dtype=float)  # (num_envs, 69) velocity of all that acts
+    # (num_envs, bones) boxes that hold the points of bones, in the rest pose: from joints to middles, half extents [m]
+    middle: wp.array2d(dtype=wp.vec3)
+    half: wp.array2d(dtype=wp.vec3)
+    # what the joints do
+    muscle: wp.array2d(dtype=float)  # (num_envs, 69) impulses
+    impulse: wp.array2d(dtype=float)
+    left: wp.array2d(dtype=float)  # (num_envs, 69) diagonal without muscles that have reached their limits
+    # what particles get
+    place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to where bones are, from the pelvis joint
+    moving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion of the joints
+    # (num_envs, bones) what the physical velocity lacks of the whole one, and the joints' motion half-way
+    steps: wp.array2d(dtype=vec12)
+    slip: wp.array2d(dtype=wp.vec3)  # as in JointState
+    pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) where its joint begins the substep [m]
+
+
+# Words of shared memory of a warp: the factor's, which have the bones' momenta until it comes; three shares, the bones'
+# motion, and the pose.
+_ROWS, _VECTORS = wp.constant(MOST_ROWS), wp.constant(3 * NUM_JOINTS)
+_LINEAR = wp.constant(0)
+_ANGULAR = wp.constant(int(_LINEAR) + 3 * int(_VECTORS))
+_SHARES = wp.constant(ROOM)
+_MOVING = wp.constant(int(_SHARES) + 3 * MOST_ROWS)
+_ROTATION = wp.constant(int(_MOVING) + 8 * NUM_JOINTS)
+_POSITION = wp.constant(int(_ROTATION) + 4 * NUM_JOINTS)
+_WORDS = -(-(int(_POSITION) + 3 * NUM_JOINTS) // 4) * 4
+# Of vectors that are solved for: where they are in a room, and words of one.
+_SPARE, _COLUMN = wp.constant(SPARE), wp.constant((ROOM - SPARE) // 3)
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+__shared__ float __align__(16) room[{_WORDS}];
+return reinterpret_cast<wp::uint64>(room);
+#else
+return 0;
+#endif
+""")
+def room_of_warp() -> wp.uint64:
+    """Room of a warp that has a CUDA block of its own; a factor's is at its beginning."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return there;
+#else
+return row;
+#endif
+""")
+def row_in_room(row: int, there: int) -> int:
+    """Row ``there`` of what has several in a warp's room; on a CPU ``row``."""
+    ...
+
+
+_SEE = """
+#if defined(__CUDA_ARCH__)
+rows.data = reinterpret_cast<decltype(rows.data)>(reinterpret_cast<float*>(room) + at);
+rows.strides[0] = 4 * words;
+rows.strides[1] = sizeof(*rows.data);  // known when it is compiled
+#endif
+return rows;
+"""
+
+
+@wp.func_native(_SEE)
+def see_numbers(rows: wp.array2d(dtype=float), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=float):
+    """The array with its first row at word ``at`` of the room, and another one every so many ``words``."""
+    ...
+
+
+@wp.func_native(_SEE)
+def see_vectors(rows: wp.array2d(dtype=wp.vec3), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.vec3):
+    """:func:`see_numbers` of vectors."""
+    ...
+
+
+@wp.func_native(_SEE)
+def see_turns(rows: wp.array2d(dtype=wp.quat), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.quat):
+    """:func:`see_numbers` of rotations."""
+    ...
+
+
+@wp.func_native(_SEE)
+def see_motions(rows: wp.array2d(dtype=vec8), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=vec8):
+    """:func:`see_numbers` of rigid motions."""
+    ...
+
+
+@wp.func
+def see_columns(rows: wp.array2d(dtype=float), room: wp.uint64):
+    """Three vectors that are solved for, in the room of a warp; on a CPU ``rows``. See :func:`place_of_part`."""
+    return see_numbers(rows, room, _SPARE, _COLUMN)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 4 * k;
+#else
+return 3 * k;
+#endif
+""")
+def place_of_part(k: int) -> int:
+    """Where in a column of :func:`see_columns` the part of joint ``k`` begins; the pelvis' place comes first."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+float* const to = reinterpret_cast<float*>(room) + at;
+const float* const from = reinterpret_cast<const float*>(&wp::index(position, e, 0));
+for (int n = thread; n < {3 * NUM_JOINTS}; n += threads) to[n] = from[n];
+#endif
+""")
+def bring_places(position: wp.array2d(dtype=wp.vec3), e: int, thread: int, threads: int, room: wp.uint64, at: int):
+    """Write where the joints of an environment are to the room, from word ``at`` on."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+float* const to = reinterpret_cast<float*>(room);
+const float* const rotation = reinterpret_cast<const float*>(&wp::index(w.pose.rotation, e, 0));
+const float* const position = reinterpret_cast<const float*>(&wp::index(w.pose.position, e, 0));
+for (int n = threadIdx.x & 31; n < {4 * NUM_JOINTS}; n += 32) to[{_ROTATION} + n] = rotation[n];
+for (int n = threadIdx.x & 31; n < {3 * NUM_JOINTS}; n += 32) to[{_POSITION} + n] = position[n];
+__syncwarp();
+#endif
+""")
+def bring_pose(w: JointBench, e: int, room: wp.uint64):
+    """Write the pose of an environment to the room."""
+    ...
+
+
+@wp.func
+def enter_room(w: JointBench, e: int):
+    """The bench with pose, motion, momenta and shares of an environment in the room of its warp.
+
+    What has several rows has them as :func:`row_in_room` says; all else has one there, whatever the environment. On a
+    CPU it is the bench itself.
+    """
+    room = room_of_warp()
+    bring_pose(w, e, room)
+    w.linear = see_vectors(w.linear, room, _LINEAR, _VECTORS)
+    w.angular = see_vectors(w.angular, room, _ANGULAR, _VECTORS)
+    w.shares = see_numbers(w.shares, room, _SHARES, _ROWS)
+    w.moving = see_motions(w.moving, room, _MOVING, 0)
+    w.pose.rotation = see_turns(w.pose.rotation, room, _ROTATION, 0)
+    w.pose.position = see_vectors(w.pose.position, room, _POSITION, 0)
+    return w
+
+
+@wp.func_native(f"""
+const float* const from = reinterpret_cast<const float*>(&wp::index(motion, e, 0));
+float* const to = reinterpret_cast<float*>(&wp::index(steps, e, 0)) + first;
+for (int n = thread; n < {6 * NUM_JOINTS}; n += threads) to[12 * (n / 6) + n % 6] = from[8 * (n / 6) + n % 6];
+""")
+def keep_motion(
+    motion: wp.array2d(dtype=vec8), e: int, first: int, thread: int, threads: int, steps: wp.array2d(dtype=vec12)
+):
+    """Write the motion of all bones to their records, from number ``first`` on."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+const auto keep = [&](const auto& rows, const auto& into, int words) {{
+    const float* const from = reinterpret_cast<const float*>(rows.data);
+    float* const to = reinterpret_cast<float*>(&wp::index(into, e, 0));
+    for (int n = threadIdx.x & 31; n < words; n += 32) to[n] = from[n];
+}};
+keep(near.moving, w.moving, {8 * NUM_JOINTS});
+keep(near.pose.rotation, w.pose.rotation, {4 * NUM_JOINTS});
+keep(near.pose.position, w.pose.position, {3 * NUM_JOINTS});
+#endif
+""")
+def leave_room(w: JointBench, e: int, near: JointBench):
+    """Write motion and pose from the room, as all threads have left them."""
+    ...

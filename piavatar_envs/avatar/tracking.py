@@ -1,0 +1,206 @@
+"""Rigid motion of bones and of the whole body, fitted to the physical velocity.
+
+A fit is mass- and skinning-weighted least squares, so the blended field ``sum_b w_b (V_b + Omega_b x (x - c_b))`` has
+exactly the linear and angular momentum of the velocity it was fitted to, bone by bone. Everything the drive gives back
+or takes away goes through such fields, which is why it keeps momentum.
+
+The particles' sums are :mod:`piavatar_envs.avatar.segment_sums`; ``threads`` threads share the chunks of a bone, or the
+bones of a body.
+
+Tracking: the rigid motion of every bone from its particles.
+
+Kabsch's closed form (Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976): the rotation
+that maximises ``tr(R^T H)`` for the correlation ``H = sum (x - mean x)(x0 - mean x0)^T`` is ``U V^T`` of its singular
+value decomposition. ``wp.svd3`` returns proper rotations and puts the sign into the smallest singular value, so
+``U V^T`` is the proper rotation also for reflected point sets.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.avatar.rotation import quat_exp
+from piavatar_envs.avatar.types import Body, RigidFit, RigidFits, vec12, vec16
+from piavatar_envs.core.cuda_intrinsics import sum_threads12, sum_threads16
+from piavatar_envs.mpm.types import row
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def spin_of(inertia: wp.mat33, angular_momentum: wp.vec3):
+    """Angular velocity ``I^-1 L``; zero where the inertia is singular."""
+    det = wp.determinant(inertia)
+    trace = inertia[0, 0] + inertia[1, 1] + inertia[2, 2]
+    if det <= 1.0e-9 * trace * trace * trace:
+        return wp.vec3(0.0)
+    return wp.inverse(inertia) * angular_momentum
+
+
+@wp.func
+def symmetric(diag: wp.vec3, off: wp.vec3):
+    """Symmetric matrix with the diagonal ``xx, yy, zz`` and beside it ``yz, zx, xy``."""
+    # fmt: off
+    return wp.mat33(
+        diag[0], off[2], off[1],
+        off[2], diag[1], off[0],
+        off[1], off[0], diag[2],
+    )
+    # fmt: on
+
+
+@wp.func
+def point_inertia(mass: float, d: wp.vec3):
+    """Inertia of a point mass at ``d``."""
+    return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
+
+
+@wp.func
+def fit_bone(
+    body: Body,
+    reference: wp.array2d(dtype=wp.vec3),
+    moments: wp.array2d(dtype=vec16),
+    e: int,
+    b: int,
+    thread: int,
+    threads: int,
+    # out
+    bones: RigidFits,
+):
+    """Rigid motion of one bone: centre [m], its velocity [m/s], angular velocity [rad/s], inertia [kg m^2]."""
+    s = vec16()
+    for c in range(body.chunk_start[b] + thread, body.chunk_start[b + 1], threads):
+        s += moments[e, c]
+    s = sum_threads16(s, threads)
+    if thread > 0:
+        return
+    m = wp.max(s[0], 1.0e-12)
+    d = wp.vec3(s[1], s[2], s[3]) / m
+    V = wp.vec3(s[4], s[5], s[6]) / m
+    second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12])) - m * wp.outer(d, d)
+    I = wp.diag(wp.vec3(wp.trace(second))) - second
+    L = wp.vec3(s[13], s[14], s[15]) - m * wp.cross(d, V)
+    bones.center[e, b] = reference[e, b] + d
+    bones.velocity[e, b] = V
+    bones.spin[e, b] = spin_of(I, L)
+    bones.inertia[e, b] = I
+
+
+@wp.func
+def fit_whole(
+    body: Body,
+    bones: RigidFits,
+    e: int,
+    thread: int,
+    threads: int,
+    # out
+    whole: RigidFit,
+):
+    """Rigid motion of the whole body from those of its bones: their momenta add up to the body's."""
+    r = row(e, body.bone_mass.shape[0])
+    pelvis = bones.center[e, 0]
+    m = float(0.0)
+    mx = wp.vec3()
+    mv = wp.vec3()
+    for b in range(thread, body.parent.shape[0], threads):
+        m += body.bone_mass[r, b]
+        mx += body.bone_mass[r, b] * (bones.center[e, b] - pelvis)
+        mv += body.bone_mass[r, b] * bones.velocity[e, b]
+    s = sum_threads12(vec12(m, mx[0], mx[1], mx[2], mv[0], mv[1], mv[2], 0.0, 0.0, 0.0, 0.0, 0.0), threads)
+    c = pelvis + wp.vec3(s[1], s[2], s[3]) / s[0]
+    I = wp.mat33()
+    L = wp.vec3()
+    for b in range(thread, body.parent.shape[0], threads):
+        d = bones.center[e, b] - c
+        I += bones.inertia[e, b] + point_inertia(body.bone_mass[r, b], d)
+        L += bones.inertia[e, b] * bones.spin[e, b] + body.bone_mass[r, b] * wp.cross(d, bones.velocity[e, b])
+    # fmt: off
+    t = sum_threads12(
+        vec12(L[0], L[1], L[2], I[0, 0], I[0, 1], I[0, 2], I[1, 0], I[1, 1], I[1, 2], I[2, 0], I[2, 1], I[2, 2]),
+        threads,
+    )
+    # fmt: on
+    if thread == 0:
+        I = wp.mat33(t[3], t[4], t[5], t[6], t[7], t[8], t[9], t[10], t[11])
+        whole.center[e] = c
+        whole.velocity[e] = wp.vec3(s[4], s[5], s[6]) / s[0]
+        whole.spin[e] = spin_of(I, wp.vec3(t[0], t[1], t[2]))
+        whole.inertia[e] = I
+
+
+@wp.func
+def kabsch_rotation(H: wp.mat33):
+    """Proper rotation that maximises ``tr(R^T H)``.
+
+    ``H`` is normalised first: ``wp.svd3`` errs by tens of degrees when the entries are near 1e-5. It also errs by up
+    to 0.3 degrees where singular values are close together, so two Newton steps on the optimum follow: the best ``R``
+    makes ``M = R^T H`` symmetric, and a turn by ``w`` changes its axial vector by ``(tr(M) I - M) w``.
+    """
+    U = wp.mat33()
+    S = wp.vec3()
+    V = wp.mat33()
+    scale = wp.sqrt(wp.ddot(H, H))
+    H = H * (1.0 / wp.max(scale, 1.0e-30))
+    wp.svd3(H, U, S, V)
+    R = U * wp.transpose(V)
+    for _ in range(2):
+        M = wp.transpose(R) * H
+        slope = wp.diag(wp.vec3(wp.trace(M))) - 0.5 * (M + wp.transpose(M))
+        if wp.determinant(slope) > 1.0e-3:  # else two rotations are almost equally good
+            w = wp.inverse(slope) * wp.vec3(M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1])
+            R = R * wp.quat_to_matrix(quat_exp(w))
+    return R
+
+
+@wp.kernel
+def track_bones(
+    body: Body,
+    x: wp.array2d(dtype=wp.vec3),
+    u: wp.array2d(dtype=wp.vec3),
+    vk: wp.array2d(dtype=wp.vec3),
+    failure: wp.array(dtype=int),
+    # out
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+):
+    """World rotation, joint position [m] and velocity [m/s] of every bone. A failed environment keeps its last."""
+    e, b = wp.tid()
+    if failure[e] != 0:
+        return
+    r = row(e, body.rest.shape[0])
+    start = body.tracker_start[b]
+    end = body.tracker_start[b + 1]
+    share = 1.0 / float(end - start)
+    mean = wp.vec3()
+    mean0 = wp.vec3()
+    v = wp.vec3()
+    for t in range(start, end):
+        p = body.tracker[t]
+        mean += share * x[e, body.first + p]
+        mean0 += share * body.rest[r, p]
+        v += share * (u[e, body.first + p] + vk[e, body.first + p])
+    H = wp.mat33()
+    for t in range(start, end):
+        p = body.tracker[t]
+        H += wp.outer(x[e, body.first + p] - mean, body.rest[r, p] - mean0)
+    R = kabsch_rotation(H)
+    rotation[e, b] = wp.normalize(wp.quat_from_matrix(R))
+    position[e, b] = mean + R * (body.rest_joint[row(e, body.rest_joint.shape[0]), b] - mean0)
+    velocity[e, b] = v
+
+
+@wp.kernel
+def local_rotations(
+    body: Body,
+    rotation: wp.array2d(dtype=wp.quat),
+    # out
+    local: wp.array2d(dtype=wp.quat),
+):
+    """Rotation of every bone relative to its parent; the root's is its world rotation."""
+    e, b = wp.tid()
+    parent = body.parent[b]
+    if parent < 0:
+        local[e, b] = rotation[e, b]
+    else:
+        local[e, b] = wp.quat_inverse(rotation[e, parent]) * rotation[e, b]

@@ -1,0 +1,484 @@
+"""Sections of a configuration: the continuum, the drive, the body's shape, what episodes vary, pictures.
+
+What is in a world besides the ground: avatars, soft props and analytic colliders, and how they touch.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.config.load import ConfigError, load_config
+from piavatar_envs.mpm.model import CFL_STABLE
+
+#: Shared by every model. Strict, because a number in quotes is a mistake; ``.inf`` and ``.nan`` are never a setting.
+FROZEN = ConfigDict(
+    frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
+)
+
+
+class FrozenDict(dict):
+    """A read-only, hashable ``dict``, so that a configuration that holds one is frozen all through."""
+
+    def _refuse(self, *_args: Any, **_kwargs: Any) -> None:
+        raise TypeError("the configuration is frozen; make a changed copy with replace(config, {...})")
+
+    __setitem__ = __delitem__ = __ior__ = update = pop = popitem = setdefault = clear = _refuse  # type: ignore[assignment]
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(frozenset(self.items()))
+
+    def __reduce__(self) -> tuple:
+        # dict's own protocol refills an empty copy item by item, which a frozen one refuses.
+        return FrozenDict, (dict(self),)
+
+
+MOST_SUBSTEPS = 10_000
+#: Greatest Young's modulus [Pa] and densities [kg/m^3] of soft matter: a hard plastic, thin smoke, the heaviest metal.
+MOST_MODULUS = 1.0e9
+LEAST_DENSITY, MOST_DENSITY = 0.1, 25_000.0
+#: Greatest distance from the origin of anything in the world, along each axis [m].
+FARTHEST = 1000.0
+#: Of avatars and what they play with, from which other things are a hundred metres away at most [m].
+Place = Annotated[float, Field(ge=-100.0, le=100.0)]
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
+ShapeValue = Annotated[float, Field(ge=-1.0, le=1.0)]
+
+
+Rate = Annotated[float, Field(le=1.0e6)]
+
+
+def _check_flesh_rate(rates: tuple[float, float]) -> tuple[float, float]:
+    """Refuse rates that are no growing pull from skin to bone; two zeros are none at all."""
+    skin, bone = rates
+    if not (0.0 < skin <= bone or skin == bone == 0.0):
+        raise ValueError(f"the skin's rate {skin:g} must be positive and at most the bone's {bone:g}, as in (30, 1000)")
+    return rates
+
+
+class PhysicsConfig(BaseModel):
+    """The continuum: resolution, material, coupling and time step."""
+
+    model_config = FROZEN
+
+    fidelity: Literal["tiny", "coarse", "medium", "fine"] = Field(
+        "coarse",
+        description="resolution of the body: tiny (some 400 particles, for tests), coarse (grid spacing height/32, "
+        "2,500-3,000 particles), medium (height/64), fine (grid spacing about 1 cm)",
+    )
+    control_dt: float = Field(1.0 / 30.0, ge=1.0e-4, le=0.2, description="time between two actions [s]")
+    num_substeps: int | None = Field(
+        None, ge=1, le=MOST_SUBSTEPS, description="substeps a control step; null chooses them from the CFL limit"
+    )
+    cfl: float = Field(
+        0.5,
+        gt=0.0,
+        le=CFL_STABLE,
+        description="largest c dt / dx a substep may have, c the P-wave speed; beyond 0.84 it is not stable [-]",
+    )
+    material: Literal["neo_hookean", "fixed_corotated"] = Field(
+        "neo_hookean", description="elastic energy of the flesh"
+    )
+    young_modulus: float = Field(1.0e5, ge=1.0, le=MOST_MODULUS, description="Young's modulus of the flesh [Pa]")
+    soft_young_modulus: float | None = Field(
+        None,
+        ge=1.0,
+        le=MOST_MODULUS,
+        description="Young's modulus of the softest flesh of trunk and thighs; null as the rest [Pa]",
+    )
+    poisson_ratio: float = Field(0.3, ge=0.0, lt=0.5, description="Poisson's ratio of the flesh [-]")
+    density: float = Field(1000.0, ge=LEAST_DENSITY, le=MOST_DENSITY, description="density of the flesh [kg/m^3]")
+    decoupling: Literal["split", "paper", "none", "no_stress"] = Field(
+        "split",
+        description="how commanded motion is kept out of the strain: split (two velocities, the default), paper (its "
+        "deformation-gradient decoupling), none (velocity injected, strain and all), no_stress (no elasticity); paper "
+        "and none have one velocity, in which no root can be held: they need root=free",
+    )
+    gravity: float = Field(9.81, ge=0.0, le=100.0, description="gravitational acceleration, along -z [m/s^2]")
+    friction: float = Field(0.8, ge=0.0, le=10.0, description="Coulomb coefficient of the ground; walls are smooth [-]")
+
+
+class DriveConfig(BaseModel):
+    """How actions move the body, and what holds it up."""
+
+    model_config = FROZEN
+
+    control: Literal["pose", "pd", "torque"] = Field(
+        "pose",
+        description="what actions are: pose (increments of a pose that moves the body), pd (joint targets of springs "
+        "with limited torques) or torque (torques of the joints); root_assist to bone_contact are for pd and torque, "
+        "all other settings of this section for pose",
+    )
+    root_assist: float = Field(
+        0.0, ge=0.0, le=1.0, description="help for the pelvis from outside: 0 none, 1 springs that nearly hold it [-]"
+    )
+    joint_stiffness: float = Field(
+        1.0, ge=0.0, le=1.0e6, description="factor on the stiffness of the joints' springs [-]"
+    )
+    joint_damping: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the damping of the joints' springs [-]")
+    strength: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the greatest torques of the joints [-]")
+    flesh_rate: Annotated[tuple[Rate, Rate], AfterValidator(_check_flesh_rate)] = Field(
+        (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
+    )
+    firm_bones: bool = Field(
+        True,
+        description="whether particles of bones, which slip from them under load, are put into their places after "
+        "every control step, unless these lie beyond a surface: tracked bones stay together",
+    )
+    bone_contact: bool = Field(
+        True,
+        description="whether bones stop at the floor and at colliders, a millimetre before; else only flesh does, and "
+        "bones go through it into them",
+    )
+    drive: Literal["increment", "target"] = Field(
+        "increment",
+        description="increment (the tracked pose plus the command's change) or target (to the command's absolute pose; "
+        "only for undisturbed reproduction)",
+    )
+    tone: float = Field(1.0, ge=0.0, le=1.0, description="resistance of the pose to contact: 0 limp, 1 tensed [-]")
+    alpha: float = Field(0.3, ge=0.0, le=1.0, description="shape preservation, as a share of a control step [-]")
+    shape_preservation: Literal["physical", "kinematic"] = Field(
+        "physical",
+        description="physical (a momentum-keeping pull of the flesh) or kinematic (the paper's term in the velocity)",
+    )
+    soft_tissue: float = Field(
+        0.0, ge=0.0, le=1.0, description="share of a change of commanded motion that the softest flesh misses [-]"
+    )
+    joint_speed_limit: float = Field(
+        4.0, gt=0.0, le=50.0, description="fastest rotation an action of 1 commands about a joint's axis [rad/s]"
+    )
+    root: Literal["wrench", "free"] = Field(
+        "wrench", description="wrench (a bounded force and torque hold the commanded root) or free (nothing does)"
+    )
+    free_motion: bool | None = Field(
+        None,
+        description="take the rigid part out of commanded motion, so that it carries no unreacted momentum; null where "
+        "nothing holds the root",
+    )
+    max_force_weight: float = Field(2.0, ge=0.0, le=1000.0, description="largest root force, in body weights [m g]")
+    max_torque_weight: float = Field(
+        0.7, ge=0.0, le=1000.0, description="largest root torque, in metres of body weight [m * m g]"
+    )
+    let_go_tilt: float = Field(
+        math.radians(45.0), gt=0.0, le=math.pi, description="tilt error at which the root wrench lets go [rad]"
+    )
+    let_go_distance: float = Field(
+        0.5,
+        gt=0.0,
+        le=FARTHEST,
+        description="horizontal error at which the root wrench lets go, until the next reset [m]",
+    )
+    let_go_height: float = Field(
+        0.4, gt=0.0, le=FARTHEST, description="height error at which the root wrench lets go [m]"
+    )
+
+    @property
+    def moves_freely(self) -> bool:
+        """Whether commanded motion has its rigid part taken out: ``free_motion``, where that is null, too."""
+        return self.root == "free" if self.free_motion is None else self.free_motion
+
+
+class ShapeConfig(BaseModel):
+    """The body's shape: fixed parameters, or a random shape at each reset."""
+
+    model_config = FROZEN
+
+    randomize: bool = Field(False, description="draw a random shape at each reset")
+    pool: int | None = Field(
+        None,
+        ge=1,
+        le=4096,
+        description="bodies that random shapes are taken from, shaped beforehand, so that a reset can draw on the "
+        "device; null shapes a new one at each reset, on the host, 0.1 s each [-]",
+    )
+    parameters: Annotated[dict[str, ShapeValue], AfterValidator(FrozenDict)] = Field(
+        default_factory=dict, description="shape parameters by name, each in [-1, 1], 0 the mean; kept when randomizing"
+    )
+    scale: float = Field(
+        1.0, ge=0.0, le=1.0, description="width of the random shapes: 0 the mean shape, 1 the full range [-]"
+    )
+
+
+def _rising(bounds: tuple[float, float]) -> tuple[float, float]:
+    """``bounds``, in order.
+
+    Raises:
+        ValueError: they fall.
+    """
+    if not bounds[0] <= bounds[1]:
+        raise ValueError("bounds must not fall; give the lower one first")
+    return bounds
+
+
+Factor = Annotated[float, Field(ge=1.0e-3, le=1.0e3)]
+FactorRange = Annotated[tuple[Factor, Factor], AfterValidator(_rising)]
+#: The range of a factor that changes nothing.
+UNCHANGED = (1.0, 1.0)
+
+
+class RandomizeConfig(BaseModel):
+    """Factors that every episode draws, uniform in their logarithm; see :mod:`piavatar_envs.sim.randomize`."""
+
+    model_config = FROZEN
+
+    mass_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on an avatar's density, and so on its mass and inertia [-]"
+    )
+    stiffness_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on Young's modulus of an avatar's flesh [-]"
+    )
+    ground_friction_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on all friction with the ground, walls and colliders [-]"
+    )
+    body_friction_factor: FactorRange = Field(
+        UNCHANGED, description="range of the factor on all friction between avatars and props [-]"
+    )
+
+
+class RenderConfig(BaseModel):
+    """Pictures of the scene; used only with a ``render_mode``."""
+
+    model_config = FROZEN
+
+    width: int = Field(480, ge=16, le=7680, description="width of a frame [pixel]")
+    height: int = Field(480, ge=16, le=4320, description="height of a frame [pixel]")
+    color: Literal["skin", "strain"] = Field("skin", description="colour of the body: its skin, or its deformation")
+    camera_position: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
+        None, description="where the camera is, from the ground below what it follows; null: where the task has it [m]"
+    )
+    camera_target: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
+        None, description="where it looks, from the same point; null: where the task has it [m]"
+    )
+    camera_follows: bool | None = Field(
+        None, description="whether it follows the avatars, or stays about the origin; null: as the task has it"
+    )
+
+
+#: Settings of the section ``physics`` that an avatar may have of its own.
+OF_FLESH = ("material", "young_modulus", "soft_young_modulus", "poisson_ratio", "density")
+
+
+def _not_zero(rotation: tuple[float, ...]) -> tuple[float, ...]:
+    """``rotation``, if it is one.
+
+    Raises:
+        ValueError: it is too near to zero to say about which axis it turns.
+    """
+    if math.hypot(*rotation) < 1.0e-3:
+        raise ValueError(f"{list(rotation)} must be a quaternion wxyz, not zero")
+    return rotation
+
+
+def _of_flesh(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``settings``, if avatars may differ in them.
+
+    Raises:
+        ConfigError: one belongs to the whole world.
+    """
+    strange = [name for name in settings if name not in OF_FLESH]
+    if strange:
+        raise ConfigError(f"{strange[0]} cannot differ between avatars; only {', '.join(OF_FLESH)}")
+    return settings
+
+
+def _of_drive(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Likewise."""
+    if "control" in settings:
+        raise ConfigError("control cannot differ between avatars; set it for the environment")
+    return settings
+
+
+def _settings_of(section: type[BaseModel]) -> AfterValidator:
+    """Refuses what ``section`` would refuse, long before it is laid over the environment's own."""
+
+    def check(settings: Mapping[str, Any]) -> FrozenDict:
+        load_config(section, settings)
+        return FrozenDict(settings)
+
+    return AfterValidator(check)
+
+
+def _joint(name: str) -> str:
+    """``name``, if a joint has it.
+
+    Raises:
+        ValueError: none has.
+    """
+    try:
+        joint_index(name)
+    except KeyError as error:
+        raise ValueError(error.args[0]) from None
+    return name
+
+
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Part = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+Quaternion = Annotated[tuple[Part, Part, Part, Part], AfterValidator(_not_zero)]
+Length = Annotated[float, Field(gt=0.0, le=100.0)]
+Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
+TopSpeed = Annotated[float, Field(ge=0.0, le=1.0e6)]
+Spin = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+MaterialName = Literal["neo_hookean", "fixed_corotated"]
+
+
+class RegionConfig(BaseModel):
+    """Flesh of some bones that is of another material: hair, a garment, a stiff boot."""
+
+    model_config = FROZEN
+
+    joints: tuple[Annotated[str, AfterValidator(_joint)], ...] = Field(
+        ..., min_length=1, description="joints whose flesh it is, by name"
+    )
+    beyond: float = Field(
+        0.0, ge=0.0, le=FARTHEST, description="only flesh farther than this from the nearest bone particle [m]"
+    )
+    material: MaterialName | None = Field(None, description="elastic energy; null as the rest")
+    young_modulus: float | None = Field(
+        None, ge=1.0, le=MOST_MODULUS, description="Young's modulus; null as the rest [Pa]"
+    )
+    poisson_ratio: float | None = Field(None, ge=0.0, lt=0.5, description="Poisson's ratio; null as the rest [-]")
+    density: float | None = Field(
+        None, ge=LEAST_DENSITY, le=MOST_DENSITY, description="density; null as the rest [kg/m^3]"
+    )
+
+
+class AvatarConfig(BaseModel):
+    """One avatar: where it starts, and what differs from the environment's own settings."""
+
+    model_config = FROZEN
+
+    position: tuple[Place, Place] = Field((0.0, 0.0), description="where it stands, x and y [m]")
+    yaw: float = Field(0.0, ge=-10.0, le=10.0, description="turn about the vertical; at 0 it faces -y [rad]")
+    physics: Annotated[dict[str, Any], AfterValidator(_of_flesh), _settings_of(PhysicsConfig)] = Field(
+        default_factory=dict,
+        description="material, young_modulus, soft_young_modulus, poisson_ratio or density of its flesh",
+    )
+    drive: Annotated[dict[str, Any], AfterValidator(_of_drive), _settings_of(DriveConfig)] = Field(
+        default_factory=dict, description="settings of its drive, such as tone"
+    )
+    shape: Annotated[dict[str, Any], _settings_of(ShapeConfig)] = Field(
+        default_factory=dict, description="settings of its shape"
+    )
+    regions: tuple[RegionConfig, ...] = Field((), description="flesh of other materials; later ones win")
+
+
+class PropConfig(BaseModel):
+    """A soft thing of its own: it is matter like the flesh, and flies, rolls, dents and rubs."""
+
+    model_config = FROZEN
+
+    name: str = Field(..., min_length=1, description="by which it is observed and referred to")
+    shape: Literal["sphere", "box", "capsule", "mesh"] = Field("sphere", description="its solid")
+    size: tuple[Length, ...] = Field(
+        (0.11,), description="sphere: radius; box: half extents; capsule: radius, half length; mesh: scale [m]"
+    )
+    file: str | None = Field(None, description="watertight mesh, for shape mesh")
+    mass: float | None = Field(None, ge=1.0e-6, le=1.0e4, description="mass; null to take the density [kg]")
+    density: float = Field(
+        1000.0, ge=LEAST_DENSITY, le=MOST_DENSITY, description="density, where no mass is given [kg/m^3]"
+    )
+    material: MaterialName = Field("neo_hookean", description="elastic energy")
+    young_modulus: float | None = Field(
+        None,
+        ge=1.0,
+        le=MOST_MODULUS,
+        description="Young's modulus; null for waves as fast as the flesh's, at no more substeps [Pa]",
+    )
+    poisson_ratio: float = Field(0.3, ge=0.0, lt=0.5, description="Poisson's ratio [-]")
+    position: Vector = Field((0.0, -1.0, 1.0), description="of its centre of mass at the start [m]")
+    rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="at the start, quaternion wxyz")
+    velocity: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="at the start [m/s]")
+    spin: tuple[Spin, Spin, Spin] = Field((0.0, 0.0, 0.0), description="angular velocity at the start [rad/s]")
+    top_speed: TopSpeed = Field(
+        0.0,
+        description="greatest speed that a task, or you, will give any part of it later, as in a throw; substeps are "
+        "short enough for it [m/s]",
+    )
+    friction: float = Field(0.5, ge=0.0, le=10.0, description="Coulomb coefficient on the ground and colliders [-]")
+
+
+class ColliderConfig(BaseModel):
+    """An analytic solid, at rest or moving as told; nothing moves it."""
+
+    model_config = FROZEN
+
+    name: str = Field(..., min_length=1, description="by which it is referred to")
+    kind: Literal["plane", "box", "sphere", "capsule"] = Field("box", description="its solid")
+    size: tuple[Length, ...] = Field(
+        (), description="box: half extents; sphere: radius; capsule: radius, half length [m]"
+    )
+    position: Vector = Field((0.0, 0.0, 0.0), description="of its origin [m]")
+    rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="quaternion wxyz; a plane faces its local +z")
+    velocity: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="of its origin [m/s]")
+    spin: tuple[Spin, Spin, Spin] = Field((0.0, 0.0, 0.0), description="angular velocity [rad/s]")
+    top_speed: TopSpeed = Field(
+        0.0, description="greatest speed that a task, or you, will give any part of it later [m/s]"
+    )
+    friction: float = Field(0.5, ge=0.0, le=10.0, description="Coulomb coefficient [-]")
+
+
+class PairFriction(BaseModel):
+    """Friction of two things by name: avatars (agent names), props, colliders, or ``ground``."""
+
+    model_config = FROZEN
+
+    a: str = Field(..., description="one")
+    b: str = Field(..., description="the other")
+    friction: float = Field(..., ge=0.0, le=10.0, description="Coulomb coefficient [-]")
+
+
+class SceneConfig(BaseModel):
+    """Avatars, props and colliders. A task adds its own to those given here."""
+
+    model_config = FROZEN
+
+    avatars: tuple[AvatarConfig, ...] = Field((), description="one an agent; where empty, the task places them")
+    props: tuple[PropConfig, ...] = Field((), description="soft props besides the task's")
+    colliders: tuple[ColliderConfig, ...] = Field((), description="analytic solids besides the ground and the task's")
+    ground: bool = Field(True, description="a floor at z = 0")
+    walls: bool = Field(
+        True,
+        description="where there are props or several avatars: smooth walls around the domain, to keep them in it",
+    )
+    self_contact: bool = Field(
+        False, description="torso, arms and legs as velocity fields of their own, so that they touch each other"
+    )
+    body_friction: float = Field(0.5, ge=0.0, le=10.0, description="Coulomb coefficient between bodies [-]")
+    pair_friction: tuple[PairFriction, ...] = Field((), description="coefficients that differ")
+    contact_normals: Literal["shared", "own"] = Field(
+        "shared", description="shared (one normal a pair: keeps momentum) or own (the paper's rule, which does not)"
+    )
+    contact_gate: float = Field(
+        0.15, ge=0.0, le=3.0, description="gap between two bodies' surfaces below which they touch [grid spacings]"
+    )
+
+
+class EnvConfig(BaseModel):
+    """What every environment has. A task adds its own settings in one subclass."""
+
+    model_config = FROZEN
+
+    physics: PhysicsConfig = Field(default_factory=PhysicsConfig, description="the continuum")
+    drive: DriveConfig = Field(default_factory=DriveConfig, description="how poses move the body")
+    shape: ShapeConfig = Field(default_factory=ShapeConfig, description="the body's shape")
+    randomize: RandomizeConfig = Field(
+        default_factory=RandomizeConfig, description="what every episode draws anew, besides the task and the shape"
+    )
+    scene: SceneConfig = Field(default_factory=SceneConfig, description="what is in the world, and how it touches")
+    render: RenderConfig = Field(default_factory=RenderConfig, description="pictures")
+    episode_seconds: float = Field(5.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
+    joints: tuple[str, ...] | None = Field(
+        None, description="joints that act, the others do what they would do anyway; null for all 21"
+    )
+    observe_parameters: bool = Field(
+        False,
+        description="observe what the episode has drawn (randomize, random shapes, the task), under pd and torque "
+        "root_assist as it is now, and the episode's clock",
+    )
+    obs_mode: Literal["flat", "dict"] = Field(
+        "flat", description="observations as one float32 vector (flat) or by name (dict)"
+    )

@@ -1,0 +1,321 @@
+"""Which way two fields face each other at a node, and how far their surfaces are apart.
+
+A normal from the gradients of two volumes at a *single* node tilts at edges, where a body's volume ends to the side as
+well: the front edge of a sliding block then ploughs through what it lies on, and brakes it like a friction of 0.15.
+Gradients are therefore summed over the neighbours ``k`` of a node at which the bodies meet, too, and most where most
+matter of both is, by the square of the reduced volume::
+
+    n_ab ~ sum_k c_k r_k^2 (V_a g_a - V_b g_b)_k,    r = V_a V_b / (V_a + V_b),    c = 1 / (1 + distance^2)
+
+with volumes ``V`` and their outward gradients ``g`` in grid units. The gradients' own weights ``V`` let the body that
+fills more of a node say more about the direction.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.core.cuda_intrinsics import environment_of
+from piavatar_envs.mpm.bspline import BLOCK_NODES, block_index, node_in_block
+from piavatar_envs.mpm.contact_sensors import read_change, write_change
+from piavatar_envs.mpm.grid_arrays import mass_of, move_offset, offset_at, read_record, take_sum, write_record
+from piavatar_envs.mpm.sparse_grid import first_record, has_field, has_told, lacks_slots, nodes_shared, shared_block
+from piavatar_envs.mpm.sweep import LANES, THREADS, Sweep, lane_of_thread, vector_sum_of_team
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums, row, vec8, vec8i
+
+# on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+
+#: Nodes lighter than this [kg] carry nothing but round-off.
+MASS_MIN = wp.constant(1.0e-15)
+#: Volume of two fields [cells] at a node below which there is nothing: less than the least mass has.
+EMPTY = wp.constant(1.0e-30)
+#: Mass of a record whose field has grown together with its subject's trunk at a node.
+GROWN_TOGETHER = wp.constant(-1.0)
+
+#: Distance of the matter of two half-spaces that touch, as a node at any distance from their common surface sees it:
+#: ``TOUCHING - SLOPE (4 V_a V_b / (V_a + V_b)^2)^(1/4)`` grid spacings, to 0.011, from 0.81 at the surface to 1.5.
+TOUCHING = wp.constant(1.544)
+SLOPE = wp.constant(0.74)
+#: Distance that the matter at a node gains with a gap: the spline sees less of what goes away.
+PER_GAP = wp.constant(0.65)
+
+
+@wp.func
+def take_sums(
+    grid: Grid,
+    contact: Contact,
+    blocks: Blocks,
+    sums: Sums,
+    mask: int,
+    e: int,
+    block: int,
+    local: int,
+    # out
+    node_velocity: wp.array2d(dtype=wp.vec4),
+):
+    """Move the sums of a node to where its velocities will be, and join limbs to their trunk.
+
+    They grow together where both have seam particles, those that are skinned to both, and have told the node so. Mass,
+    momentum *and* kinematic momentum are summed, or the shoulders would tear. Without the condition a hand would grow
+    to the belly.
+    """
+    for f in range(contact.num_fields):
+        if has_field(mask, f):
+            r = first_record(grid, blocks, e, f, block) + local
+            s = take_sum(sums, e, f, r)
+            write_record(node_velocity, e, r, s)
+            t = contact.trunk[f]
+            if t != f and has_field(mask, t):
+                into = first_record(grid, blocks, e, t, block) + local
+                told = has_told(blocks, e, r) and has_told(blocks, e, into)
+                if told and offset_at(grid, sums, e, f, r)[3] > 0.0 and offset_at(grid, sums, e, t, into)[3] > 0.0:
+                    write_record(node_velocity, e, into, read_record(node_velocity, e, into) + s)
+                    move_offset(sums, e, r, into)
+                    write_record(node_velocity, e, r, vec8(GROWN_TOGETHER, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+
+
+@wp.func
+def volume_at(grid: Grid, contact: Contact, e: int, f: int, m: float):
+    """Volume of mass ``m`` of a field in its reference state, in cells; 0 if there is none."""
+    cells = grid.inv_dx * grid.inv_dx * grid.inv_dx / contact.density[row(e, contact.density.shape[0]), f]
+    return wp.where(m > MASS_MIN, m * cells, 0.0)
+
+
+@wp.func
+def weighted_gradient(grid: Grid, V: float, m: float, offset: wp.vec4):
+    """Outward gradient of a volume at a node, times the volume; up to a factor common to all."""
+    return (V * V * grid.inv_dx / m) * wp.vec3(offset[0], offset[1], offset[2])
+
+
+@wp.func
+def facing_from(grid: Grid, V: float, m: float, offset: wp.vec4):
+    """Weighted outward gradient and volume [cells] of a field of volume ``V`` and mass ``m`` with that ``offset``."""
+    outward = weighted_gradient(grid, V, m, offset)
+    return wp.vec4(outward[0], outward[1], outward[2], V)
+
+
+@wp.func
+def facing_of(grid: Grid, contact: Contact, sums: Sums, e: int, f: int, r: int, m: float):
+    """:func:`facing_from` of field ``f`` of mass ``m`` at the node of record ``r``; nothing if there is none of it."""
+    V = volume_at(grid, contact, e, f, m)
+    facing = wp.vec4()
+    if V > 0.0:
+        facing = facing_from(grid, V, m, offset_at(grid, sums, e, f, r))
+    return facing
+
+
+@wp.func
+def face_node(
+    grid: Grid,
+    contact: Contact,
+    blocks: Blocks,
+    sums: Sums,
+    mask: int,
+    e: int,
+    block: int,
+    local: int,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    # out
+    node_facing: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
+):
+    """What a node says of every field: its weighted outward gradient, and its volume [cells]; nothing has touched."""
+    for f in range(contact.num_fields):
+        if has_field(mask, f):
+            r = first_record(grid, blocks, e, f, block) + local
+            m = mass_of(node_velocity, e, r)
+            facing = wp.vec4()
+            if has_told(blocks, e, r):
+                facing = facing_of(grid, contact, sums, e, f, r, m)
+            write_change(node_facing, e, r, facing)
+            if local == 0:
+                sensors.touched[e, r // BLOCK_NODES] = 0
+
+
+@wp.kernel(launch_bounds=(THREADS, 6))
+def find_facing(
+    grid: Grid,
+    contact: Contact,
+    sweep: Sweep,
+    blocks: Blocks,
+    failure: wp.array(dtype=int),
+    # in and out: taken where several fields are
+    sums: Sums,
+    # out
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    node_facing: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
+):
+    """What every node of a block with several fields says about the normals around it.
+
+    Gradients and volumes of its fields, from which a pair makes its own summand: a third body has no say in it. Limbs
+    grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
+    """
+    at = environment_of(wp.tid(), sweep.threads)
+    e = at[0]
+    end = wp.where(lacks_slots(failure, e), 0, nodes_shared(blocks, e))  # else nobody has added up all particles
+    for turn in range(sweep.turns):
+        first = at[1] * sweep.share + turn * sweep.stride
+        block = shared_block(blocks, e, first)
+        if first >= end:
+            break
+        mask = blocks.fields[e, block]
+        for n in range(first, first + sweep.share):
+            take_sums(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity)
+            face_node(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity, node_facing, sensors)
+
+
+@wp.func
+def records_around(grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int):
+    """First records of the fields ``a`` and ``b`` in the blocks of a node and its neighbours, two along each axis.
+
+    That of the lower neighbour comes first, and both are the same where all are in one. -1 where a block has not both
+    fields: it holds nothing that was written in this substep.
+    """
+    both = (1 << a) | (1 << b)
+    of_a = vec8i()
+    of_b = vec8i()
+    for n in range(8):
+        i = wp.clamp(node[0] - 1 + 2 * (n >> 2), 0, grid.nodes[0] - 1)
+        j = wp.clamp(node[1] - 1 + 2 * ((n >> 1) & 1), 0, grid.nodes[1] - 1)
+        k = wp.clamp(node[2] - 1 + 2 * (n & 1), 0, grid.nodes[2] - 1)
+        block = block_index(grid, i, j, k)
+        has_both = (blocks.fields[e, block] & both) == both
+        of_a[n] = wp.where(has_both, first_record(grid, blocks, e, a, block), -1)
+        of_b[n] = wp.where(has_both, first_record(grid, blocks, e, b, block), -1)
+    return of_a, of_b
+
+
+@wp.func
+def component(of: vec8i, x: int, y: int, z: int):
+    """``of[4 x + 2 y + z]``; a GPU would put ``of`` into memory for an index."""
+    lower = wp.where(y == 0, wp.where(z == 0, of[0], of[1]), wp.where(z == 0, of[2], of[3]))
+    upper = wp.where(y == 0, wp.where(z == 0, of[4], of[5]), wp.where(z == 0, of[6], of[7]))
+    return wp.where(x == 0, lower, upper)
+
+
+@wp.func
+def in_grid(grid: Grid, node: wp.vec3i):
+    """Whether there is such a node."""
+    low = wp.min(node[0], wp.min(node[1], node[2]))
+    return low >= 0 and node[0] < grid.nodes[0] and node[1] < grid.nodes[1] and node[2] < grid.nodes[2]
+
+
+@wp.func
+def share_of_normal(c: float, of_a: wp.vec4, of_b: wp.vec4):
+    """What a node adds to a normal, times ``c`` for its distance, from what both its fields say."""
+    reduced = of_a[3] * of_b[3] / wp.max(of_a[3] + of_b[3], EMPTY)
+    return (c * reduced * reduced) * (of_a - of_b)
+
+
+@wp.func
+def normal_along(facing: wp.vec4):
+    """Unit vector along a sum of :func:`share_of_normal`; zero if there is no telling.
+
+    Summands of nearly empty nodes are so small that their squares are not.
+    """
+    n_ab = wp.vec3(facing[0], facing[1], facing[2])
+    largest = wp.max(wp.abs(n_ab))
+    if largest <= 0.0:
+        return wp.vec3()
+    return wp.normalize(n_ab / largest)
+
+
+@wp.func
+def say_of(distance_sq: float):
+    """How much a node around another says of its normal, by the square of their distance [grid spacings squared]."""
+    return 1.0 / (1.0 + distance_sq)
+
+
+@wp.func
+def normal_from(
+    grid: Grid, e: int, node: wp.vec3i, first_a: vec8i, first_b: vec8i, node_facing: wp.array2d(dtype=wp.vec4)
+):
+    """:func:`shared_normal`, from the :func:`records_around` a node."""
+    # along an axis, the node's own block is the lower of the two unless the node is the first of it
+    x = wp.where((node[0] & 3) == 0, 1, 0)
+    y = wp.where((node[1] & 3) == 0, 1, 0)
+    z = wp.where((node[2] & 3) == 0, 1, 0)
+    own = node_in_block(node[0], node[1], node[2])
+    ra = component(first_a, x, y, z) + own
+    rb = component(first_b, x, y, z) + own
+    facing = wp.vec4()
+    planes = int(3)  # not a constant: a GPU has too few registers for the loads of all three at once
+    for i in range(planes):
+        for j in range(3):
+            for k in range(3):
+                at = node + wp.vec3i(i - 1, j - 1, k - 1)
+                bx = wp.where(i == 1, x, i // 2)
+                by = wp.where(j == 1, y, j // 2)
+                bz = wp.where(k == 1, z, k // 2)
+                n = node_in_block(at[0], at[1], at[2])
+                to_a = component(first_a, bx, by, bz)
+                to_b = component(first_b, bx, by, bz)
+                counts = to_a >= 0 and in_grid(grid, at)
+                across = float((j - 1) * (j - 1) + (k - 1) * (k - 1))
+                c = wp.where(i == 1, say_of(across), say_of(1.0 + across))
+                # what does not count is the node itself, times 0: all are read before the first has come
+                of_a = read_change(node_facing, e, wp.where(counts, to_a + n, ra))
+                of_b = read_change(node_facing, e, wp.where(counts, to_b + n, rb))
+                facing += share_of_normal(wp.where(counts, c, 0.0), of_a, of_b)
+    return normal_along(facing)
+
+
+@wp.struct
+class Neighbour:
+    """The node that a thread looks at, of the 27 around one that a warp has."""
+
+    c: float  # for its distance; 0 if it does not count
+    a: int  # record of one field there, and of the other: any that exist if it does not count
+    b: int
+
+
+@wp.func
+def neighbour_of_lane(grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int):
+    """The :class:`Neighbour` of ``node`` that a thread has, for the fields ``a`` and ``b``."""
+    n = lane_of_thread()
+    to = wp.vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
+    at = node + to
+    last = grid.nodes - wp.vec3i(1)
+    near = wp.max(wp.min(at, last), wp.vec3i(0))
+    block = block_index(grid, near[0], near[1], near[2])
+    local = node_in_block(near[0], near[1], near[2])
+    both = (1 << a) | (1 << b)
+    found = Neighbour()
+    found.a = wp.max(first_record(grid, blocks, e, a, block), 0) + local
+    found.b = wp.max(first_record(grid, blocks, e, b, block), 0) + local
+    if n < 27 and in_grid(grid, at) and (blocks.fields[e, block] & both) == both:  # else nobody has written there
+        found.c = say_of(float(to[0] * to[0] + to[1] * to[1] + to[2] * to[2]))
+    return found
+
+
+@wp.func
+def normal_of_warp(c: float, of_a: wp.vec4, of_b: wp.vec4):
+    """:func:`shared_normal` for a node that a warp of a GPU has, from what its threads have found around.
+
+    Each has the :class:`Neighbour` that it looks at, with this ``c``, and what that says of both fields; all come here.
+    What does not count is times 0, so it must be finite.
+    """
+    share = share_of_normal(c, of_a, of_b)
+    total = vector_sum_of_team(LANES, wp.vec3(share[0], share[1], share[2]))
+    return normal_along(wp.vec4(total[0], total[1], total[2], 0.0))
+
+
+@wp.func
+def shared_normal(
+    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, node_facing: wp.array2d(dtype=wp.vec4)
+):
+    """Unit normal from field ``a`` to field ``b`` at a node; zero if there is no telling."""
+    first_a, first_b = records_around(grid, blocks, e, node, a, b)
+    return normal_from(grid, e, node, first_a, first_b, node_facing)
+
+
+@wp.func
+def surface_gap(grid: Grid, V_a: float, V_b: float, distance: float):
+    """Gap of two surfaces [m], from their volumes at a node and the distance of their matter there along the normal.
+
+    Right to a tenth of a grid spacing from touch to a gap of 0.6; overlaps are underestimated.
+    """
+    share = 4.0 * V_a * V_b / ((V_a + V_b) * (V_a + V_b))
+    return (distance - grid.dx * (TOUCHING - SLOPE * wp.sqrt(wp.sqrt(share)))) / PER_GAP

@@ -1,0 +1,339 @@
+"""Impulses of contact, added up over a control step in fixed point: in whatever order they come, the sum is the same.
+
+A list an environment: of the colliders on every subject, of every pair of subjects, of every subject on every contact
+sensor, and the moments of the colliders' impulses.
+
+Contact sensors: impulses by body part and subject, and how deep bodies are in each other.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.bspline import (
+    BLOCK_NODES,
+    base_node,
+    block_index,
+    grid_position,
+    stencil_at,
+    stencil_inside,
+)
+from piavatar_envs.mpm.grid_arrays import mass_of
+from piavatar_envs.mpm.sparse_grid import (
+    VECTORS,
+    fields_around,
+    first_record,
+    has_field,
+    line_of_records,
+    noted_around,
+    record_of,
+    slab_records,
+)
+from piavatar_envs.mpm.sweep import THREADS
+from piavatar_envs.mpm.types import BESIDE, Blocks, Contact, Grid, Model, Particles, Sensors, row
+
+# unrolled, the stencil takes so many registers that a GPU has few threads at once
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+
+
+#: Units in a newton second: sums are right to 1e-12 N s, and end at 8e6 N s.
+UNITS = wp.constant(float(2**40))
+
+
+@wp.func
+def boundary_entry(sensors: Sensors, subject: int):
+    """Place of the colliders' impulse on a subject."""
+    return subject
+
+
+@wp.func
+def pair_entry(sensors: Sensors, pair: int):
+    """Place of a pair's impulse."""
+    return sensors.boundary_impulse.shape[1] + pair
+
+
+@wp.func
+def part_entry(sensors: Sensors, sensor: int, giver: int):
+    """Place of the impulse that subject ``giver`` has given a sensor."""
+    subjects = sensors.boundary_impulse.shape[1]
+    return subjects + subjects * subjects + sensor * subjects + giver
+
+
+@wp.func
+def moment_entry(sensors: Sensors, subject: int):
+    """Place of the moment of the colliders' impulse on a subject."""
+    return part_entry(sensors, sensors.part_impulse.shape[1], 0) + subject
+
+
+@wp.func
+def add_impulse(sensors: Sensors, e: int, entry: int, J: wp.vec3):
+    """Add an impulse [N s] to an entry."""
+    for axis in range(3):
+        wp.atomic_add(sensors.sums, e, 3 * entry + axis, wp.int64(wp.rint(UNITS * J[axis])))
+
+
+@wp.func
+def impulse_at(sensors: Sensors, e: int, entry: int):
+    """Sum of an entry [N s]."""
+    x = float(sensors.sums[e, 3 * entry])
+    y = float(sensors.sums[e, 3 * entry + 1])
+    z = float(sensors.sums[e, 3 * entry + 2])
+    return wp.vec3(x, y, z) / UNITS
+
+
+@wp.func
+def forget(e: int, sensors: Sensors):
+    """Zero the sensors of an environment."""
+    for n in range(sensors.sums.shape[1]):
+        sensors.sums[e, n] = wp.int64(0)
+    for s in range(sensors.boundary_impulse.shape[1]):
+        sensors.boundary_impulse[e, s] = wp.vec3(0.0)
+        sensors.boundary_moment[e, s] = wp.vec3(0.0)
+        sensors.penetration[e, s] = 0.0
+    for s in range(sensors.pair_impulse.shape[1]):
+        sensors.pair_impulse[e, s] = wp.vec3(0.0)
+    for i in range(sensors.part_impulse.shape[1]):
+        for s in range(sensors.part_impulse.shape[2]):
+            sensors.part_impulse[e, i, s] = wp.vec3(0.0)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+const float4 v = *reinterpret_cast<const float4*>(&wp::index(node, e, r));
+return wp::vec_t<4, wp::float32>(v.x, v.y, v.z, v.w);
+#else
+return wp::index(node, e, r);
+#endif
+""")
+def read_change(node: wp.array2d(dtype=wp.vec4), e: int, r: int) -> wp.vec4:
+    """``node[e, r]``, of the sensors or of what faces what, on a GPU in one load of 16 bytes."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+*reinterpret_cast<float4*>(&wp::index(node, e, r)) = make_float4(value[0], value[1], value[2], value[3]);
+#else
+wp::index(node, e, r) = value;
+#endif
+""")
+def write_change(node: wp.array2d(dtype=wp.vec4), e: int, r: int, value: wp.vec4):
+    """``node[e, r] = value`` in one store."""
+    ...
+
+
+@wp.kernel
+def clear_sensors(sensors: Sensors):
+    """Forget the contacts of the last control step."""
+    forget(wp.tid(), sensors)
+
+
+@wp.kernel
+def clear_masked_sensors(mask: wp.array(dtype=wp.bool), sensors: Sensors):
+    """Forget the contacts of the masked environments."""
+    e = wp.tid()
+    if mask[e]:
+        forget(e, sensors)
+
+
+@wp.kernel
+def read_impulses(sensors: Sensors):
+    """Write the impulses that have been added up since the sensors were cleared; a thread has an entry."""
+    e, entry = wp.tid()
+    subjects = sensors.boundary_impulse.shape[1]
+    J = impulse_at(sensors, e, entry)
+    if entry < pair_entry(sensors, 0):
+        sensors.boundary_impulse[e, entry - boundary_entry(sensors, 0)] = J
+    elif entry < part_entry(sensors, 0, 0):
+        sensors.pair_impulse[e, entry - pair_entry(sensors, 0)] = J
+    elif entry < moment_entry(sensors, 0):
+        n = entry - part_entry(sensors, 0, 0)
+        sensors.part_impulse[e, n // subjects, n % subjects] = J
+    else:
+        sensors.boundary_moment[e, entry - moment_entry(sensors, 0)] = J
+
+
+#: Volume fraction of another subject at which a particle lies on its surface.
+SURFACE = wp.constant(0.5)
+#: Slope of the volume fraction at a flat surface, times the grid spacing: a step seen through the spline twice has the
+#: slope of the integral of its square, 11/20.
+SURFACE_SLOPE = wp.constant(0.55)
+
+
+@wp.func
+def pick(w: wp.vec3, n: int):
+    """``w[n]``; where a loop is not unrolled, a GPU would put ``w`` into memory for it."""
+    return wp.where(n == 0, w[0], wp.where(n == 1, w[1], w[2]))
+
+
+@wp.func
+def touched_around(grid: Grid, blocks: Blocks, sensors: Sensors, e: int, f: int, base: wp.vec3i):
+    """Whether contact has changed velocities of field ``f`` in any block of a stencil."""
+    any = int(0)
+    for i in range(2):  # see fields_around
+        for j in range(2):
+            for k in range(2):
+                block = block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)
+                any = any | sensors.touched[e, first_record(grid, blocks, e, f, block) // BLOCK_NODES]
+    return any != 0
+
+
+@wp.func
+def change_at(sensors: Sensors, e: int, r: int):
+    """What contact has done to a record: change of velocity, and the subject that did most of it."""
+    change = read_change(sensors.node, e, r)
+    # else it is of the past
+    return wp.where(sensors.touched[e, r // BLOCK_NODES] != 0, change, wp.vec4())
+
+
+@wp.func
+def give(sensors: Sensors, e: int, sensor: int, taken: wp.vec4):
+    """Add an impulse to a sensor, by the subject in its last component."""
+    impulse = wp.vec3(taken[0], taken[1], taken[2])
+    if wp.length_sq(impulse) > 0.0:
+        add_impulse(sensors, e, part_entry(sensors, sensor, int(taken[3])), impulse)
+
+
+@wp.func
+def take_share(sensors: Sensors, e: int, sensor: int, taken: wp.vec4, change: wp.vec4, share: float):
+    """Impulse that a particle has taken so far, and from whom, with its ``share`` [kg] of a node's change.
+
+    As long as it comes from one subject it is added up before it is rounded.
+    """
+    if wp.length_sq(wp.vec3(change[0], change[1], change[2])) == 0.0:
+        return taken
+    if change[3] != taken[3]:
+        give(sensors, e, sensor, taken)
+        taken = wp.vec4(0.0, 0.0, 0.0, change[3])
+    return taken + share * wp.vec4(change[0], change[1], change[2], 0.0)
+
+
+@wp.func
+def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
+    """Impulse that contact gives particle ``p`` at grid position ``xg``, on its sensor, by the subject that gave it."""
+    sensor = particles.sensor[p]
+    own = particles.field[p]
+    stencil = stencil_at(xg)
+    base = stencil.base
+    # nearly all particles leave here
+    if sensor < 0 or fields_around(grid, blocks, base, e) == (1 << own):
+        return
+    if not touched_around(grid, blocks, sensors, e, own, base):
+        return
+    m = particles.mass[row(e, particles.mass.shape[0]), p]
+    taken = wp.vec4()
+    slab = wp.vec4i()
+    three = int(3)  # not a constant, where loops are unrolled: what few particles come to is as short as can be
+    for i in range(three):
+        if i == 0 or ((base[0] + i) & 3) == 0:
+            slab = slab_records(grid, blocks, e, own, base, i, VECTORS)
+        for j in range(three):
+            at = line_of_records(slab, base, i, j)
+            w = m * pick(stencil.wx, i) * pick(stencil.wy, j)
+            # all of a line are asked for before the first has answered
+            first = change_at(sensors, e, at[0])
+            second = change_at(sensors, e, at[1])
+            third = change_at(sensors, e, at[2])
+            taken = take_share(sensors, e, sensor, taken, first, w * stencil.wz[0])
+            taken = take_share(sensors, e, sensor, taken, second, w * stencil.wz[1])
+            taken = take_share(sensors, e, sensor, taken, third, w * stencil.wz[2])
+    give(sensors, e, sensor, taken)
+
+
+@wp.func
+def sense_gathered(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
+    """:func:`sense_particle` of one near which the grid pass has seen another field; nearly all leave here."""
+    base = base_node(xg)
+    r = first_record(grid, blocks, e, particles.field[p], block_index(grid, base[0], base[1], base[2]))
+    if blocks.beside[e, r // BLOCK_NODES] != 0:
+        sense_particle(grid, particles, blocks, sensors, e, p, xg)
+
+
+@wp.func
+def is_alone(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i):
+    """Whether the grid pass has noted that a stencil of field ``f`` lies in no block of another one.
+
+    It has noted nothing of blocks that have been marked since, nor where a gather does not ask for it.
+    """
+    if blocks.beside.shape[1] == 1:
+        return False
+    r = first_record(grid, blocks, e, f, block_index(grid, base[0], base[1], base[2]))
+    if r >= BLOCK_NODES * blocks.swept[e]:
+        return False
+    return blocks.beside[e, r // BLOCK_NODES] == 0
+
+
+def senses_in_gather(model: Model) -> bool:
+    """Whether particles sense contact in the gather, that of large bodies on a GPU, and not in a launch of its own."""
+    senses = model.contact.num_fields > 1 and model.num_sensors > 0
+    return senses and model.scatter not in ("plain", "shared")
+
+
+@wp.kernel(launch_bounds=(THREADS, 7))
+def sense_contact(
+    grid: Grid,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    blocks: Blocks,
+    failure: wp.array(dtype=int),
+    # in and out
+    sensors: Sensors,
+):
+    """Impulse on every sensor, by the subject that gave it.
+
+    A particle takes its share ``w m`` of each node's change of velocity; summed over a subject's particles that is
+    the impulse at the nodes. Where three subjects meet at a node, all of it is booked on the one that did most.
+    """
+    e, p = wp.tid()
+    xg = grid_position(grid, x[e, p])
+    if failure[e] == 0 and (noted_around(blocks, e, p) & BESIDE) != 0:
+        sense_particle(grid, particles, blocks, sensors, e, p, xg)
+
+
+@wp.kernel
+def sense_penetration(
+    grid: Grid,
+    particles: Particles,
+    contact: Contact,
+    x: wp.array2d(dtype=wp.vec3),
+    blocks: Blocks,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    failure: wp.array(dtype=int),
+    # in and out
+    penetration: wp.array2d(dtype=float),
+):
+    """Deepest particle of a subject below the surface of another [m].
+
+    The surface is where the other's volume fraction, seen through the spline, is one half; depths are linear there
+    and end at 0.9 grid spacings.
+    """
+    e, p = wp.tid()
+    if failure[e] != 0:
+        return
+    xg = grid_position(grid, x[e, p])
+    stencil = stencil_at(xg)
+    base = stencil.base
+    if not stencil_inside(grid, base):
+        return
+    if is_alone(grid, blocks, e, particles.field[p], base):
+        return
+    own = contact.subject[particles.field[p]]
+    around = fields_around(grid, blocks, base, e)
+    fraction = float(0.0)
+    for g in range(contact.num_fields):
+        if has_field(around, g) and contact.subject[g] != own:
+            m = float(0.0)
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):
+                        if has_field(blocks.fields[e, block_index(grid, base[0] + i, base[1] + j, base[2] + k)], g):
+                            r = record_of(grid, blocks, e, g, base[0] + i, base[1] + j, base[2] + k)
+                            # a block that the last gather has marked knows nothing yet
+                            if r < BLOCK_NODES * blocks.swept[e]:
+                                w = pick(stencil.wx, i) * pick(stencil.wy, j) * pick(stencil.wz, k)
+                                m += w * mass_of(node_velocity, e, r)
+            density = contact.density[row(e, contact.density.shape[0]), g]
+            fraction += m * grid.inv_dx * grid.inv_dx * grid.inv_dx / density
+    depth = grid.dx * (wp.min(fraction, 1.0) - SURFACE) / SURFACE_SLOPE
+    if depth > 0.0:
+        wp.atomic_max(penetration, e, own, depth)

@@ -1,0 +1,279 @@
+"""The grid pass of a body whose nodes are in the shared memory of its CUDA block.
+
+The gather of a body from the velocities in the shared memory of its CUDA block.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.core.cuda_intrinsics import (
+    half_word,
+    has_bit,
+    meet_warp,
+    number,
+    thread_of_block,
+    threads_of_block,
+    word,
+)
+from piavatar_envs.mpm.bspline import BLOCK_NODES, Stencil, block_corner, grid_position, stencil_at
+from piavatar_envs.mpm.colliders import nearest_boundary
+from piavatar_envs.mpm.cuda.block_grid import (
+    BLOCK_BRICKS,
+    NO_BRICK,
+    PLACES,
+    SPEED,
+    block_of,
+    bricks_around,
+    bricks_of_round,
+    in_marked_plane,
+    kinematic_at,
+    kinematic_of,
+    kinematic_word,
+    line_in_bricks,
+    node_word,
+    physical_at,
+    place_of_record,
+    record_of_place,
+    set_velocities,
+    sums_at,
+    unit_of_mass,
+)
+from piavatar_envs.mpm.g2p import Gathered, Gradients, asks_kinematic, finish_gather, gather
+from piavatar_envs.mpm.grid_arrays import write_record
+from piavatar_envs.mpm.grid_update import meet_boundaries, physical_velocity, place_of, total_velocity
+from piavatar_envs.mpm.sparse_grid import has_field, slots_used
+from piavatar_envs.mpm.stores import store_particle
+from piavatar_envs.mpm.types import (
+    NO_STRESS,
+    SPLIT,
+    Blocks,
+    Boundaries,
+    Contact,
+    Grid,
+    Moving,
+    Particles,
+    Room,
+    Sensors,
+    Step,
+    Sums,
+    vec8,
+    vec8i,
+)
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.func
+def updated_node(
+    grid: Grid,
+    step: Step,
+    boundaries: Boundaries,
+    contact: Contact,
+    blocks: Blocks,
+    room: Room,
+    sums: Sums,
+    sensors: Sensors,
+    e: int,
+    n: int,
+    marked: int,
+    unit: float,
+    speed: float,
+):
+    """Velocity of node ``n`` of a round, from its sums; the units are those of one field, if it is the only.
+
+    See :func:`piavatar_envs.mpm.grid_update.update_grid`. In a block with several fields they stay sums.
+    """
+    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    several = contact.num_fields > 1
+    near = in_marked_plane(marked, n)
+    place = marked % PLACES
+    r = record_of_place(place, n % 8)
+    block = int(0)
+    f = int(0)
+    m = float(unit)
+    q = unit * speed
+    if near or several:  # others need not wait to know
+        held = blocks.held[e, place // BLOCK_BRICKS]
+        block = block_of(grid, contact, held)
+        if several:
+            f = held // grid.num_blocks
+            m = unit_of_mass(f)
+            q = m * number(SPEED + f)
+    physical = sums_at(node_word(room, n))
+    at = kinematic_word(room, n)
+    s = vec8(
+        m * float(physical[0]), q * float(physical[1]), q * float(physical[2]), q * float(physical[3]),
+        q * float(word(at)), q * float(word(at + 1)), q * float(word(at + 2)), 0.0,
+    )  # fmt: skip
+    if not several or blocks.fields[e, block] == (1 << f):
+        s = total_velocity(step, split, s)
+        if near:
+            x = place_of(grid, block_corner(grid, block), r % BLOCK_NODES)
+            s = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, s, sensors)
+        s = physical_velocity(split, s)
+        if near or several:
+            sums.offset[e, r] = wp.vec4()
+    return s
+
+
+@wp.func
+def update_bricks(
+    grid: Grid,
+    step: Step,
+    boundaries: Boundaries,
+    contact: Contact,
+    blocks: Blocks,
+    room: Room,
+    sums: Sums,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
+    e: int,
+    first: int,
+    writes: bool,
+):
+    """Sums of a round's nodes to velocities; where it ``writes``, outside. All threads come here."""
+    unit = unit_of_mass(0)
+    speed = number(SPEED)
+    count = 8 * bricks_of_round(room, first)
+    for n in range(thread_of_block(), count, threads_of_block()):
+        marked = half_word(room.places, first + n // 8)
+        s = updated_node(
+            grid, step, boundaries, contact, blocks, room, sums, sensors, e, n, marked, unit, speed
+        )  # fmt: skip
+        if writes:
+            write_record(node_velocity, e, record_of_place(marked % PLACES, n % 8), s)
+        else:
+            set_velocities(node_word(room, n), kinematic_word(room, n), s)
+
+
+@wp.func
+def clear_untouched(
+    grid: Grid,
+    blocks: Blocks,
+    room: Room,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
+    e: int,
+    part: wp.vec3i,
+):
+    """Records of nodes that no particle touches, in slots that the fields use; nothing has touched anything yet."""
+    for r in range(thread_of_block(), BLOCK_NODES * slots_used(blocks, e), threads_of_block()):
+        slot = r // BLOCK_NODES
+        if has_field(part[2], blocks.held[e, slot] // grid.num_blocks):
+            if half_word(room.numbers, place_of_record(r)) == NO_BRICK:
+                write_record(node_velocity, e, r, vec8())
+            if r % BLOCK_NODES == 0:
+                sensors.touched[e, slot] = 0
+
+
+@wp.func
+def kinematic_from_bricks(room: Room, bricks: vec8i, stencil: Stencil):
+    """Kinematic velocity of a stencil's nodes, in components 1 to 3; few particles ask for it."""
+    base = stencil.base
+    wz = stencil.wz
+    mean = wp.vec4()
+    lines = int(9)  # not a constant: it is as short as can be
+    for n in range(lines):
+        at = line_in_bricks(bricks, base, n // 3, n % 3)
+        w = stencil.wx[n // 3] * stencil.wy[n % 3]
+        first = wz[0] * kinematic_at(kinematic_of(room, at[0]))
+        second = wz[1] * kinematic_at(kinematic_of(room, at[1]))
+        mean += w * (first + second + wz[2] * kinematic_at(kinematic_of(room, at[2])))
+    return mean
+
+
+@wp.func
+def physical_from_bricks(bricks: vec8i, stencil: Stencil):
+    """Sums over a stencil, see :func:`piavatar_envs.mpm.g2p.gather_physical`."""
+    base = stencil.base
+    wx = stencil.wx
+    wy = stencil.wy
+    wz = stencil.wz
+    g = Gradients()
+    planes = int(3)  # not a constant: too few registers for the loads of all three at once
+    for i in range(planes):
+        wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
+        plane = wp.vec4()
+        along_y = wp.vec4()
+        along_z = wp.vec4()
+        for j in range(3):
+            at = line_in_bricks(bricks, base, i, j)
+            second = physical_at(at[1])
+            third = physical_at(at[2])
+            line = wz[0] * physical_at(at[0]) + wz[1] * second + wz[2] * third
+            plane += wy[j] * line
+            along_y += (float(j) * wy[j]) * line
+            along_z += (wy[j] * wz[1]) * second + (2.0 * wy[j] * wz[2]) * third
+        g.mean += wi * plane
+        g.along_x += (float(i) * wi) * plane
+        g.along_y += wi * along_y
+        g.along_z += wi * along_z
+    return g
+
+
+@wp.func
+def gather_from_bricks(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    blocks: Blocks,
+    room: Room,
+    moved: Moving,
+    failure: wp.array(dtype=int),
+    e: int,
+    p: int,
+):
+    """Particle ``p`` from the nodes, see :func:`piavatar_envs.mpm.g2p.gather`."""
+    x = moved.x[e, p]
+    stencil = stencil_at(grid_position(grid, x))
+    bricks = bricks_around(grid, blocks, room, e, particles.field[p], stencil.base, 0)
+    kinematic = Gradients()
+    asked = bool(False)
+    if has_bit(room.told, p):  # who is that near a boundary tells its place
+        asked = asks_kinematic(grid, step, nearest_boundary(boundaries, e, x))
+    if asked:
+        kinematic.mean = kinematic_from_bricks(room, bricks, stencil)
+    physical = physical_from_bricks(bricks, stencil)
+    return finish_gather(
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, stencil
+    )  # fmt: skip
+
+
+@wp.func
+def gather_all(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    blocks: Blocks,
+    room: Room,
+    moved: Moving,
+    failure: wp.array(dtype=int),
+    e: int,
+    fails: bool,
+    outside: bool,
+):
+    """Move all particles, unless the environment ``fails``; velocities are in the room or ``outside``."""
+    t = thread_of_block()
+    count = moved.x.shape[1]
+    if outside:
+        for start in range(0, count, threads_of_block()):
+            p = wp.min(start + t, count - 1)
+            s = Gathered()
+            stays = fails or p < start + t
+            if not stays:
+                s, _ = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+            meet_warp()
+            store_particle(moved, e, p, s, not stays and s.fault == 0)
+    else:
+        for start in range(0, count, threads_of_block()):
+            p = wp.min(start + t, count - 1)
+            s = Gathered()
+            stays = fails or p < start + t
+            if not stays:
+                s = gather_from_bricks(grid, step, particles, boundaries, blocks, room, moved, failure, e, p)
+            meet_warp()
+            store_particle(moved, e, p, s, not stays and s.fault == 0)

@@ -1,0 +1,583 @@
+"""Which worlds have their grids in shared memory, in what parts, and what lies where there.
+
+The bodies of an environment have CUDA blocks of their own where they share no velocity field: until contact they have
+nothing to do with each other.
+
+The grid of a small body in the shared memory of one CUDA block: where its nodes lie there, and how to get at them.
+
+A small body touches two thousand nodes. They fit into the memory that a multiprocessor shares among the threads of a
+CUDA block, where an integer is added a hundred times as fast as in the GPU's own. There they lie in bricks of 2 x 2 x 2
+nodes, numbered anew in every substep as the particles touch them; what touches more than fit goes in several rounds.
+
+An integer has 32 bits. Of mass they count units of 2^-27 of a field's heaviest particle, so a node may hold 16 of them;
+where one gets more, the environment counts anew, eight units as one. Of momentum they count such units at a speed that
+none of the field's particles exceeds, a power of two, in every substep another: so the integers are used to the full,
+and what a particle adds is rounded as a floating-point number would be.
+
+Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; for every brick of every slot a half word, its
+number; a bit for every particle; a byte for every slot; the bricks' own places; bricks of four words a node; three more
+of every node, in the same order. A brick has a word in each of the 32 banks, and its place in the brick says in which:
+threads that add to different nodes of the eight, or to different words of the four, do not wait for each other.
+
+Which bricks of nodes a body touches, and which of its particles tell their places.
+
+What the words of nodes in shared memory count: units of mass, and speeds that momenta are counted at.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.core.cuda_intrinsics import (
+    APPEND,
+    add_word,
+    byte,
+    clear_words,
+    fill_words,
+    meet,
+    native,
+    number,
+    or_word,
+    power_of_two,
+    raise_to,
+    set_byte,
+    set_half_word,
+    set_number,
+    thread_of_block,
+    threads_of_block,
+    word,
+)
+from piavatar_envs.mpm.bspline import BLOCK_NODES, base_node, block_corner, grid_position
+from piavatar_envs.mpm.colliders import GATED_SLAB
+from piavatar_envs.mpm.grid_update import SLAB_NODES, block_is_near, slab_is_near
+from piavatar_envs.mpm.p2g import Scattered, takes_part, tells_place
+from piavatar_envs.mpm.sparse_grid import fields_beyond, has_field, slots_used
+from piavatar_envs.mpm.types import Blocks, Boundaries, Contact, Grid, Model, Particles, Room, row, vec8, vec8i
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+#: Words of a room of which two fit into a multiprocessor, and of one that takes it all; with what stores take of it.
+SMALL_ROOM, LARGE_ROOM = 27_008, 54_272
+#: Threads of their CUDA blocks.
+SMALL_THREADS, LARGE_THREADS = 320, 640
+#: Slots of a part up to which the small one does: they are more than will be used, and half of their nodes.
+MOST_SLOTS_SMALL = 210
+#: Particles of a part up to which its CUDA block has no more to do than others have time for.
+MOST_PARTICLES = 8192
+#: Particles of an environment, which are listed in half words.
+MOST_LISTED = 2**16
+
+
+def parts_of(field: np.ndarray) -> list[tuple[int, int, int]]:
+    """The shortest runs of particles that share no velocity field, each for a CUDA block of its own.
+
+    Args:
+        field: velocity fields of the particles, shape ``(num_particles,)``.
+
+    Returns:
+        First particle, one after the last, and bits of the fields, of every part.
+    """
+    last = {int(f): int(np.flatnonzero(field == f)[-1]) for f in np.unique(field)}
+    parts, first, end = [], 0, 0
+    for p, f in enumerate(field.tolist()):
+        end = max(end, last[f])
+        if p == end:
+            parts.append((first, p + 1, int(np.bitwise_or.reduce(1 << np.unique(field[first : p + 1])))))
+            first = p + 1
+    return parts
+
+
+def most_particles(field: np.ndarray) -> int:
+    """Particles of the largest part."""
+    return max(end - first for first, end, _ in parts_of(field))
+
+
+def suits_shared(device: str, field: np.ndarray, max_slots: int) -> bool:
+    """Whether environments with such particles may have CUDA blocks of their own, and enough shared memory."""
+    target = wp.get_device(device)
+    few = most_particles(field) <= MOST_PARTICLES and len(field) <= MOST_LISTED
+    if not (target.is_cuda and target.arch >= 80 and few):
+        return False
+    tables = int(BLOCK_BRICKS) * max_slots + len(field) // 32 + max_slots // 4
+    fits = 4 * tables < LARGE_ROOM and int(BLOCK_BRICKS) * max_slots < int(PLACES)
+    return target.max_shared_memory_per_block >= 227 * 1024 and fits
+
+
+def has_large_room(model: Model, parts: list[tuple[int, int, int]]) -> bool:
+    """Whether rooms of these ``parts`` take a multiprocessor each: nodes need it, or there are enough of them.
+
+    A large room has more threads, and what they add up are integers: the result is the same.
+    """
+    share = max(end - first for first, end, _ in parts) / model.num_particles
+    if share * model.max_slots > MOST_SLOTS_SMALL:
+        return True
+    return model.num_envs * len(parts) <= wp.get_device(model.device).sm_count
+
+
+def plan_room(model: Model) -> tuple[Room, bool]:
+    """Where things lie in a room, and whether it is a large one."""
+    room = Room()
+    if model.scatter != "shared":
+        return room, False
+    parts = parts_of(model.particles.field.numpy())
+    large = has_large_room(model, parts)
+    room.numbers = int(HEADER)
+    room.told = room.numbers + int(BLOCK_BRICKS) * model.max_slots // 2
+    room.near = room.told + -(-model.num_particles // 32)
+    room.places = _multiple_of_4(room.near + -(-model.max_slots // 4))
+    room.bricks = _multiple_of_4(room.places + int(BLOCK_BRICKS) * model.max_slots // 2)
+    words = int(BRICK_WORDS) + int(KINEMATIC_BRICK_WORDS)
+    room.capacity = ((LARGE_ROOM if large else SMALL_ROOM) - room.bricks) // words - 1
+    room.kinematic = room.bricks + int(BRICK_WORDS) * (room.capacity + 1)
+    room.part = wp.array(np.array(parts, np.int32), dtype=wp.vec3i, device=model.device)
+    room.speed = wp.zeros((model.num_envs, model.contact.num_fields), dtype=float, device=model.device)
+    return room, large
+
+
+def _multiple_of_4(words: int) -> int:
+    return -(-words // 4) * 4
+
+
+#: Words of a node: mass and physical momentum, later physical velocity and nothing, for loads of 16 bytes.
+NODE_WORDS = wp.constant(4)
+#: Words that it has elsewhere: kinematic momentum, later kinematic velocity.
+KINEMATIC_WORDS = wp.constant(3)
+#: Words of a brick of 2 x 2 x 2 nodes, as many as there are banks, and those that it has elsewhere.
+BRICK_WORDS, KINEMATIC_BRICK_WORDS = wp.constant(8 * NODE_WORDS), wp.constant(8 * KINEMATIC_WORDS)
+#: Bricks of a block of 4 x 4 x 4 nodes.
+BLOCK_BRICKS = wp.constant(8)
+#: Words of the header: bricks in use; bits FAILURE_*; particles that tell their places; mass that has been lost
+#: [LOST_UNITS]; units in a field's heaviest particle; how many particles are listed; and of every field, of which there
+#: are 32 at most, for they are bits of a block's mask: the mass of its heaviest particle [kg], the speed of its
+#: fastest, and the speed that its momenta are counted at [m/s].
+HEADER = wp.constant(104)
+COUNT, FAULTS, TOLD, LOST, UNITS, LISTED = (wp.constant(n) for n in range(6))
+HEAVIEST, FASTEST, SPEED = (wp.constant(n) for n in (8, 40, 72))
+#: Units of mass in a field's heaviest particle, if no node holds too much.
+MOST_UNITS = wp.constant(float(2**27))
+#: No brick has this number; nor this one, which those have that are to be numbered.
+NO_BRICK, TOUCHED = wp.constant(0xFFFF), wp.constant(0xFFFE)
+#: What a brick's place has besides its slot and its number there: a bit for each of its planes of nodes across x.
+PLACES = wp.constant(0x4000)
+
+
+def brick_native(cuda: str, otherwise: str = "") -> str:
+    """A snippet that knows the header's words, the strides of the nodes of a brick, and :func:`kinematic_of`."""
+    z, rest = int(NODE_WORDS), int(KINEMATIC_WORDS)
+    strides = f"constexpr int ALONG_Z = {z}, ALONG_Y = {2 * z}, ALONG_X = {4 * z}, BRICK = {8 * z};\n"
+    words = f"COUNT = {int(COUNT)}, TOUCHED = {int(TOUCHED)}, PLACES = {int(PLACES)}"
+    of = f"[](const auto& in, int at) {{ return in.kinematic + (at - in.bricks) / {z} * {rest}; }}"
+    return native(f"constexpr int {words};\n{strides}auto kinematic_of = {of};\n{cuda}", otherwise)
+
+
+@wp.func_native(
+    brick_native(
+        APPEND
+        + """
+unsigned short* const number = reinterpret_cast<unsigned short*>(room + numbers);
+unsigned short* const place = reinterpret_cast<unsigned short*>(room + places);
+const unsigned char* const slabs = reinterpret_cast<const unsigned char*>(room + near);
+const int lane = threadIdx.x & 31;
+for (int n = threadIdx.x; n - lane < most; n += blockDim.x) {
+    const bool touched = n < most && number[n] == TOUCHED;
+    // of the four slabs of a block a brick has the first or the last two
+    const int planes = touched ? slabs[n >> 3] >> ((n & 4) >> 1) & 3 : 0;
+    const bool own = touched && (planes != 0) == by_boundaries;
+    const int next = append(room + COUNT, __ballot_sync(0xffffffffu, own), lane);
+    if (own) number[n] = next, place[next] = n + planes * PLACES;
+}
+"""
+    )
+)
+def number_bricks(numbers: int, places: int, near: int, most: int, by_boundaries: bool):
+    """Number the touched bricks of ``most`` that boundaries are near, or those that none is, and note their places.
+
+    All threads come here; which number a brick gets depends on who comes first, and nothing depends on that.
+    """
+    ...
+
+
+@wp.func
+def bricks_of_round(room: Room, first: int):
+    """How many bricks there are in a round of those from the ``first`` on."""
+    return wp.min(word(COUNT) - first, room.capacity)
+
+
+@wp.func
+def node_word(room: Room, n: int):
+    """Word at which node ``n`` of a round begins, eight a brick."""
+    return room.bricks + NODE_WORDS * n
+
+
+@wp.func
+def kinematic_word(room: Room, n: int):
+    """Word at which the kinematic momentum of node ``n`` of a round begins."""
+    return room.kinematic + KINEMATIC_WORDS * n
+
+
+@wp.func
+def kinematic_of(room: Room, at: int):
+    """The same of the node that begins at word ``at``."""
+    return kinematic_word(room, (at - room.bricks) >> 2)
+
+
+@wp.func
+def clear_bricks(room: Room, first: int):
+    """Zero the nodes of a round."""
+    clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
+    clear_words(room.kinematic, KINEMATIC_BRICK_WORDS * bricks_of_round(room, first))
+
+
+@wp.func
+def in_marked_plane(marked: int, n: int):
+    """Whether the plane of node ``n`` of a round has its bit in the ``marked`` place of the brick."""
+    return (marked & (PLACES << ((n >> 2) & 1))) != 0
+
+
+# of two bricks along an axis the upper one lies in the next block if the lower one is a block's second; a thread asks
+# for no slot twice: reads of a warp in many places are what keeps a multiprocessor busy
+_AROUND = """
+const int ny = grid.blocks[1], nz = grid.blocks[2];
+const int* const slots =
+    &wp::index(blocks.slot, e, field * grid.num_blocks + ((base[0] >> 2) * ny + (base[1] >> 2)) * nz + (base[2] >> 2));
+const bool next_x = base[0] & 2, next_y = base[1] & 2, next_z = base[2] & 2;
+int asked[8] = {};
+#pragma unroll
+for (int b = 0; b < 8; ++b)
+    if ((!(b & 4) || next_x) && (!(b & 2) || next_y) && (!(b & 1) || next_z))
+        asked[b] = slots[(b & 4 ? ny * nz : 0) + (b & 2 ? nz : 0) + (b & 1)];
+const int in_x = (base[0] & 2) << 1, in_y = base[1] & 2, in_z = (base[2] & 2) >> 1;
+wp::vec_t<8, wp::int32> n;
+#pragma unroll
+for (int b = 0; b < 8; ++b) {
+    if ((b & 4) && !next_x) asked[b] = asked[b ^ 4];
+    else if ((b & 2) && !next_y) asked[b] = asked[b ^ 2];
+    else if ((b & 1) && !next_z) asked[b] = asked[b ^ 1];
+    n[b] = 8 * asked[b] + (b & 4 ? 4 - in_x : in_x) + (b & 2 ? 2 - in_y : in_y) + (b & 1 ? 1 - in_z : in_z);
+}
+"""
+
+
+@wp.func_native(brick_native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
+def places_around(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i) -> vec8i:
+    """Where the bricks of a stencil have their half words: 8 slot + brick in block, for x, y and z lower and upper."""
+    ...
+
+
+@wp.func_native(
+    brick_native(
+        _AROUND
+        + """
+const unsigned short* const number = reinterpret_cast<const unsigned short*>(room + layout.numbers);
+for (int b = 0; b < 8; ++b)  // the last brick takes what is not of this round
+    n[b] = layout.bricks + BRICK * (int)min((unsigned)(number[n[b]] - first), (unsigned)layout.capacity);
+return n;
+""",
+        "return wp::vec_t<8, wp::int32>();",
+    )
+)
+def bricks_around(grid: Grid, blocks: Blocks, layout: Room, e: int, field: int, base: wp.vec3i, first: int) -> vec8i:
+    """Words at which the bricks of a stencil begin, in a round of bricks from the ``first`` on."""
+    ...
+
+
+@wp.func_native(
+    brick_native(
+        """
+const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
+const bool far = px + i > 1, upper = py + j > 1;
+const int lower_z = far ? (upper ? bricks[6] : bricks[4]) : (upper ? bricks[2] : bricks[0]);
+const int upper_z = far ? (upper ? bricks[7] : bricks[5]) : (upper ? bricks[3] : bricks[1]);
+const int line = ((px + i) & 1) * ALONG_X + ((py + j) & 1) * ALONG_Y;
+const int second = pz ? upper_z : lower_z + ALONG_Z;
+return wp::vec3i(line + lower_z + pz * ALONG_Z, line + second, line + upper_z + pz * ALONG_Z);
+""",
+        "return wp::vec3i();",
+    )
+)
+def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
+    """Words at which the nodes ``base + (i, j, 0..2)`` begin."""
+    ...
+
+
+@wp.func_native(
+    brick_native(
+        """
+const float4 v = *reinterpret_cast<const float4*>(room + at);
+return wp::vec_t<4, wp::float32>(0.0f, v.x, v.y, v.z);
+""",
+        "return wp::vec_t<4, wp::float32>();",
+    )
+)
+def physical_at(at: int) -> wp.vec4:
+    """Nothing, and the physical velocity of the node that begins at a word."""
+    ...
+
+
+@wp.func_native(
+    brick_native(
+        """
+const float* const v = reinterpret_cast<const float*>(room + at);
+return wp::vec_t<4, wp::float32>(0.0f, v[0], v[1], v[2]);
+""",
+        "return wp::vec_t<4, wp::float32>();",
+    )
+)
+def kinematic_at(at: int) -> wp.vec4:
+    """Nothing, and the kinematic velocity of the node that has it at a word."""
+    ...
+
+
+@wp.func_native(
+    brick_native(
+        """
+const int4 v = *reinterpret_cast<const int4*>(room + at);
+return wp::vec_t<4, wp::int32>(v.x, v.y, v.z, v.w);
+""",
+        "return wp::vec_t<4, wp::int32>();",
+    )
+)
+def sums_at(at: int) -> wp.vec4i:
+    """Mass and physical momentum of the node that begins at a word."""
+    ...
+
+
+@wp.func_native(
+    brick_native("""
+*reinterpret_cast<float4*>(room + at) = make_float4(value[1], value[2], value[3], 0.0f);
+float* const k = reinterpret_cast<float*>(room + kinematic);
+for (int c = 0; c < 3; ++c) k[c] = value[4 + c];
+""")
+)
+def set_velocities(at: int, kinematic: int, value: vec8):
+    """Write what :func:`physical_at` and :func:`kinematic_at` read, of one node, where its sums were."""
+    ...
+
+
+#: Bit of a slot whose particles may tell their places; the bits of its four slabs come before.
+MAY_TELL = wp.constant(16)
+
+
+@wp.func
+def block_of(grid: Grid, contact: Contact, held: int):
+    """The block that a slot holds, of whatever field; a division, where there are several."""
+    block = held
+    if contact.num_fields > 1:
+        block = held % grid.num_blocks
+    return block
+
+
+@wp.func
+def record_of_place(place: int, node: int):
+    """Record of node ``node`` of 2 x 2 x 2 of a brick."""
+    brick = place % BLOCK_BRICKS
+    i = ((brick >> 2) << 1) + (node >> 2)
+    j = (((brick >> 1) & 1) << 1) + ((node >> 1) & 1)
+    k = ((brick & 1) << 1) + (node & 1)
+    return BLOCK_NODES * (place // BLOCK_BRICKS) + 16 * i + 4 * j + k
+
+
+@wp.func
+def place_of_record(r: int):
+    """Place of the brick that a record's node is in, see :func:`record_of_place`."""
+    return BLOCK_BRICKS * (r // BLOCK_NODES) + ((r >> 5) & 1) * 4 + ((r >> 3) & 1) * 2 + ((r >> 1) & 1)
+
+
+@wp.func
+def end_of_part(blocks: Blocks, failure: wp.array(dtype=int), e: int, part: wp.vec3i):
+    """One after the last particle of a part that takes part: where the environment does not, they may be anywhere."""
+    end = part[1]
+    if not takes_part(blocks, e, failure):
+        end = part[0]
+    return end
+
+
+@wp.func
+def note_boundaries(grid: Grid, boundaries: Boundaries, contact: Contact, blocks: Blocks, room: Room, e: int):
+    """Find the slabs of every slot that a boundary is near, and whether its particles may tell their places."""
+    for slot in range(thread_of_block(), slots_used(blocks, e), threads_of_block()):
+        held = blocks.held[e, slot]
+        corner = block_corner(grid, block_of(grid, contact, held))
+        bits = int(0)
+        for slab in range(4):
+            if slab_is_near(grid, boundaries, e, corner, SLAB_NODES * slab, GATED_SLAB):
+                bits = bits | (1 << slab)
+        near = block_is_near(grid, boundaries, e, corner)
+        if contact.num_fields > 1:
+            near = near or fields_beyond(grid, blocks, corner, e) != (1 << (held // grid.num_blocks))
+        set_byte(room.near, slot, wp.where(near, bits | MAY_TELL, bits))
+
+
+@wp.func
+def touch_bricks(
+    grid: Grid,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    blocks: Blocks,
+    room: Room,
+    e: int,
+    p: int,
+    at: wp.vec3,
+    mass: float,
+    field: int,
+    places: vec8i,
+):
+    """Mark the bricks of a particle's stencil, which are at ``places``, and note whether it tells its place."""
+    raise_to(HEAVIEST + field, mass)
+    for b in range(8):
+        set_half_word(room.numbers, places[b], TOUCHED)
+    if (byte(room.near, places[0] // BLOCK_BRICKS) & MAY_TELL) != 0:  # noqa: SIM102 - `and` would ask in any case
+        if tells_place(grid, particles, boundaries, contact, blocks, e, p, at, base_node(grid_position(grid, at))):
+            or_word(room.told + p // 32, 1 << (p % 32))
+            add_word(TOLD, 1)
+
+
+@wp.func
+def touch_with_all(
+    grid: Grid,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    blocks: Blocks,
+    room: Room,
+    e: int,
+    begin: int,
+    end: int,
+    x: wp.array2d(dtype=wp.vec3),
+):
+    """:func:`touch_bricks` with the particles from ``begin`` to ``end``, three of a thread at a time."""
+    r = row(e, particles.mass.shape[0])
+    step = threads_of_block()
+    for p in range(begin + thread_of_block(), end, 3 * step):
+        second = wp.min(p + step, end - 1)
+        third = wp.min(p + 2 * step, end - 1)
+        at = x[e, p]
+        at_second = x[e, second]
+        at_third = x[e, third]
+        f = wp.vec3i(particles.field[p], particles.field[second], particles.field[third])
+        m = wp.vec3(particles.mass[r, p], particles.mass[r, second], particles.mass[r, third])
+        n = places_around(grid, blocks, e, f[0], base_node(grid_position(grid, at)))
+        n_second = places_around(grid, blocks, e, f[1], base_node(grid_position(grid, at_second)))
+        n_third = places_around(grid, blocks, e, f[2], base_node(grid_position(grid, at_third)))
+        touch_bricks(grid, particles, boundaries, contact, blocks, room, e, p, at, m[0], f[0], n)
+        if p + step < end:
+            touch_bricks(grid, particles, boundaries, contact, blocks, room, e, second, at_second, m[1], f[1], n_second)
+        if p + 2 * step < end:
+            touch_bricks(grid, particles, boundaries, contact, blocks, room, e, third, at_third, m[2], f[2], n_third)
+
+
+@wp.func
+def lay_out(
+    grid: Grid,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    blocks: Blocks,
+    room: Room,
+    failure: wp.array(dtype=int),
+    e: int,
+    part: wp.vec3i,
+    x: wp.array2d(dtype=wp.vec3),
+):
+    """Number the bricks that particles touch, and find the particles that tell their places.
+
+    Bricks that no boundary is near come first, so that few warps have to do with boundaries at their nodes.
+    """
+    clear_words(0, room.numbers)
+    fill_words(room.numbers, room.told - room.numbers, -1)  # NO_BRICK twice
+    clear_words(room.told, room.places - room.told)
+    meet()
+    note_boundaries(grid, boundaries, contact, blocks, room, e)
+    meet()
+    end = end_of_part(blocks, failure, e, part)
+    touch_with_all(grid, particles, boundaries, contact, blocks, room, e, part[0], end, x)
+    meet()
+    most = BLOCK_BRICKS * slots_used(blocks, e)
+    number_bricks(room.numbers, room.places, room.near, most, False)
+    meet()
+    number_bricks(room.numbers, room.places, room.near, most, True)
+    meet()
+
+
+#: Slowest speed that momenta are counted at [m/s].
+SLOWEST = wp.constant(2.0**-20)
+#: Units of mass in a field's heaviest particle where places are told.
+PLACE_UNITS = wp.constant(2.0**20)
+#: Units of mass in which is counted what particles have given and nodes have not got. Where a word has run over, 2^20
+#: are missing at least; what is rounded is far less than half of that.
+LOST_UNITS, MOST_LOST = wp.constant(2**12), wp.constant(2**19)
+
+
+@wp.func
+def unit_of_mass(field: int):
+    """Mass that a word counts [kg], a power of two."""
+    return power_of_two(number(HEAVIEST + field)) / number(UNITS)
+
+
+@wp.func
+def unit_of_place(field: int):
+    """Mass that a word of places counts [kg]: more than it does of masses, for they are seen to after these."""
+    return power_of_two(number(HEAVIEST + field)) / PLACE_UNITS
+
+
+@wp.func
+def speed_of(s: Scattered, physical: float):
+    """A bound of the momenta that a particle adds, by its mass [m/s]; of the ``physical`` ones it is known [kg m/s]."""
+    most = physical
+    for c in range(3):
+        most = wp.max(most, wp.abs(s.at_base[4 + c]))
+    return most / s.at_base[0]
+
+
+@wp.func
+def speed_for(fastest: float):
+    """A power of two that the fastest particle will not exceed, if it does not gain a quarter at once."""
+    return wp.max(SLOWEST, power_of_two(1.25 * fastest))
+
+
+@wp.func
+def speeds_known(room: Room, part: wp.vec3i):
+    """Whether there is a speed at which to count the momenta of every field."""
+    known = bool(True)
+    for f in range(room.speed.shape[1]):
+        known = known and (number(SPEED + f) > 0.0 or not has_field(part[2], f))
+    return known
+
+
+@wp.func
+def sums_hold(room: Room, part: wp.vec3i, first: int, given: int):
+    """Whether momenta have been counted at speeds that no particle exceeds, and no word counts more than it can.
+
+    All threads come here; their particles have ``given`` so much mass [LOST_UNITS].
+    """
+    known = speeds_known(room, part)
+    if known:
+        lost = int(given)
+        for n in range(thread_of_block(), 8 * bricks_of_round(room, first), threads_of_block()):
+            lost -= word(node_word(room, n)) // LOST_UNITS
+        add_word(LOST, lost)
+    meet()
+    hold = known and word(LOST) < MOST_LOST
+    for f in range(room.speed.shape[1]):
+        hold = hold and (number(FASTEST + f) <= number(SPEED + f) or not has_field(part[2], f))
+    return hold
+
+
+@wp.func
+def correct_units(room: Room, part: wp.vec3i):
+    """Count the momenta of fields that were too fast at higher speeds, and in larger units if words were too small.
+
+    All threads come here.
+    """
+    f = thread_of_block()
+    meet()
+    if f == 0 and word(LOST) >= MOST_LOST:
+        set_number(UNITS, number(UNITS) / 8.0)
+    if f < room.speed.shape[1]:
+        slow = number(SPEED + f) == 0.0 or number(FASTEST + f) > number(SPEED + f)
+        if slow and has_field(part[2], f):
+            set_number(SPEED + f, speed_for(number(FASTEST + f)))
+    meet()

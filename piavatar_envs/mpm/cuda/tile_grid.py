@@ -1,0 +1,369 @@
+"""The nodes of a group of particles in the shared memory of its CUDA block, in CUDA: where they lie.
+
+They are those of a box around the particles' stencils, in bricks of 2 x 2 x 2 nodes, so where a node is follows from
+where it is on the grid. A group whose box has too many bricks goes in turns: each takes the particles that are near the
+first of those that are left, and a box around that one. Whose turn comes when depends on the particles' places only.
+
+Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; of every brick its record, which nodes have got
+mass, and where it is in its block; whose particles tell their nodes more than momentum; four sums of every node, one
+brick after the other. A brick has a word in each of the 32 banks, as in :mod:`piavatar_envs.mpm.cuda.block_grid`.
+
+The sums of a group of particles in shared memory, put down on the nodes.
+
+What particles add has a scalar and a vector that is linear over the stencil. It is counted in units of the group: 2^-25
+of the most that any of its particles has, a power of two, and not less than what the sums outside count. So integers
+are added in any order, and put down exactly. A weight is 27/64 at most: 128 summands stay below 2^31. (Units four times
+as large would do with a fused addition to make an integer of a summand, but a body that drifts through the grid makes
+the same errors again and again: it lost 1e-5 of its momentum in 300 substeps.)
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.core.cuda_intrinsics import native, number
+from piavatar_envs.mpm.cuda.block_grid import BRICK_WORDS
+from piavatar_envs.mpm.cuda.tiled_g2p import KINEMATIC, PLACE, bounded
+from piavatar_envs.mpm.p2g import Scattered
+from piavatar_envs.mpm.types import FAILURE_CFL, Blocks, Grid, Sums
+
+wp.set_module_options({"enable_backward": False})
+
+
+#: Particles of a group, at most, a thread each.
+THREADS = 128
+#: Bricks that there is room for, enough for a box of ``REACH`` grid spacings to each side of a particle.
+CAPACITY = wp.constant(128)
+REACH = wp.constant(3)
+#: Words of the header: how many tell their nodes more than momentum; whether some are left for another turn; the first
+#: of these; the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units;
+#: the least and the greatest lowest node of a stencil, along three axes, and whether any of the nodes has others.
+MORE, LEFT, FIRST = (wp.constant(n) for n in range(3))
+HEAVIEST, FASTEST, DRIVEN = (wp.constant(n) for n in range(3, 6))
+MASS_UNIT, MOMENTUM_UNIT = (wp.constant(n) for n in (6, 7))
+LOWEST, BESIDE, HIGHEST = (wp.constant(n) for n in (8, 11, 12))
+RECORDS = wp.constant(16)
+MASSIVE = wp.constant(int(RECORDS) + int(CAPACITY))
+WITHIN = wp.constant(int(MASSIVE) + int(CAPACITY))
+TELLERS = wp.constant(int(WITHIN) + int(CAPACITY))
+NODES = wp.constant(-(-(int(TELLERS) + THREADS) // 32) * 32)
+#: Words of a room.
+WORDS = wp.constant(int(NODES) + int(BRICK_WORDS) * int(CAPACITY))
+#: Units of the most that a particle has.
+UNITS = wp.constant(float(2**25))
+#: What a brick has besides its place in its block: whether there is matter of another field there; then bits of its
+#: nodes, those that had another field.
+SHARED, OTHERS = wp.constant(1 << 30), wp.constant(256)
+
+#: The least power of two that is not below the positive number in a word.
+POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fffff) & 0x7f800000); };"
+#: How many bricks a box has along each axis, none if nobody is in it.
+SIZE = """
+int lowest[3], size[3];
+for (int c = 0; c < 3; ++c) {
+    lowest[c] = room[LOWEST + c] >> 1;
+    size[c] = max((room[HIGHEST + c] + 2 >> 1) - lowest[c] + 1, 0);
+}
+"""
+
+
+def in_group(cuda: str, otherwise: str = "") -> str:
+    """A snippet that knows what lies where."""
+    names = "CAPACITY REACH MORE LEFT FIRST HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT LOWEST HIGHEST RECORDS"
+    names += " BESIDE MASSIVE WITHIN TELLERS NODES BRICK_WORDS SHARED OTHERS"
+    values = {name: globals()[name] for name in names.split()} | {"KINEMATIC": KINEMATIC, "PLACE": PLACE}
+    known = ", ".join(f"{name} = {int(value)}" for name, value in values.items())
+    return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
+
+
+@wp.func_native(
+    in_group("""
+int4* const nodes = reinterpret_cast<int4*>(room + NODES);
+if (blockDim.x == 128) {  // the usual case without a loop
+#pragma unroll
+    for (int n = 0; n < BRICK_WORDS * CAPACITY / 512; ++n) nodes[threadIdx.x + 128 * n] = make_int4(0, 0, 0, 0);
+} else
+    for (int n = threadIdx.x; n < BRICK_WORDS * CAPACITY / 4; n += blockDim.x) nodes[n] = make_int4(0, 0, 0, 0);
+""")
+)
+def clear_nodes():
+    """Nothing has been added to any node."""
+    ...
+
+
+@wp.func_native(
+    in_group("""
+if (threadIdx.x != 0) return;
+room[MORE] = 0, room[LEFT] = 0, room[BESIDE] = 0, room[FIRST] = 0x7fffffff;
+for (int c = 0; c < 3; ++c) room[LOWEST + c] = 0x7fffffff, room[HIGHEST + c] = -1;
+""")
+)
+def begin_turn():
+    """Nobody is in the box, and nobody tells anything."""
+    ...
+
+
+@wp.func_native(
+    in_group("""
+int mass = takes ? __float_as_int(scalar) : 0, most = takes ? __float_as_int(momentum) : 0;
+#if __CUDA_ARCH__ >= 800
+mass = __reduce_max_sync(ALL, mass), most = __reduce_max_sync(ALL, most);
+takes = (threadIdx.x & 31) == 0;
+#endif
+int* const of_vector = room + (kind == 0 ? FASTEST : DRIVEN);
+if (takes && mass > room[HEAVIEST]) atomicMax(room + HEAVIEST, mass);  // it is 0 where it is not asked for
+if (takes && most > *of_vector) atomicMax(of_vector, most);
+""")
+)
+def raise_most(takes: bool, kind: int, scalar: float, momentum: float):
+    """See that the group's units are large enough for a particle's momenta; all threads of a warp come here."""
+    ...
+
+
+@wp.func_native(
+    in_group("""
+int low[3], high[3];
+for (int c = 0; c < 3; ++c) {
+    low[c] = takes ? base[c] : 0x7fffffff, high[c] = takes ? base[c] : -1;
+#if __CUDA_ARCH__ >= 800
+    low[c] = __reduce_min_sync(ALL, low[c]), high[c] = __reduce_max_sync(ALL, high[c]);
+#endif
+}
+#if __CUDA_ARCH__ >= 800
+takes = (threadIdx.x & 31) == 0;
+#endif
+if (!takes) return;
+for (int c = 0; c < 3; ++c) atomicMin(room + LOWEST + c, low[c]), atomicMax(room + HIGHEST + c, high[c]);
+""")
+)
+def widen_box(takes: bool, base: wp.vec3i):
+    """See that a stencil is in the box; all threads of a warp come here."""
+    ...
+
+
+@wp.func_native(
+    in_group(
+        SIZE
+        + """
+const bool fits = (float)size[0] * (float)size[1] * (float)size[2] <= (float)CAPACITY;
+if (threadIdx.x == 0) room[LEFT] = !fits;
+if (fits) return takes;
+__syncthreads();  // all have seen it
+if (takes) atomicMin(room + FIRST, (int)threadIdx.x);
+__syncthreads();
+if (threadIdx.x == room[FIRST])
+    for (int c = 0; c < 3; ++c) {
+        room[LOWEST + c] = max(base[c] - REACH, 0);
+        room[HIGHEST + c] = min(base[c] + REACH, grid.nodes[c] - 3);
+    }
+__syncthreads();
+for (int c = 0; c < 3; ++c) takes = takes && base[c] >= room[LOWEST + c] && base[c] <= room[HIGHEST + c];
+return takes;
+""",
+        "return takes;",
+    )
+)
+def has_turn(grid: Grid, takes: bool, base: wp.vec3i) -> bool:
+    """Whether it is a particle's turn: that of all who take part, or of some, for whom the box is made smaller.
+
+    All threads come here, and have met since the box was widened. Whether some are left is in word ``LEFT``.
+    """
+    ...
+
+
+@wp.func_native(
+    in_group(
+        SIZE
+        + """
+const int along_y = BRICK_WORDS * size[2], along_x = along_y * size[1];
+const int first = NODES + ((base[0] >> 1) - lowest[0]) * along_x + ((base[1] >> 1) - lowest[1]) * along_y
+    + ((base[2] >> 1) - lowest[2]) * BRICK_WORDS;
+return wp::vec_t<3, wp::int32>(first, along_x, along_y);
+""",
+        "return wp::vec_t<3, wp::int32>();",
+    )
+)
+def bricks_around(base: wp.vec3i) -> wp.vec3i:
+    """Word at which the brick of a stencil's lowest node begins, and how far on its neighbors along x and y do."""
+    ...
+
+
+@wp.func_native(
+    in_group(
+        SIZE
+        + """
+const int bricks = size[0] * size[1] * size[2];
+for (int n = threadIdx.x; n < bricks; n += blockDim.x) {
+    // halves are so far from any border that a quotient need not be exact, and a whole number's takes longer
+    const int line = (int)(((float)n + 0.5f) / (float)size[2]), plane = (int)(((float)line + 0.5f) / (float)size[1]);
+    const int i = lowest[0] + plane, j = lowest[1] + line - plane * size[1], l = lowest[2] + n - line * size[2];
+    const int block = ((i >> 1) * grid.blocks[1] + (j >> 1)) * grid.blocks[2] + (l >> 1);
+    int within = ((i & 1) << 5) + ((j & 1) << 3) + ((l & 1) << 1);
+    const int* const slot = &wp::index(blocks.slot, e, field * grid.num_blocks + block);
+#if __CUDA_ARCH__ >= 800
+    const unsigned to = (unsigned)__cvta_generic_to_shared(room + RECORDS + n);
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" :: "r"(to), "l"(slot) : "memory");
+#else
+    room[RECORDS + n] = *slot;
+#endif
+    if (num_fields > 1 && wp::index(blocks.fields, e, block) != 1 << field) within |= SHARED;
+    room[WITHIN + n] = within;
+}
+"""
+    )
+)
+def fetch_slots(grid: Grid, blocks: Blocks, num_fields: int, e: int, field: int):
+    """Ask for the slots of the bricks' blocks, which nobody waits for before :func:`note_records`."""
+    ...
+
+
+@wp.func_native(
+    in_group(
+        SIZE
+        + """
+#if __CUDA_ARCH__ >= 800
+asm volatile("cp.async.wait_all;" ::: "memory");
+#endif
+const int bricks = size[0] * size[1] * size[2];
+for (int n = threadIdx.x; n < bricks; n += blockDim.x) {
+    const int slot = room[RECORDS + n], within = room[WITHIN + n];
+    room[RECORDS + n] = 128 * slot + (within & ~SHARED);
+    if (within & SHARED) {
+        // of half a block, two planes of 16 nodes, those of a brick: two nodes along each axis
+        const unsigned half = wp::index(blocks.others, e, 2 * slot + (within >> 5 & 1));
+        const unsigned two = half >> (within & 10) & 0x330033u, four = (two | two >> 2) & 0xf000fu;
+        const int others = (four | four >> 12) & 0xff;
+        room[WITHIN + n] = OTHERS * others;
+        if (others != 0) room[BESIDE] = 1;
+    }
+}
+"""
+    )
+)
+def note_records(blocks: Blocks, e: int):
+    """Find the record of every brick's first node, of its momentum, and which of its nodes had another field.
+
+    The slots are those that the same threads have fetched.
+    """
+    ...
+
+
+@wp.func_native(
+    in_group(
+        """
+if (room[BESIDE] == 0) return false;
+// of a brick's two nodes along an axis, those that are in the stencil: of the lower brick, and of the upper one
+int lower[3], upper[3];
+for (int c = 0; c < 3; ++c) lower[c] = base[c] & 1 ? 2 : 3, upper[c] = base[c] & 1 ? 3 : 1;
+int all = 0;
+#pragma unroll 1
+for (int n = 0; n < 8; ++n) {
+    const int at = box[0] + (n & 4 ? box[1] : 0) + (n & 2 ? box[2] : 0) + (n & 1 ? BRICK_WORDS : 0);
+    const int x = n & 4 ? upper[0] : lower[0], y = n & 2 ? upper[1] : lower[1], z = n & 1 ? upper[2] : lower[2];
+    const int plane = z * ((y & 1) + 2 * (y & 2));
+    all |= room[WITHIN + (at - NODES) / BRICK_WORDS] & OTHERS * plane * ((x & 1) + 8 * (x & 2));
+}
+return all != 0;
+""",
+        "return false;",
+    )
+)
+def has_others(box: wp.vec3i, base: wp.vec3i) -> bool:
+    """Whether any node of the stencil at ``base`` had another field, its bricks :func:`bricks_around` it."""
+    ...
+
+
+@wp.func_native(
+    in_group(
+        POWER + "return __int_as_float(0x7f000000 - __float_as_int(power_of_two(room[at]))) * 0x1p25f;",
+        "return 0.0f;",
+    )
+)
+def per_unit_of(at: int) -> float:
+    """One over the unit for what has the most in word ``at``; exact, however the module divides."""
+    ...
+
+
+@wp.func
+def raised(s: Scattered, takes: bool, kind: int, failure: wp.array(dtype=int), e: int):
+    """Whether a particle can be added up; if so, the group's units are raised to its momenta. All threads come here."""
+    momentum = float(0.0)
+    if takes:
+        momentum = bounded(s, number(MOMENTUM_UNIT), failure, e)
+        takes = momentum >= 0.0
+    raise_most(takes, kind, s.at_base[0], momentum)
+    return takes
+
+
+@wp.func_native(
+    in_group(f"""
+{POWER}{SIZE}
+const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, c = lane & 3;  // of four sums
+int warps = blockDim.x >> 5;
+asm volatile("" : "+r"(warps));  // or a compiler finds it anew for each brick
+const int bricks = size[0] * size[1] * size[2];
+const bool is_place = kind == PLACE, of_mass = c == 0 || is_place;
+const int word = kind == 0 ? c : c + 3 & 3;  // a vector begins where the mass was, if there is none
+const int within = (lane & 16) + (lane >> 1 & 4) + (lane >> 2 & 1) + (kind == KINEMATIC ? 64 : 0);
+const unsigned mass_of_node = 1u << (lane & 28);
+// the group's units are not smaller than those of the sums: shifted, they are exact
+float unit = power_of_two(room[of_mass ? HEAVIEST : kind == KINEMATIC ? DRIVEN : FASTEST]);
+unit *= is_place && c > 0 ? 0x1p-24f : 0x1p-25f;
+const int shift = __float_as_int(unit) - room[of_mass ? MASS_UNIT : MOMENTUM_UNIT] >> 23;
+// a loop for what comes first and one for the rest: threads that branch in it would wait for each other
+struct First {{ enum {{ IS = 1 }}; }};
+struct Later {{ enum {{ IS = 0 }}; }};
+auto put_bricks = [&](auto which, auto add) {{
+    int* from = room + NODES + start + BRICK_WORDS * warp + lane;
+#pragma unroll 1
+    for (int n = RECORDS + warp; n < RECORDS + bricks; n += warps, from += BRICK_WORDS * warps) {{
+        const int sum = *from, record = room[n] + within;
+        int& massive = room[n - RECORDS + MASSIVE];
+        if (decltype(which)::IS) massive = __ballot_sync(ALL, sum != 0);  // written by all threads, the same
+        if (sum != 0 && (massive & mass_of_node)) add(record, sum);  // who adds no mass adds nothing
+    }}
+}};
+auto put = [&](auto add) {{
+    if (kind == 0) put_bricks(First(), add);
+    else put_bricks(Later(), add);
+}};
+// memory takes the four numbers of a node at a time
+auto red = [](size_t to, int record, long long added) {{
+    size_t node;
+    asm("mad.wide.s32 %0, %1, %2, %3;" : "=l"(node) : "r"(record), "r"(32), "l"(to));
+    asm volatile("red.global.add.u64 [%0], %1;" :: "l"(node), "l"(added) : "memory");
+}};
+// what places have of records has no halves
+auto own = [&](int record) {{ return is_place ? (record >> 1 & ~63) + (record & 63) : record; }};
+if (is_place)
+    for (int n = threadIdx.x; n < bricks; n += blockDim.x)
+        if (room[MASSIVE + n]) wp::index(sums.told, e, room[RECORDS + n] >> 7) = 1;
+bool too_much = false;
+// sums have 31 bits, so most of them cannot be too large
+if (!is_place && __all_sync(ALL, shift < 18)) {{
+    const size_t to = __cvta_generic_to_global(&wp::index(sums.fixed, e, 0)) + 8 * word;
+    const int factor = 1 << shift;
+    put([&](int record, int sum) {{
+        long long added;
+        asm("mul.wide.s32 %0, %1, %2;" : "=l"(added) : "r"(sum), "r"(factor));
+        red(to, record, added);
+    }});
+}} else {{
+    void* const records = is_place ? (void*)&wp::index(sums.offset_fixed, e, 0) : &wp::index(sums.fixed, e, 0);
+    const size_t to = __cvta_generic_to_global(records) + 8 * word;
+    const int most_counted = shift > 48 ? 0 : shift < 18 ? 0x7fffffff : 1 << (48 - shift);
+    put([&](int record, int sum) {{
+        if (abs(sum) <= most_counted) red(to, own(record), (long long)sum << shift);
+        else too_much = true;
+    }});
+}}
+if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
+""")
+)
+def put_down(grid: Grid, sums: Sums, failure: wp.array(dtype=int), e: int, kind: int, start: int):
+    """Add what the nodes have got of a ``kind`` to the sums outside; sums that are too large are not.
+
+    It begins ``start`` words after the nodes' first. Four threads a node. Masses come first; slots whose nodes are told
+    places are noted.
+    """
+    ...

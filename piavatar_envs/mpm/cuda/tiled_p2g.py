@@ -1,0 +1,385 @@
+"""Which particles the P2G of large bodies takes together, see :mod:`piavatar_envs.mpm.cuda.tiled_p2g`.
+
+What few particles of a group tell their nodes besides momentum: how they are driven, and where they are.
+
+Contact asks for that, see :func:`piavatar_envs.mpm.p2g.tells_place`. These particles are listed, so that the first
+threads of the group's CUDA block have them, and what they tell is added up and put down as momenta are, see
+:mod:`piavatar_envs.mpm.cuda.tiled_p2g`.
+
+The scatter of a GPU for large, dense bodies: particles are added up by the group before the nodes are touched.
+
+A group is of neighbours in memory, which should be neighbours in the body: the fewer bricks of nodes there are in the
+box around them, the less there is to put down. It has a CUDA block of its own, see
+:mod:`piavatar_envs.mpm.cuda.tile_grid` and :mod:`piavatar_envs.mpm.cuda.tile_grid`. What it adds up depends on its own
+particles only, and integers are added: runs repeat bit for bit, and an environment does the same in any batch. What few
+particles have besides is in :mod:`piavatar_envs.mpm.cuda.tiled_p2g`.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from piavatar_envs.core.cuda_intrinsics import (
+    APPEND,
+    block_of_launch,
+    environment_of,
+    meet,
+    native,
+    set_number,
+    thread_of_block,
+    word,
+)
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.mpm.bspline import spline
+from piavatar_envs.mpm.cuda.block_p2g import add_to_box, tell_box
+from piavatar_envs.mpm.cuda.tile_grid import (
+    CAPACITY,
+    DRIVEN,
+    FASTEST,
+    HEAVIEST,
+    LEFT,
+    MASS_UNIT,
+    MOMENTUM_UNIT,
+    MORE,
+    SIZE,
+    TELLERS,
+    THREADS,
+    UNITS,
+    WORDS,
+    begin_turn,
+    bricks_around,
+    clear_nodes,
+    fetch_slots,
+    has_others,
+    has_turn,
+    in_group,
+    note_records,
+    per_unit_of,
+    put_down,
+    raised,
+    widen_box,
+)
+from piavatar_envs.mpm.cuda.tiled_g2p import KINEMATIC, MOMENTUM, PLACE, told_by
+from piavatar_envs.mpm.p2g import Scattered, near_boundary, prepare, scatters
+from piavatar_envs.mpm.types import (
+    PAPER,
+    Blocks,
+    Boundaries,
+    Contact,
+    Grid,
+    Model,
+    Moving,
+    Particles,
+    Step,
+    Sums,
+    row,
+)
+
+# divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls: a
+# warp with a few particles waits for its instructions as much as for its numbers
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+
+
+#: Up to how many particles of an environment a group has so many: smaller worlds fill a GPU with small groups only. The
+#: numbers must not depend on the batch: units do on the group.
+SHARES = ((16384, 32), (65536, 64), (2**31, THREADS))
+#: Ways in which a body may be turned, of which a group's box should be small enough in each.
+_TURNS = Rotation.random(8, random_state=0).as_matrix()
+
+
+def share_of(per_env: int) -> int:
+    """Particles of a group, at most, where an environment has ``per_env``."""
+    return next(share for most, share in SHARES if per_env <= most)
+
+
+def begin_groups(field: np.ndarray, rest: np.ndarray | None, dx: float) -> np.ndarray:
+    """First particles and velocity fields of groups, ``(G + 1, 2)`` int32; the last row says where the others end.
+
+    A group is of one field, and is halved where the box around it would be too large: then it would go in turns, and a
+    substep would wait for it.
+
+    Args:
+        field: velocity fields of the particles of an environment, shape ``(P,)``.
+        rest: where they are at rest [m], shape ``(P, 3)``; if not given, nothing is halved.
+        dx: grid spacing [m].
+    """
+    share, changes = share_of(len(field)), np.flatnonzero(np.diff(field)) + 1
+    bounds = np.concatenate([[0], changes, [len(field)]])
+    begins = np.concatenate([*(np.arange(*ends, share) for ends in pairwise(bounds)), [len(field)]])
+    while rest is not None and (too_large := _too_large(rest, begins, dx)).any():
+        middle = (begins[:-1] + begins[1:] + 1) // 2
+        begins = np.sort(np.concatenate([begins, middle[too_large]]))
+    return np.column_stack([begins, np.append(field[begins[:-1]], 0)]).astype(np.int32)
+
+
+def _too_large(rest: np.ndarray, begins: np.ndarray, dx: float) -> np.ndarray:
+    """Of which groups, of more than one particle, the box has too many bricks in one of ``_TURNS``, shape ``(G,)``."""
+    most = np.zeros(len(begins) - 1)
+    for turn in _TURNS:
+        places = rest @ turn.T / dx
+        edges = np.maximum.reduceat(places, begins[:-1]) - np.minimum.reduceat(places, begins[:-1])
+        most = np.maximum(most, np.prod((edges + 3.0) / 2.0 + 1.0, axis=1))  # a stencil is three nodes long
+    return (most > int(CAPACITY)) & (np.diff(begins) > 1)
+
+
+@wp.func_native(
+    in_group(
+        APPEND
+        + """
+const int place = append(room + MORE, __ballot_sync(ALL, tells), threadIdx.x & 31);
+if (tells) room[TELLERS + place] = threadIdx.x;
+"""
+    )
+)
+def note_teller(tells: bool):
+    """List the thread, if its particle ``tells`` its nodes more than momentum, in any order; all threads come here."""
+    ...
+
+
+@wp.func_native(
+    in_group(
+        SIZE
+        + """
+const int bricks = size[0] * size[1] * size[2];
+return 2 * bricks <= CAPACITY ? BRICK_WORDS * bricks : 0;
+""",
+        "return 0;",
+    )
+)
+def beyond_box() -> int:
+    """Words from a node's to as many more for it, beyond those of the box; 0 where there is no room for these."""
+    ...
+
+
+@wp.func
+def add_told(t: int, driven: Scattered, place: Scattered, drives: bool, to_place: int):
+    """:func:`tell_box` of how a particle is ``driven`` and of its ``place``."""
+    per_mass = per_unit_of(HEAVIEST)
+    per_way = 0.5 * per_mass  # up to 1.5 masses
+    k = per_unit_of(DRIVEN) * wp.vec3(driven.at_base[1], driven.at_base[2], driven.at_base[3])
+    at_base = wp.vec4(
+        per_mass * place.at_base[0], per_way * place.at_base[1], per_way * place.at_base[2], per_way * place.at_base[3]
+    )
+    tell_box(
+        bricks_around(place.base), t, place.base, spline(place.f[0]), spline(place.f[1]), spline(place.f[2]), k,
+        at_base, per_way * place.A[0, 0], drives, to_place,
+    )  # fmt: skip
+
+
+@wp.func
+def tell_nodes(
+    grid: Grid, particles: Particles, moving: Moving, failure: wp.array(dtype=int), sums: Sums, at: wp.vec4i
+):
+    """Scatter what particles that tell their nodes have besides momentum; all threads come here, few groups do.
+
+    The first threads have those particles. How they are driven and where they are is added up at once, if there is room
+    for both.
+    """
+    e = at[0]
+    t = thread_of_block()
+    tells = t < word(MORE)
+    p = at[1] - t + word(TELLERS + wp.where(tells, t, 0))
+    driven = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], KINEMATIC)
+    place = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], PLACE)
+    beyond = beyond_box()
+    kinds = int(2)
+    rounds = wp.where(beyond > 0, 1, kinds)
+    for n in range(rounds):
+        clear_nodes()
+        if n == 0:  # what is added of places is no momentum, and as sound as the masses were
+            tells = raised(driven, tells, KINEMATIC, failure, e)
+        meet()
+        if tells:
+            add_told(t, driven, place, n == 0, wp.where(n == rounds - 1, beyond, -1))
+        meet()
+        for k in range(kinds):
+            if rounds == 1 or k == n:
+                put_down(grid, sums, failure, e, KINEMATIC + k, k * beyond)
+        meet()
+
+
+@wp.func_native(native("return (first + (int)threadIdx.x) & 0x7fffffff;", "return first;"))
+def particle_of_thread(first: int) -> int:
+    """The particle of a thread, of a group's ``first``; the mask tells the compiler that it is not negative."""
+    ...
+
+
+@wp.func
+def begin_group(particles: Particles, sums: Sums):
+    """The group of a CUDA block: environment, particle of the thread, field, particle after the last.
+
+    Nothing has been added yet; units are not smaller than those of the sums. All threads meet later.
+    """
+    at_group = environment_of(block_of_launch(), particles.groups.shape[0] - 1)
+    e = at_group[0]
+    begins = particles.groups[at_group[1]]
+    field = begins[1]
+    if thread_of_block() == 0:
+        mass = sums.mass_unit[row(e, sums.mass_unit.shape[0]), field]
+        momentum = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
+        set_number(MASS_UNIT, mass)
+        set_number(MOMENTUM_UNIT, momentum)
+        set_number(HEAVIEST, UNITS * mass)
+        set_number(FASTEST, UNITS * momentum)
+        set_number(DRIVEN, UNITS * momentum)
+    begin_turn()
+    clear_nodes()
+    return wp.vec4i(e, particle_of_thread(begins[0]), field, particles.groups[at_group[1] + 1][0])
+
+
+@wp.func
+def begins_again():
+    """Whether particles are left for another turn, which begins then; all threads come here."""
+    goes_on = word(LEFT) != 0
+    if goes_on:
+        meet()
+        begin_turn()
+        clear_nodes()
+    return goes_on
+
+
+@wp.func
+def add_momentum(box: wp.vec3i, s: Scattered):
+    """Add mass and momentum of a particle to the group's nodes."""
+    add_to_box(
+        box, thread_of_block(), s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_unit_of(HEAVIEST),
+        per_unit_of(FASTEST),
+    )  # fmt: skip
+
+
+@wp.struct
+class Turn:
+    """A particle while its group scatters."""
+
+    takes: bool  # whether it takes part
+    ours: bool  # whether it has its turn
+    base: wp.vec3i  # lowest node of its stencil
+    box: wp.vec3i  # where the bricks around that are, see :func:`bricks_around`
+
+
+@wp.func
+def add_turn(
+    grid: Grid,
+    blocks: Blocks,
+    failure: wp.array(dtype=int),
+    num_fields: int,
+    at: wp.vec4i,
+    left: bool,
+    s: Scattered,
+):
+    """Add up those of the particles that are ``left`` whose turn it is; ``s`` is what one scatters that is left.
+
+    All threads come here, and to :func:`put_turn` then.
+    """
+    e = at[0]
+    meet()  # not before memory has been asked for what particles have; a turn has begun then
+    takes = raised(s, left, MOMENTUM, failure, e)
+    widen_box(takes, s.base)
+    meet()
+    ours = has_turn(grid, takes, s.base)
+    box = bricks_around(s.base)
+    fetch_slots(grid, blocks, num_fields, e, at[2])
+    if ours:
+        add_momentum(box, s)
+    note_records(blocks, e)  # nobody needs them before
+    return Turn(takes, ours, s.base, box)
+
+
+@wp.func
+def put_turn(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    moving: Moving,
+    failure: wp.array(dtype=int),
+    sums: Sums,
+    num_fields: int,
+    at: wp.vec4i,
+    turn: Turn,
+    near: bool,
+):
+    """Put down what has been added up; returns whether this particle is left then.
+
+    A boundary may be ``near`` it. All threads have met since they added.
+    """
+    tells = near or step.decoupling == PAPER  # which needs the gradient of kinematic momentum everywhere
+    # others are asked for only of who has a box
+    note_teller(turn.ours and (tells or (num_fields > 1 and has_others(turn.box, turn.base))))
+    put_down(grid, sums, failure, at[0], MOMENTUM, 0)
+    meet()
+    if word(MORE) != 0:
+        tell_nodes(grid, particles, moving, failure, sums, at)
+    return turn.takes and not turn.ours
+
+
+@wp.func
+def scatter_left(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    moving: Moving,
+    boundaries: Boundaries,
+    blocks: Blocks,
+    failure: wp.array(dtype=int),
+    sums: Sums,
+    num_fields: int,
+    at: wp.vec4i,
+    left: bool,
+):
+    """Scatter those of the particles that are ``left`` whose turn it is; returns whether this one is left then.
+
+    Written into a kernel's loop, ``s`` would be kept from turn to turn, and four times as many registers be spilled.
+    """
+    e = at[0]
+    s = Scattered()
+    if left:
+        s = prepare(grid, step, particles, moving, e, at[1], False)
+    turn = add_turn(grid, blocks, failure, num_fields, at, left, s)
+    meet()
+    # not before: the less a thread keeps while it waits for what particles have, the earlier it asks for it
+    near = near_boundary(grid, boundaries, e, moving.x[e, wp.min(at[1], moving.x.shape[1] - 1)])
+    return put_turn(grid, step, particles, moving, failure, sums, num_fields, at, turn, near)
+
+
+# that leaves a thread 80 registers, all but a few of those that it asks for
+@wp.kernel(launch_bounds=(THREADS, 6))
+def runs_to_grid(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    moving: Moving,
+    blocks: Blocks,
+    # in and out
+    failure: wp.array(dtype=int),
+    sums: Sums,
+):
+    """The same sums as :func:`piavatar_envs.mpm.p2g.particles_to_grid`.
+
+    A CUDA block takes one group of an environment, a thread a particle; all of its threads come to what they do
+    together.
+    """
+    reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
+    at = begin_group(particles, sums)
+    left = bool(False)
+    if at[1] < at[3]:
+        left = scatters(blocks, moving, at[0], at[1], failure)
+    goes_on = bool(True)
+    while goes_on:
+        left = scatter_left(
+            grid, step, particles, moving, boundaries, blocks, failure, sums, contact.num_fields, at, left
+        )  # fmt: skip
+        goes_on = begins_again()
+
+
+def record_groups(graph: LaunchGraph, model: Model, inputs: list[Any], outputs: list[Any]) -> None:
+    """Append the P2G of all groups of all environments; no CUDA block has two."""
+    share = share_of(model.num_particles)
+    threads = model.num_envs * (model.particles.groups.shape[0] - 1) * share
+    graph.launch(runs_to_grid, threads, inputs, outputs, block_dim=share)

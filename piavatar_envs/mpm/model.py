@@ -1,0 +1,471 @@
+"""How long a time step may be; in a file of its own, because settings know it before anybody needs Warp.
+
+Analytic solids in NumPy terms, and their upload.
+
+Velocity fields in NumPy terms: which subject owns them, and how they rub.
+
+From NumPy to device: choose the grid and the time step, refuse what cannot run, allocate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.mpm.bspline import BLOCK
+from piavatar_envs.mpm.colliders import COLLIDER_KINDS
+from piavatar_envs.mpm.cuda.block_grid import MOST_LISTED, MOST_PARTICLES, most_particles, suits_shared
+from piavatar_envs.mpm.cuda.tiled_p2g import begin_groups
+from piavatar_envs.mpm.materials import lame_parameters, material_index
+from piavatar_envs.mpm.memory import bound_slots, check_memory, choose_marks
+from piavatar_envs.mpm.types import (
+    DECOUPLING,
+    SCATTERS,
+    Boundaries,
+    Contact,
+    Grid,
+    Model,
+    Particles,
+    Step,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+#: Largest stable ``c dt / dx`` that was measured (0.84 to 1.04, less near incompressibility).
+CFL_STABLE = 0.84
+
+
+#: Components of ``size`` that must be positive, by kind.
+_EXTENTS: dict[str, int] = {"plane": 0, "sphere": 1, "box": 3, "capsule": 2}
+
+
+@dataclass(frozen=True)
+class Collider:
+    """An analytic solid, at rest or moving as told.
+
+    Attributes:
+        kind: ``"plane"``, ``"sphere"``, ``"box"`` or ``"capsule"``.
+        size: sphere: radius; box: half extents; capsule: radius and half length of its axis, along local z [m].
+        position: of its origin, for a plane of any of its points [m].
+        rotation: local to world, quaternion ``wxyz``; a plane's outward normal is local z.
+        velocity: of its origin [m/s].
+        spin: angular velocity [rad/s].
+        friction: Coulomb coefficient, one or one a velocity field.
+        kinematic: may be given another velocity later.
+    """
+
+    kind: str
+    size: Sequence[float] = ()
+    position: Sequence[float] = (0.0, 0.0, 0.0)
+    rotation: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
+    velocity: Sequence[float] = (0.0, 0.0, 0.0)
+    spin: Sequence[float] = (0.0, 0.0, 0.0)
+    friction: float | Sequence[float] = 0.0
+    kinematic: bool = False
+
+    @classmethod
+    def plane(cls, normal: Sequence[float], offset: float, friction: float | Sequence[float] = 0.0) -> Collider:
+        """The half-space ``dot(normal, x) < offset`` [m].
+
+        Raises:
+            ValueError: the normal is zero.
+        """
+        normal = np.asarray(normal, float)
+        length = float(np.linalg.norm(normal))
+        if not length > 0.0:
+            raise ValueError(f"bad collider: the normal {normal.tolist()} of a plane must not be zero")
+        n = normal / length
+        # shortest turn from z to n; a half turn about x where n points down
+        turn = np.array([1.0 + n[2], -n[1], n[0], 0.0]) if n[2] > -1.0 + 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])
+        rotation = turn / np.linalg.norm(turn)
+        return cls("plane", (), tuple(n * offset / length), tuple(rotation), friction=friction)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has a velocity or a spin."""
+        return bool(np.any(self.velocity) or np.any(self.spin))
+
+    def check(self) -> None:
+        """Refuse what is no solid.
+
+        Raises:
+            ValueError: an unknown kind, a size that is missing or not positive, or negative friction.
+        """
+        if self.kind not in COLLIDER_KINDS:
+            raise ValueError(f"unknown collider {self.kind!r}; use one of {', '.join(COLLIDER_KINDS)}")
+        extents = _EXTENTS[self.kind]
+        if len(self.size) != extents or not all(np.isfinite(s) and s > 0.0 for s in self.size):
+            raise ValueError(f"size={list(self.size)} of a {self.kind} must be {extents} positive numbers [m]")
+        if not np.all(np.asarray(self.friction) >= 0.0):
+            raise ValueError(f"friction={self.friction} of a {self.kind} must not be negative")
+        if not np.linalg.norm(self.rotation) > 0.0:
+            raise ValueError(f"rotation={list(self.rotation)} of a {self.kind} must be a quaternion wxyz, not zero")
+
+
+def make_boundaries(colliders: Sequence[Collider], num_fields: int, rows: int, device: str) -> Boundaries:
+    """Colliders on the device, with ``rows`` (1 or ``num_envs``) copies of their poses.
+
+    Raises:
+        ValueError: a collider is none, see :meth:`Collider.check`.
+    """
+    count = max(1, len(colliders))
+    kind, size = np.zeros(count, np.int32), np.zeros((count, 3), np.float32)
+    pose = {name: np.zeros((rows, count, 3), np.float32) for name in ("position", "velocity", "spin")}
+    rotation = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (rows, count, 1))
+    friction = np.zeros((1, num_fields, count), np.float32)
+    for b, collider in enumerate(colliders):
+        collider.check()
+        kind[b] = COLLIDER_KINDS[collider.kind]
+        size[b, : len(collider.size)] = collider.size
+        for name, array in pose.items():
+            array[:, b] = getattr(collider, name)
+        wxyz = np.asarray(collider.rotation, float) / np.linalg.norm(collider.rotation)
+        rotation[:, b] = np.roll(wxyz, -1)
+        friction[0, :, b] = collider.friction
+    boundaries = Boundaries()
+    boundaries.count = len(colliders)
+    boundaries.kind = wp.array(kind, dtype=int, device=device)
+    boundaries.size = wp.array(size, dtype=wp.vec3, device=device)
+    for name, array in pose.items():
+        setattr(boundaries, name, wp.array(array, dtype=wp.vec3, device=device))
+    boundaries.rotation = wp.array(rotation, dtype=wp.quat, device=device)
+    boundaries.friction = wp.array(friction.reshape(1, -1), dtype=float, device=device)
+    return boundaries
+
+
+@wp.kernel
+def place_colliders(
+    mask: wp.array(dtype=wp.bool),
+    start: Boundaries,
+    # out
+    boundaries: Boundaries,
+):
+    """Put the colliders of the masked environments where they started, over ``(num_envs, B)``."""
+    e, b = wp.tid()
+    if mask[e]:
+        boundaries.position[e, b] = start.position[e, b]
+        boundaries.rotation[e, b] = start.rotation[e, b]
+        boundaries.velocity[e, b] = start.velocity[e, b]
+        boundaries.spin[e, b] = start.spin[e, b]
+
+
+#: One bit of an int32 a field; the sign is left alone.
+MAX_FIELDS = 31
+#: Gap between two bodies' surfaces below which they touch [grid spacings].
+CONTACT_GATE = 0.15
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Velocity fields of a world; the default is a single body.
+
+    Attributes:
+        subject: subject of each field, counted from 0, the fields of a subject next to each other, its trunk first.
+        friction: Coulomb coefficient of every pair of fields, shape ``(F, F)`` or one number.
+        density: reference density of each field's matter [kg/m^3], shape ``(F,)`` or one number.
+        gate: gap between the surfaces of two fields below which they touch [grid spacings]; from 3 on any.
+        normals: ``"shared"`` (one normal a pair) or ``"own"`` (the paper's rule, which loses momentum).
+        num_sensors: rows of the contact sensor that particles refer to.
+    """
+
+    subject: Sequence[int] = (0,)
+    friction: np.ndarray | float = 0.0
+    density: np.ndarray | float = 1000.0
+    gate: float = CONTACT_GATE
+    normals: str = "shared"
+    num_sensors: int = 0
+
+    @property
+    def num_fields(self) -> int:
+        """Number of velocity fields."""
+        return len(self.subject)
+
+    @property
+    def num_subjects(self) -> int:
+        """Number of subjects."""
+        return max(self.subject) + 1
+
+    def check(self) -> None:
+        """Refuse what the grid cannot hold.
+
+        Raises:
+            ValueError: too many fields, subjects out of order, a negative friction, an unknown rule for normals, or
+                fields of one subject with different reference densities.
+        """
+        if self.num_fields > MAX_FIELDS:
+            raise ValueError(
+                f"{self.num_fields} velocity fields exceed {MAX_FIELDS}; use fewer subjects, or self_contact=False"
+            )
+        steps = np.diff(np.array([-1, *self.subject]))
+        if not np.isin(steps, (0, 1)).all() or self.subject[0] != 0:
+            raise ValueError(f"subjects of the fields {list(self.subject)} must be 0, 1, ... in order")
+        if not np.all(np.asarray(self.friction) >= 0.0):
+            raise ValueError(f"friction={np.min(self.friction):g} between bodies must not be negative")
+        density = np.broadcast_to(np.asarray(self.density, float), (self.num_fields,))
+        for subject in range(self.num_subjects):
+            own = density[np.array(self.subject) == subject]
+            if np.ptp(own) > 0.0:
+                raise ValueError(
+                    f"density={own.tolist()} of the fields of subject {subject}: fields that grow together share one "
+                    f"reference density"
+                )
+        if self.normals not in ("shared", "own"):
+            raise ValueError(f"normals={self.normals!r} must be 'shared' or 'own'")
+        if not (np.isfinite(self.gate) and self.gate >= 0.0):
+            raise ValueError(f"gate={self.gate} must be a gap of at least 0 grid spacings")
+
+    def upload(self, dx: float, rows: int, device: str) -> Contact:
+        """Kernel argument; ``rows`` (1 or ``num_envs``) copies of the densities and coefficients.
+
+        Raises:
+            ValueError: see :meth:`check`.
+        """
+        self.check()
+        count = self.num_fields
+        friction = np.broadcast_to(np.asarray(self.friction, np.float32), (rows, count, count)).reshape(rows, -1)
+        density = np.broadcast_to(np.asarray(self.density, np.float32), (rows, count))
+        contact = Contact()
+        contact.num_fields, contact.num_subjects = count, self.num_subjects
+        contact.own_normals = int(self.normals == "own")
+        contact.gate = self.gate * dx
+        trunk = [self.subject.index(subject) for subject in self.subject]
+        contact.subject = wp.array(np.array(self.subject, np.int32), dtype=int, device=device)
+        contact.trunk = wp.array(np.array(trunk, np.int32), dtype=int, device=device)
+        contact.friction = wp.array(np.ascontiguousarray(friction), dtype=float, device=device)
+        contact.density = wp.array(np.ascontiguousarray(density), dtype=float, device=device)
+        return contact
+
+
+@dataclass(frozen=True)
+class MaterialPoints:
+    """Matter to simulate, in NumPy. Arrays have shape ``(1 or num_envs, num_particles)`` unless said otherwise.
+
+    Attributes:
+        volume: rest volume [m^3].
+        density: rest density [kg/m^3].
+        young_modulus: Young's modulus [Pa].
+        poisson_ratio: Poisson's ratio.
+        material: index of the constitutive model, see :func:`piavatar_envs.mpm.materials.material_index`.
+        field: velocity field, shape ``(num_particles,)`` int; the first for all if not given.
+        seam: 1 where fields of a subject grow together, shape ``(num_particles,)``; nowhere if not given.
+        sensor: row of the contact sensor, -1 for none, shape ``(num_particles,)`` int; none if not given.
+    """
+
+    volume: np.ndarray
+    density: np.ndarray
+    young_modulus: np.ndarray
+    poisson_ratio: np.ndarray
+    material: np.ndarray
+    field: np.ndarray | None = None
+    seam: np.ndarray | None = None
+    sensor: np.ndarray | None = None
+
+    @classmethod
+    def uniform(
+        cls,
+        volume: np.ndarray,
+        density: float = 1000.0,
+        young_modulus: float = 1.0e5,
+        poisson_ratio: float = 0.3,
+        material: str = "neo_hookean",
+    ) -> MaterialPoints:
+        """One material for all particles; ``volume`` [m^3] has shape ``([1 or num_envs,] num_particles)``."""
+        volume = np.atleast_2d(np.asarray(volume, np.float32))
+        one = np.ones((1, volume.shape[1]), np.float32)
+        index = np.full(one.shape, material_index(material), np.int32)
+        return cls(volume, density * one, young_modulus * one, poisson_ratio * one, index)
+
+    @property
+    def fields(self) -> np.ndarray:
+        """Velocity field of every particle, shape ``(num_particles,)`` int."""
+        return np.zeros(self.num_particles, int) if self.field is None else self.field
+
+    @property
+    def num_particles(self) -> int:
+        """Particles of one environment."""
+        return self.volume.shape[1]
+
+    def sound_speed(self) -> float:
+        """Fastest elastic wave ``sqrt((lam + 2 mu) / rho)`` [m/s]."""
+        mu, lam = lame_parameters(self.young_modulus, self.poisson_ratio)
+        return float(np.sqrt((lam + 2.0 * mu) / self.density).max())
+
+
+def choose_num_substeps(control_dt: float, dx: float, sound_speed: float, cfl: float = 0.5) -> int:
+    """Fewest substeps a control step with ``sound_speed * dt <= cfl * dx``."""
+    return max(1, math.ceil(control_dt * sound_speed / (cfl * dx) - 1.0e-9))
+
+
+def check_num_substeps(num_substeps: int, control_dt: float, dx: float, sound_speed: float) -> None:
+    """Refuse a time step that is known to be unstable.
+
+    Raises:
+        ValueError: there is no substep, or ``sound_speed * dt / dx`` exceeds the largest stable value.
+    """
+    if num_substeps < 1:
+        raise ValueError(f"num_substeps={num_substeps} must be at least 1")
+    dt = control_dt / num_substeps
+    if dt * sound_speed > CFL_STABLE * dx:
+        limit = CFL_STABLE * dx / sound_speed
+        raise ValueError(
+            f"sim_dt={dt:.3g} s exceeds the CFL limit {limit:.3g} s (dx={dx:.3g} m, c={sound_speed:.3g} m/s); "
+            f"use num_substeps >= {choose_num_substeps(control_dt, dx, sound_speed, CFL_STABLE)}"
+        )
+
+
+def make_grid(lower: Sequence[float], upper: Sequence[float], dx: float) -> Grid:
+    """Grid whose particles may move freely in the box ``lower`` to ``upper`` [m].
+
+    Raises:
+        ValueError: the box is empty, or has more nodes than 32-bit indices count with room to spare.
+    """
+    lower, upper = np.asarray(lower, float), np.asarray(upper, float)
+    if not (np.all(np.isfinite([lower, upper])) and np.all(upper > lower) and dx > 0.0):
+        raise ValueError(f"empty domain: lower={lower.tolist()}, upper={upper.tolist()} m, dx={dx} m")
+    nodes = np.ceil((upper - lower) / dx).astype(int) + 4  # two nodes of margin for the stencil on each side
+    if nodes.prod() >= 2**30:
+        raise ValueError(f"{nodes.prod():.3g} grid nodes exceed 2^30; use a dx larger than {dx} m or a smaller domain")
+    grid = Grid()
+    grid.origin = wp.vec3(*(lower - 2.0 * dx))
+    grid.dx, grid.inv_dx = dx, 1.0 / dx
+    grid.nodes = wp.vec3i(*nodes.tolist())
+    grid.blocks = wp.vec3i(*(-(-nodes // BLOCK)).tolist())
+    grid.num_blocks = int(np.prod(-(-nodes // BLOCK)))
+    return grid
+
+
+def check_points(points: MaterialPoints, num_envs: int, fields: Fields) -> None:
+    """Refuse matter without mass and arrays that fit no environment.
+
+    Raises:
+        ValueError: a volume or density is not positive, an array has neither one row nor one an environment, or a
+            particle is of a velocity field that there is not.
+    """
+    if points.field is not None and not (points.field.min() >= 0 and points.field.max() < fields.num_fields):
+        raise ValueError(f"field={points.field.max()} of a particle: there are {fields.num_fields} velocity fields")
+    for name in ("volume", "density", "young_modulus", "poisson_ratio", "material"):
+        array = getattr(points, name)
+        if len(array) not in (1, num_envs):
+            raise ValueError(f"{name} has {len(array)} rows; give it 1 or {num_envs}, one an environment")
+    for name, array in (("volume", points.volume), ("density", points.density)):
+        bad = array[~(array > 0.0)]
+        if bad.size:
+            raise ValueError(f"{name}={bad[0]:g} must be positive: a particle without mass cannot move")
+
+
+def build_model(
+    points: MaterialPoints,
+    grid: Grid,
+    *,
+    num_envs: int = 1,
+    device: str = "cpu",
+    control_dt: float = 1.0 / 30.0,
+    num_substeps: int | None = None,
+    cfl: float = 0.5,
+    gravity: Sequence[float] = (0.0, 0.0, -9.81),
+    decoupling: str = "split",
+    colliders: Sequence[Collider] = (),
+    fields: Fields | None = None,
+    sound_speed: float | None = None,
+    max_slots: int | None = None,
+    rest: np.ndarray | None = None,
+    scatter: str | None = None,
+) -> Model:
+    """Constants of a simulation on ``device``.
+
+    ``num_substeps`` is chosen from the CFL limit unless given; the limit comes from the points, or from
+    ``sound_speed`` [m/s] where parameters will be randomised. ``max_slots`` bounds the blocks with matter of an
+    environment, each field's counted; if not given, no state can exceed it. ``rest``, shape ``(P, 3)``, is where
+    particles are when their body is at rest [m]; on a GPU, those of large bodies are added up by compact groups then.
+    ``scatter`` is a key of ``SCATTERS``; if not given, ``"shared"`` on a GPU whose shared memory holds an environment's
+    grid; ``"runs"`` on another one that can match within a warp; else ``"plain"``.
+
+    Raises:
+        ValueError: bad material, unstable time step, a scatter that the device does not know, or more memory than it
+            has.
+    """
+    if decoupling not in DECOUPLING:
+        raise ValueError(f"unknown decoupling {decoupling!r}; use one of {', '.join(DECOUPLING)}")
+    fields = fields or Fields()
+    check_points(points, num_envs, fields)
+    sound_speed = max(points.sound_speed(), sound_speed or 0.0)
+    if num_substeps is None:
+        num_substeps = choose_num_substeps(control_dt, grid.dx, sound_speed, cfl)
+    check_num_substeps(num_substeps, control_dt, grid.dx, sound_speed)
+    mu, lam = lame_parameters(points.young_modulus, points.poisson_ratio)
+    max_slots = bound_slots(max_slots, points.fields, grid, fields.num_fields)
+    scatter = choose_scatter(scatter, device, points.fields, max_slots, decoupling)
+    check_memory(num_envs, points.num_particles, max_slots, device, fields.num_fields, grid.num_blocks, scatter)
+    step = Step()
+    step.dt = control_dt / num_substeps
+    step.gravity = wp.vec3(*gravity)
+    step.decoupling = DECOUPLING[decoupling]
+    return Model(
+        num_envs=num_envs,
+        num_particles=points.num_particles,
+        device=device,
+        grid=grid,
+        step=step,
+        particles=upload_points(points, mu, lam, rest, grid.dx, device),
+        boundaries=make_boundaries(colliders, fields.num_fields, num_envs, device),
+        contact=fields.upload(grid.dx, num_envs, device),
+        num_substeps=num_substeps,
+        control_dt=control_dt,
+        sound_speed=sound_speed,
+        moving_boundaries=any(collider.moves or collider.kinematic for collider in colliders),
+        num_sensors=fields.num_sensors,
+        max_slots=max_slots,
+        marks_every=choose_marks(scatter, points.fields),
+        scatter=scatter,
+    )
+
+
+def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slots: int, decoupling: str) -> str:
+    """How particles of velocity fields ``field`` reach the nodes, on a device.
+
+    Raises:
+        ValueError: there is no such way, or not on this device or for that size.
+    """
+    target = wp.get_device(device)
+    matches = target.is_cuda and target.arch >= 70
+    # in shared memory nobody asks for the gradient of the kinematic velocity
+    shared = decoupling != "paper" and suits_shared(device, field, max_slots)
+    if scatter is None:
+        return "shared" if shared else "runs" if matches else "plain"
+    if scatter not in SCATTERS:
+        raise ValueError(f"unknown scatter {scatter!r}; use one of {', '.join(SCATTERS)}")
+    if scatter != "plain" and not matches:
+        raise ValueError(f"scatter={scatter!r} needs a GPU of compute capability 7.0 or more; {target} takes 'plain'")
+    if scatter == "shared" and not shared:
+        raise ValueError(
+            f"scatter='shared' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
+            f"particles a body (here {most_particles(field)}), {MOST_LISTED} in all ({len(field)}), few slots "
+            f"({max_slots}) and another decoupling than 'paper' ({decoupling!r}); {target} takes "
+            f"{('runs' if matches else 'plain')!r}"
+        )
+    return scatter
+
+
+def upload_points(
+    points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, rest: np.ndarray | None, dx: float, device: str
+) -> Particles:
+    """Per-particle constants on the device; ``rest`` and ``dx`` as for :func:`begin_groups`."""
+    particles, count = Particles(), points.num_particles
+
+    def upload(value, dtype):
+        scalar = np.int32 if dtype is int else np.float32
+        return wp.array(np.ascontiguousarray(value, scalar), dtype=dtype, device=device)
+
+    particles.mass = upload(points.volume * points.density, float)
+    particles.volume, particles.mu, particles.lam = upload(points.volume, float), upload(mu, float), upload(lam, float)
+    particles.material = upload(points.material, int)
+    particles.field = upload(points.fields, int)
+    particles.groups = wp.array(begin_groups(points.fields, rest, dx), dtype=wp.vec2i, device=device)
+    particles.seam = upload(np.zeros(count) if points.seam is None else points.seam, float)
+    particles.sensor = upload(np.full(count, -1) if points.sensor is None else points.sensor, int)
+    return particles

@@ -1,0 +1,409 @@
+"""Sums over the lines of nodes of a stencil, on a CPU four numbers at a time.
+
+Of products and sums of ``vec4`` in functions of their own, a compiler for a CPU makes operations on two numbers, and
+none that multiplies and adds; here it sees all of them together.
+
+Particle-to-grid (P2G) transfer; the way back is in :mod:`piavatar_envs.mpm.g2p`.
+
+APIC (Jiang et al., "The Affine Particle-In-Cell Method", 2015) with the MLS form of the stress force (Hu et al., "A
+Moving Least Squares Material Point Method", 2018, eq. 16). The physical and the kinematic momentum share one pass.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.bspline import BLOCK_NODES, Stencil, grid_position, stencil_at
+from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
+from piavatar_envs.mpm.grid_arrays import TO_KINEMATIC
+from piavatar_envs.mpm.materials import kirchhoff_stress
+from piavatar_envs.mpm.sparse_grid import HALVES, VECTORS, fields_around, note_around, slab_records
+from piavatar_envs.mpm.types import (
+    FAILURE_BLOCKS,
+    FAILURE_NONFINITE,
+    NO_STRESS,
+    PAPER,
+    Blocks,
+    Boundaries,
+    Contact,
+    Grid,
+    Moving,
+    Particles,
+    Step,
+    Sums,
+    matrix_at,
+    row,
+    vec8,
+)
+
+# Warp's own unrolling hides the loops over the stencil from the C++ compiler, which turns them into vector code
+wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+
+
+# Places of a line's nodes as piavatar_envs.mpm.sparse_grid has them, of all nine lines, one after the other.
+_LINES = """
+#if defined(__clang__) && !defined(__CUDA_ARCH__)
+#pragma clang fp contract(fast)
+typedef float four __attribute__((vector_size(16), aligned(4)));
+auto vector = [](float a, float b, float c, float d) { return four{a, b, c, d}; };
+#else
+typedef wp::vec_t<4, wp::float32> four;
+auto vector = [](float a, float b, float c, float d) { return four(a, b, c, d); };
+#endif
+const int bx = lines.of.base[0] & 3, by = lines.of.base[1] & 3, bz = lines.of.base[2] & 3;
+const wp::vec3 wx = lines.of.wx, wy = lines.of.wy, wz = lines.of.wz;
+// calls what is to be done with the places of the three nodes of line j of plane i
+auto with_line = [&](int i, int j, auto visit) {
+    const wp::vec_t<4, wp::int32>& slab = i == 0 ? lines.slab0 : i == 1 ? lines.slab1 : lines.slab2;
+    const bool upper = by + j > 3;
+    const int within = 16 * ((bx + i) & 3) + 4 * ((by + j) & 3) + bz;
+    const int first = slab[upper ? 2 : 0] + within, last = slab[upper ? 3 : 1] + within;
+    visit(first, (bz == 3 ? last : first) + 1, last + 2);
+};
+"""
+
+
+@wp.struct
+class Lines:
+    """The nine lines of a stencil: where their nodes are in an array, and what they weigh."""
+
+    of: Stencil
+    slab0: wp.vec4i  # places of the three planes, see :func:`piavatar_envs.mpm.sparse_grid.slab_records`
+    slab1: wp.vec4i
+    slab2: wp.vec4i
+
+
+@wp.func
+def lines_of(grid: Grid, blocks: Blocks, e: int, field: int, stencil: Stencil, of_block: int):
+    """Lines of a stencil in an array of ``of_block`` entries a block."""
+    base = stencil.base
+    s = Lines()
+    s.of = stencil
+    s.slab0 = slab_records(grid, blocks, e, field, base, 0, of_block)
+    s.slab1 = s.slab0
+    s.slab2 = s.slab0
+    if ((base[0] + 1) & 3) == 0:
+        s.slab1 = slab_records(grid, blocks, e, field, base, 1, of_block)
+        s.slab2 = s.slab1
+    elif ((base[0] + 2) & 3) == 0:
+        s.slab2 = slab_records(grid, blocks, e, field, base, 2, of_block)
+    return s
+
+
+@wp.func_native(
+    _LINES
+    + """
+const four* const halves = reinterpret_cast<const four*>(nodes);
+four mean = vector(0.0f, 0.0f, 0.0f, 0.0f), along_x = mean, along_y = mean, along_z = mean;
+#pragma unroll
+for (int i = 0; i < 3; ++i) {
+    four plane = vector(0.0f, 0.0f, 0.0f, 0.0f), plane_y = plane, plane_z = plane;
+#pragma unroll
+    for (int j = 0; j < 3; ++j)
+        with_line(i, j, [&](int first, int middle, int last) {
+            const four second = halves[middle] * wz[1], third = halves[last] * wz[2];
+            const four line = halves[first] * wz[0] + second + third;
+            plane = plane + line * wy[j];
+            plane_y = plane_y + line * ((float)j * wy[j]);
+            plane_z = plane_z + (second + third * 2.0f) * wy[j];
+        });
+    mean = mean + plane * wx[i];
+    along_x = along_x + plane * ((float)i * wx[i]);
+    along_y = along_y + plane_y * wx[i];
+    along_z = along_z + plane_z * wx[i];
+}
+wp::mat_t<4, 4, wp::float32> sums;
+for (int c = 0; c < 4; ++c)
+    sums.data[0][c] = mean[c], sums.data[1][c] = along_x[c], sums.data[2][c] = along_y[c], sums.data[3][c] = along_z[c];
+return sums;
+"""
+)
+def gather_lines(
+    nodes: wp.uint64,
+    lines: Lines,
+) -> wp.mat44:
+    """Weighted sum of the halves of records in ``nodes``, and those times the nodes' places along x, y and z."""
+    ...
+
+
+# Who adds to the vectors of an environment; on a CPU no two threads have particles of the same.
+_ADDING = """
+auto adding_to = [](auto& vectors, int e) {
+    four* const first = reinterpret_cast<four*>(&wp::index(vectors, e, 0));
+    return [=](int at, four value) {
+#if defined(__CUDA_ARCH__)
+        for (int c = 0; c < 4; ++c) atomicAdd(reinterpret_cast<float*>(first + at) + c, value[c]);
+#else
+        first[at] = first[at] + value;
+#endif
+    };
+};
+"""
+
+
+@wp.func_native(
+    _LINES
+    + _ADDING
+    + f"""
+constexpr int TO_KINEMATIC = {int(TO_KINEMATIC)};
+const auto add = adding_to(sums.value, e);
+auto along = [&](int axis) {{ return vector(0.0f, A.data[0][axis], A.data[1][axis], A.data[2][axis]); }};
+const four along_x = along(0), along_y = along(1), along_z = along(2);
+const four kinematic = vector(at_base[4], at_base[5], at_base[6], 0.0f);
+four plane = vector(at_base[0], at_base[1], at_base[2], at_base[3]);
+#pragma unroll
+for (int i = 0; i < 3; ++i) {{
+    four line = plane;
+#pragma unroll
+    for (int j = 0; j < 3; ++j) {{
+        const float w = wx[i] * wy[j];
+        with_line(i, j, [&](int first, int middle, int last) {{
+            add(first, line * (w * wz[0]));
+            add(middle, (line + along_z) * (w * wz[1]));
+            add(last, (line + along_z * 2.0f) * (w * wz[2]));
+            if (driven) {{
+                add(first + TO_KINEMATIC, kinematic * (w * wz[0]));
+                add(middle + TO_KINEMATIC, kinematic * (w * wz[1]));
+                add(last + TO_KINEMATIC, kinematic * (w * wz[2]));
+            }}
+        }});
+        line = line + along_y;
+    }}
+    plane = plane + along_x;
+}}
+"""
+)
+def scatter_lines(
+    sums: Sums,
+    e: int,
+    lines: Lines,
+    at_base: vec8,
+    A: wp.mat33,
+    driven: bool,
+):
+    """Add mass, momentum that is ``at_base`` and changes by ``A``, and if ``driven`` kinematic momentum to nodes."""
+    ...
+
+
+@wp.func_native(
+    _LINES
+    + _ADDING
+    + """
+const auto add = adding_to(sums.offset, e);
+const wp::vec3 f = lines.of.f;
+#pragma unroll
+for (int i = 0; i < 3; ++i)
+#pragma unroll
+    for (int j = 0; j < 3; ++j)
+        with_line(i, j, [&](int first, int middle, int last) {
+            const float w = wx[i] * wy[j] * mass;
+            const four place = vector(dx * ((float)i - f[0]), dx * ((float)j - f[1]), -dx * f[2], seam);
+            const four up = vector(0.0f, 0.0f, dx, 0.0f);
+            add(first, place * (w * wz[0]));
+            add(middle, (place + up) * (w * wz[1]));
+            add(last, (place + up * 2.0f) * (w * wz[2]));
+        });
+"""
+)
+def scatter_places(
+    sums: Sums,
+    e: int,
+    lines: Lines,
+    mass: float,
+    seam: float,
+    dx: float,
+):
+    """Tell the nodes where a particle is; ``lines`` are of ``VECTORS``."""
+    ...
+
+
+@wp.func
+def note_told(sums: Sums, e: int, lines: Lines):
+    """Note that nodes in the blocks of a stencil have been told something; ``lines`` are of ``VECTORS``."""
+    for n in range(4):  # what is less by 4 is the last of two along z, see slab_records
+        sums.told[e, (lines.slab0[n] + 4) // BLOCK_NODES] = 1
+        sums.told[e, (lines.slab2[n] + 4) // BLOCK_NODES] = 1
+
+
+_NONFINITE = wp.constant(FAILURE_NONFINITE)
+_BLOCKS = wp.constant(FAILURE_BLOCKS)
+
+
+@wp.struct
+class Scattered:
+    """What a particle adds to the nodes around it; momentum ``m u + affine (x_i - x_p)`` is linear over the stencil."""
+
+    base: wp.vec3i  # lowest node of the stencil
+    f: wp.vec3  # position from there, in grid spacings
+    at_base: vec8  # mass, physical and kinematic momentum, at the lowest node
+    A: wp.mat33  # change of physical momentum from node to node, along the columns
+
+
+@wp.func
+def placed(grid: Grid, x: wp.vec3):
+    """A particle at ``x`` that scatters nothing."""
+    s = Scattered()
+    stencil = stencil_at(grid_position(grid, x))
+    s.base = stencil.base
+    s.f = stencil.f
+    return s
+
+
+@wp.func
+def impulse_of_stress(grid: Grid, step: Step, volume: float, tau: wp.mat33):
+    """What a particle's Kirchhoff stress takes from its affine momentum in a substep [kg/s]."""
+    return (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
+
+
+@wp.func
+def affine_momentum(grid: Grid, m: float, C: wp.mat33, stress: wp.mat33):
+    """Change of a particle's momentum from node to node, that of its affine velocity less the impulse of ``stress``."""
+    return grid.dx * (m * C - stress)
+
+
+@wp.func
+def with_momentum(s: Scattered, m: float, u: wp.vec3, k: wp.vec3, A: wp.mat33):
+    """``s`` with mass, physical momentum, which changes by ``A`` from node to node, and kinematic momentum."""
+    s.A = A
+    q = m * u - A * s.f
+    s.at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
+    return s
+
+
+@wp.func
+def stressed(grid: Grid, step: Step, particles: Particles, e: int, p: int, F: wp.mat33):
+    """:func:`impulse_of_stress` of particle ``p`` with deformation ``F``."""
+    tau = kirchhoff_stress(
+        particles.material[row(e, particles.material.shape[0]), p],
+        F,
+        particles.mu[row(e, particles.mu.shape[0]), p],
+        particles.lam[row(e, particles.lam.shape[0]), p],
+    )
+    return impulse_of_stress(grid, step, particles.volume[row(e, particles.volume.shape[0]), p], tau)
+
+
+@wp.func
+def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, tells: bool):
+    """What particle ``p`` of environment ``e`` scatters.
+
+    Kinematic momentum is for contact, which acts on the total velocity; elsewhere it would be added and taken off
+    again. So only particles add it that ``tell`` the nodes how they are driven. (The paper's variant needs its gradient
+    everywhere.)
+    """
+    s = placed(grid, moving.x[e, p])
+    m = particles.mass[row(e, particles.mass.shape[0]), p]
+    C = matrix_at(moving.C, e, p)  # first used after the stress: its parameters are asked for before this has come
+    stress = wp.mat33()
+    if step.decoupling != NO_STRESS:
+        stress = stressed(grid, step, particles, e, p, matrix_at(moving.F, e, p))
+    k = wp.vec3()
+    if tells or step.decoupling == PAPER:
+        k = m * moving.vk[e, p]
+    return with_momentum(s, m, moving.u[e, p], k, affine_momentum(grid, m, C, stress))
+
+
+@wp.func
+def momentum_bounds(s: Scattered):
+    """Bounds of the components of physical momentum that a particle has anywhere in its stencil [kg m/s]."""
+    bounds = wp.vec3()
+    for c in range(3):
+        reach = wp.abs(s.A[c, 0]) + wp.abs(s.A[c, 1]) + wp.abs(s.A[c, 2])
+        center = s.at_base[1 + c] + s.A[c, 0] + s.A[c, 1] + s.A[c, 2]
+        bounds[c] = wp.abs(center) + reach
+    return bounds
+
+
+@wp.func
+def takes_part(blocks: Blocks, e: int, failure: wp.array(dtype=int)):
+    """Whether an environment goes on. Where slots have run out, some particles have none.
+
+    No scatter sets that flag, but a gather beside it may, of another part of the world: some go on then who have not
+    seen it, and the grid pass forgets what they add.
+    """
+    return (blocks.frozen[e] | (failure[e] & _BLOCKS)) == 0
+
+
+@wp.func
+def moves_finitely(moving: Moving, e: int, p: int):
+    """Whether a particle's velocities are finite."""
+    return wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p]))
+
+
+@wp.func
+def admitted(takes: bool, moves: bool, e: int, failure: wp.array(dtype=int)):
+    """Whether a particle that ``takes`` part is added up; one that does not move finitely flags its environment."""
+    if takes and not moves:
+        wp.atomic_or(failure, e, _NONFINITE)
+    return takes and moves
+
+
+@wp.func
+def scatters(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
+    """Whether a particle takes part; one that is not finite flags its environment and does not."""
+    moves = moves_finitely(moving, e, p)  # asked for before it is known who takes part
+    return admitted(takes_part(blocks, e, failure), moves, e, failure)
+
+
+@wp.func
+def near_boundary(grid: Grid, boundaries: Boundaries, e: int, x: wp.vec3):
+    """Whether a particle at ``x`` is so near a boundary that its nodes must know where it is."""
+    return nearest_boundary(boundaries, e, x) < NEAR_PARTICLE * grid.dx
+
+
+@wp.func
+def is_beside(grid: Grid, particles: Particles, contact: Contact, blocks: Blocks, e: int, p: int, base: wp.vec3i):
+    """Whether another field is in a block of a particle's stencil."""
+    return contact.num_fields > 1 and fields_around(grid, blocks, base, e) != (1 << particles.field[p])
+
+
+@wp.func
+def tells_place(
+    grid: Grid,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    blocks: Blocks,
+    e: int,
+    p: int,
+    x: wp.vec3,
+    base: wp.vec3i,
+):
+    """Whether nodes must know where this particle is and how it is driven: another field or a boundary is near."""
+    if is_beside(grid, particles, contact, blocks, e, p, base):
+        return True
+    return near_boundary(grid, boundaries, e, x)
+
+
+@wp.kernel
+def particles_to_grid(
+    grid: Grid,
+    step: Step,
+    particles: Particles,
+    boundaries: Boundaries,
+    contact: Contact,
+    moving: Moving,
+    blocks: Blocks,
+    # in and out
+    failure: wp.array(dtype=int),
+    sums: Sums,
+):
+    """Sum mass, physical momentum with the stress impulse, and kinematic momentum on the nodes of a field.
+
+    The plain scatter: a thread a particle, which adds to one node after the other.
+    """
+    e, p = wp.tid()
+    if not scatters(blocks, moving, e, p, failure):
+        return
+    x = moving.x[e, p]
+    stencil = stencil_at(grid_position(grid, x))
+    beside = is_beside(grid, particles, contact, blocks, e, p, stencil.base)
+    tells = beside or near_boundary(grid, boundaries, e, x)
+    note_around(blocks, e, p, tells, beside)
+    s = prepare(grid, step, particles, moving, e, p, tells)
+    field = particles.field[p]
+    driven = tells or step.decoupling == PAPER
+    scatter_lines(sums, e, lines_of(grid, blocks, e, field, stencil, HALVES), s.at_base, s.A, driven)
+    if tells:
+        lines = lines_of(grid, blocks, e, field, stencil, VECTORS)
+        scatter_places(sums, e, lines, s.at_base[0], particles.seam[p], grid.dx)
+        note_told(sums, e, lines)

@@ -1,0 +1,486 @@
+"""What a warp of a GPU finds out together about the blocks around its particles: neighbours would ask for the same.
+
+The sparse grid: blocks of 4 x 4 x 4 nodes get room for their nodes' records when matter comes to them.
+
+A block has a bit for every velocity field with matter in it, and a slot for each of those. Slots are given out as
+particles arrive and taken back when blocks are marked anew, so memory and time depend on the bodies, not on the empty
+space around them. In which order they are given out is not determined on a GPU; nothing but addresses depends on it.
+
+Where the nodes of a stencil have their records: as few look-ups as its blocks allow, and little arithmetic.
+
+At which nodes of a field another one has been: there its particles tell their nodes where they are.
+
+Contact acts at nodes to which all particles of both fields have told that. Which these are must be known before the
+particles are scattered, whatever the order in which they are: it is known of the substep before. A field tells a node
+if another one was there then, and only fields that have told a node touch there. That is a substep after the second has
+come to it, with little weight unless it moves nearly a grid spacing in a time step. When blocks are marked anew, their
+slots are others, and fields tell all nodes of blocks that have several: who comes then touches at once.
+
+For :mod:`piavatar_envs.mpm.cuda.tiled_p2g`, where a group takes much longer if one of its particles tells; other
+scatters tell all nodes of blocks with several fields in every substep.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from piavatar_envs.mpm.bspline import (
+    BLOCK_NODES,
+    base_node,
+    block_index,
+    blocks_touched,
+    grid_position,
+    node_in_block,
+    stencil_inside,
+)
+from piavatar_envs.mpm.sweep import lane_of_thread, lanes_with
+from piavatar_envs.mpm.types import (
+    BESIDE,
+    FAILURE_BLOCKS,
+    FAILURE_NONFINITE,
+    FAILURE_OUT_OF_GRID,
+    TELLS,
+    Blocks,
+    Grid,
+    Model,
+    Particles,
+)
+
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+constexpr unsigned ALL = 0xffffffffu;
+const wp::vec2i apart(-2, -2);
+const int lane = threadIdx.x & 31;
+if (__activemask() != ALL) return apart;
+const int e0 = __shfl_sync(ALL, e, 0), field0 = __shfl_sync(ALL, field, 0);
+if (!__all_sync(ALL, e == e0 && field == field0)) return apart;
+const unsigned takers = __ballot_sync(ALL, takes);
+if (takers == 0u) return wp::vec2i(-1, -1);
+int begin[3], lower[3], upper[3];  // blocks of all stencils, and of the thread's own from the first of those
+bool many = false;
+#pragma unroll
+for (int c = 0; c < 3; ++c) {
+    const int of_first = __shfl_sync(ALL, base[c], __ffs(takers) - 1);
+    const int own = takes ? base[c] : of_first;
+    begin[c] = __reduce_min_sync(ALL, own) >> 2;
+    lower[c] = (own >> 2) - begin[c];
+    upper[c] = ((own + 2) >> 2) - begin[c];
+    many |= upper[c] > 3;
+}
+if (__any_sync(ALL, many)) return apart;
+// a bit for each of 4 x 4 x 4 blocks, 16 a plane
+const unsigned line = 1u << lower[2] | 1u << upper[2];
+const unsigned long long plane = line << 4 * lower[1] | line << 4 * upper[1];
+const unsigned long long touched = plane << 16 * lower[0] | plane << 16 * upper[0];
+const int j = begin[1] + (lane >> 2 & 3), k = begin[2] + (lane & 3);
+wp::vec2i mine(-1, -1);
+#pragma unroll
+for (int q = 0; q < 2; ++q) {
+    const int i = begin[0] + 2 * q + (lane >> 4);
+    if (__reduce_or_sync(ALL, (unsigned)(touched >> 32 * q)) >> lane & 1u)
+        mine[q] = (i * grid.blocks[1] + j) * grid.blocks[2] + k;
+}
+return mine;
+#else
+return wp::vec2i(-2, -2);
+#endif
+""")
+def share_of_blocks(grid: Grid, e: int, field: int, base: wp.vec3i, takes: bool) -> wp.vec2i:
+    """Blocks that a thread sees to of those that the stencils of the warp touch, each block once; -1 for none.
+
+    ``base`` is the lowest node of the thread's own stencil, if it ``takes`` part. -2 if every thread has to see to its
+    own: their blocks are too many, or not all threads of a warp have come with the same environment and field.
+    """
+    ...
+
+
+_BLOCKS = wp.constant(FAILURE_BLOCKS)
+_NONFINITE = wp.constant(FAILURE_NONFINITE)
+_OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
+
+
+#: What ``held`` says of a slot that nobody has got yet.
+NOBODY = wp.constant(-1)
+
+
+@wp.func
+def has_field(mask: int, f: int):
+    """Whether bit ``f`` of a block's mask is set."""
+    return ((mask >> f) & 1) != 0
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return mask != 0 ? __ffs(mask) - 1 : num_fields;
+#else
+return mask != 0 ? __builtin_ctz(mask) : num_fields;
+#endif
+""")
+def lowest_field(mask: int, num_fields: int) -> int:
+    """First field of a mask; ``num_fields`` if it is empty."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 32 - __clz(mask);
+#else
+return mask != 0 ? 32 - __builtin_clz(mask) : 0;
+#endif
+""")
+def end_of_fields(mask: int) -> int:
+    """One more than the last field of a mask; 0 if it is empty."""
+    ...
+
+
+@wp.func
+def lowest_other(mask: int, f: int, num_fields: int):
+    """First field of a mask that is not ``f``."""
+    other = lowest_field(mask, num_fields)
+    if other == f:
+        other = f + 1
+        while other < num_fields - 1 and not has_field(mask, other):
+            other += 1
+    return other
+
+
+@wp.func
+def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
+    """Fields that have matter in any block of a stencil."""
+    mask = int(0)
+    for i in range(2):  # a block may come twice: so all are asked for before the first has answered
+        for j in range(2):
+            for k in range(2):
+                mask = mask | blocks.fields[e, block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)]
+    return mask
+
+
+@wp.func_native(f"""
+const volatile int* const slot_of = &wp::index(blocks.slot, e, held);
+const volatile int* const failing = &wp::index(failure, e);
+do {{
+    const int slot = *slot_of;
+    if (slot >= 0 && slot < blocks.held.shape[1] && *(const volatile int*)&wp::index(blocks.held, e, slot) == held)
+        return slot;
+}} while (!(*failing & {FAILURE_BLOCKS}));
+return {int(NOBODY)};
+""")
+def awaited_slot(blocks: Blocks, e: int, held: int, failure: wp.array(dtype=int)) -> int:
+    """Slot of a field's block that is marked in this launch, maybe by another thread; ``NOBODY`` if there is none."""
+    ...
+
+
+# A GPU finds out anew: to write it down and read it takes as long
+@wp.func_native(f"""
+#if !defined(__CUDA_ARCH__)
+wp::index(blocks.around, e, p) = tells ? {int(TELLS)} | (beside ? {int(BESIDE)} : 0) : 0;
+#endif
+""")
+def note_around(blocks: Blocks, e: int, p: int, tells: bool, beside: bool):
+    """Note whether particle ``p`` tells its nodes where it is, and whether that is because another field is beside."""
+    ...
+
+
+@wp.func_native(f"""
+#if !defined(__CUDA_ARCH__)
+return wp::index(blocks.around, e, p);
+#else
+return {int(TELLS) | int(BESIDE)};
+#endif
+""")
+def noted_around(blocks: Blocks, e: int, p: int) -> int:
+    """Bits ``TELLS`` and ``BESIDE`` of particle ``p``; what may be, where nobody notes what is."""
+    ...
+
+
+@wp.func
+def fields_beyond(grid: Grid, blocks: Blocks, corner: wp.vec3i, e: int):
+    """Fields with matter in any block that a stencil may lie in whose lowest node is in the block at ``corner``."""
+    mask = int(0)
+    for n in range(8):
+        x = wp.min(corner[0] + 4 * (n >> 2), 4 * (grid.blocks[0] - 1))
+        y = wp.min(corner[1] + 4 * ((n >> 1) & 1), 4 * (grid.blocks[1] - 1))
+        z = wp.min(corner[2] + 4 * (n & 1), 4 * (grid.blocks[2] - 1))
+        mask = mask | blocks.fields[e, block_index(grid, x, y, z)]
+    return mask
+
+
+@wp.func
+def fields_next(grid: Grid, blocks: Blocks, block: int, e: int, n: int):
+    """Fields with matter in the ``n``-th of the eight blocks that a stencil may lie in which begins in a ``block``.
+
+    Where the grid ends, in another block instead: no stencil begins there, and to look for neither row nor column takes
+    no division.
+    """
+    beyond = block + ((n >> 2) * grid.blocks[1] + ((n >> 1) & 1)) * grid.blocks[2] + (n & 1)
+    return blocks.fields[e, wp.min(beyond, grid.num_blocks - 1)]
+
+
+@wp.func
+def first_record(grid: Grid, blocks: Blocks, e: int, f: int, block: int):
+    """Record of the first node of a block that holds matter of field ``f``."""
+    return BLOCK_NODES * blocks.slot[e, f * grid.num_blocks + block]
+
+
+@wp.func
+def record_of(grid: Grid, blocks: Blocks, e: int, f: int, i: int, j: int, k: int):
+    """Record of node ``(i, j, k)``, whose block must hold matter of field ``f``."""
+    return first_record(grid, blocks, e, f, block_index(grid, i, j, k)) + node_in_block(i, j, k)
+
+
+@wp.func
+def slots_used(blocks: Blocks, e: int):
+    """Slots of environment ``e`` that mean something, though more may have been asked for."""
+    return wp.min(blocks.count[e], blocks.held.shape[1])
+
+
+@wp.func
+def held_by(grid: Grid, held: int):
+    """Field and block that a slot belongs to, from what ``held`` says of it."""
+    return wp.vec2i(held // grid.num_blocks, held % grid.num_blocks)
+
+
+@wp.func
+def list_shared(blocks: Blocks, e: int, block: int, before: int):
+    """Note that a block which had the fields ``before`` gets another one, if that is its second."""
+    if before != 0 and (before & (before - 1)) == 0:
+        n = wp.atomic_add(blocks.num_shared, e, 1)
+        if n < blocks.shared.shape[1]:
+            blocks.shared[e, n] = block
+
+
+@wp.func
+def nodes_shared(blocks: Blocks, e: int):
+    """Nodes of the blocks of environment ``e`` that have several fields."""
+    return BLOCK_NODES * wp.min(blocks.num_shared[e], blocks.shared.shape[1])
+
+
+@wp.func
+def lacks_slots(failure: wp.array(dtype=int), e: int):
+    """Whether slots have run out: some particles have none. No scatter and no grid pass sets that flag."""
+    return (failure[e] & _BLOCKS) != 0
+
+
+@wp.func
+def shared_block(blocks: Blocks, e: int, n: int):
+    """Block with the ``n``-th of :func:`nodes_shared`, nonsense beyond: who asks need not know their number yet."""
+    return blocks.shared[e, wp.min(n // BLOCK_NODES, blocks.shared.shape[1] - 1)]
+
+
+@wp.func
+def mark_block(grid: Grid, blocks: Blocks, block: int, field: int, e: int, failure: wp.array(dtype=int)):
+    """See that a field has a slot in a block; too few slots flag the environment."""
+    bit = 1 << field
+    if (blocks.fields[e, block] & bit) != 0:
+        return
+    before = wp.atomic_or(blocks.fields, e, block, bit)
+    if (before & bit) != 0:
+        return
+    list_shared(blocks, e, block, before)
+    slot = wp.atomic_add(blocks.count, e, 1)
+    if slot < blocks.held.shape[1]:
+        blocks.held[e, slot] = field * grid.num_blocks + block
+        blocks.slot[e, field * grid.num_blocks + block] = slot
+    else:
+        wp.atomic_and(blocks.fields, e, block, ~bit)
+        wp.atomic_or(failure, e, _BLOCKS)
+
+
+@wp.func
+def mark_blocks(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: int, failure: wp.array(dtype=int)):
+    """:func:`mark_block` of all blocks that a stencil touches."""
+    touched = blocks_touched(base)
+    for i in range(touched[0]):
+        for j in range(touched[1]):
+            for k in range(touched[2]):
+                block = block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)
+                mark_block(grid, blocks, block, field, e, failure)
+
+
+@wp.kernel
+def forget_blocks(grid: Grid, blocks: Blocks):
+    """No block holds matter; the slots are taken back by :func:`free_slots`."""
+    e, slot = wp.tid()
+    if slot < slots_used(blocks, e):
+        blocks.fields[e, blocks.held[e, slot] % grid.num_blocks] = 0
+        blocks.held[e, slot] = NOBODY
+
+
+@wp.kernel
+def free_slots(failure: wp.array(dtype=int), blocks: Blocks):
+    """No slot is in use."""
+    e = wp.tid()
+    blocks.count[e] = 0
+    blocks.num_shared[e] = 0
+    blocks.frozen[e] = failure[e]
+
+
+@wp.kernel
+def freeze(failure: wp.array(dtype=int), blocks: Blocks):
+    """From now on environments that have failed take no part.
+
+    Threads of one launch must not stop at what others of it have found, or what a failed environment is left with would
+    depend on their order.
+    """
+    e = wp.tid()
+    blocks.frozen[e] = failure[e]
+
+
+@wp.kernel
+def mark_particles(
+    grid: Grid,
+    particles: Particles,
+    x: wp.array2d(dtype=wp.vec3),
+    # in and out
+    blocks: Blocks,
+    failure: wp.array(dtype=int),
+):
+    """Mark the blocks of all particles, wherever they have been put; one outside the grid flags its environment.
+
+    A warp marks each block once, where it can: the first to come all find it without a mark.
+    """
+    e, p = wp.tid()
+    field = particles.field[p]
+    base = wp.vec3i()
+    takes = bool(False)
+    if blocks.frozen[e] == 0:
+        if wp.isfinite(wp.length_sq(x[e, p])):
+            base = base_node(grid_position(grid, x[e, p]))
+            takes = stencil_inside(grid, base)
+            if not takes:
+                wp.atomic_or(failure, e, _OUT_OF_GRID)
+        else:
+            wp.atomic_or(failure, e, _NONFINITE)
+    mine = share_of_blocks(grid, e, field, base, takes)
+    if mine[0] == -2:
+        if takes:
+            mark_blocks(grid, blocks, base, field, e, failure)
+        return
+    for n in range(2):
+        if mine[n] >= 0:
+            mark_block(grid, blocks, mine[n], field, e, failure)
+
+
+#: What a block has in an array of a vector a node, and in one of halves of records.
+VECTORS, HALVES = wp.constant(int(BLOCK_NODES)), wp.constant(2 * int(BLOCK_NODES))
+
+
+@wp.func_native("return (wp::uint64)&wp::index(blocks.slot, e, n);")
+def address_of_slot(blocks: Blocks, e: int, n: int) -> wp.uint64:
+    """Address of ``blocks.slot[e, n]``, for :func:`slot_from`."""
+    ...
+
+
+@wp.func_native("return reinterpret_cast<const int*>(address)[n];")
+def slot_from(address: wp.uint64, n: int) -> int:
+    """The ``n``-th slot from an address: neighbours are found without looking for the row again."""
+    ...
+
+
+@wp.func
+def slab_records(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i, i: int, of_block: int):
+    """Where the blocks of the nodes ``base + (i, ...)`` of a stencil begin in an array, for :func:`line_of_records`.
+
+    The slab lies in two blocks along y and two along z; where it does not, the second repeats the first. What is found
+    holds for all slabs of a stencil in the same blocks. A block has ``of_block`` entries, ``VECTORS`` or ``HALVES``.
+    """
+    block = block_index(grid, base[0] + i, base[1], base[2])
+    slots = address_of_slot(blocks, e, f * grid.num_blocks + block)
+    lower = of_block * slot_from(slots, 0)
+    lower_last = lower
+    upper = lower
+    upper_last = lower
+    if (base[2] & 3) > 1:
+        lower_last = of_block * slot_from(slots, 1) - 4
+        upper_last = lower_last
+    if (base[1] & 3) > 1:
+        upper = of_block * slot_from(slots, grid.blocks[2])
+        upper_last = upper
+        if (base[2] & 3) > 1:
+            upper_last = of_block * slot_from(slots, grid.blocks[2] + 1) - 4
+    return wp.vec4i(lower, lower_last, upper, upper_last)
+
+
+@wp.func
+def ends_of_line(slab: wp.vec4i, base: wp.vec3i, i: int, j: int):
+    """Places of the nodes ``base + (i, j, 0)`` and, less 2, ``base + (i, j, 2)``; see :func:`slab_records`."""
+    y = (base[1] & 3) + j
+    in_block = 16 * ((base[0] + i) & 3) + 4 * (y & 3) + (base[2] & 3)
+    return wp.vec2i(wp.where(y > 3, slab[2], slab[0]) + in_block, wp.where(y > 3, slab[3], slab[1]) + in_block)
+
+
+@wp.func
+def line_of_records(slab: wp.vec4i, base: wp.vec3i, i: int, j: int):
+    """Places of the nodes ``base + (i, j, 0..2)`` of a stencil, ``slab`` those of the blocks of ``i``."""
+    ends = ends_of_line(slab, base, i, j)
+    return wp.vec3i(ends[0], wp.where((base[2] & 3) == 3, ends[1], ends[0]) + 1, ends[1] + 2)
+
+
+def notes_others(model: Model) -> bool:
+    """Whether that is noted, and not told everywhere."""
+    return model.scatter == "runs" and model.contact.num_fields > 1
+
+
+@wp.func
+def told_at_first(blocks: Blocks, e: int, slot: int):
+    """Bits of a slot's nodes that are told where particles are when blocks have just been marked: all or none."""
+    told = int(0)
+    if slot < slots_used(blocks, e):
+        mask = blocks.fields[e, blocks.held[e, slot] % blocks.fields.shape[1]]
+        if (mask & (mask - 1)) != 0:
+            told = -1
+    return told
+
+
+@wp.kernel
+def begin_others(blocks: Blocks):
+    """Blocks have been marked."""
+    e, slot = wp.tid()
+    told = told_at_first(blocks, e, slot)
+    blocks.others[e, 2 * slot] = told
+    blocks.others[e, 2 * slot + 1] = told
+
+
+@wp.func
+def has_bit(words: wp.array2d(dtype=int), e: int, first: int, local: int):
+    """Whether a node of a block has its bit, of the two words from ``first`` on."""
+    return ((words[e, first + local // 32] >> (local & 31)) & 1) != 0
+
+
+@wp.func
+def note_bits(words: wp.array2d(dtype=int), e: int, first: int, local: int, here: bool):
+    """Give a node of a block its bit, or take it away; all threads of a warp, with half a block, come here."""
+    bits = lanes_with(here)
+    if lane_of_thread() == 0:
+        words[e, first + local // 32] = bits
+
+
+@wp.func
+def had_others(others: wp.array2d(dtype=int), e: int, r: int):
+    """Whether the node of a field's record ``r`` had another field in the substep whose bits these are.
+
+    In the next, all particles of its own field have told it where they are.
+    """
+    return has_bit(others, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES)
+
+
+@wp.func
+def has_told(blocks: Blocks, e: int, r: int):
+    """Whether all particles have told the node of a field's record ``r``, in a block that has several, where they are.
+
+    They have where nobody notes who is where.
+    """
+    if blocks.others.shape[1] == 1:
+        return True
+    return had_others(blocks.others, e, r)
+
+
+@wp.func
+def note_others(blocks: Blocks, e: int, r: int, here: bool):
+    """Note whether others are ``here``, at the node of record ``r``; all threads of a warp, with half a block, do."""
+    if blocks.others.shape[1] == 1:
+        return
+    note_bits(blocks.others, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES, here)

@@ -1,0 +1,251 @@
+"""Bodies and worlds that differ from episode to episode: factors on mass, stiffness and friction.
+
+At every reset the masked environments draw factors, uniform in their logarithm, on the device and from (seed, episode)
+alone: nothing waits for the host, and environment ``i`` of a batch draws what a single one of its seed draws. A factor
+multiplies all constants that follow from it, each from its nominal value, so that none of them drifts or disagrees:
+
+- *mass*: an avatar's density: the mass of its particles and of its bones, hence the inertia that the drive fits, the
+  limits of the root wrench (which are in body weights), the strength and the springs of its joints under torques (a
+  heavier body is a stronger one), and the reference density of its velocity fields;
+- *stiffness*: its moduli;
+- *ground friction*: coefficients on the ground, walls and colliders; *body friction*: those between bodies.
+
+Only what is randomised gets a row for each environment. The time step is that of the stiffest and lightest body that
+can be drawn (:func:`fastest_wave`): were it a sample's, environments of a batch would not be single environments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.pose_control.controller import AvatarDrive
+from piavatar_envs.config.schema import UNCHANGED, RandomizeConfig
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.envs.observations import Parameter
+from piavatar_envs.envs.rng import STREAM_PARAMETERS, generator
+from piavatar_envs.mpm.model import MaterialPoints
+from piavatar_envs.mpm.types import Model, row
+
+wp.set_module_options({"enable_backward": False})
+
+#: Factors of a world, then those of each avatar: their settings, in the order of the columns, with what they are.
+OF_WORLD = {
+    "ground_friction_factor": "friction with the ground, walls and colliders",
+    "body_friction_factor": "friction between bodies",
+}
+OF_AVATAR = {"mass_factor": "density", "stiffness_factor": "Young's modulus"}
+
+
+def fastest_wave(config: RandomizeConfig, flesh: Iterable[MaterialPoints]) -> float:
+    """Speed of the fastest elastic wave [m/s] in any of ``flesh`` that ``config`` can draw; it sets the time step."""
+    fastest = max(matter.sound_speed() for matter in flesh)
+    return fastest * math.sqrt(config.stiffness_factor[1] / config.mass_factor[0])
+
+
+@dataclass
+class _Scaled:
+    """Constants that a factor multiplies, ``value = factor * nominal``.
+
+    Attributes:
+        factor: its column.
+        nominal: shape ``(1 or num_envs, K)``.
+        value: what kernels read, shape ``(num_envs, K)``.
+    """
+
+    factor: int
+    nominal: wp.array
+    value: wp.array
+
+
+@dataclass
+class _Body:
+    """Nominal masses of an avatar whose mass is random, for shapes to change: particles, bones, all of it [kg]."""
+
+    mass: wp.array
+    bone_mass: wp.array
+    body_mass: wp.array
+
+
+@dataclass
+class Randomization:
+    """The factors of every environment, and the constants of the world that follow them.
+
+    Attributes:
+        config: ranges.
+        model, avatars: the world; constants that are randomised get their own rows.
+        factors: shape ``(num_envs, factors)``, 1 until a reset; the world's, then those of each avatar.
+    """
+
+    config: RandomizeConfig
+    model: Model
+    avatars: Sequence[AvatarDrive]
+    factors: wp.array = field(init=False)
+
+    def __post_init__(self) -> None:
+        n, device, count = self.model.num_envs, self.model.device, len(self.avatars)
+        names = [*OF_WORLD, *(list(OF_AVATAR) * count)]
+        bounds = [getattr(self.config, name) for name in names]
+        self.factors = wp.array(np.ones((n, len(names)), np.float32), dtype=float, device=device)
+        self._bounds = wp.array(np.array(bounds, np.float32), dtype=wp.vec2, device=device)
+        self._kept: dict[str, wp.array] = {}
+        self._scaled: list[_Scaled] = []
+        self._bodies: dict[int, _Body] = {}
+        if self._varies("ground_friction_factor"):
+            self._scale(0, self.model.boundaries, "friction", "colliders.friction")
+        if self._varies("body_friction_factor"):
+            self._scale(1, self.model.contact, "friction", "contact.friction")
+        for index, avatar in enumerate(self.avatars):
+            column = len(OF_WORLD) + index * len(OF_AVATAR)
+            if self._varies("mass_factor"):
+                self._scale_mass(column, index, avatar)
+            if self._varies("stiffness_factor"):
+                own = slice(avatar.body.first, avatar.body.first + avatar.body.count)
+                for name in ("mu", "lam"):
+                    self._scale(column + 1, self.model.particles, name, f"matter.{name}", own)
+
+    def _varies(self, name: str) -> bool:
+        return getattr(self.config, name) != UNCHANGED
+
+    def parameters(self) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
+        """What is drawn: for the world, and for each avatar."""
+        found = [
+            tuple(
+                Parameter(name, "-", *getattr(self.config, name), f"factor on {what}", log=True)
+                for name, what in names.items()
+                if self._varies(name)
+            )
+            for names in (OF_WORLD, OF_AVATAR)
+        ]
+        return found[0], found[1]
+
+    def column(self, name: str, avatar: int = 0) -> wp.array:
+        """The factor of the setting ``name`` in every environment, shape ``(num_envs,)``."""
+        if name in OF_WORLD:
+            return self.factors[:, list(OF_WORLD).index(name)]
+        return self.factors[:, len(OF_WORLD) + avatar * len(OF_AVATAR) + list(OF_AVATAR).index(name)]
+
+    def _scale(self, factor: int, holder: Any, name: str, key: str, part: slice = slice(None)) -> wp.array:
+        """Let a factor multiply columns ``part`` of the array ``name`` of ``holder``; returns their nominal values."""
+        array = _own_rows(holder, name, self.model.num_envs)
+        self._kept[key] = array
+        return self._add(factor, array[:, part], array.numpy()[:1, part])
+
+    def _add(self, factor: int, value: wp.array, nominal: np.ndarray) -> wp.array:
+        copy = wp.array(np.ascontiguousarray(nominal, np.float32), dtype=float, device=self.model.device)
+        self._scaled.append(_Scaled(factor, copy, value))
+        return copy
+
+    def _scale_mass(self, factor: int, index: int, avatar: AvatarDrive) -> None:
+        """All that an avatar's density decides. Masses of random shapes have nominal rows of their own."""
+        n, body, contact = self.model.num_envs, avatar.body, self.model.contact
+        own = slice(body.first, body.first + body.count)
+        rows = body.rest.shape[0]
+        mass = _own_rows(self.model.particles, "mass", n)
+        bone_mass = _own_rows(body, "bone_mass", n)
+        _own_rows(body, "rest_center", n)  # whoever reads the bones' masses by row reads their centres alike
+        avatar.body_mass = total = wp.array(
+            np.broadcast_to(avatar.body_mass.numpy(), n).copy(), dtype=float, device=self.model.device
+        )
+        self._bodies[index] = _Body(
+            self._add(factor, mass[:, own], mass.numpy()[:rows, own]),
+            self._add(factor, bone_mass, bone_mass.numpy()[:rows]),
+            self._add(factor, total.reshape((n, 1)), total.numpy()[:rows, None]),
+        )
+        bones = {f"body_{index}.bone_mass": bone_mass, f"body_{index}.body_mass": total}
+        self._kept |= {"matter.mass": mass, **bones}
+        fields = np.flatnonzero(contact.subject.numpy() == index)  # those of a subject are next to each other
+        self._scale(factor, contact, "density", "contact.density", slice(int(fields[0]), int(fields[-1]) + 1))
+
+    def set_nominal_mass(self, avatar: int, env: int, mass: np.ndarray, bone_mass: np.ndarray) -> None:
+        """Another shape of an avatar in ``env``: what a factor of 1 would make of it, from the next reset on.
+
+        Args:
+            avatar: index of the avatar; its shape must be random.
+            env: environment.
+            mass: of its particles [kg], shape ``(P,)``.
+            bone_mass: of its bones [kg], shape ``(22,)``.
+        """
+        if avatar in self._bodies:
+            body = self._bodies[avatar]
+            for array, value in (
+                (body.mass, mass),
+                (body.bone_mass, bone_mass),
+                (body.body_mass, mass.sum(keepdims=True)),
+            ):
+                array[env].assign(np.ascontiguousarray(value, np.float32))
+
+    def nominal_mass(self, avatar: int) -> dict[str, wp.array]:
+        """Where masses [kg] of an avatar belong before a factor multiplies them, ``(num_envs, ...)`` by name.
+
+        Those of its particles, of its bones, of all of it; its shape must be random.
+        """
+        if avatar in self._bodies:
+            return dict(vars(self._bodies[avatar]))
+        drive, n = self.avatars[avatar], self.model.num_envs
+        own = slice(drive.body.first, drive.body.first + drive.body.count)
+        mass = self.model.particles.mass[:, own]
+        return {"mass": mass, "bone_mass": drive.body.bone_mass, "body_mass": drive.body_mass.reshape((n, 1))}
+
+    def record_reset(self, graph: LaunchGraph, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
+        """Append: the masked environments draw their factors, and their constants follow. Nothing if nothing varies."""
+        if not self._scaled:
+            return
+        graph.launch(draw_factors, self.factors.shape, [mask, seed, episode, self._bounds], [self.factors])
+        for scaled in self._scaled:
+            factor = self.factors[:, scaled.factor]
+            graph.launch(scale_rows, scaled.value.shape, [mask, factor, scaled.nominal], [scaled.value])
+
+    def arrays(self) -> dict[str, wp.array]:
+        """Arrays of a checkpoint, by name: what was drawn, and what follows from it."""
+        return {"randomize.factors": self.factors, **self._kept} if self._scaled else {}
+
+
+def _own_rows(holder: Any, name: str, rows: int) -> wp.array:
+    """The array ``name`` of ``holder``, with ``rows`` rows from now on; to be called before a launch binds it."""
+    array = getattr(holder, name)
+    if array.shape[0] != rows:
+        array = wp.array(np.repeat(array.numpy(), rows, 0), dtype=array.dtype, device=array.device)
+        setattr(holder, name, array)
+    return array
+
+
+@wp.kernel
+def draw_factors(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    bounds: wp.array(dtype=wp.vec2),
+    # out
+    factors: wp.array2d(dtype=float),
+):
+    """Factors of the masked environments, uniform in their logarithm, over ``(num_envs, factors)``.
+
+    Each draws apart: whether another one varies makes no difference to it.
+    """
+    e, n = wp.tid()
+    if not mask[e]:
+        return
+    low = bounds[n][0]
+    high = bounds[n][1]
+    random = generator(seed[e], episode[e], STREAM_PARAMETERS, n)
+    factors[e, n] = wp.clamp(wp.exp(wp.randf(random, wp.log(low), wp.log(high))), low, high)
+
+
+@wp.kernel
+def scale_rows(
+    mask: wp.array(dtype=wp.bool),
+    factor: wp.array(dtype=float),
+    nominal: wp.array2d(dtype=float),
+    # out
+    value: wp.array2d(dtype=float),
+):
+    """``value = factor * nominal`` in the masked environments."""
+    e, k = wp.tid()
+    if mask[e]:
+        value[e, k] = factor[e] * nominal[row(e, nominal.shape[0]), k]

@@ -1,0 +1,265 @@
+"""Balls that are thrown at an avatar, caught where they have flown past, and thrown again.
+
+A throw depends on the episode's seed, its number and where the body is then; nothing has to be remembered for it. When
+balls are thrown is said in ``turns.py`` and ``pushes.py``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import warp as wp
+
+from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.avatar.rotation import quat_exp
+from piavatar_envs.envs.rng import STREAM_BALL, generator
+from piavatar_envs.sim.scene import Domain
+
+if TYPE_CHECKING:
+    from piavatar_envs.config import PhysicsConfig
+    from piavatar_envs.core.launch_graph import LaunchGraph
+    from piavatar_envs.envs.batch_env import BatchEnv
+
+wp.set_module_options({"enable_backward": False})
+
+#: Heights that balls are thrown from [m].
+HEIGHT = (1.0, 1.5)
+#: A ball that moves outwards faster than this beyond the catching radius is caught [m/s]; a slower one may lie there.
+OUTWARDS = wp.constant(0.2)
+#: Greatest angular velocity of a throw about each axis [rad/s].
+MAX_SPIN = wp.constant(6.0)
+#: Distance from every joint that a ball keeps where it is thrown: a hand's or a foot's length and its own radius [m].
+CLEARANCE = wp.constant(0.4)
+#: Longest way from where a ball is thrown, out of the body's reach, to where the body has gone [m].
+REACH = 2.5
+#: Of the balls' masses the first draw in their stream, one a ball; the draws around them are the schedule's.
+MASSES = wp.constant(1)
+
+
+class ThrowConfig(Protocol):
+    """What the configuration of a task that throws balls has. Ranges are a lower and an upper bound."""
+
+    physics: PhysicsConfig
+    num_balls: int
+    ball_radius: float  # [m]
+    ball_mass: tuple[float, float]  # [kg]
+    throw_interval: float  # time between two throws [s]
+    throw_speed: tuple[float, float]  # [m/s]
+    throw_distance: tuple[float, float]  # of the origins from the avatar's place [m]
+    throw_angle: float  # greatest azimuth of the origins from the front [rad]
+    aim_spread: float  # greatest error of the aim along each axis [m]
+
+
+@wp.struct
+class Throws:
+    """Constants of the throws. Ranges are a lower and an upper bound."""
+
+    num_balls: int  # they are props 0 ... num_balls - 1
+    interval: int  # control steps between two throws
+    place: wp.vec3  # where the avatar belongs: x, y [m] and yaw [rad]
+    distance: wp.vec2  # of the origins from there [m]
+    height: wp.vec2  # of the origins [m]
+    angle: float  # greatest azimuth of the origins from the front [rad]
+    speed: wp.vec2  # distance to the aim over the time of flight [m/s]
+    aim: wp.vec2i  # joints; balls are thrown at the line between them
+    spread: float  # greatest distance of the aim from that line, along each axis [m]
+    gravity: float  # [m/s^2]
+    mass: wp.vec2  # [kg]
+    log_mass: int  # whether it is drawn uniformly in its logarithm
+    volume: float  # of a ball [m^3]
+    reach: float  # distance from the place beyond which balls are caught [m]
+    rest: wp.array(dtype=wp.vec3)  # (num_balls,) where balls wait [m]
+
+
+def catching_distance(config: ThrowConfig) -> float:
+    """Distance from the avatar's place beyond which a ball that flies on is caught [m]."""
+    return config.throw_distance[1] + 0.1
+
+
+def thrown_speed(config: ThrowConfig) -> float:
+    """Greatest speed of any part of a ball as it is thrown [m/s]: slow ones are thrown high, to come as far."""
+    way = math.hypot(max(config.throw_distance[1], REACH) + math.sqrt(3.0) * config.aim_spread, HEIGHT[1])
+    rising = (speed + 0.5 * config.physics.gravity * way / speed for speed in config.throw_speed)
+    return max(rising) + math.sqrt(3.0) * MAX_SPIN * config.ball_radius
+
+
+def waiting_places(place: Sequence[float], config: ThrowConfig) -> np.ndarray:
+    """Where balls wait: on the floor behind the avatar, side by side, shape ``(num_balls, 3)`` [m].
+
+    Args:
+        place: of the avatar, x, y [m] and yaw [rad].
+        config: how many balls of which size, and where they are caught.
+    """
+    distance = catching_distance(config) + 0.1
+    index = np.arange(config.num_balls) - 0.5 * (config.num_balls - 1)
+    angle = place[2] + 3.0 * config.ball_radius / distance * index
+    away = distance * np.stack([-np.sin(angle), np.cos(angle), np.zeros_like(angle)], axis=1)
+    return away + np.array([place[0], place[1], config.ball_radius])
+
+
+def throwing_domain(config: ThrowConfig, place: Sequence[float]) -> Domain:
+    """Room for balls to wait in, and to fly past the waiting ones before they are caught."""
+    x, y, _ = place
+    out = catching_distance(config) + config.ball_radius
+    out += 0.1 + 1.5 * config.throw_speed[1] * config.physics.control_dt
+    return Domain().around([place]).including((x - out, y - out, 0.0), (x + out, y + out, 0.0))
+
+
+def make_throws(
+    config: ThrowConfig,
+    place: Sequence[float],
+    waiting: np.ndarray,
+    env: BatchEnv,
+    aim: tuple[str, str] = ("spine3", "head"),
+    log_mass: bool = False,
+) -> Throws:
+    """Kernel argument; the balls are the first props of ``env``.
+
+    Args:
+        config: how many balls of which size and mass, from where and how fast.
+        place: of the avatar, x, y [m] and yaw [rad].
+        waiting: where balls wait [m], shape ``(num_balls, 3)``.
+        env: the batch.
+        aim: joints; balls are thrown at the line between them.
+        log_mass: whether masses are drawn uniformly in their logarithm.
+    """
+    throws = Throws()
+    throws.num_balls = config.num_balls
+    throws.interval = max(1, round(config.throw_interval / config.physics.control_dt))
+    throws.place = wp.vec3(*place)
+    throws.distance, throws.height = wp.vec2(*config.throw_distance), wp.vec2(*HEIGHT)
+    throws.angle, throws.spread = config.throw_angle, config.aim_spread
+    throws.speed, throws.gravity = wp.vec2(*config.throw_speed), config.physics.gravity
+    throws.aim, throws.log_mass = wp.vec2i(*map(joint_index, aim)), int(log_mass)
+    throws.mass, throws.volume = wp.vec2(*config.ball_mass), float(env.simulation.props.volume[0])
+    throws.reach = catching_distance(config)
+    throws.rest = wp.array(waiting.astype(np.float32), dtype=wp.vec3, device=env.device)
+    return throws
+
+
+@wp.func
+def launch_velocity(start: wp.vec3, aim: wp.vec3, speed: float, gravity: float):
+    """Velocity [m/s] of a free body from ``start`` to ``aim`` in the time of a straight way at ``speed``."""
+    way = aim - start
+    time = wp.length(way) / speed
+    return way / time + wp.vec3(0.0, 0.0, 0.5 * gravity * time)
+
+
+@wp.func
+def out_of_the_body(joints: wp.array2d(dtype=wp.vec3), e: int, start: wp.vec3, outwards: wp.vec3):
+    """``start``, moved on along the unit vector ``outwards`` until no limb reaches so far."""
+    further = float(0.0)
+    for b in range(joints.shape[1]):
+        way = joints[e, b] - start
+        along = wp.dot(way, outwards)
+        inside = CLEARANCE * CLEARANCE - wp.length_sq(way - along * outwards)
+        if inside > 0.0:
+            further = wp.max(further, along + wp.sqrt(inside))
+    return start + further * outwards
+
+
+@wp.func
+def draw_throw(throws: Throws, random: wp.uint32, e: int, joints: wp.array2d(dtype=wp.vec3)):
+    """Where a ball is thrown from [m], how fast [m/s], to meet the body where that is now, and its spin [rad/s]."""
+    turn = quat_exp(wp.vec3(0.0, 0.0, throws.place[2] + wp.randf(random, -throws.angle, throws.angle)))
+    away = wp.quat_rotate(turn, wp.vec3(0.0, -1.0, 0.0))
+    start = wp.vec3(throws.place[0], throws.place[1], wp.randf(random, throws.height[0], throws.height[1]))
+    start += wp.randf(random, throws.distance[0], throws.distance[1]) * away
+    start = out_of_the_body(joints, e, start, away)
+    aim = wp.lerp(joints[e, throws.aim[0]], joints[e, throws.aim[1]], wp.randf(random))
+    aim += 2.0 * throws.spread * wp.sample_unit_cube(random)
+    speed = wp.randf(random, throws.speed[0], throws.speed[1])
+    spin = 2.0 * MAX_SPIN * wp.sample_unit_cube(random)
+    return start, launch_velocity(start, aim, speed, throws.gravity), spin
+
+
+@wp.func
+def flies_on(throws: Throws, position: wp.vec3, velocity: wp.vec3):
+    """Whether a ball moves outwards beyond the catching radius."""
+    out = position - wp.vec3(throws.place[0], throws.place[1], 0.0)
+    out[2] = 0.0
+    distance = wp.length(out)
+    return distance > throws.reach and wp.dot(velocity, out) > OUTWARDS * distance
+
+
+@wp.func
+def rest_ball(
+    throws: Throws,
+    e: int,
+    ball: int,
+    # out
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+):
+    """Let a ball lie where it waits."""
+    position[e, ball] = throws.rest[ball]
+    velocity[e, ball] = wp.vec3(0.0)
+    spin[e, ball] = wp.vec3(0.0)
+
+
+@wp.func
+def throw_or_catch(
+    throws: Throws,
+    due: bool,
+    random: wp.uint32,
+    e: int,
+    ball: int,
+    joints: wp.array2d(dtype=wp.vec3),
+    ball_position: wp.array2d(dtype=wp.vec3),
+    ball_velocity: wp.array2d(dtype=wp.vec3),
+    # out
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+):
+    """Whether a ball is placed anew, and how: thrown if it is due, caught if it flies on."""
+    if due:
+        at, way, turning = draw_throw(throws, random, e, joints)
+        position[e, ball] = at
+        velocity[e, ball] = way
+        spin[e, ball] = turning
+        return True
+    if flies_on(throws, ball_position[e, ball], ball_velocity[e, ball]):
+        rest_ball(throws, e, ball, position, velocity, spin)
+        return True
+    return False
+
+
+@wp.kernel
+def draw_balls(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    throws: Throws,
+    # out
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+    density: wp.array2d(dtype=float),
+):
+    """At reset every ball is given its mass, and waits."""
+    e, ball = wp.tid()
+    if not mask[e]:
+        return
+    random = generator(seed[e], episode[e], STREAM_BALL, MASSES + ball)
+    mass = wp.randf(random, throws.mass[0], throws.mass[1])
+    if throws.log_mass != 0:
+        share = (mass - throws.mass[0]) / wp.max(throws.mass[1] - throws.mass[0], 1.0e-9)
+        mass = throws.mass[0] * wp.pow(throws.mass[1] / throws.mass[0], share)
+    density[e, ball] = mass / throws.volume
+    rest_ball(throws, e, ball, position, velocity, spin)
+
+
+def record_balls(env: BatchEnv, graph: LaunchGraph, throws: Throws) -> None:
+    """Append, at reset: in the masked environments every ball is given its mass, and waits."""
+    props = env.simulation.props
+    graph.launch(
+        draw_balls,
+        (env.num_envs, throws.num_balls),
+        [env.mask, env.seed, env.episode, throws],
+        [props.spawn.position, props.spawn.velocity, props.spawn.spin, props.density],
+    )

@@ -1,0 +1,456 @@
+"""Kernels of PassBall: how the ball is served, whose turn it is, what is a pass.
+
+PassBall: a ball goes round a circle of avatars, each of whom sends it on to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+import warp as wp
+from pydantic import Field
+
+from piavatar_envs.config import EnvConfig, SceneConfig, replace
+from piavatar_envs.envs.actions import ActionSpec, select_joints, speed_within
+from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.envs.parameters import Drawn
+from piavatar_envs.envs.rng import STREAM_BALL, generator
+from piavatar_envs.envs.task import Task
+from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.sim.scene import Domain
+from piavatar_envs.tasks.common.ball_goal import BALL, ball_config
+from piavatar_envs.tasks.common.cooperation import record_fall_together, record_shift
+from piavatar_envs.tasks.common.fall import UNDER_TORQUES_DOC, FallConfig
+from piavatar_envs.tasks.common.fights import Referee, on_circle
+from piavatar_envs.tasks.common.leash import held_back, record_leash
+from piavatar_envs.tasks.common.ranges import Margin, MassRange, SpeedRange, Weight, check_ranges
+from piavatar_envs.tasks.common.rewards import mean_square_action
+from piavatar_envs.tasks.common.spawn import record_standing
+from piavatar_envs.tasks.kick_ball import observe_feet
+
+wp.set_module_options({"enable_backward": False})
+
+
+#: Impulse of ball and body in a control step above which they have touched [N s].
+TOUCH = wp.constant(1.0e-3)
+
+
+@wp.struct
+class Serve:
+    """Constants of how the ball comes into play, from the middle of the circle."""
+
+    prop: int
+    radius: float  # of the ball [m]
+    slow: float  # least speed [m/s]
+    fast: float  # greatest speed [m/s]
+    spread: float  # greatest angle off the way to the first passer [rad]
+    light: float  # natural logarithm of the least density in kg/m^3
+    heavy: float  # and of the greatest
+
+
+@wp.struct
+class PassRule:
+    """Constants of the game."""
+
+    subject: int  # the ball among the subjects of the world
+    ball_volume: float  # [m^3]
+    reach: float  # distance from a pelvis at which the ball has arrived [m]
+    sent: float  # how far it must have come from where the passer touched it last [m]
+    fetch: float  # and at which a slow ball can still be fetched [m]
+    rim: float  # distance from the origin at which the ball is out [m]
+    dead_speed: float  # [m/s]
+    goal_passes: int
+    progress_weight: float
+    pass_bonus: float
+    control_cost: float
+
+
+@wp.struct
+class Play:
+    """How the game stands in every environment; all of it belongs into a checkpoint."""
+
+    passer: wp.array(dtype=int)  # (num_envs,) whose turn it is
+    touched: wp.array(dtype=int)  # (num_envs,) whether they have touched the ball in this turn
+    passes: wp.array(dtype=int)  # (num_envs,) completed
+    left: wp.array(dtype=wp.vec3)  # (num_envs,) where the ball was when they touched it last [m], if they have
+    gap: wp.array(dtype=float)  # (num_envs,) from the ball to where it shall go [m]; negative: not yet known
+    contact: wp.array2d(dtype=int)  # (num_envs, num_agents) whether one touched the ball in the last step
+    touches: wp.array2d(dtype=int)  # (num_envs, num_agents) so far
+
+
+@wp.kernel
+def serve_ball(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    serve: Serve,
+    places: wp.array(dtype=wp.vec3),
+    # out
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+    density: wp.array2d(dtype=float),
+    play: Play,
+):
+    """A ball that rolls from the middle of ``places`` towards one of them, in the masked environments."""
+    e = wp.tid()
+    if not mask[e]:
+        return
+    random = generator(seed[e], episode[e], STREAM_BALL, 0)
+    agents = places.shape[0]
+    first = wp.randi(random, 0, agents)
+    speed = wp.randf(random, serve.slow, serve.fast)
+    angle = wp.randf(random, -serve.spread, serve.spread)
+    middle = wp.vec3()
+    for agent in range(agents):
+        middle += places[agent] / float(agents)
+    up = wp.vec3(0.0, 0.0, 1.0)
+    way = wp.quat_rotate(wp.quat_from_axis_angle(up, angle), wp.normalize(places[first] - middle))
+    position[e, serve.prop] = middle + serve.radius * up
+    velocity[e, serve.prop] = speed * way
+    spin[e, serve.prop] = (speed / serve.radius) * wp.cross(up, way)
+    density[e, serve.prop] = wp.exp(wp.randf(random, serve.light, serve.heavy))
+    play.passer[e] = first
+    play.touched[e] = 0
+    play.passes[e] = 0
+    play.left[e] = wp.vec3()
+    play.gap[e] = -1.0
+    for agent in range(agents):
+        play.contact[e, agent] = 0
+        play.touches[e, agent] = 0
+
+
+@wp.kernel
+def keep_near(
+    place: wp.vec3,
+    reach: float,
+    command_root: wp.array(dtype=wp.vec3),
+    # out
+    reference_root: wp.array(dtype=wp.vec3),
+):
+    """The commanded root, no farther from its place than it may be before it acts."""
+    e = wp.tid()
+    reference_root[e] = held_back(command_root[e], place, reach)
+
+
+@wp.func
+def flat_distance(a: wp.vec3, b: wp.vec3):
+    """Length of the horizontal part of ``a - b``."""
+    return wp.length(wp.vec2(a[0] - b[0], a[1] - b[1]))
+
+
+@wp.func
+def goes_to(play: Play, e: int, agents: int):
+    """Who shall have the ball next: the passer until they have touched it, then the one after them."""
+    return (play.passer[e] + play.touched[e]) % agents
+
+
+@wp.func
+def way_come(play: Play, e: int, ball: wp.vec3):
+    """How far the ball has come from where the passer touched it last [m]; 0 before they have."""
+    return wp.where(play.touched[e] == 1, flat_distance(ball, play.left[e]), 0.0)
+
+
+@wp.func
+def update_touches(rule: PassRule, sensors: Sensors, e: int, play: Play):
+    """Book who touches the ball; a touch counts when it begins."""
+    for agent in range(play.contact.shape[1]):
+        impulse = sensors.pair_impulse[e, agent * sensors.boundary_impulse.shape[1] + rule.subject]
+        touching = wp.where(wp.length(impulse) > TOUCH, 1, 0)
+        if touching == 1 and play.contact[e, agent] == 0:
+            play.touches[e, agent] += 1
+        play.contact[e, agent] = touching
+
+
+@wp.kernel
+def judge(
+    rule: PassRule,
+    ball: wp.array(dtype=wp.vec3),
+    velocity: wp.array(dtype=wp.vec3),
+    pelvis: wp.array2d(dtype=wp.vec3),
+    sensors: Sensors,
+    action: wp.array3d(dtype=float),
+    # in and out
+    play: Play,
+    # out
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
+    terminated: wp.array2d(dtype=wp.bool),
+):
+    """Follow the game: a step's progress, passes, and a ball that nobody can play any more."""
+    e = wp.tid()
+    agents = pelvis.shape[1]
+    update_touches(rule, sensors, e, play)
+    gap = flat_distance(ball[e], pelvis[e, goes_to(play, e, agents)])
+    progress = wp.where(play.gap[e] < 0.0, 0.0, play.gap[e] - gap)
+    passer = play.passer[e]
+    receiver = (passer + 1) % agents
+    if play.contact[e, passer] == 1:
+        play.touched[e] = 1
+        play.left[e] = ball[e]
+    arrived = flat_distance(ball[e], pelvis[e, receiver]) <= rule.reach or play.contact[e, receiver] == 1
+    # feet that meet around a ball, and tap or hold it, send it nowhere
+    passed = play.touched[e] == 1 and arrived and way_come(play, e, ball[e]) >= rule.sent
+    if passed:
+        play.passes[e] += 1
+        play.passer[e] = receiver
+        play.touched[e] = play.contact[e, receiver]
+        play.left[e] = ball[e]
+    play.gap[e] = flat_distance(ball[e], pelvis[e, goes_to(play, e, agents)])
+    nearest = float(1.0e6)
+    for agent in range(agents):
+        nearest = wp.min(nearest, flat_distance(ball[e], pelvis[e, agent]))
+    slow = flat_distance(velocity[e], wp.vec3()) < rule.dead_speed
+    over = (slow and nearest > rule.fetch) or flat_distance(ball[e], wp.vec3()) > rule.rim
+    for agent in range(agents):
+        terms[e, agent, 0] = rule.progress_weight * progress
+        terms[e, agent, 1] = wp.where(passed, rule.pass_bonus, 0.0)
+        terms[e, agent, 2] = -rule.control_cost * mean_square_action(action, e, agent)
+        metrics[e, agent, 0] = float(play.passes[e])
+        metrics[e, agent, 1] = float(play.touches[e, agent])
+        metrics[e, agent, 2] = play.gap[e]
+        metrics[e, agent, 3] = wp.length(velocity[e])
+        success[e, agent] = play.passes[e] >= rule.goal_passes
+        if over:
+            terminated[e, agent] = True
+
+
+@wp.kernel
+def observe_game(
+    rule: PassRule,
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    pelvis: wp.array2d(dtype=wp.vec3),
+    ball: wp.array(dtype=wp.vec3),
+    density: wp.array(dtype=float),
+    place: wp.vec3,
+    play: Play,
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """How the game stands, from component ``start``; agents are counted on from oneself."""
+    e = wp.tid()
+    agents = pelvis.shape[1]
+    to_root = wp.quat_inverse(rotation[e, 0])
+    own = pelvis[e, agent]
+    to = pelvis[e, goes_to(play, e, agents)]
+    home = wp.vec3(place[0] - own[0], place[1] - own[1], 0.0)
+    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, to - own))
+    write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, to - ball[e]))
+    write_vector(observation, e, agent, start + 6, wp.quat_rotate(to_root, home))
+    # a tenth and ten times the mass differ as much: what a kick does to them does, too
+    observation[e, agent, start + 9] = wp.log10(density[e] * rule.ball_volume)
+    observation[e, agent, start + 10] = float(play.touched[e])
+    observation[e, agent, start + 11] = way_come(play, e, ball[e])
+    for n in range(agents):
+        turn = play.passer[e] == (agent + n) % agents
+        observation[e, agent, start + 12 + n] = wp.where(turn, 1.0, 0.0)
+
+
+JOINTS = tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle") for side in ("left", "right"))
+#: How far beyond the avatars' circle the ball is still in play, and how far behind it the walls are [m].
+RIM, ROOM = 0.5, 1.3
+
+
+class PassBallConfig(EnvConfig):
+    """Settings of PassBall."""
+
+    episode_seconds: float = Field(8.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
+    num_agents: int = Field(3, ge=2, le=4, description="number of avatars")
+    spacing: float = Field(1.6, ge=1.2, le=4.0, description="between neighbours on the circle [m]")
+    joints: tuple[str, ...] | None = Field(JOINTS, description="joints that act, besides the root; null for all 21")
+    root_speed: float = Field(1.5, gt=0.0, le=5.0, description="speed of the root at action 1 [m/s]")
+    roam: float = Field(0.4, ge=0.0, le=1.0, description="how far the root may be steered from its place [m]")
+    leash: float = Field(
+        0.12, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body before an action [m]"
+    )
+    leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning before an action [rad]")
+    ball_mass: MassRange = Field((0.4, 2.0), description="range of the ball's mass, uniform in its log [kg]")
+    ball_radius: float = Field(0.11, ge=0.06, le=0.3, description="radius of the ball [m]")
+    serve_speed: SpeedRange = Field((1.0, 1.6), description="range of the ball's speed at the start [m/s]")
+    serve_angle: float = Field(0.15, ge=0.0, le=0.5, description="greatest angle off the way to the first passer [rad]")
+    reach: float = Field(0.4, gt=0.1, le=1.0, description="distance from a pelvis at which the ball has arrived [m]")
+    sent: float = Field(
+        0.5, ge=0.0, le=2.0, description="how far a pass must go from where the passer touched the ball last [m]"
+    )
+    dead_speed: Margin = Field(0.1, description="horizontal speed below which a ball out of reach is dead [m/s]")
+    goal_passes: int = Field(2, ge=1, le=1000, description="passes that count as a success [-]")
+    progress_weight: Weight = Field(1.0, description="reward for a metre of the ball's way to its goal [1/m]")
+    pass_bonus: Weight = Field(2.0, description="reward of a completed pass [-]")
+    control_cost: Weight = Field(0.01, description="weight of the mean squared action [-]")
+    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall under torques")
+    pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
+    place_noise: float = Field(0.05, ge=0.0, le=0.3, description="greatest displacement of each along x and y [m]")
+
+
+class PassBallTask(Task):
+    """Send the ball on to the next."""
+
+    Config = PassBallConfig
+    description = "avatars on a circle send a ball of unknown mass on to each other, in turn"
+    reward_terms = ("progress", "pass", "control")
+    metrics = ("passes", "touches", "distance", "ball_speed")
+    observes_contact = True
+    observes_others = True
+    camera_position = (3.9, 2.7, 2.4)
+    camera_target = (0.0, 0.0, 0.65)
+    camera_follows = False
+
+    summary = """`num_agents` avatars stand around a circle, `spacing` apart and facing its middle. From there a soft
+ball of 0.4 to 2 kg (`ball_mass`) rolls towards one of them, the first passer, who shall kick or push it on to the next,
+counterclockwise from above, whose turn it then is. A pass is complete when the ball, after the passer has touched it,
+comes within `reach` of the next one's pelvis or touches them, and is at least `sent` from where the passer touched it
+last: it must be sent, not carried, and not held by feet that meet around it. Legs and root act; a root goes no farther
+than `roam` from its place. All are paid alike, but for the cost of their actions."""
+    reward_docs: ClassVar[Mapping[str, str]] = {
+        "progress": "`progress_weight` times the metres that the ball has come nearer, horizontally, to whoever shall "
+        "have it: the passer until they have touched it, then the next",
+        "pass": "`pass_bonus` in the step that completes a pass",
+        "control": "`-control_cost` times the mean of the agent's own squared action components",
+    }
+    metric_docs: ClassVar[Mapping[str, str]] = {
+        "passes": "completed passes so far [-]",
+        "touches": "how often the agent has begun to touch the ball so far [-]",
+        "distance": "horizontally from the ball to the pelvis of whoever shall have it [m]",
+        "ball_speed": "speed of the ball [m/s]",
+    }
+    success_doc = "there have been `goal_passes` passes"
+    termination_doc = (
+        "all agents' ends when the ball is slower than `dead_speed` and farther than `reach + roam` from everybody, "
+        "when it is 0.5 m outside the circle, and when one of them falls;\n- "
+        f"{UNDER_TORQUES_DOC}"
+    )
+    picture_seconds = 0.4
+    picture_actions = "zero"
+
+    config: PassBallConfig
+
+    def __init__(self, config: PassBallConfig) -> None:
+        check_ranges(config, "ball_mass", "serve_speed")
+        super().__init__(config)
+        self.joints = select_joints(config.joints)
+        self.rim = max(float(np.hypot(*avatar.position)) for avatar in self.scene.avatars) + RIM
+
+    def build_scene(self) -> SceneConfig:
+        config = self.config
+        scene = on_circle(config.scene, config.num_agents, config.spacing)
+        # it rolls: its top goes twice as fast as its middle
+        ball = ball_config(config, (0.0, 0.0, config.ball_radius), 2.0 * config.serve_speed[1])
+        return replace(scene, props=[ball, *scene.props])
+
+    def terms(self) -> tuple[ObservationTerm, ...]:
+        agents = len(self.scene.avatars)
+        return (
+            ObservationTerm("receiver", 3, "m", "root", "pelvis of whoever shall have the ball, from one's own"),
+            ObservationTerm("receiver_from_ball", 3, "m", "root", "the same from the ball"),
+            ObservationTerm("place", 3, "m", "root", "one's place, from the pelvis, horizontally"),
+            ObservationTerm("ball_mass", 1, "-", "-", "decimal logarithm of the ball's mass in kg"),
+            ObservationTerm("touched", 1, "-", "-", "1 if the passer has touched the ball in this turn"),
+            ObservationTerm("way", 1, "m", "-", "how far the ball has come from there, horizontally; 0 before"),
+            ObservationTerm("turn", agents, "-", "-", "1 for the passer, counted on from oneself"),
+            ObservationTerm("ball_from_left_foot", 3, "m", "root", "the ball from the left foot's ball"),
+            ObservationTerm("ball_from_right_foot", 3, "m", "root", "the ball from the right foot's ball"),
+        )
+
+    def drawn(self) -> tuple[Parameter, ...]:
+        return (Parameter("ball_mass", "kg", *self.config.ball_mass, "mass of the ball", log=True),)
+
+    def drawn_values(self, env) -> tuple[Drawn, ...]:
+        return (Drawn(env.simulation.props.density[:, self.index], self.rule.ball_volume),)
+
+    def action_spec(self) -> ActionSpec:
+        config = self.config
+        speed = speed_within(config.roam, config.root_speed, config.physics.control_dt)
+        return ActionSpec(self.joints, root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
+
+    def domain(self) -> Domain:
+        side = self.rim - RIM + ROOM
+        box = Domain()
+        return Domain((-side, -side, box.lower[2]), (side, side, box.upper[2]))
+
+    def allocate(self, env) -> None:
+        n, device, config, props = env.num_envs, env.device, self.config, env.simulation.props
+        self.index = props.index(BALL)
+        volume, serve, rule, play = float(props.volume[self.index]), Serve(), PassRule(), Play()
+        serve.prop, serve.radius, serve.spread = self.index, config.ball_radius, config.serve_angle
+        serve.slow, serve.fast = config.serve_speed
+        serve.light, serve.heavy = (float(np.log(mass / volume)) for mass in config.ball_mass)
+        rule.subject, rule.ball_volume = env.simulation.subjects.names.index(BALL), volume
+        rule.reach, rule.fetch, rule.rim = config.reach, config.reach + config.roam, self.rim
+        rule.sent, rule.dead_speed, rule.goal_passes = config.sent, config.dead_speed, config.goal_passes
+        rule.progress_weight, rule.pass_bonus = config.progress_weight, config.pass_bonus
+        rule.control_cost = config.control_cost
+        for name in ("passer", "touched", "passes"):
+            setattr(play, name, wp.zeros(n, dtype=int, device=device))
+        play.left = wp.zeros(n, dtype=wp.vec3, device=device)
+        play.gap = wp.zeros(n, dtype=float, device=device)
+        play.contact, play.touches = (wp.zeros((n, env.num_agents), dtype=int, device=device) for _ in range(2))
+        self.serve, self.rule, self.play, self.referee = serve, rule, play, Referee(env, self.config.fall)
+        places = [(*avatar.position, 0.0) for avatar in self.scene.avatars]
+        self.places = wp.array(places, dtype=wp.vec3, device=device)
+        self.reference_root = [wp.zeros(n, dtype=wp.vec3, device=device) for _ in places]
+
+    def arrays(self) -> dict[str, wp.array]:
+        names = ("passer", "touched", "passes", "left", "gap", "contact", "touches")
+        return {name: getattr(self.play, name) for name in names}
+
+    def record_reset(self, env, graph) -> None:
+        record_standing(env, graph, self.config.pose_noise)
+        record_shift(env, graph, self.config.place_noise)
+        props = env.simulation.props
+        graph.launch(
+            serve_ball,
+            env.num_envs,
+            [env.mask, env.seed, env.episode, self.serve, self.places],
+            [props.spawn.position, props.spawn.velocity, props.spawn.spin, props.density, self.play],
+        )
+
+    def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
+        references = record_leash(env, graph, self.config.leash, self.config.leash_turn)
+        # the action comes on top of what is kept within reach
+        reach = self.config.roam - self.action_spec().greatest_speed * self.config.physics.control_dt
+        kept = []
+        for (rotation, root), own, avatar in zip(references, self.reference_root, self.scene.avatars, strict=True):
+            graph.launch(keep_near, env.num_envs, [wp.vec3(*avatar.position, 0.0), reach, root], [own])
+            kept.append((rotation, own))
+        return kept
+
+    def record_outcome(self, env, graph) -> None:
+        self.referee.record(env, graph)
+        state, sim = env.simulation.props.state, env.simulation
+        graph.launch(
+            judge,
+            env.num_envs,
+            [
+                self.rule, state.position[:, self.index], state.velocity[:, self.index], self.referee.pelvis,
+                sim.sensors, env.action,
+            ],
+            [self.play, env.terms, env.metrics, env.success, env.terminated],
+        )  # fmt: skip
+        record_fall_together(env, graph, self.referee.out)
+
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
+        self.referee.record(env, graph)
+        props, tracked = env.simulation.props, env.simulation.avatars[agent].tracked
+        ball = props.state.position[:, self.index]
+        place = wp.vec3(*self.scene.avatars[agent].position, 0.0)
+        graph.launch(
+            observe_game,
+            env.num_envs,
+            [
+                self.rule, agent, start, tracked.rotation, self.referee.pelvis, ball, props.density[:, self.index],
+                place, self.play,
+            ],
+            [env.observation],
+        )  # fmt: skip
+        feet = env.layout["ball_from_left_foot"].slice.start
+        graph.launch(
+            observe_feet, env.num_envs, [agent, feet, tracked.rotation, tracked.position, ball], [env.observation]
+        )
+
+
+TASK = PassBallTask
