@@ -129,7 +129,7 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
 
     target = wp.get_device(find_device(device))
     start = time.perf_counter()
-    rooms = ("mpm", "avatar", "props", "envs", "tasks", "render") + (("multi",) if _found("pettingzoo") else ())
+    rooms = ("core", "mpm", "avatar", "sim", "envs", "tasks", "render") + (("multi",) if _found("pettingzoo") else ())
     for room in rooms:
         package = importlib.import_module(f"piavatar_envs.{room}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):

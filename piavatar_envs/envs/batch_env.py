@@ -1,4 +1,4 @@
-"""THE step and reset: a batch of environments, everything on the device. The views in ``api/`` only reshape this."""
+"""Step and reset of a batch of environments, everything on the device. The views in ``api/`` only reshape it."""
 
 from __future__ import annotations
 
@@ -15,17 +15,31 @@ from piavatar_envs.avatar.torque_control.controller import checked_assist
 from piavatar_envs.config.idle import idle_settings
 from piavatar_envs.core.launch_graph import LaunchGraph, compile_graphs
 from piavatar_envs.envs.actions import apply_actions, apply_targets, apply_torques, follow_reference, refuse_nonfinite
-from piavatar_envs.envs.episodes import begin_episode, count_episodes, end_agent, end_step, find_ended, retire
+from piavatar_envs.envs.episodes import (
+    EpisodeArrays,
+    begin_episode,
+    count_episodes,
+    end_agent,
+    end_step,
+    find_ended,
+    retire,
+    seeds_as_int32,
+)
 from piavatar_envs.envs.observer import Observer
 from piavatar_envs.envs.rng import NUM_SEEDS
-from piavatar_envs.envs.state import SETTINGS, check_settings, settings_rows
+from piavatar_envs.envs.state import SETTINGS, check_arrays, check_settings, settings_rows
 from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.props import check_places
 from piavatar_envs.sim.world import Simulation
 
 
 def check_count(name: str, count: Any, otherwise: str = "") -> None:
-    """Refuse what is not a number of things.
+    """Refuse a count that is not a whole number of at least 1.
+
+    Args:
+        name: of the count, for the message.
+        count: the value.
+        otherwise: appended to the message: another value that is accepted.
 
     Raises:
         ValueError: it is not a whole number, or less than 1.
@@ -34,25 +48,21 @@ def check_count(name: str, count: Any, otherwise: str = "") -> None:
         raise ValueError(f"{name}={count!r} must be a whole number, at least 1{otherwise}")
 
 
-class BatchEnv:
-    """``num_envs`` copies of a task. Never resets by itself.
+class BatchEnv(EpisodeArrays):
+    """``num_envs`` copies of a task; nothing resets by itself.
 
-    Arrays live on ``device`` and are overwritten by the next call; copy what you keep. The second dimension counts the
-    agents of an environment, one for each avatar.
+    :meth:`reset` begins episodes, :meth:`step` advances all of them by one control step under :attr:`action`. Each runs
+    a launch graph that is recorded once, in :meth:`_record_reset` and :meth:`_record_step`. For the arrays see
+    :class:`~piavatar_envs.envs.episodes.EpisodeArrays`.
 
     Attributes:
-        action: ``(num_envs, num_agents, action_size)`` float32, written by the caller before :meth:`step`.
-        observation: ``(num_envs, num_agents, observation_size)`` float32.
-        reward: ``(num_envs, num_agents)`` float32, the sum of ``terms`` ``(num_envs, num_agents, reward terms)``.
-        cost: ``(num_envs, num_agents)`` float32, the sum of ``cost_terms``; not part of the reward.
-        metrics: ``(num_envs, num_agents, metrics)`` float32.
-        terminated, success: ``(num_envs, num_agents)`` bool.
-        alive: ``(num_envs, num_agents)`` bool. Where there are several agents, one that has terminated stays in the
-            world as a passive body: its actions count as zero (targets: the rest pose), nothing holds its root, its
-            reward is zero.
-        truncated: ``(num_envs,)`` bool, the clock has run out for those still alive.
-        failure: ``(num_envs,)`` int32, bits ``FAILURE_*``.
-        restarts: how often episodes have begun by :meth:`reset`, or a state has been set: time has jumped then.
+        task: the task.
+        config: its settings.
+        control: ``"pose"``, ``"pd"`` or ``"torque"``.
+        action_spec: the joints that act.
+        action_map: from action components to joints, on the device.
+        observer: writes the observation.
+        restarts: number of calls that made time jump: of :meth:`reset` and :meth:`set_state`.
     """
 
     def __init__(self, task: Task, num_envs: int = 1, device: str = "cpu", seed: int = 0) -> None:
@@ -63,10 +73,10 @@ class BatchEnv:
             ValueError: a bad device, batch or time step; see :class:`Simulation`.
         """
         check_count("num_envs", num_envs)
-        for told in idle_settings(task.config):
-            warnings.warn(told, stacklevel=2)
-        self.task, self.config, self.num_envs = task, task.config, num_envs
-        self.simulation = Simulation(
+        for warning in idle_settings(task.config):
+            warnings.warn(warning, stacklevel=2)
+        self.task, self.config, self.control = task, task.config, task.config.drive.control
+        simulation = Simulation(
             task.config,
             num_envs,
             device,
@@ -75,116 +85,44 @@ class BatchEnv:
             avatar_names=task.agent_names,
             impulses=task.impulses(),
         )
-        placed = self.simulation.props.points, task.prop_places()
-        check_places(self.simulation.domain, self.simulation.dx, task.scene.props, *placed)
-        self.device, self.num_agents = self.simulation.device, len(self.simulation.avatars)
-        self.control = task.config.drive.control
+        places = simulation.props.points, task.prop_places()
+        check_places(simulation.domain, simulation.dx, task.scene.props, *places)
         self.action_spec = task.action_spec().under(self.control)
         if self.control == "torque":
-            for avatar in self.simulation.avatars:
+            for avatar in simulation.avatars:
                 avatar.joints.release([joint_index(name) for name in self.action_spec.joints])
-        self.observer = Observer(self.simulation, task)
-        self.layout = self.observer.layout
-        self.max_steps = max(1, round(task.config.episode_seconds / task.config.physics.control_dt))
-        self._allocate(seed)
+        self.observer = Observer(simulation, task)
+        names = len(task.reward_terms), len(task.cost_terms), len(task.metrics)
+        max_steps = max(1, round(task.config.episode_seconds / task.config.physics.control_dt))
+        super().__init__(simulation, self.observer.layout, self.action_spec.size, names, max_steps, seed)
+        self.action_map = self.action_spec.upload(self.config.physics.control_dt, task.limits(), self.device)
+        self.restarts = 0
         task.allocate(self)
         self.observer.connect(self)
-        self.reset_graph = LaunchGraph(self.device, condition=self._begins)
+        self.reset_graph = LaunchGraph(self.device, condition=self.begins)
         self.step_graph, self.observe_graph = LaunchGraph(self.device), LaunchGraph(self.device)
         self.count_graph, self.ended_graph = LaunchGraph(self.device), LaunchGraph(self.device)
-        self._record()
+        self._record_reset()
+        self._record_observation(self.observe_graph)
+        self._record_step(self.step_graph)
         compile_graphs((self.reset_graph, self.step_graph, self.observe_graph, self.count_graph, self.ended_graph))
 
-    @property
-    def failure(self) -> wp.array:
-        """Bits ``FAILURE_*`` of every environment."""
-        return self.simulation.state.failure
+    # the reset
 
-    def _allocate(self, seed: int) -> None:
-        n, device, task = self.num_envs, self.device, self.task
-
-        def zeros(shape, dtype):
-            return wp.zeros(shape, dtype=dtype, device=device)
-
-        agents = (n, self.num_agents)
-        self.restarts = 0
-        self.mask, self._seeded, self._new_seed = zeros(n, wp.bool), zeros(n, wp.bool), zeros(n, int)
-        self._begins = zeros(1, int)  # whether any episode does
-        self.seed = wp.array(_as_int32(seed + np.arange(n)), dtype=int, device=device)
-        self.episode = wp.full(n, -1, dtype=int, device=device)
-        self.step_count, self.truncated = zeros(n, int), zeros(n, wp.bool)
-        self.head_start = zeros(n, int)  # control steps that the time limit is ahead of the world's clock
-        self.action = zeros((*agents, self.action_spec.size), float)
-        self.observation = zeros((*agents, self.layout.size), float)
-        self.reward, self.cost = zeros(agents, float), zeros(agents, float)
-        self.terms = zeros((*agents, max(1, len(task.reward_terms))), float)
-        self.cost_terms = zeros((*agents, max(1, len(task.cost_terms))), float)
-        self.metrics = zeros((*agents, max(1, len(task.metrics))), float)
-        self.terminated, self.success, self.alive = (zeros(agents, wp.bool) for _ in range(3))
-        self.action_map = self.action_spec.upload(self.config.physics.control_dt, task.limits(), device)
-
-    def _record(self) -> None:
-        n, sim = self.num_envs, self.simulation
-        agents = (n, self.num_agents)
+    def _record_reset(self) -> None:
+        """Record the reset: find the environments that have ended, count their episodes, begin these."""
+        n, sim, graph = self.num_envs, self.simulation, self.reset_graph
         self.ended_graph.launch(find_ended, n, [self.terminated, self.truncated], [self.mask])
-        counters = [self._seeded, self.seed, self.episode, self._begins]
-        self.count_graph.launch(count_episodes, n, [self.mask, self._new_seed], counters)
+        counters = [self.seeded, self.seed, self.episode, self.begins]
+        self.count_graph.launch(count_episodes, n, [self.mask, self.new_seed], counters)
 
-        graph = self.reset_graph
         clocks, flags = [self.step_count, self.head_start], [self.terminated, self.truncated, self.success, self.alive]
-        graph.launch(begin_episode, agents, [self.mask], [*clocks, *flags, self._begins])
+        graph.launch(begin_episode, (n, self.num_agents), [self.mask], [*clocks, *flags, self.begins])
         sim.record_draws(graph, self.mask, self.seed, self.episode)
         self.task.record_reset(self, graph)
         sim.record_reset(graph, self.mask)
         self.observer.record_reset(graph, self.mask)
         self._record_observation(graph, self.mask)
-        self._record_observation(self.observe_graph)
-
-        graph = self.step_graph
-        references = self.task.record_references(self, graph)
-        for agent, (avatar, reference) in enumerate(zip(sim.avatars, references, strict=True)):
-            graph.launch(refuse_nonfinite, (n, self.action_spec.size), [self.action, agent, self.alive], [self.failure])
-            self._record_actions(graph, agent, avatar, reference)
-            if self.num_agents > 1:
-                graph.launch(retire, n, [agent, self.alive], [avatar.state.let_go])
-        sim.record_control_step(graph)
-        self.task.record_outcome(self, graph)
-        for agent, avatar in enumerate(sim.avatars):
-            graph.launch(
-                end_agent,
-                n,
-                [agent, self.num_agents, self.failure, avatar.state.let_go, self.terms, self.cost_terms],
-                [self.reward, self.cost, self.terminated, self.alive],
-            )
-        ends = [self.max_steps, self.terminated, self.head_start]
-        graph.launch(end_step, n, ends, [self.step_count, self.truncated])
-        self._record_observation(graph)
-
-    def _record_actions(self, graph: LaunchGraph, agent: int, avatar: AvatarDrive, reference: tuple) -> None:
-        """Append what an agent's action makes of its goal, counted from the reference pose."""
-        bones, goal = (self.num_envs, NUM_JOINTS), [avatar.state.goal_rotation, avatar.state.goal_root]
-        acting = [self.action_map, self.action, agent, self.alive]
-        if self.control == "pose":
-            graph.launch(apply_actions, bones, [*acting, *reference, avatar.tracked.rotation], goal)
-            return
-        command = [avatar.state.command_rotation, avatar.state.command_root]
-        inputs = [int(not self.task.targets_about_reference), *reference, self.failure]
-        graph.launch(follow_reference, bones, inputs, [*command, *goal])
-        if self.control == "pd":
-            graph.launch(apply_targets, bones, acting, goal[:1])
-        else:
-            joints = avatar.joints
-            graph.launch(apply_torques, bones, [*acting, joints.body.strength], [joints.state.torque])
-
-    def _record_observation(self, graph: LaunchGraph, mask: wp.array | None = None) -> None:
-        """Append what writes the observation; it changes nothing else. A reset has changed that of the ``mask``."""
-        self.observer.record_settings(graph)
-        for agent in range(self.num_agents):
-            self.observer.record(graph, agent, self.observation, mask)
-            if self.task.terms():
-                self.task.record_observe(self, graph, agent, self.observer.task_start)
-            self.observer.record_parameters(graph, self, agent)
-        self.observer.record_clean(graph, self.observation)
 
     def reset(
         self, env_mask: np.ndarray | None = None, seeds: Sequence[int | None] | np.ndarray | None = None
@@ -211,15 +149,15 @@ class BatchEnv:
             values = np.array([0 if seed is None else seed for seed in seeds], np.int64)
             if values.shape != (n,) or (values < 0).any() or (values >= NUM_SEEDS).any():
                 raise ValueError(f"seeds={seeds} must have shape ({n},) and be in [0, 2^32)")
-            self._new_seed.assign(_as_int32(values))
-            self._seeded.assign(mask & given)
+            self.new_seed.assign(seeds_as_int32(values))
+            self.seeded.assign(mask & given)
         self.mask.assign(mask)
         self.restarts += 1
-        self._begins.fill_(1)  # whoever asks for observations here gets those of all environments, as they are now
-        return self._begin()
+        self.begins.fill_(1)  # with an empty mask, too, the observations returned are the present ones
+        return self.reset_masked()
 
     def find_ended(self) -> wp.array:
-        """Write into :attr:`mask`, and return, which environments have ended: nobody is in, or the clock has run out.
+        """Write into :attr:`mask`, and return, the environments whose agents are all out or whose clock has run out.
 
         Nothing leaves the device.
         """
@@ -231,17 +169,70 @@ class BatchEnv:
 
         Nothing leaves the device, unless shapes are random and not from a pool: those are drawn on the host.
         """
-        return self._begin()
-
-    def _begin(self) -> wp.array:
         self.count_graph.run()
         self.simulation.shapes.draw(self.mask, self.seed, self.episode)
         self.reset_graph.run()
         self.simulation.shapes.fall_behind()
         return self.observation
 
+    # the step
+
+    def step(self) -> None:
+        """Advance every environment by one control step under :attr:`action`."""
+        self.step_graph.run()
+
+    def _record_step(self, graph: LaunchGraph) -> None:
+        """Record the step: actions to goals, the physics, the outcome, the observation."""
+        n, sim = self.num_envs, self.simulation
+        references = self.task.record_references(self, graph)
+        for agent, (avatar, reference) in enumerate(zip(sim.avatars, references, strict=True)):
+            graph.launch(refuse_nonfinite, (n, self.action_spec.size), [self.action, agent, self.alive], [self.failure])
+            self._record_actions(graph, agent, avatar, reference)
+            if self.num_agents > 1:
+                graph.launch(retire, n, [agent, self.alive], [avatar.state.let_go])
+        sim.record_control_step(graph)
+        self.task.record_outcome(self, graph)
+        for agent, avatar in enumerate(sim.avatars):
+            graph.launch(
+                end_agent,
+                n,
+                [agent, self.num_agents, self.failure, avatar.state.let_go, self.terms, self.cost_terms],
+                [self.reward, self.cost, self.terminated, self.alive],
+            )
+        ends = [self.max_steps, self.terminated, self.head_start]
+        graph.launch(end_step, n, ends, [self.step_count, self.truncated])
+        self._record_observation(graph)
+
+    def _record_actions(self, graph: LaunchGraph, agent: int, avatar: AvatarDrive, reference: tuple) -> None:
+        """Append the launches that turn an agent's action into its goal, relative to the reference pose."""
+        bones, goal = (self.num_envs, NUM_JOINTS), [avatar.state.goal_rotation, avatar.state.goal_root]
+        acting = [self.action_map, self.action, agent, self.alive]
+        if self.control == "pose":
+            graph.launch(apply_actions, bones, [*acting, *reference, avatar.tracked.rotation], goal)
+            return
+        command = [avatar.state.command_rotation, avatar.state.command_root]
+        inputs = [int(not self.task.targets_about_reference), *reference, self.failure]
+        graph.launch(follow_reference, bones, inputs, [*command, *goal])
+        if self.control == "pd":
+            graph.launch(apply_targets, bones, acting, goal[:1])
+        else:
+            joints = avatar.joints
+            graph.launch(apply_torques, bones, [*acting, joints.body.strength], [joints.state.torque])
+
+    def _record_observation(self, graph: LaunchGraph, mask: wp.array | None = None) -> None:
+        """Append the launches that write the observation and change nothing else; only ``mask`` was reset, if given."""
+        self.observer.record_settings(graph)
+        for agent in range(self.num_agents):
+            self.observer.record(graph, agent, self.observation, mask)
+            if self.task.terms():
+                self.task.record_observe(self, graph, agent, self.observer.task_start)
+            self.observer.record_parameters(graph, self, agent)
+        self.observer.record_clean(graph, self.observation)
+
+    # state
+
     def assist_root(self, share: float | np.ndarray) -> None:
-        """Help the pelvis from now on, as ``drive.root_assist`` says; for ``control="pd"`` and ``"torque"``.
+        """Set the share of root assistance from now on (``drive.root_assist``), for ``control="pd"`` and ``"torque"``.
 
         Args:
             share: from 0, none, to 1; of all environments, or of each, shape ``(num_envs,)``. Resets leave it.
@@ -255,12 +246,8 @@ class BatchEnv:
         for avatar in self.simulation.avatars:
             avatar.joints.assist.assign(shares)
 
-    def step(self) -> None:
-        """Advance every environment by one control step under :attr:`action`."""
-        self.step_graph.run()
-
     def arrays(self) -> dict[str, wp.array]:
-        """Every array a checkpoint holds, by name."""
+        """Return every array of a checkpoint, by name."""
         clocks, flags = ("step_count", "head_start"), ("terminated", "truncated", "success", "alive")
         own = {name: getattr(self, name) for name in (*clocks, "seed", "episode", *flags)}
         return (
@@ -270,7 +257,7 @@ class BatchEnv:
         )
 
     def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on, as copies on the host; the settings, too."""
+        """Copy everything that the future depends on to the host, the settings too."""
         state = {name: array.numpy().copy() for name, array in self.arrays().items()}
         state[SETTINGS] = settings_rows(self.config, self.num_envs)
         for avatar in self.simulation.shapes.of_host:
@@ -285,17 +272,7 @@ class BatchEnv:
                 type; nothing has changed then.
         """
         check_settings(state, self.config)
-        present = self.get_state()
-        if set(state) != set(present):
-            missing, unknown = sorted(set(present) - set(state)), sorted(set(state) - set(present))
-            raise ValueError(f"the state is of another environment: missing {missing}, unknown {unknown}")
-        del present[SETTINGS]  # they are compared already
-        for name, have in present.items():
-            if np.shape(state[name]) != have.shape or np.asarray(state[name]).dtype != have.dtype:
-                raise ValueError(
-                    f"state[{name!r}] has shape {np.shape(state[name])} and type {np.asarray(state[name]).dtype}, "
-                    f"expected {have.shape} and {have.dtype}"
-                )
+        check_arrays(state, self.get_state())
         for name, array in self.arrays().items():
             array.assign(state[name])
         for avatar in self.simulation.shapes.of_host:
@@ -303,8 +280,3 @@ class BatchEnv:
         self.simulation.shapes.fall_behind()
         self.restarts += 1
         self.observe_graph.run()
-
-
-def _as_int32(seeds: np.ndarray) -> np.ndarray:
-    """Seeds in [0, 2^32) as kernels take them."""
-    return np.asarray(seeds, np.int64).astype(np.uint32).view(np.int32)

@@ -1,115 +1,95 @@
-"""What a task writes that is not finite, or beyond its columns: noted before it is replaced, or in the next row.
-
-Values that are not finite are replaced by zeros, which nobody would notice; a third term where two are declared would
-be the next environment's first.
-
-Kernels by which episodes begin, are counted, and end.
-"""
+"""Episodes of a batch: their arrays, and the kernels by which they begin, are counted and end."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.sim.world import Simulation
 
 wp.set_module_options({"enable_backward": False})
 
 
-if TYPE_CHECKING:
-    from piavatar_envs.core.launch_graph import LaunchGraph
-    from piavatar_envs.envs.batch_env import BatchEnv
+class EpisodeArrays:
+    """Arrays of a batch of environments: all that a task reads and writes.
 
+    They live on ``device`` and are overwritten by the next step or reset; copy what you keep. The second dimension
+    counts the agents of an environment, one for each avatar.
 
-#: Numbers behind the last row in which is seen what a task writes beyond its columns, and what stands there until then.
-SPARE, UNTOUCHED = 8, -1.2345678e30
-#: Arrays of the batch whose last dimension are a task's names, and how these are called.
-NAMED = {"terms": "reward_terms", "cost_terms": "cost_terms", "metrics": "metrics"}
+    Attributes:
+        simulation: the simulated world.
+        layout: of the flat observation of an agent.
+        num_envs, num_agents: number of environments, and of agents in each.
+        device: the Warp device.
+        max_steps: control steps until the clock runs out.
+        mask: ``(num_envs,)`` bool, environments whose next episode begins.
+        seed, episode: ``(num_envs,)`` int32, by which an episode draws its random numbers.
+        step_count: ``(num_envs,)`` int32, control steps since the reset.
+        head_start: ``(num_envs,)`` int32, control steps that the time limit is ahead of ``step_count``.
+        action: ``(num_envs, num_agents, action_size)`` float32, written by the caller before a step.
+        observation: ``(num_envs, num_agents, observation_size)`` float32.
+        reward: ``(num_envs, num_agents)`` float32, the sum of ``terms`` ``(num_envs, num_agents, reward terms)``.
+        cost: ``(num_envs, num_agents)`` float32, the sum of ``cost_terms``; not part of the reward.
+        metrics: ``(num_envs, num_agents, metrics)`` float32.
+        terminated, success: ``(num_envs, num_agents)`` bool.
+        alive: ``(num_envs, num_agents)`` bool. Where there are several agents, one that has terminated stays in the
+            world as a passive body: its actions count as zero (targets: the rest pose), nothing holds its root, its
+            reward is zero.
+        truncated: ``(num_envs,)`` bool, the clock has run out for agents that are still alive.
+    """
 
-
-class FiniteWatch:
-    """Looks at all that a task writes, in every step of the one batch that is built of it afterwards."""
-
-    def __init__(self, task: Task) -> None:
-        """Stand between the task and its batch."""
-        self._found: dict[tuple[str, ...], wp.array] = {}
-        self._long: dict[str, wp.array] = {}
-        self._task = task
-        allocate, record_outcome, record_observe = task.allocate, task.record_outcome, task.record_observe
-
-        def lengthen(env: BatchEnv) -> None:
-            for name in NAMED:
-                setattr(env, name, self._with_spare(name, getattr(env, name)))
-            allocate(env)
-
-        def outcome(env: BatchEnv, graph: LaunchGraph) -> None:
-            record_outcome(env, graph)
-            for name, declared in NAMED.items():
-                self._note(env, graph, getattr(env, name), getattr(task, declared), 0, range(env.num_agents))
-
-        def observe(env: BatchEnv, graph: LaunchGraph, agent: int, start: int) -> None:
-            record_observe(env, graph, agent, start)
-            names = [f"{term.name}[{index}]" for term in task.terms() for index in range(term.size)]
-            self._note(env, graph, env.observation, names, start, range(agent, agent + 1))
-
-        task.allocate, task.record_outcome, task.record_observe = lengthen, outcome, observe
-
-    def _with_spare(self, name: str, array: wp.array) -> wp.array:
-        """An array such as ``array``, whose rows follow each other as they do there: it can be reshaped."""
-        long = np.full(array.size + SPARE, UNTOUCHED, np.float32)
-        long[: array.size] = 0.0
-        self._long[name] = wp.array(long, dtype=float, device=array.device)
-        return self._long[name][: array.size].reshape(array.shape)
-
-    def _note(
-        self, env: BatchEnv, graph: LaunchGraph, values: wp.array, names: Sequence[str], start: int, agents: range
+    def __init__(
+        self,
+        simulation: Simulation,
+        layout: ObservationLayout,
+        action_size: int,
+        names: tuple[int, int, int],
+        max_steps: int,
+        seed: int = 0,
     ) -> None:
-        """Append: note which columns of ``values``, called ``names`` from ``start`` on, some agent has not finite."""
-        if names:
-            found = self._found.setdefault(tuple(names), wp.zeros(len(names), dtype=int, device=env.device))
-            shape = env.num_envs, len(agents), len(names)
-            graph.launch(note_columns, shape, [env.failure, values, agents.start, start], [found])
+        """Allocate the arrays.
 
-    def names(self) -> list[str]:
-        """Of all that was not finite in an environment that had not failed."""
-        return [name for names, found in self._found.items() for name, n in zip(names, found.numpy(), strict=True) if n]
-
-    def beyond(self) -> dict[str, tuple[int, int]]:
-        """Of ``reward_terms``, ``cost_terms`` and ``metrics``, those of which the task writes more than it declares.
-
-        What is written beyond a row is the next one's, where nobody can tell it from what that row's agent has written;
-        it is seen behind the last agent of the last environment.
-
-        Returns:
-            How many names there are, and how many columns are written, as far as :data:`SPARE` more can tell.
+        Args:
+            simulation: the simulated world.
+            layout: of the flat observation of an agent.
+            action_size: number of components of an agent's action.
+            names: number of reward terms, cost terms and metrics.
+            max_steps: control steps until the clock runs out.
+            seed: of the first environment; the others count on from it.
         """
-        found = {}
-        for name, long in self._long.items():
-            declared, values = len(getattr(self._task, NAMED[name])), long.numpy()
-            behind = np.flatnonzero(values[-SPARE:] != np.float32(UNTOUCHED))
-            if len(behind):
-                found[NAMED[name]] = declared, max(1, declared) + int(behind[-1]) + 1
-            elif not declared and values[:-SPARE].any():  # without names there is a column that means nothing
-                found[NAMED[name]] = declared, 1
-        return found
+        self.simulation, self.layout, self.max_steps = simulation, layout, max_steps
+        self.num_envs, self.num_agents = simulation.num_envs, len(simulation.avatars)
+        self.device = simulation.device
+        n, agents = self.num_envs, (self.num_envs, self.num_agents)
+        self.mask, self.new_seed, self.seeded = self._zeros(n, wp.bool), self._zeros(n, int), self._zeros(n, wp.bool)
+        self.begins = self._zeros(1, int)  # whether any episode does
+        self.seed = wp.array(seeds_as_int32(seed + np.arange(n)), dtype=int, device=self.device)
+        self.episode = wp.full(n, -1, dtype=int, device=self.device)
+        self.step_count, self.head_start, self.truncated = (
+            self._zeros(n, int),
+            self._zeros(n, int),
+            self._zeros(n, wp.bool),
+        )
+        self.action = self._zeros((*agents, action_size), float)
+        self.observation = self._zeros((*agents, layout.size), float)
+        self.reward, self.cost = self._zeros(agents, float), self._zeros(agents, float)
+        # a launch takes no array without columns
+        self.terms, self.cost_terms, self.metrics = (self._zeros((*agents, max(1, count)), float) for count in names)
+        self.terminated, self.success, self.alive = (self._zeros(agents, wp.bool) for _ in range(3))
+
+    def _zeros(self, shape: int | tuple[int, ...], dtype: type) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.device)
+
+    @property
+    def failure(self) -> wp.array:
+        """Bits ``FAILURE_*`` of every environment, ``(num_envs,)`` int32."""
+        return self.simulation.state.failure
 
 
-@wp.kernel
-def note_columns(
-    failure: wp.array(dtype=int),
-    values: wp.array3d(dtype=float),
-    agent: int,
-    start: int,
-    # out
-    found: wp.array(dtype=int),
-):
-    """Note columns from ``start`` on that are not finite, of agents from ``agent`` on, where nothing has failed."""
-    e, a, n = wp.tid()
-    if failure[e] == 0 and not wp.isfinite(values[e, agent + a, start + n]):
-        wp.atomic_max(found, n, 1)
+def seeds_as_int32(seeds: np.ndarray) -> np.ndarray:
+    """Convert seeds in [0, 2^32) to the 32 bits that kernels read."""
+    return np.asarray(seeds, np.int64).astype(np.uint32).view(np.int32)
 
 
 @wp.kernel
@@ -123,7 +103,7 @@ def count_episodes(
     episode: wp.array(dtype=int),
     begins: wp.array(dtype=int),
 ):
-    """The next episode of the masked environments, or the first one of a new seed; whether any ``begins``."""
+    """Advance the episode count of the masked environments, from 0 after a new seed; flag that one ``begins``."""
     e = wp.tid()
     if not mask[e]:
         return
@@ -142,7 +122,7 @@ def find_ended(
     # out
     mask: wp.array(dtype=wp.bool),
 ):
-    """Where every agent has terminated or the clock has run out."""
+    """Set the mask where every agent has terminated or the clock has run out."""
     e = wp.tid()
     ended = bool(True)
     for agent in range(terminated.shape[1]):
@@ -163,7 +143,7 @@ def begin_episode(
     alive: wp.array2d(dtype=wp.bool),
     begins: wp.array(dtype=int),
 ):
-    """Clocks and flags of the masked environments back to the start; that any ``begins`` is known by now."""
+    """Reset clocks and flags of the masked environments; clear ``begins``, which the graph has read by now."""
     e, agent = wp.tid()
     begins[0] = 0
     if mask[e]:
@@ -177,7 +157,7 @@ def begin_episode(
 
 @wp.kernel
 def retire(agent: int, alive: wp.array2d(dtype=wp.bool), let_go: wp.array(dtype=int)):
-    """Nothing holds the root of an agent that is out."""
+    """Release the root of an agent that is out."""
     e = wp.tid()
     if not alive[e, agent]:
         let_go[e] = 1
@@ -198,7 +178,7 @@ def end_agent(
     terminated: wp.array2d(dtype=wp.bool),
     alive: wp.array2d(dtype=wp.bool),
 ):
-    """Sum the terms of an agent; a fall and a failure terminate it. What is out among several earns nothing."""
+    """Sum the terms of an agent; a fall or a failure terminates it. Among several, one that is out earns nothing."""
     e = wp.tid()
     out = num_agents > 1 and not alive[e, agent]
     total = float(0.0)
@@ -227,7 +207,7 @@ def end_step(
     # out
     truncated: wp.array(dtype=wp.bool),
 ):
-    """Count the step; the clock truncates where an agent is still in."""
+    """Count the step; truncate where the clock has run out and an agent is still in."""
     e = wp.tid()
     step_count[e] = step_count[e] + 1
     left = int(0)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, NUM_JOINTS
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.envs.episodes import EpisodeArrays
 from piavatar_envs.envs.observations import (
     CONTACT_TERMS,
     JOINT_TERMS,
@@ -26,11 +25,8 @@ from piavatar_envs.envs.observations import (
     tracked_arrays,
 )
 from piavatar_envs.envs.parameters import Parameters
+from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.world import Simulation
-
-if TYPE_CHECKING:
-    from piavatar_envs.envs.batch_env import BatchEnv
-    from piavatar_envs.envs.task import Task
 
 
 class Observer:
@@ -63,7 +59,7 @@ class Observer:
             terms += other_terms(index)
         self.task_start = sum(term.size for term in terms)
         self._num_others = others
-        self.parameters = Parameters(simulation, task) if task.config.observe_parameters else None
+        self.parameters = Parameters(simulation, task.drawn()) if task.config.observe_parameters else None
         last = [self.parameters.term] if self.parameters else []
         self.layout = ObservationLayout((*terms, *task.terms(), *last))
         device = simulation.device
@@ -125,10 +121,10 @@ class Observer:
             )
             at += size
 
-    def connect(self, env: BatchEnv) -> None:
+    def connect(self, env: EpisodeArrays) -> None:
         """Find what is observed of the task's draws, when the task has allocated it."""
         if self.parameters:
-            self.parameters.connect(env)
+            self.parameters.connect(env.num_envs, self.task.drawn_values(env))
 
     def record_reset(self, graph: LaunchGraph, mask: wp.array) -> None:
         """Append, when all has been drawn: keep what the masked environments have drawn."""
@@ -140,7 +136,7 @@ class Observer:
         if self.parameters:
             self.parameters.record_settings(graph)
 
-    def record_parameters(self, graph: LaunchGraph, env: BatchEnv, agent: int) -> None:
+    def record_parameters(self, graph: LaunchGraph, env: EpisodeArrays, agent: int) -> None:
         """Append: write what the episode has drawn for ``agent``. Changes nothing else."""
         if self.parameters:
             self.parameters.record_observe(graph, env, agent)

@@ -10,18 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.envs.episodes import EpisodeArrays
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.sim.world import Simulation
-
-if TYPE_CHECKING:
-    from piavatar_envs.envs.batch_env import BatchEnv
-    from piavatar_envs.envs.task import Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -63,13 +60,13 @@ class Parameters:
             each avatar, the task's. None before :meth:`connect`.
     """
 
-    def __init__(self, simulation: Simulation, task: Task) -> None:
-        self.simulation = simulation
+    def __init__(self, simulation: Simulation, task: Sequence[Parameter]) -> None:
+        self.simulation, self._drawn = simulation, task
         world, own = simulation.randomization.parameters()
         shape = [parameter for parameter, _ in simulation.shapes.drawn(0).values()]
         settings = [ASSIST] if simulation.avatar.joints else []
         own = *own, *shape, *settings
-        self._world, self._own, self._task = (_ranging(group) for group in (world, own, task.drawn()))
+        self._world, self._own, self._task = (_ranging(group) for group in (world, own, task))
         others = [
             replace(parameter, name=f"other_{index}_{parameter.name}")
             for index in range(len(simulation.avatars) - 1)
@@ -81,7 +78,7 @@ class Parameters:
         )
         self.values: wp.array | None = None
 
-    def connect(self, env: BatchEnv) -> None:
+    def connect(self, num_envs: int, values: Sequence[Drawn]) -> None:
         """Find the numbers, when the task has allocated its own."""
         simulation, count = self.simulation, len(self.simulation.avatars)
         random, device = simulation.randomization, simulation.device
@@ -93,11 +90,11 @@ class Parameters:
             for parameter in self._own:
                 column = known.get(parameter.name)
                 sources.append((parameter, Drawn(random.column(parameter.name, index) if column is None else column)))
-        of_task = zip(env.task.drawn(), env.task.drawn_values(env), strict=True)
+        of_task = zip(self._drawn, values, strict=True)
         sources += [(parameter, drawn) for parameter, drawn in of_task if parameter in self._task]
         self._sources = sources
-        self.values = wp.zeros((env.num_envs, max(1, len(sources))), dtype=float, device=device)
-        self._everywhere = wp.full(env.num_envs, True, dtype=wp.bool, device=device)
+        self.values = wp.zeros((num_envs, max(1, len(sources))), dtype=float, device=device)
+        self._everywhere = wp.full(num_envs, True, dtype=wp.bool, device=device)
         self._columns = [wp.array(self._columns_of(agent, count), dtype=int, device=device) for agent in range(count)]
 
     def _columns_of(self, agent: int, count: int) -> np.ndarray:
@@ -127,7 +124,7 @@ class Parameters:
             [self.values],
         )
 
-    def record_observe(self, graph: LaunchGraph, env: BatchEnv, agent: int) -> None:
+    def record_observe(self, graph: LaunchGraph, env: EpisodeArrays, agent: int) -> None:
         """Append: write the term for ``agent``. Changes nothing else."""
         graph.launch(
             observe_parameters,

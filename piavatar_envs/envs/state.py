@@ -1,7 +1,7 @@
-"""The settings in a state: those that decide what comes of it, so that no environment of others takes it for its own.
+"""Saved states: the settings that they hold, and the checks that a state passes before anything changes.
 
-They are text (JSON) in bytes, a row an environment as all of a state: it can be cut, joined, kept in any file of arrays
-and made a tensor like the rest.
+A state maps names to arrays whose first dimension is the environment. The settings on which the future depends are
+part of it, as JSON in bytes, one row for each environment: a state can be split, joined and stored like other arrays.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from pydantic import BaseModel
 
 from piavatar_envs.config.errors import shown
 
-#: Their name in a state.
+#: Name of the settings in a state.
 SETTINGS = "env.settings"
-#: What changes nothing that happens; and what holds until somebody says otherwise, so that the state has it as it is.
+#: Settings without effect on the future, and the setting that a state holds as a number of its own.
 _SHOWN, _BEGUN_WITH = ("render", "obs_mode"), "root_assist"
 
 
 def settings_rows(config: BaseModel, num_envs: int) -> np.ndarray:
-    """What decides the future in ``config``, for each environment: JSON in UTF-8, ``(num_envs, length)`` uint8."""
+    """Encode the settings on which the future depends: JSON in UTF-8, ``(num_envs, length)`` uint8."""
     kept = {name: value for name, value in config.model_dump(mode="json").items() if name not in _SHOWN}
     text = json.dumps(_without_beginnings(kept), sort_keys=True, separators=(",", ":"))
     return np.tile(np.frombuffer(text.encode(), np.uint8), (num_envs, 1))
 
 
 def check_settings(state: Mapping[str, Any], config: BaseModel) -> None:
-    """Refuse a state that was saved under settings by which its future would be another one.
+    """Refuse a state that was saved under settings that would change its future.
 
     Args:
-        state: of any number of environments; whether it holds settings is for others to see.
-        config: settings of the environment that shall go on from it.
+        state: of any number of environments; one without settings passes here and is refused as incomplete.
+        config: settings of the environment that is to continue from it.
 
     Raises:
-        ValueError: a setting differs, or there are none to be read.
+        ValueError: a setting differs, or the settings cannot be read.
     """
     if SETTINGS not in state:
         return
@@ -48,11 +48,31 @@ def check_settings(state: Mapping[str, Any], config: BaseModel) -> None:
         _compare(row, own[0])
 
 
+def check_arrays(state: Mapping[str, Any], present: Mapping[str, np.ndarray]) -> None:
+    """Refuse a state whose arrays are not those of an environment; its settings are compared elsewhere.
+
+    Args:
+        state: the state.
+        present: that of the environment as it is.
+
+    Raises:
+        ValueError: arrays are missing, unknown, or of another shape or type.
+    """
+    if set(state) != set(present):
+        missing, unknown = sorted(set(present) - set(state)), sorted(set(state) - set(present))
+        raise ValueError(f"the state is of another environment: missing {missing}, unknown {unknown}")
+    for name, have in present.items():
+        value = np.asarray(state[name])
+        if name != SETTINGS and (value.shape != have.shape or value.dtype != have.dtype):
+            expected = f"expected {have.shape} and {have.dtype}"
+            raise ValueError(f"state[{name!r}] has shape {value.shape} and type {value.dtype}, {expected}")
+
+
 def _compare(saved: np.ndarray, own: np.ndarray) -> None:
-    """Refuse one environment's settings where they are not those of ``own``, both as they are in a state."""
+    """Refuse the encoded settings of one environment where they differ from ``own``."""
     try:
         then = json.loads(saved.tobytes())
-    except ValueError:  # also of bytes that are no text
+    except ValueError:  # also raised for bytes that are not text
         raise ValueError(_unreadable("is no text of settings")) from None
     unlike = _first_unlike(then, json.loads(own.tobytes()))
     if unlike:
@@ -68,14 +88,14 @@ def _unreadable(what: str) -> str:
 
 
 def _without_beginnings(value: Any) -> Any:
-    """Nested settings, without those that are only what a new environment begins with."""
+    """Drop from nested settings those that only initialise a new environment."""
     if isinstance(value, Mapping):
         return {name: _without_beginnings(item) for name, item in value.items() if name != _BEGUN_WITH}
     return [_without_beginnings(item) for item in value] if isinstance(value, list) else value
 
 
 def _first_unlike(was: Any, now: Any, name: str = "") -> tuple[str, Any, Any] | None:
-    """The first of what is not alike in nested settings: its dotted name and both values, None where there is none."""
+    """Return the first difference between nested settings: dotted name and both values, or None."""
     if isinstance(was, Mapping) and isinstance(now, Mapping):
         pairs = [(key, was.get(key), now.get(key)) for key in sorted({*was, *now})]
     elif _are_entries(was) and _are_entries(now) and len(was) == len(now):
@@ -87,5 +107,5 @@ def _first_unlike(was: Any, now: Any, name: str = "") -> tuple[str, Any, Any] | 
 
 
 def _are_entries(value: Any) -> bool:
-    """Whether it is a list of sections, not of numbers or names."""
+    """Return whether a value is a list of sections, not of numbers or names."""
     return isinstance(value, list) and all(isinstance(item, Mapping) for item in value)

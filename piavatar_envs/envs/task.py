@@ -20,7 +20,7 @@ from piavatar_envs.sim.scene import Domain
 
 if TYPE_CHECKING:
     from piavatar_envs.core.launch_graph import LaunchGraph
-    from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.envs.episodes import EpisodeArrays
     from piavatar_envs.envs.parameters import Drawn
     from piavatar_envs.render.scene import Marker
 
@@ -195,7 +195,7 @@ class Task:
         """
         return ()
 
-    def drawn_values(self, env: BatchEnv) -> tuple[Drawn, ...]:
+    def drawn_values(self, env: EpisodeArrays) -> tuple[Drawn, ...]:
         """Where those numbers are, in the order of :meth:`drawn`; called once, after :meth:`allocate`."""
         return ()
 
@@ -215,14 +215,14 @@ class Task:
         """Greatest impulse that the task gives a bone at once [N s], by joint: substeps are short enough for it."""
         return {}
 
-    def allocate(self, env: BatchEnv) -> None:
+    def allocate(self, env: EpisodeArrays) -> None:
         """Create the task's arrays."""
 
     def arrays(self) -> dict[str, wp.array]:
         """Arrays of the task that a checkpoint must hold."""
         return {}
 
-    def record_reset(self, env: BatchEnv, graph: LaunchGraph) -> None:
+    def record_reset(self, env: EpisodeArrays, graph: LaunchGraph) -> None:
         """Append: for environments of ``env.mask``, write the avatars' first commanded poses and draw the task.
 
         Props and colliders start where the scene says, unless this writes other places into
@@ -234,7 +234,7 @@ class Task:
         """
         raise NotImplementedError(f"{type(self).__name__} must define record_reset(env, graph)")
 
-    def record_references(self, env: BatchEnv, graph: LaunchGraph) -> list[tuple[wp.array, wp.array]]:
+    def record_references(self, env: EpisodeArrays, graph: LaunchGraph) -> list[tuple[wp.array, wp.array]]:
         """Append what comes before the physics; return the pose that actions are added to, of every avatar.
 
         A pose is its local rotations and its root; by default what was commanded last.
@@ -242,7 +242,7 @@ class Task:
         states = [avatar.state for avatar in env.simulation.avatars]
         return [(state.command_rotation, state.command_root) for state in states]
 
-    def record_outcome(self, env: BatchEnv, graph: LaunchGraph) -> None:
+    def record_outcome(self, env: EpisodeArrays, graph: LaunchGraph) -> None:
         """Append, after the physics: write reward and cost terms, metrics, success and termination of every agent.
 
         Raises:
@@ -250,11 +250,11 @@ class Task:
         """
         raise NotImplementedError(f"{type(self).__name__} must define record_outcome(env, graph)")
 
-    def record_observe(self, env: BatchEnv, graph: LaunchGraph, agent: int, start: int) -> None:
+    def record_observe(self, env: EpisodeArrays, graph: LaunchGraph, agent: int, start: int) -> None:
         """Append: write the task's observation terms from component ``start``. Must not change any state."""
 
     def markers(
-        self, env: BatchEnv, index: int
+        self, env: EpisodeArrays, index: int
     ) -> Sequence[tuple[np.ndarray, float, tuple[float, float, float]] | Marker]:
         """Things to draw for environment ``index``: ``(position [m], radius [m], rgb)`` spheres, or what renders them.
 

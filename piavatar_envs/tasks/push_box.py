@@ -234,7 +234,7 @@ of the root, too: before each action it is brought back to within 0.1 m and 0.3 
         )
 
     def markers(self, env, index: int) -> list[Marker]:
-        from piavatar_envs.render import Ring
+        from piavatar_envs.render.scene import Ring
 
         at = self.target.numpy()[index] + np.float32([0.0, 0.0, 0.01])
         return [Ring(at, np.array([0.0, 0.0, 1.0]), self.config.target_radius)]

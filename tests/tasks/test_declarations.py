@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.api.conformance import TaskError, check_task
+from piavatar_envs.api.conformance import FiniteWatch, TaskError, check_task
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.episodes import FiniteWatch
 from piavatar_envs.envs.task import NAMES_OF_INFO, Task
 from piavatar_envs.tasks.common.spawn import record_standing
 

@@ -235,7 +235,7 @@ METRICS = ("ball_speed", "distance_to_target", "ball_mass", "contact_impulse")
 if TYPE_CHECKING:
     from piavatar_envs.core.launch_graph import LaunchGraph
     from piavatar_envs.envs.batch_env import BatchEnv
-    from piavatar_envs.render import Ring
+    from piavatar_envs.render.scene import Ring
 
 BALL = "ball"
 #: Of the ball on the ground; a rough soft ball loses much of its speed to rolling.
@@ -424,7 +424,7 @@ class Goal:
 
     def markers(self, index: int) -> list[Ring]:
         """The gate of environment ``index`` as a ring, the part of it that is above the ground."""
-        from piavatar_envs.render import Ring
+        from piavatar_envs.render.scene import Ring
 
         center, forward = (getattr(self.course, name).numpy()[index].copy() for name in ("center", "forward"))
         return [Ring(center, forward, self.gate.radius)]
