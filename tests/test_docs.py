@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 from functools import partial
 from pathlib import Path
 
@@ -51,6 +52,14 @@ def test_links_lead_somewhere():
 def test_every_guide_is_linked_from_the_readme():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert [name for name in PAGES if name != "README.md" and f"({name})" not in readme] == []
+
+
+def test_committed_results_stay_small():
+    listed = subprocess.run(["git", "ls-files", "-z", "benchmarks/results"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    sizes = {name: (ROOT / name).stat().st_size for name in listed.stdout.split("\0") if (ROOT / name).is_file()}
+    assert sum(sizes.values()) < 8e6 and [name for name, size in sizes.items() if size > 1e6] == []
 
 
 def test_what_is_made_smaller_is_there():

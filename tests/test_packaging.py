@@ -84,7 +84,7 @@ def test_the_wheel_holds_the_package_and_its_data(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     top = {name.partition("/")[0] for name in names}
     assert {name for name in top if not name.endswith(".dist-info")} == {"piavatar_envs"}
-    for name in ("py.typed", "data/body.npz", "data/BODY_LICENSE.txt", "cli.py", "envs/config.py"):
+    for name in ("py.typed", "data/body.npz", "data/BODY_LICENSE.txt", "cli.py", "config/schema.py"):
         assert f"piavatar_envs/{name}" in names, name
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "piavatar_envs").rglob("*.py")}
     assert modules <= set(names), "a module was left out"
