@@ -14,9 +14,10 @@ from benchmarks.matter import push_particles
 from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.model import Collider, Fields, MaterialPoints, build_model, make_grid
+from piavatar_envs.mpm.model import Fields, MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.sim import prop_geometry as geometry
 from piavatar_envs.sim.world import GRID_PER_HEIGHT

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks import runner
 from benchmarks.collisions import BLOCK, Collision, ball, block, body, collide, grid_spacing
-from piavatar_envs.mpm.model import Collider
+from piavatar_envs.mpm.colliders import Collider
 
 GRAVITY = 9.81
 #: Slope of the inclines: a block stays on it from a coefficient of 0.364 on.

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from piavatar_envs.core.arrays import components_of, matrix_at, store_matrix
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.model import Collider, MaterialPoints, build_model, make_grid
+from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
-from piavatar_envs.mpm.types import Model, Scratch, State, components_of, matrix_at, store_matrix
+from piavatar_envs.mpm.types import Model, Scratch, State
 
 wp.set_module_options({"enable_backward": False})
 

@@ -14,7 +14,7 @@ from benchmarks.poses import random_poses, random_shapes
 from benchmarks.rig import Rig, World
 from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.types import DriveSettings
-from piavatar_envs.mpm.types import matrices_of
+from piavatar_envs.core.arrays import matrices_of
 
 COLORS = {"split": "#1b7f79", "paper": "#d1495b", "none": "#8d6a9f"}
 TITLES = {"split": "split (ours)", "paper": "F (F^k)^-1 (paper)", "none": "no decoupling"}

@@ -16,10 +16,11 @@ from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
 from piavatar_envs.avatar.pose_control.controller import AvatarDrive, record_control_step
 from piavatar_envs.avatar.types import DriveSettings, Tracked
+from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.model import Collider, MaterialPoints, build_model, make_grid
-from piavatar_envs.mpm.types import matrices_of
+from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
 from piavatar_envs.sim.world import GRID_PER_HEIGHT
 from piavatar_envs.tasks.common.disturb import apply_impulse
 

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 
 from benchmarks import runner
-from piavatar_envs.mpm.types import matrices_of
+from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.tasks import task_modules
 
 

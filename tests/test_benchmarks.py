@@ -15,8 +15,8 @@ from benchmarks.rig import Rig, World
 from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import joint_index, joint_limits
 from piavatar_envs.avatar.pose_control.controller import DriveSettings
+from piavatar_envs.core.arrays import components_of
 from piavatar_envs.mpm.diagnostics import totals
-from piavatar_envs.mpm.types import components_of
 
 TABLE_1 = {"table", "decoupling", "substeps", "mean_distance_m", "rmse_m", "acc_at_1cm", "disturbed"}
 TABLE_2 = {

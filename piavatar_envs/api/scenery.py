@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.mpm.types import matrices_of
 from piavatar_envs.sim.bodies import Flesh
 
 if TYPE_CHECKING:

@@ -12,7 +12,8 @@ import warp as wp
 
 from piavatar_envs.avatar.body.device import BodyPoints, bone_lists, set_lists
 from piavatar_envs.avatar.segment_sums import moments_of, share_chunks, store_both
-from piavatar_envs.avatar.types import Body, vec12, vec16
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.arrays import vec12, vec16
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 

@@ -21,16 +21,9 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.types import Body, Drive, vec12, vec16
-from piavatar_envs.core.cuda_intrinsics import (
-    BLOCK,
-    float_at,
-    int_at,
-    number_at,
-    place_in_chunks,
-    sum_threads12,
-    vector_at,
-)
+from piavatar_envs.avatar.types import Body, Drive
+from piavatar_envs.core.arrays import float_at, int_at, number_at, vec12, vec16, vector_at
+from piavatar_envs.core.cuda_intrinsics import BLOCK, place_in_chunks, sum_threads12
 from piavatar_envs.mpm.types import Particles, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})

@@ -16,8 +16,8 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
-from piavatar_envs.avatar.types import Body, vec8, vec12, vec24, vec44
-from piavatar_envs.core.cuda_intrinsics import vector_at
+from piavatar_envs.avatar.types import Body, vec24, vec44
+from piavatar_envs.core.arrays import vec8, vec12, vector_at
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False})

@@ -6,8 +6,9 @@ import warp as wp
 
 from piavatar_envs.avatar.skinning import skinned_place
 from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.arrays import store_matrix
 from piavatar_envs.core.cuda_intrinsics import environment_of
-from piavatar_envs.mpm.types import Kinematic, store_matrix
+from piavatar_envs.mpm.types import Kinematic
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 

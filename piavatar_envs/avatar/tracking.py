@@ -20,7 +20,8 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.avatar.types import Body, RigidFit, RigidFits, vec12, vec16
+from piavatar_envs.avatar.types import Body, RigidFit, RigidFits
+from piavatar_envs.core.arrays import vec12, vec16
 from piavatar_envs.core.cuda_intrinsics import sum_threads12, sum_threads16
 from piavatar_envs.mpm.types import row
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from piavatar_envs.core.arrays import vec8, vec12, vec16
 from piavatar_envs.mpm.types import Model
 
 wp.set_module_options({"enable_backward": False})
@@ -79,15 +80,9 @@ class DriveSettings:
         return drive
 
 
-#: Partial sums of a chunk: m, m x (3), m u (3), m x x^T (6), m x cross u (3).
-vec16 = wp.types.vector(length=16, dtype=wp.float32)
-#: Partial sums of a chunk's corrections: momentum and angular momentum of the pulls (6), those of the lean alone (6).
-vec12 = wp.types.vector(length=12, dtype=wp.float32)
 #: All that a particle blends over its bones, and what it has blended, see :mod:`piavatar_envs.avatar.skinning`.
 vec44 = wp.types.vector(length=44, dtype=wp.float32)
 vec24 = wp.types.vector(length=24, dtype=wp.float32)
-#: Change of a bone's rigid motion: velocity where the pelvis' centre is (3), spin (3), padding to 32 bytes.
-vec8 = wp.types.vector(length=8, dtype=wp.float32)
 
 DRIVE_INCREMENT = wp.constant(0)
 DRIVE_TARGET = wp.constant(1)

@@ -23,172 +23,43 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.types import vec8, vec12, vec16
+from piavatar_envs.core.arrays import vec8, vec12, vec16
 
 wp.set_module_options({"enable_backward": False})
 
 
-def native(cuda: str, otherwise: str = "") -> str:
-    """A snippet that finds the room as ``room``; on a CPU, where nobody launches it, ``otherwise``."""
-    start = "extern __shared__ int piavatar_room[];\nint* const room = piavatar_room;\n"
-    return f"#if defined(__CUDA_ARCH__)\n{start}{cuda}\n#else\n{otherwise}\n#endif\n"
+def cuda_native(cuda: str, otherwise: str = "") -> str:
+    """Return a snippet that is ``cuda`` on a GPU and ``otherwise`` on a CPU."""
+    return f"#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{otherwise}\n#endif\n"
 
 
-#: In CUDA: the place of thread ``of`` among those of a warp in ``all``, which count on in a word, one after the other.
-APPEND = """
-auto append = [](int* count, unsigned all, int of) {
-    int begin = 0;
-    if ((threadIdx.x & 31) == 0 && all != 0u) begin = atomicAdd(count, __popc(all));
-    return __shfl_sync(0xffffffffu, begin, 0) + __popc(all & ((1u << of) - 1u));
-};
-"""
-
-
-@wp.func_native(native("__syncwarp();"))
+@wp.func_native(cuda_native("__syncwarp();"))
 def meet_warp():
     """Wait for the other threads of the warp; all that have not ended come here."""
     ...
 
 
-@wp.func_native(native("return threadIdx.x;", "return 0;"))
+@wp.func_native(cuda_native("return threadIdx.x;", "return 0;"))
 def thread_of_block() -> int:
     """Place of a thread in its CUDA block."""
     ...
 
 
-@wp.func_native(native("return blockIdx.x;", "return 0;"))
+@wp.func_native(cuda_native("return blockIdx.x;", "return 0;"))
 def block_of_launch() -> int:
     """Place of a CUDA block among those of a launch."""
     ...
 
 
-@wp.func_native(native("return blockDim.x;", "return 1;"))
+@wp.func_native(cuda_native("return blockDim.x;", "return 1;"))
 def threads_of_block() -> int:
     """Threads of a CUDA block."""
     ...
 
 
-@wp.func_native(native("__syncthreads();"))
+@wp.func_native(cuda_native("__syncthreads();"))
 def meet():
     """Wait for the other threads of the CUDA block."""
-    ...
-
-
-@wp.func_native(native("return room[at];", "return 0;"))
-def word(at: int) -> int:
-    """Word ``at``."""
-    ...
-
-
-@wp.func_native(native("room[at] = value;"))
-def set_word(at: int, value: int):
-    """Write word ``at``."""
-    ...
-
-
-@wp.func_native(native("atomicOr(room + at, bits);"))
-def or_word(at: int, bits: int):
-    """Set bits of word ``at``."""
-    ...
-
-
-@wp.func_native(native("atomicAdd(room + at, value);"))
-def add_word(at: int, value: int):
-    """Add to word ``at``."""
-    ...
-
-
-@wp.func_native(native("return (room[bits + (n >> 5)] >> (n & 31)) & 1;", "return false;"))
-def has_bit(bits: int, n: int) -> bool:
-    """Bit ``n`` of those that begin at a word."""
-    ...
-
-
-@wp.func_native(native("return reinterpret_cast<const unsigned short*>(room + at)[n];", "return 0;"))
-def half_word(at: int, n: int) -> int:
-    """Half word ``n`` after word ``at``."""
-    ...
-
-
-@wp.func_native(native("reinterpret_cast<unsigned short*>(room + at)[n] = (unsigned short)value;"))
-def set_half_word(at: int, n: int, value: int):
-    """Write half word ``n`` after word ``at``."""
-    ...
-
-
-@wp.func_native(native("return reinterpret_cast<const unsigned char*>(room + at)[n];", "return 0;"))
-def byte(at: int, n: int) -> int:
-    """Byte ``n`` after word ``at``."""
-    ...
-
-
-@wp.func_native(native("reinterpret_cast<unsigned char*>(room + at)[n] = (unsigned char)value;"))
-def set_byte(at: int, n: int, value: int):
-    """Write byte ``n`` after word ``at``."""
-    ...
-
-
-@wp.func_native(native("if (value > __int_as_float(room[at])) atomicMax(room + at, __float_as_int(value));"))
-def raise_to(at: int, value: float):
-    """Make the number in word ``at`` at least ``value``, which is not negative."""
-    ...
-
-
-@wp.func_native(native("return __int_as_float(room[at]);", "return 0.0f;"))
-def number(at: int) -> float:
-    """The number in word ``at``."""
-    ...
-
-
-@wp.func_native(native("room[at] = __float_as_int(value);"))
-def set_number(at: int, value: float):
-    """Write a number to word ``at``."""
-    ...
-
-
-@wp.func_native(native("return __uint_as_float((__float_as_uint(x) + 0x7fffffu) & 0xff800000u);", "return x;"))
-def power_of_two(x: float) -> float:
-    """The least power of two that is not below ``x``, which is positive or 0."""
-    ...
-
-
-@wp.func_native(
-    native("""
-int4* const first = reinterpret_cast<int4*>(room + start);
-const int4 four = make_int4(value, value, value, value);
-for (int n = threadIdx.x; n < words / 4; n += blockDim.x) first[n] = four;
-""")
-)
-def fill_words(start: int, words: int, value: int):
-    """Write ``value`` to ``words`` words, a multiple of four; ``start`` is one, too."""
-    ...
-
-
-@wp.func
-def clear_words(start: int, words: int):
-    """Zero ``words`` words, a multiple of four; ``start`` is one, too."""
-    fill_words(start, words, 0)
-
-
-@wp.func_native(
-    native(
-        APPEND
-        + """
-unsigned short* const list = reinterpret_cast<unsigned short*>(room + at);
-const int lane = threadIdx.x & 31, warps = blockDim.x >> 5;
-for (int n = threadIdx.x >> 5; n < words; n += warps) {
-    const unsigned some = (unsigned)room[bits + n];
-    const int place = append(room + count, some, lane);
-    if (some >> lane & 1u) list[place] = (unsigned short)(32 * n + lane);
-}
-"""
-    )
-)
-def list_bits(bits: int, words: int, at: int, count: int):
-    """Write which bits of ``words`` words are set to half words from word ``at`` on, in any order.
-
-    How many is added to word ``count``. All threads come here.
-    """
     ...
 
 
@@ -201,56 +72,6 @@ return wp::vec2i((int)(e & 0x7fffffffu), (int)((all - e * each) & 0x7fffffffu));
 """)
 def environment_of(thread: int, per_env: int) -> wp.vec2i:
     """Environment, and place among its threads, of a thread of a launch over ``num_envs * per_env``."""
-    ...
-
-
-_ROW = "rows.data[rows.shape[1] * e + p]"
-
-
-@wp.func_native("return values.data[n];")
-def int_at(values: wp.array(dtype=int), n: int) -> int:
-    """``values[n]``."""
-    ...
-
-
-@wp.func_native("return values.data[n];")
-def float_at(values: wp.array(dtype=float), n: int) -> float:
-    """``values[n]``."""
-    ...
-
-
-@wp.func_native(f"return {_ROW};")
-def number_at(rows: wp.array2d(dtype=float), e: int, p: int) -> float:
-    """``rows[e, p]``."""
-    ...
-
-
-@wp.func_native(f"return {_ROW};")
-def vector_at(rows: wp.array2d(dtype=wp.vec3), e: int, p: int) -> wp.vec3:
-    """``rows[e, p]``."""
-    ...
-
-
-@wp.func_native(f"wp::vec3 value;\nif (p >= first) value = {_ROW};\nreturn value;")
-def vector_from(rows: wp.array2d(dtype=wp.vec3), first: int, e: int, p: int) -> wp.vec3:
-    """``rows[e, p]``, or zero before ``first``: a branch of Warp's own would wait for what is asked for."""
-    ...
-
-
-@wp.func_native(f"{_ROW} = value;")
-def set_vector(rows: wp.array2d(dtype=wp.vec3), e: int, p: int, value: wp.vec3):
-    """``rows[e, p] = value``."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-const char* const line = reinterpret_cast<const char*>(&rows.data[rows.shape[1] * e + p]) + 128 * thread;
-if (128 * thread < (int)sizeof(*rows.data) * count) asm volatile("prefetch.global.L2 [%0];" :: "l"(line));
-#endif
-""")
-def ask_ahead(rows: wp.array2d(dtype=wp.vec3), e: int, p: int, count: int, thread: int):
-    """Let a GPU fetch ``rows[e, p : p + count]`` into its second-level cache: each thread a line of it."""
     ...
 
 
@@ -510,39 +331,6 @@ def meet_threads(threads: int):
     ...
 
 
-# Several rows are asked for at once, by 16 bytes.
-_ADD_ROWS = """
-constexpr int WORDS = %d;
-wp::vec_t<WORDS, wp::float32> sum;
-const auto* const from = &wp::index(rows, e, 0);
-#if defined(__CUDA_ARCH__)
-#pragma unroll 4
-for (int n = first; n < last; ++n)
-#pragma unroll
-    for (int q = 0; q < WORDS / 4; ++q) {
-        const float4 four = reinterpret_cast<const float4*>(from + n)[q];
-        sum[4 * q] += four.x, sum[4 * q + 1] += four.y, sum[4 * q + 2] += four.z, sum[4 * q + 3] += four.w;
-    }
-#else
-for (int n = first; n < last; ++n)
-    for (int k = 0; k < WORDS; ++k) sum[k] += from[n][k];
-#endif
-return sum;
-"""
-
-
-@wp.func_native(_ADD_ROWS % 12)
-def add_rows12(rows: wp.array2d(dtype=vec12), e: int, first: int, last: int) -> vec12:
-    """Sum of ``rows[e, first : last]``, one after the other."""
-    ...
-
-
-@wp.func_native(_ADD_ROWS % 16)
-def add_rows16(rows: wp.array2d(dtype=vec16), e: int, first: int, last: int) -> vec16:
-    """:func:`add_rows12` of sixteen numbers each."""
-    ...
-
-
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 return 31 - __clz(bits);
@@ -552,4 +340,52 @@ return 0;
 """)
 def highest_bit(bits: int) -> int:
     """The highest of ``bits``, of which there are any; on a CPU nobody asks."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return threadIdx.x & 31;
+#else
+return 0;
+#endif
+""")
+def lane_of_thread() -> int:
+    """Place of a thread in its warp; 0 on a CPU."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return __any_sync(0xffffffffu, here);
+#else
+return here;
+#endif
+""")
+def any_lane(here: bool) -> bool:
+    """Whether it is so ``here`` in any thread of the warp; all of its threads must come here."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return (int)__ballot_sync(0xffffffffu, here);
+#else
+return here;
+#endif
+""")
+def lanes_with(here: bool) -> int:
+    """A bit for each thread of a warp, whether it is so ``here``; all of them come here. One bit on a CPU."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return 32;
+#else
+return 1;
+#endif
+""")
+def lanes_of_warp() -> int:
+    """Threads of a warp; 1 on a CPU."""
     ...

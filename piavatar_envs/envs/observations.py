@@ -18,9 +18,10 @@ import warp as wp
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, NUM_ACTUATED, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.types import Body, Tracked
 from piavatar_envs.config.errors import ConfigError
+from piavatar_envs.core.arrays import matrix_at
 from piavatar_envs.core.cuda_intrinsics import environment_of
 from piavatar_envs.mpm.materials import kirchhoff_stress, von_mises_stress
-from piavatar_envs.mpm.types import Particles, Sensors, matrix_at, row
+from piavatar_envs.mpm.types import Particles, Sensors, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 

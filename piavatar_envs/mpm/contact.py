@@ -28,22 +28,24 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.core.arrays import read_change, vec8, write_change
 from piavatar_envs.core.cuda_intrinsics import environment_of
 from piavatar_envs.mpm.bspline import BLOCK_NODES, block_corner, node_of_block
 from piavatar_envs.mpm.colliders import GATED_SLAB
 from piavatar_envs.mpm.contact_normals import (
     GROWN_TOGETHER,
-    MASS_MIN,
     normal_from,
     records_around,
     shared_normal,
     surface_gap,
     volume_at,
 )
-from piavatar_envs.mpm.contact_sensors import add_impulse, pair_entry, read_change, write_change
-from piavatar_envs.mpm.grid_arrays import clear_offset, offset_at, read_record, write_record
+from piavatar_envs.mpm.contact_sensors import add_impulse, pair_entry
+from piavatar_envs.mpm.grid_arrays import MASS_MIN, clear_offset, offset_at, read_record, write_record
 from piavatar_envs.mpm.grid_update import meet_boundaries, physical_velocity, place_of, slab_is_near, total_velocity
 from piavatar_envs.mpm.sparse_grid import (
+    THREADS,
+    Sweep,
     end_of_fields,
     first_record,
     has_field,
@@ -55,8 +57,7 @@ from piavatar_envs.mpm.sparse_grid import (
     note_others,
     shared_block,
 )
-from piavatar_envs.mpm.sweep import THREADS, Sweep
-from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, row, vec8
+from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, row
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})

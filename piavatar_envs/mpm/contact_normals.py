@@ -15,19 +15,25 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.core.arrays import read_change, vec8, vec8i, write_change
 from piavatar_envs.core.cuda_intrinsics import environment_of
 from piavatar_envs.mpm.bspline import BLOCK_NODES, block_index, node_in_block
-from piavatar_envs.mpm.contact_sensors import read_change, write_change
-from piavatar_envs.mpm.grid_arrays import mass_of, move_offset, offset_at, read_record, take_sum, write_record
-from piavatar_envs.mpm.sparse_grid import first_record, has_field, has_told, lacks_slots, nodes_shared, shared_block
-from piavatar_envs.mpm.sweep import LANES, THREADS, Sweep, lane_of_thread, vector_sum_of_team
-from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums, row, vec8, vec8i
+from piavatar_envs.mpm.grid_arrays import MASS_MIN, mass_of, move_offset, offset_at, read_record, take_sum, write_record
+from piavatar_envs.mpm.sparse_grid import (
+    THREADS,
+    Sweep,
+    first_record,
+    has_field,
+    has_told,
+    lacks_slots,
+    nodes_shared,
+    shared_block,
+)
+from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums, row
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: Nodes lighter than this [kg] carry nothing but round-off.
-MASS_MIN = wp.constant(1.0e-15)
 #: Volume of two fields [cells] at a node below which there is nothing: less than the least mass has.
 EMPTY = wp.constant(1.0e-30)
 #: Mass of a record whose field has grown together with its subject's trunk at a node.
@@ -260,46 +266,6 @@ def normal_from(
                 of_b = read_change(node_facing, e, wp.where(counts, to_b + n, rb))
                 facing += share_of_normal(wp.where(counts, c, 0.0), of_a, of_b)
     return normal_along(facing)
-
-
-@wp.struct
-class Neighbour:
-    """The node that a thread looks at, of the 27 around one that a warp has."""
-
-    c: float  # for its distance; 0 if it does not count
-    a: int  # record of one field there, and of the other: any that exist if it does not count
-    b: int
-
-
-@wp.func
-def neighbour_of_lane(grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int):
-    """The :class:`Neighbour` of ``node`` that a thread has, for the fields ``a`` and ``b``."""
-    n = lane_of_thread()
-    to = wp.vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
-    at = node + to
-    last = grid.nodes - wp.vec3i(1)
-    near = wp.max(wp.min(at, last), wp.vec3i(0))
-    block = block_index(grid, near[0], near[1], near[2])
-    local = node_in_block(near[0], near[1], near[2])
-    both = (1 << a) | (1 << b)
-    found = Neighbour()
-    found.a = wp.max(first_record(grid, blocks, e, a, block), 0) + local
-    found.b = wp.max(first_record(grid, blocks, e, b, block), 0) + local
-    if n < 27 and in_grid(grid, at) and (blocks.fields[e, block] & both) == both:  # else nobody has written there
-        found.c = say_of(float(to[0] * to[0] + to[1] * to[1] + to[2] * to[2]))
-    return found
-
-
-@wp.func
-def normal_of_warp(c: float, of_a: wp.vec4, of_b: wp.vec4):
-    """:func:`shared_normal` for a node that a warp of a GPU has, from what its threads have found around.
-
-    Each has the :class:`Neighbour` that it looks at, with this ``c``, and what that says of both fields; all come here.
-    What does not count is times 0, so it must be finite.
-    """
-    share = share_of_normal(c, of_a, of_b)
-    total = vector_sum_of_team(LANES, wp.vec3(share[0], share[1], share[2]))
-    return normal_along(wp.vec4(total[0], total[1], total[2], 0.0))
 
 
 @wp.func

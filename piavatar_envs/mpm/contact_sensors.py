@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.core.arrays import read_change
 from piavatar_envs.mpm.bspline import (
     BLOCK_NODES,
     base_node,
@@ -20,6 +21,7 @@ from piavatar_envs.mpm.bspline import (
 )
 from piavatar_envs.mpm.grid_arrays import mass_of
 from piavatar_envs.mpm.sparse_grid import (
+    THREADS,
     VECTORS,
     fields_around,
     first_record,
@@ -29,7 +31,6 @@ from piavatar_envs.mpm.sparse_grid import (
     record_of,
     slab_records,
 )
-from piavatar_envs.mpm.sweep import THREADS
 from piavatar_envs.mpm.types import BESIDE, Blocks, Contact, Grid, Model, Particles, Sensors, row
 
 # unrolled, the stencil takes so many registers that a GPU has few threads at once
@@ -95,31 +96,6 @@ def forget(e: int, sensors: Sensors):
     for i in range(sensors.part_impulse.shape[1]):
         for s in range(sensors.part_impulse.shape[2]):
             sensors.part_impulse[e, i, s] = wp.vec3(0.0)
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-const float4 v = *reinterpret_cast<const float4*>(&wp::index(node, e, r));
-return wp::vec_t<4, wp::float32>(v.x, v.y, v.z, v.w);
-#else
-return wp::index(node, e, r);
-#endif
-""")
-def read_change(node: wp.array2d(dtype=wp.vec4), e: int, r: int) -> wp.vec4:
-    """``node[e, r]``, of the sensors or of what faces what, on a GPU in one load of 16 bytes."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-*reinterpret_cast<float4*>(&wp::index(node, e, r)) = make_float4(value[0], value[1], value[2], value[3]);
-#else
-wp::index(node, e, r) = value;
-#endif
-""")
-def write_change(node: wp.array2d(dtype=wp.vec4), e: int, r: int, value: wp.vec4):
-    """``node[e, r] = value`` in one store."""
-    ...
 
 
 @wp.kernel

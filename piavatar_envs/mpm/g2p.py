@@ -20,10 +20,11 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.core.arrays import matrix_at, store_matrix, store_pair
 from piavatar_envs.mpm.bspline import Stencil, base_node, grid_position, in_same_brick, stencil_at, stencil_inside
 from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.grid_arrays import TO_KINEMATIC, first_of_halves, read_half_from
-from piavatar_envs.mpm.p2g import gather_lines, lines_of
+from piavatar_envs.mpm.p2g import _LINES, Lines, lines_of
 from piavatar_envs.mpm.sparse_grid import HALVES, ends_of_line, line_of_records, mark_blocks, noted_around, slab_records
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
@@ -39,8 +40,6 @@ from piavatar_envs.mpm.types import (
     Moving,
     Particles,
     Step,
-    matrix_at,
-    store_matrix,
 )
 
 # Warp's own unrolling hides the loops over the stencil from the C++ compiler, which turns them into vector code
@@ -389,3 +388,48 @@ def grid_to_particles(
         moved.u[e, p] = s.u
         store_matrix(moved.C, e, p, s.C)
         store_matrix(moved.F, e, p, s.F)
+
+
+@wp.func
+def store_particle(moved: Moving, e: int, p: int, s: Gathered, store: bool):
+    """All that a particle ``p`` has become, if ``store``; at best all threads of a warp come here."""
+    store_pair(moved.x, moved.u, e, p, s.x, s.u, True, store)
+    if store:
+        store_matrix(moved.C, e, p, s.C)
+        store_matrix(moved.F, e, p, s.F)
+
+
+@wp.func_native(
+    _LINES
+    + """
+const four* const halves = reinterpret_cast<const four*>(nodes);
+four mean = vector(0.0f, 0.0f, 0.0f, 0.0f), along_x = mean, along_y = mean, along_z = mean;
+#pragma unroll
+for (int i = 0; i < 3; ++i) {
+    four plane = vector(0.0f, 0.0f, 0.0f, 0.0f), plane_y = plane, plane_z = plane;
+#pragma unroll
+    for (int j = 0; j < 3; ++j)
+        with_line(i, j, [&](int first, int middle, int last) {
+            const four second = halves[middle] * wz[1], third = halves[last] * wz[2];
+            const four line = halves[first] * wz[0] + second + third;
+            plane = plane + line * wy[j];
+            plane_y = plane_y + line * ((float)j * wy[j]);
+            plane_z = plane_z + (second + third * 2.0f) * wy[j];
+        });
+    mean = mean + plane * wx[i];
+    along_x = along_x + plane * ((float)i * wx[i]);
+    along_y = along_y + plane_y * wx[i];
+    along_z = along_z + plane_z * wx[i];
+}
+wp::mat_t<4, 4, wp::float32> sums;
+for (int c = 0; c < 4; ++c)
+    sums.data[0][c] = mean[c], sums.data[1][c] = along_x[c], sums.data[2][c] = along_y[c], sums.data[3][c] = along_z[c];
+return sums;
+"""
+)
+def gather_lines(
+    nodes: wp.uint64,
+    lines: Lines,
+) -> wp.mat44:
+    """Weighted sum of the halves of records in ``nodes``, and those times the nodes' places along x, y and z."""
+    ...

@@ -24,9 +24,13 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.types import Grid, Step, Sums, row, vec4l, vec8
+from piavatar_envs.core.arrays import vec4l, vec8
+from piavatar_envs.mpm.types import Grid, Step, Sums, row
 
 wp.set_module_options({"enable_backward": False})
+
+#: Nodes lighter than this [kg] carry nothing but round-off.
+MASS_MIN = wp.constant(1.0e-15)
 
 
 #: From the first half of a record to its second; as many as a block has nodes.
@@ -107,12 +111,6 @@ def read_record(halves: wp.array2d(dtype=wp.vec4), e: int, r: int) -> vec8:
 @wp.func_native(_WRITE % (0, 1))
 def write_physical(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
     """The first half of :func:`write_record`."""
-    ...
-
-
-@wp.func_native(_WRITE % (1, 2))
-def write_kinematic(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8):
-    """The second half of :func:`write_record`."""
     ...
 
 

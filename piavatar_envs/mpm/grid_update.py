@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.core.cuda_intrinsics import environment_of, meet_warp
+from piavatar_envs.core.arrays import vec4l, vec8
+from piavatar_envs.core.cuda_intrinsics import any_lane, environment_of, lane_of_thread, lanes_of_warp, meet_warp
 from piavatar_envs.mpm.bspline import BLOCK_NODES, block_corner, node_of_block, node_position
 from piavatar_envs.mpm.colliders import CONTACT_GATE, GATED_SLAB, NEAR_BLOCK, boundary_contact, nearest_boundary
-from piavatar_envs.mpm.contact_normals import MASS_MIN
 from piavatar_envs.mpm.contact_sensors import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.grid_arrays import (
+    MASS_MIN,
     begin_sum,
     clear_offset,
     end_sum,
@@ -19,8 +20,7 @@ from piavatar_envs.mpm.grid_arrays import (
     write_physical,
     write_record,
 )
-from piavatar_envs.mpm.sparse_grid import fields_next, held_by, lacks_slots, slots_used
-from piavatar_envs.mpm.sweep import THREADS, any_lane, lane_of_thread, lanes_of_warp, nodes_of_lane
+from piavatar_envs.mpm.sparse_grid import THREADS, fields_next, held_by, lacks_slots, slots_used
 from piavatar_envs.mpm.types import (
     NO_STRESS,
     PAPER,
@@ -29,15 +29,22 @@ from piavatar_envs.mpm.types import (
     Boundaries,
     Contact,
     Grid,
+    Model,
     Sensors,
     Step,
     Sums,
-    vec4l,
-    vec8,
 )
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
+
+#: Threads of a warp.
+LANES = 32
+
+#: Slots for which a large GPU has threads at once, and the fewest for which an environment gets them.
+SLOTS_AT_ONCE = 132 * 28
+
+FEWEST_SLOTS = 8
 
 #: Nodes of a slab of a block, the unit in which boundaries are looked for.
 SLAB_NODES = wp.constant(16)
@@ -285,3 +292,21 @@ def update_grid(
                 )  # fmt: skip
         slot += slots
         goes_on = slot < used
+
+
+def slots_at_once(model: Model) -> int:
+    """Slots of an environment that a grid pass begins with; who has one comes back for more."""
+    if wp.get_device(model.device).is_cuda:
+        return min(model.max_slots, max(FEWEST_SLOTS, -(-SLOTS_AT_ONCE // model.num_envs)))
+    return model.max_slots
+
+
+def slot_threads(model: Model) -> int:
+    """Threads that a slot has in a grid pass."""
+    return LANES if wp.get_device(model.device).is_cuda else 1
+
+
+@wp.func
+def nodes_of_lane():
+    """Nodes of a block that each of them has."""
+    return BLOCK_NODES // lanes_of_warp()

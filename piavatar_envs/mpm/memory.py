@@ -7,26 +7,13 @@ import math
 import numpy as np
 import warp as wp
 
+from piavatar_envs.core.arrays import allocate_matrices, components_of, group, vec4l, whole_lines
 from piavatar_envs.mpm.bspline import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.contact_sensors import senses_in_gather
 from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, plan_room
 from piavatar_envs.mpm.grid_arrays import units
-from piavatar_envs.mpm.sparse_grid import NOBODY, notes_others
-from piavatar_envs.mpm.sweep import most_shared
-from piavatar_envs.mpm.types import (
-    Blocks,
-    Grid,
-    Model,
-    Scratch,
-    Sensors,
-    State,
-    Sums,
-    allocate_matrices,
-    components_of,
-    group,
-    vec4l,
-    whole_lines,
-)
+from piavatar_envs.mpm.sparse_grid import NOBODY, most_shared, notes_others
+from piavatar_envs.mpm.types import Blocks, Grid, Model, Scratch, Sensors, State, Sums
 
 #: Blocks with matter that a body may come to need, over those that it needs at rest. Random full-scale actions, also of
 #: random shapes, made it 1.2 times as many at most.

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.core.arrays import matrix_at, vec8
 from piavatar_envs.mpm.bspline import BLOCK_NODES, Stencil, grid_position, stencil_at
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.grid_arrays import TO_KINEMATIC
@@ -20,6 +21,7 @@ from piavatar_envs.mpm.materials import kirchhoff_stress
 from piavatar_envs.mpm.sparse_grid import HALVES, VECTORS, fields_around, note_around, slab_records
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
+    FAILURE_CFL,
     FAILURE_NONFINITE,
     NO_STRESS,
     PAPER,
@@ -31,13 +33,14 @@ from piavatar_envs.mpm.types import (
     Particles,
     Step,
     Sums,
-    matrix_at,
     row,
-    vec8,
 )
 
 # Warp's own unrolling hides the loops over the stencil from the C++ compiler, which turns them into vector code
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
+
+#: Units of momentum that a particle may have: those of 4,000 full cells that move a grid spacing in a time step.
+MOST_COUNTED = wp.constant(float(2**48))
 
 
 # Places of a line's nodes as piavatar_envs.mpm.sparse_grid has them, of all nine lines, one after the other.
@@ -88,42 +91,6 @@ def lines_of(grid: Grid, blocks: Blocks, e: int, field: int, stencil: Stencil, o
     elif ((base[0] + 2) & 3) == 0:
         s.slab2 = slab_records(grid, blocks, e, field, base, 2, of_block)
     return s
-
-
-@wp.func_native(
-    _LINES
-    + """
-const four* const halves = reinterpret_cast<const four*>(nodes);
-four mean = vector(0.0f, 0.0f, 0.0f, 0.0f), along_x = mean, along_y = mean, along_z = mean;
-#pragma unroll
-for (int i = 0; i < 3; ++i) {
-    four plane = vector(0.0f, 0.0f, 0.0f, 0.0f), plane_y = plane, plane_z = plane;
-#pragma unroll
-    for (int j = 0; j < 3; ++j)
-        with_line(i, j, [&](int first, int middle, int last) {
-            const four second = halves[middle] * wz[1], third = halves[last] * wz[2];
-            const four line = halves[first] * wz[0] + second + third;
-            plane = plane + line * wy[j];
-            plane_y = plane_y + line * ((float)j * wy[j]);
-            plane_z = plane_z + (second + third * 2.0f) * wy[j];
-        });
-    mean = mean + plane * wx[i];
-    along_x = along_x + plane * ((float)i * wx[i]);
-    along_y = along_y + plane_y * wx[i];
-    along_z = along_z + plane_z * wx[i];
-}
-wp::mat_t<4, 4, wp::float32> sums;
-for (int c = 0; c < 4; ++c)
-    sums.data[0][c] = mean[c], sums.data[1][c] = along_x[c], sums.data[2][c] = along_y[c], sums.data[3][c] = along_z[c];
-return sums;
-"""
-)
-def gather_lines(
-    nodes: wp.uint64,
-    lines: Lines,
-) -> wp.mat44:
-    """Weighted sum of the halves of records in ``nodes``, and those times the nodes' places along x, y and z."""
-    ...
 
 
 # Who adds to the vectors of an environment; on a CPU no two threads have particles of the same.
@@ -227,6 +194,7 @@ def note_told(sums: Sums, e: int, lines: Lines):
 
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _BLOCKS = wp.constant(FAILURE_BLOCKS)
+_CFL = wp.constant(FAILURE_CFL)
 
 
 @wp.struct
@@ -407,3 +375,27 @@ def particles_to_grid(
         lines = lines_of(grid, blocks, e, field, stencil, VECTORS)
         scatter_places(sums, e, lines, s.at_base[0], particles.seam[p], grid.dx)
         note_told(sums, e, lines)
+
+
+@wp.func
+def fault_of_sums(s: Scattered, unit: float):
+    """Why a particle must not be added up, bits ``FAILURE_*``: an integer would hide what is no number or too large."""
+    columns = s.A * wp.vec3(1.0, 1.0, 1.0)
+    momentum = wp.vec3(s.at_base[1], s.at_base[2], s.at_base[3])
+    kinematic = wp.vec3(s.at_base[4], s.at_base[5], s.at_base[6])
+    if not wp.isfinite(wp.dot(momentum + kinematic + columns, wp.vec3(1.0, 1.0, 1.0))):
+        return _NONFINITE
+    most = wp.max(wp.max(wp.abs(momentum)), wp.max(wp.abs(kinematic)))
+    for i in range(3):
+        for j in range(3):
+            most = wp.max(most, wp.abs(s.A[i, j]))
+    return wp.where(most > MOST_COUNTED * unit, _CFL, 0)
+
+
+@wp.func
+def fault_within(s: Scattered, bounds: wp.vec3, unit: float):
+    """:func:`fault_of_sums`, asked for only where the ``bounds`` of what a particle has leave that open."""
+    fault = int(0)
+    if not bounds[0] + bounds[1] + bounds[2] < MOST_COUNTED * unit:  # of what is no number, either
+        fault = fault_of_sums(s, unit)
+    return fault

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from piavatar_envs.core.arrays import group
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.contact import solve_contact
@@ -28,11 +29,19 @@ from piavatar_envs.mpm.cuda import tiled_g2p as runs
 from piavatar_envs.mpm.cuda.block_substep import forget_speeds, record_in_block
 from piavatar_envs.mpm.cuda.tiled_p2g import record_groups
 from piavatar_envs.mpm.g2p import grid_to_particles
-from piavatar_envs.mpm.grid_update import update_grid
+from piavatar_envs.mpm.grid_update import slot_threads, slots_at_once, update_grid
 from piavatar_envs.mpm.p2g import particles_to_grid
-from piavatar_envs.mpm.sparse_grid import begin_others, forget_blocks, free_slots, freeze, mark_particles, notes_others
-from piavatar_envs.mpm.sweep import THREADS, plan_sweep, slot_threads, slots_at_once
-from piavatar_envs.mpm.types import Model, Moving, Scratch, State, group
+from piavatar_envs.mpm.sparse_grid import (
+    THREADS,
+    begin_others,
+    forget_blocks,
+    free_slots,
+    freeze,
+    mark_particles,
+    notes_others,
+    plan_sweep,
+)
+from piavatar_envs.mpm.types import Model, Moving, Scratch, State
 
 
 def record_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scratch, index: int) -> None:

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.core.cuda_intrinsics import lane_of_thread, lanes_with
 from piavatar_envs.mpm.bspline import (
     BLOCK_NODES,
     base_node,
@@ -33,7 +34,6 @@ from piavatar_envs.mpm.bspline import (
     node_in_block,
     stencil_inside,
 )
-from piavatar_envs.mpm.sweep import lane_of_thread, lanes_with
 from piavatar_envs.mpm.types import (
     BESIDE,
     FAILURE_BLOCKS,
@@ -47,6 +47,14 @@ from piavatar_envs.mpm.types import (
 )
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+#: Threads of a CUDA block: four slots.
+THREADS = 128
+
+#: The same for blocks that have several fields.
+SHARED_AT_ONCE = 132 * 6
+
+FEWEST_SHARED = 2
 
 
 @wp.func_native("""
@@ -156,21 +164,6 @@ def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
             for k in range(2):
                 mask = mask | blocks.fields[e, block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)]
     return mask
-
-
-@wp.func_native(f"""
-const volatile int* const slot_of = &wp::index(blocks.slot, e, held);
-const volatile int* const failing = &wp::index(failure, e);
-do {{
-    const int slot = *slot_of;
-    if (slot >= 0 && slot < blocks.held.shape[1] && *(const volatile int*)&wp::index(blocks.held, e, slot) == held)
-        return slot;
-}} while (!(*failing & {FAILURE_BLOCKS}));
-return {int(NOBODY)};
-""")
-def awaited_slot(blocks: Blocks, e: int, held: int, failure: wp.array(dtype=int)) -> int:
-    """Slot of a field's block that is marked in this launch, maybe by another thread; ``NOBODY`` if there is none."""
-    ...
 
 
 # A GPU finds out anew: to write it down and read it takes as long
@@ -484,3 +477,33 @@ def note_others(blocks: Blocks, e: int, r: int, here: bool):
     if blocks.others.shape[1] == 1:
         return
     note_bits(blocks.others, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES, here)
+
+
+@wp.struct
+class Sweep:
+    """Who takes which nodes of blocks that have several fields; nobody where there are none."""
+
+    threads: int  # of an environment
+    turns: int  # that a thread may have
+    share: int  # nodes of a thread in a turn
+    stride: int  # nodes from one turn to the next
+
+
+def most_shared(model: Model) -> int:
+    """Most blocks of an environment that can have several fields, and so several slots; 1 where there is but one."""
+    return max(1, model.max_slots // 2) if model.contact.num_fields > 1 else 1
+
+
+def plan_sweep(model: Model) -> Sweep:
+    """How the threads of each environment walk over its blocks that have several fields."""
+    nodes, blocks = int(BLOCK_NODES), 1
+    sweep = Sweep()
+    if model.contact.num_fields == 1:
+        return sweep
+    sweep.share = nodes
+    if wp.get_device(model.device).is_cuda:
+        blocks = min(most_shared(model), max(FEWEST_SHARED, -(-SHARED_AT_ONCE // model.num_envs)))
+        sweep.share = 1
+    sweep.turns, sweep.stride = -(-most_shared(model) // blocks), nodes * blocks
+    sweep.threads = sweep.stride // sweep.share
+    return sweep

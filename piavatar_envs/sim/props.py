@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.tracking import kabsch_rotation, point_inertia, spin_of
 from piavatar_envs.config import ColliderConfig, ConfigError, PropConfig
+from piavatar_envs.core.arrays import store_matrix
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.materials import lame_parameters
 from piavatar_envs.mpm.model import MaterialPoints
-from piavatar_envs.mpm.types import Kinematic, Model, Particles, State, row, store_matrix
+from piavatar_envs.mpm.types import Kinematic, Model, Particles, State, row
 from piavatar_envs.sim.prop_geometry import PropPoints
 from piavatar_envs.sim.scene import Domain
 

@@ -13,7 +13,8 @@ import numpy as np
 from piavatar_envs.avatar.body.sampling import LIMB_GROUPS, limb_groups
 from piavatar_envs.config import ConfigError, PhysicsConfig, PropConfig, SceneConfig
 from piavatar_envs.config.schema import LEAST_DENSITY, MOST_DENSITY
-from piavatar_envs.mpm.model import Collider, Fields, MaterialPoints
+from piavatar_envs.mpm.colliders import Collider
+from piavatar_envs.mpm.model import Fields, MaterialPoints
 from piavatar_envs.sim import prop_geometry as geometry
 from piavatar_envs.sim.bodies import NUM_PARTS, Flesh
 from piavatar_envs.sim.prop_geometry import PropPoints

@@ -17,16 +17,10 @@ from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConf
 from piavatar_envs.config.schema import MOST_SUBSTEPS
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.actions import select_joints
+from piavatar_envs.mpm.colliders import Collider, make_boundaries, place_colliders
 from piavatar_envs.mpm.contact_sensors import clear_masked_sensors
 from piavatar_envs.mpm.memory import allocate, estimate_slots
-from piavatar_envs.mpm.model import (
-    Collider,
-    build_model,
-    choose_num_substeps,
-    make_boundaries,
-    make_grid,
-    place_colliders,
-)
+from piavatar_envs.mpm.model import build_model, choose_num_substeps, make_grid
 from piavatar_envs.sim.bodies import Flesh, Shapes, drive_settings
 from piavatar_envs.sim.checks import STRUCK, check_beside_solids, commanded_speed, fastest_blow, fastest_thing
 from piavatar_envs.sim.prop_geometry import PropPoints

@@ -17,9 +17,10 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kine
 from piavatar_envs.avatar.pose_control.controller import AvatarDrive, record_control_step
 from piavatar_envs.avatar.types import DriveSettings
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.model import Collider, MaterialPoints, build_model, make_grid
+from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.types import Model, Scratch, State
 
 DENSITY = 1000.0

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.rig import joint_gaps
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.torque_control.bone_contact import LAYER
-from piavatar_envs.mpm.model import Collider
+from piavatar_envs.mpm.colliders import Collider
 from tests.avatar.jointed import Joints
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -25,7 +25,7 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import fetch_factor
 from piavatar_envs.avatar.torque_control.workspace import JointBench, room_of_warp
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.cuda_intrinsics import warp_threads
-from piavatar_envs.mpm.model import Collider
+from piavatar_envs.mpm.colliders import Collider
 from tests.avatar.jointed import Joints, carried_by
 
 

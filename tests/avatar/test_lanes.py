@@ -16,7 +16,8 @@ from piavatar_envs.avatar.skinning import (
     pack,
     store_record,
 )
-from piavatar_envs.avatar.types import vec8, vec12, vec16, vec24, vec44
+from piavatar_envs.avatar.types import vec24, vec44
+from piavatar_envs.core.arrays import vec8, vec12, vec16
 from piavatar_envs.core.cuda_intrinsics import (
     chunk_threads,
     sum_threads12,

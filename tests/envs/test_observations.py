@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS
+from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.envs.observations import (
     CONTACT_TERMS,
     JOINT_TERMS,
@@ -16,7 +17,6 @@ from piavatar_envs.envs.observations import (
     ObservationTerm,
     prop_terms,
 )
-from piavatar_envs.mpm.types import matrices_of
 
 
 def kabsch(x: np.ndarray, x0: np.ndarray) -> np.ndarray:

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 from piavatar_envs.mpm import memory
+from piavatar_envs.mpm.colliders import Collider, make_boundaries
 from piavatar_envs.mpm.materials import MATERIALS, material_index
 from piavatar_envs.mpm.memory import allocate, estimate_bytes
 from piavatar_envs.mpm.model import (
     CFL_STABLE,
-    Collider,
     Fields,
     MaterialPoints,
     build_model,
     check_num_substeps,
     choose_num_substeps,
-    make_boundaries,
     make_grid,
 )
 

@@ -11,17 +11,13 @@ from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.bspline import block_corner, node_of_block, node_position
 from piavatar_envs.mpm.contact_normals import (
     find_facing,
-    neighbour_of_lane,
-    normal_of_warp,
     shared_normal,
     surface_gap,
     volume_at,
 )
-from piavatar_envs.mpm.contact_sensors import read_change
 from piavatar_envs.mpm.grid_arrays import mass_of, offset_at
 from piavatar_envs.mpm.solver import record_marks, record_p2g
-from piavatar_envs.mpm.sparse_grid import held_by, record_of
-from piavatar_envs.mpm.sweep import THREADS, plan_sweep
+from piavatar_envs.mpm.sparse_grid import THREADS, held_by, plan_sweep, record_of
 from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums
 
 DX = 0.05
@@ -72,28 +68,6 @@ def look_at_nodes(
         position[n] = node_position(grid, node[0], node[1], node[2])
 
 
-@wp.kernel
-def look_by_warps(
-    grid: Grid,
-    blocks: Blocks,
-    node_facing: wp.array2d(dtype=wp.vec4),
-    # out
-    normal: wp.array(dtype=wp.vec3),
-):
-    """The same normals, found by a warp each."""
-    n = wp.tid() // 32
-    slot = n // 64
-    held = wp.vec2i(-1, 0)
-    if slot < blocks.count[0]:
-        held = held_by(grid, blocks.held[0, slot])
-    if held[0] == 0 and (blocks.fields[0, held[1]] & 3) == 3:  # so for all threads of a warp
-        node = node_of_block(block_corner(grid, held[1]), n % 64)
-        near = neighbour_of_lane(grid, blocks, 0, node, 0, 1)
-        n_ab = normal_of_warp(near.c, read_change(node_facing, 0, near.a), read_change(node_facing, 0, near.b))
-        if wp.tid() % 32 == 0:
-            normal[n] = n_ab
-
-
 class Look:
     """What the nodes that two bodies share see: normals, gaps [m], reduced volumes, positions, and local normals."""
 
@@ -139,19 +113,6 @@ def placed(meet, boxes, gap=0.0, turn=None, **kwargs):
     sim = meet([{"box": upper}, {"box": boxes[1]}], spacing=0.5 * DX, dx=DX, **kwargs)
     turn = turn or Rotation.identity()
     return sim.set(x=turn.apply(sim.rest) + (0.013, 0.007, 0.004))
-
-
-def test_a_warp_finds_the_normals_that_a_thread_finds(device, meet):
-    """At every node that two boxes share, also at those with few neighbours that are written."""
-    if device == "cpu":
-        pytest.skip("a CPU has no warps")
-    sim = placed(meet, HALVES, turn=Rotation.from_rotvec((0.2, 0.5, 0.1)))
-    look, scratch = Look(sim), sim.scratch
-    normal = wp.zeros(64 * sim.model.max_slots, dtype=wp.vec3, device=device)
-    inputs = [sim.model.grid, scratch.blocks, scratch.facing]
-    wp.launch(look_by_warps, 32 * normal.size, inputs, [normal], device=device, block_dim=128)
-    assert look.shared.sum() > 100
-    np.testing.assert_allclose(normal.numpy()[look.shared], look.normal, atol=1e-5)
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.5, 1.0, 2.0])

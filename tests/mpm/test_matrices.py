@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm.types import LINE, allocate_matrices, components_of, matrices_of, matrix_at, store_matrix
+from piavatar_envs.core.arrays import LINE, allocate_matrices, components_of, matrices_of, matrix_at, store_matrix
 
 wp.set_module_options({"enable_backward": False})
 

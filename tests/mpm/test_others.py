@@ -10,7 +10,7 @@ from piavatar_envs.mpm.contact import solve_contact
 from piavatar_envs.mpm.contact_normals import find_facing
 from piavatar_envs.mpm.grid_arrays import TO_KINEMATIC
 from piavatar_envs.mpm.solver import record_marks, record_p2g
-from piavatar_envs.mpm.sweep import THREADS, plan_sweep
+from piavatar_envs.mpm.sparse_grid import THREADS, plan_sweep
 
 
 @pytest.fixture

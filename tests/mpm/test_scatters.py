@@ -12,10 +12,10 @@ from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.cuda import tiled_p2g as group_plan
 from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, parts_of, suits_shared
 from piavatar_envs.mpm.cuda.tile_grid import CAPACITY
-from piavatar_envs.mpm.cuda.tiled_g2p import MOST_COUNTED
 from piavatar_envs.mpm.grid_arrays import units
 from piavatar_envs.mpm.memory import LARGE_MARGIN, SLOT_MARGIN, choose_marks, estimate_slots
 from piavatar_envs.mpm.model import MaterialPoints, choose_scatter
+from piavatar_envs.mpm.p2g import MOST_COUNTED
 from piavatar_envs.mpm.solver import record_marks, record_p2g
 from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, SCATTERS
 

@@ -46,15 +46,13 @@ from piavatar_envs.avatar.types import (
     RigidFits,
     Tracked,
     Wrench,
-    vec8,
-    vec12,
-    vec16,
     vec44,
 )
+from piavatar_envs.core.arrays import group, vec8, vec12, vec16
 from piavatar_envs.core.cuda_intrinsics import BLOCK, chunk_threads, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
-from piavatar_envs.mpm.types import DECOUPLING, Model, Scratch, State, group
+from piavatar_envs.mpm.types import DECOUPLING, Model, Scratch, State
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 

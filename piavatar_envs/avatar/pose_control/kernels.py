@@ -68,25 +68,20 @@ from piavatar_envs.avatar.types import (
     RigidFit,
     RigidFits,
     Wrench,
-    vec8,
-    vec12,
-    vec16,
     vec44,
 )
+from piavatar_envs.core.arrays import number_at, store_pair, store_vector, vec8, vec12, vec16, vector_at
 from piavatar_envs.core.cuda_intrinsics import (
     BLOCK,
     first_particle,
     meet,
     meet_threads,
-    number_at,
     place_in_block,
     sum_threads12,
     sum_threads16,
     threads_of_environment,
-    vector_at,
     warp_of_block,
 )
-from piavatar_envs.mpm.stores import store_pair, store_vector
 from piavatar_envs.mpm.types import Kinematic, Particles, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})

@@ -13,7 +13,8 @@ import warp as wp
 from piavatar_envs.avatar.critical_damping import critical_pull
 from piavatar_envs.avatar.rotation import quat_exp, quat_log
 from piavatar_envs.avatar.tracking import kabsch_rotation
-from piavatar_envs.avatar.types import Anchor, Body, Carry, Command, Drive, Held, Pose, RigidFit, Wrench, vec12
+from piavatar_envs.avatar.types import Anchor, Body, Carry, Command, Drive, Held, Pose, RigidFit, Wrench
+from piavatar_envs.core.arrays import vec12
 from piavatar_envs.core.cuda_intrinsics import sum_threads12
 from piavatar_envs.mpm.types import row
 

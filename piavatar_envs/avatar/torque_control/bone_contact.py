@@ -30,8 +30,9 @@ from piavatar_envs.avatar.torque_control.dynamics import part_of, set_part, spre
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, NUM_DOF
 from piavatar_envs.avatar.torque_control.tree_cholesky import begin_solution, end_solution
 from piavatar_envs.avatar.torque_control.workspace import JointBench, place_of_part, row_in_room, see_columns
-from piavatar_envs.avatar.types import Body, vec8
-from piavatar_envs.core.cuda_intrinsics import bits_of_threads, meet_threads, most_of_threads, sum_threads6, vector_at
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.arrays import vec8, vector_at
+from piavatar_envs.core.cuda_intrinsics import bits_of_threads, meet_threads, most_of_threads, sum_threads6
 from piavatar_envs.mpm.colliders import PLANE, signed_distance, surface_velocity
 from piavatar_envs.mpm.contact_sensors import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.types import Boundaries, Sensors, row

@@ -92,10 +92,11 @@ from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, put
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, JointMass, grid_inertia
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
 from piavatar_envs.avatar.torque_control.workspace import JointBench
-from piavatar_envs.avatar.types import ROOT_RATE, Body, JointState, Pose, vec8, vec12, vec16
+from piavatar_envs.avatar.types import ROOT_RATE, Body, JointState, Pose
+from piavatar_envs.core.arrays import group, vec8, vec12, vec16
 from piavatar_envs.core.cuda_intrinsics import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.mpm.types import Model, Scratch, State, group, row
+from piavatar_envs.mpm.types import Model, Scratch, State, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 

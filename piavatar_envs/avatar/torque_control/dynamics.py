@@ -35,7 +35,8 @@ from piavatar_envs.avatar.rotation import quat_exp, quat_log, short_of_pi, torqu
 from piavatar_envs.avatar.skinning import blend_steps, motion_at
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, I3, NUM_DOF
 from piavatar_envs.avatar.tracking import point_inertia, spin_of, symmetric
-from piavatar_envs.avatar.types import Body, Pose, vec8, vec12, vec16
+from piavatar_envs.avatar.types import Body, Pose
+from piavatar_envs.core.arrays import group, store_triple, vec8, vec12, vec16, vector_at, vector_from
 from piavatar_envs.core.cuda_intrinsics import (
     BLOCK,
     first_particle,
@@ -43,11 +44,8 @@ from piavatar_envs.core.cuda_intrinsics import (
     over_ancestors,
     sum_threads16,
     threads_of_environment,
-    vector_at,
-    vector_from,
 )
-from piavatar_envs.mpm.stores import store_velocities
-from piavatar_envs.mpm.types import Kinematic, group, row
+from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -193,7 +191,7 @@ def take_over(
         spin = wp.vec3(s[9], s[10], s[11])
         vk = wp.vec3(s[6], s[7], s[8]) + wp.cross(spin, arm)
         vk += wp.cross(0.5 * dt * spin, vk - wp.vec3(root[6], root[7], root[8]))
-        store_velocities(u, driven, e, body.first + p, whole - vk, vk + apart, spin, True)
+        store_triple(u, driven.vk, driven.spin, e, body.first + p, whole - vk, vk + apart, spin, True)
         p += threads
 
 

@@ -19,20 +19,10 @@ from piavatar_envs.avatar.skinning import blend_back, blend_images, skinned_plac
 from piavatar_envs.avatar.torque_control.dynamics import blended_motion, motion_apart
 from piavatar_envs.avatar.torque_control.workspace import JointBench
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.core.cuda_intrinsics import (
-    ask_ahead,
-    environment_of,
-    int_at,
-    lane_of_warp,
-    meet,
-    number_at,
-    set_vector,
-    threads_of_block,
-    vector_at,
-    warp_of_block,
-)
+from piavatar_envs.core.arrays import ask_ahead, int_at, matrix_at, number_at, set_vector, store_matrix, vector_at
+from piavatar_envs.core.cuda_intrinsics import environment_of, lane_of_warp, meet, threads_of_block, warp_of_block
 from piavatar_envs.mpm.colliders import signed_distance
-from piavatar_envs.mpm.types import Boundaries, Grid, matrix_at, row, store_matrix
+from piavatar_envs.mpm.types import Boundaries, Grid, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 

@@ -46,20 +46,9 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import (
     set_in_rooms,
 )
 from piavatar_envs.avatar.tracking import symmetric
-from piavatar_envs.avatar.types import Body, vec12, vec16
-from piavatar_envs.core.cuda_intrinsics import (
-    BLOCK,
-    add_rows12,
-    add_rows16,
-    float_at,
-    highest_bit,
-    int_at,
-    meet,
-    number_at,
-    sum_threads16,
-    vector_at,
-    warp_threads,
-)
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.arrays import add_rows12, add_rows16, float_at, int_at, number_at, vec12, vec16, vector_at
+from piavatar_envs.core.cuda_intrinsics import BLOCK, highest_bit, meet, sum_threads16, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.types import Model, Particles, State, row
 

@@ -54,7 +54,8 @@ from piavatar_envs.avatar.torque_control.workspace import (
     row_in_room,
     see_vectors,
 )
-from piavatar_envs.avatar.types import Body, vec8
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.arrays import vec8
 from piavatar_envs.core.cuda_intrinsics import meet, meet_threads, place_in_block, sum_threads
 from piavatar_envs.mpm.types import row
 

@@ -9,7 +9,8 @@ import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.torque_control.tree_cholesky import MOST_ROWS, ROOM, SPARE, Pattern
-from piavatar_envs.avatar.types import Pose, vec8, vec12, vec16
+from piavatar_envs.avatar.types import Pose
+from piavatar_envs.core.arrays import vec8, vec12, vec16
 
 wp.set_module_options({"enable_backward": False})
 

@@ -7,15 +7,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.core.cuda_intrinsics import (
-    half_word,
-    has_bit,
-    meet_warp,
-    number,
-    thread_of_block,
-    threads_of_block,
-    word,
-)
+from piavatar_envs.core.arrays import vec8, vec8i
+from piavatar_envs.core.cuda_intrinsics import meet_warp, thread_of_block, threads_of_block
+from piavatar_envs.core.shared_memory import half_word, has_bit, number, word
 from piavatar_envs.mpm.bspline import BLOCK_NODES, Stencil, block_corner, grid_position, stencil_at
 from piavatar_envs.mpm.colliders import nearest_boundary
 from piavatar_envs.mpm.cuda.block_grid import (
@@ -39,11 +33,10 @@ from piavatar_envs.mpm.cuda.block_grid import (
     sums_at,
     unit_of_mass,
 )
-from piavatar_envs.mpm.g2p import Gathered, Gradients, asks_kinematic, finish_gather, gather
+from piavatar_envs.mpm.g2p import Gathered, Gradients, asks_kinematic, finish_gather, gather, store_particle
 from piavatar_envs.mpm.grid_arrays import write_record
 from piavatar_envs.mpm.grid_update import meet_boundaries, physical_velocity, place_of, total_velocity
 from piavatar_envs.mpm.sparse_grid import has_field, slots_used
-from piavatar_envs.mpm.stores import store_particle
 from piavatar_envs.mpm.types import (
     NO_STRESS,
     SPLIT,
@@ -57,8 +50,6 @@ from piavatar_envs.mpm.types import (
     Sensors,
     Step,
     Sums,
-    vec8,
-    vec8i,
 )
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})

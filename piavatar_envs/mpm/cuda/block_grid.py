@@ -29,23 +29,21 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.core.cuda_intrinsics import (
+from piavatar_envs.core.arrays import vec8, vec8i
+from piavatar_envs.core.cuda_intrinsics import meet, thread_of_block, threads_of_block
+from piavatar_envs.core.shared_memory import (
     APPEND,
     add_word,
     byte,
     clear_words,
     fill_words,
-    meet,
     native,
     number,
     or_word,
-    power_of_two,
     raise_to,
     set_byte,
     set_half_word,
     set_number,
-    thread_of_block,
-    threads_of_block,
     word,
 )
 from piavatar_envs.mpm.bspline import BLOCK_NODES, base_node, block_corner, grid_position
@@ -53,7 +51,7 @@ from piavatar_envs.mpm.colliders import GATED_SLAB
 from piavatar_envs.mpm.grid_update import SLAB_NODES, block_is_near, slab_is_near
 from piavatar_envs.mpm.p2g import Scattered, takes_part, tells_place
 from piavatar_envs.mpm.sparse_grid import fields_beyond, has_field, slots_used
-from piavatar_envs.mpm.types import Blocks, Boundaries, Contact, Grid, Model, Particles, Room, row, vec8, vec8i
+from piavatar_envs.mpm.types import Blocks, Boundaries, Contact, Grid, Model, Particles, Room, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -581,3 +579,9 @@ def correct_units(room: Room, part: wp.vec3i):
         if slow and has_field(part[2], f):
             set_number(SPEED + f, speed_for(number(FASTEST + f)))
     meet()
+
+
+@wp.func_native(native("return __uint_as_float((__float_as_uint(x) + 0x7fffffu) & 0xff800000u);", "return x;"))
+def power_of_two(x: float) -> float:
+    """The least power of two that is not below ``x``, which is positive or 0."""
+    ...

@@ -10,19 +10,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.core.cuda_intrinsics import (
-    half_word,
-    has_bit,
-    list_bits,
-    meet,
-    number,
-    or_word,
-    raise_to,
-    set_word,
-    thread_of_block,
-    threads_of_block,
-    word,
-)
+from piavatar_envs.core.arrays import vec8i
+from piavatar_envs.core.cuda_intrinsics import meet, thread_of_block, threads_of_block
+from piavatar_envs.core.shared_memory import half_word, has_bit, list_bits, number, or_word, raise_to, set_word, word
 from piavatar_envs.mpm.bspline import spline
 from piavatar_envs.mpm.cuda.block_grid import (
     BLOCK_BRICKS,
@@ -53,8 +43,7 @@ from piavatar_envs.mpm.cuda.block_grid import (
     unit_of_mass,
     unit_of_place,
 )
-from piavatar_envs.mpm.cuda.tiled_g2p import fault_within
-from piavatar_envs.mpm.p2g import Scattered, momentum_bounds, moves_finitely, placed, prepare
+from piavatar_envs.mpm.p2g import Scattered, fault_within, momentum_bounds, moves_finitely, placed, prepare
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -66,7 +55,6 @@ from piavatar_envs.mpm.types import (
     Step,
     Sums,
     row,
-    vec8i,
 )
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -172,84 +160,6 @@ def add_to_bricks(
     per_momentum: float,
 ):
     """Add mass and physical momentum of particle ``p`` to its 27 nodes, in bricks that begin at those words."""
-    ...
-
-
-@wp.func_native(
-    adding(
-        unit=4,
-        before="for (int n = 0; n < 3; ++n) place_z[n] += upper_z[n] ? UNIT * BRICK : 0;",
-        plane="const int first = UNIT * (box[0] + (far ? box[1] : 0));",
-        line="const int first_of_line = first + line + UNIT * (upper ? box[2] : 0);",
-        node="first_of_line + place_z[l]",
-        unrolled=3,
-    )
-)
-def add_to_box(
-    box: wp.vec3i,
-    p: int,
-    s: Scattered,
-    wx: wp.vec3,
-    wy: wp.vec3,
-    wz: wp.vec3,
-    per_mass: float,
-    per_momentum: float,
-):
-    """:func:`add_to_bricks`, in bricks that lie in a row.
-
-    ``box`` has the word at which the first brick begins, and how far on the next ones along x and along y do.
-    """
-    ...
-
-
-@wp.func_native(
-    brick_native("""
-const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
-const float k[3] = {driven[0], driven[1], driven[2]};
-#pragma unroll 1
-for (int m = 0; m < 9; ++m) {
-    int n = m + t % 9;  // who has the same nodes adds to others of them meanwhile
-    n -= n > 8 ? 9 : 0;
-    const int i = n * 11 >> 5, j = n - 3 * i;
-    int* const line = room + box[0] + (px + i > 1 ? box[1] : 0) + (py + j > 1 ? box[2] : 0)
-        + ((px + i) & 1) * ALONG_X + ((py + j) & 1) * ALONG_Y;
-    const float w = (i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2]) * (j == 0 ? wy[0] : j == 1 ? wy[1] : wy[2]);
-    const float way_x = place[1] + (float)i * change, way_y = place[2] + (float)j * change;
-#pragma unroll
-    for (int l = 0; l < 3; ++l) {
-        int* const node = line + (pz + l > 1 ? BRICK : 0) + ((pz + l) & 1) * ALONG_Z;
-        const float wl = w * wz[l];
-        if (drives)
-            for (int c = 0; c < 3; ++c) atomicAdd(node + 1 + c, __float2int_rn(wl * k[c]));
-        if (to_place < 0) continue;
-        if (place[0] != 0.0f) atomicAdd(node + to_place, __float2int_rn(wl * place[0]));
-        atomicAdd(node + to_place + 1, __float2int_rn(wl * way_x));
-        atomicAdd(node + to_place + 2, __float2int_rn(wl * way_y));
-        atomicAdd(node + to_place + 3, __float2int_rn(wl * (place[3] + (float)l * change)));
-    }
-}
-""")
-)
-def tell_box(
-    box: wp.vec3i,
-    t: int,
-    base: wp.vec3i,
-    wx: wp.vec3,
-    wy: wp.vec3,
-    wz: wp.vec3,
-    driven: wp.vec3,
-    place: wp.vec4,
-    change: float,
-    drives: bool,
-    to_place: int,
-):
-    """Add a vector, how a particle is ``driven``, to its nodes in a ``box``, if it ``drives`` them, and where it is.
-
-    The latter goes to words ``to_place`` further on, nowhere if that is negative: a scalar and a vector, ``place`` at
-    the lowest node. The vector's components change by ``change`` from node to node, each along its own axis. All is in
-    units; ``box`` is as for :func:`add_to_box`. Thread ``t`` begins with another line of nodes than those beside it.
-    Few particles come here, so it is short.
-    """
     ...
 
 

@@ -13,15 +13,9 @@ from functools import cache
 
 import warp as wp
 
-from piavatar_envs.core.cuda_intrinsics import (
-    meet,
-    number,
-    or_word,
-    set_number,
-    thread_of_block,
-    word,
-)
+from piavatar_envs.core.cuda_intrinsics import meet, thread_of_block
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.shared_memory import number, or_word, set_number, word
 from piavatar_envs.mpm.cuda.block_g2p import clear_untouched, gather_all, update_bricks
 from piavatar_envs.mpm.cuda.block_grid import (
     COUNT,

@@ -21,13 +21,15 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.core.cuda_intrinsics import native, number
+from piavatar_envs.core.shared_memory import native, number
 from piavatar_envs.mpm.cuda.block_grid import BRICK_WORDS
-from piavatar_envs.mpm.cuda.tiled_g2p import KINEMATIC, PLACE, bounded
-from piavatar_envs.mpm.p2g import Scattered
+from piavatar_envs.mpm.p2g import Scattered, fault_within, momentum_bounds
 from piavatar_envs.mpm.types import FAILURE_CFL, Blocks, Grid, Sums
 
 wp.set_module_options({"enable_backward": False})
+
+#: What is added up: mass and momentum; kinematic momentum; places and seams.
+MOMENTUM, KINEMATIC, PLACE = (wp.constant(n) for n in range(3))
 
 
 #: Particles of a group, at most, a thread each.
@@ -367,3 +369,14 @@ def put_down(grid: Grid, sums: Sums, failure: wp.array(dtype=int), e: int, kind:
     places are noted.
     """
     ...
+
+
+@wp.func
+def bounded(s: Scattered, unit: float, failure: wp.array(dtype=int), e: int):
+    """The most momentum that a particle has anywhere in its stencil [kg m/s]; -1 if it must not be added up."""
+    bounds = momentum_bounds(s)
+    fault = fault_within(s, bounds, unit)
+    if fault != 0:
+        wp.atomic_or(failure, e, fault)
+        return -1.0
+    return wp.max(bounds)

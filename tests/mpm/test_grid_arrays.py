@@ -1,14 +1,12 @@
-"""The grid passes find every node once, and read and clear what particles have added up."""
+"""Grid arrays: what is taken from an accumulator is cleared, and records lie in halves."""
 
 from __future__ import annotations
-
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.mpm import sweep
+from piavatar_envs.core.arrays import group, vec4l, vec8
 from piavatar_envs.mpm.grid_arrays import (
     begin_sum,
     clear_offset,
@@ -20,37 +18,10 @@ from piavatar_envs.mpm.grid_arrays import (
     write_physical,
     write_record,
 )
-from piavatar_envs.mpm.types import Grid, Sums, group, vec4l, vec8
+from piavatar_envs.mpm.types import Grid, Sums
 
 RECORDS = 64
 SLOTS = 3
-
-
-@pytest.mark.parametrize("cuda", [False, True])
-@pytest.mark.parametrize("num_envs", [1, 3, 64, 4096])
-@pytest.mark.parametrize("slots", [1, 7, 208, 17784, 200000])
-def test_slots_have_threads(monkeypatch, cuda, num_envs, slots):
-    """Few environments have a warp for every slot at once; of many, each goes on with every so-many-th."""
-    monkeypatch.setattr(sweep.wp, "get_device", lambda name: SimpleNamespace(is_cuda=cuda))
-    model = SimpleNamespace(device="any", num_envs=num_envs, max_slots=slots)
-    at_once = sweep.slots_at_once(model)
-    assert min(slots, sweep.FEWEST_SLOTS) <= at_once <= slots
-    assert sweep.slot_threads(model) == (32 if cuda else 1)
-    assert at_once == slots or num_envs * at_once >= sweep.SLOTS_AT_ONCE
-
-
-@pytest.mark.parametrize("cuda", [False, True])
-@pytest.mark.parametrize("num_envs", [1, 64, 4096])
-@pytest.mark.parametrize("slots", [1, 7, 208, 17784])
-def test_every_node_of_shared_blocks_has_one_thread(monkeypatch, cuda, num_envs, slots):
-    monkeypatch.setattr(sweep.wp, "get_device", lambda name: SimpleNamespace(is_cuda=cuda))
-    model = SimpleNamespace(device="any", num_envs=num_envs, max_slots=slots, contact=SimpleNamespace(num_fields=2))
-    plan = sweep.plan_sweep(model)
-    assert plan.threads % (64 if cuda else 1) == 0
-    nodes = plan.share * np.arange(plan.threads)[:, None] + plan.stride * np.arange(plan.turns)
-    nodes = (nodes[..., None] + np.arange(plan.share)).ravel()
-    most = 64 * sweep.most_shared(model)
-    assert most >= 64 * (slots // 2) and np.array_equal(np.sort(nodes[nodes < most]), np.arange(most))
 
 
 @wp.kernel
