@@ -148,9 +148,9 @@ def demonstrated(options: Options) -> TrainingConfig:
                 f"{name}={getattr(config, name)!r}: the demo is of PPO on {shown.env_id} in processes; train others by "
                 "python -m agents.train"
             )
-    if config.env["drive"]["control"] != "pose":
+    if config.env["control"]["mode"] != "pose":
         raise ConfigError(
-            f"env.drive.control={config.env['drive']['control']!r} must be 'pose': the scripted agent of the demo poses"
+            f"env.control.mode={config.env['control']['mode']!r} must be 'pose': the scripted agent of the demo poses"
         )
     return config
 

@@ -17,11 +17,11 @@ def interface(task: Task, observe: Collection[str] | None = None) -> dict[str, A
         observe: terms of the observation that the policy sees; None for all of it.
     """
     config = task.config
-    control = config.drive.control
+    control = config.control.mode
     actions = task.action_spec().under(control)
     seen = [term for term in task.terms() if observe is None or term.name in observe]
     return {
-        "drive.control": control,
+        "control.mode": control,
         "its actions": actions if control == "pose" else actions.joints,  # under torques nothing has a speed of its own
         "observe_parameters": config.observe_parameters,
         "its observations": (seen, task.observed_props() if observe is None else ()),

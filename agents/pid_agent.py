@@ -81,7 +81,7 @@ class PIDAgent:
         points = env.simulation.flesh[0].points
         self.bones, self.acting = Bones.of(points), [joint_index(name) for name in env.action_spec.joints]
         size = self.bones.mass.sum() * np.ptp(points.rest[0][:, 2]) / (REFERENCE_MASS * REFERENCE_HEIGHT)
-        muscles = make_muscles(strength=env.config.drive.strength)
+        muscles = make_muscles(strength=env.config.control.strength)
         self.lower, self.upper = size * muscles.lower, size * muscles.upper
         # what tissue resists within a step, as an inertia: that of a hand is less
         self._resisting = np.repeat(self.dt * muscles.tissue_damping[1:], 3)

@@ -225,11 +225,11 @@ def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
         ConfigError: there is no such term to observe, or nothing to be helped, or a lesson is none.
     """
     settings = with_lessons(task, config.lessons)
-    if config.help is not None and settings.drive.control == "pose":
-        raise ConfigError('help is for bodies under torques, and env.drive.control="pose"; use "pd" or "torque"')
-    if config.help is not None and settings.drive.root_assist > 0.0:
+    if config.help is not None and settings.control.mode == "pose":
+        raise ConfigError('help is for bodies under torques, and env.control.mode="pose"; use "pd" or "torque"')
+    if config.help is not None and settings.control.root_assist > 0.0:
         raise ConfigError(
-            f"help wanes to nothing, and env.drive.root_assist={settings.drive.root_assist} stays; give one of them"
+            f"help wanes to nothing, and env.control.root_assist={settings.control.root_assist} stays; give one of them"
         )
     groups = None if config.observe is None else {"policy": config.observe}
     about = (config.env_id, config.num_envs, device, settings, groups, config.first_seed)

@@ -32,7 +32,7 @@ class Options:
 
     #: registered id
     env_id: tyro.conf.Positional[str]
-    #: settings of the environment: physics.fidelity=coarse drive.root_assist=0.1
+    #: settings of the environment: physics.fidelity=coarse control.root_assist=0.1
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: how many episodes, and from which seed on
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)

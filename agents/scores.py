@@ -41,7 +41,7 @@ STREAMS = "score_random"
 #: Returns of the same actions in the same episodes, on another device.
 _ALIKE = 1.0e-3
 #: What a policy may be scored on though it was trained on another; the row says which.
-_PLAYED = "env.drive.bone_contact"
+_PLAYED = "env.control.bone_contact"
 
 
 def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -129,21 +129,23 @@ def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     with contextlib.suppress(ValueError):  # a world of several agents, or settings that are no longer there
         config = load_config(load_task(env_id).Config, settings)
         settings = config.model_dump(mode="json")
-        settings["drive"]["free_motion"] = config.drive.moves_freely
+        if config.control.mode == "pose":
+            settings["control"]["free_motion"] = config.control.moves_freely
     return flattened({"env": settings})
 
 
 def _drive(run: Mapping[str, Any]) -> dict[str, Any]:
     """What drives the avatar that was scored, and what holds its bones; None where its environment does not say."""
     known = _known(run["config"]["env_id"], run.get("evaluation", run["config"])["env"])
-    return {name: known.get(f"env.drive.{name}") for name in ("control", "firm_bones", "bone_contact")}
+    keys = {"control": "mode", "firm_bones": "firm_bones", "bone_contact": "bone_contact"}
+    return {name: known.get(f"env.control.{key}") for name, key in keys.items()}
 
 
 def _check_alike(group: Mapping[str, Mapping[str, Any]]) -> None:
     """Refuse seeds that were not all scored on the same bones."""
     bones = {name: _drive(run)["bone_contact"] for name, run in group.items()}
     if len(set(bones.values())) > 1:
-        raise ValueError(f"drive.bone_contact of what was scored differs: {bones}; score all of them alike")
+        raise ValueError(f"control.bone_contact of what was scored differs: {bones}; score all of them alike")
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

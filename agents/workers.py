@@ -76,7 +76,7 @@ def prepare(make: EnvFactory | WorldFactory) -> EnvFacts:
         env.step(np.zeros(env.action_space.shape, np.float32))
         bare = env.unwrapped
         control_dt = bare.config.physics.control_dt
-        step = bare.config.drive.joint_speed_limit * control_dt
+        step = bare.config.control.joint_speed_limit * control_dt
         agents = bare.names if isinstance(bare, World) else ()
         return EnvFacts(bare.observation_layout, bare.action_names, step, control_dt, agents)
     finally:

@@ -57,7 +57,7 @@ def kicks(masses: tuple[float, ...] = (0.5, 1.5, 8.0)) -> list[Act]:
         "kick, no ball",
         seconds=1.2,
         script=low_kick(),
-        drive={"tone": 0.3},
+        control={"tone": 0.3},
         domain=Domain().including((0.0, -4.0, 0.0)),
         view=replace(SIDE, eye=(3.0, -2.6, 1.0), target=(0.0, -0.6, 0.7), moments=(0.3, 0.5, 0.7)),
         tags={"ball_kg": None},
@@ -93,7 +93,7 @@ def head_hits(tones: tuple[float, ...] = (1.0, 0.3, 0.0)) -> list[Act]:
             f"head hit, tone {tone:g}",
             seconds=1.5,
             scene=SceneConfig(props=(thrown,)),
-            drive={"tone": tone},
+            control={"tone": tone},
             view=View(eye=(3.3, -1.9, 1.35), target=(0.0, -0.1, 0.85), moments=(0.1667, 0.4, 1.5)),
             tags={"tone": tone},
         )
@@ -122,7 +122,7 @@ def crowd(mesh: Path) -> Act:
         "several objects at once",
         seconds=1.0,
         scene=SceneConfig(props=props),
-        drive={"tone": 0.5},
+        control={"tone": 0.5},
         view=replace(FRONT, eye=(2.6, -3.0, 1.6), moments=(0.0, 0.2, 0.4)),
     )
 
@@ -138,7 +138,7 @@ def belly_dents() -> list[Act]:
                 seconds=1.3,
                 scene=SceneConfig(props=(thrown,)),
                 physics={"soft_young_modulus": 2e4},
-                drive={"tone": 0.0, "alpha": alpha, "shape_preservation": kind},
+                control={"tone": 0.0, "alpha": alpha, "shape_preservation": kind},
                 view=View((1.7, -1.0, 1.25), (0.0, -0.15, 1.05), (0.1, 0.3, 1.3), color="strain"),
                 tags={"alpha": alpha, "shape_preservation": kind},
             )
@@ -184,7 +184,7 @@ def pillows(moduli: tuple[float, ...] = (1e3, 2e3, 5e3, 1e5)) -> list[Act]:
                 f"pillow of {young:.0e} Pa at the head",
                 seconds=0.7,
                 scene=SceneConfig(props=(pillow,)),
-                drive={"tone": 0.3},
+                control={"tone": 0.3},
                 view=replace(HEAD, eye=(2.2, -1.5, 1.65), moments=(0.0, 0.1333)),
                 tags={"young_modulus_pa": young},
             )
@@ -255,7 +255,7 @@ def jumps() -> list[Act]:
                 scene=SceneConfig(avatars=(AvatarConfig(shape={"parameters": {"belly": 1.0, "weight": 0.7}}),)),
                 script=script,
                 physics={"soft_young_modulus": young},
-                drive={"soft_tissue": soft},
+                control={"soft_tissue": soft},
                 domain=Domain().including((0.0, -2.8, 0.0)),
                 view=View(
                     eye=(4.6, -1.9, 1.1), target=(0.0, -0.55, 0.92), moments=(0.0, 0.9667, 1.3333), color="strain"

@@ -26,8 +26,8 @@ BALLS = (0.45, 1.5, 8.0)  # [kg]
 SPEED, DISTANCE = 5.0, 0.1  # of a ball that is thrown at the chest [m/s], and its way there [m]
 STIFFNESSES = (100.0, 300.0, 1000.0)  # of all joints of a body that is hit [N m/rad]
 BOUNDLESS = 1000.0  # factor on the torques of muscles, which are not to be the limit here
-# settings of ``drive``: particles of bones are put into their places after a control step, and bones stop at the floor;
-# or they slip under load, and the floor stops only flesh
+# settings of ``control``: particles of bones are put into their places after a control step, and bones stop at the
+# floor; or they slip under load, and the floor stops only flesh
 HOLDS: dict[str, dict[str, Any]] = {"": {}, "_slipping": {"firm_bones": False, "bone_contact": False}}
 FINER = 4  # control steps in one of the environments': peaks are short
 SETTLING = 0.2  # last share of the time over which an error is averaged
@@ -45,9 +45,9 @@ LEAD = 0.06  # from where the toes are fastest to the ball's surface [m]: they h
 def afloat(name: str, *props: PropConfig, **settings: Any) -> Act:
     """A body under springs in empty space; ``settings`` are those of an act."""
     scene = SceneConfig(ground=False, walls=False, props=props)
-    drive = {"control": "pd", **settings.pop("drive", {})}
+    control = {"mode": "pd", **settings.pop("control", {})}
     physics = {"gravity": 0.0, **settings.pop("physics", {})}
-    return Act(name, seconds=0.0, scene=scene, domain=SPACE, drive=drive, physics=physics, **settings)
+    return Act(name, seconds=0.0, scene=scene, domain=SPACE, control=control, physics=physics, **settings)
 
 
 def subject_totals(stage: Stage, subject: int) -> Totals:
@@ -78,8 +78,8 @@ def hit(options: Options, mass: float, stiffness: float, hold: str = "") -> dict
     """A ball at the chest of a floating body, whose bones are held as a key of :data:`HOLDS` says."""
     start = (0.0, CHEST[1] - BALL_RADIUS - DISTANCE, CHEST[2])
     prop = ball(mass, start, (0.0, SPEED, 0.0))
-    drive = {"strength": BOUNDLESS, **HOLDS[hold]}
-    act = afloat("hit", prop, drive=drive, physics={"control_dt": PhysicsConfig().control_dt / FINER})
+    control = {"strength": BOUNDLESS, **HOLDS[hold]}
+    act = afloat("hit", prop, control=control, physics={"control_dt": PhysicsConfig().control_dt / FINER})
     stage = Stage(act, options.fidelity, options.device)
     before = subject_totals(stage, 1)
     stage.step()  # which builds the mass matrix; the ball is still on its way
@@ -127,7 +127,7 @@ class Kick:
 
 def swing(options: Options, held: bool, hold: str, *props: PropConfig) -> Kick:
     """Swing the leg, with a ball in its way or none."""
-    act = afloat("kick", *props, script=keyed(*SWING), drive={"root_assist": float(held), **HOLDS[hold]})
+    act = afloat("kick", *props, script=keyed(*SWING), control={"root_assist": float(held), **HOLDS[hold]})
     stage = Stage(act, options.fidelity, options.device)
     drive, joints = stage.simulation.avatar.state, stage.simulation.avatar.joints.state
     toes, pelvis, support, gaps = [], [], [], []

@@ -35,7 +35,7 @@ class Options(runner.Options):
     num_envs: int = 1024
     #: resolution of the bodies
     fidelity: str = "coarse"
-    #: settings of the environment, as drive.bone_contact=false
+    #: settings of the environment, as control.bone_contact=false
     settings: tuple[str, ...] = ()
     #: steps that are timed, each way
     repeats: int = 10

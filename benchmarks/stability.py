@@ -65,14 +65,14 @@ class Trial:
         """The body, at rest in the rest pose; from the first step on it is asked for ``pose`` (22, 3) [rad]."""
         rest = standing(0.0)
         physics = {"control_dt": self.control_dt, "young_modulus": self.young, "num_substeps": self.substeps}
-        drive = {"joint_stiffness": self.stiffness, "joint_damping": self.damping, "strength": self.strength}
+        control = {"joint_stiffness": self.stiffness, "joint_damping": self.damping, "strength": self.strength}
         act = Act(
             "trial",
             SECONDS,
             scene=SceneConfig(ground=self.grounded, walls=False),
             script=lambda time: (pose if time > 0.0 else rest[0], rest[1]),
             physics={**physics, "gravity": GRAVITY * self.grounded},
-            drive={**drive, "control": "pd", "root_assist": float(self.grounded)},
+            control={**control, "mode": "pd", "root_assist": float(self.grounded)},
             domain=SPACE,
         )
         return Stage(act, options.fidelity, options.device)

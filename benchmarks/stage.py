@@ -16,7 +16,7 @@ from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index, skin
 from piavatar_envs.avatar.motion import Motion
 from piavatar_envs.avatar.motion.interpolation import ease
-from piavatar_envs.config import DriveConfig, EnvConfig, PhysicsConfig, RenderConfig, SceneConfig
+from piavatar_envs.config import EnvConfig, RenderConfig, SceneConfig, load_config
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.sim.world import Simulation
@@ -93,7 +93,7 @@ class Act:
         seconds: how long it is.
         scene: avatar, props and colliders.
         script: commanded poses.
-        physics, drive: settings that differ from the environments' own.
+        physics, control: settings that differ from the environments' own.
         domain: where matter may go; the usual one if not given.
         view: for pictures.
         tags: what a row of results says about the act.
@@ -104,7 +104,7 @@ class Act:
     scene: SceneConfig = field(default_factory=SceneConfig)
     script: Script = standing
     physics: dict[str, Any] = field(default_factory=dict)
-    drive: dict[str, Any] = field(default_factory=dict)
+    control: dict[str, Any] = field(default_factory=dict)
     domain: Domain | None = None
     view: View = View()
     tags: dict[str, Any] = field(default_factory=dict)
@@ -134,11 +134,8 @@ class Stage:
     def __init__(self, act: Act, fidelity: str = "coarse", device: str = "cpu") -> None:
         """Build the world; the avatar stands in the script's first pose."""
         self.act = act
-        config = EnvConfig(
-            physics=PhysicsConfig(fidelity=fidelity, **act.physics),
-            drive=DriveConfig(**act.drive),
-            scene=act.scene,
-        )
+        physics = {"fidelity": fidelity, **act.physics}
+        config = load_config(EnvConfig, {"physics": physics, "control": act.control, "scene": act.scene})
         self.simulation = Simulation(config, 1, device, act.domain)
         self.task = _Backdrop(act.view.eye, act.view.target)
         self.dt, self.steps_done = config.physics.control_dt, 0

@@ -90,7 +90,7 @@ def _row(act: Act, measure: Callable[[Course], Row], play: Play, fidelity: str) 
         "resolution": fidelity,
         "substeps": simulation.model.num_substeps,
         "particles": course.x.shape[1],
-        "tone": simulation.flesh[0].drive.tone,
+        "tone": simulation.flesh[0].control.tone,
         "failed": course.failed,
         "let_go": course.let_go,
         **act.tags,

@@ -45,7 +45,7 @@ ARM = ("collar", "shoulder", "elbow", "wrist")
 ANKLES = ("left_ankle", "right_ankle")
 STAND_SECONDS, FALLEN = 10.0, 30.0  # how long a body is to stand [s], and the tilt of the pelvis at which it has not
 RATE = 300.0  # of the pulls that hold flesh to bones [1/s]
-# settings of ``drive``: flesh is held to bones as in environments, or by its own stiffness only
+# settings of ``control``: flesh is held to bones as in environments, or by its own stiffness only
 FLESH: dict[str, dict[str, Any]] = {"_loose": {"flesh_rate": (0.0, 0.0)}, "": {}}
 REPLAYS = 30  # of a control step whose cost is measured
 MODULES = (attachment, joint_motion, joint_stages, mass_pairs)
@@ -72,7 +72,7 @@ def flail_under_pd(options: Options, flesh: str, hold: str) -> dict[str, Any]:
     def script(time: float) -> Pose:
         return (rest if time == 0.0 else poses[int(time / interval - 1e-6)]), root
 
-    act = afloat("flail", script=script, drive={**FLESH[flesh], **HOLDS[hold]})
+    act = afloat("flail", script=script, control={**FLESH[flesh], **HOLDS[hold]})
     stage = Stage(act, options.fidelity, options.device)
     simulation = stage.simulation
     row = {"case": f"free_float_pd{flesh}{hold}"}

@@ -72,7 +72,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 
 def make_task(world: str, fidelity: str, settings: Sequence[str] = ()) -> Task:
-    """The task of a world at a resolution, with settings such as ``drive.bone_contact=false``.
+    """The task of a world at a resolution, with settings such as ``control.bone_contact=false``.
 
     Raises:
         ValueError: there is no such world or setting.

@@ -21,7 +21,7 @@ AgentName = Annotated[Literal["random", "zero"], tyro.conf.arg(help="where the a
 Seed = Annotated[int, tyro.conf.arg(help="of the first reset and of the random actions")]
 Device = Annotated[str, tyro.conf.arg(help="where to simulate: cpu, cuda, cuda:1, ...")]
 Overrides = Annotated[
-    tuple[str, ...], tyro.conf.arg(aliases=["-c"], help="settings, e.g. -c fidelity=tiny drive.tone=0")
+    tuple[str, ...], tyro.conf.arg(aliases=["-c"], help="settings, e.g. -c fidelity=tiny control.tone=0")
 ]
 
 

@@ -56,7 +56,8 @@ def main(
     device: Annotated[str, tyro.conf.arg(help="where to simulate")] = "cpu",
     jobs: Annotated[int, tyro.conf.arg(help="agents that play at a time")] = 1,
     bone_contact: Annotated[
-        bool | None, tyro.conf.arg(help="override drive.bone_contact of the policies; else as in their last evaluation")
+        bool | None,
+        tyro.conf.arg(help="override control.bone_contact of the policies; else as in their last evaluation"),
     ] = None,
 ) -> int:
     """Score the committed agents, and write the table.
@@ -91,17 +92,17 @@ def find_jobs(results: Path, out: Path, device: str, bone_contact: bool | None =
         jobs.append(Job(folder, new, command))
     for folder in sorted(path.parent for path in results.glob("ppo/*/policy.*")):
         new, bones = out / folder.relative_to(results), scored_on(folder) if bone_contact is None else bone_contact
-        settings = () if bones is None else (f"drive.bone_contact={str(bones).lower()}",)
+        settings = () if bones is None else (f"control.bone_contact={str(bones).lower()}",)
         where = ("--device", device, "--out", str(new / "evaluation.json"))
         jobs.append(Job(folder, new, ("agents.play", str(folder), *settings, *where)))
     return jobs
 
 
 def scored_on(folder: Path) -> bool | None:
-    """Return ``drive.bone_contact`` of a policy's last evaluation; None if it does not say."""
+    """Return ``control.bone_contact`` of a policy's last evaluation; None if it does not say."""
     path = folder / "evaluation.json"
     env = read_json(path).get("env", {}) if path.is_file() else {}
-    return env.get("drive", {}).get("bone_contact")
+    return env.get("control", {}).get("bone_contact")
 
 
 def written(folder: Path, new: Path, device: str) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ RUNS = {
     "profile_projection.json": (
         profile,
         ["--case", "PIAvatar/Stand-v0", "--fidelity", "tiny", "--num-envs", "2", "--repeats", "1"]
-        + ["--settings", "drive.bone_contact=false"],
+        + ["--settings", "control.bone_contact=false"],
     ),
     "soak.json": (soak, ["--fidelity", "tiny", "--num-envs", "2", "--steps", "50", "--window", "5"]),
 }

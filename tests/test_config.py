@@ -12,14 +12,16 @@ from pydantic import BaseModel, Field, ValidationError
 
 from piavatar_envs.config import (
     ConfigError,
-    DriveConfig,
+    ControlConfig,
     EnvConfig,
+    PoseControlConfig,
+    TorqueControlConfig,
     dump_yaml,
     load_config,
     parse_assignments,
     replace,
 )
-from piavatar_envs.config.load import setting_keys
+from piavatar_envs.config.errors import models_of, setting_keys
 
 
 class Task(EnvConfig):
@@ -41,34 +43,37 @@ def test_defaults_are_those_of_the_design():
     config = load_config(EnvConfig)
     assert config.physics.young_modulus == 1e5 and config.physics.control_dt == pytest.approx(1 / 30)
     assert config.physics.num_substeps is None and config.physics.decoupling == "split"
-    assert config.drive.max_force_weight == 2.0 and config.drive.let_go_tilt == pytest.approx(np.pi / 4)
+    assert config.control.max_root_force == 2.0 and config.control.release_tilt == pytest.approx(np.pi / 4)
     assert config == EnvConfig()
 
 
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
-        ({"drive.tone": 1.5}, "drive.tone=1.5 must be <= 1"),
-        ({"drive": {"tone": -0.1}}, "drive.tone=-0.1 must be >= 0"),
+        ({"control.tone": 1.5}, "control.tone=1.5 must be <= 1"),
+        ({"control": {"tone": -0.1}}, "control.tone=-0.1 must be >= 0"),
         ({"physics.control_dt": 0}, "physics.control_dt=0 must be >= 0.0001 [s]"),
         ({"physics.poisson_ratio": 0.5}, "physics.poisson_ratio=0.5 must be < 0.5"),
         ({"fidelity": "ultra"}, "physics.fidelity='ultra' must be one of 'tiny', 'coarse', 'medium' or 'fine'"),
         ({"young_modulus": "soft"}, "physics.young_modulus='soft' must be a number [Pa]"),
         ({"young_modulus": "100000"}, "physics.young_modulus='100000' must be a number [Pa]"),
-        ({"tone": True}, "drive.tone=True must be a number"),
+        ({"tone": True}, "control.tone=True must be a number"),
         ({"num_substeps": 1.5}, "physics.num_substeps=1.5 must be a whole number"),
-        ({"free_motion": 1}, "drive.free_motion=1 must be true or false"),
-        ({"tone": float("nan")}, "drive.tone=nan must be a finite number"),
+        ({"free_motion": 1}, "control.free_motion=1 must be true or false"),
+        ({"tone": float("nan")}, "control.tone=nan must be a finite number"),
         ({"density": float("inf")}, "physics.density=inf must be a finite number [kg/m^3]"),
         ({"shape.parameters.age": 2}, "shape.parameters.age=2 must be <= 1"),
         ({"physics": 3}, "physics=3 must be a section, with its settings below it"),
         ({"target_radius": 2.0}, "target_radius=2.0 must be <= 1 [m]"),
         ({"width": 8}, "render.width=8 must be >= 16 [pixel]"),
-        ({"drive.ton": 1}, "drive.ton is no setting of Task; did you mean drive.tone?"),
-        ({"drive.young_modulus": 1}, "drive.young_modulus is no setting of Task; did you mean physics.young_modulus?"),
+        ({"control.ton": 1}, "control.ton is no setting of Task; did you mean control.tone?"),
+        (
+            {"control.young_modulus": 1},
+            "control.young_modulus is no setting of Task; did you mean physics.young_modulus?",
+        ),
         ({"physcs": {"fidelity": "tiny"}}, "physcs is no setting of Task; did you mean physics?"),
         ({"target_radius.x": 1}, "target_radius={'x': 1} must be a number [m]"),
-        ({"drive": {"tone": 0.1}, "tone": 0.2}, "drive.tone is given twice, last as {'tone': 0.2}; give it once"),
+        ({"control": {"tone": 0.1}, "tone": 0.2}, "control.tone is given twice, last as {'tone': 0.2}; give it once"),
     ],
 )
 def test_a_refusal_names_key_value_and_limit(overrides, told):
@@ -86,33 +91,33 @@ def test_all_errors_come_in_one_line_with_their_file(tmp_path):
     message = refusal(path, {"tone": 7})
     assert f"{path}: physics.density=-1 must be >= 0.1 [kg/m^3]" in message
     assert f"{path}: obs_mode='both' must be one of 'flat' or 'dict'" in message
-    assert "; drive.tone=7 must be <= 1; " in message  # not the file's fault
+    assert "; control.tone=7 must be <= 1; " in message  # not the file's fault
 
 
 def test_files_that_cannot_be_read(tmp_path):
     assert "cannot read the configuration" in refusal(tmp_path / "none.yaml")
     endless = tmp_path / "endless.yaml"
-    endless.write_text("drive: &d {tone: 0.3, more: *d}")
+    endless.write_text("control: &d {tone: 0.3, more: *d}")
     assert "has a value that holds itself; write it out" in refusal(endless)
     broken = tmp_path / "broken.yaml"
     broken.write_text("physics: [1,\n")
     assert f"{broken} is not YAML" in refusal(broken)
     broken.write_text("- a\n- b\n")
     assert "holds a list, not settings" in refusal(broken)
-    broken.write_text("drive:\n  tone: 0.1\n  tone: 0.2\n")
+    broken.write_text("control:\n  tone: 0.1\n  tone: 0.2\n")
     assert "'tone' is given twice" in refusal(broken)
-    broken.write_text("drive: !!python/object/apply:os.getcwd []\n")
+    broken.write_text("control: !!python/object/apply:os.getcwd []\n")
     assert "is not YAML" in refusal(broken)
 
 
 def test_file_then_keywords(tmp_path):
     path = tmp_path / "some.yaml"
-    path.write_text("physics:\n  young_modulus: 1e6\n  fidelity: tiny\ndrive:\nshape.parameters.age: 0.5\n")
+    path.write_text("physics:\n  young_modulus: 1e6\n  fidelity: tiny\ncontrol:\nshape.parameters.age: 0.5\n")
     config = load_config(Task, path, {"fidelity": "medium", "shape": {"parameters": {"weight": -0.5}}})
     assert config.physics.young_modulus == 1e6  # YAML 1.1 would call this a string
     assert config.physics.fidelity == "medium"
     assert config.shape.parameters == {"age": 0.5, "weight": -0.5}
-    assert config.drive == Task().drive  # an empty section is one with defaults
+    assert config.control == Task().control  # an empty section is one with defaults
 
 
 def test_a_mapping_may_begin_as_another_one(tmp_path):
@@ -120,10 +125,6 @@ def test_a_mapping_may_begin_as_another_one(tmp_path):
     path = tmp_path / "merged.yaml"
     path.write_text("shape:\n  parameters:\n    <<: {age: 0.5, weight: 0.1}\n    weight: 0.2\n")
     assert load_config(Task, path).shape.parameters == {"age": 0.5, "weight": 0.2}
-
-
-def test_a_name_shared_with_its_section_means_the_setting():
-    assert load_config(Task, None, {"drive": "target"}).drive.drive == "target"
 
 
 def test_an_ambiguous_name_is_refused():
@@ -141,7 +142,7 @@ def test_numpy_and_tuples_are_welcome():
     config = load_config(
         Task, None, {"tone": np.float32(0.5), "span": np.array([0.1, 0.2]), "num_substeps": np.int64(9)}
     )
-    assert config.drive.tone == 0.5 and config.span == (0.1, 0.2) and config.physics.num_substeps == 9
+    assert config.control.tone == 0.5 and config.span == (0.1, 0.2) and config.physics.num_substeps == 9
     assert "a setting is a number" in refusal(None, {"tone": object()})
 
 
@@ -159,7 +160,7 @@ def test_frozen_all_through_hashable_and_copied():
     with pytest.raises(ValidationError):
         config.obs_mode = "dict"
     with pytest.raises(ValidationError):
-        config.drive.tone = 0.0
+        config.control.tone = 0.0
     for change in (lambda d: d.update(age=1), lambda d: d.pop("age"), lambda d: d.__setitem__("age", 1)):
         with pytest.raises(TypeError, match="frozen"):
             change(config.shape.parameters)
@@ -169,17 +170,19 @@ def test_frozen_all_through_hashable_and_copied():
 
 def test_replace_changes_a_copy_and_validates():
     config = Task()
-    changed = replace(config, {"drive.alpha": 0}, tone=0.7)
-    assert (changed.drive.alpha, changed.drive.tone) == (0.0, 0.7)
+    changed = replace(config, {"control.alpha": 0}, tone=0.7)
+    assert (changed.control.alpha, changed.control.tone) == (0.0, 0.7)
     assert config == Task() and type(changed) is Task
-    with pytest.raises(ConfigError, match=r"drive\.tone=2 must be <= 1"):
+    with pytest.raises(ConfigError, match=r"control\.tone=2 must be <= 1"):
         replace(config, tone=2)
 
 
 def test_assignments_of_a_command_line():
-    parsed = parse_assignments(["drive.tone=0.3", "young_modulus=1e5", "fidelity=tiny", "span=[1, 2]", "num_substeps="])
+    parsed = parse_assignments(
+        ["control.tone=0.3", "young_modulus=1e5", "fidelity=tiny", "span=[1, 2]", "num_substeps="]
+    )
     assert parsed == {
-        "drive.tone": 0.3,
+        "control.tone": 0.3,
         "young_modulus": 1e5,
         "fidelity": "tiny",
         "span": [1, 2],
@@ -194,8 +197,8 @@ def test_every_setting_is_described_with_its_unit():
     def fields(cls, prefix=""):
         for name, field in cls.model_fields.items():
             yield f"{prefix}{name}", field
-            if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-                yield from fields(field.annotation, f"{prefix}{name}.")
+            for model in models_of(field):
+                yield from fields(model, f"{prefix}{name}.")
 
     undescribed = [name for name, field in fields(EnvConfig) if not field.description]
     unitless = [name for name, field in fields(EnvConfig) if field.annotation is float and "[" not in field.description]
@@ -204,13 +207,81 @@ def test_every_setting_is_described_with_its_unit():
     assert len(bare) == len(set(bare)), "a bare name would be ambiguous as a keyword of gym.make"
 
 
-def test_a_part_of_a_section_leaves_the_tasks_own_defaults_of_the_rest():
-    class Own(EnvConfig):
-        drive: DriveConfig = Field(
-            default_factory=lambda: DriveConfig(control="pd", tone=0.4), description="how actions move the body"
+class Held(EnvConfig):
+    """A task that has another mode, and a setting of its own in that mode."""
+
+    control: ControlConfig = Field(
+        default_factory=lambda: TorqueControlConfig(root_assist=0.4), description="how actions move the body"
+    )
+
+
+class Quick(EnvConfig):
+    """A task that has the usual mode, and a setting of its own in that mode."""
+
+    control: ControlConfig = Field(
+        default_factory=lambda: PoseControlConfig(joint_speed_limit=7.0), description="how actions move the body"
+    )
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"control": "pd", "strength": 0.5},
+        {"control": {"mode": "pd", "strength": 0.5}},
+        {"control": "pd", "control.strength": 0.5},
+        {"control.mode": "pd", "control": {"strength": 0.5}},
+        {"mode": "pd", "strength": 0.5},
+        {"control": TorqueControlConfig(strength=0.5)},
+    ],
+)
+def test_a_mode_is_chosen_by_any_name(overrides, tmp_path):
+    expected = TorqueControlConfig(mode="pd", strength=0.5)
+    assert load_config(Task, None, overrides).control == expected
+    if "control" not in overrides or not isinstance(overrides["control"], BaseModel):
+        path = tmp_path / "mode.yaml"
+        path.write_text(yaml.safe_dump(overrides))
+        assert load_config(Task, path).control == expected
+
+
+def test_settings_of_the_tasks_mode_need_no_mode():
+    assert load_config(Held, None, {"strength": 0.5}).control == TorqueControlConfig(root_assist=0.4, strength=0.5)
+    assert load_config(Held, None, {"control": "torque"}).control.root_assist == 0.4
+    assert load_config(Quick, None, {"tone": 0.5}).control == PoseControlConfig(joint_speed_limit=7.0, tone=0.5)
+
+
+@pytest.mark.parametrize(
+    ("cls", "overrides", "key", "mode"),
+    [
+        (Task, {"root_assist": 0.5}, "control.root_assist=0.5", "'pd' or 'torque'"),
+        (Task, {"control": "pd", "tone": 0.5}, "control.tone=0.5", "'pose'"),
+        (Task, {"control": {"mode": "torque", "alpha": 0.1}}, "control.alpha=0.1", "'pose'"),
+        (Held, {"tone": 1.0}, "control.tone=1.0", "'pose'"),
+        (Held, {"scene": {"avatars": [{}, {"control": {"tone": 0}}]}}, "scene.avatars.1.control.tone=0", "'pose'"),
+        (Task, {"scene": {"avatars": [{"control.strength": 2}]}}, "scene.avatars.0.control.strength=2", "'pd' or"),
+    ],
+)
+def test_a_setting_of_another_mode_is_refused_with_its_mode(cls, overrides, key, mode):
+    message = refusal(None, overrides, cls)
+    assert message.startswith(f"{key} belongs to control.mode={mode}")
+
+
+def test_another_mode_begins_with_its_defaults():
+    quick = load_config(Quick, None, {"tone": 0.5})
+    under_torques = replace(quick, control="pd", strength=2.0)
+    assert under_torques.control == TorqueControlConfig(strength=2.0)
+    assert replace(under_torques, control="torque").control == TorqueControlConfig(mode="torque", strength=2.0)
+    assert replace(under_torques, control="pose").control == PoseControlConfig(joint_speed_limit=7.0)
+    assert load_config(Held, None, {"control": "pose"}).control == PoseControlConfig()
+
+
+def test_a_mode_that_there_is_not_is_refused():
+    for mode in ("push", 3, ["pd"]):
+        assert refusal(None, {"control": mode}).startswith(
+            f"control.mode={mode!r} must be one of 'pose', 'pd', 'torque'"
         )
 
-    config = load_config(Own, None, {"root_assist": 0.5, "drive.tone": 0.7})
-    assert (config.drive.control, config.drive.root_assist, config.drive.tone) == ("pd", 0.5, 0.7)
-    again = replace(config, {"drive.root_assist": 0.25})
-    assert (again.drive.control, again.drive.root_assist, again.drive.tone) == ("pd", 0.25, 0.7)
+
+def test_a_part_of_a_section_leaves_the_tasks_own_defaults_of_the_rest():
+    config = load_config(Held, None, {"strength": 0.5, "control.joint_damping": 0.7})
+    assert config.control == TorqueControlConfig(root_assist=0.4, strength=0.5, joint_damping=0.7)
+    assert replace(config, {"control.strength": 0.25}).control == config.control.model_copy(update={"strength": 0.25})

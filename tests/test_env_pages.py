@@ -12,7 +12,7 @@ import pytest
 from pydantic import BaseModel, Field
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
-from piavatar_envs.config import FROZEN, DriveConfig, EnvConfig
+from piavatar_envs.config import FROZEN, ControlConfig, EnvConfig, PoseControlConfig
 from piavatar_envs.config.load import setting_keys
 from piavatar_envs.config.schema import AvatarConfig, ColliderConfig, PropConfig, SceneConfig
 from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
@@ -109,7 +109,7 @@ def test_steps_of_actions_are_what_the_kernels_take(made, name):
     table, action_map = rows(entry_page(ENTRIES[name], facts), "Actions"), env.batch.action_map
     offset, scale = action_map.offset.numpy(), action_map.scale.numpy()
     lower, upper = np.degrees(action_map.lower.numpy()), np.degrees(action_map.upper.numpy())
-    posed = facts.config.drive.control == "pose"
+    posed = facts.config.control.mode == "pose"
     acting = [b for b in np.argsort(offset) if offset[b] >= 0]
     assert [row[1].split(".")[0].strip("`") for row in table[: len(acting)]] == [JOINT_NAMES[b] for b in acting]
     for row, b in zip(table, acting, strict=False):
@@ -180,7 +180,7 @@ class Item(BaseModel):
 
 
 class MadeUpConfig(EnvConfig):
-    drive: DriveConfig = Field(DriveConfig(root="free"), description="how poses move the body")
+    control: ControlConfig = Field(PoseControlConfig(root="free"), description="how poses move the body")
     tuned: Tuned = Field(Tuned(gain=3.0), description="a section of the task")
     items: tuple[Item, ...] = Field((Item(name="ball"), Item(name="box", at=(0, 0, 2))), description="things")
     count: int | None = Field(None, ge=1, description="how many")
@@ -214,8 +214,8 @@ def test_settings_are_told_with_default_range_and_unit():
     told = {row.key: row for section in reversed(sections_of(MadeUpConfig())) for row in section.settings}
     expected = {
         "tuned.gain": ("`3`", "1/s", "(0, 9)", True),
-        "drive.root": ('`"free"`', "", '`"wrench"`, `"free"`', True),
-        "drive.tone": ("`1`", "-", "[0, 1]", False),
+        "control.root": ('`"free"`', "", '`"wrench"`, `"free"`', True),
+        "control.tone": ("`1`", "-", "[0, 1]", False),
         "physics.young_modulus": ("`100000`", "Pa", "[1, 1e+09]", False),
         "physics.num_substeps": ("`None`", "", "integer [1, 10000] or `None`", False),
         "shape.randomize": ("`False`", "", "`True`, `False`", False),
@@ -261,7 +261,9 @@ def test_a_page_says_what_the_task_says(facts, monkeypatch):
     assert "from piavatar_envs.multi import made_up_v0" in text and "`red`, `blue`" in text
     assert rows(text, "Reward") == [["`near`", "of being near"]]
     assert rows(text, "Costs") == [["`force`", "of pressing"]]
-    assert "True when it is near." in text and "- the root wrench lets go" not in text  # nothing holds the root here
+    assert (
+        "True when it is near." in text and "- the root wrench is released" not in text
+    )  # nothing holds the root here
     assert [row[0] for row in rows(text, "Info")] == ["`success`", "`distance`", "`cost`"]
     assert "after a step" not in rows(text, "Info")[0] and "after a step" in rows(text, "Info")[1]
     assert "- v0: first version" in text

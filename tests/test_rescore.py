@@ -47,7 +47,7 @@ def test_the_arguments_of_a_pid_agent_are_its_settings(folder):
 def test_scoring_again_comes_to_the_same(tmp_path, device):
     """Score two agents of a small body: the same scores, a new date, one table, and the record untouched."""
     pid, stream = tmp_path / "pid" / "pid_Stand", tmp_path / "random" / "Stand"
-    small = ("PIAvatar/Stand-v0", "fidelity=tiny", "episode_seconds=0.2", "drive.firm_bones=false")
+    small = ("PIAvatar/Stand-v0", "fidelity=tiny", "episode_seconds=0.2", "control.firm_bones=false")
     episodes = ("--evaluation.episodes", "3", "--evaluation.first-seed", "7", "--device", device)
     score_pid.main([*small, *episodes, "--design.hip-share", "0.25", "--out", str(pid)])
     score_random.main([str(pid), "--seeds", "2", *episodes, "--out", str(stream)])
@@ -84,12 +84,12 @@ def test_policies_are_scored_on_the_bones_of_last_time_or_on_others(tmp_path):
 
     as_trained = command()
     assert not any("bone_contact" in word for word in as_trained)
-    assert set(command(True)) - set(as_trained) == {"drive.bone_contact=true"}
+    assert set(command(True)) - set(as_trained) == {"control.bone_contact=true"}
     (folder / "evaluation.json").write_text(json.dumps({"env": {"physics": {"fidelity": "coarse"}}}))
     assert command() == as_trained  # from before there was this setting
-    (folder / "evaluation.json").write_text(json.dumps({"env": {"drive": {"bone_contact": False}}}))
-    assert set(command()) - set(as_trained) == {"drive.bone_contact=false"}
-    assert command(True) == (*as_trained[:2], "drive.bone_contact=true", *as_trained[2:])
+    (folder / "evaluation.json").write_text(json.dumps({"env": {"control": {"bone_contact": False}}}))
+    assert set(command()) - set(as_trained) == {"control.bone_contact=false"}
+    assert command(True) == (*as_trained[:2], "control.bone_contact=true", *as_trained[2:])
 
 
 def test_kept_policies_were_scored_in_the_environment_as_it_comes():

@@ -96,7 +96,7 @@ class Each:
             )
         if name in self._own or name in _SINGLE or name in _ELSEWHERE or hasattr(type(self), name):
             raise ValueError(f"set_attr({name!r}): it is what the environments are made with; make others")
-        if any(name in (key, key.rpartition(".")[2]) for key in setting_keys(type(self.config))):
+        if any(name in (key, *key.split(".")) for key in setting_keys(type(self.config))):
             raise ValueError(
                 f"set_attr({name!r}): settings hold for as long as the environments live; make others with {name}=..., "
                 "or have episodes draw it from a range, where the settings have one"

@@ -3,11 +3,12 @@
 A configuration is an :class:`EnvConfig` (or a task's subclass of it, one level deep) with one section for each part of
 the simulation. Every field has a default, so a YAML file or a keyword of ``gym.make`` only says what differs::
 
-    config = load_config(ReachConfig, "overrides.yaml", {"drive.tone": 0.3, "fidelity": "tiny"})
+    config = load_config(ReachConfig, "overrides.yaml", {"control.tone": 0.3, "fidelity": "tiny"})
     print(dump_yaml(config))
 
-Keys are nested (``drive: {tone: 0.3}``) or dotted (``drive.tone``); where only one section has a setting of that name,
-the bare name is enough (``tone``), which lets ``gym.make(ID, fidelity="coarse")`` work.
+Keys are nested (``control: {tone: 0.3}``) or dotted (``control.tone``); where only one section has a setting of that
+name, the bare name is enough (``tone``), which lets ``gym.make(ID, fidelity="coarse")`` work. The section ``control``
+has one of two sets of settings, by its ``mode``; ``control="pd"`` is short for ``control={"mode": "pd"}``.
 """
 
 from piavatar_envs.config.errors import ConfigError
@@ -16,17 +17,19 @@ from piavatar_envs.config.schema import (
     FROZEN,
     AvatarConfig,
     ColliderConfig,
-    DriveConfig,
+    ControlConfig,
     EnvConfig,
     FrozenDict,
     PairFriction,
     PhysicsConfig,
+    PoseControlConfig,
     PropConfig,
     RandomizeConfig,
     RegionConfig,
     RenderConfig,
     SceneConfig,
     ShapeConfig,
+    TorqueControlConfig,
 )
 
 __all__ = [
@@ -34,17 +37,19 @@ __all__ = [
     "AvatarConfig",
     "ColliderConfig",
     "ConfigError",
-    "DriveConfig",
+    "ControlConfig",
     "EnvConfig",
     "FrozenDict",
     "PairFriction",
     "PhysicsConfig",
+    "PoseControlConfig",
     "PropConfig",
     "RandomizeConfig",
     "RegionConfig",
     "RenderConfig",
     "SceneConfig",
     "ShapeConfig",
+    "TorqueControlConfig",
     "dump_yaml",
     "load_config",
     "parse_assignments",

@@ -8,10 +8,12 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 #: Most characters of a value in a message.
 MOST_SHOWN = 120
@@ -35,21 +37,36 @@ class ConfigError(ValueError):
 
 
 def setting_keys(cls: type[BaseModel]) -> tuple[str, ...]:
-    """The dotted names of all settings of ``cls``, in order, e.g. ``("physics.fidelity", ..., "obs_mode")``."""
-    keys: list[str] = []
+    """Return the dotted names of all settings of ``cls``, in order, e.g. ``("physics.fidelity", ..., "obs_mode")``."""
+    keys: dict[str, None] = {}
     for name, field in cls.model_fields.items():
-        section = section_of(field.annotation)
-        keys += [f"{name}.{key}" for key in setting_keys(section)] if section else [name]
+        models = models_of(field)
+        below = [f"{name}.{key}" for model in models for key in setting_keys(model)]
+        keys.update(dict.fromkeys(below if models else [name]))
     return tuple(keys)
 
 
 def section_of(annotation: Any) -> type[BaseModel] | None:
-    """The model that a field nests, or None for a plain value."""
+    """Return the model that a field nests, or None for a plain value."""
     return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
 
 
+def variants_of(field: FieldInfo) -> dict[str, type[BaseModel]]:
+    """Return the models of a discriminated union by the values of its tag; empty for any other field."""
+    if not isinstance(field.discriminator, str):
+        return {}
+    models = get_args(field.annotation)
+    return {tag: model for model in models for tag in get_args(model.model_fields[field.discriminator].annotation)}
+
+
+def models_of(field: FieldInfo) -> tuple[type[BaseModel], ...]:
+    """Return the models that a field may hold: one of a section, several of a union, none of a plain value."""
+    section = section_of(field.annotation)
+    return (section,) if section else tuple(dict.fromkeys(variants_of(field).values()))
+
+
 def entry_of(annotation: Any) -> type[BaseModel] | None:
-    """The model of a list's entries, or None for what is no list of models."""
+    """Return the model of a list's entries, or None for any other field."""
     return section_of(get_args(annotation)[0]) if get_origin(annotation) is tuple else None
 
 
@@ -82,75 +99,124 @@ _LIMITS = {
 }
 
 
+@dataclass(frozen=True)
+class _Place:
+    """The place of an error in a configuration.
+
+    Attributes:
+        key: its dotted name, without the tags of unions.
+        entry: the part of ``key`` up to the innermost entry of a list, with a dot at its end.
+        model: the innermost model on the way to it.
+        rest: the part of the way that begins in ``model``.
+        union: the field whose union ``model`` is one of, and its dotted name; None for other models.
+    """
+
+    key: str
+    entry: str
+    model: type[BaseModel]
+    rest: tuple[str | int, ...]
+    union: tuple[str, FieldInfo] | None = None
+
+    @property
+    def field(self) -> FieldInfo | None:
+        """The setting itself, or None where the model has none of that name."""
+        return self.model.model_fields.get(self.rest[0]) if self.rest else None
+
+
+def _locate(cls: type[BaseModel], loc: Sequence[str | int]) -> _Place:
+    """Follow ``loc`` from ``cls`` through sections, unions of them and lists of them."""
+    model, depth, entry, union = cls, 0, 0, None
+    parts: list[str] = []
+    while depth < len(loc) and loc[depth] in model.model_fields:
+        field, below = model.model_fields[loc[depth]], loc[depth + 1] if depth + 1 < len(loc) else None
+        variants, item = variants_of(field), entry_of(field.annotation)
+        if item and isinstance(below, int):
+            parts += [str(loc[depth]), str(below)]
+            model, depth, entry, union = item, depth + 2, len(parts), None
+        elif variants and below in variants:
+            parts.append(str(loc[depth]))
+            model, depth, union = variants[below], depth + 2, (".".join(parts), field)
+        elif section := section_of(field.annotation):
+            parts.append(str(loc[depth]))
+            model, depth, union = section, depth + 1, None
+        else:
+            break
+    rest = tuple(loc[depth:])
+    key = ".".join([*parts, *map(str, rest)])
+    return _Place(key, "".join(f"{part}." for part in parts[:entry]), model, rest, union)
+
+
 def error_line(cls: type[BaseModel], error: Mapping[str, Any], path: str | Path | None, given: set[str]) -> str:
-    """One validation error as ``[file: ]key=value must be LIMIT [unit]``.
+    """Write one validation error as ``[file: ]key=value must be LIMIT [unit]``.
 
     Args:
-        cls: the model that was to be.
-        error: what pydantic says is wrong.
+        cls: the model that was to be built.
+        error: an entry of pydantic's list of errors.
         path: the file that the settings are from, if they are from one.
         given: dotted keys that are not from there.
     """
-    loc, kind, context = error["loc"], error["type"], error.get("ctx", {})
-    key, cause = ".".join(str(part) for part in loc), context.get("error")
-    if isinstance(cause, ConfigError):  # of settings that were looked at by themselves
-        line = "; ".join(f"{key}.{part}" for part in cause.args)
+    place, kind, context = _locate(cls, error["loc"]), error["type"], error.get("ctx", {})
+    key, cause, value = place.key, context.get("error"), error["input"]
+    if isinstance(cause, ConfigError):  # of a part that was validated by itself
+        line = "; ".join(f"{key}.{part}" if key else part for part in cause.args)
+        key = line.partition("=")[0]
     elif kind == "extra_forbidden":
-        line = _unknown_key(cls, loc)
+        line = _unknown_key(cls, place, value)
     elif kind == "missing":
         line = f"{key} is missing, and has no default"
     else:
         if kind in _LIMITS:
             name, words = _LIMITS[kind]
-            rule = f"must be {words.format(context[name])}{_unit(cls, loc)}"
+            rule = f"must be {words.format(context[name])}{_unit(place)}"
         elif kind == "literal_error":
             rule = f"must be one of {context['expected']}"
+        elif kind == "union_tag_invalid":
+            tag = context["discriminator"].strip("'")
+            key, value, rule = f"{key}.{tag}", value[tag], f"must be one of {context['expected_tags']}"
         elif kind in _KINDS:
-            rule = f"must be {_KINDS[kind]}{_unit(cls, loc)}"
+            rule = f"must be {_KINDS[kind]}{_unit(place)}"
         else:
             rule = f"is refused: {cause or error['msg']}"
-        line = f"{key or cls.__name__}={shown(error['input'])} {rule}"
+        line = f"{key or cls.__name__}={shown(value)} {rule}"
     from_file = path is not None and not any(key == one or key.startswith(f"{one}.") for one in given)
     return f"{path}: {line}" if from_file else line
 
 
-def _holder(cls: type[BaseModel], loc: Sequence[str | int]) -> tuple[type[BaseModel], int]:
-    """The innermost model on the way to ``loc``, through sections and lists of them, and how long the way to it is."""
-    held, depth = cls, 0
-    while depth < len(loc) and loc[depth] in held.model_fields:
-        annotation = held.model_fields[loc[depth]].annotation
-        entry = entry_of(annotation) if len(loc) > depth + 1 and isinstance(loc[depth + 1], int) else None
-        inner = entry or section_of(annotation)
-        if inner is None:
-            break
-        held, depth = inner, depth + (2 if entry else 1)
-    return held, depth
-
-
-def _unit(cls: type[BaseModel], loc: Sequence[str | int]) -> str:
-    """The unit that ends the description of the setting at ``loc``, with a space before it, or nothing."""
-    held, depth = _holder(cls, loc)
-    field = held.model_fields.get(loc[depth]) if depth < len(loc) else None
-    found = re.search(r" (\[[^\]\d-][^\]]*\])", (field.description or "") if field else "")
+def _unit(place: _Place) -> str:
+    """Return the unit that ends the description of the setting, with a space before it, or nothing."""
+    found = re.search(r" (\[[^\]\d-][^\]]*\])", (place.field.description or "") if place.field else "")
     return f" {found[1]}" if found else ""
 
 
-def _unknown_key(cls: type[BaseModel], loc: Sequence[str | int]) -> str:
-    """That there is no setting at ``loc``, and which one may have been meant; in an entry of a list, one of its own."""
-    held, depth = _holder(cls, loc)
-    if not any(isinstance(part, int) for part in loc):
-        held, depth = cls, 0  # of all sections: what is asked for may be in another one
-    entry = "".join(f"{part}." for part in loc[:depth])
-    key = ".".join(str(part) for part in loc[depth:])
-    names = setting_keys(held)
+def _unknown_key(cls: type[BaseModel], place: _Place, value: Any) -> str:
+    """Say that there is no such setting, and name a close one; in an entry of a list, one of the entry's own."""
+    if place.union and (line := _other_variant(place, value)):
+        return line
+    held = place.model if place.entry else cls  # of all sections: the setting may be in another one
+    key, names = place.key.removeprefix(place.entry), setting_keys(held)
     section, _, leaf = key.rpartition(".")
-    if loc[0] in _ELSEWHERE and len(loc) == 1:
+    if key in _ELSEWHERE and not place.entry:
         return f"{key} is no setting of {held.__name__}; {_ELSEWHERE[key]}"
     leaves = {name.rpartition(".")[2]: name for name in reversed(names)}
     close = difflib.get_close_matches(leaf, leaves, n=1, cutoff=0.6)
     sections = [name for name in held.model_fields if name not in names and name != section]
     near = leaves[close[0]] if close else next(iter(difflib.get_close_matches(leaf, sections, n=1)), None)
     if near:
-        return f"{entry}{key} is no setting of {held.__name__}; did you mean {entry}{near}?"
+        return f"{place.key} is no setting of {held.__name__}; did you mean {place.entry}{near}?"
     siblings = [name for name in names if name.startswith(f"{section}.")] if section else list(held.model_fields)
-    return f"{entry}{key} is no setting of {held.__name__}; there are {', '.join(siblings or names)}"
+    return f"{place.key} is no setting of {held.__name__}; there are {', '.join(siblings or names)}"
+
+
+def _other_variant(place: _Place, value: Any) -> str | None:
+    """Say which variants of a union have the setting; None if none has it."""
+    name, field = place.union
+    variants = variants_of(field)
+    tags = [tag for tag, model in variants.items() if place.rest[0] in model.model_fields]
+    own = [tag for tag, model in variants.items() if model is place.model]
+    if not tags:
+        return None
+    tag, those = f"{name}.{field.discriminator}", " or ".join(map(repr, tags))
+    return (
+        f"{place.key}={shown(value)} belongs to {tag}={those}, and has no effect under {' or '.join(map(repr, own))}; "
+        f"leave it out, or set {tag}={tags[0]!r}"
+    )

@@ -15,14 +15,16 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from piavatar_envs.config.errors import (
     ConfigError,
     entry_of,
     error_line,
-    section_of,
+    models_of,
     setting_keys,
     shown,
+    variants_of,
 )
 
 Config = TypeVar("Config", bound=BaseModel)
@@ -67,7 +69,7 @@ def load_config(
     path = source if isinstance(source, (str, Path)) else None
     base = _expand(cls, _read_settings(cls, Path(path)) if path is not None else _settings("config", source))
     above = _expand(cls, _settings("overrides", overrides))
-    merged = _merge(base, above)
+    merged = _merge(_without_replaced_variants(cls, base, above), above)
     merged = _merge(_own_defaults(cls, merged), merged)
     try:
         # JSON is what YAML, keywords and command lines have in common: a list may be a tuple, a string is no number.
@@ -78,7 +80,7 @@ def load_config(
 
 
 def replace(config: Config, overrides: Mapping[str, Any] | None = None, /, **settings: Any) -> Config:
-    """A validated copy of ``config`` with settings changed: ``replace(config, {"drive.tone": 0}, fidelity="tiny")``.
+    """A validated copy of ``config`` with settings changed: ``replace(config, {"control.tone": 0}, fidelity="tiny")``.
 
     Raises:
         ConfigError: as :func:`load_config`.
@@ -93,7 +95,7 @@ def dump_yaml(config: BaseModel) -> str:
 
 
 def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
-    """Overrides from a command line: ``["drive.tone=0.3", "fidelity=tiny"]``, the values read as YAML.
+    """Overrides from a command line: ``["control.tone=0.3", "fidelity=tiny"]``, the values read as YAML.
 
     Raises:
         ConfigError: an assignment has no ``=``, its value is not YAML, or a key comes twice.
@@ -102,7 +104,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not equals or not key.strip():
-            raise ConfigError(f"{assignment!r} is not an override; write KEY=VALUE, e.g. drive.tone=0.3")
+            raise ConfigError(f"{assignment!r} is not an override; write KEY=VALUE, e.g. control.tone=0.3")
         if key.strip() in overrides:
             raise ConfigError(f"{key.strip()} is given twice, last as {text!r}; give it once")
         try:
@@ -153,39 +155,56 @@ def _settings(what: str, given: Any) -> Mapping[str, Any] | BaseModel:
     return given
 
 
-def _expand(cls: type[BaseModel], settings: Mapping[str, Any] | BaseModel, prefix: str = "") -> dict[str, Any]:
-    """Dotted and bare keys to nested mappings; refuses a setting that is given twice."""
+def _expand(
+    cls: type[BaseModel] | tuple[type[BaseModel], ...], settings: Mapping[str, Any] | BaseModel, prefix: str = ""
+) -> dict[str, Any]:
+    """Turn dotted and bare keys into nested mappings.
+
+    Args:
+        cls: the model that is to be built; several where it is one of a union.
+        settings: by nested, dotted or bare name.
+        prefix: dotted name of the section that they are in, with a dot at its end.
+
+    Raises:
+        ConfigError: a name is no string or has an empty part, or a setting is given twice.
+    """
     if isinstance(settings, BaseModel):
         return settings.model_dump(mode="json")
+    models = cls if isinstance(cls, tuple) else (cls,)
     nested: dict[str, Any] = {}
     for key, value in settings.items():
         if not isinstance(key, str):
             raise ConfigError(f"{prefix}{key!r} is of type {type(key).__name__}; {_NAMES}")
         if "" in key.split("."):
-            raise ConfigError(f"{prefix}{key!r} is no name of a setting; names are as drive.tone, without empty parts")
-        head, _, rest = (key if prefix else _qualified(cls, key)).partition(".")
-        annotation = cls.model_fields[head].annotation if head in cls.model_fields else None
-        section, entry = section_of(annotation), entry_of(annotation)
-        if rest:
-            value = {rest: value}
-        if section and value is None:
-            value = {}  # a section whose lines are all commented out
-        elif section and head in section.model_fields and not isinstance(value, (Mapping, BaseModel)):
-            value = {head: value}  # drive="target" means drive.drive
-        if section and isinstance(value, (Mapping, BaseModel)):
-            value = _expand(section, value, f"{prefix}{head}.")
-        elif isinstance(value, (Mapping, BaseModel)):
-            value = dict(value)
-        elif entry and isinstance(value, (list, tuple)):
-            value = [
-                _expand(entry, item, f"{prefix}{head}.{index}.") if isinstance(item, (Mapping, BaseModel)) else item
-                for index, item in enumerate(value)
-            ]
+            raise ConfigError(
+                f"{prefix}{key!r} is no name of a setting; write names without empty parts, as control.tone"
+            )
+        head, _, rest = (key if prefix else _qualified(models[0], key)).partition(".")
+        field = next((model.model_fields[head] for model in models if head in model.model_fields), None)
+        value = _expand_value(field, {rest: value} if rest else value, f"{prefix}{head}.")
         twice = set(_flat_keys({head: value})) & set(_flat_keys(nested))
         if twice:
             raise ConfigError(f"{prefix}{min(twice)} is given twice, last as {shown(value)}; give it once")
         nested = _merge(nested, {head: value})
     return nested
+
+
+def _expand_value(field: FieldInfo | None, value: Any, prefix: str) -> Any:
+    """Expand the value of a section, of a union of sections, or of a list of them; return any other as it is."""
+    models = models_of(field) if field else ()
+    if models and value is None:
+        return {}  # a section whose lines are all commented out
+    if field and variants_of(field) and not isinstance(value, (Mapping, BaseModel)):
+        return {field.discriminator: value}  # control="pd" is short for control.mode="pd"
+    if isinstance(value, (Mapping, BaseModel)):
+        return _expand(models, value, prefix) if models else dict(value)
+    entry = entry_of(field.annotation) if field else None
+    if entry and isinstance(value, (list, tuple)):
+        return [
+            _expand(entry, item, f"{prefix}{index}.") if isinstance(item, (Mapping, BaseModel)) else item
+            for index, item in enumerate(value)
+        ]
+    return value
 
 
 def _qualified(cls: type[BaseModel], key: str) -> str:
@@ -207,14 +226,42 @@ def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
+def _without_replaced_variants(
+    cls: type[BaseModel], base: Mapping[str, Any], top: Mapping[str, Any]
+) -> Mapping[str, Any]:
+    """Drop from ``base`` the settings of a union's variant that ``top`` replaces by another one."""
+    kept = dict(base)
+    for name, field in cls.model_fields.items():
+        if not variants_of(field) or not isinstance(base.get(name), Mapping) or not isinstance(top.get(name), Mapping):
+            continue
+        before = _variant(field, base[name])
+        after = _variant(field, {field.discriminator: base[name].get(field.discriminator, ...)} | top[name])
+        if before and before is not after:
+            kept[name] = {key: value for key, value in base[name].items() if key not in before.model_fields}
+    return kept
+
+
+def _variant(field: FieldInfo, settings: Mapping[str, Any]) -> type[BaseModel] | None:
+    """Return the model that ``settings`` choose from a union, by default that of the field's default; None for none."""
+    tag = settings.get(field.discriminator, ...)
+    if tag is ...:
+        return type(field.get_default(call_default_factory=True))
+    return variants_of(field).get(tag) if isinstance(tag, str) else None
+
+
 def _own_defaults(cls: type[BaseModel], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Defaults by ``cls`` of the sections of which ``settings`` has some: a task's may not be the section's own."""
-    sections = {name: field for name, field in cls.model_fields.items() if section_of(field.annotation)}
-    return {
-        name: field.get_default(call_default_factory=True).model_dump(mode="json")
-        for name, field in sections.items()
-        if isinstance(settings.get(name), Mapping) and not field.is_required()
-    }
+    """Return the defaults by ``cls`` of the sections that ``settings`` mention: a task's may not be the section's own.
+
+    Of a union, those of another variant than the default's are its own; only the tag must then be given.
+    """
+    defaults: dict[str, Any] = {}
+    for name, field in cls.model_fields.items():
+        if not models_of(field) or not isinstance(settings.get(name), Mapping) or field.is_required():
+            continue
+        default = field.get_default(call_default_factory=True)
+        if not variants_of(field) or _variant(field, settings[name]) is type(default):
+            defaults[name] = default.model_dump(mode="json")
+    return defaults
 
 
 def _flat_keys(nested: Mapping[str, Any], prefix: str = "") -> list[str]:

@@ -1,4 +1,4 @@
-"""Sections of a configuration: the continuum, the drive, the body's shape, what episodes vary, pictures.
+"""Sections of a configuration: the continuum, the control, the body's shape, what episodes vary, pictures.
 
 What is in a world besides the ground: avatars, soft props and analytic colliders, and how they touch.
 """
@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config.load import ConfigError, load_config
@@ -102,42 +102,16 @@ class PhysicsConfig(BaseModel):
     friction: float = Field(0.8, ge=0.0, le=10.0, description="Coulomb coefficient of the ground; walls are smooth [-]")
 
 
-class DriveConfig(BaseModel):
-    """How actions move the body, and what holds it up."""
+class PoseControlConfig(BaseModel):
+    """Actions move a commanded pose, which the body follows; a bounded wrench may hold the commanded root."""
 
     model_config = FROZEN
 
-    control: Literal["pose", "pd", "torque"] = Field(
-        "pose",
-        description="what actions are: pose (increments of a pose that moves the body), pd (joint targets of springs "
-        "with limited torques) or torque (torques of the joints); root_assist to bone_contact are for pd and torque, "
-        "all other settings of this section for pose",
-    )
-    root_assist: float = Field(
-        0.0, ge=0.0, le=1.0, description="help for the pelvis from outside: 0 none, 1 springs that nearly hold it [-]"
-    )
-    joint_stiffness: float = Field(
-        1.0, ge=0.0, le=1.0e6, description="factor on the stiffness of the joints' springs [-]"
-    )
-    joint_damping: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the damping of the joints' springs [-]")
-    strength: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the greatest torques of the joints [-]")
-    flesh_rate: Annotated[tuple[Rate, Rate], AfterValidator(_check_flesh_rate)] = Field(
-        (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
-    )
-    firm_bones: bool = Field(
-        True,
-        description="whether particles of bones, which slip from them under load, are put into their places after "
-        "every control step, unless these lie beyond a surface: tracked bones stay together",
-    )
-    bone_contact: bool = Field(
-        True,
-        description="whether bones stop at the floor and at colliders, a millimetre before; else only flesh does, and "
-        "bones go through it into them",
-    )
-    drive: Literal["increment", "target"] = Field(
+    mode: Literal["pose"] = Field("pose", description="pose: actions are increments of a pose that moves the body")
+    command: Literal["increment", "target"] = Field(
         "increment",
-        description="increment (the tracked pose plus the command's change) or target (to the command's absolute pose; "
-        "only for undisturbed reproduction)",
+        description="increment (the tracked pose moves by the command's change) or target (the tracked pose moves to "
+        "the commanded one; only for undisturbed reproduction)",
     )
     tone: float = Field(1.0, ge=0.0, le=1.0, description="resistance of the pose to contact: 0 limp, 1 tensed [-]")
     alpha: float = Field(0.3, ge=0.0, le=1.0, description="shape preservation, as a share of a control step [-]")
@@ -159,27 +133,72 @@ class DriveConfig(BaseModel):
         description="take the rigid part out of commanded motion, so that it carries no unreacted momentum; null where "
         "nothing holds the root",
     )
-    max_force_weight: float = Field(2.0, ge=0.0, le=1000.0, description="largest root force, in body weights [m g]")
-    max_torque_weight: float = Field(
+    max_root_force: float = Field(2.0, ge=0.0, le=1000.0, description="largest root force, in body weights [m g]")
+    max_root_torque: float = Field(
         0.7, ge=0.0, le=1000.0, description="largest root torque, in metres of body weight [m * m g]"
     )
-    let_go_tilt: float = Field(
-        math.radians(45.0), gt=0.0, le=math.pi, description="tilt error at which the root wrench lets go [rad]"
+    release_tilt: float = Field(
+        math.radians(45.0), gt=0.0, le=math.pi, description="tilt error at which the root wrench is released [rad]"
     )
-    let_go_distance: float = Field(
+    release_distance: float = Field(
         0.5,
         gt=0.0,
         le=FARTHEST,
-        description="horizontal error at which the root wrench lets go, until the next reset [m]",
+        description="horizontal error at which the root wrench is released, until the next reset [m]",
     )
-    let_go_height: float = Field(
-        0.4, gt=0.0, le=FARTHEST, description="height error at which the root wrench lets go [m]"
+    release_height: float = Field(
+        0.4, gt=0.0, le=FARTHEST, description="height error at which the root wrench is released [m]"
     )
 
     @property
     def moves_freely(self) -> bool:
-        """Whether commanded motion has its rigid part taken out: ``free_motion``, where that is null, too."""
+        """Whether commanded motion has its rigid part taken out: ``free_motion``, or its default where it is null."""
         return self.root == "free" if self.free_motion is None else self.free_motion
+
+
+class TorqueControlConfig(BaseModel):
+    """Joints move under torques: those of springs towards joint targets (pd), or the actions themselves (torque)."""
+
+    model_config = FROZEN
+
+    mode: Literal["pd", "torque"] = Field(
+        "pd", description="pd: joint targets of springs with limited torques; torque: torques of the joints"
+    )
+    root_assist: float = Field(
+        0.0, ge=0.0, le=1.0, description="external support of the pelvis: 0 none, 1 springs that nearly hold it [-]"
+    )
+    joint_stiffness: float = Field(
+        1.0, ge=0.0, le=1.0e6, description="factor on the stiffness of the joints' springs [-]"
+    )
+    joint_damping: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the damping of the joints' springs [-]")
+    strength: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the greatest torques of the joints [-]")
+    flesh_rate: Annotated[tuple[Rate, Rate], AfterValidator(_check_flesh_rate)] = Field(
+        (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
+    )
+    firm_bones: bool = Field(
+        True,
+        description="return particles of bones, which slip from them under load, to their places after every control "
+        "step, unless these lie beyond a surface: tracked bones stay together",
+    )
+    bone_contact: bool = Field(
+        True,
+        description="stop bones a millimetre before the floor and colliders; otherwise only flesh stops, and bones "
+        "sink through it into them",
+    )
+
+    @property
+    def joint_speed_limit(self) -> float:
+        """Zero: neither a target nor a torque commands a speed [rad/s]."""
+        return 0.0
+
+    @property
+    def soft_tissue(self) -> float:
+        """Zero: no commanded motion, so no flesh that misses its changes [-]."""
+        return 0.0
+
+
+#: The settings of either kind of control; those of the other kind are refused.
+ControlConfig = Annotated[PoseControlConfig | TorqueControlConfig, Field(discriminator="mode")]
 
 
 class ShapeConfig(BaseModel):
@@ -285,11 +304,40 @@ def _of_flesh(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     return settings
 
 
-def _of_drive(settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Likewise."""
-    if "control" in settings:
-        raise ConfigError("control cannot differ between avatars; set it for the environment")
-    return settings
+class AvatarControl(BaseModel):
+    """The section ``control`` by itself, in which an avatar's own settings of it are validated."""
+
+    model_config = FROZEN
+
+    control: ControlConfig
+
+
+def _check_control(mode: str, settings: Mapping[str, Any], place: str = "") -> None:
+    """Refuse settings of an avatar that ``mode`` does not have, or out of their range.
+
+    Args:
+        mode: what actions are.
+        settings: by name.
+        place: the dotted name of the avatar, with a dot at its end, for the message.
+    """
+    try:
+        load_config(AvatarControl, {"control": {"mode": mode, **settings}})
+    except ConfigError as error:
+        raise ConfigError(*(f"{place}{part}" for part in error.args)) from None
+
+
+def _of_control(settings: Mapping[str, Any]) -> FrozenDict:
+    """Refuse ``mode``, which is the environment's, and settings that no mode has, or out of their range."""
+    if "mode" in settings:
+        raise ConfigError(f"mode={settings['mode']!r} cannot differ between avatars; set control.mode")
+    pose = {name: value for name, value in settings.items() if name not in TorqueControlConfig.model_fields}
+    torque = {name: value for name, value in settings.items() if name not in pose}
+    try:
+        _check_control("pose", pose)
+        _check_control("pd", torque)
+    except ConfigError as error:
+        raise ConfigError(*(part.removeprefix("control.") for part in error.args)) from None
+    return FrozenDict(settings)
 
 
 def _settings_of(section: type[BaseModel]) -> AfterValidator:
@@ -357,8 +405,8 @@ class AvatarConfig(BaseModel):
         default_factory=dict,
         description="material, young_modulus, soft_young_modulus, poisson_ratio or density of its flesh",
     )
-    drive: Annotated[dict[str, Any], AfterValidator(_of_drive), _settings_of(DriveConfig)] = Field(
-        default_factory=dict, description="settings of its drive, such as tone"
+    control: Annotated[dict[str, Any], AfterValidator(_of_control)] = Field(
+        default_factory=dict, description="settings of its control, such as tone; all avatars have the same mode"
     )
     shape: Annotated[dict[str, Any], _settings_of(ShapeConfig)] = Field(
         default_factory=dict, description="settings of its shape"
@@ -463,7 +511,7 @@ class EnvConfig(BaseModel):
     model_config = FROZEN
 
     physics: PhysicsConfig = Field(default_factory=PhysicsConfig, description="the continuum")
-    drive: DriveConfig = Field(default_factory=DriveConfig, description="how poses move the body")
+    control: ControlConfig = Field(default_factory=PoseControlConfig, description="how actions move the body")
     shape: ShapeConfig = Field(default_factory=ShapeConfig, description="the body's shape")
     randomize: RandomizeConfig = Field(
         default_factory=RandomizeConfig, description="what every episode draws anew, besides the task and the shape"
@@ -482,3 +530,10 @@ class EnvConfig(BaseModel):
     obs_mode: Literal["flat", "dict"] = Field(
         "flat", description="observations as one float32 vector (flat) or by name (dict)"
     )
+
+    @model_validator(mode="after")
+    def _check_avatars(self) -> EnvConfig:
+        """Refuse an avatar's settings of another mode than the environment's."""
+        for index, avatar in enumerate(self.scene.avatars):
+            _check_control(self.control.mode, avatar.control, f"scene.avatars.{index}.")
+        return self

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +11,6 @@ import warp as wp
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.avatar.pose_control.controller import AvatarDrive
 from piavatar_envs.avatar.torque_control.controller import checked_assist
-from piavatar_envs.config.idle import idle_settings
 from piavatar_envs.core.launch_graph import LaunchGraph, compile_graphs
 from piavatar_envs.envs.actions import apply_actions, apply_targets, apply_torques, follow_reference, refuse_nonfinite
 from piavatar_envs.envs.episodes import (
@@ -66,16 +64,14 @@ class BatchEnv(EpisodeArrays):
     """
 
     def __init__(self, task: Task, num_envs: int = 1, device: str = "cpu", seed: int = 0) -> None:
-        """Build everything; call :meth:`reset` before :meth:`step`. Warns of settings that have no effect.
+        """Build everything; call :meth:`reset` before :meth:`step`.
 
         Raises:
             ConfigError: the task would place a prop outside the domain.
             ValueError: a bad device, batch or time step; see :class:`Simulation`.
         """
         check_count("num_envs", num_envs)
-        for warning in idle_settings(task.config):
-            warnings.warn(warning, stacklevel=2)
-        self.task, self.config, self.control = task, task.config, task.config.drive.control
+        self.task, self.config, self.control = task, task.config, task.config.control.mode
         simulation = Simulation(
             task.config,
             num_envs,
@@ -232,7 +228,7 @@ class BatchEnv(EpisodeArrays):
     # state
 
     def assist_root(self, share: float | np.ndarray) -> None:
-        """Set the share of root assistance from now on (``drive.root_assist``), for ``control="pd"`` and ``"torque"``.
+        """Set the share of root assistance from now on (``control.root_assist``), for ``control="pd"`` and ``"torque"``.
 
         Args:
             share: from 0, none, to 1; of all environments, or of each, shape ``(num_envs,)``. Resets leave it.

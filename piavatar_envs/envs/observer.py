@@ -49,7 +49,7 @@ class Observer:
         terms = [*SELF_TERMS]
         if task.observes_contact:
             terms += CONTACT_TERMS
-        if task.config.drive.control != "pose":
+        if task.config.control.mode != "pose":
             terms += JOINT_TERMS
         self._first_prop = sum(term.size for term in terms)
         for name in task.observed_props():

@@ -201,7 +201,7 @@ class Task:
 
     def action_spec(self) -> ActionSpec:
         """Joints that act, and whether the root does."""
-        return ActionSpec(self.joints, joint_speed=self.config.drive.joint_speed_limit)
+        return ActionSpec(self.joints, joint_speed=self.config.control.joint_speed_limit)
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of the joints' rotation vectors [rad], each ``(22, 3)``."""

@@ -28,7 +28,15 @@ from piavatar_envs.avatar.body.soft_tissue import bone_distance, inert_share, so
 from piavatar_envs.avatar.pose_control.controller import AvatarDrive
 from piavatar_envs.avatar.torque_control.controller import JointSettings
 from piavatar_envs.avatar.types import DriveSettings
-from piavatar_envs.config import AvatarConfig, ConfigError, DriveConfig, EnvConfig, RegionConfig, ShapeConfig
+from piavatar_envs.config import (
+    AvatarConfig,
+    ConfigError,
+    ControlConfig,
+    EnvConfig,
+    PoseControlConfig,
+    RegionConfig,
+    ShapeConfig,
+)
 from piavatar_envs.config import replace as changed
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.observations import Parameter
@@ -157,20 +165,21 @@ def take_vectors(
 NUM_PARTS = len(BODY_PARTS)
 
 
-def drive_settings(d: DriveConfig) -> DriveSettings:
-    """The drive's parameters of a configuration."""
+def drive_settings(control: ControlConfig) -> DriveSettings:
+    """Return the parameters of a drive; those of commanded poses are the defaults under torques."""
+    d = control if isinstance(control, PoseControlConfig) else PoseControlConfig()
     return DriveSettings(
-        mode=d.drive,
+        mode=d.command,
         tone=d.tone,
         alpha=d.alpha,
         shape_preservation=d.shape_preservation,
         root=d.root,
         free_motion=d.moves_freely,
-        max_force=d.max_force_weight,
-        max_torque=d.max_torque_weight,
-        max_tilt=d.let_go_tilt,
-        max_horizontal_error=d.let_go_distance,
-        max_height_error=d.let_go_height,
+        max_force=d.max_root_force,
+        max_torque=d.max_root_torque,
+        max_tilt=d.release_tilt,
+        max_horizontal_error=d.release_distance,
+        max_height_error=d.release_height,
     )
 
 
@@ -190,7 +199,7 @@ class Flesh:
     """One avatar's matter in every environment of a batch.
 
     Attributes:
-        physics, drive, shape: the environment's sections with the avatar's own settings laid over them.
+        physics, control, shape: the environment's sections with the avatar's own settings laid over them.
         asset, sampled: the body, and its particles in the mean shape.
         pool: bodies that episodes draw from on the device, or None.
         part: index into ``BODY_PARTS`` of every particle, shape ``(P,)`` int32.
@@ -205,7 +214,7 @@ class Flesh:
             ConfigError: a region holds nothing, or there is no shape parameter of that name.
         """
         self.physics = changed(config.physics, avatar.physics)
-        self.drive = changed(config.drive, avatar.drive)
+        self.control = changed(config.control, avatar.control)
         self.shape = changed(config.shape, avatar.shape)
         self.avatar, self.asset, self.sampled, self.num_envs = avatar, asset, sampled, num_envs
         self.base_parameters = shape_parameters(asset, self.shape)
@@ -222,7 +231,7 @@ class Flesh:
     @property
     def settings(self) -> tuple:
         """All that decides which bodies are drawn: avatars with equal settings have equal ones."""
-        return self.physics, self.shape, self.drive.soft_tissue, self.avatar.regions
+        return self.physics, self.shape, self.control.soft_tissue, self.avatar.regions
 
     @property
     def drawn_on_host(self) -> bool:
@@ -264,7 +273,7 @@ class Flesh:
             skin_joints=sampled.skin_joints,
             skin_weights=sampled.skin_weights,
             bone=sampled.bone,
-            inert=inert_share(self.drive.soft_tissue, self._softness(rest))[None],
+            inert=inert_share(self.control.soft_tissue, self._softness(rest))[None],
         )
         return points, volume[None]
 
@@ -274,26 +283,26 @@ class Flesh:
         Raises:
             ConfigError: torques, or a root that is held, with a scheme of one velocity.
         """
-        d = self.drive
-        held = d.control != "pose" or d.root == "wrench"
+        control = self.control
+        held = control.mode != "pose" or control.root == "wrench"
         if held and self.physics.decoupling in ("paper", "none"):
-            what = "root='wrench'" if d.control == "pose" else f"control={d.control!r}"
-            remedy = "split or no_stress" + (", or drive.root=free" if d.control == "pose" else "")
+            what = "root='wrench'" if control.mode == "pose" else f"mode={control.mode!r}"
+            remedy = "split or no_stress" + (", or control.root=free" if control.mode == "pose" else "")
             raise ConfigError(
-                f"drive.{what} needs two velocities: physics.decoupling={self.physics.decoupling!r} has one; use "
+                f"control.{what} needs two velocities: physics.decoupling={self.physics.decoupling!r} has one; use "
                 f"{remedy}"
             )
-        if d.control == "pose":
+        if control.mode == "pose":
             return None
         sampled = self.sampled
         distance = bone_distance(sampled.rest_positions, sampled.bone)
         firm = firmness(sampled.skin_joints, sampled.skin_weights)
         return JointSettings(
-            muscles=make_muscles(d.joint_stiffness, d.joint_damping, d.strength),
-            assist=d.root_assist,
-            attachment=attachment_rates(sampled.depth, distance, firm, *d.flesh_rate),
-            firm=(sampled.bone >= 0) & d.firm_bones,
-            solid=d.bone_contact,
+            muscles=make_muscles(control.joint_stiffness, control.joint_damping, control.strength),
+            assist=control.root_assist,
+            attachment=attachment_rates(sampled.depth, distance, firm, *control.flesh_rate),
+            firm=(sampled.bone >= 0) & control.firm_bones,
+            solid=control.bone_contact,
         )
 
     def masses(self, volume: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.device import bone_masses
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index
-from piavatar_envs.config import AvatarConfig, ColliderConfig, ConfigError, DriveConfig, PropConfig, SceneConfig
+from piavatar_envs.config import AvatarConfig, ColliderConfig, ConfigError, ControlConfig, PropConfig, SceneConfig
 from piavatar_envs.mpm.colliders import COLLIDER_KINDS
 from piavatar_envs.sim.prop_geometry import PropPoints, primitive_distance
 from piavatar_envs.sim.props import turn_of
@@ -254,12 +254,12 @@ def lever(joints: Sequence[str], rest: np.ndarray, places: np.ndarray, bones: np
     return float(total.max())
 
 
-def commanded_speed(drive: DriveConfig, joints: Sequence[str], flesh: Sequence[Flesh]) -> float:
+def commanded_speed(control: ControlConfig, joints: Sequence[str], flesh: Sequence[Flesh]) -> float:
     """Greatest speed that commands to the acting joints give the flesh of posed bodies [m/s]; 0 under torques."""
-    if drive.control != "pose":
+    if control.mode != "pose":
         return 0.0
     levers = [lever(joints, one.points.rest[0], one.points.joints[0], one.sampled.skin_joints[:, 0]) for one in flesh]
-    return drive.joint_speed_limit * max(levers)
+    return control.joint_speed_limit * max(levers)
 
 
 def fastest_thing(

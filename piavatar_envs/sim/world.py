@@ -119,7 +119,7 @@ class Simulation:
         first, count, fields = self.subjects.first, len(self.flesh), self.model.contact.num_fields
         self.collider_spawn = make_boundaries(self.subjects.colliders, fields, num_envs, self.device)
         self.avatars = [
-            AvatarDrive(flesh.points, first[index], self.model, drive_settings(flesh.drive), joints[index])
+            AvatarDrive(flesh.points, first[index], self.model, drive_settings(flesh.control), joints[index])
             for index, flesh in enumerate(self.flesh)
         ]
         # before anything is recorded: it gives what varies rows of its own
@@ -161,7 +161,7 @@ class Simulation:
             ConfigError: as configured they are too long for torques or for something fast, or more would be needed than
                 can be configured.
         """
-        physics, control, asked = self.config.physics, self.config.drive.control, self.config.physics.num_substeps
+        physics, control, asked = self.config.physics, self.config.control.mode, self.config.physics.num_substeps
         by_torques = 1 if control == "pose" else math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
         striking = fastest_thing(self.scene, solids, self.domain, physics.gravity)
         struck = fastest_blow(impulses, self.flesh, self.config.randomize.mass_factor[0])
@@ -177,10 +177,10 @@ class Simulation:
             if asked < by_torques:
                 raise ConfigError(
                     f"physics.num_substeps={asked}: substeps of {1e3 * physics.control_dt / asked:.3g} ms are too long "
-                    f"for drive.control={control!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {by_torques}"
+                    f"for control.mode={control!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {by_torques}"
                 )
             return asked
-        commanded = commanded_speed(self.config.drive, select_joints(self.config.joints), self.flesh)
+        commanded = commanded_speed(self.config.control, select_joints(self.config.joints), self.flesh)
         moving = max(commanded, STRUCK * striking[1], struck[1])
         waves = max(wave, self.subjects.matter.sound_speed())
         chosen = choose_num_substeps(physics.control_dt, self.dx, max(waves, physics.cfl * moving), physics.cfl)

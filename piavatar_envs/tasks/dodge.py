@@ -129,7 +129,7 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
     def action_spec(self) -> ActionSpec:
         config = self.config
         speed = speed_within(config.root_range, ROOT_SPEED, config.physics.control_dt)
-        return ActionSpec(self.joints, root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
+        return ActionSpec(self.joints, root=True, joint_speed=config.control.joint_speed_limit, root_speed=speed)
 
     def domain(self) -> Domain:
         return throwing_domain(self.config, self.place)

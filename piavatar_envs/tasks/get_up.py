@@ -11,7 +11,7 @@ from pydantic import Field
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.config import DriveConfig, EnvConfig
+from piavatar_envs.config import ControlConfig, EnvConfig, TorqueControlConfig
 from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Task
@@ -44,9 +44,7 @@ ASIDE = 3.0
 class GetUpConfig(EnvConfig):
     """Settings of GetUp."""
 
-    drive: DriveConfig = Field(
-        default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
-    )
+    control: ControlConfig = Field(default_factory=TorqueControlConfig, description="how actions move the body")
     upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
     still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")

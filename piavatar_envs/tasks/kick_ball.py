@@ -9,7 +9,7 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import joint_index
-from piavatar_envs.config import DriveConfig, EnvConfig, SceneConfig, replace
+from piavatar_envs.config import ControlConfig, EnvConfig, PoseControlConfig, SceneConfig, replace
 from piavatar_envs.config.schema import Place
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
 from piavatar_envs.envs.parameters import Drawn
@@ -48,8 +48,8 @@ _RIGHT_FOOT = wp.constant(joint_index("right_foot"))
 class KickBallConfig(EnvConfig):
     """Settings of KickBall."""
 
-    drive: DriveConfig = Field(
-        default_factory=lambda: DriveConfig(joint_speed_limit=7.0), description="how poses move the body"
+    control: ControlConfig = Field(
+        default_factory=lambda: PoseControlConfig(joint_speed_limit=7.0), description="how actions move the body"
     )
     episode_seconds: float = Field(3.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     joints: tuple[str, ...] | None = Field(KICKING, description="joints that act; null for all 21")

@@ -156,7 +156,7 @@ of the root, too: before each action it is brought back to within 0.1 m and 0.3 
         return Drawn(env.simulation.props.density[:, self.push.box], self.push.volume), Drawn(self.way)
 
     def action_spec(self) -> ActionSpec:
-        joint_speed = self.config.drive.joint_speed_limit
+        joint_speed = self.config.control.joint_speed_limit
         return ActionSpec(self.joints, root=True, joint_speed=joint_speed, root_speed=WALK, root_turn_speed=TURN)
 
     def domain(self) -> Domain:

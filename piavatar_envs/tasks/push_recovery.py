@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from piavatar_envs.config import DriveConfig, EnvConfig, PropConfig, SceneConfig, replace
+from piavatar_envs.config import ControlConfig, EnvConfig, PropConfig, SceneConfig, TorqueControlConfig, replace
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Task
@@ -41,9 +41,7 @@ BALL = "ball"
 class PushRecoveryConfig(EnvConfig):
     """Settings of PushRecovery."""
 
-    drive: DriveConfig = Field(
-        default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
-    )
+    control: ControlConfig = Field(default_factory=TorqueControlConfig, description="how actions move the body")
     upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
     still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
     fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")

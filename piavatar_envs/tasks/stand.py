@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from piavatar_envs.config import DriveConfig, EnvConfig
+from piavatar_envs.config import ControlConfig, EnvConfig, TorqueControlConfig
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks.common.fall import FallConfig
 from piavatar_envs.tasks.common.ground import Grounding
@@ -33,9 +33,7 @@ from piavatar_envs.tasks.common.upright import (
 class StandConfig(EnvConfig):
     """Settings of Stand."""
 
-    drive: DriveConfig = Field(
-        default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
-    )
+    control: ControlConfig = Field(default_factory=TorqueControlConfig, description="how actions move the body")
     upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
     still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
     fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")

@@ -179,7 +179,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         return Drawn(self.start, dt), Drawn(self.offset, dt)
 
     def action_spec(self) -> ActionSpec:
-        speed = self.config.drive.joint_speed_limit
+        speed = self.config.control.joint_speed_limit
         return ActionSpec(self.joints, root=self.config.root_action, joint_speed=speed)
 
     def domain(self) -> Domain:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.config import DriveConfig, EnvConfig
+from piavatar_envs.config import ControlConfig, EnvConfig, TorqueControlConfig
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.scene import Domain
@@ -63,9 +63,7 @@ _WAY_SIZE = 4
 class WalkConfig(EnvConfig):
     """Settings of Walk."""
 
-    drive: DriveConfig = Field(
-        default_factory=lambda: DriveConfig(control="pd"), description="how actions move the body"
-    )
+    control: ControlConfig = Field(default_factory=TorqueControlConfig, description="how actions move the body")
     upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
     gait: GaitConfig = Field(default_factory=GaitConfig, description="feet that bear the body in turn")
     fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
@@ -240,7 +238,7 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
         super().__init__(config)
         #: whether there is a clock
         self.clocked = config.gait.worth > 0.0
-        self.targets_about_reference = self.clocked and config.drive.control != "pose"
+        self.targets_about_reference = self.clocked and config.control.mode != "pose"
         check_gait(config.gait, config.target_speed, config.physics.control_dt)
 
     def terms(self) -> tuple[ObservationTerm, ...]:

@@ -13,7 +13,7 @@ from scripts.pages.markdown import code, number, page, table
 
 def actions_section(facts: Facts) -> str:
     """What the components of an action are, by default and under the other kinds of control."""
-    spec, dt, posed = facts.actions, facts.config.physics.control_dt, facts.config.drive.control == "pose"
+    spec, dt, posed = facts.actions, facts.config.physics.control_dt, facts.config.control.mode == "pose"
     lower, upper = np.degrees(facts.task.limits())
     joints, root = [], []
     for n, joint in enumerate(spec.joints):

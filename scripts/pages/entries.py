@@ -82,7 +82,7 @@ class Facts:
     @property
     def actions(self) -> ActionSpec:
         """What acts at the default settings."""
-        return self.task.action_spec().under(self.config.drive.control)
+        return self.task.action_spec().under(self.config.control.mode)
 
 
 def single_entries() -> list[Entry]:

@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from piavatar_envs.config import EnvConfig
+from piavatar_envs.config.errors import models_of, variants_of
 from scripts.pages.markdown import code, listed
 
 _SINGULAR = {float: "number", int: "integer", str: "text", bool: "truth value"}
@@ -61,7 +62,10 @@ def _sections(
     for key, field in model.model_fields.items():
         path, nested = f"{name}.{key}" if name else key, _model(field.annotation)
         value = getattr(values, key) if values is not None else _default(field)
-        other = getattr(usual, key, None)
+        other, variants = getattr(usual, key, None), variants_of(field)
+        if variants:
+            yield from _union(path, field, value, other)
+            continue
         if nested:
             inner = value if isinstance(value, BaseModel) else None
             below.append((path, field.description or "", nested, inner, other))
@@ -76,6 +80,26 @@ def _sections(
         yield Section(name, description, tuple(rows))
     for deeper in below:
         yield from _sections(*deeper)
+
+
+def _union(path: str, field: FieldInfo, value: BaseModel, usual: BaseModel | None) -> Iterator[Section]:
+    """The sections of a discriminated union: its tag, and the other settings of each model."""
+    tag, variants = field.discriminator, variants_of(field)
+    meaning = "; ".join(model.model_fields[tag].description or "" for model in models_of(field))
+    default = getattr(value, tag)
+    choices = listed(f'"{one}"' for one in variants)
+    own = default != getattr(usual, tag, None)
+    row = Setting(f"{path}.{tag}", shown(default), "", choices, meaning, own)
+    yield Section(path, field.description or "", (row,))
+    for model in models_of(field):
+        chosen, common = (one if type(one) is model else model() for one in (value, usual))
+        rows = [
+            _setting(f"{path}.{key}", inner, getattr(chosen, key), getattr(chosen, key) != getattr(common, key))
+            for key, inner in model.model_fields.items()
+            if key != tag
+        ]
+        modes = " or ".join(f'{tag}="{name}"' for name, one in variants.items() if one is model)
+        yield Section(path, f"with {modes}", tuple(rows))
 
 
 def _setting(key: str, field: FieldInfo, value: Any, own: bool) -> Setting:

@@ -188,13 +188,14 @@ def _costs(entry: Entry) -> str:
 
 def _episode(entry: Entry, facts: Facts) -> str:
     task, config = entry.task, facts.config
-    drive = config.drive
+    control = config.control
     ends = [task.termination_doc] if task.termination_doc else []
-    if drive.root == "wrench" and drive.control == "pose":
+    if control.mode == "pose" and control.root == "wrench":
         ends.append(
-            f"the root wrench lets go: the pelvis is off its commanded pose by {number(np.degrees(drive.let_go_tilt))} "
-            f"degrees of tilt (`let_go_tilt`), {number(drive.let_go_distance)} m horizontally (`let_go_distance`) or "
-            f"{number(drive.let_go_height)} m in height (`let_go_height`)"
+            "the root wrench is released: the pelvis is off its commanded pose by "
+            f"{number(np.degrees(control.release_tilt))} degrees of tilt (`release_tilt`), "
+            f"{number(control.release_distance)} m horizontally (`release_distance`) or "
+            f"{number(control.release_height)} m in height (`release_height`)"
         )
     failures = ", ".join(f"{code(name)} ({FAILURE_DOCS[name]})" for name in FAILURE_NAMES.values())
     ends.append(f'the simulation gives up; `info["failure"]` says why: {failures}')
@@ -239,7 +240,7 @@ def _arguments(entry: Entry, facts: Facts) -> str:
         f'{code(maker)} takes `render_mode` (`None`, `"rgb_array"`, or `"human"`: live in a web browser), `device` (of '
         'Warp: `"cpu"` or `"cuda:0"`), '
         f"{more}`config` (a mapping or a YAML file, where `None` is `null`) and, by keyword, every setting below: its "
-        'last name will do, as in `tone=0.3`; the whole one can be given as `**{"drive.tone": 0.3}`. The unit `-` is '
+        'last name will do, as in `tone=0.3`; the whole one can be given as `**{"control.tone": 0.3}`. The unit `-` is '
         "that of a pure number."
     )
     return page(

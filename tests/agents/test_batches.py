@@ -63,7 +63,7 @@ def test_every_episode_is_the_one_a_single_env_would_play(make_env, device):
     [
         ({"iteration": 10}, ["iteration is no setting of Training", "did you mean iterations"]),
         ({"num_envs": 0}, ["num_envs=0", ">= 1"]),
-        ({"env": {"tone": 7.0}}, ["env:", "drive.tone=7.0", "<= 1"]),
+        ({"env": {"tone": 7.0}}, ["env:", "control.tone=7.0", "<= 1"]),
         ({"env_id": "PIAvatar/Fly-v0"}, ["env_id", "Fly-v0", "PIAvatar/Reach-v0"]),
         ({"env": {"obs_mode": "dict"}}, ["obs_mode='dict'", "flat", "observe"]),
     ],
@@ -78,7 +78,7 @@ def test_the_command_line_wins_over_the_file(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_text("iterations: 7\nenv: {fidelity: tiny, tone: 0.5}\n")
     config = load_batched(Training, load_task, path, {"env.tone": 0.25, "iterations": 3})
-    assert config.iterations == 3 and config.env["drive"]["tone"] == 0.25
+    assert config.iterations == 3 and config.env["control"]["tone"] == 0.25
     assert config.env["physics"]["density"] == 1000.0, "defaults are said, too"
 
 

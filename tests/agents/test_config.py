@@ -31,7 +31,7 @@ def test_published_configurations_load_and_observe_what_there_is(path, device):
         ({"ppo": {"discount": 1.5}}, ["ppo.discount=1.5", "<= 1"]),
         ({"ppo.hidden": "large"}, ["ppo.hidden='large'", "list"]),
         ({"env": {"fidelty": "tiny"}}, ["env:", "fidelty", "did you mean physics.fidelity"]),
-        ({"env": {"tone": 7.0}}, ["env:", "drive.tone=7.0", "<= 1"]),
+        ({"env": {"tone": 7.0}}, ["env:", "control.tone=7.0", "<= 1"]),
         ({"env_id": "PIAvatar/Fly-v0"}, ["env_id", "Fly-v0", "PIAvatar/Reach-v0"]),
         ({"env": {"obs_mode": "dict"}}, ["obs_mode='dict'", "flat", "observe"]),
         ({"num_workers": 1, "ppo": {"rollout_steps": 8, "batch_size": 9}}, ["batch_size=9", "<= 8"]),

@@ -76,10 +76,10 @@ def test_a_resumed_training_has_the_help_that_it_would_have_had(device, tmp_path
 
 
 def test_what_cannot_be_helped_is_refused(device, tmp_path, capsys):
-    posed = ("env.drive.control=pose", "help={first: 0.5, rollouts: 3}", "iterations=1")
+    posed = ("env.control.mode=pose", "help={first: 0.5, rollouts: 3}", "iterations=1")
     with pytest.raises(SystemExit, match=r"help is for bodies under torques"):
         rsl_ppo.main([*FEW, *posed, "--device", device, "--out", str(tmp_path)])
-    both = ("env.drive.root_assist=0.1", "help={first: 0.5, rollouts: 3}", "iterations=1")
+    both = ("env.control.root_assist=0.1", "help={first: 0.5, rollouts: 3}", "iterations=1")
     with pytest.raises(SystemExit, match=r"root_assist=0.1 stays; give one of them"):
         rsl_ppo.main([*FEW, *both, "--device", device, "--out", str(tmp_path)])
     neither = ("help={first: 0.5}", "iterations=1")
@@ -90,12 +90,12 @@ def test_what_cannot_be_helped_is_refused(device, tmp_path, capsys):
 
 
 def test_lessons_are_for_learning_only(device, tmp_path, capsys):
-    lessons = "lessons={pose_noise: 0.3, drive.root_assist: 0.1}"
+    lessons = "lessons={pose_noise: 0.3, control.root_assist: 0.1}"
     config = load_batched(RslTraining, load_task, FEW[0], parse_assignments([*FEW[1:], lessons]))
     task = load_task(config.env_id)
     env = rsl_ppo.make_env(config, task(load_config(task.Config, config.env)), device)
-    assert env.config.pose_noise == 0.3 and env.config.drive.root_assist == 0.1
-    assert config.env["pose_noise"] == 0.05 and config.env["drive"]["root_assist"] == 0.0
+    assert env.config.pose_noise == 0.3 and env.config.control.root_assist == 0.1
+    assert config.env["pose_noise"] == 0.05 and config.env["control"]["root_assist"] == 0.0
     env.close()
     with pytest.raises(SystemExit, match=r"tail is no setting of StandConfig"):
         rsl_ppo.main([*FEW, "lessons={tail: 1}", "iterations=1", "--device", device, "--out", str(tmp_path)])
@@ -104,7 +104,7 @@ def test_lessons_are_for_learning_only(device, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("lesson", "told"),
     [
-        ("drive.control: pd", "drive.control"),
+        ("control.mode: pd", "control.mode"),
         ("joints: [left_hip]", "its actions"),
         ("observe_parameters: true", "observe_parameters"),
     ],

@@ -48,7 +48,7 @@ def test_twice_is_as_before_and_once_is_not(name, device):
 def test_a_symmetric_clip_is_its_own_mirror_image(device):
     """What is left to follow of a squat, from a body that stays behind."""
     settings = {"motion": "squat", "random_start": False, "impulse": 0.0, "root_action": False, "fail_distance": 2.0}
-    episodes = batch("TrackMotion-v0", 1, device, **settings, drive={"control": "torque"})
+    episodes = batch("TrackMotion-v0", 1, device, **settings, control="torque")
     mirror = mirror_of(episodes)
     episodes.reset([0])
     for _ in range(8):
@@ -72,14 +72,14 @@ LEGS = ["left_hip", "right_hip", "left_knee", "right_knee"]
         ("pd", {"gait": {"arm_swing": 0.0}}, 0),
         ("torque", {"gait": {"arm_swing": 0.0}}, 0),
         # held until the arms of both are where their clocks have them
-        ("pd", {"drive": {"root_assist": 0.5}}, 20),
-        ("torque", {"drive": {"root_assist": 0.5}, "joints": LEGS}, 20),
+        ("pd", {"control": {"root_assist": 0.5}}, 20),
+        ("torque", {"control": {"root_assist": 0.5}, "joints": LEGS}, 20),
     ],
 )
 def test_mirrored_actions_have_mirrored_consequences(control, settings, before, device):
     """The body, its muscles, the ground and what is observed of them are the same on both sides."""
-    drive = {"control": control, **settings.get("drive", {})}
-    episodes = batch("Walk-v0", 2, device, pose_noise=0.0, **{**settings, "drive": drive})
+    section = {"mode": control, **settings.get("control", {})}
+    episodes = batch("Walk-v0", 2, device, pose_noise=0.0, **{**settings, "control": section})
     mirror = mirror_of(episodes)
     episodes.reset([0, 0])
     episodes.groups[0].step_count.assign([0, 15])  # in the mirror the clock is half a stride on

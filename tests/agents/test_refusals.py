@@ -160,7 +160,7 @@ def test_figures_that_cannot_be_written_are_refused_before_anything_is_played(pl
         (("--device", "cuda:99"), "device='cuda:99' is not available"),
         (("env_id=Stand-v0",), "env_id='PIAvatar/Stand-v0': the demo is of PPO on PIAvatar/Reach-v0"),
         (("sac={}",), "the demo is of PPO"),
-        (("env.drive.control=pd",), "env.drive.control='pd' must be 'pose'"),
+        (("env.control.mode=pd",), "env.control.mode='pd' must be 'pose'"),
         (("total_steps=-1",), "total_steps=-1 must be >= 1"),
     ],
 )
@@ -175,7 +175,7 @@ def test_what_is_no_demo_is_refused(line, words, tmp_path, monkeypatch):
     [
         (
             ("control=torque",),
-            "control=torque changes drive.control, its actions: the policy was trained for other ones",
+            "control=torque changes control.mode, its actions: the policy was trained for other ones",
         ),
         (("joints=[left_knee]",), "changes its actions"),
         (("joint_speed_limit=3", "color=strain"), "error: joint_speed_limit=3 changes its actions"),

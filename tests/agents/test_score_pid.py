@@ -35,14 +35,14 @@ def test_it_plays_the_walk_of_deepmimic(device, tmp_path):
     score_pid.main([*walk, "--evaluation.episodes", "2", "--out", str(tmp_path), "--device", device])
     report = json.loads((tmp_path / "results.json").read_text())
     assert report["config"]["env"]["motion"] == "deepmimic:walk"
-    assert report["config"]["env"]["drive"]["control"] == "torque"
+    assert report["config"]["env"]["control"]["mode"] == "torque"
     zero, _, pid = (row["return_mean"] for row in report["results"])
     assert pid > 0.0 and pid != zero
 
 
 def test_bodies_that_no_torques_move_are_refused():
     with pytest.raises(SystemExit, match="error: control='pose'"):
-        score_pid.main([*SHORT, "drive.control=pose"])
+        score_pid.main([*SHORT, "control.mode=pose"])
     with pytest.raises(SystemExit, match=r"error: .*Fly-v0"):
         score_pid.main(["PIAvatar/Fly-v0"])
 

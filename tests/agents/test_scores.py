@@ -95,7 +95,7 @@ def test_the_untrained_of_one_environment_stand_once_also_in_fewer_episodes(runs
 @pytest.mark.parametrize("value, same", [(False, True), (True, False)])
 def test_what_is_null_is_the_same_as_what_follows(value, same, runs):
     """``free_motion`` is off where nothing is said of it, and a wrench holds the root."""
-    runs["stand_pid"]["config"]["env"]["drive"] = {"free_motion": value}
+    runs["stand_pid"]["config"]["env"]["control"] = {"free_motion": value}
     runs["stand_pid"]["results"][:2] = [row("zero", 3.4), row("random", 2.4)]
     found = {r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"}
     assert found == {"random", "zero", "PID", "rsl_ppo"} | (
@@ -105,8 +105,8 @@ def test_what_is_null_is_the_same_as_what_follows(value, same, runs):
 
 def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     """With what drives the avatar; what an environment does not say is as by default."""
-    runs["push"]["config"]["env"]["drive"] = {"control": "pd", "firm_bones": False}
-    runs["stand_pid"]["config"]["env"]["drive"] = {"control": "torque", "bone_contact": False}
+    runs["push"]["config"]["env"]["control"] = {"mode": "pd", "firm_bones": False}
+    runs["stand_pid"]["config"]["env"]["control"] = {"mode": "torque", "bone_contact": False}
     for name, content in runs.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "results.json").write_text(json.dumps(content))
@@ -151,12 +151,12 @@ def test_a_setting_that_the_training_did_not_know_has_its_default_in_a_later_eva
     folder.mkdir()
     older = runs["stand_0"]["config"] | {"env_id": env_id, "env": {"physics": {"fidelity": "coarse"}}}
     (folder / "results.json").write_text(json.dumps(runs["stand_0"] | {"config": older}))
-    later(folder, env=older["env"] | {"drive": {"firm_bones": True}})
+    later(folder, env=older["env"] | {"control": {"firm_bones": True}})
     scores.main([str(folder), "--out", str(tmp_path / "table.json")])
     later(folder, env={})
     with pytest.raises(SystemExit, match=r"has env\.\S+=None, of this run it would have"):
         scores.main([str(folder)])
-    later(folder, env=older["env"] | {"drive": {"bone_contact": False}})  # a policy may be scored on other bones
+    later(folder, env=older["env"] | {"control": {"bone_contact": False}})  # a policy may be scored on other bones
     scores.main([str(folder), "--out", str(tmp_path / "table.json")])
     found = {row["agent"]: row["bone_contact"] for row in json.loads((tmp_path / "table.json").read_text())["results"]}
     assert found == {"rsl_ppo": False}, "the untrained were played on the bones of the training"
@@ -164,10 +164,10 @@ def test_a_setting_that_the_training_did_not_know_has_its_default_in_a_later_eva
     other.mkdir()
     again = runs["stand_1"]["config"] | {"env_id": env_id}
     (other / "results.json").write_text(json.dumps(runs["stand_1"] | {"config": again}))
-    with pytest.raises(SystemExit, match=r"drive\.bone_contact of what was scored differs"):
+    with pytest.raises(SystemExit, match=r"control\.bone_contact of what was scored differs"):
         scores.main([str(folder), str(other)])
-    later(folder, env=older["env"] | {"drive": {"firm_bones": False}})
-    with pytest.raises(SystemExit, match=r"env\.drive\.firm_bones=False, of this run it would have True"):
+    later(folder, env=older["env"] | {"control": {"firm_bones": False}})
+    with pytest.raises(SystemExit, match=r"env\.control\.firm_bones=False, of this run it would have True"):
         scores.main([str(folder)])
 
 

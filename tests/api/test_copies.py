@@ -22,7 +22,7 @@ SHORT = {"episode_seconds": 0.2}
 SETTINGS = [
     {"shape.randomize": True, "obs_mode": "dict"},
     {"shape.randomize": True, "shape.pool": 3, "randomize.mass_factor": (0.8, 1.25)},
-    {"control": "pose", "drive.tone": 0.2},
+    {"control": "pose", "control.tone": 0.2},
     {"control": "pd", "root_assist": 0.3},
 ]
 

@@ -95,7 +95,7 @@ def test_attributes_of_ones_own_are_shared(device):
         "note": ([1, 2], "share their attributes; give one value"),
         "list": ([1, 2, 3], "there are 3 values for num_envs=2"),
         "tone": (0.5, r"settings hold for as long as the environments live; make others with tone=\.\.\."),
-        "drive.tone": (0.5, "settings hold"),
+        "control.tone": (0.5, "settings hold"),
         "config": (None, "what the environments are made with"),
         "render_mode": ("rgb_array", "what the environments are made with"),
         "observation_space": (None, "what the environments are made with"),

@@ -30,8 +30,8 @@ def refusal(env_id: str, settings: dict) -> str:
         ({"fidelty": "tiny"}, ["fidelty is no setting of", "physics.fidelity"]),
         ({"fidelity": "ultra"}, ["physics.fidelity='ultra'", "'tiny'", "'coarse'"]),
         ({"obs_mode": "pixels"}, ["obs_mode='pixels'", "'flat'", "'dict'"]),
-        ({"drive.tone": 2.0}, ["drive.tone=2.0", "<= 1"]),
-        ({"config": {"drive": {"tune": 1}}}, ["drive.tune is no setting of", "drive.tone"]),
+        ({"control": "pose", "tone": 2.0}, ["control.tone=2.0", "<= 1"]),
+        ({"config": {"control": {"tune": 1}}}, ["control.tune is no setting of", "control.tone"]),
         ({"config": "no/such/file.yaml"}, ["no/such/file.yaml"]),
         ({"device": "cuda:99"}, ["device='cuda:99'", "cpu"]),
         ({"device": "tpu"}, ["device='tpu'", "cpu"]),
@@ -52,9 +52,9 @@ def test_unknown_render_mode_is_refused(device, env_id):
 
 def test_a_yaml_file_and_keywords_configure(tmp_path, device, env_id):
     path = tmp_path / "run.yaml"
-    path.write_text("episode_seconds: 0.5\nphysics: {fidelity: tiny}\ndrive: {tone: 0.25, alpha: 0.1}\n")
+    path.write_text("episode_seconds: 0.5\nphysics: {fidelity: tiny}\ncontrol: {mode: pose, tone: 0.25, alpha: 0.1}\n")
     env = gymnasium.make(env_id, device=device, config=path, alpha=0.2).unwrapped
-    assert env.config.drive.tone == 0.25 and env.config.drive.alpha == 0.2
+    assert env.config.control.tone == 0.25 and env.config.control.alpha == 0.2
     assert env.batch.max_steps == 15
 
 
@@ -130,20 +130,16 @@ def test_what_is_no_action_is_refused(make_env, env_id, action):
 
 
 @pytest.mark.parametrize(
-    ("task", "settings", "idle"),
+    ("task", "settings", "line"),
     [
-        ("Stand-v0", {"tone": 0.0, "strength": 0.5}, ["drive.tone=0.0"]),
-        ("Reach-v0", {"root_assist": 1.0, "tone": 0.5}, ["drive.root_assist=1.0"]),
-        ("Reach-v0", {"control": "pd", "alpha": 0.1, "firm_bones": False}, ["drive.alpha=0.1"]),
-        ("Stand-v0", {"tone": 1.0, "root_assist": 0.5}, []),
+        ("Stand-v0", {"tone": 0.0, "strength": 0.5}, r"control\.tone=0\.0 belongs to control\.mode='pose'"),
+        ("Reach-v0", {"root_assist": 1.0, "tone": 0.5}, r"control\.root_assist=1\.0 belongs to control\.mode='pd'"),
+        ("Reach-v0", {"control": "pd", "alpha": 0.1}, r"control\.alpha=0\.1 belongs to control\.mode='pose'"),
     ],
 )
-def test_settings_that_have_no_effect_warn(device, task, settings, idle):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+def test_settings_of_another_mode_are_refused(device, task, settings, line):
+    with pytest.raises(ConfigError, match=line):
         AvatarEnv(task, device=device, fidelity="tiny", **settings)
-    told = [str(one.message) for one in caught if "no effect" in str(one.message)]
-    assert [one.split(" has")[0] for one in told] == idle
 
 
 def test_a_torch_device_is_taken(device, env_id):

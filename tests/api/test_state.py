@@ -11,7 +11,7 @@ import pytest
 SETTINGS = [
     {},
     {"shape.randomize": True},
-    {"control": "pose", "drive.tone": 0.2, "root": "free", "decoupling": "paper"},
+    {"control": "pose", "control.tone": 0.2, "root": "free", "decoupling": "paper"},
 ]
 
 #: Of a scene, beside the avatar.
@@ -214,7 +214,7 @@ def bytes_of(state) -> dict[str, bytes]:
         ("Reach-v0", {"radius": 0.2}, r"with radius=0.45, .* has 0.2"),
         ("Reach-v0", {"mass_factor": (0.8, 1.25)}, r"randomize.mass_factor=\[1.0, 1.0\], .* has \[0.8, 1.25\]"),
         ("Reach-v0", {"shape.randomize": True}, r"shape.randomize=False, .* has True"),
-        ("Stand-v0", {"bone_contact": False}, r"drive.bone_contact=True, .* has False"),
+        ("Stand-v0", {"bone_contact": False}, r"control.bone_contact=True, .* has False"),
         ("Reach-v0", {"scene.props": [BALL]}, r"scene.props=\[\], .* has \[{'"),
     ],
 )

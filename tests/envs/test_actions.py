@@ -142,7 +142,7 @@ def test_a_named_component_turns_its_joint_and_no_other(make_env, component, sig
     action[env.action_names.index(component)] = sign
     env.step(action)
     expected = np.zeros((NUM_JOINTS, 3))
-    expected[index, "xyz".index(axis)] = sign * env.config.drive.joint_speed_limit * env.config.physics.control_dt
+    expected[index, "xyz".index(axis)] = sign * env.config.control.joint_speed_limit * env.config.physics.control_dt
     turned = (before.inv() * tracked_local(env)).as_rotvec()
     assert np.degrees(np.abs(turned - expected).max()) < 0.01
 
@@ -151,7 +151,7 @@ def test_increments_are_composed_on_the_right(make_env):
     """The second turn is about the axis that the first has turned, not about the one of the rest pose."""
     env = make_env("PIAvatar/Reach-v0", gravity=0.0, pose_noise=0.0)
     env.reset(seed=0)
-    step = env.config.drive.joint_speed_limit * env.config.physics.control_dt
+    step = env.config.control.joint_speed_limit * env.config.physics.control_dt
     for component in ["left_shoulder.x"] * 5 + ["left_shoulder.z"] * 5:
         action = np.zeros(env.action_space.shape)
         action[env.action_names.index(component)] = 1.0

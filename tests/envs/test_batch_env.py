@@ -124,7 +124,7 @@ def test_the_clock_truncates_at_the_episodes_length(make_env, env_id, seconds, c
 
 def test_letting_go_of_the_root_terminates_and_does_not_truncate(make_env, env_id):
     """An impulse that no root wrench can hold; the end comes in the very last step, where the clock would truncate."""
-    env = make_env(env_id, control="pose", let_go_distance=0.05, episode_seconds=0.4)
+    env = make_env(env_id, control="pose", release_distance=0.05, episode_seconds=0.4)
     env.reset(seed=0)
     assert not any(any(env.step(np.zeros(env.action_space.shape))[2:4]) for _ in range(11))
     velocity = env.batch.simulation.state.u

@@ -187,10 +187,10 @@ def test_what_torques_cannot_do_is_refused(device):
     with pytest.raises(ConfigError, match=r"needs two velocities.*split"):
         gymnasium.make(REACH, device=device, fidelity="tiny", control="pd", decoupling="paper")
     for decoupling in ("paper", "none"):  # a body that is said to be held would lie on the ground
-        with pytest.raises(ConfigError, match=rf"root='wrench' needs two velocities.*{decoupling}.*drive\.root=free"):
+        with pytest.raises(ConfigError, match=rf"root='wrench' needs two velocities.*{decoupling}.*control\.root=free"):
             gymnasium.make(REACH, device=device, fidelity="tiny", decoupling=decoupling)
-    with pytest.raises(ConfigError, match=r"drive\.control cannot differ"):
-        avatars = [{"drive": {"control": "pd"}}]
+    with pytest.raises(ConfigError, match=r"control\.mode='pd' cannot differ"):
+        avatars = [{"control": {"mode": "pd"}}]
         gymnasium.make(REACH, device=device, fidelity="tiny", scene={"avatars": avatars})
     env = gymnasium.make(REACH, device=device, fidelity="tiny").unwrapped
     with pytest.raises(ValueError, match="root wrench"):

@@ -132,7 +132,7 @@ def test_layout_tiles_the_vector_and_explains_it(make_env, env_id):
     assert list(layout)[: len(SELF_TERMS)] == [term.name for term in SELF_TERMS]
     task = env.batch.task
     seen = [term.name for term in CONTACT_TERMS] if task.observes_contact else []
-    seen += [term.name for term in JOINT_TERMS] if task.config.drive.control != "pose" else []
+    seen += [term.name for term in JOINT_TERMS] if task.config.control.mode != "pose" else []
     seen += [term.name for prop in task.observed_props() for term in prop_terms(prop)]
     assert list(layout)[len(SELF_TERMS) :] == seen + [term.name for term in task.terms()]
 

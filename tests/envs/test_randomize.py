@@ -267,7 +267,7 @@ def test_the_root_carries_the_drawn_weight(make_batch):
 @pytest.mark.parametrize("limit", ["force", "torque"])
 def test_limits_of_the_root_are_in_drawn_weights(make_batch, limit):
     """A command too far away: the wrench is as large as it may be, over the body's own weight."""
-    settings = {"pose_noise": 0.0, "gravity": 0.0, "max_force_weight": 0.5, "max_torque_weight": 0.05, **VARIED}
+    settings = {"pose_noise": 0.0, "gravity": 0.0, "max_root_force": 0.5, "max_root_torque": 0.05, **VARIED}
     batch = make_batch(REACH, 3, **settings)
     batch.reset(seeds=[5, 6, 7])
     batch.action.zero_()

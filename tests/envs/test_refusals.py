@@ -10,7 +10,7 @@ from typing import Annotated, Literal, get_args, get_origin
 import pytest
 
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
-from piavatar_envs.config.errors import entry_of, section_of
+from piavatar_envs.config.errors import entry_of, models_of
 from piavatar_envs.multi import multi_modules
 from piavatar_envs.tasks import load_task, task_modules
 
@@ -41,8 +41,8 @@ def test_what_is_no_settings_is_not_taken_for_none(given):
         ({"avatars": [{"positon": [0, 0]}]}, "avatars.0.positon is no setting of AvatarConfig; did you mean X.positi"),
         ({"avatars": [{}, {"qqq": 0}]}, "avatars.1.qqq is no setting of AvatarConfig; there are position, yaw, "),
         ({"avatars": [{"yaw": "left"}]}, "avatars.0.yaw='left' must be a number [rad]"),
-        ({"avatars": [{"drive": {"tone": 2, "alpha": 3}}]}, "avatars.0.drive.tone=2 must be <= 1; X.drive.alpha=3 mus"),
-        ({"avatars": [{"drive.tone": 2}]}, "avatars.0.drive.tone=2 must be <= 1"),
+        ({"avatars": [{"control": {"tone": 2, "alpha": 3}}]}, "avatars.0.control.tone=2 must be <= 1; X.control.alp"),
+        ({"avatars": [{"control.tone": 2}]}, "avatars.0.control.tone=2 must be <= 1"),
         ({"avatars": [{"physics": {"fidelity": "fine"}}]}, "avatars.0.physics.fidelity cannot differ between avatars"),
         ({"avatars": [{"shape": {"scal": 1}}]}, "avatars.0.shape.scal is no setting of ShapeConfig; did you mean sca"),
         ({"avatars": [{"regions": [{"joints": ["tail"]}]}]}, "avatars.0.regions.0.joints.0='tail' is refused: unknown"),
@@ -83,9 +83,9 @@ def test_an_entry_of_a_file_is_the_files_fault_and_one_of_a_keyword_is_not(tmp_p
 def test_what_yaml_makes_of_values_is_refused_by_name(tmp_path):
     path = tmp_path / "odd.yaml"
     for text, told in {
-        "drive:\n  tone: 2020-01-01\n": "drive.tone=datetime.date(2020, 1, 1) is of type date; a setting is a number",
+        "control:\n  tone: 2020-01-01\n": "control.tone=datetime.date(2020, 1, 1) is of type date; a setting is",
         "shape:\n  parameters: {1: 0.5}\n": "shape.parameters.1 is of type int; the name of a setting is a string",
-        "drive.: 1\n": "'drive.' is no name of a setting",
+        "control.: 1\n": "'control.' is no name of a setting",
         f"density: 1{'0' * 400}\n": "0000... must be a finite number [kg/m^3]",
     }.items():
         path.write_text(text)
@@ -106,9 +106,9 @@ def test_every_number_has_an_upper_limit():
 
     def walk(cls):
         for name, field in cls.model_fields.items():
-            below = section_of(field.annotation) or entry_of(field.annotation)
-            if below:
-                yield from walk(below)
+            below = entry_of(field.annotation)
+            for model in (below,) if below else models_of(field):
+                yield from walk(model)
             for limits in numbers(field.annotation, list(field.metadata)):
                 bounds = {bound for limit in limits for bound in ("gt", "ge", "lt", "le") if hasattr(limit, bound)}
                 if not bounds & {"lt", "le"}:

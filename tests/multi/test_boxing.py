@@ -126,7 +126,7 @@ def straight_right() -> tuple[np.ndarray, np.ndarray]:
 def strike(world, steps: int = 20) -> list[tuple]:
     """Agent 0 steps in, throws a straight right and draws it back; agent 1 keeps its guard."""
     poses, log = [Rotation.from_quat(pose, scalar_first=True) for pose in straight_right()], []
-    step = world.config.drive.joint_speed_limit * world.config.physics.control_dt
+    step = world.config.control.joint_speed_limit * world.config.physics.control_dt
     for _ in range(steps):
         k = int(world.batch.step_count.numpy()[0])
         actions = {name: np.zeros(world.action_space(name).shape) for name in world.agents}

@@ -38,7 +38,7 @@ class Swing:
         self.rest = batch.simulation.flesh[0].points.joints[0].astype(float)
         body, self.wrist = batch.simulation.avatar.body, joint_index("right_wrist")
         self.arm = (body.rest_center.numpy()[0] - body.rest_joint.numpy()[0])[self.wrist].astype(float)
-        self.step = batch.config.drive.joint_speed_limit * batch.config.physics.control_dt
+        self.step = batch.config.control.joint_speed_limit * batch.config.physics.control_dt
         self.bounds = [bound[self.joints].ravel() for bound in joint_limits()]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:

@@ -77,7 +77,7 @@ def bend_towards_box(env) -> np.ndarray:
     """Actions that bring the commanded joints to ``BENT``."""
     command = Rotation.from_quat(env.batch.simulation.avatar.state.command_rotation.numpy()[0])
     action = np.zeros(env.action_space.shape)
-    step = env.config.drive.joint_speed_limit * env.config.physics.control_dt
+    step = env.config.control.joint_speed_limit * env.config.physics.control_dt
     for name, vector in BENT.items():
         for side, mirror in (("left", 1.0), ("right", -1.0)) if name.startswith("left") else (("", 1.0),):
             joint = name.replace("left", side) if side else name

@@ -211,7 +211,7 @@ def test_zero_actions_hold_the_clip_and_actions_leave_it(make_env):
         env.step(action)
     elbow = joint_index("left_elbow")
     offset = Rotation.from_matrix(clip_frame(env, 0)[0][elbow].T @ tracked(env)[0][elbow]).magnitude()
-    step = env.config.drive.joint_speed_limit * env.config.physics.control_dt
+    step = env.config.control.joint_speed_limit * env.config.physics.control_dt
     assert offset == pytest.approx(3 * step, abs=0.02)
     for _ in range(3):
         env.step(-action)

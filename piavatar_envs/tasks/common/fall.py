@@ -48,7 +48,7 @@ def least_heights(config: EnvConfig, fall: FallConfig) -> wp.vec2:
 
     Where a wrench holds the root, its letting go is the fall, and no posture is.
     """
-    if config.drive.control == "pose":
+    if config.control.mode == "pose":
         return wp.vec2(-math.inf, -math.inf)
     return fall.least
 

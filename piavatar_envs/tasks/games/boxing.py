@@ -14,7 +14,7 @@ from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key
-from piavatar_envs.config import ConfigError, DriveConfig, EnvConfig, SceneConfig
+from piavatar_envs.config import ConfigError, ControlConfig, EnvConfig, PoseControlConfig, SceneConfig
 from piavatar_envs.envs.actions import ActionSpec, select_joints
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Task
@@ -163,8 +163,8 @@ class BoxingConfig(EnvConfig):
 
     # spine, shoulder, elbow and root add up: with a second spinal joint as fast as this, full actions could move a fist
     # by more than a grid spacing a substep
-    drive: DriveConfig = Field(
-        default_factory=lambda: DriveConfig(joint_speed_limit=6.0), description="how poses move the body"
+    control: ControlConfig = Field(
+        default_factory=lambda: PoseControlConfig(joint_speed_limit=6.0), description="how actions move the body"
     )
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until the gong [s]")
     num_agents: int = Field(2, ge=1, le=8, description="number of avatars")
@@ -306,7 +306,7 @@ agent strikes fast, at the head, and withdraws."""
         return (*self.observation_terms, *others_in_terms(self.config.num_agents))
 
     def action_spec(self) -> ActionSpec:
-        speed = self.config.drive.joint_speed_limit
+        speed = self.config.control.joint_speed_limit
         return ActionSpec(self.joints, root=True, joint_speed=speed, root_speed=self.config.root_speed)
 
     def domain(self) -> Domain:

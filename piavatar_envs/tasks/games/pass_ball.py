@@ -365,7 +365,7 @@ than `roam` from its place. All are paid alike, but for the cost of their action
     def action_spec(self) -> ActionSpec:
         config = self.config
         speed = speed_within(config.roam, config.root_speed, config.physics.control_dt)
-        return ActionSpec(self.joints, root=True, joint_speed=config.drive.joint_speed_limit, root_speed=speed)
+        return ActionSpec(self.joints, root=True, joint_speed=config.control.joint_speed_limit, root_speed=speed)
 
     def domain(self) -> Domain:
         side = self.rim - RIM + ROOM

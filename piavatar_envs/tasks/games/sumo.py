@@ -205,7 +205,7 @@ balance."""
         return (*self.observation_terms, *others_in_terms(self.config.num_agents))
 
     def action_spec(self) -> ActionSpec:
-        speed = self.config.drive.joint_speed_limit
+        speed = self.config.control.joint_speed_limit
         return ActionSpec(self.joints, root=True, joint_speed=speed, root_speed=self.config.root_speed)
 
     def domain(self) -> Domain:
