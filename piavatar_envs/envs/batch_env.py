@@ -228,7 +228,7 @@ class BatchEnv(EpisodeArrays):
     # state
 
     def assist_root(self, share: float | np.ndarray) -> None:
-        """Set the share of root assistance from now on (``control.root_assist``), for ``control="pd"`` and ``"torque"``.
+        """Set the share of root assistance from now on (``control.root_assist``); not for ``control="pose"``.
 
         Args:
             share: from 0, none, to 1; of all environments, or of each, shape ``(num_envs,)``. Resets leave it.
