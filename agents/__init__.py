@@ -1,1 +1,1 @@
-"""Training scripts: one algorithm a file. Run from a checkout (``python -m agents.train``), not part of the wheel."""
+"""Trainings, controllers and evaluations, run from a checkout (``python -m agents.NAME``); not part of the wheel."""

@@ -19,8 +19,8 @@ from piavatar_envs.config import ConfigError, load_config
 Options = TypeVar("Options")
 
 #: Which script a configuration is for: by the folder that it is in, and by settings that together no other one's has.
-_FOLDERS = {"rsl_rl": "rsl_ppo", "sb3": "train", "skrl": "skrl_mappo"}
-_SETTINGS = {"rsl_ppo": {"iterations", "ppo"}, "train": {"total_steps"}, "skrl_mappo": {"mappo"}}
+_FOLDERS = {"rsl_rl": "rsl_rl.train", "sb3": "sb3.train", "skrl": "skrl.train"}
+_SETTINGS = {"rsl_rl.train": {"iterations", "ppo"}, "sb3.train": {"total_steps"}, "skrl.train": {"mappo"}}
 
 _registry = ConstructorRegistry()
 

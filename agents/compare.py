@@ -1,7 +1,7 @@
 """Sum up trainings that differ in their seed: ``python -m agents.compare runs/reach_*/results.json --out FILE.json``.
 
-The runs are of ``agents.train``, ``agents.rsl_ppo`` or ``agents.skrl_mappo``, each with a seed of its own. What no seed
-of a training changes (zero and random actions) is shown once, with its interval over episodes.
+The runs are of ``agents.sb3.train``, ``agents.rsl_rl.train`` or ``agents.skrl.train``, each with a seed of its own.
+What no seed of a training changes (zero and random actions) is shown once, with its interval over episodes.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from rich.table import Table
 from agents.checkpoint import differences
 from agents.command import in_a_line
 from agents.evaluate import over_seeds
-from agents.folders import check_figures, read_json
-from benchmarks.runner import plain, write_json
+from agents.files import check_figures, plain, read_json, write_json
 
 #: Settings that may differ: nothing that is learned depends on how often a training is saved.
 FREE = ("seed", "checkpoint_every")
@@ -38,7 +37,9 @@ def read_run(path: Path) -> dict[str, Any]:
     needed = ("benchmark", "config", "seed", "results", "commit", "device", "versions")
     missing = [name for name in needed if not (isinstance(run, dict) and name in run)]
     if missing:
-        raise ValueError(f"{path} has no {missing[0]!r}; give runs of agents.train, agents.rsl_ppo or agents.score_pid")
+        raise ValueError(
+            f"{path} has no {missing[0]!r}; give runs of agents.sb3.train, agents.rsl_rl.train or agents.pid.score"
+        )
     return run
 
 

@@ -1,25 +1,33 @@
-"""Configuration of a training run: which environment, which algorithm, how long, from which seed."""
+"""Configurations of trainings: what all libraries' have in common, seeds of episodes, and what a policy is made for."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, Field, field_validator
+from pydantic import BaseModel, Field
 
-from agents.ppo import PPOSettings
-from agents.sac import SACSettings
-from agents.seeds import FIRST_TRAINED, MOST_RUNS
-from agents.selfplay import SelfPlaySettings
 from piavatar_envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
+from piavatar_envs.envs.task import Task
 from piavatar_envs.multi import load_world
-from piavatar_envs.tasks import listed_name, load_task
 
 Resolved = TypeVar("Resolved", bound=BaseModel)
-_MULTI_ID = re.compile(r"\w+_v\d+")
+
+#: Of the hidden layers of a network.
+Widths = tuple[Annotated[int, Field(ge=1)], ...]
+#: Training episodes begin here; those of evaluations, which no agent was trained on, end before it.
+FIRST_TRAINED = 2**30
+#: Environments that one training can have: so many seeds are its own.
+MOST_ENVS = 2**16
+#: Seeds that trainings can have: the episodes' seeds stay below 2^31.
+MOST_RUNS = 1000
+
+
+def first_seed(run: int) -> int:
+    """Seed of the first environment's episodes in the training of seed ``run``."""
+    return FIRST_TRAINED + MOST_ENVS * run
 
 
 class EvaluationSettings(BaseModel):
@@ -35,50 +43,6 @@ class EvaluationSettings(BaseModel):
         lt=FIRST_TRAINED // 2,
         description="seed of the first episode; each episode has its own, counted upwards",
     )
-
-
-#: Workers that are processes of their own.
-MOST_PROCESSES = 256
-
-
-class TrainingConfig(BaseModel):
-    """Everything that a training run depends on."""
-
-    model_config = FROZEN
-
-    env_id: str = Field(
-        "PIAvatar/Reach-v0", description="registered id, or a PettingZoo module of piavatar_envs.multi such as sumo_v0"
-    )
-    env: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
-        default_factory=dict, description="settings of the environment that differ from its defaults"
-    )
-    observe: tuple[str, ...] | None = Field(
-        None, description="terms of the observation that the networks see; null for all of it"
-    )
-    total_steps: int = Field(
-        100_000, ge=1, description="control steps to train for, over all workers and their learning agents"
-    )
-    num_workers: int = Field(4, ge=1, le=16_384, description="environments, each in a process of its own")
-    vector: bool = Field(
-        False, description="step the environments as one batch (a GPU's, or on the threads of a CPU), not in processes"
-    )
-    seed: int = Field(0, ge=0, lt=MOST_RUNS, description="of the networks, the actions and the training episodes")
-    checkpoint_every: int = Field(
-        50_000, ge=1, description="control steps between two checkpoints; they are written between rollouts"
-    )
-    ppo: PPOSettings = Field(default_factory=PPOSettings, description="the algorithm")
-    sac: SACSettings | None = Field(None, description="the algorithm in place of ppo, for one agent; null for ppo")
-    selfplay: SelfPlaySettings | None = Field(
-        None, description="agents compete, also with earlier policies; null where there is one, or they have one aim"
-    )
-    evaluation: EvaluationSettings = Field(default_factory=EvaluationSettings, description="how agents are compared")
-
-    _list_env_id = field_validator("env_id")(listed_name)
-
-    @property
-    def is_multi(self) -> bool:
-        """Whether the environment is a world of several agents."""
-        return _MULTI_ID.fullmatch(self.env_id) is not None
 
 
 def multi_module(env_id: str) -> ModuleType:
@@ -122,40 +86,26 @@ def load_resolved(
     return config.model_copy(update={"env": FrozenDict(env.model_dump(mode="json"))})
 
 
-def load_training(
-    source: Mapping[str, Any] | str | Path | None = None, overrides: Mapping[str, Any] | None = None
-) -> TrainingConfig:
-    """A resolved configuration: what ``env`` left to the task's defaults is filled in.
+def interface(task: Task, observe: Collection[str] | None = None) -> dict[str, Any]:
+    """What a policy is made for: what its actions do, and what it sees.
 
     Args:
-        source: a YAML file or a mapping.
-        overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
-
-    Raises:
-        ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment.
+        task: of the environment.
+        observe: terms of the observation that the policy sees; None for all of it.
     """
-    config = load_resolved(TrainingConfig, _env_class, source, overrides)
-    if config.selfplay and not config.is_multi:
-        raise ConfigError(f"selfplay is given, but env_id={config.env_id!r} has one agent; use a world such as sumo_v0")
-    if config.vector and config.is_multi:
-        raise ConfigError(f"vector is for one agent; env_id={config.env_id!r} is a world of several")
-    if config.num_workers > MOST_PROCESSES and not config.vector:
-        raise ConfigError(f"num_workers={config.num_workers} must be <= {MOST_PROCESSES} processes; use vector=true")
-    if config.sac and config.is_multi:
-        raise ConfigError(f"sac is for one agent; env_id={config.env_id!r} is a world of several, use ppo")
-    batch, rollout = config.ppo.batch_size, config.num_workers * config.ppo.rollout_steps
-    if batch > rollout and not config.sac:
-        raise ConfigError(
-            f"ppo.batch_size={batch} must be <= {rollout}, the steps of a rollout (num_workers * ppo.rollout_steps)"
-        )
-    return config
+    config = task.config
+    control = config.control.mode
+    actions = task.action_spec().under(control)
+    seen = [term for term in task.terms() if observe is None or term.name in observe]
+    return {
+        "control.mode": control,
+        "its actions": actions if control == "pose" else actions.joints,  # under torques nothing has a speed of its own
+        "observe_parameters": config.observe_parameters,
+        "its observations": (seen, task.observed_props() if observe is None else ()),
+    }
 
 
-def env_config(config: TrainingConfig) -> EnvConfig:
-    """The environment's part of a resolved configuration."""
-    return load_config(_env_class(config), config.env)
-
-
-def _env_class(config: TrainingConfig) -> type[EnvConfig]:
-    task = multi_module(config.env_id).TASK if config.is_multi else load_task(config.env_id)
-    return task.Config
+def changed(task: Task, other: Task, observe: Collection[str] | None = None) -> list[str]:
+    """What of :func:`interface` is not the same in another environment, by name: a policy would take it for another."""
+    then = interface(other, observe)
+    return [name for name, now in interface(task, observe).items() if now != then[name]]

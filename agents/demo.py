@@ -15,17 +15,18 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from agents import ppo
+from agents.checkpoint import Diverged
 from agents.command import in_a_line, read_options
-from agents.config import TrainingConfig, load_training
-from agents.divergence import Diverged
-from agents.evaluate import Evaluation, baselines, evaluate, policy_agent, separated
-from agents.film import film
-from agents.folders import RESULTS, claim, hold
-from agents.ik import ReachIK
+from agents.evaluate import Evaluation, baselines, evaluate, separated
+from agents.files import RESULTS, claim, hold
+from agents.play import film
+from agents.reach_ik import ReachIK
 from agents.report import draw_curve, show_table, versions, write_results
-from agents.train import train
-from agents.workers import EnvFacts, components, factory, prepare, start_workers
+from agents.sb3 import ppo
+from agents.sb3.config import TrainingConfig, load_training
+from agents.sb3.policy import policy_agent
+from agents.sb3.train import train
+from agents.sb3.workers import EnvFacts, components, factory, prepare, start_workers
 from piavatar_envs.config import ConfigError, parse_assignments
 from piavatar_envs.sim.world import check_device
 
@@ -146,7 +147,7 @@ def demonstrated(options: Options) -> TrainingConfig:
         if getattr(config, name) != getattr(shown, name):
             raise ConfigError(
                 f"{name}={getattr(config, name)!r}: the demo is of PPO on {shown.env_id} in processes; train others by "
-                "python -m agents.train"
+                "python -m agents.sb3.train"
             )
     if config.env["control"]["mode"] != "pose":
         raise ConfigError(

@@ -13,6 +13,7 @@ One training says little of an algorithm: :func:`over_seeds` sums up several, of
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,12 +22,25 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
-from agents.intervals import NORMAL, mean_over_seeds, share_interval, share_interval_over_seeds, wilson
-from benchmarks.runner import Estimate, mean_and_interval
+from agents.intervals import (
+    NORMAL,
+    Estimate,
+    mean_and_interval,
+    mean_over_seeds,
+    share_interval,
+    share_interval_over_seeds,
+    wilson,
+)
+from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.mpm.types import failure_name
 
 Agent = Callable[[np.ndarray], np.ndarray]
 #: Width of a class of pushes [N s].
 PUSH_CLASS = 5.0
+#: Metrics of tasks that evaluations sum up.
+TOLD = ("distance", "strongest_push")
+#: Seconds between two signs of life where nobody looks on, as in a log.
+_LOG_SECONDS = 30.0
 
 
 @dataclass
@@ -237,6 +251,61 @@ def _play_round(agent: Agent, venv: VecEnv, first_seed: int) -> list[Episode]:
     return episodes
 
 
+def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Evaluation:
+    """Let an agent play one episode in every environment of a batch, to their ends.
+
+    Args:
+        name: the agent's, for tables.
+        agent: from observations ``(num_envs, num_agents, size)`` to actions ``(num_envs, num_agents, action_size)``.
+        batch: of NumPy arrays; whatever it was playing is given up.
+        first_seed: environment ``i`` plays the episode of ``first_seed + i``.
+    """
+    episodes = [Episode(first_seed + env) for env in range(batch.num_envs)]
+    batch.reset([episode.seed for episode in episodes])
+    told = {name: batch.task.metrics.index(name) for name in TOLD if name in batch.task.metrics}
+    success = np.zeros((batch.num_envs, batch.num_agents), bool)
+    playing = np.ones(batch.num_envs, bool)
+    begin_round(agent, batch.num_envs)
+    seconds = 0.1 if sys.stderr.isatty() else _LOG_SECONDS
+    with episode_bar(name, batch.num_envs, mininterval=seconds, dynamic_ncols=True) as bar:
+        while playing.any():
+            acted = batch.alive()
+            batch.step(agent(batch.observation()))
+            # that of an agent that is out is what it was in its last step
+            success = np.where(acted, batch.read(lambda group: group.success), success)
+            metrics = batch.read(lambda group: group.metrics)
+            rewards, failures = batch.reward(), batch.read(lambda group: group.failure)
+            over = batch.read(lambda group: group.terminated).all(axis=1)
+            for env in np.flatnonzero(playing):
+                info: dict[str, Any] = {"success": success[env].all(), "failure": failure_name(int(failures[env]))}
+                info |= {name: float(metrics[env, acted[env], place].mean()) for name, place in told.items()}
+                if batch.num_agents > 1:
+                    info |= {"rewards": rewards[env].astype(np.float64), "successes": success[env].copy()}
+                episodes[env].book(float(rewards[env].mean()), info, bool(over[env]))
+            ended = playing & batch.find_ended()
+            playing &= ~ended
+            # all go on at once, and often end at once
+            bar.set_postfix(longest=max(episode.steps for episode in episodes), refresh=False)
+            bar.update(int(ended.sum()))
+    return Evaluation(name, episodes)
+
+
+def play_beside_baselines(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> list[Evaluation]:
+    """What zero, random and the agent's actions come to, all in the same episodes; as :func:`play`."""
+    players = {other: in_every_seat(player) for other, player in baselines(batch.action_size, first_seed).items()}
+    return [play(player, act, batch, first_seed) for player, act in {**players, name: agent}.items()]
+
+
+def in_every_seat(agent: Agent) -> Agent:
+    """An agent as :func:`play` takes it, from one for observations ``(n, size)``."""
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        envs, agents = observation.shape[:2]
+        return agent(observation.reshape(envs * agents, -1)).reshape(envs, agents, -1)
+
+    return act
+
+
 def begin_round(agent: Agent, num_envs: int) -> None:
     """Tell an agent that remembers that ``num_envs`` episodes begin."""
     begin = getattr(agent, "begin", None)
@@ -253,11 +322,6 @@ def random_agent(action_size: int, seed: int) -> Agent:
     """Uniformly random in the whole action space."""
     rng = np.random.default_rng(seed)
     return lambda observation: rng.uniform(-1.0, 1.0, (len(observation), action_size)).astype(np.float32)
-
-
-def policy_agent(model: Any) -> Agent:
-    """The mean action of a trained stable-baselines3 policy."""
-    return lambda observation: model.predict(observation, deterministic=True)[0]
 
 
 def baselines(action_size: int, seed: int) -> dict[str, Agent]:

@@ -2,15 +2,53 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
-from benchmarks.runner import Estimate
-
 #: Quantile of the normal distribution for 95 %.
 NORMAL = float(stats.norm.ppf(0.975))
+
+
+class Estimate(NamedTuple):
+    """Mean of a sample, and half the width of its 95 % confidence interval (infinite for a single value)."""
+
+    mean: float
+    half_width: float
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval."""
+        return self.mean - self.half_width
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval."""
+        return self.mean + self.half_width
+
+
+def mean_and_interval(values: Sequence[float] | np.ndarray) -> Estimate:
+    """Mean and 95 % interval of the mean, by Student's t with n - 1 degrees of freedom.
+
+    Args:
+        values: independent measurements (seeds, not steps of one run), shape (n,).
+
+    Raises:
+        ValueError: no value, more than one dimension, or a value that is not finite.
+    """
+    sample = np.asarray(values, dtype=np.float64)
+    if sample.ndim != 1 or sample.size == 0:
+        raise ValueError(f"values have shape {sample.shape}; give one dimension of at least one value")
+    if not np.isfinite(sample).all():
+        first = int(np.flatnonzero(~np.isfinite(sample))[0])
+        raise ValueError(f"values[{first}]={sample[first]} is not finite; drop or explain it before averaging")
+    if sample.size == 1:
+        return Estimate(float(sample[0]), math.inf)
+    error = sample.std(ddof=1) / math.sqrt(sample.size)
+    return Estimate(float(sample.mean()), float(stats.t.ppf(0.975, sample.size - 1) * error))
 
 
 def share_interval(outcomes: Sequence[bool]) -> list[float]:

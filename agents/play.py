@@ -1,36 +1,42 @@
 """Let what a training has left play again: ``python -m agents.play runs/stand_rsl --film stand.gif``.
 
-Takes the folder of a run with one agent, by ``agents.rsl_ppo`` (policy.pt) or ``agents.train`` (policy.zip), builds the
-environment of its config.yaml, and plays the episodes of its evaluation. Asked for a film alone it plays no others;
-with ``--live`` it plays in a web browser instead, until Ctrl-C. Nothing in the files is unpickled.
+Takes the folder of a run with one agent, by ``agents.rsl_rl.train`` (policy.pt) or ``agents.sb3.train`` (policy.zip),
+builds the environment of its config.yaml, and plays the episodes of its evaluation. Asked for a film alone it plays no
+others; with ``--live`` it plays in a web browser instead, until Ctrl-C. Nothing in the files is unpickled.
+
+A video of one agent, or of two in the same episodes side by side.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from rich.console import Console
+from stable_baselines3.common.vec_env import VecEnv
+from tqdm import tqdm
 
-from agents.batches import in_every_seat, play
 from agents.command import in_a_line, read_options
-from agents.config import EvaluationSettings, load_training
-from agents.evaluate import Agent, begin_round
-from agents.film import check_film, film
-from agents.folders import RESULTS, check_figures
-from agents.lessons import changed
+from agents.config import EvaluationSettings, changed
+from agents.evaluate import Agent, begin_round, in_every_seat, play
+from agents.files import RESULTS, check_figures, check_writable
 from agents.report import show_table, versions, write_results
-from agents.workers import EnvFactory
+from agents.sb3.config import load_training
+from agents.sb3.workers import EnvFactory, start_workers
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.envs.rng import check_seeds
 from piavatar_envs.envs.task import Task
+from piavatar_envs.render import label, side_by_side, write_video
+from piavatar_envs.render.video import check_suffix
 from piavatar_envs.tasks import load_task
 
 
@@ -74,7 +80,7 @@ def open_run(folder: Path, device: str = "cpu") -> Run:
 
 
 def _open_rsl(settings: Path, policy: Path, device: str) -> Run:
-    from agents.rsl_policy import load_agent, load_rsl  # needs the extra rsl
+    from agents.rsl_rl.policy import load_agent, load_rsl  # needs the extra rsl
 
     config = load_rsl(settings)
     return Run(
@@ -87,7 +93,7 @@ def _open_rsl(settings: Path, policy: Path, device: str) -> Run:
 
 
 def _open_sb3(settings: Path, policy: Path, _device: str) -> Run:
-    from agents.sb3_policy import load_agent
+    from agents.sb3.policy import load_agent
 
     config = load_training(settings)
     if config.is_multi:
@@ -232,6 +238,70 @@ def film_run(run: Run, agent: Agent, seconds: float, first: int, options: Option
     alone = {options.run.name: lambda observation: agent(observation[:, None])[:, 0]}
     film(options.film, make, alone, range(first, first + options.film_episodes), 1.0 / seconds, options.film_every)
     print(f"wrote {options.film}")
+
+
+def film(
+    path: Path, make: EnvFactory, agents: dict[str, Agent], seeds: Sequence[int], fps: float, every: int = 1
+) -> Path:
+    """Write a video in which all agents play the episodes ``seeds``; two have a process each.
+
+    Args:
+        path: ``.mp4`` or ``.gif``.
+        make: makes the environments.
+        agents: one or two of them, by the text that stands in their half.
+        seeds: of the episodes.
+        fps: control steps a second, so that the video runs as fast as life.
+        every: control steps between two pictures.
+
+    Raises:
+        ImportError: the extra ``render`` is not installed.
+        ValueError: no agents, or more than two.
+    """
+    if len(agents) not in (1, 2):
+        raise ValueError(f"{len(agents)} agents; a film shows one, or two side by side")
+    halves = start_workers(replace(make, render_mode="rgb_array"), len(agents))
+    try:
+        return write_video(path, _frames(halves, agents, seeds, every), fps / every)
+    finally:
+        halves.close()
+
+
+def check_film(path: Path | None, every: int, episodes: int = 1) -> None:
+    """Refuse a video without pictures, or that cannot be written, before there is anything to film.
+
+    Raises:
+        ConfigError: ``every`` or ``episodes`` is less than 1, or nothing can be written there.
+        ValueError: an unknown suffix.
+    """
+    for name, value in (("film_every", every), ("film_episodes", episodes)):
+        if value < 1:
+            raise ConfigError(f"{name}={value} must be >= 1")
+    if path is not None:
+        check_suffix(path)
+        check_writable(path)
+
+
+def _frames(halves: VecEnv, agents: dict[str, Agent], seeds: Sequence[int], every: int) -> Iterator[np.ndarray]:
+    for seed in tqdm(seeds, desc="film", unit="episode"):
+        for agent in agents.values():
+            begin_round(agent, 1)
+        observation = np.stack([first for first, _ in halves.env_method("reset", seed=int(seed))])
+        totals, playing = np.zeros(len(agents)), np.ones(len(agents), bool)
+        shown: list[np.ndarray] = []
+        for step in count():
+            if step % every == 0:
+                pictures = halves.env_method("render")
+                # a half that has ended stands still until the other one has
+                shown = [pictures[i] if playing[i] else shown[i] for i in range(len(agents))]
+                texts = [f"{name}: {total:.0f}" for name, total in zip(agents, totals, strict=True)]
+                labelled = [label(picture, text) for picture, text in zip(shown, texts, strict=True)]
+                yield side_by_side(*labelled) if len(agents) == 2 else labelled[0]
+            action = np.stack([agent(observation[i : i + 1])[0] for i, agent in enumerate(agents.values())])
+            observation, rewards, dones, _ = halves.step(action)
+            totals += rewards * playing
+            playing &= ~dones
+            if not playing.any():
+                break
 
 
 def main(args: list[str] | None = None) -> None:

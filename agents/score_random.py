@@ -1,6 +1,6 @@
 """Scores of random actions, of several seeds: ``python -m agents.score_random RUN --out FOLDER``.
 
-Plays the environment of a run, which is any folder with the ``results.json`` of a training or of ``agents.score_pid``.
+Plays the environment of a run, which is any folder with the ``results.json`` of a training or of ``agents.pid.score``.
 Every seed is a stream of actions of its own, in the episodes that all agents are evaluated in, and counts as a
 training's does: intervals are over seeds. ``agents.scores`` puts this row in the place of those of single streams, in
 all runs of these settings.
@@ -15,14 +15,11 @@ from typing import Any
 
 import tyro
 
-from agents import seeds
-from agents.batches import in_every_seat, play
 from agents.command import in_a_line, read_options
-from agents.config import EvaluationSettings
-from agents.evaluate import over_seeds, random_agent
-from agents.folders import RESULTS, claim, read_json
+from agents.config import MOST_RUNS, EvaluationSettings
+from agents.evaluate import in_every_seat, over_seeds, play, random_agent
+from agents.files import RESULTS, claim, plain, read_json, write_json
 from agents.report import versions
-from benchmarks.runner import plain, write_json
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.doctor import quiet_warp
@@ -55,7 +52,7 @@ def score(batch: BatchedEpisodes, first_seed: int, count: int) -> dict[str, Any]
         first_seed: of the episodes, the same for all streams.
         count: of streams; the seed of each is the one with which a training of that place would begin.
     """
-    streams = [random_agent(batch.action_size, seeds.first_seed(stream)) for stream in range(count)]
+    streams = [random_agent(batch.action_size, first_seed(stream)) for stream in range(count)]
     return over_seeds([play("random", in_every_seat(stream), batch, first_seed).row() for stream in streams])
 
 
@@ -65,8 +62,8 @@ def check_streams(count: int) -> None:
     Raises:
         ConfigError: a count that has no interval, or is larger than that of the seeds that trainings can have.
     """
-    if not 2 <= count <= seeds.MOST_RUNS:
-        raise ConfigError(f"seeds={count} must be >= 2 and <= {seeds.MOST_RUNS}: of one there is no interval")
+    if not 2 <= count <= MOST_RUNS:
+        raise ConfigError(f"seeds={count} must be >= 2 and <= {MOST_RUNS}: of one there is no interval")
 
 
 def main(args: list[str] | None = None) -> None:

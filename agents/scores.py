@@ -1,7 +1,7 @@
 """A table of scores out of many runs: ``python -m agents.scores runs/* --out benchmarks/results/NAME.json``.
 
-Every run is a folder with the ``results.json`` of ``agents.train``, ``agents.rsl_ppo``, ``agents.score_pid`` or
-``agents.score_random``. Runs of one configuration that differ in their seed become one row (:mod:`agents.compare`),
+Every run is a folder with the ``results.json`` of ``agents.sb3.train``, ``agents.rsl_rl.train``, ``agents.pid.score``
+or ``agents.score_random``. Runs of one configuration that differ in their seed become one row (:mod:`agents.compare`),
 runs of one environment one table; what no training changes (zero and random actions) stands in it once, unless an
 environment's settings change what an action means. A run has played one stream of random actions; the row of an
 ``agents.score_random`` of the same settings, which is of several, takes its place. Beside the JSON file comes the same
@@ -12,6 +12,8 @@ A policy can be scored anew without training it anew: ``python -m agents.play RU
 then takes the place of the training's own; what the training took, and zero and random actions, stay as they were. If
 it was scored on other bones than those that it was trained on, zero and random actions of the training are left out:
 they were not played where the policy was.
+
+Scores as Markdown: what :mod:`agents.scores` has summed up, for people.
 """
 
 from __future__ import annotations
@@ -30,14 +32,14 @@ from rich.markdown import Markdown
 from agents import compare
 from agents.checkpoint import flattened
 from agents.command import in_a_line
-from agents.folders import RESULTS, check_figures, check_writable, read_json, write_whole
-from agents.score_table import markdown
-from benchmarks.runner import describe_run, plain, write_json
+from agents.files import RESULTS, check_figures, check_writable, describe_run, plain, read_json, write_json, write_whole
 from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 #: Script of runs that are random actions of several streams.
 STREAMS = "score_random"
+#: Library and algorithm by the script of a training.
+_LEARNERS = {"rsl_rl.train": "rsl_ppo", "sb3.train": "sb3_ppo", "skrl.train": "skrl_mappo"}
 #: Returns of the same actions in the same episodes, on another device.
 _ALIKE = 1.0e-3
 #: What a policy may be scored on though it was trained on another; the row says which.
@@ -87,10 +89,10 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _learner(run: Mapping[str, Any]) -> str:
-    """The script of a run; for that of stable-baselines3, which has several, the algorithm."""
-    if run["benchmark"] != "train":
-        return run["benchmark"]
-    return "sb3_sac" if run["config"].get("sac") else "sb3_ppo"
+    """Name the library and the algorithm of a training, or the script of another run."""
+    if run["benchmark"] == "sb3.train" and run["config"].get("sac"):
+        return "sb3_sac"
+    return _LEARNERS.get(run["benchmark"], run["benchmark"])
 
 
 def _rows(
@@ -216,6 +218,72 @@ def _check_out(path: Path) -> None:
     check_writable(beside)
     if beside.exists() and not path.exists():
         raise ValueError(f"{beside} is of something else, and the table would take its place; give --out another name")
+
+
+_RESULTS = ("return", "succeeds at the end", "at some time", "steps", "trained for")
+_COLUMNS = ("agent", "control", "bones", "seeds", "episodes", *_RESULTS)
+
+
+def markdown(rows: Sequence[Mapping[str, Any]], about: str) -> str:
+    """The rows as Markdown: a table an environment, and one of pushes where there are any."""
+    lines = ["# Scores", "", about, ""]
+    for env_id in sorted({row["env_id"] for row in rows}):
+        own = [row for row in rows if row["env_id"] == env_id]
+        lines += [f"## {env_id}", "", _line(_COLUMNS), _line(["---"] * len(_COLUMNS))]
+        lines += [_line(_cells(row)) for row in own]
+        pushed = [row for row in own if row.get("by_push")]
+        if pushed:
+            lines += ["", *_pushes(pushed)]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _bones(row: Mapping[str, Any]) -> str:
+    """What holds the bones of a row's avatar; nothing where its environment does not say."""
+    if row.get("firm_bones") is None:
+        return ""
+    if not row["firm_bones"]:
+        return "slipping"
+    return "solid" if row.get("bone_contact") else "firm"
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    trained = "" if row.get("training_s") is None else f"{row['training_s']:.0f} s"
+    if row.get("train_steps"):
+        trained = f"{row['train_steps'] / 1e6:.2g} M steps, {trained}"
+    return [
+        row["agent"],
+        row.get("control") or "",
+        _bones(row),
+        str(row["seeds"] or ""),
+        str(row["episodes"]),
+        _with(row["return_mean"], row["return_interval"], ".1f"),
+        _with(row["success_at_end"], row["success_at_end_interval"], ".0%"),
+        _with(row["success_once"], row["success_once_interval"], ".0%"),
+        _with(row["mean_steps"], row["steps_interval"], ".0f"),
+        trained,
+    ]
+
+
+def _pushes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Share of episodes that lasted, by the greatest impulse of a push."""
+    classes = sorted({tuple(push["impulse_n_s"]) for row in rows for push in row["by_push"]})
+    lines = [_line(["strongest push [N s]", *(row["agent"] for row in rows)]), _line(["---"] * (1 + len(rows)))]
+    for bounds in classes:
+        cells = [f"{bounds[0]:g} to {bounds[1]:g}"]
+        for row in rows:
+            push = next((push for push in row["by_push"] if tuple(push["impulse_n_s"]) == bounds), None)
+            cells.append("" if push is None else f"{push['lasted']:.0%} of {push['episodes']}")
+        lines.append(_line(cells))
+    return ["Episodes that lasted, by the strongest push in them:", "", *lines]
+
+
+def _with(mean: float, interval: Sequence[float] | None, form: str) -> str:
+    return f"{mean:{form}}" if interval is None else f"{mean:{form}} ({interval[0]:{form}} to {interval[1]:{form}})"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ import tyro
 import yaml
 
 from agents.checkpoint import UNREADABLE, differences
-from agents.folders import read_json
-from agents.sb3_policy import CRITICS, PARAMETERS
+from agents.files import read_json
+from agents.sb3.policy import CRITICS, PARAMETERS
 
 #: Files of every run, and files of the one whose policy is kept.
 NEEDED, SCORES, POLICY = ("config.yaml", "results.json"), ("results.json", "evaluation.json"), "policy.pt"

@@ -21,8 +21,8 @@ from typing import Annotated, Any
 import tyro
 from rich.progress import track
 
-from agents.design import Design
-from agents.folders import read_json
+from agents.files import read_json
+from agents.pid.agent import Design
 from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
 
@@ -85,7 +85,7 @@ def find_jobs(results: Path, out: Path, device: str, bone_contact: bool | None =
     jobs = []
     for folder in sorted(path.parent for path in results.glob("pid/*/results.json")):
         new = out / folder.relative_to(results)
-        jobs.append(Job(folder, new, ("agents.score_pid", *pid_arguments(folder), *written(folder, new, device))))
+        jobs.append(Job(folder, new, ("agents.pid.score", *pid_arguments(folder), *written(folder, new, device))))
     for folder in sorted(path.parent for path in results.glob("random/*/results.json")):
         new, count = out / folder.relative_to(results), read_json(folder / "results.json")["results"][0]["seeds"]
         command = ("agents.score_random", str(folder), "--seeds", str(count), *written(folder, new, device))

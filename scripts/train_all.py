@@ -27,19 +27,19 @@ from pydantic import BaseModel
 from rich.progress import track
 
 from agents.checkpoint import LENGTHS, learned_otherwise
-from agents.config import load_training
-from agents.folders import read_json
+from agents.files import read_json
+from agents.sb3.config import load_training
 from piavatar_envs.config import parse_assignments
 
 
 def _load_rsl(source: Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> BaseModel:
-    from agents.rsl_policy import load_rsl  # needs the extra rsl
+    from agents.rsl_rl.policy import load_rsl  # needs the extra rsl
 
     return load_rsl(source, overrides)
 
 
 #: By the folder of a configuration, the script that trains by it, and what resolves it as that script does.
-SCRIPTS = {"rsl_rl": "agents.rsl_ppo", "sb3": "agents.train"}
+SCRIPTS = {"rsl_rl": "agents.rsl_rl.train", "sb3": "agents.sb3.train"}
 LOADERS = {"rsl_rl": _load_rsl, "sb3": load_training}
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 #: Seconds between two looks at a training.

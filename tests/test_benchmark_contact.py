@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import collisions, contact
+from benchmarks.physics import collisions, contact
 
 
 @pytest.fixture(scope="module")

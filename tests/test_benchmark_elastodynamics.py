@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import elastodynamics
+from benchmarks.physics import elastodynamics
 
 
 @pytest.fixture(scope="module")

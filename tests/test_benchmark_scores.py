@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("stable_baselines3", reason="the scores need the extra train")
 pytest.importorskip("pettingzoo", reason="the scores need the extra multi")
 
-from benchmarks import scores
+from benchmarks.learning import scores
 from piavatar_envs.tasks import task_modules
 
 

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from benchmarks import profile, roofline, runner, soak, timing, vector
+from agents import files
+from benchmarks import roofline, runner
+from benchmarks.speed import profile, soak, timing, vector
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.mpm.memory import allocate
@@ -197,11 +199,11 @@ def test_a_long_run_goes_on_where_it_was_stopped(tmp_path: Path, device: str):
     arguments = ["--fidelity", "tiny", "--num-envs", "1", "--steps", "6", "--window", "2", "--device", device]
     arguments += ["--out", str(out)]
     report = runner.main("soak", soak.cases, soak.Options, arguments)
-    runner.write_json(out, report | {"complete": False, "results": report["results"][:2]})
+    files.write_json(out, report | {"complete": False, "results": report["results"][:2]})
     again = runner.main("soak", soak.cases, soak.Options, arguments)
     assert again["results"][:2] == report["results"][:2]
     assert [(row["steps"], row["process"]) for row in again["results"][:-1]] == [(2, 0), (4, 0), (6, 1)]
-    runner.write_json(out, report | {"complete": False, "results": report["results"][:2]})
+    files.write_json(out, report | {"complete": False, "results": report["results"][:2]})
     with pytest.raises(ValueError, match="options"):
         runner.main("soak", soak.cases, soak.Options, [*arguments, "--steps", "8"])
 

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import acts, measures, paper_figures, runner, supplement
-from benchmarks.stage import Act, keyed, perform, standing
+from benchmarks import runner
+from benchmarks.paper import acts, measures, supplement
+from benchmarks.paper import supplement_figures as paper_figures
+from benchmarks.paper.stage import Act, keyed, perform, standing
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index
 
 STUDIES = {

@@ -11,13 +11,14 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from benchmarks import limbs, runner, stability, torque, wear
-from benchmarks.limbs import Options
-from benchmarks.rig import joint_gaps
+from agents.files import ROOT
+from benchmarks.physics import limbs, stability, torque, wear
+from benchmarks.physics.limbs import Options
+from benchmarks.physics.rig import joint_gaps
 from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, forward_kinematics, joint_index
 
-RESULTS = runner.ROOT / "benchmarks" / "results" / "torque.json"
+RESULTS = ROOT / "benchmarks" / "results" / "torque.json"
 HOLDS = ("", "_slipping")
 FLOATS = [f"free_float_{how}{hold}" for how in ("loose", "attached", "pd", "pd_loose") for hold in HOLDS]
 KICKS = [f"kick_{mass}_{how}" for mass in ("0.45", "1.5", "8") for how in ("floating", "held")]

@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import cpu, disturbance, metrics, paper, poses, runner, tracking
-from benchmarks.rig import Rig, World
+from benchmarks import runner
+from benchmarks.paper import disturbance, metrics, poses, tracking
+from benchmarks.paper import metrics as paper
+from benchmarks.physics.rig import Rig, World
+from benchmarks.speed import cpu
 from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import joint_index, joint_limits
 from piavatar_envs.avatar.pose_control.controller import DriveSettings

@@ -22,7 +22,7 @@ def make_run(folder, value):
     folder.mkdir(parents=True)
     rows = [{"case": "zero", "return_mean": 1000.0}, {"case": "trained", "return_mean": value}]
     (folder / "config.yaml").write_text(yaml.safe_dump(CONFIG))
-    (folder / "results.json").write_text(json.dumps({"benchmark": "train", "config": CONFIG, "results": rows}))
+    (folder / "results.json").write_text(json.dumps({"benchmark": "sb3.train", "config": CONFIG, "results": rows}))
     (folder / "curve.csv").write_text("step,return\n10,1.5\n")
     held = io.BytesIO()
     torch.save({"action_net.weight": torch.arange(600.0), "value_net.weight": torch.arange(3.0)}, held)

@@ -9,8 +9,9 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the extra train")
 
-from agents import score_pid, score_random
-from agents.design import Design
+from agents import score_random
+from agents.pid import score as score_pid
+from agents.pid.agent import Design
 from piavatar_envs.config import load_config, parse_assignments
 from piavatar_envs.tasks import load_task
 from scripts import rescore

@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agents import files
+from agents.intervals import mean_and_interval
 from benchmarks import runner
 
 
 def test_interval_of_a_known_sample():
     # mean 3, s^2 = 2.5, n = 5: half width t(0.975, 4) s / sqrt(5) with t = 2.776445 from any table
-    estimate = runner.mean_and_interval([1.0, 2.0, 3.0, 4.0, 5.0])
+    estimate = mean_and_interval([1.0, 2.0, 3.0, 4.0, 5.0])
     assert estimate.mean == pytest.approx(3.0)
     assert estimate.half_width == pytest.approx(2.776445 * math.sqrt(2.5 / 5), rel=1e-6)
     assert estimate.high - estimate.low == pytest.approx(2 * estimate.half_width)
@@ -25,15 +27,15 @@ def test_interval_of_a_known_sample():
 def test_interval_covers_the_mean_19_times_in_20():
     rng = np.random.default_rng(1)
     samples = rng.normal(2.0, 3.0, size=(2000, 4))
-    hits = sum(abs(estimate.mean - 2.0) < estimate.half_width for estimate in map(runner.mean_and_interval, samples))
+    hits = sum(abs(estimate.mean - 2.0) < estimate.half_width for estimate in map(mean_and_interval, samples))
     assert hits / 2000 == pytest.approx(0.95, abs=0.02)  # four standard errors
 
 
 def test_interval_of_one_value_and_of_none():
-    assert runner.mean_and_interval([2.0]) == (2.0, math.inf)
+    assert mean_and_interval([2.0]) == (2.0, math.inf)
     for wrong, told in (([], "shape"), ([[1.0]], "shape"), ([1.0, math.nan], r"values\[1\]=nan")):
         with pytest.raises(ValueError, match=told):
-            runner.mean_and_interval(wrong)
+            mean_and_interval(wrong)
 
 
 @dataclass(frozen=True)
@@ -93,15 +95,15 @@ def test_a_bad_row_is_refused(row, told):
 
 def test_an_unknown_device_is_refused():
     with pytest.raises(ValueError, match="no device 'cuda:99'"):
-        runner.describe_run("example", "cuda:99")
+        files.describe_run("example", "cuda:99")
 
 
 def test_writing_is_atomic(tmp_path, monkeypatch):
     path = tmp_path / "result.json"
-    runner.write_json(path, {"old": 1})
+    files.write_json(path, {"old": 1})
     monkeypatch.setattr(runner.os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
-        runner.write_json(path, {"new": 2})
+        files.write_json(path, {"new": 2})
     assert json.loads(path.read_text()) == {"old": 1}
     assert list(tmp_path.iterdir()) == [path]
 
@@ -113,20 +115,20 @@ def test_commit_and_whether_the_checkout_differs(tmp_path, monkeypatch):
 
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     monkeypatch.delenv("PIAVATAR_COMMIT", raising=False)
-    assert runner.git_commit(tmp_path) == ("unknown", None)
+    assert files.git_commit(tmp_path) == ("unknown", None)
     monkeypatch.setenv("PIAVATAR_COMMIT", "abc")
-    assert runner.git_commit(tmp_path) == ("abc", None)
-    assert runner.git_commit() == ("abc", None)  # also where another history came along with the copy
+    assert files.git_commit(tmp_path) == ("abc", None)
+    assert files.git_commit() == ("abc", None)  # also where another history came along with the copy
     monkeypatch.delenv("PIAVATAR_COMMIT")
     git("init", "--quiet")
     (tmp_path / "code.py").write_text("a = 1\n")
     git("add", "code.py")
     git("commit", "--quiet", "--message", "first", "--no-verify")
-    commit, dirty = runner.git_commit(tmp_path)
+    commit, dirty = files.git_commit(tmp_path)
     assert len(commit) == 40 and dirty is False
     results = Path(tmp_path, "benchmarks", "results")
     results.mkdir(parents=True)
     (results / "new.json").write_text("{}")
-    assert runner.git_commit(tmp_path) == (commit, False)
+    assert files.git_commit(tmp_path) == (commit, False)
     (tmp_path / "code.py").write_text("a = 2\n")
-    assert runner.git_commit(tmp_path) == (commit, True)
+    assert files.git_commit(tmp_path) == (commit, True)

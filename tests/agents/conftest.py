@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.config import TrainingConfig, load_training
+from agents.sb3.config import TrainingConfig, load_training
 
 TINY: dict[str, Any] = {
     "env": {"fidelity": "tiny", "episode_seconds": 0.5},

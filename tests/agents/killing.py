@@ -1,6 +1,6 @@
 """Trainings that are killed: by an exception in this process, or by SIGKILL in one of their own.
 
-``python -m tests.agents.killing train step 40 ARGS`` is ``python -m agents.train ARGS`` until its 40th step of the
+``python -m tests.agents.killing sb3.train step 40 ARGS`` is ``python -m agents.sb3.train ARGS`` until its 40th step of the
 environments, and ``... write 5 ARGS`` until it has written half of what its fifth ``fsync`` is of: its configuration,
 and then each checkpoint, synchronises its file, then its folder, so this is the second checkpoint.
 """
@@ -22,8 +22,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 ROOT = Path(__file__).resolve().parents[2]
 #: What takes a step of all environments, in the process that learns.
 _STEPS = {
-    "train": ("stable_baselines3.common.vec_env", "VecMonitor", "step_wait"),
-    "rsl_ppo": ("piavatar_envs.api.rsl_rl", "AvatarRslEnv", "step"),
+    "sb3.train": ("stable_baselines3.common.vec_env", "VecMonitor", "step_wait"),
+    "rsl_rl.train": ("piavatar_envs.api.rsl_rl", "AvatarRslEnv", "step"),
 }
 
 
@@ -79,7 +79,7 @@ def main(script: str, when: str, count: int, args: list[str]) -> None:
         return counted
 
     if when == "write":
-        folders = importlib.import_module("agents.folders")
+        folders = importlib.import_module("agents.files")
         folders.os.fsync = counting(os.fsync)
     else:
         module, views, method = _STEPS[script]

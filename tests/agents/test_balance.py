@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agents.balance import FRONTAL, GRAVITY, SAGITTAL, Balance, Effort, Stance
+from agents.pid.balance import FRONTAL, GRAVITY, SAGITTAL, Balance, Effort, Stance
 from piavatar_envs.avatar.body.skeleton import joint_index
 
 STANCE = Stance(mass=70.0, height=0.9, behind=0.06, ahead=0.18, beside=0.14, foot_width=0.08)

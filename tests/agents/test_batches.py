@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from agents.batches import BatchTraining, in_every_seat, load_batched, play, run
-from agents.evaluate import Episode, zero_agent
+from agents.batch_training import BatchTraining, load_batched, run
+from agents.evaluate import Episode, in_every_seat, play, zero_agent
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.tasks import load_task
@@ -86,7 +86,7 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_written(tmp_pa
     (tmp_path / "run.yaml").write_text("env_id: Reach-v0\n")
     line = [str(tmp_path / "run.yaml"), "--device", "cuda:99", "--out", str(tmp_path / "run")]
     with pytest.raises(SystemExit, match=r"^error: device='cuda:99' is not available .*; use one of cpu"):
-        run("rsl_ppo", Training, load_task, pytest.fail, line)
+        run("rsl_rl.train", Training, load_task, pytest.fail, line)
     assert not (tmp_path / "run").exists()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from agents.bones import BEYOND, NUM_DOF, Bones, Posture, answered, force_moments, in_bones
+from agents.pid.bones import BEYOND, NUM_DOF, Bones, Posture, answered, force_moments, in_bones
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
 
 GRAVITY = 9.81

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from agents import batches, demo, play, score_pid, train
+from agents import batch_training as batches
+from agents import demo, play
 from agents.command import meant_for, read_options
+from agents.pid import score as score_pid
+from agents.sb3 import train
 
 #: Scripts that take settings, and what they want first.
 SCRIPTS = {play: ["run"], train: ["run.yaml"], batches: ["run.yaml"], score_pid: ["PIAvatar/Stand-v0"], demo: []}
@@ -45,8 +48,8 @@ def test_options_that_there_are_not_are_refused(script, first, line, capsys):
 
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-#: What scripts call files that are theirs; those that lie in no library's folder are agents.train's.
-OWNERS = {"rsl_rl": "rsl_ppo", "skrl": "skrl_mappo", "sb3": "train", "configs": "train"}
+#: What scripts call files that are theirs; those that lie in no library's folder are agents.sb3.train's.
+OWNERS = {"rsl_rl": "rsl_rl.train", "skrl": "skrl.train", "sb3": "sb3.train", "configs": "sb3.train"}
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: path.stem)
@@ -54,7 +57,7 @@ def test_files_of_other_scripts_are_known_wherever_they_lie(path, tmp_path):
     owner = OWNERS[path.parent.name]
     copy = tmp_path / "config.yaml"
     copy.write_bytes(path.read_bytes())
-    for script in ("rsl_ppo", "skrl_mappo", "train"):
+    for script in ("rsl_rl.train", "skrl.train", "sb3.train"):
         told = "" if script == owner else f" (this is a file for python -m agents.{owner})"
         assert meant_for(path, script) == meant_for(copy, script) == told
 
@@ -63,7 +66,7 @@ def test_files_of_other_scripts_are_known_wherever_they_lie(path, tmp_path):
 def test_files_that_may_be_anybodys_are_nobodys(text, tmp_path):
     if text is not None:
         (tmp_path / "config.yaml").write_text(text, encoding="latin-1")
-    assert meant_for(tmp_path / "config.yaml", "train") == ""
+    assert meant_for(tmp_path / "config.yaml", "sb3.train") == ""
 
 
 def test_a_file_of_another_script_is_refused_with_that_ones_name():

@@ -7,8 +7,9 @@ import json
 
 import pytest
 
-from agents import compare, train
-from agents.config import load_training
+from agents import compare
+from agents.sb3 import train
+from agents.sb3.config import load_training
 from piavatar_envs.config import dump_yaml
 from tests.agents.conftest import TINY
 
@@ -27,7 +28,7 @@ def runs(device, tmp_path_factory):
 def test_runs_of_several_seeds_become_one_table(runs, tmp_path, capsys):
     compare.main([*map(str, runs), "--out", str(tmp_path / "scores.json")])
     report = json.loads((tmp_path / "scores.json").read_text())
-    assert report["seeds"] == [0, 1, 2] and report["of"] == "train" and "seed" not in report["config"]
+    assert report["seeds"] == [0, 1, 2] and report["of"] == "sb3.train" and "seed" not in report["config"]
     zero, random, trained = report["results"]
     own = [json.loads((run / "results.json").read_text())["results"] for run in runs]
     assert zero == {**own[0][0], "seeds": None} and random == {**own[0][1], "seeds": None}

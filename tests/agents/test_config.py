@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from agents.config import env_config, load_training
-from agents.workers import components, factory
+from agents.sb3.config import env_config, load_training
+from agents.sb3.workers import components, factory
 from piavatar_envs.config import ConfigError, dump_yaml
 from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
 

@@ -12,7 +12,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra train")
 
-from agents.divergence import Diverged, check_finite  # noqa: E402
+from agents.checkpoint import Diverged, check_finite  # noqa: E402
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 ALL = ("env.fidelity=tiny", "env.episode_seconds=0.3", "evaluation.episodes=2")
@@ -23,17 +23,17 @@ RSL = ("ppo.rollout_steps=8", "ppo.minibatches=2", "ppo.epochs=2")
 MAPPO = ("mappo.rollout_steps=8", "mappo.minibatches=2", "mappo.epochs=2")
 #: Name -> what it needs, script, configuration, its settings, the learning rate's, steps of a rollout.
 TRAININGS = {
-    "rsl": ("rsl_rl", "rsl_ppo", "rsl_rl/reach_rsl", (*BATCH, *RSL), "ppo", 16),
-    "ppo": ("stable_baselines3", "train", "reach_ppo", (*WORKER, *PPO), "ppo", 16),
+    "rsl": ("rsl_rl", "rsl_rl.train", "rsl_rl/reach_rsl", (*BATCH, *RSL), "ppo", 16),
+    "ppo": ("stable_baselines3", "sb3.train", "reach_ppo", (*WORKER, *PPO), "ppo", 16),
     "sac": (
         "stable_baselines3",
-        "train",
+        "sb3.train",
         "sb3/reach_sac",
         (*WORKER, "sac.batch_size=8", "sac.first_random=20"),
         "sac",
         1,
     ),
-    "mappo": ("skrl", "skrl_mappo", "skrl/high_five_mappo", (*BATCH, *MAPPO), "mappo", 16),
+    "mappo": ("skrl", "skrl.train", "skrl/high_five_mappo", (*BATCH, *MAPPO), "mappo", 16),
 }
 
 
@@ -96,7 +96,7 @@ def test_the_checkpoint_of_before_is_kept(name, device, tmp_path, monkeypatch):
     elif name == "ppo":
         from stable_baselines3 import PPO as Algorithm
 
-        spoil_after(monkeypatch, Algorithm, "train", 3, lambda model: model.policy.mlp_extractor.value_net)
+        spoil_after(monkeypatch, Algorithm, "sb3.train", 3, lambda model: model.policy.mlp_extractor.value_net)
     else:
         from skrl.multi_agents.torch.mappo import MAPPO as Algorithm
 

@@ -17,9 +17,8 @@ from agents.evaluate import (
     separated,
     zero_agent,
 )
-from agents.intervals import mean_over_seeds, share_interval, share_interval_over_seeds, wilson
-from agents.matches import seated
-from benchmarks.runner import mean_and_interval
+from agents.intervals import mean_and_interval, mean_over_seeds, share_interval, share_interval_over_seeds, wilson
+from agents.sb3.matches import seated
 
 
 def ones(observation):

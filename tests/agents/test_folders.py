@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from agents import play, scores
-from agents.batches import load_batched
+from agents.batch_training import load_batched
 from agents.checkpoint import UNREADABLE, Checkpoint, load_whole
-from agents.config import load_training
-from agents.folders import hold
-from agents.rsl_policy import RslTraining
+from agents.files import hold
+from agents.rsl_rl.policy import RslTraining
+from agents.sb3.config import load_training
 from piavatar_envs.config import ConfigError
 from piavatar_envs.tasks import load_task
 from scripts import train_all
@@ -24,7 +24,7 @@ def test_no_other_process_trains_where_one_does(tmp_path):
     pytest.importorskip("fcntl", reason="Windows knows no such locks")
     hold(tmp_path)
     hold(tmp_path)  # one process may go on where it was
-    code = f"from pathlib import Path; from agents.folders import hold; hold(Path({str(tmp_path)!r}))"
+    code = f"from pathlib import Path; from agents.files import hold; hold(Path({str(tmp_path)!r}))"
     other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert "another training writes to" in other.stderr and "--out" in other.stderr
 
@@ -35,7 +35,7 @@ def test_a_run_that_was_kept_is_not_written_over(name, resume, tmp_path):
     (tmp_path / name).write_text("kept")
     config = load_training({"env_id": "PIAvatar/Reach-v0", "env": {"fidelity": "tiny"}})
     with pytest.raises(ConfigError, match=rf"{name} is of a training that has ended"):
-        Checkpoint(tmp_path, "train", config, "cpu", resume)
+        Checkpoint(tmp_path, "sb3.train", config, "cpu", resume)
     assert (tmp_path / name).read_text() == "kept"
 
 

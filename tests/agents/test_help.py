@@ -9,10 +9,10 @@ torch = pytest.importorskip("torch", reason="needs the extras train and rsl")
 for needed in ("rsl_rl", "tensordict", "git"):
     pytest.importorskip(needed, reason="needs the extra rsl")
 
-from agents import rsl_ppo  # noqa: E402
-from agents.batches import load_batched  # noqa: E402
-from agents.help import HelpedEnv, HelpSettings  # noqa: E402
-from agents.rsl_policy import RslTraining  # noqa: E402
+from agents.batch_training import load_batched  # noqa: E402
+from agents.rsl_rl import train as rsl_ppo  # noqa: E402
+from agents.rsl_rl.curriculum import HelpedEnv, HelpSettings  # noqa: E402
+from agents.rsl_rl.policy import RslTraining  # noqa: E402
 from piavatar_envs.config import load_config, parse_assignments  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 

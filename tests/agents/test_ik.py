@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from agents.config import load_training
+from agents.demo import ReachIK
 from agents.evaluate import evaluate, zero_agent
-from agents.ik import ReachIK
-from agents.workers import factory, prepare, start_workers
+from agents.sb3.config import load_training
+from agents.sb3.workers import factory, prepare, start_workers
 
 
 def test_inverse_kinematics_reaches_every_target(device):

@@ -6,7 +6,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra train")
 
-from agents.mirror import Mirror, other_side  # noqa: E402
+from agents.rsl_rl.ppo import Mirror, other_side  # noqa: E402
 from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES  # noqa: E402
 from piavatar_envs.config import ConfigError, load_config  # noqa: E402

@@ -11,15 +11,14 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents import ppo
-from agents.config import load_training
 from agents.evaluate import evaluate, zero_agent
-from agents.matches import seated
-from agents.parallel import WAITING, AgentVecEnv, World, WorldFactory
-from agents.ppo import PPOSettings
-from agents.rollouts import MarkPlayed, PlayedBuffer
-from agents.train import train
-from agents.workers import factory, prepare, start_workers
+from agents.sb3 import ppo
+from agents.sb3.config import load_training
+from agents.sb3.matches import seated
+from agents.sb3.parallel import WAITING, AgentVecEnv, World, WorldFactory
+from agents.sb3.ppo import MarkPlayed, PlayedBuffer, PPOSettings
+from agents.sb3.train import train
+from agents.sb3.workers import factory, prepare, start_workers
 from piavatar_envs.config import ConfigError
 from tests.agents.games.auction_v0 import Auction
 from tests.agents.games.ledger_v0 import LEAVES, TERMINATED, Ledger

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from agents.gains import LoadSchedule, gains_by_strength, gains_for, subtrees
-from agents.pid import PID, Gains, PosePID, difference, follow, motion_poses, turned
+from agents.pid.controller import PID, Gains, PosePID, difference, follow, motion_poses, turned
+from agents.pid.gains import LoadSchedule, gains_by_strength, gains_for, subtrees
 
 M, L, G = 2.0, 0.5, 9.81
 INERTIA, LOAD = M * L**2, M * G * L  # [kg m^2], [N m]

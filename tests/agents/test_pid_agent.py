@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import agents.pid_agent
-from agents.design import Design
-from agents.pid import motion_poses
-from agents.pid_agent import PIDAgent, make_pid_agent, rest_poses
+import agents.pid.agent
+from agents.pid.agent import Design, PIDAgent, make_pid_agent, rest_poses
+from agents.pid.controller import motion_poses
 from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_limits
 from piavatar_envs.avatar.motion import deepmimic, load_motion
@@ -76,7 +75,7 @@ def test_it_stands_where_no_torque_and_joints_for_themselves_fall(standing, monk
     assert (agent.effort.margin > 0.0).all()  # caught: within the feet
     limp = np.zeros((len(SEEDS), standing.action_spec.size))
     assert play(standing, lambda _: limp, 1.0, SEEDS).max() < 0.7
-    monkeypatch.setattr(agents.pid_agent, "answered", alone)
+    monkeypatch.setattr(agents.pid.agent, "answered", alone)
     assert play(standing, agent, 2.0, SEEDS).max() < 1.8
 
 

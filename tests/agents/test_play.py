@@ -13,8 +13,9 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra train")
 pytest.importorskip("stable_baselines3", reason="needs the extra train")
 
-from agents import play, scores, train  # noqa: E402
+from agents import play, scores  # noqa: E402
 from agents.play import open_run  # noqa: E402
+from agents.sb3 import train  # noqa: E402
 from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
 from piavatar_envs.config import ConfigError, load_config  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
@@ -31,7 +32,7 @@ def run_of(kind: str, folder, device: str) -> None:
     if kind == "rsl":
         for needed in ("rsl_rl", "tensordict", "git"):
             pytest.importorskip(needed, reason="needs the extra rsl")
-        from agents import rsl_ppo
+        from agents.rsl_rl import train as rsl_ppo
 
         few = ("num_envs=2", "iterations=2", "ppo.rollout_steps=4", "ppo.minibatches=1", "ppo.epochs=1")
         rsl_ppo.main(["configs/rsl_rl/reach_rsl.yaml", *QUICK, *few, "--out", str(folder), "--device", device])

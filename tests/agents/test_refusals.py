@@ -10,11 +10,13 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="needs the extra train")
 
-from agents import compare, demo, play, score_pid, score_random, scores, train
-from agents.batches import BatchTraining, load_batched, run
+from agents import compare, demo, play, score_random, scores
+from agents.batch_training import BatchTraining, load_batched, run
 from agents.checkpoint import Checkpoint, learned_otherwise
-from agents.config import load_training
-from agents.lessons import changed
+from agents.config import changed
+from agents.pid import score as score_pid
+from agents.sb3 import train
+from agents.sb3.config import load_training
 from piavatar_envs.config import dump_yaml, load_config
 from piavatar_envs.tasks import load_task
 from tests.agents.conftest import TINY

@@ -15,12 +15,12 @@ import torch
 from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from agents import train
 from agents.checkpoint import Checkpoint, as_arrays, as_tensors, random_states, set_random_states
-from agents.config import load_training
-from agents.folders import write_whole
-from agents.learning import begin, learn
-from agents.workers import factory, prepare, start_vector, start_workers
+from agents.files import write_whole
+from agents.sb3 import train
+from agents.sb3.config import load_training
+from agents.sb3.learning import begin, learn
+from agents.sb3.workers import factory, prepare, start_vector, start_workers
 from piavatar_envs.config import ConfigError, dump_yaml
 from tests.agents.conftest import TINY
 from tests.agents.killing import KillAt, Killed, flat, run_killed
@@ -38,7 +38,7 @@ def networks(policy: Path) -> dict[str, str]:
     return found
 
 
-def checkpoint_of(config, folder: Path, resume: bool = True, script: str = "train") -> Checkpoint:
+def checkpoint_of(config, folder: Path, resume: bool = True, script: str = "sb3.train") -> Checkpoint:
     folder.mkdir(exist_ok=True)
     return Checkpoint(folder, script, config, "cpu", resume)
 
@@ -51,11 +51,11 @@ def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path):
     command = [str(path), "--device", device, "--out"]
     train.main([*command, str(tmp_path / "whole")])
     parts = tmp_path / "parts"
-    run_killed("train", "step", 75, *command, str(parts))
+    run_killed("sb3.train", "step", 75, *command, str(parts))
     assert checkpoint_steps(parts) == 64
     assert not (parts / "policy.zip").exists()
     # it keeps one at 96 steps, and half of the one at 128
-    run_killed("train", "write", 5, *command, str(parts), "--resume")
+    run_killed("sb3.train", "write", 5, *command, str(parts), "--resume")
     assert checkpoint_steps(parts) == 96
     half = parts / "checkpoint.pt.partial"
     assert 0 < half.stat().st_size < (parts / "checkpoint.pt").stat().st_size
@@ -157,9 +157,9 @@ def test_another_configuration_is_refused(tiny, change, words, tmp_path):
 def test_other_versions_devices_and_scripts_are_refused(tiny, tmp_path, monkeypatch):
     checkpoint_of(tiny, tmp_path).save({})
     with pytest.raises(ConfigError, match=r"script 'train', now it is 'rsl_ppo'"):
-        checkpoint_of(tiny, tmp_path, script="rsl_ppo")
+        checkpoint_of(tiny, tmp_path, script="rsl_rl.train")
     with pytest.raises(ConfigError, match=r"device 'cpu', now it is 'cuda:0'"):
-        Checkpoint(tmp_path, "train", tiny, "cuda:0", resume=True)
+        Checkpoint(tmp_path, "sb3.train", tiny, "cuda:0", resume=True)
     with monkeypatch.context() as patch:
         patch.setattr("agents.checkpoint.package_version", lambda name: "0.0.1" if name == "torch" else "1")
         with pytest.raises(ConfigError, match=r"now it is .*; install that version, or begin anew"):

@@ -12,10 +12,11 @@ torch = pytest.importorskip("torch", reason="needs the extras train and rsl")
 for needed in ("rsl_rl", "tensordict", "git"):
     pytest.importorskip(needed, reason="needs the extra rsl")
 
-from agents import rsl_algorithm, rsl_ppo  # noqa: E402
-from agents.batches import load_batched, new_task  # noqa: E402
+from agents.batch_training import load_batched, new_task  # noqa: E402
 from agents.checkpoint import Checkpoint  # noqa: E402
-from agents.rsl_policy import RslTraining  # noqa: E402
+from agents.rsl_rl import ppo as rsl_algorithm  # noqa: E402
+from agents.rsl_rl import train as rsl_ppo  # noqa: E402
+from agents.rsl_rl.policy import RslTraining  # noqa: E402
 from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
 from piavatar_envs.avatar.motion import deepmimic  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
@@ -41,7 +42,7 @@ def test_published_configurations_train_and_leave_their_results(path, device, tm
     left = {entry.name for entry in tmp_path.iterdir()}
     assert {"policy.pt", "curve.png", "curve.csv", "config.yaml", "results.json"} <= left
     results = json.loads((tmp_path / "results.json").read_text())
-    assert results["benchmark"] == "rsl_ppo" and results["num_envs"] == 2 and results["training_s"] > 0.0
+    assert results["benchmark"] == "rsl_rl.train" and results["num_envs"] == 2 and results["training_s"] > 0.0
     assert [row["case"] for row in results["results"]] == ["zero", "random", "trained"]
     assert np.isfinite([row["return_mean"] for row in results["results"]]).all()
     steps = [line.split(",")[0] for line in (tmp_path / "curve.csv").read_text().split()[1:]]
@@ -60,7 +61,7 @@ def test_training_changes_the_policy_repeats_and_depends_on_its_seed(device, tmp
         config = load_batched(RslTraining, load_task, None, overrides | extra)
         folder = tmp_path / name
         folder.mkdir()
-        checkpoint = Checkpoint(folder, "rsl_ppo", config, device, resume=False)
+        checkpoint = Checkpoint(folder, "rsl_rl.train", config, device, resume=False)
         agents[name] = rsl_ppo.learn(config, new_task(config, load_task), folder, device, checkpoint).agent
         saved = torch.load(folder / "policy.pt", weights_only=True, map_location="cpu")
         actors[name] = {key: value for key, value in saved.items() if "weight" in key}
@@ -139,9 +140,11 @@ def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path, capsys
     command, more = ([str(path), *longer, f"iterations={n}", "--device", device, "--out"] for n in (6, 8))
     rsl_ppo.main([*command, str(tmp_path / "whole")])
     parts = tmp_path / "parts"
-    run_killed("rsl_ppo", "step", 30, *command, str(parts))  # in the fourth iteration; the first and third are kept
+    run_killed(
+        "rsl_rl.train", "step", 30, *command, str(parts)
+    )  # in the fourth iteration; the first and third are kept
     assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 3
-    run_killed("rsl_ppo", "write", 5, *command, str(parts), "--resume")
+    run_killed("rsl_rl.train", "write", 5, *command, str(parts), "--resume")
     assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 5
     assert (parts / "checkpoint.pt.partial").exists()
     rsl_ppo.main([*command, str(parts), "--resume"])

@@ -8,7 +8,8 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the extra train")
 
-from agents import score_pid, scores
+from agents import scores
+from agents.pid import score as score_pid
 from piavatar_envs.avatar.motion import deepmimic
 
 SHORT = ("PIAvatar/Stand-v0", "fidelity=tiny", "episode_seconds=0.2")

@@ -9,10 +9,10 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the extra train")
 
-from agents import score_pid, score_random, scores
-from agents.batches import in_every_seat, play
-from agents.evaluate import over_seeds, random_agent
-from agents.seeds import first_seed
+from agents import score_random, scores
+from agents.config import first_seed
+from agents.evaluate import in_every_seat, over_seeds, play, random_agent
+from agents.pid import score as score_pid
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task

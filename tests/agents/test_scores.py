@@ -34,14 +34,14 @@ def runs() -> dict[str, dict]:
     """Two seeds and another script in one environment, and one run in another."""
     pushes = {"by_push": [{"impulse_n_s": [0.0, 5.0], "episodes": 10, "lasted": 0.5, "lasted_interval": [0.2, 0.8]}]}
     return {
-        "stand_0": run("rsl_ppo", "Stand-v0", 0, row("trained", 80.0)),
-        "stand_1": run("rsl_ppo", "Stand-v0", 1, row("trained", 90.0), seconds=80.0),
+        "stand_0": run("rsl_rl.train", "Stand-v0", 0, row("trained", 80.0)),
+        "stand_1": run("rsl_rl.train", "Stand-v0", 1, row("trained", 90.0), seconds=80.0),
         "stand_pid": {
             key: value
-            for key, value in run("score_pid", "Stand-v0", 0, row("PID", 40.0)).items()
+            for key, value in run("pid.score", "Stand-v0", 0, row("PID", 40.0)).items()
             if key not in ("training_s", "train_steps")
         },
-        "push": run("train", "Push-v0", 0, row("trained", 10.0, **pushes)),
+        "push": run("sb3.train", "Push-v0", 0, row("trained", 10.0, **pushes)),
     }
 
 
@@ -79,7 +79,7 @@ def test_several_streams_of_random_actions_take_the_place_of_single_ones(runs):
     found = {(r["env_id"], r["agent"]): (r["return_mean"], r["seeds"], r["episodes"]) for r in rows}
     assert found["Push-v0", "random"] == (2.5, 5, 4)
     assert found["Stand-v0", "random"] == (2.7, 5, 4)
-    assert found["Stand-v0", "random, as score_pid"] == (1.5, None, 10)
+    assert found["Stand-v0", "random, as pid.score"] == (1.5, None, 10)
     assert found["Stand-v0", "random, as score_random"] == (2.9, 5, 4)
     assert len(rows) == 9 and found["Stand-v0", "zero"] == (3.0, None, 10)
 
@@ -89,7 +89,7 @@ def test_the_untrained_of_one_environment_stand_once_also_in_fewer_episodes(runs
     found = [(r["agent"], r["return_mean"]) for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
     assert found == [("random", 2.0), ("zero", 3.0), ("PID", 40.0), ("rsl_ppo", 85.0)]
     runs["stand_pid"]["config"]["env"]["physics"]["fidelity"] = "fine"
-    assert {r["agent"] for r in scores.scores(runs)} >= {"random, as score_pid", "zero, as score_pid"}
+    assert {r["agent"] for r in scores.scores(runs)} >= {"random, as pid.score", "zero, as pid.score"}
 
 
 @pytest.mark.parametrize("value, same", [(False, True), (True, False)])
@@ -99,7 +99,7 @@ def test_what_is_null_is_the_same_as_what_follows(value, same, runs):
     runs["stand_pid"]["results"][:2] = [row("zero", 3.4), row("random", 2.4)]
     found = {r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"}
     assert found == {"random", "zero", "PID", "rsl_ppo"} | (
-        set() if same else {"random, as score_pid", "zero, as score_pid"}
+        set() if same else {"random, as pid.score", "zero, as pid.score"}
     )
 
 
@@ -174,7 +174,7 @@ def test_a_setting_that_the_training_did_not_know_has_its_default_in_a_later_eva
 @pytest.mark.parametrize(
     ("run_name", "more", "words"),
     [
-        ("push", {"benchmark": "train"}, "benchmark='train', of this run it would have 'play'"),
+        ("push", {"benchmark": "sb3.train"}, "benchmark='sb3.train', of this run it would have 'play'"),
         ("push", {"run": "push_1"}, "run='push_1', of this run it would have 'push'"),
         ("push", {"env": {"physics": {"fidelity": "tiny"}}}, "env.physics.fidelity='tiny', .* 'coarse'"),
         ("push", {"env": {}}, "env.physics.fidelity=None, .* 'coarse'"),
@@ -237,7 +237,7 @@ def test_untrained_agents_stand_twice_where_actions_mean_something_else(runs):
     runs["stand_pid"]["results"][0]["return_mean"] = 3.0001  # rounding, on another device
     runs["stand_pid"]["results"][1]["return_mean"] = 2.5
     agents = [r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
-    assert agents == ["random", "random, as score_pid", "zero", "PID", "rsl_ppo"]
+    assert agents == ["random", "random, as pid.score", "zero", "PID", "rsl_ppo"]
 
 
 def test_other_settings_are_refused(runs):

@@ -8,9 +8,11 @@ import pytest
 from pydantic import Field
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents import ppo, sac, seeds
-from agents.batches import BatchTraining, load_batched, new_task
-from agents.config import EvaluationSettings, load_training
+from agents import config as seeds
+from agents.batch_training import BatchTraining, load_batched, new_task
+from agents.config import EvaluationSettings
+from agents.sb3 import ppo, sac
+from agents.sb3.config import load_training
 from piavatar_envs.config import ConfigError
 from piavatar_envs.tasks import load_task
 
@@ -59,8 +61,8 @@ def test_environments_of_stable_baselines3_begin_with_the_run_s_episodes(countdo
 def test_environments_of_rsl_rl_begin_with_the_run_s_episodes(device):
     for needed in ("rsl_rl", "tensordict", "git"):
         pytest.importorskip(needed, reason="needs the extra rsl")
-    from agents import rsl_ppo
-    from agents.rsl_policy import RslTraining
+    from agents.rsl_rl import train as rsl_ppo
+    from agents.rsl_rl.policy import RslTraining
 
     config = load_batched(RslTraining, load_task, {"seed": 5, "num_envs": 3, "env": {"fidelity": "tiny"}})
     env = rsl_ppo.make_env(config, new_task(config, load_task), device)

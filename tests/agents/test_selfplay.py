@@ -10,15 +10,15 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents import matches, ppo, selfplay, train
 from agents.checkpoint import Checkpoint
-from agents.config import TrainingConfig, load_training
+from agents.config import first_seed
 from agents.evaluate import Episode, random_agent, zero_agent
-from agents.learning import begin, learn
-from agents.parallel import AgentVecEnv, WorldFactory
-from agents.seeds import first_seed
-from agents.selfplay import Opponents, Pool, SelfPlaySettings
-from agents.workers import factory, prepare
+from agents.sb3 import matches, ppo, selfplay, train
+from agents.sb3.config import TrainingConfig, load_training
+from agents.sb3.learning import begin, learn
+from agents.sb3.parallel import AgentVecEnv, WorldFactory
+from agents.sb3.selfplay import Opponents, Pool, SelfPlaySettings
+from agents.sb3.workers import factory, prepare
 from piavatar_envs.config import ConfigError, dump_yaml
 from tests.agents.killing import KillAt, Killed
 
@@ -42,7 +42,7 @@ def auction(games) -> TrainingConfig:
 
 def keep(config: TrainingConfig, folder) -> Checkpoint:
     folder.mkdir(exist_ok=True)
-    return Checkpoint(folder, "train", config, "cpu", resume=True)
+    return Checkpoint(folder, "sb3.train", config, "cpu", resume=True)
 
 
 def play(config: TrainingConfig, folder, checkpoint: Checkpoint | None = None, watcher: BaseCallback | None = None):
@@ -200,7 +200,7 @@ def test_what_is_interrupted_goes_on_with_its_pool_as_if_it_had_not_been(auction
 
 
 def test_self_play_beats_where_it_began(games, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("agents.workers.start_workers", lambda make, count: DummyVecEnv([make] * count))
+    monkeypatch.setattr("agents.sb3.workers.start_workers", lambda make, count: DummyVecEnv([make] * count))
     path = tmp_path / "auction.yaml"
     path.write_text(dump_yaml(load_training(AUCTION)))
     settings = ["total_steps=2304", "selfplay.snapshot_every=576", "checkpoint_every=1000"]

@@ -15,9 +15,9 @@ torch = pytest.importorskip("torch", reason="needs the extras train and skrl")
 pytest.importorskip("skrl", reason="needs the extra skrl")
 pytest.importorskip("pettingzoo", reason="needs the extra multi")
 
-from agents import skrl_mappo  # noqa: E402
-from agents.batches import load_batched, new_task  # noqa: E402
+from agents.batch_training import load_batched, new_task  # noqa: E402
 from agents.checkpoint import Checkpoint  # noqa: E402
+from agents.skrl import train as skrl_mappo  # noqa: E402
 from piavatar_envs.api.skrl import AvatarSkrlMultiEnv  # noqa: E402
 from piavatar_envs.config import ConfigError  # noqa: E402
 from tests.agents.killing import Killed, flat  # noqa: E402
@@ -63,7 +63,7 @@ def test_published_configurations_train_and_leave_their_results(path, device, tm
     left = {entry.name for entry in tmp_path.iterdir()}
     assert {"policy.pt", "curve.png", "curve.csv", "config.yaml", "results.json"} <= left
     results = json.loads((tmp_path / "results.json").read_text())
-    assert results["benchmark"] == "skrl_mappo" and results["agents"] == ["agent_0", "agent_1"]
+    assert results["benchmark"] == "skrl.train" and results["agents"] == ["agent_0", "agent_1"]
     assert [row["case"] for row in results["results"]] == ["zero", "random", "trained"]
     assert all(len(row["agent_return_mean"]) == 2 for row in results["results"])
     # 20 steps of two worlds, whose episodes have 9
@@ -184,7 +184,7 @@ def test_training_repeats_and_depends_on_its_seed(config, env, device, tmp_path)
         folder.mkdir()
         changed = config.model_copy(update={"seed": seed, "iterations": iterations})
         task = new_task(changed, skrl_mappo.find_world)
-        checkpoint = Checkpoint(folder, "skrl_mappo", changed, device, resume=False)
+        checkpoint = Checkpoint(folder, "skrl.train", changed, device, resume=False)
         actions.append(skrl_mappo.learn(changed, task, folder, device, checkpoint).agent(seen))
         saved = torch.load(folder / "policy.pt", weights_only=False, map_location="cpu")
         first_layers.append(saved["agent_1"]["policy"]["net.0.weight"])
@@ -203,7 +203,7 @@ def test_what_is_interrupted_goes_on_as_if_it_had_not_been(config, device, tmp_p
         changed = config.model_copy(update={"iterations": iterations, "checkpoint_every": 2})
         folder = tmp_path / name
         folder.mkdir(exist_ok=True)
-        checkpoint = Checkpoint(folder, "skrl_mappo", changed, device, resume)
+        checkpoint = Checkpoint(folder, "skrl.train", changed, device, resume)
         curve = skrl_mappo.learn(changed, new_task(changed, skrl_mappo.find_world), folder, device, checkpoint).curve
         saved = torch.load(folder / "checkpoint.pt", weights_only=True)["state"]
         return curve.steps, curve.returns, flat({name: saved[name] for name in ("agents", "envs", "playing", "random")})

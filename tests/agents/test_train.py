@@ -12,10 +12,12 @@ from rich.console import Console
 from stable_baselines3 import PPO
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from agents import demo, train
-from agents.config import load_training
-from agents.evaluate import evaluate, policy_agent
-from agents.workers import factory, prepare, start_vector, start_workers
+from agents import demo
+from agents.evaluate import evaluate
+from agents.sb3 import train
+from agents.sb3.config import load_training
+from agents.sb3.policy import policy_agent
+from agents.sb3.workers import factory, prepare, start_vector, start_workers
 from piavatar_envs.config import ConfigError, dump_yaml
 
 PUBLISHED = sorted((Path(__file__).resolve().parents[2] / "configs" / "sb3").glob("*.yaml"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.rig import joint_gaps
+from benchmarks.physics.rig import joint_gaps
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.torque_control.bone_contact import LAYER
 from piavatar_envs.mpm.colliders import Collider

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.rig import joint_gaps
+from benchmarks.physics.rig import joint_gaps
 from piavatar_envs.config import load_config
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv

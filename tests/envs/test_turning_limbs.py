@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.wear import set_spinning, straight_growth, widths
+from benchmarks.physics.wear import set_spinning, straight_growth, widths
 from piavatar_envs.avatar.body.asset import dense_weights
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index
 from piavatar_envs.avatar.torque_control.dynamics import LOCK

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks.matter import Matter, ball, build_matter, lattice
+from benchmarks.physics.matter import Matter, ball, build_matter, lattice
 from piavatar_envs.mpm.model import CONTACT_GATE, Fields, MaterialPoints
 
 FLOOR = [((0.0, 0.0, 1.0), -0.11, 0.5)]
@@ -17,7 +17,7 @@ FLOOR = [((0.0, 0.0, 1.0), -0.11, 0.5)]
 
 @pytest.fixture(scope="session")
 def simulate(device: str) -> Callable[..., Matter]:
-    """Builds a box of matter, see :func:`benchmarks.matter.build_matter`."""
+    """Builds a box of matter, see :func:`benchmarks.physics.matter.build_matter`."""
     return partial(build_matter, device=device)
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import elastodynamics, impacts
-from benchmarks.textbook import HertzImpact
+from benchmarks.physics import elastodynamics, impacts
+from benchmarks.physics.textbook import HertzImpact
 from piavatar_envs.mpm import model as build
 from piavatar_envs.mpm.model import CFL_STABLE, MaterialPoints
 

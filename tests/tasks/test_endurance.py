@@ -1,4 +1,4 @@
-"""Random full-scale actions: a few hundred steps here, the ten thousand of a release in benchmarks/robustness.py."""
+"""Random full-scale actions: a few hundred steps; benchmarks/physics/robustness.py takes ten thousand."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from benchmarks import robustness
+from benchmarks.physics import robustness
 from piavatar_envs.tasks import task_modules
 
 SEEDS, STEPS = 20, 10

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from agents.mirror import Mirror
+from agents.rsl_rl.ppo import Mirror
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.envs.batch_env import BatchEnv

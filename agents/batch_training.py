@@ -1,0 +1,197 @@
+"""What trainings on one batch have in common, whichever library learns: configuration, command line, evaluation.
+
+A batch advances all its environments in the same kernel launches and hands out tensors on their device. The learning
+itself is in ``agents/skrl/train.py`` and ``agents/rsl_rl/train.py``.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+from pydantic import AfterValidator, BaseModel, Field, field_validator
+
+from agents.checkpoint import Checkpoint, Diverged
+from agents.command import meant_for, read_options
+from agents.config import MOST_ENVS, MOST_RUNS, EvaluationSettings, first_seed, load_resolved
+from agents.evaluate import Agent, play_beside_baselines
+from agents.files import made
+from agents.report import Curve, conclude, draw_curve, versions
+from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.config import (
+    FROZEN,
+    ConfigError,
+    EnvConfig,
+    FrozenDict,
+    load_config,
+    parse_assignments,
+)
+from piavatar_envs.doctor import quiet_warp
+from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.world import check_device
+from piavatar_envs.tasks import listed_name
+
+
+class BatchTraining(BaseModel):
+    """What a training on a batch depends on; a library's settings come in a subclass."""
+
+    model_config = FROZEN
+
+    env_id: str = Field(description="registered id, or a module of piavatar_envs.multi such as high_five_v0")
+    env: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
+        default_factory=dict, description="settings of the environment that differ from its defaults"
+    )
+    observe: tuple[str, ...] | None = Field(
+        None, description="terms of the observation that the networks see; null for all of it"
+    )
+    num_envs: int = Field(64, ge=1, le=MOST_ENVS, description="environments of the batch")
+    iterations: int = Field(100, ge=1, description="rollouts, each followed by an update")
+    seed: int = Field(0, ge=0, lt=MOST_RUNS, description="of the networks, the actions and the training episodes")
+    checkpoint_every: int = Field(10, ge=1, description="iterations between two checkpoints")
+    evaluation: EvaluationSettings = Field(default_factory=EvaluationSettings, description="how agents are compared")
+
+    _list_env_id = field_validator("env_id")(listed_name)
+
+    @property
+    def first_seed(self) -> int:
+        """Seed of the first environment's episodes; environment ``i`` plays those of ``first_seed + i``."""
+        return first_seed(self.seed)
+
+
+Training = TypeVar("Training", bound=BatchTraining)
+#: From a training's environment id to the task.
+FindTask = Callable[[str], type[Task]]
+
+
+def load_batched(
+    cls: type[Training],
+    find_task: FindTask,
+    source: Mapping[str, Any] | str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Training:
+    """A resolved configuration: what ``env`` left to the task's defaults is filled in.
+
+    Args:
+        cls: of the library's training.
+        find_task: the task of an environment's id; a ValueError where there is none.
+        source: a YAML file or a mapping.
+        overrides: settings that win over it, as from a command line; ``env.NAME`` for those of the environment.
+
+    Raises:
+        ConfigError: a setting that is unknown, of the wrong type or out of range, also of the environment; or more
+            minibatches than there are steps to share.
+    """
+    config = load_resolved(cls, lambda config: find_task(config.env_id).Config, source, overrides)
+    for name in ("ppo", "mappo"):
+        settings = getattr(config, name, None)
+        if settings is not None and settings.minibatches > (steps := config.num_envs * settings.rollout_steps):
+            raise ConfigError(
+                f"{name}.minibatches={settings.minibatches} must be <= {steps}, the steps of a rollout of num_envs="
+                f"{config.num_envs} environments"
+            )
+    return config
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a library hands back.
+
+    Attributes:
+        agent: the trained policy's mean action, as :func:`play` takes it.
+        curve: returns of the training episodes.
+    """
+
+    agent: Agent
+    curve: Curve
+
+
+def iterations_of(checkpoint: Checkpoint, asked: int) -> int:
+    """How many iterations a training has had when it begins or goes on.
+
+    Raises:
+        ConfigError: more than are asked for.
+    """
+    had = checkpoint.state["iterations"] if checkpoint.state else 0
+    if had > asked:
+        raise ConfigError(f"{checkpoint.path} has had {had} iterations, iterations={asked}; ask for as many or more")
+    return had
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train agents on one batch of environments, and evaluate them."""
+
+    #: YAML file with what differs from the defaults
+    config: tyro.conf.Positional[Path]
+    #: settings that win over the file: iterations=10 env.fidelity=tiny num_envs=256
+    settings: tyro.conf.Positional[tuple[str, ...]] = ()
+    #: folder to write to; by default runs/ and the name of the file
+    out: Path | None = None
+    #: where to simulate and to learn
+    device: str = "cpu"
+    #: go on from the folder's checkpoint; where there is none, begin
+    resume: bool = False
+
+
+def run(
+    name: str,
+    cls: type[Training],
+    find_task: FindTask,
+    learn: Callable[[Training, Task, Path, str, Checkpoint], Learned],
+    args: list[str] | None = None,
+) -> None:
+    """The command line of a script: train as a file says, evaluate, leave ``results.json`` and a curve.
+
+    Args:
+        name: of the script.
+        cls: its configuration.
+        find_task: the task of an environment's id.
+        learn: trains; given the configuration, the task, the folder to write to, the device, and the checkpoint from
+            which to go on and which to keep up. It leaves the configuration in the folder when it refuses no more.
+        args: command line, by default the process's own.
+    """
+    options = read_options(Options, name, args)
+    quiet_warp()
+    try:
+        config = load_batched(cls, find_task, options.config, parse_assignments(options.settings))
+        check_device(options.device)
+    except ValueError as error:
+        sys.exit(f"error: {error}{meant_for(options.config, name)}")
+    folder = options.out or Path("runs") / options.config.stem
+    try:
+        task = new_task(config, find_task)
+        with made(folder):
+            checkpoint = Checkpoint(folder, name, config, options.device, options.resume)
+            iterations_of(checkpoint, config.iterations)
+            learned = learn(config, task, folder, options.device, checkpoint)
+        conclude_batch(name, config, find_task, learned, folder, options.device)
+    except (ConfigError, Diverged, OSError) as error:
+        sys.exit(f"error: {error}")
+
+
+def conclude_batch(
+    name: str, config: BatchTraining, find_task: FindTask, learned: Learned, folder: Path, device: str
+) -> None:
+    """Evaluate what was learned; leaves ``results.json`` and the curve. Arguments are as for :func:`run`."""
+    task = new_task(config, find_task)
+    batch = BatchedEpisodes(task, config.evaluation.episodes, device)
+    results = play_beside_baselines("trained", learned.agent, batch, config.evaluation.first_seed)
+    batch.close()
+    learned.curve.save(folder / "curve.csv")
+    bands = {result.agent: result.estimate() for result in results}
+    draw_curve(folder / "curve.png", learned.curve.steps, learned.curve.returns, bands, config.env_id)
+    about = versions(name, device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
+    cost = {"training_s": learned.curve.seconds, "train_steps": learned.curve.train_steps}
+    extra = {**cost, "num_envs": config.num_envs, "agents": task.agent_names}
+    conclude(folder, about, results, extra, "policy.pt, curve.png, curve.csv, config.yaml, results.json")
+
+
+def new_task(config: BatchTraining, find_task: FindTask) -> Task:
+    """The task of a resolved configuration; every batch needs one of its own, which holds its arrays."""
+    task_class = find_task(config.env_id)
+    settings: EnvConfig = load_config(task_class.Config, config.env)
+    return task_class(settings)

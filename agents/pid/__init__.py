@@ -1,0 +1,1 @@
+"""PID controllers and balance for bodies under joint torques."""

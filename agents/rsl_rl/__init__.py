@@ -1,0 +1,1 @@
+"""PPO with rsl_rl on a batch of environments."""

@@ -1,0 +1,180 @@
+"""rsl_rl's PPO, with what trainings of the suite ask of it besides.
+
+Left and right changed over: what a body sees and does, seen in a mirror.
+
+A body is the same on both sides, and so is what it can do: whatever is a good action here is, mirrored, a good action
+in the mirrored state. An algorithm that is told so learns from every step twice (Mittal, Rudin, Klemm, Allshire &
+Hutter, "Symmetry considerations for learning task symmetric robot policies", ICRA 2024).
+
+The mirror is the plane x = 0, in which a body that faces -y looks straight ahead. Vectors change their x; spins and
+rotation vectors keep it and change y and z; a rotation matrix becomes ``S R S`` with ``S = diag(-1, 1, 1)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
+
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
+from piavatar_envs.config import ConfigError
+
+
+class ScaledPPO(PPO):
+    """rsl_rl's PPO, which learns from scaled rewards and noisy observations, and in smaller and smaller updates.
+
+    What is logged are the environment's own rewards.
+
+    Attributes:
+        updates: how many there have been; to be set where a training goes on.
+        check: is called after each, also after one that torch has refused to end; to be set.
+    """
+
+    check: Callable[[], None]
+
+    def __init__(
+        self, *args: Any, reward_scale: float, observation_noise: float, kl_targets: Sequence[float], **settings: Any
+    ) -> None:
+        """As rsl_rl's.
+
+        Args:
+            args: of the base.
+            reward_scale: the factor.
+            observation_noise: standard deviation of what is added to every component.
+            kl_targets: of the first update and all that follow, in place of ``desired_kl``; none for a fixed one.
+            settings: of the base.
+        """
+        super().__init__(*args, **settings)
+        self.reward_scale, self.kl_targets, self.updates = reward_scale, kl_targets, 0
+        self.observation_noise = observation_noise
+
+    def update(self) -> dict[str, float]:
+        """Learn from a rollout.
+
+        Raises:
+            Diverged: the networks are not finite any more.
+        """
+        if self.kl_targets:
+            self.desired_kl = self.kl_targets[min(self.updates, len(self.kl_targets) - 1)]
+        self.updates += 1
+        try:
+            losses = super().update()
+        except (RuntimeError, ValueError):  # what torch says of broken networks says nothing to whoever trains
+            self.check()
+            raise
+        self.check()
+        return losses
+
+    def process_env_step(
+        self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, torch.Tensor]
+    ) -> None:
+        """Record a step."""
+        super().process_env_step(obs, self.reward_scale * rewards, dones, extras)
+
+    def act(self, obs: TensorDict) -> torch.Tensor:
+        """Draw actions, and record what they are drawn for."""
+        if self.observation_noise > 0.0:
+            obs = obs.apply(lambda seen: seen + self.observation_noise * torch.randn_like(seen))
+        return super().act(obs)
+
+
+if TYPE_CHECKING:
+    from piavatar_envs.envs.observations import ObservationTerm
+
+#: Signs in the mirror of one scalar, of a scalar that counts to the left, and of the kinds above.
+_SCALAR, _ASIDE = (1.0,), (-1.0,)
+_VECTOR, _SPIN = (-1.0, 1.0, 1.0), (1.0, -1.0, -1.0)
+_ROOT = (-1.0, 1.0, -1.0)  # x, y, yaw
+_ROTATION = (1.0, -1.0, -1.0, -1.0, 1.0, 1.0)  # two columns
+_HALF_A_STRIDE = (-1.0, -1.0)  # sine and cosine of a clock
+_SIDES, _BODY, _JOINTS, _PARTS = ("left", "right"), JOINT_NAMES, JOINT_NAMES[1:], tuple(BODY_PARTS)
+
+#: What terms of observations hold: the signs of one item, and the names of the items.
+_TERMS: Mapping[str, tuple[tuple[float, ...], Sequence[str]]] = {
+    "root_height": (_SCALAR, ("root",)),
+    "root_orientation": (_ROTATION, ("root",)),
+    "joint_rotations": (_ROTATION, _JOINTS),
+    "bone_positions": (_VECTOR, _JOINTS),
+    "bone_velocities": (_VECTOR, _BODY),
+    "stress": (_SCALAR, _PARTS),
+    "contact_impulse": (_VECTOR, _PARTS),
+    "root_spin": (_SPIN, ("root",)),
+    "joint_velocities": (_SPIN, _JOINTS),
+    "ground_impulse": (_VECTOR, ("root",)),
+    "gravity_direction": (_VECTOR, ("root",)),
+    "foot_impulses": (_SCALAR, _SIDES),
+    "ball_position": (_VECTOR, ("ball",)),
+    "ball_velocity": (_VECTOR, ("ball",)),
+    "reference_positions": (_VECTOR, _BODY),
+    "reference_root": (_ROTATION, ("root",)),
+    "reference_turns": (_SPIN, _JOINTS),
+    "way_direction": (_VECTOR, ("way",)),
+    "way_offset": (_ASIDE, ("way",)),
+    "gait_phase": (_HALF_A_STRIDE, ("clock",)),
+}
+
+
+def other_side(name: str) -> str:
+    """The name of what is on the other side; of what is in the middle, its own."""
+    side, underscore, rest = name.partition("_")
+    return {"left": "right", "right": "left"}.get(side, side) + underscore + rest
+
+
+class Mirror:
+    """Mirrors observations and actions; both as tensors whose last dimension are the components."""
+
+    def __init__(
+        self, terms: Iterable[ObservationTerm], joints: Sequence[str], device: str | torch.device, root: bool = False
+    ) -> None:
+        """Find where every component comes from.
+
+        Args:
+            terms: of the observation, in order.
+            joints: names of those that act, in order.
+            root: whether x, y and yaw of the root follow.
+            device: of the tensors.
+
+        Raises:
+            ConfigError: a term of which it is not known what it becomes, or a joint acts and its other side does not.
+        """
+        pairs: list[tuple[np.ndarray, np.ndarray]] = []
+        for term in terms:
+            signs, items = _TERMS.get(term.name, (_SCALAR, ()))
+            if len(signs) * len(items) != term.size:
+                raise ConfigError(f"the mirror knows no observation term {term.name!r} of size {term.size}; do without")
+            pairs.append(_changed_over(items, signs))
+        lonely = [joint for joint in joints if other_side(joint) not in joints]
+        if lonely:
+            raise ConfigError(f"{lonely[0]!r} acts, but {other_side(lonely[0])!r} does not; do without the mirror")
+        self._seen = _joined(pairs, device)
+        acts = [_changed_over(joints, _SPIN)] + ([_changed_over(("root",), _ROOT)] if root else [])
+        self._done = _joined(acts, device)
+
+    def observations(self, seen: torch.Tensor) -> torch.Tensor:
+        """What is seen in the mirrored state."""
+        source, sign = self._seen
+        return seen[..., source] * sign
+
+    def actions(self, done: torch.Tensor) -> torch.Tensor:
+        """What is done there: rotation vectors or torques, as shares of ranges that are mirrored, too."""
+        source, sign = self._done
+        return done[..., source] * sign
+
+
+def _changed_over(items: Sequence[str], signs: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Where the components of items come from, and their signs."""
+    first = len(signs) * np.array([items.index(other_side(item)) for item in items])
+    return (first[:, None] + np.arange(len(signs))).ravel(), np.tile(signs, len(items))
+
+
+def _joined(
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]], device: str | torch.device
+) -> tuple[torch.Tensor, torch.Tensor]:
+    starts = np.cumsum([0, *(len(source) for source, _ in pairs)])
+    source = np.concatenate([start + own for start, (own, _) in zip(starts, pairs, strict=False)])
+    sign = np.concatenate([own for _, own in pairs])
+    return torch.as_tensor(source, device=device), torch.as_tensor(sign, dtype=torch.float32, device=device)

@@ -1,0 +1,270 @@
+"""PPO by rsl_rl on a batch of environments: ``python -m agents.rsl_rl.train configs/rsl_rl/reach_rsl.yaml``.
+
+Leaves in the folder: the resolved configuration, the networks, TensorBoard's files and rsl_rl's own saved networks, the
+learning curve, and the evaluation. What was killed goes on with ``--resume``, from the latest checkpoint and as if
+nothing had happened.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from rsl_rl.utils.log_writer import LogWriter
+from tensordict import TensorDict
+from torch.utils.tensorboard import SummaryWriter
+
+from agents.batch_training import Learned, iterations_of, run
+from agents.checkpoint import Checkpoint, as_arrays, check_finite, random_states, seed_all, set_random_states
+from agents.files import write_config, write_whole
+from agents.report import Curve
+from agents.rsl_rl.curriculum import HelpedEnv, with_lessons
+from agents.rsl_rl.policy import RslTraining, actor_settings, mean_agent, network_settings
+from agents.rsl_rl.ppo import Mirror, ScaledPPO
+from agents.sb3.workers import components
+from piavatar_envs.api.rsl_rl import AvatarRslEnv
+from piavatar_envs.config import ConfigError
+from piavatar_envs.envs.task import Task
+from piavatar_envs.tasks import load_task
+
+
+class CurveWriter(LogWriter):
+    """Writes what rsl_rl reports for TensorBoard, and keeps the mean return of the latest 100 training episodes."""
+
+    def __init__(self, log_dir: str, steps_an_iteration: int, first_iteration: int, curve: Curve) -> None:
+        """Write to a folder.
+
+        Args:
+            log_dir: for the files; those of the run's earlier parts stay.
+            steps_an_iteration: of all environments.
+            first_iteration: what was logged of this one and later ones, before the run was killed, is no longer shown.
+            curve: so far.
+        """
+        self.curve, self.steps_an_iteration = curve, steps_an_iteration
+        self._events = SummaryWriter(log_dir=log_dir, purge_step=first_iteration or None)
+
+    def add_scalar(self, tag: str, scalar_value: Any, global_step: int) -> None:
+        """Log a number of an iteration."""
+        if tag.endswith("/time"):  # against seconds; TensorBoard does that by itself, and would purge it by iterations
+            return
+        self._events.add_scalar(tag, scalar_value, global_step)
+        if tag == "Train/mean_reward":
+            self.curve.steps.append(self.steps_an_iteration * (global_step + 1))
+            self.curve.returns.append(float(scalar_value))
+
+    def stop(self) -> None:
+        """Close the file."""
+        self._events.close()
+
+
+class Runner(OnPolicyRunner):
+    """rsl_rl's runner, which keeps up a checkpoint beside the networks that it saves, and goes on from one.
+
+    Attributes:
+        curve: of the training.
+        iterations: how many it has had.
+    """
+
+    def __init__(self, env: AvatarRslEnv, config: RslTraining, folder: Path, checkpoint: Checkpoint) -> None:
+        """Begin, or go on where the checkpoint is."""
+        saved = checkpoint.state
+        self.curve, self.iterations, self.checkpoint = Curve(), saved["iterations"] if saved else 0, checkpoint
+        if saved:
+            self.curve.load(saved["curve"])
+        self._begun = time.monotonic() - self.curve.seconds
+        settings = runner_settings(config, env) | {
+            "logger": {
+                "class_name": CurveWriter,
+                "steps_an_iteration": config.num_envs * config.ppo.rollout_steps,
+                "first_iteration": self.iterations,
+                "curve": self.curve,
+            }
+        }
+        super().__init__(env, settings, log_dir=str(folder / "rsl_rl"), device=str(env.device))
+        self.alg.check, self._config = self._check_finite, config
+        self.logger.git_status_repos.clear()  # results.json says which commit; no diffs of what is around
+        if saved:
+            self._restore(saved)
+
+    def train(self, iterations: int) -> None:
+        """Learn until there have been so many iterations.
+
+        Raises:
+            ConfigError: there have been more already.
+        """
+        left = iterations - iterations_of(self.checkpoint, iterations)
+        if left:
+            self.current_learning_iteration = self.iterations
+            self.learn(left, init_at_random_ep_len=self.iterations == 0)
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        """Save the networks, and the checkpoint; rsl_rl calls it between iterations."""
+        super().save(path, infos)
+        self.iterations, self.curve = self.current_learning_iteration + 1, self.logger.writer.curve
+        self.curve.seconds = time.monotonic() - self._begun
+        self.checkpoint.save(self._state())
+
+    def _check_finite(self) -> None:
+        """Refuse to go on, or to keep anything, after networks have diverged.
+
+        Raises:
+            Diverged: they have.
+        """
+        networks, config = {"actor": self.alg.actor, "critic": self.alg.critic}, self._config
+        seen = self.env.get_observations()
+        with torch.no_grad():
+            outputs = {f"the {name}'s output": network(seen) for name, network in networks.items()}
+        steps = self.alg.updates * config.num_envs * config.ppo.rollout_steps
+        check_finite(networks, outputs, steps, ("ppo.learning_rate", config.ppo.learning_rate), self.checkpoint.path)
+
+    def _state(self) -> dict[str, Any]:
+        log = self.logger
+        helped = {"help": self.env.help} if isinstance(self.env, HelpedEnv) else {}
+        return helped | {
+            "iterations": self.iterations,
+            "algorithm": self.alg.save(),
+            "envs": self.env.episodes.get_state(),
+            "returns": [list(log.rewbuffer), list(log.lenbuffer)],
+            "playing": [log.cur_reward_sum, log.cur_episode_length],
+            "logged": [log.tot_timesteps, log.tot_time],
+            "curve": self.curve.state(),
+            "random": random_states(),
+        }
+
+    def _restore(self, saved: dict[str, Any]) -> None:
+        self.alg.load(saved["algorithm"], None, strict=True)  # the adapted learning rate is the optimizer's
+        self.env.episodes.set_state(as_arrays(saved["envs"]))
+        log = self.logger
+        for own, latest in zip((log.rewbuffer, log.lenbuffer), saved["returns"], strict=True):
+            own.extend(latest)
+        for own, sums in zip((log.cur_reward_sum, log.cur_episode_length), saved["playing"], strict=True):
+            own.copy_(sums)
+        log.tot_timesteps, log.tot_time = saved["logged"]
+        set_random_states(saved["random"])
+        self.alg.updates = self.iterations
+        if isinstance(self.env, HelpedEnv):
+            self.env.steps = self.iterations * self.env.rollout_steps
+            self.env.help = saved["help"].to(self.env.device)
+
+
+def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
+    """The configuration as rsl_rl's runner takes it.
+
+    Raises:
+        ConfigError: steps cannot be mirrored.
+    """
+    ppo = config.ppo
+    return {
+        "num_steps_per_env": ppo.rollout_steps,
+        "save_interval": config.checkpoint_every,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": actor_settings(ppo),
+        "critic": network_settings(ppo),
+        "algorithm": {
+            "class_name": ScaledPPO,
+            "reward_scale": ppo.reward_scale,
+            "observation_noise": ppo.observation_noise,
+            "kl_targets": kl_targets(config),
+            "num_learning_epochs": ppo.epochs,
+            "num_mini_batches": ppo.minibatches,
+            "learning_rate": ppo.learning_rate,
+            "schedule": "fixed" if ppo.desired_kl is None else "adaptive",
+            "desired_kl": ppo.desired_kl,
+            "gamma": ppo.discount,
+            "lam": ppo.gae_lambda,
+            "clip_param": ppo.clip_range,
+            "value_loss_coef": ppo.value_weight,
+            "entropy_coef": ppo.entropy_weight,
+            "max_grad_norm": ppo.largest_gradient,
+            "symmetry_cfg": _symmetry(env) if ppo.mirrored else None,
+        },
+    }
+
+
+def kl_targets(config: RslTraining) -> list[float]:
+    """Divergences that the updates of a training aim at; none where that does not change.
+
+    Raises:
+        ConfigError: there is a last one without a first one.
+    """
+    first, last = config.ppo.desired_kl, config.ppo.final_kl
+    if last is None:
+        return []
+    if first is None:
+        raise ConfigError(f"ppo.final_kl={last} is what ppo.desired_kl falls to, and there is none; give both")
+    return np.linspace(first, last, config.iterations).tolist()
+
+
+def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
+    """The settings by which rsl_rl appends mirrored steps to every minibatch."""
+    terms = [env.observation_layout[name] for name in env.groups["policy"]]
+    spec = env.episodes.groups[0].action_spec
+    mirror = Mirror(terms, spec.joints, env.device, spec.root)
+
+    def append(
+        env: AvatarRslEnv, obs: TensorDict | None = None, actions: torch.Tensor | None = None
+    ) -> tuple[TensorDict | None, torch.Tensor | None]:
+        if obs is not None:
+            obs = torch.cat([obs, obs.apply(mirror.observations)])
+        return obs, None if actions is None else torch.cat([actions, mirror.actions(actions)])
+
+    return {"data_augmentation_func": append, "use_data_augmentation": True}
+
+
+def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
+    """The environments to learn in.
+
+    Raises:
+        ConfigError: there is no such term to observe, or nothing to be helped, or a lesson is none.
+    """
+    settings = with_lessons(task, config.lessons)
+    if config.help is not None and settings.control.mode == "pose":
+        raise ConfigError('help is for bodies under torques, and env.control.mode="pose"; use "pd" or "torque"')
+    if config.help is not None and settings.control.root_assist > 0.0:
+        raise ConfigError(
+            f"help wanes to nothing, and env.control.root_assist={settings.control.root_assist} stays; give one of them"
+        )
+    groups = None if config.observe is None else {"policy": config.observe}
+    about = (config.env_id, config.num_envs, device, settings, groups, config.first_seed)
+    if config.help is None:
+        return AvatarRslEnv(*about)
+    return HelpedEnv(config.help, config.ppo.rollout_steps, *about)
+
+
+def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:
+    """Train an agent.
+
+    Args:
+        config: resolved.
+        task: of the environments.
+        folder: where to write; exists.
+        device: where to simulate and to learn.
+        checkpoint: from which to go on, and which to keep up.
+
+    Raises:
+        ConfigError: what is asked for does not fit the environment, or the checkpoint has had more iterations.
+        Diverged: the networks are not finite any more.
+    """
+    env = make_env(config, task, device)
+    seed_all(config.seed)
+    runner = Runner(env, config, folder, checkpoint)
+    write_config(folder, config)
+    runner.train(config.iterations)
+    runner.curve.train_steps = config.iterations * config.num_envs * config.ppo.rollout_steps
+    actor = runner.get_inference_policy(str(env.device))
+    write_whole(folder / "policy.pt", lambda file: torch.save(actor.state_dict(), file))
+    env.close()
+    return Learned(mean_agent(actor, components(env.observation_layout, config.observe), str(env.device)), runner.curve)
+
+
+def main(args: list[str] | None = None) -> None:
+    """The command line."""
+    run("rsl_rl.train", RslTraining, load_task, learn, args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Trainings with stable-baselines3: PPO, SAC, worlds of several agents and self-play."""

@@ -1,0 +1,128 @@
+"""Environments in processes of their own, as stable-baselines3 wants them."""
+
+from __future__ import annotations
+
+import multiprocessing
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+from agents.config import multi_module
+from agents.sb3.config import TrainingConfig
+from agents.sb3.parallel import World, WorldFactory
+from piavatar_envs.api.sb3 import SB3VecEnv
+from piavatar_envs.config import ConfigError
+from piavatar_envs.doctor import quiet_warp
+from piavatar_envs.envs.observations import ObservationLayout
+
+
+@dataclass(frozen=True)
+class EnvFactory:
+    """Makes one environment, in whichever process calls it."""
+
+    env_id: str
+    settings: dict[str, Any]
+    device: str = "cpu"
+    render_mode: str | None = None
+
+    def __call__(self) -> gym.Env:
+        """The environment."""
+        import piavatar_envs  # noqa: F401 - registers the ids, also in a fresh process
+
+        quiet_warp()
+        return gym.make(
+            self.env_id,
+            config=self.settings,
+            device=self.device,
+            render_mode=self.render_mode,
+            disable_env_checker=True,
+        )
+
+
+def factory(config: TrainingConfig, device: str = "cpu") -> EnvFactory | WorldFactory:
+    """What makes the environments of a training run: worlds, where there are several agents."""
+    if config.is_multi:
+        return WorldFactory(multi_module(config.env_id).__name__, dict(config.env), device)
+    return EnvFactory(config.env_id, dict(config.env), device)
+
+
+@dataclass(frozen=True)
+class EnvFacts:
+    """What agents must know of an environment.
+
+    Attributes:
+        layout: what lies where in the flat observation.
+        action_names: of every component of an action.
+        action_step: rotation that an action of 1 commands in a control step [rad].
+        control_dt: time of a control step [s].
+        agents: names, where there are several.
+    """
+
+    layout: ObservationLayout
+    action_names: tuple[str, ...]
+    action_step: float
+    control_dt: float
+    agents: tuple[str, ...] = ()
+
+
+def prepare(make: EnvFactory | WorldFactory) -> EnvFacts:
+    """Compile the kernels, once and before the workers start: side by side they would race each other's files."""
+    env = make()
+    try:
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape, np.float32))
+        bare = env.unwrapped
+        control_dt = bare.config.physics.control_dt
+        step = bare.config.control.joint_speed_limit * control_dt
+        agents = bare.names if isinstance(bare, World) else ()
+        return EnvFacts(bare.observation_layout, bare.action_names, step, control_dt, agents)
+    finally:
+        env.close()
+
+
+def start(config: TrainingConfig, make: EnvFactory | WorldFactory, device: str = "cpu") -> VecEnv:
+    """The environments of a configuration, as it says: one batch, or processes.
+
+    Raises:
+        ValueError: a batch that does not fit.
+    """
+    return start_vector(config, device) if config.vector else start_workers(make, config.num_workers)
+
+
+def start_workers(make: EnvFactory | WorldFactory, num_workers: int) -> VecEnv:
+    """``num_workers`` environments; a single one stays in this process."""
+    torch.set_num_threads(1)  # the workers have the cores; the networks are small
+    if num_workers == 1:
+        return DummyVecEnv([make])
+    methods = multiprocessing.get_all_start_methods()  # never fork: a copy of a running Warp is not a working one
+    return SubprocVecEnv([make] * num_workers, start_method="forkserver" if "forkserver" in methods else "spawn")
+
+
+def start_vector(config: TrainingConfig, device: str = "cpu") -> VecEnv:
+    """The environments of a configuration as one batch, in this process.
+
+    Raises:
+        ValueError: an unknown device, or a batch that does not fit.
+    """
+    if device == "cpu":
+        torch.set_num_threads(1)  # the environments have the cores; the networks are small
+    return SB3VecEnv(config.env_id, config.num_workers, device=device, config=dict(config.env))
+
+
+def components(layout: ObservationLayout, observe: tuple[str, ...] | None) -> list[int]:
+    """Places in the flat observation of the named terms; all of it for None.
+
+    Raises:
+        ConfigError: there is no such term, or none is named.
+    """
+    names = tuple(layout) if observe is None else observe
+    if not names:
+        raise ConfigError(f"observe=[] shows the networks nothing; use some of {', '.join(layout)}, or null for all")
+    unknown = [name for name in names if name not in layout]
+    if unknown:
+        raise ConfigError(f"observe: there is no term {unknown[0]!r}; use some of {', '.join(layout)}")
+    return [index for name in names for index in range(layout[name].slice.start, layout[name].slice.stop)]

@@ -1,0 +1,1 @@
+"""Multi-agent PPO with skrl on a batch of worlds."""

@@ -1,0 +1,99 @@
+"""Networks and memory of a training with skrl: policies of what an agent sees, critics of what all see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import gymnasium as gym
+import torch
+from pydantic import BaseModel, Field
+from skrl.memories.torch import RandomMemory
+from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
+
+from agents.config import Widths
+from piavatar_envs.config import FROZEN
+
+
+class MAPPOSettings(BaseModel):
+    """Hyper-parameters of MAPPO."""
+
+    model_config = FROZEN
+
+    rollout_steps: int = Field(32, ge=2, description="steps of every world between two updates")
+    epochs: int = Field(8, ge=1, description="passes over a rollout")
+    minibatches: int = Field(4, ge=1, description="minibatches in a pass")
+    learning_rate: float = Field(5.0e-4, gt=0.0, description="Adam's learning rate [-]")
+    discount: float = Field(0.95, gt=0.0, le=1.0, description="discount of a step's reward, gamma [-]")
+    gae_lambda: float = Field(0.9, ge=0.0, le=1.0, description="bias against variance of the advantage [-]")
+    clip_range: float = Field(0.2, gt=0.0, description="largest change of an action's probability ratio [-]")
+    value_weight: float = Field(0.5, ge=0.0, description="weight of the critic's squared error [-]")
+    entropy_weight: float = Field(0.0, ge=0.0, description="weight of the entropy bonus [-]")
+    largest_gradient: float = Field(0.5, ge=0.0, description="norm to which gradients are clipped [-]; 0 for never")
+    log_std: float = Field(-0.7, ge=-10.0, le=2.0, description="logarithm of the first actions' standard deviation [-]")
+    hidden: Widths = Field((128, 128), description="widths of the hidden layers of both networks")
+
+
+def layers(seen: int, hidden: Sequence[int], out: int) -> torch.nn.Sequential:
+    """A network with tanh between its layers, whose first answers are near zero."""
+    widths = [seen, *hidden]
+    inner = [module for size, width in pairwise(widths) for module in (torch.nn.Linear(size, width), torch.nn.Tanh())]
+    last = torch.nn.Linear(widths[-1], out)
+    torch.nn.init.orthogonal_(last.weight, 0.01)
+    torch.nn.init.zeros_(last.bias)
+    return torch.nn.Sequential(*inner, last)
+
+
+class Policy(GaussianMixin, Model):
+    """Normally distributed actions from some components of the agent's observation."""
+
+    def __init__(
+        self, observation: gym.Space, action: gym.Space, seen: Sequence[int], settings: MAPPOSettings, device: Any
+    ) -> None:
+        Model.__init__(self, observation_space=observation, action_space=action, device=device)
+        GaussianMixin.__init__(self)
+        self.register_buffer("seen", torch.as_tensor(list(seen)))
+        self.net = layers(len(seen), settings.hidden, self.num_actions)
+        self.log_std = torch.nn.Parameter(torch.full((self.num_actions,), settings.log_std))
+
+    def compute(self, inputs: dict[str, torch.Tensor], role: str = "") -> tuple[torch.Tensor, dict[str, Any]]:
+        """Mean actions and the logarithm of their spread."""
+        return self.net(inputs["observations"][:, self.seen]), {"log_std": self.log_std}
+
+
+class Critic(DeterministicMixin, Model):
+    """The value of a world for one agent, from the same components of all agents' observations."""
+
+    def __init__(self, state: gym.Space, seen: Sequence[int], settings: MAPPOSettings, device: Any) -> None:
+        Model.__init__(self, state_space=state, device=device)
+        DeterministicMixin.__init__(self)
+        self.register_buffer("seen", torch.as_tensor(list(seen)))
+        self.net = layers(len(seen), settings.hidden, 1)
+
+    def compute(self, inputs: dict[str, torch.Tensor], role: str = "") -> tuple[torch.Tensor, dict[str, Any]]:
+        """The value."""
+        return self.net(inputs["states"][:, self.seen]), {}
+
+
+class ActedMemory(RandomMemory):
+    """Gives the loss only the steps that the agent took itself, not those for which it was out."""
+
+    def __init__(self, memory_size: int, num_envs: int, device: Any) -> None:
+        super().__init__(memory_size=memory_size, num_envs=num_envs, device=device)
+        self.acted = torch.ones(memory_size, num_envs, dtype=torch.bool, device=self.device)
+
+    def set_tensor_by_name(self, name: str, tensor: torch.Tensor) -> None:
+        """As its base does, but advantages are normalised over the steps that count."""
+        if name == "advantages" and self.acted.any():
+            counted = tensor[self.acted]
+            tensor = (tensor - counted.mean()) / (counted.std(unbiased=False) + 1e-8)
+        super().set_tensor_by_name(name, tensor)
+
+    def sample(
+        self, names: list[str], *, batch_size: int, mini_batches: int = 1, sequence_length: int = 1
+    ) -> list[list[torch.Tensor]]:
+        """Minibatches in random order; none at all where the agent was out all the time."""
+        rows = self.acted.flatten().nonzero().flatten().cpu()
+        rows = rows[torch.randperm(len(rows))]
+        return self.sample_by_index(names, indexes=rows, mini_batches=min(mini_batches, len(rows))) if len(rows) else []

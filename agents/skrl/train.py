@@ -1,0 +1,285 @@
+"""Multi-Agent PPO by skrl on a batch of worlds: ``python -m agents.skrl.train configs/skrl/high_five_mappo.yaml``.
+
+MAPPO (Yu et al., "The Surprising Effectiveness of PPO in Cooperative Multi-Agent Games", 2022): every agent has a
+policy of what it sees itself and a critic of what all of them see. Leaves in the folder: the resolved configuration,
+the networks, TensorBoard's files with networks on the way there, every training episode's return, and the evaluation.
+What was killed goes on with ``--resume``, from the latest checkpoint and as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import Field
+from skrl import config as skrl_config
+from skrl.envs.wrappers.torch import wrap_env
+from skrl.multi_agents.torch.mappo import MAPPO
+from skrl.trainers.torch import SequentialTrainer
+
+from agents.batch_training import BatchTraining, Learned, iterations_of, run
+from agents.checkpoint import Checkpoint, as_arrays, check_finite, random_states, seed_all, set_random_states
+from agents.config import multi_module
+from agents.evaluate import Agent
+from agents.files import write_config, write_whole
+from agents.report import Curve
+from agents.sb3.workers import components
+from agents.skrl.networks import ActedMemory, Critic, MAPPOSettings, Policy
+from piavatar_envs.api.skrl import AvatarSkrlMultiEnv
+from piavatar_envs.envs.task import Task
+
+#: Parts of skrl's MAPPO that are not used.
+_OPTIONAL = ("learning_rate_scheduler", "observation_preprocessor", "state_preprocessor", "value_preprocessor")
+
+
+class MAPPOTraining(BatchTraining):
+    """Everything that a training with MAPPO depends on."""
+
+    env_id: str = Field("high_five_v0", description="module of piavatar_envs.multi")
+    mappo: MAPPOSettings = Field(default_factory=MAPPOSettings, description="the algorithm")
+
+
+def find_world(env_id: str) -> type[Task]:
+    """The task of a world.
+
+    Raises:
+        ValueError: there is no such world, or PettingZoo is not installed.
+    """
+    return multi_module(env_id).TASK
+
+
+class Worlds(AvatarSkrlMultiEnv):
+    """Worlds that stand where a checkpoint is when skrl's trainer has reset them, which it does first of all.
+
+    Attributes:
+        saved: the state of the worlds; None for new episodes.
+    """
+
+    saved: dict[str, np.ndarray] | None = None
+
+    def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode in every world, or go on."""
+        begun = super().reset(seed, options)
+        if self.saved is None:
+            return begun
+        self.episodes.set_state(self.saved)
+        return self._seen(self.episodes.observation()), {"alive": self._by_agent(self.episodes.alive())}
+
+
+class WorldMAPPO(MAPPO):
+    """skrl's MAPPO, told by the view who acted and where the episodes really ended, and kept up by a checkpoint.
+
+    Without that it would take the first observation of the next episode for the last one of a truncated episode.
+
+    Attributes:
+        curve: of the training.
+        iterations: how many it has had.
+    """
+
+    def __init__(self, env: Worlds, checkpoint: Checkpoint | None, checkpoint_every: int, **arguments: Any) -> None:
+        """Begin; :meth:`resume` goes on where the checkpoint is.
+
+        Args:
+            env: the worlds.
+            checkpoint: from which to go on, and which to keep up; None for neither.
+            checkpoint_every: iterations.
+            **arguments: of skrl's MAPPO.
+        """
+        super().__init__(**arguments)
+        self.env, self.checkpoint, self.checkpoint_every = env, checkpoint, checkpoint_every
+        self.curve, self.iterations = Curve(), 0
+        self._first_step, self._steps, self._totals = 0, 0, torch.zeros(env.num_envs, device=self.device)
+        self._begun = time.monotonic()
+
+    def record_transition(self, *, infos: dict[str, Any], rewards: dict[str, torch.Tensor], **transition: Any) -> None:
+        """Store a step."""
+        self._book(rewards, infos["_final_obs"])
+        for name, memory in self.memories.items():
+            memory.acted[memory.memory_index] = infos["acted"][name]
+        transition |= {
+            "next_observations": infos["final_obs"],
+            "next_states": dict.fromkeys(self.possible_agents, infos["final_state"]),
+        }
+        super().record_transition(infos=infos, rewards=rewards, **transition)
+
+    def _book(self, rewards: dict[str, torch.Tensor], ended: torch.Tensor) -> None:
+        """Add the mean over agents to the returns of the episodes, and book those that have ended."""
+        self._steps += len(ended)
+        self._totals = self._totals + torch.cat(list(rewards.values()), dim=1).mean(dim=1)
+        returns = self._totals[ended].tolist()
+        self.curve.steps += [self._steps] * len(returns)
+        self.curve.returns += returns
+        self._totals[ended] = 0.0
+
+    def post_interaction(self, *, timestep: int, timesteps: int) -> None:
+        """Learn at the end of a rollout, and write the checkpoint when its time has come, and at the end.
+
+        Raises:
+            Diverged: the networks are not finite any more.
+        """
+        super().post_interaction(timestep=self._first_step + timestep, timesteps=timesteps)
+        if self._rollout % self.cfg.rollouts == 0:
+            self.iterations += 1
+            self._check_finite()
+            self.curve.seconds = time.monotonic() - self._begun
+            due = self.iterations % self.checkpoint_every == 0 or timestep + 1 == timesteps
+            if self.checkpoint is not None and due:
+                self.checkpoint.save(self._state())
+
+    def _check_finite(self) -> None:
+        networks = {f"{name} {part}": network for name, own in self.models.items() for part, network in own.items()}
+        actions = torch.as_tensor(joint_agent(self)(self.env.episodes.observation()))
+        rate = "mappo.learning_rate", self.cfg.learning_rate[self.possible_agents[0]][0]
+        check_finite(networks, {"an action": actions}, self._steps, rate, self.checkpoint and self.checkpoint.path)
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "iterations": self.iterations,
+            "agents": {
+                name: {part: module.state_dict() for part, module in modules.items()}
+                for name, modules in self._modules()
+            },
+            "envs": self.env.episodes.get_state(),
+            "playing": [self._steps, self._totals],
+            "curve": self.curve.state(),
+            "random": random_states(),
+        }
+
+    def _modules(self) -> Iterable[tuple[str, dict[str, Any]]]:
+        """Networks and optimizers of every agent."""
+        for name, modules in self.checkpoint_modules.items():
+            yield name, {part: module for part, module in modules.items() if hasattr(module, "state_dict")}
+
+    def resume(self) -> None:
+        """Go on where the checkpoint is, if it is of a training; the last of all that draws random numbers before."""
+        saved = self.checkpoint.state if self.checkpoint else None
+        if saved is None:
+            return
+        for name, modules in self._modules():
+            for part, module in modules.items():
+                module.load_state_dict(saved["agents"][name][part])
+        self.env.saved = as_arrays(saved["envs"])
+        self.iterations = saved["iterations"]
+        self._first_step = self.iterations * self.cfg.rollouts
+        self._steps, totals = saved["playing"]
+        self._totals = totals.to(self.device)
+        self.curve.load(saved["curve"])
+        self._begun = time.monotonic() - self.curve.seconds
+        set_random_states(saved["random"])
+
+
+def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:
+    """Train the agents of a world.
+
+    Args:
+        config: resolved.
+        task: the world's.
+        folder: where to write; exists.
+        device: where to simulate and to learn.
+        checkpoint: from which to go on, and which to keep up.
+
+    Raises:
+        ConfigError: there is no such term to observe, or the checkpoint has had more iterations than are asked for.
+        Diverged: the networks are not finite any more.
+    """
+    env = Worlds(type(task), config.num_envs, device, task.config)
+    seed_all(config.seed)
+    skrl_config.torch.key = config.first_seed  # what skrl's wrapper seeds the worlds with
+    mappo = build(config, env, folder, checkpoint)
+    left = config.iterations - iterations_of(checkpoint, config.iterations)
+    trainer = SequentialTrainer(
+        env=wrap_env(env, wrapper="isaaclab-multi-agent", verbose=False),
+        agents=mappo,
+        cfg={
+            "timesteps": left * config.mappo.rollout_steps,
+            "headless": True,
+            "disable_progressbar": None,
+            "close_environment_at_exit": False,
+        },
+    )
+    write_config(folder, config)
+    mappo.resume()
+    trainer.train()
+    mappo.curve.train_steps = config.iterations * config.num_envs * config.mappo.rollout_steps
+    write_whole(folder / "policy.pt", mappo.save)
+    env.close()
+    return Learned(joint_agent(mappo), mappo.curve)
+
+
+def build(config: MAPPOTraining, env: Worlds, folder: Path, checkpoint: Checkpoint | None = None) -> WorldMAPPO:
+    """Untrained agents.
+
+    Raises:
+        ConfigError: there is no such term to observe.
+    """
+    settings, layout, names = config.mappo, env.observation_layout, env.possible_agents
+    seen = components(layout, config.observe)
+    of_all = [agent * layout.size + index for agent in range(env.num_agents) for index in seen]
+    return WorldMAPPO(
+        env,
+        checkpoint,
+        config.checkpoint_every,
+        possible_agents=names,
+        models={
+            name: {
+                "policy": Policy(env.observation_spaces[name], env.action_spaces[name], seen, settings, env.device),
+                "value": Critic(env.state_space, of_all, settings, env.device),
+            }
+            for name in names
+        },
+        memories={name: ActedMemory(settings.rollout_steps, config.num_envs, env.device) for name in names},
+        observation_spaces=env.observation_spaces,
+        state_spaces=dict.fromkeys(names, env.state_space),
+        action_spaces=env.action_spaces,
+        device=env.device,
+        cfg={
+            "rollouts": settings.rollout_steps,
+            "learning_epochs": settings.epochs,
+            "mini_batches": settings.minibatches,
+            "discount_factor": settings.discount,
+            "gae_lambda": settings.gae_lambda,
+            "learning_rate": settings.learning_rate,
+            "grad_norm_clip": settings.largest_gradient,
+            "ratio_clip": settings.clip_range,
+            "value_clip": 0.0,
+            "entropy_loss_scale": settings.entropy_weight,
+            "value_loss_scale": settings.value_weight,
+            "time_limit_bootstrap": True,
+            # skrl takes its own default, an empty dictionary, for one by agent that lacks them all
+            **{f"{what}_kwargs": {name: {} for name in names} for what in _OPTIONAL},
+            "experiment": {
+                "directory": str(folder),
+                "experiment_name": "skrl",
+                "write_interval": settings.rollout_steps,
+                "checkpoint_interval": settings.rollout_steps * max(1, config.iterations // 10),
+            },
+        },
+    )
+
+
+def joint_agent(mappo: MAPPO) -> Agent:
+    """All agents' mean actions, from observations ``(n, agents, size)`` to ``(n, agents, action_size)``."""
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        seen = torch.as_tensor(observation, device=mappo.device)
+        with torch.no_grad():
+            means = [
+                mappo.policies[name].compute({"observations": seen[:, index]})[0]
+                for index, name in enumerate(mappo.possible_agents)
+            ]
+        return torch.stack(means, dim=1).cpu().numpy()
+
+    return act
+
+
+def main(args: list[str] | None = None) -> None:
+    """The command line."""
+    run("skrl.train", MAPPOTraining, find_world, learn, args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,266 @@
+"""The scenes of the paper's supplement: what stands where, what flies, what the avatar does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from benchmarks.paper.stage import Act, Script, View, keyed, played
+from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.motion import list_motions, load_motion
+from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key, animate
+from piavatar_envs.config import AvatarConfig, PropConfig, RegionConfig, SceneConfig
+from piavatar_envs.sim.scene import Domain
+
+BALL_RADIUS = 0.11
+CAN_SPEED = 3.0  # [m/s], a fall of 46 cm
+JUMP_CLIP = "deepmimic:jump"
+FACE = (0.0, -0.13, 1.53)  # a point of the standing body's skin [m]
+BELLY = (0.0, -0.13, 1.03)
+CHEST = (0.0, -0.14, 1.25)
+
+SIDE = View(eye=(3.3, -1.7, 1.1), target=(0.0, -0.35, 0.75), moments=(0.5,))
+FRONT = View(eye=(1.6, -3.4, 1.5), target=(0.0, -0.1, 0.85), moments=(0.3,))
+HEAD = View(eye=(1.25, -1.7, 1.7), target=(0.0, -0.1, 1.38), moments=(0.2,))
+
+
+def ball(mass: float, position: tuple, velocity: tuple = (0.0, 0.0, 0.0), young: float | None = None) -> PropConfig:
+    """A ball of 22 cm."""
+    return PropConfig(
+        name="ball", size=(BALL_RADIUS,), mass=mass, position=position, velocity=velocity, young_modulus=young
+    )
+
+
+def low_kick() -> Script:
+    """A kick with the right foot along the ground, from the moment when the weight is on the left leg."""
+    guard = {
+        "left_arm": Arm((0.55, -0.35, -0.75), (0.05, -0.8, 0.35)),
+        "right_arm": Arm((0.55, -0.35, -0.75), (0.05, -0.8, 0.35)),
+    }
+    shift = {"pelvis": (0.16, 0.0, -0.05), "turns": {"spine2": (0.0, -5.0, 0.0)}, **guard}
+    back = {"turns": {"pelvis": (8.0, 0.0, -8.0), "spine2": (4.0, -5.0, 10.0)}}
+    ahead = {"turns": {"pelvis": (-10.0, 0.0, 8.0), "spine2": (4.0, -5.0, -10.0)}}
+    keys = [
+        Key(0.0),
+        Key(0.3, **shift),
+        Key(0.6, pelvis=(0.18, -0.02, -0.06), right_foot=Foot((0.05, 0.42, 0.14), pitch=35.0), **guard, **back),
+        Key(0.95, pelvis=(0.18, -0.04, -0.06), right_foot=Foot((0.05, -0.62, 0.06), pitch=-25.0), **guard, **ahead),
+        Key(1.25, pelvis=(0.18, -0.04, -0.06), right_foot=Foot((0.05, -0.62, 0.06), pitch=-25.0), **guard, **ahead),
+        Key(1.8),
+    ]
+    return played(animate("low kick", keys, load_body().joints), start=0.3)
+
+
+def kicks(masses: tuple[float, ...] = (0.5, 1.5, 8.0)) -> list[Act]:
+    """The same kick without a ball, and at balls of some masses lying on the ground."""
+    act = Act(
+        "kick, no ball",
+        seconds=1.2,
+        script=low_kick(),
+        control={"tone": 0.3},
+        domain=Domain().including((0.0, -4.0, 0.0)),
+        view=replace(SIDE, eye=(3.0, -2.6, 1.0), target=(0.0, -0.6, 0.7), moments=(0.3, 0.5, 0.7)),
+        tags={"ball_kg": None},
+    )
+    found = [act]
+    for mass in masses:
+        scene = SceneConfig(props=(ball(mass, (-0.14, -0.46, BALL_RADIUS)),))
+        found.append(replace(act, name=f"kick, ball of {mass:g} kg", scene=scene, tags={"ball_kg": mass}))
+    return found
+
+
+def throws(moduli: tuple[float, ...] = (1e3, 1e4, 1e5, 1e6, 1e7)) -> list[Act]:
+    """A ball of 1.5 kg thrown at the chest at 4 m/s, from soft to stiff."""
+    start = (0.0, CHEST[1] - BALL_RADIUS - 0.25, CHEST[2])
+    view = View(eye=(2.0, -1.35, 1.45), target=(0.0, -0.3, 1.15), moments=(0.1, 0.1667))
+    return [
+        Act(
+            f"throw, ball of {young:.0e} Pa",
+            seconds=0.6,
+            scene=SceneConfig(props=(ball(1.5, start, (0.0, 4.0, 0.0), young),)),
+            view=view,
+            tags={"young_modulus_pa": young},
+        )
+        for young in moduli
+    ]
+
+
+def head_hits(tones: tuple[float, ...] = (1.0, 0.3, 0.0)) -> list[Act]:
+    """A ball of 4 kg thrown at the face at 6 m/s; the avatar tensed, at ease, limp."""
+    thrown = ball(4.0, (0.0, FACE[1] - BALL_RADIUS - 0.2, FACE[2] + 0.02), (0.0, 6.0, 0.0))
+    return [
+        Act(
+            f"head hit, tone {tone:g}",
+            seconds=1.5,
+            scene=SceneConfig(props=(thrown,)),
+            control={"tone": tone},
+            view=View(eye=(3.3, -1.9, 1.35), target=(0.0, -0.1, 0.85), moments=(0.1667, 0.4, 1.5)),
+            tags={"tone": tone},
+        )
+        for tone in tones
+    ]
+
+
+def crowd(mesh: Path) -> Act:
+    """A ball, a box, a capsule and the solid of a mesh file at one avatar, all at once."""
+    props = (
+        PropConfig(name="ball", size=(0.12,), mass=2.0, position=(0.25, -0.75, 1.15), velocity=(-0.6, 4.0, 1.0)),
+        PropConfig(
+            name="box", shape="box", size=(0.14, 0.1, 0.1), mass=2.5, position=(-0.35, -0.8, 0.95),
+            rotation=(0.92, 0.2, 0.3, 0.1), velocity=(1.2, 4.0, 1.2), spin=(0.0, 0.0, 3.0),
+        ),
+        PropConfig(
+            name="capsule", shape="capsule", size=(0.07, 0.16), mass=1.5, position=(0.0, 0.0, 1.95),
+            rotation=(0.7071, 0.0, 0.7071, 0.0), velocity=(0.0, 0.0, -2.0),
+        ),
+        PropConfig(
+            name="torus", shape="mesh", size=(1.0,), file=str(mesh), mass=2.0, position=(0.0, -0.75, 0.55),
+            rotation=(0.7071, 0.7071, 0.0, 0.0), velocity=(0.0, 3.5, 1.0),
+        ),
+    )  # fmt: skip
+    return Act(
+        "several objects at once",
+        seconds=1.0,
+        scene=SceneConfig(props=props),
+        control={"tone": 0.5},
+        view=replace(FRONT, eye=(2.6, -3.0, 1.6), moments=(0.0, 0.2, 0.4)),
+    )
+
+
+def belly_dents() -> list[Act]:
+    """A heavy ball pushed into the belly of a limp avatar, with and without shape preservation."""
+    thrown = ball(5.0, (0.0, BELLY[1] - BALL_RADIUS - 0.1, BELLY[2]), (0.0, 3.0, 0.0))
+    found = []
+    for alpha, kind in ((0.0, "physical"), (0.3, "physical"), (1.0, "physical"), (0.3, "kinematic")):
+        found.append(
+            Act(
+                f"belly dent, alpha {alpha:g}" + (", the paper's term" if kind == "kinematic" else ""),
+                seconds=1.3,
+                scene=SceneConfig(props=(thrown,)),
+                physics={"soft_young_modulus": 2e4},
+                control={"tone": 0.0, "alpha": alpha, "shape_preservation": kind},
+                view=View((1.7, -1.0, 1.25), (0.0, -0.15, 1.05), (0.1, 0.3, 1.3), color="strain"),
+                tags={"alpha": alpha, "shape_preservation": kind},
+            )
+        )
+    return found
+
+
+def crossed_legs() -> list[Act]:
+    """Legs crossed and opened again off the ground, with and without velocity fields for the limbs.
+
+    Once the left leg passes in front of the right one, as far as commanded poses go; once both want the same place.
+    """
+    found = []
+    for pose, left, right in (
+        ("one before the other", (-0.20, 0.40, 0.0), (0.10, -0.40, 0.0)),
+        ("head on", (-0.12, 0.42, 0.0), (0.05, -0.42, 0.0)),
+    ):
+        crossed = {"left_hip": left, "right_hip": right}
+        for fields in (True, False):
+            found.append(
+                Act(
+                    f"legs crossed {pose}, {'with' if fields else 'without'} limb fields",
+                    seconds=2.4,
+                    scene=SceneConfig(self_contact=fields, ground=False),
+                    script=keyed((0.0, {}), (0.8, crossed), (1.1, crossed), (1.9, {})),
+                    view=View(eye=(0.9, -2.7, 0.7), target=(0.0, 0.0, 0.5), moments=(0.0, 1.1, 2.4)),
+                    tags={"self_contact": fields, "pose": pose},
+                )
+            )
+    return found
+
+
+def pillows(moduli: tuple[float, ...] = (1e3, 2e3, 5e3, 1e5)) -> list[Act]:
+    """A pillow of 0.6 kg thrown at the head at 5 m/s; the last is as stiff as flesh."""
+    found = []
+    for young in moduli:
+        pillow = PropConfig(
+            name="pillow", shape="box", size=(0.20, 0.07, 0.14), mass=0.6, young_modulus=young, poisson_ratio=0.1,
+            position=(0.0, FACE[1] - 0.3, FACE[2]), velocity=(0.0, 5.0, 0.0),
+        )  # fmt: skip
+        found.append(
+            Act(
+                f"pillow of {young:.0e} Pa at the head",
+                seconds=0.7,
+                scene=SceneConfig(props=(pillow,)),
+                control={"tone": 0.3},
+                view=replace(HEAD, eye=(2.2, -1.5, 1.65), moments=(0.0, 0.1333)),
+                tags={"young_modulus_pa": young},
+            )
+        )
+    return found
+
+
+def cans(mesh: Path) -> list[Act]:
+    """A can of 0.35 kg against head, belly and ankle at one speed, on flesh and on a region of another material."""
+    top, down = load_body().mean_body().vertices[:, 2].max(), (0.0, 0.0, -CAN_SPEED)
+    hair = RegionConfig(joints=("head",), beyond=0.05, material="fixed_corotated", young_modulus=7e2)
+    garment = RegionConfig(
+        joints=("pelvis", "spine1", "spine2", "spine3"), beyond=0.05, material="fixed_corotated", young_modulus=1e3
+    )
+    boot = RegionConfig(joints=("left_ankle", "left_foot"), young_modulus=5e5)
+    lying = (0.7071, 0.0, 0.7071, 0.0)
+    above = View(eye=(1.0, -1.4, 1.9), target=(0.0, 0.0, 1.5), moments=(0.0667, 0.1333))
+    low = View(eye=(1.2, -1.2, 0.6), target=(0.15, -0.1, 0.15), moments=(0.0667, 0.1333))
+    sites = (
+        ("head", hair, "hair", (0.0, -0.02, float(top) + 0.12), lying, down, above),
+        ("belly", garment, "garment", (0.0, BELLY[1] - 0.12, BELLY[2]), lying, (0.0, CAN_SPEED, 0.0),
+         View(eye=(1.4, -1.2, 1.35), target=(0.0, -0.1, 1.05), moments=(0.0667, 0.1333))),
+        ("ankle", boot, "stiff", (0.18, -0.28, 0.16), lying, (0.0, CAN_SPEED, 0.0), low),
+    )  # fmt: skip
+    found = []
+    for site, region, name, place, turn, velocity, view in sites:
+        can = PropConfig(
+            name="can", shape="mesh", size=(1.0,), file=str(mesh), mass=0.35, position=place, rotation=turn,
+            velocity=velocity,
+        )  # fmt: skip
+        for regions in ((), (region,)):
+            material = name if regions else "flesh"
+            found.append(
+                Act(
+                    f"can on the {site}, {material}",
+                    seconds=0.6,
+                    scene=SceneConfig(avatars=(AvatarConfig(regions=regions),), props=(can,)),
+                    view=view,
+                    tags={"site": site, "material": material, "young_modulus_pa": _modulus(regions)},
+                )
+            )
+    return found
+
+
+def _modulus(regions: tuple[RegionConfig, ...]) -> float | None:
+    return regions[0].young_modulus if regions else 1e5
+
+
+def jumps() -> list[Act]:
+    """A jump of a person with a belly: flesh that keeps to its bones, and soft flesh that is late."""
+    if JUMP_CLIP in list_motions():
+        motion = load_motion(JUMP_CLIP)
+        script, seconds, clip = played(motion.translated([*-motion.root_position[0, :2], 0.0])), 1.75, JUMP_CLIP
+    else:
+        down, up = {"root": (0.0, 0.0, 0.0)}, {"root": (0.0, 0.0, 0.3)}
+        script = keyed((0.0, down), (0.6, up), (0.75, up), (1.0, down))
+        seconds, clip = 1.8, "scripted drop of 0.3 m"
+    found = []
+    for name, soft, young in (
+        ("firm flesh", 0.0, None),
+        ("soft flesh", 0.8, 2e4),
+        ("softer flesh", 0.8, 5e3),
+    ):
+        found.append(
+            Act(
+                f"jump, {name}",
+                seconds=seconds,
+                scene=SceneConfig(avatars=(AvatarConfig(shape={"parameters": {"belly": 1.0, "weight": 0.7}}),)),
+                script=script,
+                physics={"soft_young_modulus": young},
+                control={"soft_tissue": soft},
+                domain=Domain().including((0.0, -2.8, 0.0)),
+                view=View(
+                    eye=(4.6, -1.9, 1.1), target=(0.0, -0.55, 0.92), moments=(0.0, 0.9667, 1.3333), color="strain"
+                ),
+                tags={"clip": clip, "soft_tissue": soft, "soft_young_modulus_pa": young},
+            )
+        )
+    return found

@@ -1,0 +1,201 @@
+"""What is read off the courses of the supplement's acts: a row of numbers for each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.paper import acts
+from benchmarks.paper.stage import Course
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
+from piavatar_envs.avatar.body.soft_tissue import bone_distance, softness
+
+Row = dict[str, Any]
+LAST_SECONDS = 0.4  # over which a settled value is averaged
+NEAR = 0.12  # [m] from where something hits
+JIGGLING = 0.6  # softness of the flesh that is watched
+
+
+def settled(course: Course, values: np.ndarray) -> float:
+    """Mean over the last moments."""
+    return float(values[course.time > course.time[-1] - LAST_SECONDS].mean())
+
+
+def pose_error(course: Course) -> Row:
+    """Worst joint, at its peak and in the end, and which it is."""
+    worst = course.joint_errors.max(1)
+    peak = int(worst.argmax())
+    return {
+        "peak_joint_error_deg": worst[peak],
+        "settled_joint_error_deg": settled(course, worst),
+        "worst_joint": JOINT_NAMES[1 + int(course.joint_errors[peak].argmax())],
+    }
+
+
+def contact(course: Course, subject: int = 1) -> Row:
+    """Impulse that a subject gave the avatar: its sum, and the most in a control step; depth in each other."""
+    impulse = np.linalg.norm(course.impulse[:, :, subject].sum(1), axis=1)
+    return {
+        "impulse_n_s": float(np.linalg.norm(course.impulse[:, :, subject].sum((0, 1)))),
+        "peak_impulse_n_s": float(impulse.max()),
+        "peak_penetration_mm": 1e3 * float(course.penetration[:, subject].max()),
+    }
+
+
+def kick(course: Course) -> Row:
+    """How much the ball bends the leg that kicks it, and how fast it leaves."""
+    error = course.errors_of("right_hip", "right_knee", "right_ankle", "right_foot")
+    row = pose_error(course) | {"peak_leg_error_deg": float(error.max()), "mean_error_deg": course.joint_errors.mean()}
+    if course.stage.simulation.props.names:
+        row |= contact(course) | {"ball_speed_m_s": float(np.linalg.norm(course.speed[:, 0], axis=1).max())}
+    return row
+
+
+def throw(course: Course) -> Row:
+    """How much a thrown ball is dented; a ball has one length along the throw, the shortest counts."""
+    prop = course.stage.simulation.props.props[0]
+    along = np.ptp(course.x[:, prop.first : prop.first + prop.count, 1], axis=1)
+    return contact(course) | {
+        "peak_ball_dent_mm": 1e3 * float(course.dent.max()),
+        "flattening": float(1.0 - along.min() / along[0]),
+        "rebound_m_s": float(-course.speed[:, 0, 1].min()),
+    }
+
+
+def head_hit(course: Course) -> Row:
+    """How far neck and head are bent, at the worst and in the end."""
+    head = course.errors_of("neck", "head")
+    bent = course.errors_of("left_hip", "left_knee", "right_hip", "right_knee", "spine1", "spine2", "spine3")
+    return (
+        pose_error(course)
+        | contact(course)
+        | {
+            "peak_head_deg": float(head.max()),
+            "settled_head_deg": settled(course, head),
+            "settled_trunk_and_legs_deg": settled(course, bent),
+        }
+    )
+
+
+def crowd(course: Course) -> Row:
+    """Whether everything touched, and what it did."""
+    simulation = course.stage.simulation
+    row = pose_error(course)
+    for subject, name in enumerate(simulation.props.names, start=1):
+        row |= {f"{name}_{key}": value for key, value in contact(course, subject).items() if key == "impulse_n_s"}
+        row[f"{name}_peak_penetration_mm"] = 1e3 * float(course.penetration[:, subject].max())
+    row["objects_that_touched"] = sum(row[f"{name}_impulse_n_s"] > 0.01 for name in simulation.props.names)
+    row["dx_mm"] = 1e3 * simulation.dx
+    return row
+
+
+def near(course: Course, place: Sequence[float], reach: float = NEAR) -> np.ndarray:
+    """The avatar's particles around a place of the standing body, shape ``(P,)`` bool."""
+    rest = course.stage.simulation.flesh[0].points.rest[0]
+    return np.linalg.norm(rest - np.asarray(place), axis=1) < reach
+
+
+def belly(course: Course) -> Row:
+    """The dent of the belly, at its deepest and later."""
+    dent = 1e3 * course.displacements(near(course, acts.BELLY))
+    deepest = int(dent.mean(1).argmax())
+
+    def after(seconds: float) -> float:
+        return float(dent[min(deepest + round(30 * seconds), len(dent) - 1)].mean())
+
+    return contact(course) | {
+        "peak_dent_mm": float(dent.max()),
+        "peak_mean_dent_mm": float(dent[deepest].mean()),
+        "mean_dent_after_0.3_s_mm": after(0.3),
+        "mean_dent_after_1_s_mm": after(1.0),
+        "largest_dent_after_1_s_mm": float(dent[min(deepest + 30, len(dent) - 1)].max()),
+    }
+
+
+def legs(course: Course) -> Row:
+    """How much of the legs is in one another, and whether they come back."""
+    part, names = course.stage.simulation.flesh[0].part, list(BODY_PARTS)
+    volume = course.stage.simulation.model.particles.volume.numpy()[0, : len(part)]
+    left, right = (part == names.index(f"{side}_leg") for side in ("left", "right"))
+    overlap = np.array([overlap_volume(course, x, left, right) for x in course.x])
+    worst = course.joint_errors.max(1)
+    return pose_error(course) | {
+        "peak_overlap_cm3": 1e6 * float(overlap.max() - overlap[0]),
+        "overlap_after_cm3": 1e6 * float(overlap[-1] - overlap[0]),
+        "leg_volume_cm3": 1e6 * float(volume[left].sum()),
+        "error_after_deg": float(worst[-1]),
+        "joint_after": JOINT_NAMES[1 + int(course.joint_errors[-1].argmax())],
+        "ankle_error_after_deg": float(np.max([course.errors_of(f"{side}_ankle")[-1] for side in ("left", "right")])),
+    }
+
+
+def overlap_volume(course: Course, x: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
+    """Volume [m^3] that two sets of the avatar's particles both fill, with particles at ``x`` [m].
+
+    Volumes are spread by quadratic B-splines, as the solver spreads masses, over nodes half a grid spacing apart: about
+    one for each particle, so that surfaces that only touch are blurred by little.
+    """
+    simulation = course.stage.simulation
+    h, volume = 0.5 * simulation.dx, simulation.model.particles.volume.numpy()[0]
+    low = x.min(0) - 2.0 * h
+    shape = tuple(np.ceil((x.max(0) - low) / h).astype(int) + 3)
+    found = []
+    for chosen in (first, second):
+        at = (x[: len(chosen)][chosen] - low) / h
+        base = np.floor(at - 0.5).astype(int)
+        f = at - base
+        weight = np.stack([0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2])
+        filled = np.zeros(shape)
+        for i, j, k in np.ndindex(3, 3, 3):
+            share = weight[i, :, 0] * weight[j, :, 1] * weight[k, :, 2] * volume[: len(chosen)][chosen]
+            np.add.at(filled, tuple((base + (i, j, k)).T), share)
+        found.append(filled)
+    return float(np.minimum(*found).sum())
+
+
+def pillow(course: Course) -> Row:
+    """What a pillow does to the head, and the head to the pillow."""
+    return contact(course) | {
+        "peak_head_deg": float(course.errors_of("neck", "head").max()),
+        "peak_pillow_dent_mm": 1e3 * float(course.dent.max()),
+    }
+
+
+def can(course: Course) -> Row:
+    """Response of a place of the body to a can."""
+    simulation = course.stage.simulation
+    way = course.speed[0, 0] / np.linalg.norm(course.speed[0, 0])
+    hit = int(np.linalg.norm(course.impulse[:, :, 1].sum(1), axis=1).argmax())
+    # the skin is a can's radius and a little flesh away from where the can is
+    chosen = near(course, course.place[hit, 0], 1.5 * NEAR)
+    row = contact(course) | {
+        "rebound_m_s": float(-(course.speed[:, 0] @ way).min()),
+        "peak_dent_mm": 1e3 * float(course.displacements(chosen).max()) if chosen.any() else None,
+    }
+    regions = simulation.flesh[0].avatar.regions
+    return row | {"particles_of_the_region": int(simulation.flesh[0].in_region(regions[0]).sum()) if regions else 0}
+
+
+def jump(course: Course) -> Row:
+    """Motion of the belly's soft flesh relative to its bones, from the landing on."""
+    flesh = course.stage.simulation.flesh[0]
+    points, sampled = flesh.points, flesh.sampled
+    rest, low, high = points.rest[0], *(course.stage.simulation.asset.joints[[0, 6], 2])
+    soft = softness(rest, sampled.bone, sampled.skin_joints, sampled.skin_weights)
+    belly = (soft > JIGGLING) & (rest[:, 1] < 0.0) & (rest[:, 2] > low) & (rest[:, 2] < high)
+    moved = 1e3 * course.displacements(belly)
+    amplitude = np.sqrt((moved**2).mean(1))
+    flight = int(course.joints[:, 0, 2].argmax())  # the landing is after the top
+    peak = flight + int(amplitude[flight:].argmax())
+    later = amplitude[min(peak + 9, len(amplitude) - 1)]
+    return {
+        "belly_particles": int(belly.sum()),
+        "deepest_flesh_mm": 1e3 * float(bone_distance(sampled.rest_positions, sampled.bone)[belly].max()),
+        "peak_rms_mm": float(amplitude[peak]),
+        "peak_largest_mm": float(moved[flight:].max()),
+        "peak_at_s": float(course.time[peak]),
+        "rms_0.3_s_later_mm": float(later),
+        "peak_joint_error_deg": float(course.joint_errors.max()),
+    }

@@ -1,0 +1,1 @@
+"""Physics against theory: contact, elastodynamics, bodies under joint torques."""

@@ -1,0 +1,1 @@
+"""Time and memory of steps on a CPU and on GPUs."""
