@@ -1,8 +1,8 @@
 """Trainings that are killed: by an exception in this process, or by SIGKILL in one of their own.
 
-``python -m tests.agents.killing sb3.train step 40 ARGS`` is ``python -m agents.sb3.train ARGS`` until its 40th step of the
-environments, and ``... write 5 ARGS`` until it has written half of what its fifth ``fsync`` is of: its configuration,
-and then each checkpoint, synchronises its file, then its folder, so this is the second checkpoint.
+``python -m tests.agents.killing sb3.train step 40 ARGS`` is ``python -m agents.sb3.train ARGS`` until its 40th step of
+the environments, and ``... write 5 ARGS`` until it has written half of what its fifth ``fsync`` is of: its
+configuration, and then each checkpoint, synchronises its file, then its folder, so this is the second checkpoint.
 """
 
 from __future__ import annotations

@@ -140,9 +140,7 @@ def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path, capsys
     command, more = ([str(path), *longer, f"iterations={n}", "--device", device, "--out"] for n in (6, 8))
     rsl_ppo.main([*command, str(tmp_path / "whole")])
     parts = tmp_path / "parts"
-    run_killed(
-        "rsl_rl.train", "step", 30, *command, str(parts)
-    )  # in the fourth iteration; the first and third are kept
+    run_killed("rsl_rl.train", "step", 30, *command, str(parts))  # in the fourth iteration
     assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 3
     run_killed("rsl_rl.train", "write", 5, *command, str(parts), "--resume")
     assert torch.load(parts / "checkpoint.pt", weights_only=True)["state"]["iterations"] == 5
