@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from agents.checkpoint import Checkpoint, Diverged
 from agents.command import meant_for, read_options
-from agents.config import MOST_ENVS, MOST_RUNS, EvaluationSettings, first_seed, load_resolved
+from agents.config import MOST_ENVS, MOST_RUNS, EvaluationSettings, first_training_seed, load_resolved
 from agents.evaluate import Agent, play_beside_baselines
 from agents.files import made
 from agents.report import Curve, conclude, draw_curve, versions
@@ -59,7 +59,7 @@ class BatchTraining(BaseModel):
     @property
     def first_seed(self) -> int:
         """Seed of the first environment's episodes; environment ``i`` plays those of ``first_seed + i``."""
-        return first_seed(self.seed)
+        return first_training_seed(self.seed)
 
 
 Training = TypeVar("Training", bound=BatchTraining)

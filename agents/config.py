@@ -25,7 +25,7 @@ MOST_ENVS = 2**16
 MOST_RUNS = 1000
 
 
-def first_seed(run: int) -> int:
+def first_training_seed(run: int) -> int:
     """Seed of the first environment's episodes in the training of seed ``run``."""
     return FIRST_TRAINED + MOST_ENVS * run
 

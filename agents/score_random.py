@@ -16,7 +16,7 @@ from typing import Any
 import tyro
 
 from agents.command import in_a_line, read_options
-from agents.config import MOST_RUNS, EvaluationSettings
+from agents.config import MOST_RUNS, EvaluationSettings, first_training_seed
 from agents.evaluate import in_every_seat, over_seeds, play, random_agent
 from agents.files import RESULTS, claim, plain, read_json, write_json
 from agents.report import versions
@@ -52,7 +52,7 @@ def score(batch: BatchedEpisodes, first_seed: int, count: int) -> dict[str, Any]
         first_seed: of the episodes, the same for all streams.
         count: of streams; the seed of each is the one with which a training of that place would begin.
     """
-    streams = [random_agent(batch.action_size, first_seed(stream)) for stream in range(count)]
+    streams = [random_agent(batch.action_size, first_training_seed(stream)) for stream in range(count)]
     return over_seeds([play("random", in_every_seat(stream), batch, first_seed).row() for stream in streams])
 
 

@@ -38,8 +38,8 @@ from piavatar_envs.tasks import load_task
 
 #: Script of runs that are random actions of several streams.
 STREAMS = "score_random"
-#: Library and algorithm by the script of a training.
-_LEARNERS = {"rsl_rl.train": "rsl_ppo", "sb3.train": "sb3_ppo", "skrl.train": "skrl_mappo"}
+#: Names of agents by the script of their run: of a training, library and algorithm.
+_LEARNERS = {"pid.score": "PID", "rsl_rl.train": "rsl_ppo", "sb3.train": "sb3_ppo", "skrl.train": "skrl_mappo"}
 #: Returns of the same actions in the same episodes, on another device.
 _ALIKE = 1.0e-3
 #: What a policy may be scored on though it was trained on another; the row says which.
@@ -68,7 +68,7 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     streams = [run for run in runs.values() if run["benchmark"] == STREAMS]
     rows: list[dict[str, Any]] = []
     shown: list[tuple[str, Mapping[str, Any]]] = []
-    for (env_id, script), group in sorted(groups.items()):
+    for (env_id, script), group in sorted(groups.items(), key=lambda item: _order(*item[0])):
         for run, row in _rows(group, streams):
             agent = row["case"] if row["case"] != "trained" else script
             if agent in compare.UNTRAINED:
@@ -86,6 +86,11 @@ def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
             played = {"env_id": env_id, "agent": agent, **_drive(run)}
             rows.append(played | {key: row[key] for key in row if key != "case"})
     return sorted(rows, key=lambda row: (row["env_id"], "runs" in row, row["agent"]))
+
+
+def _order(env_id: str, script: str) -> tuple[str, bool, str]:
+    """Order trainings before what is scored without one, whose baselines count only where no training has any."""
+    return env_id, script in ("PID", STREAMS), script
 
 
 def _learner(run: Mapping[str, Any]) -> str:

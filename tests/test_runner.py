@@ -101,7 +101,7 @@ def test_an_unknown_device_is_refused():
 def test_writing_is_atomic(tmp_path, monkeypatch):
     path = tmp_path / "result.json"
     files.write_json(path, {"old": 1})
-    monkeypatch.setattr(runner.os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr(files.os, "replace", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
         files.write_json(path, {"new": 2})
     assert json.loads(path.read_text()) == {"old": 1}

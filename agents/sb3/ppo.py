@@ -23,7 +23,7 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.config import Widths, first_seed
+from agents.config import Widths, first_training_seed
 from agents.sb3.parallel import WAITING
 from piavatar_envs.config import FROZEN
 
@@ -106,7 +106,7 @@ def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: 
         seed=seed,
         device="cpu",
     )
-    venv.seed(first_seed(seed))
+    venv.seed(first_training_seed(seed))
     return model
 
 

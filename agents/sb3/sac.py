@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.config import Widths, first_seed
+from agents.config import Widths, first_training_seed
 from agents.sb3.ppo import networks
 from piavatar_envs.config import FROZEN
 
@@ -63,5 +63,5 @@ def build(settings: SACSettings, venv: VecEnv, components: Sequence[int], seed: 
         seed=seed,
         device="cpu",
     )
-    venv.seed(first_seed(seed))
+    venv.seed(first_training_seed(seed))
     return model

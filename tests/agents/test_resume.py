@@ -156,7 +156,7 @@ def test_another_configuration_is_refused(tiny, change, words, tmp_path):
 
 def test_other_versions_devices_and_scripts_are_refused(tiny, tmp_path, monkeypatch):
     checkpoint_of(tiny, tmp_path).save({})
-    with pytest.raises(ConfigError, match=r"script 'train', now it is 'rsl_ppo'"):
+    with pytest.raises(ConfigError, match=r"script 'sb3.train', now it is 'rsl_rl.train'"):
         checkpoint_of(tiny, tmp_path, script="rsl_rl.train")
     with pytest.raises(ConfigError, match=r"device 'cpu', now it is 'cuda:0'"):
         Checkpoint(tmp_path, "sb3.train", tiny, "cuda:0", resume=True)

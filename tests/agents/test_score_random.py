@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra train")
 
 from agents import score_random, scores
-from agents.config import first_seed
+from agents.config import first_training_seed
 from agents.evaluate import in_every_seat, over_seeds, play, random_agent
 from agents.pid import score as score_pid
 from piavatar_envs.api.batched import BatchedEpisodes
@@ -37,7 +37,7 @@ def test_every_seed_is_a_stream_of_its_own_in_the_same_episodes(run, device, tmp
     assert env == json.loads((run / "results.json").read_text())["config"]["env"]
     task = load_task("Stand-v0")
     batch = BatchedEpisodes(task(load_config(task.Config, env)), 2, device)
-    agents = [random_agent(batch.action_size, first_seed(seed)) for seed in range(3)]
+    agents = [random_agent(batch.action_size, first_training_seed(seed)) for seed in range(3)]
     rows = [play("random", in_every_seat(agent), batch, 1_000_000).row() for agent in agents]
     batch.close()
     means = [seed["return_mean"] for seed in rows]

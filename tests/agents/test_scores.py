@@ -79,7 +79,7 @@ def test_several_streams_of_random_actions_take_the_place_of_single_ones(runs):
     found = {(r["env_id"], r["agent"]): (r["return_mean"], r["seeds"], r["episodes"]) for r in rows}
     assert found["Push-v0", "random"] == (2.5, 5, 4)
     assert found["Stand-v0", "random"] == (2.7, 5, 4)
-    assert found["Stand-v0", "random, as pid.score"] == (1.5, None, 10)
+    assert found["Stand-v0", "random, as PID"] == (1.5, None, 10)
     assert found["Stand-v0", "random, as score_random"] == (2.9, 5, 4)
     assert len(rows) == 9 and found["Stand-v0", "zero"] == (3.0, None, 10)
 
@@ -89,7 +89,7 @@ def test_the_untrained_of_one_environment_stand_once_also_in_fewer_episodes(runs
     found = [(r["agent"], r["return_mean"]) for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
     assert found == [("random", 2.0), ("zero", 3.0), ("PID", 40.0), ("rsl_ppo", 85.0)]
     runs["stand_pid"]["config"]["env"]["physics"]["fidelity"] = "fine"
-    assert {r["agent"] for r in scores.scores(runs)} >= {"random, as pid.score", "zero, as pid.score"}
+    assert {r["agent"] for r in scores.scores(runs)} >= {"random, as PID", "zero, as PID"}
 
 
 @pytest.mark.parametrize("value, same", [(False, True), (True, False)])
@@ -98,9 +98,7 @@ def test_what_is_null_is_the_same_as_what_follows(value, same, runs):
     runs["stand_pid"]["config"]["env"]["control"] = {"free_motion": value}
     runs["stand_pid"]["results"][:2] = [row("zero", 3.4), row("random", 2.4)]
     found = {r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"}
-    assert found == {"random", "zero", "PID", "rsl_ppo"} | (
-        set() if same else {"random, as pid.score", "zero, as pid.score"}
-    )
+    assert found == {"random", "zero", "PID", "rsl_ppo"} | (set() if same else {"random, as PID", "zero, as PID"})
 
 
 def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
@@ -237,7 +235,7 @@ def test_untrained_agents_stand_twice_where_actions_mean_something_else(runs):
     runs["stand_pid"]["results"][0]["return_mean"] = 3.0001  # rounding, on another device
     runs["stand_pid"]["results"][1]["return_mean"] = 2.5
     agents = [r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
-    assert agents == ["random", "random, as pid.score", "zero", "PID", "rsl_ppo"]
+    assert agents == ["random", "random, as PID", "zero", "PID", "rsl_ppo"]
 
 
 def test_other_settings_are_refused(runs):

@@ -40,7 +40,7 @@ def test_evaluations_play_no_episodes_of_a_training(load):
     """Not even the last episode of the longest evaluation that begins last; all agents play the same ones."""
     half = seeds.FIRST_TRAINED // 2
     last = load({"evaluation": {"first_seed": half - 1, "episodes": half}}).evaluation
-    assert last.first_seed + last.episodes <= seeds.first_seed(0)
+    assert last.first_seed + last.episodes <= seeds.first_training_seed(0)
     for name, value in (("first_seed", half), ("episodes", half + 1)):
         with pytest.raises(ConfigError, match=rf"evaluation\.{name}"):
             load({"evaluation": {name: value}})
@@ -55,7 +55,7 @@ def test_environments_of_stable_baselines3_begin_with_the_run_s_episodes(countdo
     venv = DummyVecEnv([countdown] * 3)
     build(settings, venv, [0], 5)
     venv.reset()
-    assert venv.get_attr("seed") == [seeds.first_seed(5) + env for env in range(3)]
+    assert venv.get_attr("seed") == [seeds.first_training_seed(5) + env for env in range(3)]
 
 
 def test_environments_of_rsl_rl_begin_with_the_run_s_episodes(device):
@@ -66,5 +66,5 @@ def test_environments_of_rsl_rl_begin_with_the_run_s_episodes(device):
 
     config = load_batched(RslTraining, load_task, {"seed": 5, "num_envs": 3, "env": {"fidelity": "tiny"}})
     env = rsl_ppo.make_env(config, new_task(config, load_task), device)
-    assert env.episodes.read(lambda group: group.seed).tolist() == [seeds.first_seed(5) + n for n in range(3)]
+    assert env.episodes.read(lambda group: group.seed).tolist() == [seeds.first_training_seed(5) + n for n in range(3)]
     env.close()

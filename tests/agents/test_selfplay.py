@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.checkpoint import Checkpoint
-from agents.config import first_seed
+from agents.config import first_training_seed
 from agents.evaluate import Episode, random_agent, zero_agent
 from agents.sb3 import matches, ppo, selfplay, train
 from agents.sb3.config import TrainingConfig, load_training
@@ -149,7 +149,7 @@ def test_snapshots_join_the_pool_between_rollouts_and_play(auction, tmp_path):
     assert all(snapshot < now for now, snapshot in watch.drawn)  # nobody plays before it exists
     # three slots, four rounds a game: two games and a duel end at a time
     assert curve.steps == [3 * step for step in range(4, 257, 4) for _ in range(3)]
-    assert watch.seeds == {first_seed(3), first_seed(3) + 1}
+    assert watch.seeds == {first_training_seed(3), first_training_seed(3) + 1}
 
 
 def test_snapshots_wait_for_the_first_rollout_after_their_time(auction, tmp_path):
