@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,10 @@ import pytest
 import warp as wp
 
 from agents import files
-from benchmarks import roofline, runner
+from benchmarks import runner
 from benchmarks.speed import profile, soak, timing, vector
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.mpm.memory import allocate
-from piavatar_envs.mpm.model import Fields, MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.types import FAILURE_CFL
 
 RUNS = {
@@ -54,44 +51,6 @@ def rows_of(results: Path, file: str) -> list[dict]:
     return json.loads((results / file).read_text())["results"]
 
 
-# --- the bound -------------------------------------------------------------------------------------------------------
-
-
-def one_world(positions: np.ndarray, field: list[int], device: str, num_envs: int = 1):
-    points = replace(MaterialPoints.uniform(np.full(len(field), 1e-6)), field=np.array(field))
-    grid = make_grid((0.0, 0.0, 0.0), (2.0, 2.0, 2.0), 0.1)
-    model = build_model(points, grid, num_envs=num_envs, device=device, fields=Fields(tuple(range(max(field) + 1))))
-    state, _ = allocate(model)
-    state.x.assign(np.broadcast_to(positions.astype(np.float32), (num_envs, *positions.shape)).copy())
-    return model, state
-
-
-def test_counts_of_a_few_particles(device: str):
-    # nodes start at -0.2: this particle's stencil is nodes 4 to 6 along each axis, in one block
-    model, state = one_world(np.array([[0.3, 0.3, 0.3]]), [0], device)
-    assert roofline.count(model, state) == roofline.Counts(1, 1, 27, 1, 0)
-    # nodes 3 to 5 along x: two blocks
-    model, state = one_world(np.array([[0.2, 0.3, 0.3]]), [0], device)
-    assert roofline.count(model, state) == roofline.Counts(1, 1, 27, 2, 0)
-    # two of a field in one cell, one of another field a cell further: 18 nodes in common
-    positions = np.array([[0.3, 0.3, 0.3], [0.31, 0.3, 0.3], [0.4, 0.3, 0.3]])
-    model, state = one_world(positions, [0, 0, 1], device)
-    assert roofline.count(model, state) == roofline.Counts(3, 2, 54, 1, 18)
-    model, state = one_world(positions, [0, 0, 1], device, num_envs=6)
-    assert roofline.count(model, state, most_envs=2) == roofline.Counts(18, 12, 324, 6, 108)
-
-
-def test_the_bound_is_the_largest_of_four_times():
-    counts = roofline.Counts(particles=1000, cells=100, nodes=2000, blocks=50, shared_nodes=0)
-    peaks = roofline.Peaks("a device", bandwidth=1e9, flops=1e9, additions=1e6, launch=1e-6)
-    found = roofline.bound(counts, 5.0, peaks)
-    assert found["bytes"] == 1000 * 244 + 2000 * 128 and found["additions"] == 2700
-    assert found["memory_us"] == pytest.approx(500.0) and found["launch_us"] == pytest.approx(5.0)
-    assert found["additions_us"] == pytest.approx(2700.0)
-    assert found["bound_by"] == "additions" and found["bound_ms"] == pytest.approx(2.7)
-    assert roofline.bound(counts, 5e4, peaks)["bound_by"] == "launch"
-
-
 # --- clocks ----------------------------------------------------------------------------------------------------------
 
 
@@ -113,9 +72,6 @@ def test_memory_in_use_grows_by_what_is_allocated(device: str):
     assert timing.array_bytes(device) - before == pytest.approx(4e6, rel=0.1)
     del array
     assert timing.array_bytes(device) == pytest.approx(before, abs=1e5)
-
-
-# --- a substep -------------------------------------------------------------------------------------------------------
 
 
 # --- batches ---------------------------------------------------------------------------------------------------------
@@ -242,7 +198,4 @@ def test_profile_as_a_smoke_run(results: Path):
     step, *kernels = rows_of(results, "profile_reach.json")
     assert step["case"] == profile.STEP and step["failed_envs"] == 0 and step["ms_per_step"] > 0.0
     assert sum(row["share"] for row in kernels) == pytest.approx(1.0)
-    known = [row for row in kernels if row["bytes_per_step"]]
-    assert known, "no kernel has a formula in roofline.kernel_bytes; kernels were renamed"
-    assert all(row["gb_per_s"] * row["ms_per_step"] == pytest.approx(row["bytes_per_step"] / 1e6) for row in known)
     assert (results / "profile_reach.png").stat().st_size > 10_000

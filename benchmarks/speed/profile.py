@@ -1,4 +1,4 @@
-"""Where a step's time goes: every kernel's share, its launches, and the bandwidth it reaches where its bytes are known.
+"""Time and launches of every kernel of a control step.
 
 ``python -m benchmarks.speed.profile --device cuda --num-envs 4096 --out benchmarks/results/profile_reach.json``
 writes a row a kernel and draws ``profile_reach.png`` beside it. The kernels are launched one by one to be timed; the
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import roofline, runner
+from benchmarks import runner
 from benchmarks.speed import timing
 from benchmarks.speed.vector import LEAST_STEPS, Stepper, make_task
 from piavatar_envs.envs.batch_env import BatchEnv
@@ -43,7 +43,7 @@ class Options(runner.Options):
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """A row for the step as a whole, and one for each kernel, the slowest first; then the picture."""
+    """Yield a row for the whole step and one for each kernel, the slowest first; then draw the picture."""
     world = WORLDS.get(options.case, options.case)
     batch = BatchEnv(make_task(world, options.fidelity, options.settings), options.num_envs, options.device)
     batch.reset()
@@ -51,11 +51,10 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
     for _ in range(LEAST_STEPS):
         stepper.step_only()
     captured = 1e3 * timing.wall_times(options.device, batch.step, options.repeats)
-    model = batch.simulation.model
-    counts = roofline.count(model, batch.simulation.state)
     kernels = timing.kernel_times(batch.step_graph, options.repeats)
     total = sum(kernel.ms for kernel in kernels.values())
-    rows = [
+    model = batch.simulation.model
+    rows: list[dict[str, Any]] = [
         {
             "case": STEP,
             "world": world,
@@ -66,34 +65,24 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
             "kernels_sum_ms": total,
             "launches_per_step": len(batch.step_graph),
             "failed_envs": int((batch.failure.numpy() != 0).sum()),
-            "roofline_of_a_substep": roofline.bound(counts, len(batch.step_graph) / model.num_substeps),
         }
     ]
-    for name, kernel in sorted(kernels.items(), key=lambda item: -item[1].ms):
-        moved = roofline.kernel_bytes(name, model, counts)
-        moved = None if moved is None else moved * model.num_substeps
-        added = roofline.kernel_additions(name, counts)
-        seconds = 1e-3 * kernel.ms
-        speed = None if moved is None or seconds <= 0.0 else moved / seconds
-        rows.append(
-            {
-                "case": name,
-                "ms_per_step": kernel.ms,
-                "share": kernel.ms / total,
-                "launches_per_step": kernel.launches,
-                "bytes_per_step": moved,
-                "additions_per_s": None if not added or seconds <= 0.0 else added * model.num_substeps / seconds,
-                "gb_per_s": None if speed is None else speed / 1e9,
-                "share_of_h200_bandwidth": None if speed is None else speed / roofline.H200.bandwidth,
-            }
-        )
+    rows += [
+        {
+            "case": name,
+            "ms_per_step": kernel.ms,
+            "share": kernel.ms / total,
+            "launches_per_step": kernel.launches,
+        }
+        for name, kernel in sorted(kernels.items(), key=lambda item: -item[1].ms)
+    ]
     yield from rows
     if options.out is not None and importlib.util.find_spec("matplotlib") is not None:
-        draw(rows, options.out.with_suffix(".png"))  # else python -m benchmarks.performance draws it, elsewhere
+        draw(rows, options.out.with_suffix(".png"))
 
 
 def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Bars of the kernels' times; the smallest are one bar. Needs matplotlib (extra ``train``)."""
+    """Draw the kernels' times as bars, the smallest as one. Needs matplotlib (extra ``train``)."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -103,15 +92,13 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
     kernels = [row for row in rows if row["case"] != STEP]
     shown, rest = kernels[:MOST_BARS], kernels[MOST_BARS:]
     labels, times = [row["case"] for row in shown], [row["ms_per_step"] for row in shown]
-    notes = ["" if row["gb_per_s"] is None else f", {row['gb_per_s']:.3g} GB/s" for row in shown]
     if rest:
         labels.append(f"{len(rest)} others")
         times.append(sum(row["ms_per_step"] for row in rest))
-        notes.append("")
     figure, axes = pyplot.subplots(figsize=(8.0, 0.8 + 0.27 * len(labels)), layout="constrained")
     bars = axes.barh(labels[::-1], times[::-1], color="#1b7f79")
-    axes.bar_label(bars, [f" {t:.3g} ms{note}" for t, note in zip(times, notes, strict=True)][::-1], fontsize=7)
-    axes.set_xlim(0.0, 1.35 * max(times))
+    axes.bar_label(bars, [f" {ms:.3g} ms" for ms in times][::-1], fontsize=7)
+    axes.set_xlim(0.0, 1.15 * max(times))
     axes.set_xlabel("time in one step [ms], kernels launched one by one")
     axes.tick_params(axis="y", labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
