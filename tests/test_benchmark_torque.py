@@ -15,8 +15,8 @@ from agents.files import ROOT
 from benchmarks.physics import limbs, stability, torque, wear
 from benchmarks.physics.limbs import Options
 from benchmarks.physics.rig import joint_gaps
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, forward_kinematics, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 
 RESULTS = ROOT / "benchmarks" / "results" / "torque.json"
 HOLDS = ("", "_slipping")
@@ -106,7 +106,7 @@ def test_bones_have_their_particles_where_the_joints_are(device):
     """A body that is reset has none elsewhere; joints that sink take all of them along."""
     env = wear.make(Options(device=device, fidelity="tiny"), "PIAvatar/Stand-v0")
     assert wear.ways(env).max() < 1e-5
-    before, position = wear.homes(env), env.simulation.avatar.joints.state.position
+    before, position = wear.homes(env), env.simulation.controllers[0].state.position
     position.assign(position.numpy() - np.array([0.0, 0.0, 0.1], np.float32))
     np.testing.assert_allclose(before - wear.homes(env), np.broadcast_to([0.0, 0.0, 0.1], before.shape), atol=1e-6)
 
@@ -173,7 +173,7 @@ def test_slipping_bones_gape_little_where_they_rest_and_more_where_they_are_stru
 
 def test_a_gap_is_what_a_joint_is_off_its_parent():
     """A bent body without gaps, but for an elbow that is moved: that joint is off, and the wrist is off the elbow."""
-    rest = load_body().mean_body().joints.astype(float)
+    rest = load_asset().mean_body().joints.astype(float)
     turns = Rotation.from_rotvec(np.random.default_rng(0).normal(0.0, 0.4, (len(JOINT_NAMES), 3)))
     world, position = forward_kinematics(turns.as_matrix(), np.array([0.3, -0.2, 1.1]), rest)
     elbow, moved = joint_index("left_elbow"), np.array([0.0, 0.003, -0.004])

@@ -15,9 +15,9 @@ from benchmarks.paper import disturbance, metrics, poses, tracking
 from benchmarks.paper import metrics as paper
 from benchmarks.physics.rig import Rig, World
 from benchmarks.speed import cpu
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import joint_index, joint_limits
-from piavatar_envs.avatar.pose_control.controller import DriveSettings
+from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.avatar.types import DriveSettings
 from piavatar_envs.core.arrays import components_of
 from piavatar_envs.mpm.diagnostics import totals
 
@@ -35,7 +35,7 @@ def tiny(device: str) -> World:
 
 
 def mean_shapes(count: int) -> np.ndarray:
-    return np.zeros((count, len(load_body().shape_names)))
+    return np.zeros((count, len(load_asset().shape_names)))
 
 
 # --- poses -----------------------------------------------------------------------------------------------------------
@@ -59,8 +59,8 @@ def test_a_smooth_sequence_passes_through_its_poses_in_even_turns():
 
 
 def test_random_shapes_alternate_the_sexes():
-    shapes = poses.random_shapes(load_body(), np.random.default_rng(0), 4)
-    assert shapes[:, load_body().shape_names.index("sex")].tolist() == [-1.0, 1.0, -1.0, 1.0]
+    shapes = poses.random_shapes(load_asset(), np.random.default_rng(0), 4)
+    assert shapes[:, load_asset().shape_names.index("sex")].tolist() == [-1.0, 1.0, -1.0, 1.0]
 
 
 # --- metrics ---------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ SOURCES = ("pyproject.toml", "README.md", "LICENSE", "piavatar_envs")
 PROBE = """
 import importlib.resources, json, sys
 import gymnasium, piavatar_envs
-from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import list_motions, load_motion
 
 env = gymnasium.make("PIAvatar/Reach-v0", device="cpu", fidelity="tiny")
@@ -32,7 +32,7 @@ print(json.dumps({
     "files": sorted({module.__file__ for module in mine}),
     "path": sys.path,
     "reward": float(reward),
-    "vertices": len(load_body().vertices),
+    "vertices": len(load_asset().vertices),
     "motions": {name: len(load_motion(name).root_position) for name in list_motions() if ":" not in name},
     "data": sorted(entry.name for entry in importlib.resources.files("piavatar_envs.data").iterdir()),
     "typed": importlib.resources.files("piavatar_envs").joinpath("py.typed").is_file(),

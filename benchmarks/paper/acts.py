@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.paper.stage import Act, Script, View, keyed, played
-from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import list_motions, load_motion
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key, animate
 from piavatar_envs.config import AvatarConfig, PropConfig, RegionConfig, SceneConfig
@@ -48,7 +48,7 @@ def low_kick() -> Script:
         Key(1.25, pelvis=(0.18, -0.04, -0.06), right_foot=Foot((0.05, -0.62, 0.06), pitch=-25.0), **guard, **ahead),
         Key(1.8),
     ]
-    return played(animate("low kick", keys, load_body().joints), start=0.3)
+    return played(animate("low kick", keys, load_asset().joints), start=0.3)
 
 
 def kicks(masses: tuple[float, ...] = (0.5, 1.5, 8.0)) -> list[Act]:
@@ -194,7 +194,7 @@ def pillows(moduli: tuple[float, ...] = (1e3, 2e3, 5e3, 1e5)) -> list[Act]:
 
 def cans(mesh: Path) -> list[Act]:
     """A can of 0.35 kg against head, belly and ankle at one speed, on flesh and on a region of another material."""
-    top, down = load_body().mean_body().vertices[:, 2].max(), (0.0, 0.0, -CAN_SPEED)
+    top, down = load_asset().mean_body().vertices[:, 2].max(), (0.0, 0.0, -CAN_SPEED)
     hair = RegionConfig(joints=("head",), beyond=0.05, material="fixed_corotated", young_modulus=7e2)
     garment = RegionConfig(
         joints=("pelvis", "spine1", "spine2", "spine3"), beyond=0.05, material="fixed_corotated", young_modulus=1e3

@@ -13,8 +13,8 @@ import numpy as np
 
 from benchmarks.paper.poses import random_directions, random_poses, random_shapes
 from benchmarks.physics.rig import Rig, World
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.types import DriveSettings
 from piavatar_envs.mpm.diagnostics import Totals, totals
 
@@ -91,7 +91,7 @@ def struck_free(world: World, drive: DriveSettings, seeds: int, steps: int) -> I
     bones = np.repeat([joint_index(name) for name in STRIKES], seeds)
     size = np.repeat(list(STRIKES.values()), seeds)
     directions = np.tile(random_directions(rng, seeds), (len(STRIKES), 1))
-    shapes = np.tile(random_shapes(load_body(), rng, seeds), (len(STRIKES), 1))
+    shapes = np.tile(random_shapes(load_asset(), rng, seeds), (len(STRIKES), 1))
     poses = np.tile(random_poses(rng, seeds, POSE_RANGE)[0], (len(STRIKES), 1, 1))
     rig = Rig(world, drive, shapes)
     course = follow(rig, poses, bones, size[:, None] * directions, steps)
@@ -104,7 +104,7 @@ def struck_free(world: World, drive: DriveSettings, seeds: int, steps: int) -> I
 def hit_by_balls(world: World, drive: DriveSettings, seeds: int, steps: int) -> Iterator[dict[str, Any]]:
     """A standing body, its root held by the wrench, and what balls would give its chest from the front."""
     rng = np.random.default_rng(4)
-    shapes = np.tile(random_shapes(load_body(), rng, seeds), (len(BALLS), 1))
+    shapes = np.tile(random_shapes(load_asset(), rng, seeds), (len(BALLS), 1))
     size = np.repeat([ball.impulse for ball in BALLS], seeds)
     rig = Rig(world, drive, shapes)
     bones = np.full(len(shapes), joint_index("spine3"))

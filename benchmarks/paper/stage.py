@@ -12,8 +12,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from benchmarks.physics.rig import joint_gaps
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index, skin
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion
 from piavatar_envs.avatar.motion.interpolation import ease
 from piavatar_envs.config import EnvConfig, RenderConfig, SceneConfig, load_config
@@ -29,7 +29,7 @@ Script = Callable[[float], Pose]
 
 def standing(_time: float) -> Pose:
     """The rest pose, upright."""
-    return np.zeros((NUM_JOINTS, 3)), load_body().joints[0].astype(float)
+    return np.zeros((NUM_JOINTS, 3)), load_asset().joints[0].astype(float)
 
 
 def keyed(*keys: tuple[float, dict[str, Sequence[float]]]) -> Script:

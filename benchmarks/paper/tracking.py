@@ -19,8 +19,8 @@ from benchmarks.paper import metrics as paper
 from benchmarks.paper.metrics import distance_metrics, pose_metrics, spread
 from benchmarks.paper.poses import passing_through, random_directions, random_poses, random_shapes
 from benchmarks.physics.rig import Rig, World
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.types import DriveSettings
 from piavatar_envs.core.launch_graph import LaunchGraph
 
@@ -146,7 +146,7 @@ def run_sequences(
 ) -> list[dict[str, float]]:
     """One repetition of Table 1: metrics after each of the four poses, over all bodies of the repetition."""
     rng = np.random.default_rng([seed, 1])
-    shapes = random_shapes(load_body(), rng, sequences)
+    shapes = random_shapes(load_asset(), rng, sequences)
     rotations, shifts = random_poses(rng, sequences * FRAMES)
     rotations = rotations.reshape(sequences, FRAMES, -1, 3)
     shifts = shifts.reshape(sequences, FRAMES, 3)
@@ -191,7 +191,7 @@ def table_2(
     into the pose it should have, and counted. With ``strike`` [N s], a forearm is struck before every tenth step.
     """
     rngs = [np.random.default_rng([seed, 2]) for seed in range(options.seeds)]
-    shapes = np.concatenate([random_shapes(load_body(), rng, 2)[seed % 2][None] for seed, rng in enumerate(rngs)])
+    shapes = np.concatenate([random_shapes(load_asset(), rng, 2)[seed % 2][None] for seed, rng in enumerate(rngs)])
     courses = [passing_through(*random_poses(rng, poses), steps_per_pose) for rng in rngs]
     rotations, shifts = (np.stack(parts, axis=1) for parts in zip(*courses, strict=True))
     rig = Rig(world, drive, shapes)
@@ -237,7 +237,7 @@ def table_2(
 def bone_particles(options: Options, world: World) -> Iterator[dict[str, Any]]:
     """What ten times as many bone particles cost and bring: the last frame of Table 1's protocol, and the runtime."""
     samples = [run_sequences(world, BARE, options.sequences, seed)[-1] for seed in range(options.seeds)]
-    rig = Rig(world, BARE, np.zeros((1, len(load_body().shape_names))))
+    rig = Rig(world, BARE, np.zeros((1, len(load_asset().shape_names))))
     trackers = np.bincount(rig.points.bone[~rig.flesh])
     yield {
         "case": label("bone particles", world, BARE, 0.0) + f", {5 * world.bone_rings} a joint",

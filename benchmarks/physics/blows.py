@@ -60,17 +60,17 @@ def subject_totals(stage: Stage, subject: int) -> Totals:
 def joint_errors(stage: Stage) -> np.ndarray:
     """Angle of every joint from the pose that its spring pulls to [deg], shape ``(21,)``."""
     avatar, above = stage.simulation.avatar, list(PARENTS[1:])
-    world = Rotation.from_quat(avatar.joints.state.rotation.numpy()[0].astype(float))
+    world = Rotation.from_quat(stage.simulation.controllers[0].state.rotation.numpy()[0].astype(float))
     goal = Rotation.from_quat(avatar.state.goal_rotation.numpy()[0].astype(float))
     return np.degrees(((world[above].inv() * world[1:]).inv() * goal[1:]).magnitude())
 
 
 def set_stiffness(stage: Stage, stiffness: float) -> None:
     """Give all joints one stiffness [N m/rad], and the damping that is critical for what each carries."""
-    joints = stage.simulation.avatar.joints
-    size = float(joints.body.strength.factor.numpy()[0])  # gains are the reference adult's
-    values = np.stack([np.full(NUM_JOINTS - 1, stiffness), critical_damping(joints.body, stiffness)]) / size
-    for array, row in zip((joints.gains.stiffness, joints.gains.damping), values, strict=True):
+    controller = stage.simulation.controllers[0]
+    size = float(controller.joints.strength.factor.numpy()[0])  # gains are the reference adult's
+    values = np.stack([np.full(NUM_JOINTS - 1, stiffness), critical_damping(controller.joints, stiffness)]) / size
+    for array, row in zip((controller.gains.stiffness, controller.gains.damping), values, strict=True):
         array.assign(spring_rows(np.r_[0.0, row]).astype(np.float32))
 
 
@@ -129,7 +129,7 @@ def swing(options: Options, held: bool, hold: str, *props: PropConfig) -> Kick:
     """Swing the leg, with a ball in its way or none."""
     act = afloat("kick", *props, script=keyed(*SWING), control={"root_assist": float(held), **HOLDS[hold]})
     stage = Stage(act, options.fidelity, options.device)
-    drive, joints = stage.simulation.avatar.state, stage.simulation.avatar.joints.state
+    drive, joints = stage.simulation.avatar.state, stage.simulation.controllers[0].state
     toes, pelvis, support, gaps = [], [], [], []
     for _ in range(round(KICK_SECONDS / stage.dt)):
         stage.step()

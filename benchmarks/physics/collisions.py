@@ -11,8 +11,8 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from benchmarks.physics.matter import push_particles
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.diagnostics import Totals, totals
@@ -28,7 +28,7 @@ BLOCK = (0.2, 0.2, 0.1)
 
 def grid_spacing(resolution: str) -> float:
     """Grid spacing of a fidelity [m]."""
-    return float(np.ptp(load_body().mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[resolution]
+    return float(np.ptp(load_asset().mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[resolution]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def block(center: Sequence[float], resolution: str, half: Sequence[float] = BLOC
 
 @lru_cache(maxsize=4)
 def _flesh(resolution: str):
-    return sample_particles(load_body(), spacing_for(grid_spacing(resolution)))
+    return sample_particles(load_asset(), spacing_for(grid_spacing(resolution)))
 
 
 def body(resolution: str, shift: Sequence[float] = (0.0, 0.0, 0.0), yaw: float = 0.0, **how) -> Thing:

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import runner
 from benchmarks.physics.rig import Rig, World, joint_gaps
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, forward_kinematics, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
 from piavatar_envs.avatar.types import DriveSettings
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -64,7 +64,7 @@ class Limbs:
         world = World(
             fidelity=options.fidelity, num_substeps=None, gravity=gravity, ground=ground, device=options.device
         )
-        asset = load_body()
+        asset = load_asset()
         self.rig = Rig(world, DriveSettings(), asset.parameters()[None])
         self.rig.reset(rotations[None])
         rates = np.full((1, self.rig.points.num_points), rate) if rate > 0.0 else None

@@ -10,18 +10,19 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.avatar.body.device import BodyPoints
 from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
-from piavatar_envs.avatar.pose_control.controller import AvatarDrive, record_control_step
+from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.avatar.pose_control.controller import PoseController
 from piavatar_envs.avatar.types import DriveSettings, Tracked
 from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
-from piavatar_envs.sim.world import GRID_PER_HEIGHT
+from piavatar_envs.sim.world import GRID_PER_HEIGHT, record_control_step
 from piavatar_envs.tasks.common.disturb import apply_impulse
 
 DENSITY = 1000.0
@@ -62,7 +63,7 @@ class Rig:
     def __init__(self, world: World, drive: DriveSettings, shapes: np.ndarray) -> None:
         """Build a body for each row of ``shapes`` (shape parameters, ``(num_envs, S)``) and place them."""
         self.world, self.num_envs = world, len(shapes)
-        asset = self.asset = load_body()
+        asset = self.asset = load_asset()
         self.dx = float(np.ptp(asset.mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[world.fidelity]
         particles = sample_particles(asset, spacing_for(self.dx), bone_rings=world.bone_rings)
         self.shaped = [asset.shape(parameters) for parameters in shapes]
@@ -89,7 +90,8 @@ class Rig:
             colliders=[Collider.plane((0.0, 0.0, 1.0), 0.0, 0.8)] if world.ground else [],
         )
         self.state, self.scratch = allocate(self.model)
-        self.avatar = AvatarDrive(self.points, 0, self.model, drive)
+        self.avatar = Avatar(self.points, 0, self.model)
+        self.controller = PoseController(self.avatar, drive)
         self._record()
         self.reset()
 
@@ -101,7 +103,7 @@ class Rig:
         self._reset, self._step, self._strike = LaunchGraph(device), LaunchGraph(device), LaunchGraph(device)
         self.avatar.record_reset(self._reset, self.state, self._placed)
         self.avatar.record_tracking(self._reset, self.state)
-        record_control_step(self._step, [self.avatar], self.model, self.state, self.scratch)
+        record_control_step(self._step, [self.avatar], [self.controller], self.model, self.state, self.scratch)
         self._strike.launch(
             apply_impulse,
             (n, self.points.num_points),
@@ -231,7 +233,7 @@ def joint_gaps(tracked: Tracked, joints: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=64)
 def _morphed(parameters: tuple[float, ...], spacing: float, bone_rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Rest positions [m] and volumes [m^3] of the particles of a shape; the variants all use the same bodies."""
-    asset = load_body()
+    asset = load_asset()
     return morph(asset, sample_particles(asset, spacing, bone_rings=bone_rings), asset.shape(parameters))
 
 

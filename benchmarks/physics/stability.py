@@ -81,7 +81,7 @@ class Trial:
         """Why it is not stable, as the module has it: a failure by name, ``"energy"``, ``"hum"``; None where it is."""
         pose = random_pose(np.random.default_rng(seed), self.reach)[0] * (np.arange(NUM_JOINTS) > 0)[:, None]
         stage = self.stage(options, pose * (not self.grounded))
-        simulation, joints = stage.simulation, stage.simulation.avatar.joints
+        simulation, controller = stage.simulation, stage.simulation.controllers[0]
         state, mass = simulation.state, simulation.model.particles.mass.numpy()[0].astype(float)
 
         def potential() -> float:
@@ -93,7 +93,7 @@ class Trial:
             if failure := int(state.failure.numpy()[0]):
                 return failure_name(failure)
             error = np.linalg.norm(pose, axis=1)[1:] * (not self.grounded)
-            held = 0.5 * float(joints.body.springs.stiffness.numpy()[0, 2:] @ error**2)
+            held = 0.5 * float(controller.joints.springs.stiffness.numpy()[0, 2:] @ error**2)
             now = totals(simulation.model, state)
             kinetic = now.kinetic
             if kinetic + now.elastic > held + start - potential() + CALM:
@@ -190,7 +190,7 @@ def largest_gains(options: Options, kind: str, limited: bool) -> dict[str, Any]:
     )
     stage = trial(edge.stable, False).stage(options, np.zeros((NUM_JOINTS, 3)))
     stage.step()
-    springs, hip = stage.simulation.avatar.joints.body.springs, 1 + joint_index("left_hip")
+    springs, hip = stage.simulation.controllers[0].joints.springs, 1 + joint_index("left_hip")
     return {
         "case": f"largest_{kind}_{'limited' if limited else 'boundless'}",
         "stable_factor": edge.stable,

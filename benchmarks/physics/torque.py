@@ -26,8 +26,8 @@ from benchmarks.physics.blows import HOLDS, afloat
 from benchmarks.physics.limbs import Limbs, Options, critical_damping, widest
 from benchmarks.physics.rig import joint_gaps
 from benchmarks.speed import timing
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control import dynamics as joint_motion
 from piavatar_envs.avatar.torque_control import flesh_coupling as attachment
 from piavatar_envs.avatar.torque_control import mass_matrix as mass_pairs
@@ -114,7 +114,7 @@ def stretch_arms(options: Options, stiffness: float, hold: str) -> dict[str, Any
 
     Only the springs of the arms have the ``stiffness`` [N m/rad]; those of trunk and legs have :data:`TRUNK`.
     """
-    joints, rotations = load_body().mean_body().joints.astype(float), np.zeros((NUM_JOINTS, 3))
+    joints, rotations = load_asset().mean_body().joints.astype(float), np.zeros((NUM_JOINTS, 3))
     for side, outwards in (("left", 1.0), ("right", -1.0)):
         shoulder = joint_index(f"{side}_shoulder")
         hanging = joints[joint_index(f"{side}_wrist")] - joints[shoulder]

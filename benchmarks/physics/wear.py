@@ -44,7 +44,7 @@ def make(options: Options, task: str, **settings: Any) -> BatchEnv:
 def homes(env: BatchEnv) -> np.ndarray:
     """Where its bones have each particle of the avatar, shape ``(P, 3)`` [m]."""
     simulation = env.simulation
-    pose, points = simulation.avatar.joints.state, simulation.flesh[0].points
+    pose, points = simulation.controllers[0].state, simulation.flesh[0].points
     world = Rotation.from_quat(pose.rotation.numpy()[0].astype(float)).as_matrix()
     rest, weights = points.rest[0].astype(float), points.skin_weights.astype(float)
     position, joints = pose.position.numpy()[0].astype(float), points.joints[0].astype(float)

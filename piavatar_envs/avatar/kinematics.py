@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.rotation import quat_exp
+from piavatar_envs.avatar.rotation import quat_exp, rigid_matrix
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.cuda_intrinsics import meet_threads, over_ancestors
 from piavatar_envs.mpm.types import row
@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 @wp.func
 def bone_offset(body: Body, e: int, b: int, root: wp.vec3):
-    """Where the joint of a bone is from its parent's in the frame of that; the pelvis', in the world [m]."""
+    """Return the offset of a bone's joint from its parent's, in the parent's frame; the pelvis', in the world [m]."""
     parent = body.parent[b]
     r = row(e, body.rest_joint.shape[0])
     if parent < 0:
@@ -34,7 +34,7 @@ def pose_bone(
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """Forward kinematics of one bone, whose ``rotation`` is local so far; its parent must have been posed."""
+    """Pose one bone, whose ``rotation`` is local so far; its parent must have been posed."""
     parent = body.parent[b]
     offset = bone_offset(body, e, b, root)
     if parent < 0:
@@ -46,7 +46,7 @@ def pose_bone(
 
 @wp.func_native(over_ancestors(7, "before[k] = more;", "if (up >= 0) value = wp::mul(before, value);"))
 def after_ancestors(value: wp.transform, parent: int, levels: int) -> wp.transform:
-    """Motion of a bone in the world, of the lanes of a warp: their own from the parent's, one after the other."""
+    """Return the motion of a lane's bone in the world, composed with those of its ancestors."""
     ...
 
 
@@ -65,9 +65,9 @@ def pose_bones(
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """Pose at ``fraction`` of the control step: base local rotations turned along arcs, then forward kinematics.
+    """Pose the bones at ``fraction`` of the control step: local rotations turned along arcs, then kinematics.
 
-    A thread that is alone poses the bones in their order, parents first. Each lane of a warp has a bone.
+    A single thread poses the bones in their order, parents first. In a warp each lane has a bone.
     """
     root = base_root[e] + fraction * root_increment[e]
     bones = body.parent.shape[0]
@@ -98,8 +98,22 @@ def pose_body(
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """:func:`pose_bones` of every environment, over ``(num_envs, threads)``."""
+    """Run :func:`pose_bones` for every environment, over ``(num_envs, threads)``."""
     e, thread = wp.tid()
     pose_bones(
         body, fraction, base_rotation, base_root, increment, root_increment, e, thread, threads, rotation, position
     )  # fmt: skip
+
+
+@wp.kernel
+def rest_matrices(
+    body: Body,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    # out
+    bone_from: wp.array2d(dtype=wp.mat44),
+):
+    """Write the skinning matrices of a pose, from rest to the world, over ``(num_envs, bones)``."""
+    e, b = wp.tid()
+    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+    bone_from[e, b] = rigid_matrix(rotation[e, b], rest, position[e, b])

@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.types import Body, Drive
+from piavatar_envs.avatar.types import Body, PoseControl
 from piavatar_envs.core.arrays import float_at, int_at, number_at, vec12, vec16, vector_at
 from piavatar_envs.core.cuda_intrinsics import BLOCK, place_in_chunks, sum_threads12
 from piavatar_envs.mpm.types import Particles, row
@@ -353,7 +353,7 @@ def chunk_motion(
 @wp.kernel(launch_bounds=(BLOCK, 10))
 def sum_motion(
     body: Body,
-    drive: Drive,
+    control: PoseControl,
     particles: Particles,
     x: wp.array2d(dtype=wp.vec3),
     vk: wp.array2d(dtype=wp.vec3),
@@ -369,7 +369,7 @@ def sum_motion(
     Launched over ``(num_envs, GROUPS, threads)``: most bodies have nothing to do here, and end few threads.
     """
     e, group, thread = wp.tid()
-    if failure[e] != 0 or (drive.free_motion == 0 and let_go[e] == 0):
+    if failure[e] != 0 or (control.free_motion == 0 and let_go[e] == 0):
         return
     quarters = quarters_at_once(threads)
     for n in range(group, body.quarters.shape[0] // quarters, GROUPS):

@@ -1,6 +1,4 @@
-"""Parameters of a drive: in user terms, and as a kernel argument.
-
-Data structures of a driven body: constants, parameters, checkpointed state, scratch.
+"""Data structures of an avatar: constants, parameters, checkpointed state and workspaces, and their allocation.
 
 Symbols in kernels: ``b`` bone, ``c`` chunk of a bone's particle list, ``q`` rotation, ``G`` the motion by which contact
 has carried a bone within this control step. A body occupies particles ``first ... first + count`` of each environment.
@@ -8,12 +6,16 @@ has carried a bone within this control step. A body occupies particles ``first .
 
 from __future__ import annotations
 
+import inspect
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
+from functools import partial
+from typing import Any
 
 import warp as wp
 
-from piavatar_envs.core.arrays import vec8, vec12, vec16
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.core.arrays import group, vec8, vec12, vec16
 from piavatar_envs.mpm.types import Model
 
 wp.set_module_options({"enable_backward": False})
@@ -61,9 +63,9 @@ class DriveSettings:
     max_horizontal_error: float = 0.5
     max_height_error: float = 0.4
 
-    def kernel_parameters(self, model: Model) -> Drive:
+    def kernel_parameters(self, model: Model) -> PoseControl:
         """The same as a kernel argument."""
-        drive = Drive()
+        drive = PoseControl()
         drive.dt, drive.control_dt, drive.num_substeps = model.step.dt, model.control_dt, model.num_substeps
         drive.mode = {"increment": 0, "target": 1, "reference": 2}[self.mode]
         rate = self.alpha / model.control_dt
@@ -119,7 +121,7 @@ class Body:
 
 
 @wp.struct
-class Drive:
+class PoseControl:
     """Parameters of the drive. Rates are natural frequencies of critically damped pulls [1/s]."""
 
     dt: float  # substep [s]
@@ -213,8 +215,8 @@ class Wrench:
 
 
 @wp.struct
-class Held:
-    """What the root wrench leaves behind, see :class:`DriveState`; ``(num_envs,)``."""
+class RootState:
+    """What the root wrench leaves behind, see :class:`AvatarState`; ``(num_envs,)``."""
 
     let_go: wp.array(dtype=int)
     wrench_force: wp.array(dtype=wp.vec3)
@@ -222,113 +224,100 @@ class Held:
 
 
 @wp.struct
-class Bench:
-    """What a drive works on in a substep, see :class:`DriveScratch`; ``now`` and ``after`` take turns."""
+class PoseWorkspace:
+    """Arrays of the pose controller in a substep; ``now`` and ``after`` swap their roles every substep."""
 
     start_rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) the pose that the control step starts from, local
     start_root: wp.array(dtype=wp.vec3)
-    increment: wp.array2d(dtype=wp.vec3)
-    root_increment: wp.array(dtype=wp.vec3)
+    increment: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) rotation vector added to the start pose [rad]
+    root_increment: wp.array(dtype=wp.vec3)  # (num_envs,) translation added to it [m]
     command: Command
     tracked: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) joint positions at the start of the control step [m]
-    now: Pose
-    after: Pose
-    command_pose: Pose
+    now: Pose  # the kinematic pose at the substep's start
+    after: Pose  # the same at its end
+    command_pose: Pose  # the commanded pose at the substep's start, before alignment
     carry: Carry
     anchor: Anchor
-    gap: wp.array2d(dtype=wp.vec3)
+    gap: wp.array2d(
+        dtype=wp.vec3
+    )  # (num_envs, bones) from where fixed offsets would put a bone to its tracked place [m]
     bones: RigidFits
     whole: RigidFit
     removed: RemovedMotion
     wrench: Wrench
-    moments: wp.array2d(dtype=vec16)
-    record: wp.array2d(dtype=vec44)
-    pull: wp.array2d(dtype=wp.vec3)
-    lean: wp.array2d(dtype=wp.vec3)
-    corrections: wp.array2d(dtype=vec12)
-    bone_corrections: wp.array2d(dtype=vec12)
-    change: wp.array2d(dtype=vec8)
+    moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)
+    record: wp.array2d(dtype=vec44)  # (num_envs, bones) all that particles blend of a bone
+    pull: wp.array2d(dtype=wp.vec3)  # (num_envs, count) velocity change by shape preservation and tone [m/s]
+    lean: wp.array2d(dtype=wp.vec3)  # (num_envs, count) displacement from the carried to the commanded pose [m]
+    corrections: wp.array2d(dtype=vec12)  # (num_envs, chunks)
+    bone_corrections: wp.array2d(dtype=vec12)  # (num_envs, bones) their sums
+    change: wp.array2d(dtype=vec8)  # (num_envs, bones) correction field
 
 
 @dataclass
-class DriveState:
-    """What a checkpoint holds of a drive. Quaternions are Warp's ``xyzw``; ``[:, 0]`` is the root in the world."""
+class AvatarState:
+    """Commands of an avatar and what holds its root. Quaternions are Warp's ``xyzw``; ``[:, 0]`` is the root's."""
 
-    command_rotation: wp.array  # (num_envs, bones) local rotations commanded so far
-    command_root: wp.array  # (num_envs,) commanded pelvis position [m]
-    goal_rotation: wp.array  # (num_envs, bones) local rotations to reach at the end of this control step
-    goal_root: wp.array  # (num_envs,) pelvis position to reach [m]
-    let_go: wp.array  # (num_envs,) int: 1 once the root wrench has let go
-    # (num_envs, count) kinematic velocity of inert flesh in the last substep, before any rigid part came off
-    motion: wp.array
-    wrench_force: wp.array  # (num_envs,) mean root force of the last control step [N]
-    wrench_torque: wp.array  # (num_envs,) mean root torque of the last control step [N m]
-
-
-@dataclass
-class JointState:
-    """What a checkpoint holds of joints that move under torques, besides the drive's own state."""
-
-    rotation: wp.array  # (num_envs, bones) world rotation
-    position: wp.array  # (num_envs, bones) joint position [m]
-    velocity: wp.array  # (num_envs, 69) the pelvis' [m/s], then spins of all joints in the world's axes [rad/s]
-    outside: wp.array  # (num_envs, 69) how all but the joints themselves changed it in the last substep
-    # (num_envs, bones) torques, of the reference adult, about the rest pose's axes as the parent has turned them [N m]
-    torque: wp.array
-    # (num_envs, up to the last firm one) by how much firm particles have been put back, in the frame of the rest pose
-    # [m]; at least one entry
-    slip: wp.array
+    command_rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) local rotations commanded so far
+    command_root: wp.array(dtype=wp.vec3)  # (num_envs,) commanded pelvis position [m]
+    goal_rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) local rotations at the end of this control step
+    goal_root: wp.array(dtype=wp.vec3)  # (num_envs,) pelvis position to reach [m]
+    let_go: wp.array(dtype=int)  # (num_envs,) 1 once the root is no longer held
+    # (num_envs, count) kinematic velocity of flesh with a velocity lag in the last substep, before a rigid part came
+    # off; only pose control writes it
+    motion: wp.array2d(dtype=wp.vec3)
+    wrench_force: wp.array(dtype=wp.vec3)  # (num_envs,) mean force on the root in the last control step [N]
+    wrench_torque: wp.array(dtype=wp.vec3)  # (num_envs,) mean torque on it [N m]
 
 
 @dataclass
 class Tracked:
     """Kabsch-tracked bones: recomputed from the particles whenever they have moved."""
 
-    rotation: wp.array  # (num_envs, bones) world rotation
-    position: wp.array  # (num_envs, bones) joint position [m]
-    velocity: wp.array  # (num_envs, bones) mean velocity of the bone's tracking particles [m/s]
-    local: wp.array  # (num_envs, bones) rotation relative to the parent bone
+    rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) world rotation
+    position: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) joint position [m]
+    velocity: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) mean velocity of the bone's tracking particles [m/s]
+    local: wp.array2d(dtype=wp.quat)  # (num_envs, bones) rotation relative to the parent bone
 
 
 @dataclass
-class DriveScratch:
-    """Rebuilt every control step."""
+class JointState:
+    """Joints that move under torques."""
 
-    increment: wp.array  # (num_envs, bones) rotation vector the drive adds to the tracked pose [rad]
-    command_increment: wp.array  # (num_envs, bones) rotation vector from command to goal [rad]
-    root_increment: wp.array  # (num_envs,) translation the drive adds [m]
-    pose_rotation: wp.array  # (num_envs, bones) world rotation of the kinematic pose at the current substep
-    pose_position: wp.array  # (num_envs, bones)
-    next_rotation: wp.array  # the same at the next substep
-    next_position: wp.array
-    command_pose_rotation: wp.array  # (num_envs, bones) commanded pose at the current substep, before alignment
-    command_pose_position: wp.array
-    gap: wp.array  # (num_envs, bones) from where fixed offsets would put a bone to where it is tracked [m]
-    carry_rotation: wp.array  # (num_envs, bones) G
-    carry_translation: wp.array
-    anchor_rotation: wp.array  # (num_envs,) rigid motion that lays the commanded pose on the body
-    anchor_translation: wp.array
-    moments: wp.array  # (num_envs, chunks) vec16
-    bone_center: wp.array  # (num_envs, bones) skinning-weighted centre of mass [m]
-    bone_velocity: wp.array  # (num_envs, bones) rigid fit to u: velocity of the centre
-    bone_spin: wp.array  # (num_envs, bones) rigid fit to u: angular velocity
-    bone_inertia: wp.array  # (num_envs, bones) about the centre
-    body_center: wp.array  # (num_envs,) the same for the whole body
-    body_velocity: wp.array
-    body_spin: wp.array
-    body_inertia: wp.array
-    wrench_linear: wp.array  # (num_envs,) acceleration of the body's centre by the root wrench [m/s^2]
-    wrench_angular: wp.array  # (num_envs,) angular acceleration [rad/s^2]
-    # rigid motion taken out of vk in a substep, where a body moves without support: x -> x + dt (A (x - c - dt V) - V)
-    removed_velocity: wp.array  # (num_envs,) V [m/s]
-    removed_turn: wp.array  # (num_envs,) mat33: A, the finite rotation minus the identity, over dt [1/s]
-    removed_center: wp.array  # (num_envs,) c [m]
-    # only where poses are set or velocity is injected
-    bone_from: wp.array  # (num_envs, bones) mat44: G T_s, rest world to world
-    bone_step: wp.array  # (num_envs, bones) mat44: (G T_{s+1} - G T_s) / dt
-    bone_record: wp.array  # (num_envs, bones) vec44: all that particles blend of a bone
-    pull: wp.array  # (num_envs, count) velocity change by shape preservation and tone [m/s]
-    lean: wp.array  # (num_envs, count) displacement from the carried to the commanded pose [m]
-    corrections: wp.array  # (num_envs, chunks) vec12
-    bone_corrections: wp.array  # (num_envs, bones) vec12: their sums
-    bone_change: wp.array  # (num_envs, bones) vec8: correction field
+    rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) world rotation
+    position: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) joint position [m]
+    # (num_envs, 69) the pelvis' [m/s], then spins of all joints in the world's axes [rad/s]
+    velocity: wp.array2d(dtype=float)
+    outside: wp.array2d(dtype=float)  # (num_envs, 69) how all but the joints themselves changed it in the last substep
+    # (num_envs, bones) torques, of the reference adult, about the rest pose's axes as the parent has turned them [N m]
+    torque: wp.array2d(dtype=wp.vec3)
+    # (num_envs, up to the last firm one) by how much firm particles have been put back, in the frame of the rest pose
+    # [m]; at least one entry
+    slip: wp.array2d(dtype=wp.vec3)
+
+
+def allocate(declaration: Any, num_envs: int, device: str, **given: Any) -> Any:
+    """Return an instance of ``declaration`` with zeroed arrays of the types that it declares.
+
+    Args:
+        declaration: a Warp struct, whose structs are allocated likewise, or a dataclass of arrays.
+        num_envs: rows of every array.
+        device: where to allocate.
+        given: by name, the number of columns of a two-dimensional array that has not one a bone, or a value to share
+            instead of an allocation.
+    """
+    if is_dataclass(declaration):
+        declared, build = inspect.get_annotations(declaration, eval_str=True), declaration
+    else:
+        declared = {name: variable.type for name, variable in declaration.vars.items()}
+        build = partial(group, declaration)
+    values = {}
+    for name, kind in declared.items():
+        value = given.get(name, NUM_JOINTS)
+        if not isinstance(value, int):
+            values[name] = value
+        elif hasattr(kind, "dtype"):
+            values[name] = wp.zeros((num_envs, value)[: kind.ndim], dtype=kind.dtype, device=device)
+        else:
+            values[name] = allocate(kind, num_envs, device)
+    return build(**values)

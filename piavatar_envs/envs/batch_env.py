@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
-from piavatar_envs.avatar.pose_control.controller import AvatarDrive
 from piavatar_envs.avatar.torque_control.controller import checked_assist
 from piavatar_envs.core.launch_graph import LaunchGraph, compile_graphs
 from piavatar_envs.envs.actions import apply_actions, apply_targets, apply_torques, follow_reference, refuse_nonfinite
@@ -85,8 +85,8 @@ class BatchEnv(EpisodeArrays):
         check_places(simulation.domain, simulation.dx, task.scene.props, *places)
         self.action_spec = task.action_spec().under(self.control)
         if self.control == "torque":
-            for avatar in simulation.avatars:
-                avatar.joints.release([joint_index(name) for name in self.action_spec.joints])
+            for controller in simulation.controllers:
+                controller.release([joint_index(name) for name in self.action_spec.joints])
         self.observer = Observer(simulation, task)
         names = len(task.reward_terms), len(task.cost_terms), len(task.metrics)
         max_steps = max(1, round(task.config.episode_seconds / task.config.physics.control_dt))
@@ -199,7 +199,7 @@ class BatchEnv(EpisodeArrays):
         graph.launch(end_step, n, ends, [self.step_count, self.truncated])
         self._record_observation(graph)
 
-    def _record_actions(self, graph: LaunchGraph, agent: int, avatar: AvatarDrive, reference: tuple) -> None:
+    def _record_actions(self, graph: LaunchGraph, agent: int, avatar: Avatar, reference: tuple) -> None:
         """Append the launches that turn an agent's action into its goal, relative to the reference pose."""
         bones, goal = (self.num_envs, NUM_JOINTS), [avatar.state.goal_rotation, avatar.state.goal_root]
         acting = [self.action_map, self.action, agent, self.alive]
@@ -212,8 +212,8 @@ class BatchEnv(EpisodeArrays):
         if self.control == "pd":
             graph.launch(apply_targets, bones, acting, goal[:1])
         else:
-            joints = avatar.joints
-            graph.launch(apply_torques, bones, [*acting, joints.body.strength], [joints.state.torque])
+            joints = self.simulation.controllers[agent].joints
+            graph.launch(apply_torques, bones, [*acting, joints.strength], [joints.state.torque])
 
     def _record_observation(self, graph: LaunchGraph, mask: wp.array | None = None) -> None:
         """Append the launches that write the observation and change nothing else; only ``mask`` was reset, if given."""
@@ -239,8 +239,8 @@ class BatchEnv(EpisodeArrays):
         if self.control == "pose":
             raise ValueError('control="pose" has a root wrench; root_assist is for "pd" and "torque"')
         shares = checked_assist(share, self.num_envs)
-        for avatar in self.simulation.avatars:
-            avatar.joints.assist.assign(shares)
+        for controller in self.simulation.controllers:
+            controller.assist.assign(shares)
 
     def arrays(self) -> dict[str, wp.array]:
         """Return every array of a checkpoint, by name."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, NUM_JOINTS
+from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.episodes import EpisodeArrays
 from piavatar_envs.envs.observations import (
@@ -89,8 +90,9 @@ class Observer:
             graph.launch(
                 observe_contact, (n, len(BODY_PARTS)), [agent, at, avatar.tracked.rotation, sim.sensors], [observation]
             )
-        if avatar.joints:
-            at, joints = self.layout[JOINT_TERMS[0].name].slice.start, avatar.joints.state
+        controller = sim.controllers[agent]
+        if isinstance(controller, TorqueController):
+            at, joints = self.layout[JOINT_TERMS[0].name].slice.start, controller.state
             inputs = [agent, at, avatar.body, joints.rotation, joints.velocity, sim.sensors]
             graph.launch(observe_joints, (n, NUM_JOINTS), inputs, [observation])
         self._record_others(graph, agent, observation)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.episodes import EpisodeArrays
 from piavatar_envs.envs.observations import ObservationTerm, Parameter
@@ -64,7 +65,7 @@ class Parameters:
         self.simulation, self._drawn = simulation, task
         world, own = simulation.randomization.parameters()
         shape = [parameter for parameter, _ in simulation.shapes.drawn(0).values()]
-        settings = [ASSIST] if simulation.avatar.joints else []
+        settings = [ASSIST] if isinstance(simulation.controllers[0], TorqueController) else []
         own = *own, *shape, *settings
         self._world, self._own, self._task = (_ranging(group) for group in (world, own, task))
         others = [
@@ -86,7 +87,7 @@ class Parameters:
         for index in range(count):
             known = {name: column for name, (_, column) in simulation.shapes.drawn(index).items()}
             if ASSIST in self._own:
-                known[ASSIST.name] = simulation.avatars[index].joints.assist
+                known[ASSIST.name] = simulation.controllers[index].assist
             for parameter in self._own:
                 column = known.get(parameter.name)
                 sources.append((parameter, Drawn(random.column(parameter.name, index) if column is None else column)))

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
 from piavatar_envs.avatar.body.muscles import attachment_rates, firmness, make_muscles
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.body.soft_tissue import bone_distance, inert_share, softness
-from piavatar_envs.avatar.pose_control.controller import AvatarDrive
 from piavatar_envs.avatar.torque_control.controller import JointSettings
 from piavatar_envs.avatar.types import DriveSettings
 from piavatar_envs.config import (
@@ -400,7 +400,7 @@ class Shapes:
     """
 
     def __init__(
-        self, flesh: Sequence[Flesh], avatars: Sequence[AvatarDrive], model: Model, randomization: Randomization
+        self, flesh: Sequence[Flesh], avatars: Sequence[Avatar], model: Model, randomization: Randomization
     ) -> None:
         """Shape the bodies of pools, when the factors have given what varies rows of its own."""
         self.flesh, self.avatars, self.model, self.randomization = flesh, avatars, model, randomization

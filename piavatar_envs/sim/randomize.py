@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.pose_control.controller import AvatarDrive
+from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.config.schema import UNCHANGED, RandomizeConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.observations import Parameter
@@ -84,7 +84,7 @@ class Randomization:
 
     config: RandomizeConfig
     model: Model
-    avatars: Sequence[AvatarDrive]
+    avatars: Sequence[Avatar]
     factors: wp.array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -141,7 +141,7 @@ class Randomization:
         self._scaled.append(_Scaled(factor, copy, value))
         return copy
 
-    def _scale_mass(self, factor: int, index: int, avatar: AvatarDrive) -> None:
+    def _scale_mass(self, factor: int, index: int, avatar: Avatar) -> None:
         """All that an avatar's density decides. Masses of random shapes have nominal rows of their own."""
         n, body, contact = self.model.num_envs, avatar.body, self.model.contact
         own = slice(body.first, body.first + body.count)

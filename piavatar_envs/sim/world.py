@@ -9,10 +9,13 @@ from dataclasses import fields
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, load_body
+from piavatar_envs.avatar.avatar import Avatar
+from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
-from piavatar_envs.avatar.pose_control.controller import AvatarDrive, record_control_step
-from piavatar_envs.avatar.torque_control.controller import LONGEST_SUBSTEP
+from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.avatar.controller import Controller
+from piavatar_envs.avatar.pose_control.controller import PoseController
+from piavatar_envs.avatar.torque_control.controller import LONGEST_SUBSTEP, TorqueController
 from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig
 from piavatar_envs.config.schema import MOST_SUBSTEPS
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -21,6 +24,8 @@ from piavatar_envs.mpm.colliders import Collider, make_boundaries, place_collide
 from piavatar_envs.mpm.contact_sensors import clear_masked_sensors
 from piavatar_envs.mpm.memory import allocate, estimate_slots
 from piavatar_envs.mpm.model import build_model, choose_num_substeps, make_grid
+from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
+from piavatar_envs.mpm.types import Model, Scratch, State
 from piavatar_envs.sim.bodies import Flesh, Shapes, drive_settings
 from piavatar_envs.sim.checks import STRUCK, check_beside_solids, commanded_speed, fastest_blow, fastest_thing
 from piavatar_envs.sim.prop_geometry import PropPoints
@@ -44,7 +49,8 @@ class Simulation:
         domain: where particles may go.
         model: constants of the continuum.
         state: particles; scratch: grid; sensors: contact of the last control step.
-        flesh: matter of every avatar (NumPy); avatars: their drives.
+        flesh: matter of every avatar (NumPy).
+        avatars: the avatars; controllers: what moves each of them.
         props: the soft props.
         randomization: factors on mass, stiffness and friction, and what follows from them.
         shapes: bodies of random shape.
@@ -81,7 +87,7 @@ class Simulation:
         """
         self.config, self.num_envs, self.device = config, num_envs, check_device(device)
         self.scene = scene or config.scene
-        self.asset = asset or load_body()
+        self.asset = asset or load_asset()
         physics = config.physics
         self.dx = float(np.ptp(self.asset.mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[physics.fidelity]
         spacing = spacing_for(self.dx)
@@ -119,8 +125,13 @@ class Simulation:
         first, count, fields = self.subjects.first, len(self.flesh), self.model.contact.num_fields
         self.collider_spawn = make_boundaries(self.subjects.colliders, fields, num_envs, self.device)
         self.avatars = [
-            AvatarDrive(flesh.points, first[index], self.model, drive_settings(flesh.control), joints[index])
-            for index, flesh in enumerate(self.flesh)
+            Avatar(flesh.points, begin, self.model) for flesh, begin in zip(self.flesh, first, strict=False)
+        ]
+        self.controllers: list[Controller] = [
+            TorqueController(avatar, flesh.points, torque)
+            if torque
+            else PoseController(avatar, drive_settings(flesh.control))
+            for avatar, flesh, torque in zip(self.avatars, self.flesh, joints, strict=True)
         ]
         # before anything is recorded: it gives what varies rows of its own
         self.randomization = Randomization(config.randomize, self.model, self.avatars)
@@ -129,8 +140,8 @@ class Simulation:
         self.props = PropSet(self.scene.props, solids, matter, first[count:-1], columns, self.model)
 
     @property
-    def avatar(self) -> AvatarDrive:
-        """The first avatar's drive."""
+    def avatar(self) -> Avatar:
+        """The first avatar."""
         return self.avatars[0]
 
     def _room(self, domain: Domain, solids: Sequence[PropPoints], driven: bool) -> tuple[Domain, tuple[Collider, ...]]:
@@ -199,8 +210,9 @@ class Simulation:
 
     def record_reset(self, graph: LaunchGraph, mask: wp.array) -> None:
         """Append: place the masked environments' avatars in their commanded poses and their props, and track them."""
-        for avatar in self.avatars:
+        for avatar, controller in zip(self.avatars, self.controllers, strict=True):
             avatar.record_reset(graph, self.state, mask)
+            controller.record_reset(graph, self.state, mask)
         self.props.record_reset(graph, self.state, mask)
         graph.launch(clear_masked_sensors, self.num_envs, [mask], [self.sensors])
         if self.model.moving_boundaries:
@@ -211,19 +223,15 @@ class Simulation:
 
     def record_control_step(self, graph: LaunchGraph) -> None:
         """Append: one control step towards the avatars' goals, then track."""
-        record_control_step(graph, self.avatars, self.model, self.state, self.scratch)
+        record_control_step(graph, self.avatars, self.controllers, self.model, self.state, self.scratch)
         self.props.record_tracking(graph, self.state)
 
     def arrays(self) -> dict[str, wp.array]:
         """Every array of a checkpoint, by name."""
         found = {f"particles.{field.name}": getattr(self.state, field.name) for field in fields(self.state)}
-        for index, avatar in enumerate(self.avatars):
-            groups = {"drive": avatar.state, "tracked": avatar.tracked}
-            if avatar.joints:
-                groups["joints"] = avatar.joints.state
-                found[f"joints_{index}.assist"] = avatar.joints.assist
-            for group, value in groups.items():
-                found |= {f"{group}_{index}.{f.name}": getattr(value, f.name) for f in fields(value)}
+        for index, (avatar, controller) in enumerate(zip(self.avatars, self.controllers, strict=True)):
+            for source, arrays in (("avatar", avatar.arrays()), ("controller", controller.arrays())):
+                found |= {f"{source}_{index}.{name}": array for name, array in arrays.items()}
         if self.model.moving_boundaries:
             names = ("position", "rotation", "velocity", "spin")
             found |= {f"colliders.{name}": getattr(self.model.boundaries, name) for name in names}
@@ -231,6 +239,39 @@ class Simulation:
         sensors = ("boundary_impulse", "boundary_moment", "pair_impulse", "part_impulse", "penetration")
         found |= {f"sensors.{name}": getattr(self.sensors, name) for name in sensors}
         return found | self.props.arrays()
+
+
+def record_control_step(
+    graph: LaunchGraph,
+    avatars: Sequence[Avatar],
+    controllers: Sequence[Controller],
+    model: Model,
+    state: State,
+    scratch: Scratch,
+) -> None:
+    """Append one control step of a world, after which its avatars are tracked.
+
+    Controllers of different avatars run in parallel: none reads what another one writes.
+    """
+    world = (model, state, scratch)
+    begins = graph.branches(controllers, lambda controller, own: controller.record_begin(own))
+    record_begin(graph, *world, beside=begins)  # activates blocks
+    for step in range(model.num_substeps):
+        graph.parallel_for_each(
+            controllers, lambda c, own, step=step: c.record_before_substep(own, state, scratch, step)
+        )
+        record_substep(graph, *world, step)
+
+    def end(index: int, own: LaunchGraph) -> None:
+        controllers[index].record_end(own, state)
+        avatars[index].record_tracking(own, state)
+
+    ends = graph.branches(range(len(avatars)), end)
+    # sensors read the particles where the substeps have left them
+    in_order = any(controller.moves_particles for controller in controllers)
+    record_end(graph, *world, beside=() if in_order else ends)
+    if in_order:
+        graph.parallel(*ends)
 
 
 def check_device(device: str) -> str:

@@ -9,11 +9,12 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.kinematics import pose_body
 from piavatar_envs.avatar.motion import load_motion
 from piavatar_envs.avatar.rotation import quat_log
+from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.config import ConfigError, EnvConfig
 from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_rotation, write_vector
@@ -152,7 +153,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
     def __init__(self, config: TrackMotionConfig) -> None:
         super().__init__(config)
         dt = config.physics.control_dt
-        asset = load_body()
+        asset = load_asset()
         body = asset.shape(shape_parameters(asset, config.shape))
         self.pelvis_height = float(body.joints[0, 2])
         try:
@@ -216,8 +217,9 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         self.clip_rotation, self.clip_root = zeros((n, NUM_JOINTS), wp.quat), zeros(n, wp.vec3)
         self.clip_world, self.clip_position = zeros((n, NUM_JOINTS), wp.quat), zeros((n, NUM_JOINTS), wp.vec3)
         self.still = zeros((n, NUM_JOINTS), wp.vec3)
-        if env.simulation.avatar.joints:  # torques could not bring the body up to the clip's speed at once
-            env.simulation.avatar.joints.first = self.clip_rotation, self.clip_root
+        controller = env.simulation.controllers[0]
+        if isinstance(controller, TorqueController):  # torques could not reach the clip's speed at once
+            controller.first = self.clip_rotation, self.clip_root
         self.impulse, self.struck, self.offset = zeros(n, wp.vec3), zeros(n, int), zeros(n, int)
         self.bones = wp.array([joint_index(name) for name in STRUCK], dtype=int, device=device)
 
@@ -233,7 +235,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
             [self.start, self.origin, drive.command_rotation, drive.command_root],
         )
         graph.launch(draw_offset, env.num_envs, [env.mask, env.seed, env.episode, self.interval], [self.offset])
-        if env.simulation.avatar.joints:
+        if isinstance(env.simulation.controllers[0], TorqueController):
             self._record_next_pose(env, graph)
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 import agents.pid.agent
 from agents.pid.agent import Design, PIDAgent, make_pid_agent, rest_poses
 from agents.pid.controller import motion_poses
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_limits
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import deepmimic, load_motion
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
@@ -98,8 +98,8 @@ def test_joints_get_the_torques_that_it_asks_for(standing):
     standing.reset(seeds=SEEDS)
     standing.action.assign(agent.actions(wanted).astype(np.float32)[:, None])
     standing.step()
-    joints = standing.simulation.avatar.joints
-    given = joints.state.torque.numpy()[:, 1:] * joints.body.strength.factor.numpy()[:, None, None]
+    controller = standing.simulation.controllers[0]
+    given = controller.state.torque.numpy()[:, 1:] * controller.joints.strength.factor.numpy()[:, None, None]
     np.testing.assert_allclose(given, np.clip(wanted, agent.lower[1:], agent.upper[1:]), rtol=1e-3, atol=1e-2)
 
 
@@ -216,7 +216,7 @@ def test_it_follows_the_clip_that_the_task_shows(device):
     """The pose and the rate that the motion itself has at every time, and the body with them."""
     settings = {"fidelity": "tiny", "motion": "arm_wave", "root_assist": 1.0, "impulse": 0.0, "random_start": False}
     env = make(1, device, "TrackMotion-v0", **settings)
-    motion = load_motion("arm_wave", load_body())
+    motion = load_motion("arm_wave", load_asset())
     poses = motion_poses(motion, list(range(1, NUM_JOINTS)))
     play(env, PIDAgent(env), 0.9, np.array([0]))
     now = poses(np.array([0.9]))[0]

@@ -80,7 +80,7 @@ def test_help_is_given_to_all(make_vec):
     vector = make_vec("PIAvatar/Stand-v0", 2)
     vector.reset(seed=0)
     assert vector.call("assist_root", 0.25) == (None, None)
-    assert vector.get_state()["joints_0.assist"].tolist() == [0.25, 0.25]
+    assert vector.get_state()["controller_0.assist"].tolist() == [0.25, 0.25]
     with pytest.raises(ValueError, match="give the vector's own a share for each"):
         vector.call_some([0], "assist_root", 0.5)
 

@@ -130,11 +130,11 @@ def spoil(state, how):
     elif how == "double precision":
         state["particles.u"] = state["particles.u"].astype(np.float64)
     elif how == "text":
-        state["tracked_0.rotation"] = state["tracked_0.rotation"].astype(str)
+        state["avatar_0.tracked.rotation"] = state["avatar_0.tracked.rotation"].astype(str)
     elif how == "nothing":
         state = {}
     elif how == "infinity":
-        state["drive_0.motion"].flat[0] = np.inf
+        state["avatar_0.state.motion"].flat[0] = np.inf
     return state
 
 
@@ -146,9 +146,9 @@ def spoil(state, how):
         ("fewer particles", "particles.x.*shape.*expected"),
         ("one environment more", r"env.step_count.*\(2,\).*\(1,\)"),
         ("double precision", "particles.u.*float64.*float32"),
-        ("text", "tracked_0.rotation"),
+        ("text", "avatar_0.tracked.rotation"),
         ("nothing", "missing"),
-        ("infinity", r"drive_0.motion.*\[0, .*inf.*finite"),
+        ("infinity", r"avatar_0.state.motion.*\[0, .*inf.*finite"),
     ],
 )
 def test_malformed_states_are_refused_and_change_nothing(make_env, env_id, how, told):
@@ -168,8 +168,8 @@ def test_malformed_states_are_refused_and_change_nothing(make_env, env_id, how, 
 @pytest.mark.parametrize(
     ("task", "name", "value", "told"),
     [
-        ("Stand-v0", "joints_0.assist", 1e30, r"must be >= 0 and <= 1"),
-        ("Stand-v0", "joints_0.assist", np.nan, "not finite"),
+        ("Stand-v0", "controller_0.assist", 1e30, r"must be >= 0 and <= 1"),
+        ("Stand-v0", "controller_0.assist", np.nan, "not finite"),
         ("KickBall-v0", "matter.mass", np.nan, "not finite"),
         ("KickBall-v0", "matter.mass", -1.0, r"matter.mass.*=-1.0 must be >= 0;"),
     ],
@@ -243,7 +243,7 @@ def test_settings_that_decide_nothing_may_differ(make_env, equal):
     observation = env.reset(seed=0)[0]
     seen = other.set_state(env.get_state())
     assert equal(np.concatenate([part.ravel() for part in seen.values()]), observation)
-    assert other.batch.simulation.avatar.joints.assist.numpy().tolist() == pytest.approx([0.4])
+    assert other.batch.simulation.controllers[0].assist.numpy().tolist() == pytest.approx([0.4])
 
 
 def test_one_may_go_on_under_other_settings_on_purpose(make_env):

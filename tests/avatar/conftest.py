@@ -10,11 +10,12 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.avatar.body.device import BodyPoints
 from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index, skin
-from piavatar_envs.avatar.pose_control.controller import AvatarDrive, record_control_step
+from piavatar_envs.avatar.body.sources import load_asset
+from piavatar_envs.avatar.pose_control.controller import PoseController
 from piavatar_envs.avatar.types import DriveSettings
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider
@@ -22,6 +23,7 @@ from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.types import Model, Scratch, State
+from piavatar_envs.sim.world import record_control_step
 
 DENSITY = 1000.0
 #: Where a ball hits: skin over the breastbone [m].
@@ -56,7 +58,8 @@ class Rig:
     state: State
     scratch: Scratch
     points: BodyPoints
-    drive: AvatarDrive
+    avatar: Avatar
+    controller: PoseController
     mask: wp.array
     reset_graph: LaunchGraph
     step_graph: LaunchGraph
@@ -67,7 +70,7 @@ class Rig:
         n = self.model.num_envs
         mask = np.ones(n, bool) if mask is None else np.asarray(mask)
         self.mask.assign(mask)
-        d = self.drive.state
+        d = self.avatar.state
         rotations, roots = d.command_rotation.numpy(), d.command_root.numpy()
         rotations[mask] = self.quaternions(np.zeros((NUM_JOINTS, 3)) if rotvec is None else rotvec)[mask]
         roots[mask] = np.broadcast_to(self.points.joints[:, 0] if root is None else root, (n, 3))[mask]
@@ -85,23 +88,23 @@ class Rig:
                 return
         raise ValueError(f"a control step has {count} launches of {kernel} fewer than asked for")
 
-    def run_drive(self) -> None:
-        """Run a control step up to the first substep's scatter."""
-        self.run_part_of_step("drive_body" if self.drive.in_one else "apply_corrections", 1)
+    def run_controller(self) -> None:
+        """Run a control step up to the first MPM substep."""
+        self.run_part_of_step("command_body" if self.controller.in_one_launch else "apply_corrections", 1)
 
     def track(self) -> None:
         """Track the particles where they are now."""
         graph = LaunchGraph(self.model.device)
-        self.drive.record_tracking(graph, self.state)
+        self.avatar.record_tracking(graph, self.state)
         graph.run()
 
     def command(self, rotvec=None, root=None) -> None:
         """Set the goal of the next control steps: local rotation vectors ``(22, 3)``, pelvis position."""
         if rotvec is not None:
-            self.drive.state.goal_rotation.assign(self.quaternions(rotvec))
+            self.avatar.state.goal_rotation.assign(self.quaternions(rotvec))
         if root is not None:
             n = self.model.num_envs
-            self.drive.state.goal_root.assign(np.ascontiguousarray(np.broadcast_to(root, (n, 3)), np.float32))
+            self.avatar.state.goal_root.assign(np.ascontiguousarray(np.broadcast_to(root, (n, 3)), np.float32))
 
     def step(self, count: int = 1) -> None:
         for _ in range(count):
@@ -140,13 +143,13 @@ class Rig:
 
     def target(self, env: int = 0) -> np.ndarray:
         """Particles of the commanded pose."""
-        d = self.drive.state
+        d = self.avatar.state
         rotations = Rotation.from_quat(d.goal_rotation.numpy()[env].astype(float)).as_matrix()
         return self.skinned(rotations, d.goal_root.numpy()[env].astype(float), env)
 
     def tracked_world(self, env: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Tracked world rotations ``(22, 3, 3)`` and joint positions."""
-        t = self.drive.tracked
+        t = self.avatar.tracked
         return Rotation.from_quat(t.rotation.numpy()[env].astype(float)).as_matrix(), t.position.numpy()[env].astype(
             float
         )
@@ -158,7 +161,7 @@ class Rig:
 
     def joint_errors(self, env: int = 0) -> np.ndarray:
         """Angle between commanded and tracked local rotation of every joint but the root [rad]."""
-        command = Rotation.from_quat(self.drive.state.command_rotation.numpy()[env].astype(float))
+        command = Rotation.from_quat(self.avatar.state.command_rotation.numpy()[env].astype(float))
         return (command.inv() * Rotation.from_matrix(self.tracked_local(env))).magnitude()[1:]
 
     def shape_error(self, env: int = 0) -> np.ndarray:
@@ -174,7 +177,7 @@ class Rig:
         """All that a checkpoint would hold, and the tracked pose."""
         drive, tracked = (
             {field.name: getattr(group, field.name).numpy().copy() for field in fields(group)}
-            for group in (self.drive.state, self.drive.tracked)
+            for group in (self.avatar.state, self.avatar.tracked)
         )
         return {**self.state.numpy(), **drive, **tracked}
 
@@ -251,7 +254,7 @@ def build_rig(
     many ``others`` are particles that come before the avatar's, in a row in the domain's corner. ``colliders`` follow
     the ``floor``.
     """
-    asset = load_body()
+    asset = load_asset()
     dx = float(np.ptp(asset.vertices[:, 2])) / cells
     particles = sample_particles(asset, spacing_for(dx))
     if shapes is None:
@@ -278,13 +281,14 @@ def build_rig(
     inert = np.zeros((1, volume.shape[1]), np.float32)
     mass = volume * np.float32(DENSITY)
     points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, inert)
-    drive = AvatarDrive(points, others, model, DriveSettings(**settings))
+    avatar = Avatar(points, others, model)
+    controller = PoseController(avatar, DriveSettings(**settings))
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)
     reset_graph, step_graph = LaunchGraph(device), LaunchGraph(device)
-    drive.record_reset(reset_graph, state, mask)
-    drive.record_tracking(reset_graph, state)
-    record_control_step(step_graph, [drive], model, state, scratch)
-    return Rig(model, state, scratch, points, drive, mask, reset_graph, step_graph).reset()
+    avatar.record_reset(reset_graph, state, mask)
+    avatar.record_tracking(reset_graph, state)
+    record_control_step(step_graph, [avatar], [controller], model, state, scratch)
+    return Rig(model, state, scratch, points, avatar, controller, mask, reset_graph, step_graph).reset()
 
 
 @pytest.fixture(scope="session")

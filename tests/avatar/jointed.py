@@ -37,7 +37,7 @@ class Joints:
     def __init__(self, rig, stiffness=0.0, damping=0.0, attachment=None, firm=None, solid=False):
         self.rig, self.model, self.state = rig, rig.model, rig.state
         rates = None if attachment is None else np.broadcast_to(attachment, (1, rig.points.num_points))
-        body = rig.points, rig.drive.body, rig.model
+        body = rig.points, rig.avatar.body, rig.model
         self.body = ArticulatedBody(*body, stiffness * GAINS, damping * GAINS, rates, firm, solid)
 
     def pose(self, rotvec, root=None):
@@ -123,7 +123,7 @@ class Joints:
     @property
     def besides(self) -> np.ndarray:
         """Inertia with which joints take over, besides that of the limbs they move, shape ``(69,)``."""
-        return self.body._bench.diagonals.numpy()[0].astype(float)
+        return self.body._workspace.diagonals.numpy()[0].astype(float)
 
     @property
     def mass(self) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import load_motion
 from piavatar_envs.avatar.motion.amass import HIP_DROP, LEG_LENGTH, load_file
 from piavatar_envs.avatar.motion.ground import lowest_heights
@@ -18,7 +18,7 @@ from piavatar_envs.avatar.motion.motion import Motion
 from piavatar_envs.avatar.motion.retarget import leg_length
 
 UPRIGHT = np.array([np.pi / 2, 0.0, 0.0])  # stands SMPL's y-up body up in a z-up world; it then faces -y
-REST = load_body().joints.astype(np.float64)
+REST = load_asset().joints.astype(np.float64)
 
 
 class Opened:
@@ -69,7 +69,7 @@ def test_both_layouts_are_read_without_unpickling(tmp_path: Path, width: int) ->
     motion = load_motion(write(tmp_path / "clip.npz", width))
     assert motion.fps == 120.0 and motion.num_frames == 4 and not motion.loop and motion.name == "clip"
     assert Opened.count == 0
-    assert lowest_heights(motion, load_body()).min() == pytest.approx(0.0, abs=1e-6)
+    assert lowest_heights(motion, load_asset()).min() == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("width", "key"), [(156, "mocap_frame_rate"), (165, "mocap_framerate")])

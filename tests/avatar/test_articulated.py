@@ -320,15 +320,15 @@ def test_bad_gains_are_refused(make_rig, name, bad):
     gains = {"stiffness": GAINS.copy(), "damping": GAINS.copy()}
     gains[name][0, 3] = bad
     with pytest.raises(ValueError, match=f"{name} must be finite and not negative"):
-        ArticulatedBody(rig.points, rig.drive.body, rig.model, **gains)
+        ArticulatedBody(rig.points, rig.avatar.body, rig.model, **gains)
     with pytest.raises(ValueError, match=f"{name} has shape"):
-        ArticulatedBody(rig.points, rig.drive.body, rig.model, **{**gains, name: np.ones(3)})
+        ArticulatedBody(rig.points, rig.avatar.body, rig.model, **{**gains, name: np.ones(3)})
 
 
 def test_firm_particles_are_those_of_the_body(make_rig):
     rig = make_rig(cells=16)
     with pytest.raises(ValueError, match=r"firm has shape \(3,\), expected \(\d+,\)"):
-        ArticulatedBody(rig.points, rig.drive.body, rig.model, GAINS, GAINS, firm=np.ones(3, bool))
+        ArticulatedBody(rig.points, rig.avatar.body, rig.model, GAINS, GAINS, firm=np.ones(3, bool))
 
 
 def test_a_held_pelvis_bears_the_weight(make_rig):
@@ -337,7 +337,7 @@ def test_a_held_pelvis_bears_the_weight(make_rig):
     stiffness, damping = 3000.0 * GAINS, 100.0 * GAINS
     stiffness[0, :2], damping[0, :2] = (2e4, 1e4), (2e3, 1e3)
     body = ArticulatedBody(
-        rig.points, rig.drive.body, rig.model, stiffness, damping, np.full((1, len(rig.mass)), 300.0)
+        rig.points, rig.avatar.body, rig.model, stiffness, damping, np.full((1, len(rig.mass)), 300.0)
     )
     made = Joints(rig)
     made.body = body

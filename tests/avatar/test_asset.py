@@ -7,8 +7,9 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.body.asset import dense_weights, load_body, mesh_volume, top_weights
+from piavatar_envs.avatar.body.asset import dense_weights, mesh_volume, top_weights
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 
 #: SMPL-H's joints after the 22 of the body, in its order.
 HANDS = [
@@ -21,7 +22,7 @@ HANDS = [
 
 @pytest.fixture(scope="module")
 def asset():
-    return load_body()
+    return load_asset()
 
 
 def body_file():
@@ -30,7 +31,7 @@ def body_file():
 
 def shapes():
     """The mean, both ends of every parameter, all ends at once and 20 random people."""
-    body = load_body()
+    body = load_asset()
     count = len(body.shape_names)
     named = [("mean", np.zeros(count)), ("all at -1", -np.ones(count)), ("all at +1", np.ones(count))]
     for name in body.shape_names:

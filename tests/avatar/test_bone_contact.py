@@ -189,7 +189,7 @@ def fall(make_rig):
     made.pose(pose, rig.points.joints[0, 0] + np.array([0.0, 0.0, 0.3]))
     graph = made.control_step()
     made.body.record_end(graph, rig.state)
-    rig.drive.record_tracking(graph, rig.state)
+    rig.avatar.record_tracking(graph, rig.state)
     seen = {name: [] for name in ("momentum", "turn", "center", "impulse", "moment", "gap", "lowest")}
 
     def look() -> None:
@@ -205,7 +205,7 @@ def fall(make_rig):
         sensors = rig.scratch.sensors
         seen["impulse"].append(sensors.boundary_impulse.numpy()[0, 0].astype(float))
         seen["moment"].append(sensors.boundary_moment.numpy()[0, 0].astype(float))
-        seen["gap"].append(joint_gaps(rig.drive.tracked, rig.points.joints)[0].max())
+        seen["gap"].append(joint_gaps(rig.avatar.tracked, rig.points.joints)[0].max())
         world = Rotation.from_quat(made.body.state.rotation.numpy()[0].astype(float)).as_matrix()
         bone, at = rig.points.bone[bones], made.body.state.position.numpy()[0].astype(float)
         arm = (rig.points.rest[0, bones] - rig.points.joints[0, bone]).astype(float)

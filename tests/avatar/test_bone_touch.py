@@ -22,7 +22,7 @@ from piavatar_envs.avatar.torque_control.bone_contact import (
 from piavatar_envs.avatar.torque_control.dynamics import spread_motion
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.torque_control.tree_cholesky import fetch_factor
-from piavatar_envs.avatar.torque_control.workspace import JointBench, room_of_warp
+from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, room_of_warp
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.cuda_intrinsics import warp_threads
 from piavatar_envs.mpm.colliders import Collider
@@ -37,7 +37,7 @@ def push_bone(
     x: wp.array(dtype=wp.vec3),
     p: wp.vec3,
     threads: int,
-    w: JointBench,
+    w: TorqueWorkspace,
     K: wp.array(dtype=wp.mat33),
 ):
     """``K`` of a bone, and an impulse on it, by factor ``first + e``; over ``(num_envs, threads)``."""
@@ -51,7 +51,7 @@ def push_bone(
 
 
 @wp.kernel(enable_backward=False)
-def move_bones(body: Body, q: wp.array2d(dtype=float), w: JointBench):
+def move_bones(body: Body, q: wp.array2d(dtype=float), w: TorqueWorkspace):
     """Motion of the bones under velocities ``q`` of the joints, and boxes around their points; over ``num_envs``."""
     e = wp.tid()
     measure_bones(body, e, 0, 1, w)
@@ -63,7 +63,7 @@ def look(
     body: Body,
     ground: Ground,
     dt: float,
-    w: JointBench,
+    w: TorqueWorkspace,
     may: wp.array3d(dtype=int),
     most: wp.array3d(dtype=float),
     fastest: wp.array(dtype=wp.vec2),
@@ -89,19 +89,19 @@ def test_every_bone_answers_as_the_whole_matrix_says(make_rig, wild_pose, device
     rng, n, threads = np.random.default_rng(seed), 2, warp_threads(device)
     rig = make_rig(cells=16, floor=True, room=2.0, num_envs=n)
     made = Joints(rig, stiffness, damping, solid=True).pose(wild_pose(rng))
-    body, bench, first = made.body, made.body._bench, n * driven
-    M, D = (array.astype(float) for array in (body.mass.read(), bench.diagonals.numpy()))
+    body, workspace, first = made.body, made.body._workspace, n * driven
+    M, D = (array.astype(float) for array in (body.mass.read(), workspace.diagonals.numpy()))
     assert (np.abs(D[n:, 6:]).max() > 1e-3) == (stiffness > 0.0)
     joints = body.state.position.numpy().astype(float)
     for b, carried in enumerate(carried_by().T):
         x, p = joints[:, b] + rng.normal(0.0, 0.1, (n, 3)), rng.normal(size=3)
         whole, shares = (rng.normal(size=(rows, NUM_DOF)).astype(np.float32) for rows in (n, 3 * n))
-        bench.whole.assign(whole)
-        bench.shares.assign(shares)
-        bench.touch.fill_(np.nan)  # nothing of last time is read
+        workspace.whole.assign(whole)
+        workspace.shares.assign(shares)
+        workspace.touch.fill_(np.nan)  # nothing of last time is read
         K = wp.zeros(n, dtype=wp.mat33, device=device)
         points = wp.array(x.astype(np.float32), dtype=wp.vec3, device=device)
-        inputs = [body.body, b, first, points, wp.vec3(*p), threads, bench]
+        inputs = [body.body, b, first, points, wp.vec3(*p), threads, workspace]
         wp.launch(push_bone, (n, threads), inputs, [K], block_dim=threads, device=device)
         for e in range(n):
             arms = carried[:, None] * (x[e] - joints[e])
@@ -110,9 +110,9 @@ def test_every_bone_answers_as_the_whole_matrix_says(make_rig, wild_pose, device
             answer = np.linalg.inv(M[e] + np.diag(D[first + e])) @ J.T
             np.testing.assert_allclose(K.numpy()[e], J @ answer, atol=1e-3 * np.abs(J @ answer).max())
             change, atol = answer @ p, 1e-3 * np.abs(answer @ p).max()
-            np.testing.assert_allclose(bench.whole.numpy()[e] - whole[e], change, atol=atol)
-            np.testing.assert_allclose(bench.shares.numpy()[e] - shares[e], change, atol=atol)
-        np.testing.assert_array_equal(bench.shares.numpy()[n:], shares[n:])
+            np.testing.assert_allclose(workspace.whole.numpy()[e] - whole[e], change, atol=atol)
+            np.testing.assert_allclose(workspace.shares.numpy()[e] - shares[e], change, atol=atol)
+        np.testing.assert_array_equal(workspace.shares.numpy()[n:], shares[n:])
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -127,7 +127,7 @@ def test_no_bone_is_passed_by_of_which_a_point_is_too_fast(make_rig, wild_pose, 
     ]
     rig = make_rig(cells=16, floor=True, colliders=solids, room=2.0, num_envs=n)
     made = Joints(rig, solid=True).pose(wild_pose(rng))
-    body, bench, boundaries = made.body, made.body._bench, rig.model.boundaries
+    body, workspace, boundaries = made.body, made.body._workspace, rig.model.boundaries
     ground = body._ground(rig.scratch)
     rows, count = boundaries.position.shape
     needed = looked_at = 0
@@ -144,10 +144,10 @@ def test_no_bone_is_passed_by_of_which_a_point_is_too_fast(make_rig, wild_pose, 
         q = rng.choice([0.0, 0.1, 2.0]) * rng.normal(size=(n, NUM_DOF))
         dt = float(rng.choice([1e-4, 6e-4, 2e-3, 3e-2, 0.5]))
         velocity = wp.array(q.astype(np.float32), dtype=float, device=device)
-        wp.launch(move_bones, n, [body.body, velocity, bench], device=device)
+        wp.launch(move_bones, n, [body.body, velocity, workspace], device=device)
         may = wp.zeros((n, NUM_JOINTS, count), dtype=int, device=device)
         most, fastest = wp.zeros(may.shape, dtype=float, device=device), wp.zeros(n, dtype=wp.vec2, device=device)
-        inputs = [body.body, ground, dt, bench]
+        inputs = [body.body, ground, dt, workspace]
         wp.launch(look, (n, NUM_JOINTS), inputs, [may, most, fastest], device=device)
         lacking, seen = most.numpy(), may.numpy() != 0
         assert seen[lacking > TOLERANCE].all()

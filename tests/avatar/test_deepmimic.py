@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion, deepmimic, list_motions, load_motion
 from piavatar_envs.avatar.motion.ground import lowest_heights
 from piavatar_envs.avatar.motion.retarget import leg_length
 
-REST = load_body().joints.astype(np.float64)
+REST = load_asset().joints.astype(np.float64)
 CHANNELS = {"root": 4, "chest": 8, "neck": 12, "right_hip": 16, "right_knee": 20, "right_ankle": 21}
 CHANNELS |= {"right_shoulder": 25, "right_elbow": 29, "left_hip": 30, "left_knee": 34, "left_ankle": 35}
 CHANNELS |= {"left_shoulder": 39, "left_elbow": 43}
@@ -201,7 +201,7 @@ def test_installed_clips_are_human(clip: Motion) -> None:
 
 @installed
 def test_installed_clips_stay_on_or_above_the_ground_and_come_down_to_it(clip: Motion) -> None:
-    heights = lowest_heights(clip, load_body())
+    heights = lowest_heights(clip, load_asset())
     assert heights.min() > -2e-3
     assert np.sort(heights)[: max(2, len(heights) // 20)].max() < 0.03
 
@@ -209,7 +209,7 @@ def test_installed_clips_stay_on_or_above_the_ground_and_come_down_to_it(clip: M
 @installed
 def test_walk_goes_forward_with_a_foot_on_the_ground() -> None:
     walk = load_motion("deepmimic:walk")
-    assert lowest_heights(walk, load_body()).max() < 0.012
+    assert lowest_heights(walk, load_asset()).max() < 0.012
     assert walk.joint_speeds().max() < 8.0  # [rad/s]; the file jumps at 15 where two halves were spliced
     velocity = (walk.root_position[-1] - walk.root_position[0]) / walk.duration
     assert -1.3 < velocity[1] < -0.7 and abs(velocity[0]) < 0.1

@@ -32,8 +32,10 @@ def test_kernels_pose_the_body_like_numpy(make_rig, wild_pose, fraction):
     rotation = wp.zeros((2, 22), dtype=wp.quat, device=rig.model.device)
     position = wp.zeros((2, 22), dtype=wp.vec3, device=rig.model.device)
     graph = LaunchGraph(rig.model.device)
-    threads = rig.drive.threads
-    graph.launch(kinematics.pose_body, (2, threads), [rig.drive.body, fraction, *inputs, threads], [rotation, position])
+    threads = rig.avatar.threads
+    graph.launch(
+        kinematics.pose_body, (2, threads), [rig.avatar.body, fraction, *inputs, threads], [rotation, position]
+    )
     graph.run()
     for env in range(2):
         local = (Rotation.from_rotvec(base[env]) * Rotation.from_rotvec(fraction * turn[env])).as_matrix()
@@ -63,8 +65,8 @@ def displaced(make_rig, wild_pose, **options):
     now, command, step = wild_pose(rng, 0.5), wild_pose(rng, 0.5), wild_pose(rng, 0.3)
     now[0] = command[0] = step[0] = 0.0
     rig.reset(now)
-    rig.drive.state.command_rotation.assign(rig.quaternions(command))
-    rig.drive.state.goal_rotation.assign((Rotation.from_rotvec(command) * Rotation.from_rotvec(step)).as_quat()[None])
+    rig.avatar.state.command_rotation.assign(rig.quaternions(command))
+    rig.avatar.state.goal_rotation.assign((Rotation.from_rotvec(command) * Rotation.from_rotvec(step)).as_quat()[None])
     return rig, Rotation.from_rotvec(now), Rotation.from_rotvec(command), Rotation.from_rotvec(step)
 
 
@@ -90,7 +92,7 @@ def test_a_step_forward_is_a_step_where_the_body_faces(make_rig):
     turned[0, 2] = np.pi / 2  # it faces +x now
     rig.reset(turned)
     straight = np.zeros((22, 3))
-    rig.drive.state.command_rotation.assign(rig.quaternions(straight))
+    rig.avatar.state.command_rotation.assign(rig.quaternions(straight))
     rig.command(straight, rig.points.joints[0, 0] + [0.0, -0.1, 0.02])
     rig.step()
     np.testing.assert_allclose(rig.tracked_world()[1][0] - rig.points.joints[0, 0], (0.1, 0.0, 0.02), atol=1e-4)
@@ -162,7 +164,7 @@ def test_the_papers_decoupling_is_worse_but_no_decoupling_is_worst(make_rig, wil
 def test_inert_flesh_misses_its_share_of_commanded_momentum(make_rig, inert):
     """A root commanded to move at v gives the body the momentum ``(1 - inert) M v``; inert flesh stays behind."""
     rig = make_rig(root="free", tone=0.0, alpha=0.0)
-    rig.drive.body.inert.fill_(inert)
+    rig.avatar.body.inert.fill_(inert)
     velocity = np.array([0.3, -0.2, 0.0])
     rig.command(root=rig.points.joints[0, 0] + velocity * rig.model.control_dt)
     rig.step()

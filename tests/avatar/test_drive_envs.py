@@ -7,9 +7,8 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.pose_control import controller as drive
-from piavatar_envs.avatar.pose_control import controller as substeps
-from piavatar_envs.avatar.pose_control import kernels as drive_stages
+from piavatar_envs.avatar.pose_control import kernels
+from piavatar_envs.avatar.pose_control.controller import PoseController
 from piavatar_envs.core import cuda_intrinsics as lanes
 from piavatar_envs.mpm.types import FAILURE_NONFINITE
 
@@ -84,8 +83,8 @@ def test_a_reset_body_stands_at_rest_and_unstrained(make_rig, wild_pose):
         np.testing.assert_allclose(state["x"][env], rig.skinned(rotations, (0.1, 0.2, 1.0)), atol=2e-6)
     np.testing.assert_array_equal(state["F"], np.broadcast_to(np.eye(3, dtype=np.float32), state["F"].shape))
     assert not any(state[name].any() for name in ("u", "vk", "C", "failure"))
-    np.testing.assert_array_equal(rig.drive.state.goal_rotation.numpy(), rig.drive.state.command_rotation.numpy())
-    np.testing.assert_array_equal(rig.drive.state.goal_root.numpy(), rig.drive.state.command_root.numpy())
+    np.testing.assert_array_equal(rig.avatar.state.goal_rotation.numpy(), rig.avatar.state.command_rotation.numpy())
+    np.testing.assert_array_equal(rig.avatar.state.goal_root.numpy(), rig.avatar.state.command_root.numpy())
 
 
 def test_every_environment_equals_a_single_one(make_rig, wild_pose):
@@ -155,8 +154,8 @@ def test_one_warp_prepares_a_body_as_three_do(device, make_rig, wild_pose, monke
     if not wp.get_device(device).is_cuda:
         pytest.skip("on a CPU one thread prepares a body")
     three = stepped(make_rig, wild_pose)
-    monkeypatch.setattr(drive_stages, "BODIES_PREPARED", 0)
-    assert drive_stages.warps_of_body(device, 2) == 1
+    monkeypatch.setattr(kernels, "BODIES_PREPARED", 0)
+    assert kernels.warps_of_body(device, 2) == 1
     for name, value in stepped(make_rig, wild_pose).items():
         np.testing.assert_array_equal(three[name], value, err_msg=name)
 
@@ -180,14 +179,14 @@ def test_one_launch_drives_a_body_as_many_do(make_rig, wild_pose, monkeypatch, r
     one = disturbed(make_rig, wild_pose, **options)
     if wp.get_device(one.model.device).is_cuda:
         pytest.skip("a GPU drives by passes only")
-    record_drive = substeps.record_drive
+    before_substep = PoseController.record_before_substep
 
-    def by_passes(avatar, graph, state, step):
-        avatar.in_one = False
-        record_drive(avatar, graph, state, step)
+    def by_passes(controller, *args):
+        controller.in_one_launch = False
+        before_substep(controller, *args)
 
-    monkeypatch.setattr(drive, "record_drive", by_passes)
+    monkeypatch.setattr(PoseController, "record_before_substep", by_passes)
     many = disturbed(make_rig, wild_pose, **options)
-    assert "drive_body" in one.step_graph.names and "drive_particles" in many.step_graph.names
+    assert "command_body" in one.step_graph.names and "command_particles" in many.step_graph.names
     for name, value in one.everything().items():
         np.testing.assert_array_equal(value, many.everything()[name], err_msg=name)

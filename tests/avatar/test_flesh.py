@@ -12,12 +12,12 @@ def run_fit(rig):
     """Fit rigid motions to the velocities as they are; bones ``(c, V, Omega)`` and body ``(c, V, Omega)``."""
     rig.track()
     before = rig.state.u.numpy().copy()
-    rig.run_drive()
+    rig.run_controller()
     rig.state.u.assign(before)
-    s = rig.drive.scratch
+    w = rig.controller.workspace
     bones, body = (
-        tuple(getattr(s, f"{kind}_{name}").numpy()[0].astype(float) for name in ("center", "velocity", "spin"))
-        for kind in ("bone", "body")
+        tuple(getattr(fit, name).numpy()[0].astype(float) for name in ("center", "velocity", "spin"))
+        for fit in (w.bones, w.whole)
     )
     return bones, body
 
@@ -187,7 +187,7 @@ def test_the_pull_is_given_back_bone_by_bone(make_rig, wild_pose, blended_rigid_
     u = rng.normal(size=(count, 3)) + np.cross((3.0, -2.0, 1.0), x)
     rig.state.x.assign(x[None].astype(np.float32))
     rig.state.u.assign(u[None].astype(np.float32))
-    rig.run_drive()
+    rig.run_controller()
     mass, weights, rate = rig.mass, rig.weights, 0.6 * 30.0
     u_bone = blended_rigid_part(weights, mass, x, u)
     relative = u - u_bone
@@ -284,7 +284,7 @@ def test_tone_pulls_at_its_natural_frequency(make_rig, tone):
     hip = joint_index("left_hip")
     command = np.zeros((22, 3))
     command[hip, 0] = 0.1
-    rig.drive.state.command_rotation.assign(rig.quaternions(command))
+    rig.avatar.state.command_rotation.assign(rig.quaternions(command))
     rig.command(command)
     errors = [rig.joint_errors()[hip - 1]]
     for _ in range(4):

@@ -7,11 +7,11 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.muscles import attachment_rates, firmness, joint_torques, make_muscles
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.body.soft_tissue import bone_distance
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
 from piavatar_envs.avatar.torque_control.dynamics import UNBOUNDED, stopping_torque
 from tests.avatar.jointed import Joints
@@ -34,7 +34,7 @@ class Held(Joints):
         springs[0, :2], dampers[0, :2] = 1e5, 1e4
         springs[0, 1 + np.array(self.joints)], dampers[0, 1 + np.array(self.joints)] = stiffness, damping
         self.body = ArticulatedBody(
-            rig.points, rig.drive.body, rig.model, springs, dampers, np.full((1, len(rig.mass)), 300.0)
+            rig.points, rig.avatar.body, rig.model, springs, dampers, np.full((1, len(rig.mass)), 300.0)
         )
         nothing = np.zeros(NUM_JOINTS)
         self.body.set_tissue(nothing, nothing, -EVERYWHERE, EVERYWHERE, TOES)
@@ -199,7 +199,7 @@ def test_a_joint_is_stopped_at_the_end_of_its_range(make_rig):
 
 
 def test_flesh_is_held_the_faster_the_deeper_it_lies():
-    particles = sample_particles(load_body(), spacing_for(0.07))
+    particles = sample_particles(load_asset(), spacing_for(0.07))
     distance = bone_distance(particles.rest_positions, particles.bone)
     firm = firmness(particles.skin_joints, particles.skin_weights)
     assert attachment_rates(particles.depth, distance, firm, 30.0, 500.0)[firm > 0.999] == pytest.approx(

@@ -131,7 +131,7 @@ def test_all_bones_of_a_moved_body_report_that_motion(make_rig):
     rotation, position = rig.tracked_world()
     assert angle(rotation, R).max() < 5 * ROUND_OFF
     np.testing.assert_allclose(position, rig.points.joints[0] @ R.T + t, atol=2e-6)
-    local = rig.drive.tracked.local.numpy()[0]
+    local = rig.avatar.tracked.local.numpy()[0]
     assert Rotation.from_quat(local[1:]).magnitude().max() < 10 * ROUND_OFF
 
 
@@ -143,7 +143,7 @@ def test_tracked_velocity_is_that_of_the_bones_particles(make_rig):
     rig.state.vk.assign(vk)
     rig.track()
     expected = [(u + vk)[0, rig.points.bone == bone].mean(0) for bone in range(22)]
-    np.testing.assert_allclose(rig.drive.tracked.velocity.numpy()[0], expected, atol=1e-6)
+    np.testing.assert_allclose(rig.avatar.tracked.velocity.numpy()[0], expected, atol=1e-6)
 
 
 def test_a_batch_tracks_as_single_environments_do(make_rig, wild_pose):
@@ -153,7 +153,7 @@ def test_a_batch_tracks_as_single_environments_do(make_rig, wild_pose):
     for env in range(3):
         single = make_rig().reset(poses[env])
         for name in ("rotation", "position", "local"):
-            one, many = (getattr(rig.drive.tracked, name).numpy() for rig in (single, batch))
+            one, many = (getattr(rig.avatar.tracked, name).numpy() for rig in (single, batch))
             np.testing.assert_array_equal(one[0], many[env])
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.sampling import (
     LIMB_GROUPS,
     LINK_LENGTH,
@@ -17,6 +16,7 @@ from piavatar_envs.avatar.body.sampling import (
     spacing_for,
 )
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 
 TORSO = LIMB_GROUPS.index("torso")
 
@@ -24,7 +24,7 @@ TORSO = LIMB_GROUPS.index("torso")
 @pytest.fixture(scope="module")
 def body():
     """Particles of the body at the coarse size, their groups and seams."""
-    asset = load_body()
+    asset = load_asset()
     particles = sample_particles(asset, spacing_for(np.ptp(asset.vertices[:, 2]) / 32))
     return particles, *limb_groups(particles.skin_joints, particles.skin_weights)
 
@@ -83,7 +83,7 @@ def test_particles_lie_where_their_group_is(body):
     bone = particles.bone >= 0
     assert np.array_equal(group[bone], limb_group_of_joint()[particles.bone[bone]])
     x, z = particles.rest_positions[:, 0], particles.rest_positions[:, 2]
-    pelvis, neck = (load_body().joints[joint_index(name), 2] for name in ("pelvis", "neck"))
+    pelvis, neck = (load_asset().joints[joint_index(name), 2] for name in ("pelvis", "neck"))
     for index, name in enumerate(LIMB_GROUPS):
         if name.startswith("left"):
             assert x[group == index].min() > 0.0

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion, load_motion
 from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights
 from piavatar_envs.avatar.motion.hands import lay_hands_on_ground
@@ -164,7 +164,7 @@ def test_closing_can_take_the_turn_out_of_a_loop() -> None:
 
 def test_a_mirrored_clip_moves_as_the_mirror_image() -> None:
     rng = np.random.default_rng(3)
-    rest = load_body().joints.astype(np.float64)
+    rest = load_asset().joints.astype(np.float64)
     other = {"left": "right", "right": "left"}
     swapped = [joint_index("_".join(other.get(part, part) for part in name.split("_"))) for name in JOINT_NAMES]
     rest = 0.5 * (rest + rest[swapped] * [-1, 1, 1])  # exactly symmetric, the embedded body is so to a millimetre
@@ -207,7 +207,7 @@ def test_times_and_rates_out_of_range_are_refused() -> None:
 
 def test_the_ground_offset_puts_the_lowest_skin_on_the_ground() -> None:
     """A turning body, skinned by brute force with every vertex."""
-    body = load_body()
+    body = load_asset()
     motion = clip(spinning("pelvis", np.array([2.0, 0.3, 0.0]), 5), np.linspace([0, 0, 3.0], [0, 1, 2.0], 5))
     grounded = motion.on_ground(body)
     rest = body.joints.astype(np.float64)
@@ -235,7 +235,7 @@ def test_the_level_is_smooth_below_the_heights_and_ignores_short_flights(loop: b
 
 def test_hands_lie_down_where_the_arms_stand_on_the_ground() -> None:
     """Face down on straight vertical arms: the hand is bent to the level of the forearm's end, backwards."""
-    body = load_body()
+    body = load_asset()
     rest = body.joints.astype(np.float64)
     wrists = (joint_index("left_wrist"), joint_index("right_wrist"))
     ahead = {f"{side}_{joint}": [0.0, -1.0, 0.0] for side in ("left", "right") for joint in ("shoulder", "elbow")}
@@ -257,5 +257,5 @@ def test_hands_lie_down_where_the_arms_stand_on_the_ground() -> None:
 
 def test_hands_in_the_air_are_left_alone() -> None:
     motion = load_motion("arm_wave")
-    laid = lay_hands_on_ground(motion, load_body(), None, window=0.5)
+    laid = lay_hands_on_ground(motion, load_asset(), None, window=0.5)
     np.testing.assert_allclose(laid.local_rotations, motion.local_rotations, atol=1e-12)

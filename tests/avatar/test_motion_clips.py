@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion, list_motions, load_motion
 from piavatar_envs.avatar.motion.ground import lowest_heights
 from piavatar_envs.avatar.motion.library import list_embedded
@@ -16,7 +16,7 @@ REST_POSE = np.tile([1.0, 0.0, 0.0, 0.0], (NUM_JOINTS, 1))
 
 
 def world_joints(motion: Motion) -> dict[str, np.ndarray]:
-    positions = motion.joint_frames(load_body().joints)[1]
+    positions = motion.joint_frames(load_asset().joints)[1]
     return {name: positions[:, joint] for joint, name in enumerate(JOINT_NAMES)}
 
 
@@ -40,7 +40,7 @@ def test_embedded_clips_start_and_end_at_rest(embedded: Motion) -> None:
     assert embedded.loop and embedded.source == "procedural"
     for frame in (0, -1):
         np.testing.assert_allclose(embedded.local_rotations[frame], REST_POSE, atol=2e-3)
-        np.testing.assert_allclose(embedded.root_position[frame], load_body().joints[0], atol=2e-3)
+        np.testing.assert_allclose(embedded.root_position[frame], load_asset().joints[0], atol=2e-3)
 
 
 def test_embedded_clips_are_smooth_and_human(embedded: Motion) -> None:
@@ -58,7 +58,7 @@ def test_embedded_clips_are_smooth_and_human(embedded: Motion) -> None:
 
 
 def test_embedded_clips_stand_on_the_ground(embedded: Motion) -> None:
-    heights = lowest_heights(embedded, load_body())
+    heights = lowest_heights(embedded, load_asset())
     assert heights.min() == pytest.approx(0.0, abs=1e-6)
     assert heights.max() < 0.01
 
@@ -72,7 +72,7 @@ def test_embedded_clips_stand_on_the_ground(embedded: Motion) -> None:
 )
 @pytest.mark.parametrize("sizes", [{}, {"height": 1.0}, {"height": -1.0}])
 def test_standing_feet_do_not_slide_whatever_the_size(name: str, planted: tuple[str, ...], sizes: dict) -> None:
-    asset = load_body()
+    asset = load_asset()
     body = asset.shape(asset.parameters(**sizes))
     motion = load_motion(name, asset, body)
     positions = motion.joint_frames(body.joints)[1]

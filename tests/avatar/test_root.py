@@ -27,9 +27,9 @@ def push(rig, force, steps: int = 15, after: int = 30) -> dict[str, np.ndarray]:
             rig.push(force)
         rig.step()
         log["tilt"].append(tilt(rig))
-        log["let_go"].append(int(rig.drive.state.let_go.numpy()[0]))
-        log["force"].append(np.linalg.norm(rig.drive.state.wrench_force.numpy()[0]))
-        log["torque"].append(np.linalg.norm(rig.drive.state.wrench_torque.numpy()[0]))
+        log["let_go"].append(int(rig.avatar.state.let_go.numpy()[0]))
+        log["force"].append(np.linalg.norm(rig.avatar.state.wrench_force.numpy()[0]))
+        log["torque"].append(np.linalg.norm(rig.avatar.state.wrench_torque.numpy()[0]))
         log["shift"].append(displacement(rig))
     return {name: np.array(values) for name, values in log.items()}
 
@@ -41,8 +41,8 @@ def test_standing_does_not_sag_and_costs_the_weight(make_rig, floor):
     assert np.abs(displacement(rig)).max() < 1e-4
     assert np.abs(rig.read("x") - rig.target()).max() < 1e-3
     weight = rig.mass.sum() * G
-    np.testing.assert_allclose(rig.drive.state.wrench_force.numpy()[0], (0.0, 0.0, weight), atol=1e-3 * weight)
-    np.testing.assert_allclose(rig.drive.state.wrench_torque.numpy()[0], 0.0, atol=1e-3 * weight)
+    np.testing.assert_allclose(rig.avatar.state.wrench_force.numpy()[0], (0.0, 0.0, weight), atol=1e-3 * weight)
+    np.testing.assert_allclose(rig.avatar.state.wrench_torque.numpy()[0], 0.0, atol=1e-3 * weight)
 
 
 def test_the_weight_of_every_body_is_its_own(make_rig):
@@ -50,7 +50,7 @@ def test_the_weight_of_every_body_is_its_own(make_rig):
     rig.step(5)
     weights = rig.points.mass.astype(float).sum(1) * G
     assert weights[1] > 1.1 * weights[0]
-    np.testing.assert_allclose(rig.drive.state.wrench_force.numpy()[:, 2], weights, rtol=1e-3)
+    np.testing.assert_allclose(rig.avatar.state.wrench_force.numpy()[:, 2], weights, rtol=1e-3)
 
 
 def test_a_push_within_the_limits_is_survived(make_rig):
@@ -76,9 +76,9 @@ def test_a_push_beyond_the_limits_knocks_down_for_good(make_rig):
     assert log["torque"].max() == pytest.approx(0.7 * rig.mass.sum() * G, rel=1e-3)  # it did what it could
     assert log["tilt"][-1] > 45.0
     rig.reset()
-    assert rig.drive.state.let_go.numpy()[0] == 0
+    assert rig.avatar.state.let_go.numpy()[0] == 0
     rig.step(10)
-    assert rig.drive.state.let_go.numpy()[0] == 0 and tilt(rig) < 0.1
+    assert rig.avatar.state.let_go.numpy()[0] == 0 and tilt(rig) < 0.1
 
 
 @pytest.mark.parametrize(
@@ -94,28 +94,28 @@ def test_it_lets_go_at_each_limit(make_rig, error, limit, share):
     else:
         offset = {"horizontal": (0.6, 0.8, 0.0), "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0)}[error]
         root = root + share * limit * np.array(offset)
-    rig.drive.state.command_rotation.assign(rig.quaternions(rotvec))
-    rig.drive.state.command_root.assign(root.astype(np.float32)[None])
+    rig.avatar.state.command_rotation.assign(rig.quaternions(rotvec))
+    rig.avatar.state.command_root.assign(root.astype(np.float32)[None])
     rig.command(rotvec, root)
     rig.step()
-    assert rig.drive.state.let_go.numpy()[0] == (share > 1.0)
+    assert rig.avatar.state.let_go.numpy()[0] == (share > 1.0)
 
 
 def test_turning_in_place_is_not_a_tilt(make_rig):
     rig = make_rig(gravity=0.0)
     yaw = np.zeros((22, 3))
     yaw[0, 2] = 2.0
-    rig.drive.state.command_rotation.assign(rig.quaternions(yaw))
+    rig.avatar.state.command_rotation.assign(rig.quaternions(yaw))
     rig.command(yaw)
     rig.step()
-    assert rig.drive.state.let_go.numpy()[0] == 0
+    assert rig.avatar.state.let_go.numpy()[0] == 0
 
 
 @pytest.mark.parametrize("commanded", [False, True])
 def test_a_body_let_go_falls_freely(make_rig, commanded):
     """Not even by moving its limbs, or by a commanded root, can it push itself off the air."""
     rig = make_rig(gravity=G, room=1.8)
-    rig.drive.state.let_go.fill_(1)
+    rig.avatar.state.let_go.fill_(1)
     swing = np.zeros((22, 3))
     for k in range(6):
         if commanded:
@@ -125,7 +125,7 @@ def test_a_body_let_go_falls_freely(make_rig, commanded):
     _, velocity, spin = rig.rigid_motion()
     np.testing.assert_allclose(velocity, (0.0, 0.0, -G * 0.2), atol=1e-4)
     np.testing.assert_allclose(spin, 0.0, atol=5e-3)
-    assert not rig.drive.state.wrench_force.numpy().any()
+    assert not rig.avatar.state.wrench_force.numpy().any()
     if commanded:
         assert np.degrees(rig.joint_errors().max()) < 0.1  # the limbs did move as commanded
 
@@ -135,8 +135,8 @@ def test_a_small_error_decays_critically_damped(make_rig):
     rig = make_rig(gravity=G, tone=1.0)
     root, rotvec = rig.points.joints[0, 0] + np.array([0.03, -0.04, 0.02]), np.zeros((22, 3))
     rotvec[0] = (0.02, -0.05, 0.04)
-    rig.drive.state.command_rotation.assign(rig.quaternions(rotvec))
-    rig.drive.state.command_root.assign(root.astype(np.float32)[None])
+    rig.avatar.state.command_rotation.assign(rig.quaternions(rotvec))
+    rig.avatar.state.command_root.assign(root.astype(np.float32)[None])
     rig.command(rotvec, root)
     goal = Rotation.from_rotvec(rotvec[0])
     turn0 = goal.magnitude()
@@ -164,4 +164,4 @@ def test_a_commanded_walk_is_followed_without_lag(make_rig):
         np.testing.assert_allclose(position[0], root, atol=1e-4)
         assert (Rotation.from_rotvec(rotvec[0]).inv() * Rotation.from_matrix(world[0])).magnitude() < 1e-4
     weight = rig.mass.sum() * G
-    np.testing.assert_allclose(rig.drive.state.wrench_force.numpy()[0], (0.0, 0.0, weight), atol=5e-3 * weight)
+    np.testing.assert_allclose(rig.avatar.state.wrench_force.numpy()[0], (0.0, 0.0, weight), atol=5e-3 * weight)

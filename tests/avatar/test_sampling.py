@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from piavatar_envs.avatar.body import sampling as harmonic
-from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, load_body, mesh_volume
+from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, mesh_volume
 from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.body.surface import ClosedSurface
 
 SIDE = np.array([name.startswith("left") * 1 - name.startswith("right") * 1 for name in JOINT_NAMES])
@@ -18,7 +19,7 @@ SIDE = np.array([name.startswith("left") * 1 - name.startswith("right") * 1 for 
 
 @pytest.fixture(scope="module")
 def asset():
-    return load_body()
+    return load_asset()
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def test_particles_of_few_bones_come_first(coarse):
     assert (1 + sum(a != b for a, b in itertools.pairwise(flesh))) == len(set(flesh))
     a, b = coarse.rest_positions[coarse.links].transpose(1, 0, 2)
     assert np.linalg.norm(a - b, axis=1).max() < 2.0 * coarse.spacing
-    corners = load_body().vertices[coarse.anchor_vertices]
+    corners = load_asset().vertices[coarse.anchor_vertices]
     on_skin = np.einsum("pc,pci->pi", coarse.anchor_weights, corners)
     gap = np.linalg.norm(on_skin - coarse.rest_positions, axis=1)
     np.testing.assert_allclose(gap[coarse.depth > 0.0], coarse.depth[coarse.depth > 0.0], atol=1e-5)

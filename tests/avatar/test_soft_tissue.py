@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index, skin
 from piavatar_envs.avatar.body.soft_tissue import inert_share, softness
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.tasks import load_task
 
 
 def test_softness_is_at_the_bones_zero_and_in_belly_and_thighs_high():
-    particles = sample_particles(load_body(), spacing_for(0.052))
+    particles = sample_particles(load_asset(), spacing_for(0.052))
     soft = softness(particles.rest_positions, particles.bone, particles.skin_joints, particles.skin_weights)
     assert soft.min() >= 0.0 and soft.max() <= 1.0
     assert (soft[particles.bone >= 0] == 0.0).all()

@@ -26,7 +26,7 @@ def tracked_root(env) -> tuple[np.ndarray, float]:
 
 def command(env) -> np.ndarray:
     """Rotation vectors commanded so far [rad], shape ``(22, 3)``."""
-    return Rotation.from_quat(env.batch.get_state()["drive_0.command_rotation"][0].astype(float)).as_rotvec()
+    return Rotation.from_quat(env.batch.get_state()["avatar_0.state.command_rotation"][0].astype(float)).as_rotvec()
 
 
 def clip_pose(env) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.pose_control.controller import clear_vectors
+from piavatar_envs.avatar.avatar import clear_vectors
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.tasks import load_task

@@ -27,8 +27,8 @@ def test_boxes_hold_the_bones_of_the_body_that_was_drawn(make_batch, pool):
         batch.reset(seeds=seeds)
         batch.step()
         batch.simulation.shapes.fall_behind()
-        bench = batch.simulation.avatar.joints.body._bench
-        middle, half = bench.middle.numpy().copy(), bench.half.numpy().copy()
+        workspace = batch.simulation.controllers[0].joints._workspace
+        middle, half = workspace.middle.numpy().copy(), workspace.half.numpy().copy()
         boxes = np.stack([middle - half, middle + half])
         np.testing.assert_allclose(boxes, boxes_of(batch.simulation.flesh[0].points), atol=1e-5)
         found.append(boxes)

@@ -68,7 +68,7 @@ def test_environment_i_is_the_single_one_and_a_masked_reset_spares_the_others(ma
             after = batch.get_state()
             spared = [before[name][[0, 2]].tobytes() == after[name][[0, 2]].tobytes() for name in before]
             assert all(spared)
-            assert not after["joints_0.velocity"][1].any() and before["joints_0.velocity"][1].any()
+            assert not after["controller_0.velocity"][1].any() and before["controller_0.velocity"][1].any()
         batch.action.assign(row[:, None])
         batch.step()
         seen.append(batch.observation.numpy()[:, 0].copy())
@@ -91,15 +91,15 @@ def test_bad_actions_are_refused_and_a_failure_freezes(make_env, control):
     frozen = env.get_state()
     env.step(np.ones(env.action_space.shape))
     after = env.get_state()
-    names = [name for name in frozen if name.startswith(("joints_0", "particles"))]
-    assert all(frozen[name].tobytes() == after[name].tobytes() for name in names if name != "joints_0.torque")
+    names = [name for name in frozen if name.startswith(("controller_0", "particles"))]
+    assert all(frozen[name].tobytes() == after[name].tobytes() for name in names if name != "controller_0.torque")
     env.reset(seed=0)
     assert env.step(np.zeros(env.action_space.shape))[4]["failure"] is None
 
 
 def angles(env) -> np.ndarray:
     """Rotation vectors of the joints [rad], ``(22, 3)``."""
-    world = Rotation.from_quat(env.batch.simulation.avatar.joints.state.rotation.numpy()[0].astype(float))
+    world = Rotation.from_quat(env.batch.simulation.controllers[0].state.rotation.numpy()[0].astype(float))
     return np.stack([(world[max(PARENTS[b], 0)].inv() * world[b]).as_rotvec() for b in range(len(JOINT_NAMES))])
 
 
@@ -124,13 +124,13 @@ def test_torques_are_shares_of_the_joints_strength(make_env):
     """Of the mean body, and scaled by weight times height; an agent's torque never exceeds the table."""
     env = make_env(REACH, control="torque", joints=None)
     env.reset(seed=0)
-    joints = env.batch.simulation.avatar.joints
+    controller = env.batch.simulation.controllers[0]
     lower, upper = joint_torques()
     for share in (1.0, -0.5):
         env.step(np.full(env.action_space.shape, share, np.float32))
         expected = share * (upper if share > 0.0 else -lower)
-        np.testing.assert_allclose(joints.state.torque.numpy()[0], expected, rtol=1e-5)
-    size = joints.body.strength.factor.numpy()[0]
+        np.testing.assert_allclose(controller.state.torque.numpy()[0], expected, rtol=1e-5)
+    size = controller.joints.strength.factor.numpy()[0]
     mass = env.batch.simulation.avatar.body_mass.numpy()[0]
     rest = env.batch.simulation.flesh[0].points.rest[0]
     assert size == pytest.approx(mass * np.ptp(rest[:, 2]) / (75.0 * 1.75), rel=1e-4)
@@ -213,7 +213,9 @@ def test_a_stop_does_not_let_a_joint_turn_round(make_env):
     for step in range(60):
         *_, info = env.step(action)
         assert info["failure"] is None
-        world = Rotation.from_quat(env.unwrapped.batch.simulation.avatar.joints.state.rotation.numpy()[0].astype(float))
+        world = Rotation.from_quat(
+            env.unwrapped.batch.simulation.controllers[0].state.rotation.numpy()[0].astype(float)
+        )
         turn = (world[above].inv() * world[elbow]).magnitude()
         assert turn < 3.0, f"step {step}: {turn:.2f} rad"
 

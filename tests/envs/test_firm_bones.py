@@ -31,9 +31,9 @@ def swing(batch, steps: int, seed: int = 0) -> np.ndarray:
 def put_in_place(batch) -> None:
     """What ends a control step of the joints, alone, wherever they have been put."""
     simulation = batch.simulation
-    graph, joints = LaunchGraph(simulation.model.device), simulation.avatar.joints
-    joints.body.record_pose(graph, simulation.state)
-    joints.record_end(graph, simulation.state)
+    graph, controller = LaunchGraph(simulation.model.device), simulation.controllers[0]
+    controller.joints.record_pose(graph, simulation.state)
+    controller.record_end(graph, simulation.state)
     graph.run()
 
 
@@ -109,9 +109,9 @@ def test_the_pull_goes_on_as_if_particles_had_not_been_put_in_place(make_batch):
         shaken = rng.normal(0.0, 5e-3, state.x.numpy().shape) * of_bones(batch)[None, :, None]
         state.x.assign(state.x.numpy() + shaken.astype(np.float32))
         put_in_place(batch)
-        joints = batch.simulation.avatar.joints
+        controller = batch.simulation.controllers[0]
         graph = LaunchGraph(batch.simulation.model.device)
-        joints.record_substep(graph, state, batch.simulation.scratch, 0)
+        controller.record_before_substep(graph, state, batch.simulation.scratch, 0)
         before = state.u.numpy() + state.vk.numpy()
         graph.run()
         changes[firm] = (state.u.numpy() + state.vk.numpy() - before)[0]
@@ -125,7 +125,7 @@ def test_no_particle_is_put_into_the_floor(make_batch):
     batch.reset(seeds=[0])
     simulation, chosen, down = batch.simulation, of_bones(batch), np.float32([0.0, 0.0, 0.05])
     put_in_place(batch)
-    before, position = simulation.state.x.numpy()[0, chosen], simulation.avatar.joints.state.position
+    before, position = simulation.state.x.numpy()[0, chosen], simulation.controllers[0].state.position
     position.assign(position.numpy() - down)
     put_in_place(batch)
     expected = before - down
@@ -137,10 +137,10 @@ def test_no_particle_is_put_into_the_floor(make_batch):
 def test_flesh_and_commanded_poses_are_left_alone(make_batch):
     """Only particles of bones under torques are put anywhere, and none where they may slip."""
     batch = make_batch(REACH, 1, **PD)
-    np.testing.assert_array_equal(batch.simulation.avatar.joints.body.firm.numpy(), np.flatnonzero(of_bones(batch)))
+    np.testing.assert_array_equal(batch.simulation.controllers[0].joints.firm.numpy(), np.flatnonzero(of_bones(batch)))
     assert 0 < of_bones(batch).sum() < 0.9 * len(of_bones(batch))
-    assert make_batch(REACH, 1, control="pd", firm_bones=False).simulation.avatar.joints.body.firm.size == 0
-    assert make_batch(REACH, 1).simulation.avatar.joints is None
+    assert make_batch(REACH, 1, control="pd", firm_bones=False).simulation.controllers[0].joints.firm.size == 0
+    assert make_batch(REACH, 1).simulation.controllers[0].moves_particles is False
 
 
 def test_two_bodies_that_collide_keep_their_momentum(device):

@@ -273,9 +273,9 @@ def test_limits_of_the_root_are_in_drawn_weights(make_batch, limit):
     batch.action.zero_()
     state = batch.get_state()
     if limit == "force":
-        state["drive_0.command_root"][:, 0] += 0.4
+        state["avatar_0.state.command_root"][:, 0] += 0.4
     else:
-        state["drive_0.command_rotation"][:, 0] = np.float32([np.sin(0.3), 0.0, 0.0, np.cos(0.3)])
+        state["avatar_0.state.command_rotation"][:, 0] = np.float32([np.sin(0.3), 0.0, 0.0, np.cos(0.3)])
     batch.set_state(state)
     batch.step()
     drive = batch.simulation.avatar.state

@@ -44,8 +44,8 @@ def test_light_joints_take_over_with_a_share_of_the_inertia_of_the_grid(make_bat
     """Of ``m dx^2/2``, with ``m`` of the limb that hangs on them; others have none. Toes are locked."""
     batch = make_batch(REACH, 1, control="torque")
     simulation = batch.simulation
-    joints, sampled = simulation.avatar.joints.body, simulation.flesh[0].sampled
-    besides = joints._bench.diagonals.numpy()[0, 3:].reshape(-1, 3)
+    joints, sampled = simulation.controllers[0].joints, simulation.flesh[0].sampled
+    besides = joints._workspace.diagonals.numpy()[0, 3:].reshape(-1, 3)
     mass = simulation.model.particles.mass.numpy()[0].astype(float) @ dense_weights(
         sampled.skin_joints, sampled.skin_weights
     )
@@ -58,7 +58,7 @@ def test_light_joints_take_over_with_a_share_of_the_inertia_of_the_grid(make_bat
 def weight_about_joints(batch) -> np.ndarray:
     """Moment of the weight that hangs on each joint about it, in the world's axes, ``(22, 3)`` [N m]."""
     simulation = batch.simulation
-    sampled, at = simulation.flesh[0].sampled, simulation.avatar.joints.state.position.numpy()[0].astype(float)
+    sampled, at = simulation.flesh[0].sampled, simulation.controllers[0].state.position.numpy()[0].astype(float)
     mass, x = simulation.model.particles.mass.numpy()[0].astype(float), simulation.state.x.numpy()[0].astype(float)
     share = dense_weights(sampled.skin_joints, sampled.skin_weights)
     for bone in reversed(range(1, len(PARENTS))):
@@ -69,9 +69,9 @@ def weight_about_joints(batch) -> np.ndarray:
 
 def spring_torques(batch) -> np.ndarray:
     """What the springs of the joints pull with, towards the rest pose, in the world's axes, ``(22, 3)`` [N m]."""
-    joints = batch.simulation.avatar.joints
-    world = Rotation.from_quat(joints.state.rotation.numpy()[0].astype(float))
-    stiffness = joints.body.springs.stiffness.numpy()[0, 1:]
+    controller = batch.simulation.controllers[0]
+    world = Rotation.from_quat(controller.state.rotation.numpy()[0].astype(float))
+    stiffness = controller.joints.springs.stiffness.numpy()[0, 1:]
     above = [world[max(PARENTS[b], 0)] for b in range(len(PARENTS))]
     return np.stack([-k * a.apply((a.inv() * w).as_rotvec()) for k, a, w in zip(stiffness, above, world, strict=True)])
 
@@ -83,7 +83,7 @@ def test_a_joint_at_rest_bears_the_weight_that_hangs_on_it(make_batch):
     for _ in range(150):
         batch.step()
     spring, weight = spring_torques(batch), weight_about_joints(batch)
-    moving = [b for b in range(1, len(PARENTS)) if batch.simulation.avatar.joints.body.tissue.lock.numpy()[b] == 0.0]
+    moving = [b for b in range(1, len(PARENTS)) if batch.simulation.controllers[0].joints.tissue.lock.numpy()[b] == 0.0]
     assert len(moving) == len(PARENTS) - 3  # toes are locked
     assert np.linalg.norm(weight[moving], axis=1).min() > 0.05
     np.testing.assert_allclose(spring[moving], -weight[moving], rtol=0.003, atol=0.01)
@@ -97,7 +97,10 @@ def test_legs_bear_what_stands_on_them(make_batch, name):
     for _ in range(100):
         batch.step()
     simulation, joints = batch.simulation, [joint_index(f"{side}_{name}") for side in ("left", "right")]
-    pelvis, at = simulation.avatar.joints.body.support, simulation.avatar.joints.state.position.numpy()[0].astype(float)
+    pelvis, at = (
+        simulation.controllers[0].joints.support,
+        simulation.controllers[0].state.position.numpy()[0].astype(float),
+    )
     axis = at[joints].mean(0)
     mass, x = simulation.model.particles.mass.numpy()[0].astype(float), simulation.state.x.numpy()[0].astype(float)
     weight = np.cross(x - axis, np.array([0.0, 0.0, -9.81]) * mass[:, None]).sum(0)
@@ -116,6 +119,6 @@ def test_bodies_that_thrash_on_the_ground_do_not_fail(make_batch, firm):
     for _ in range(100):
         batch.action.assign(rng.uniform(-1.0, 1.0, batch.action.shape).astype(np.float32))
         batch.step()
-        fastest = max(fastest, np.abs(batch.simulation.avatar.joints.state.velocity.numpy()).max())
+        fastest = max(fastest, np.abs(batch.simulation.controllers[0].state.velocity.numpy()).max())
     assert not batch.failure.numpy().any()
     assert fastest > 10.0  # [rad/s]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 
 SUMO, BOXING = "piavatar_envs.multi.sumo_v0", "piavatar_envs.multi.boxing_v0"
 HIGH_FIVE, PASS_BALL = "piavatar_envs.multi.high_five_v0", "piavatar_envs.multi.pass_ball_v0"
@@ -34,7 +34,7 @@ def help_only(world, *agents: int) -> None:
     """Hold the pelvises of these agents up, as ``root_assist`` does for all."""
     state = world.get_state()
     for agent in range(len(world.possible_agents)):
-        state[f"joints_{agent}.assist"][:] = float(agent in agents)
+        state[f"controller_{agent}.assist"][:] = float(agent in agents)
     world.set_state(state)
 
 
@@ -111,7 +111,7 @@ def test_where_a_wrench_holds_the_root_no_posture_is_a_fall(make_world, play, mo
 def test_to_kneel_and_to_reach_the_ground_is_to_be_down_and_to_duck_is_not(make_world, module):
     """Of the mean body, as geometry has it: legs and a straight trunk that leans forwards by any angle."""
     world = make_world(module)
-    fall, body = world.config.fall, load_body().mean_body()
+    fall, body = world.config.fall, load_asset().mean_body()
     joint = {name: body.joints[joint_index(name)].astype(float) for name in ("head", "pelvis", "left_knee", "left_hip")}
     arm = [body.joints[joint_index(f"left_{name}")].astype(float) for name in ("shoulder", "elbow", "wrist")]
     tip = body.vertices[body.vertices[:, 0].argmax()]  # of the left hand

@@ -272,7 +272,7 @@ def test_when_one_falls_it_is_over_for_both(make_world, play):
     world = make_world(FIVE)
     world.reset(seed=0)
     state = world.get_state()
-    state["drive_1.let_go"][:] = 1
+    state["avatar_1.state.let_go"][:] = 1
     world.set_state(state)
     [(_, rewards, terminations, _, infos)] = play(world, 1)
     assert all(terminations.values()) and not world.agents

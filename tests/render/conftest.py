@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody, load_body
+from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph, sample_particles
 from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.render import Skin
 
 
@@ -26,7 +27,7 @@ class Subject:
 
 @pytest.fixture(scope="session")
 def subject() -> Subject:
-    asset = load_body()
+    asset = load_asset()
     body = asset.shape(asset.parameters(sex=0.4, weight=0.3))
     particles = sample_particles(asset, spacing=0.035)
     positions, _ = morph(asset, particles, body)

@@ -159,7 +159,13 @@ def test_there_is_room_to_wander(make_env):
     env = make_env(GET_UP, pose_noise=0.0)
     env.reset(seed=0)
     state = env.get_state()
-    placed = ("particles.x", "joints_0.position", "tracked_0.position", "drive_0.goal_root", "drive_0.command_root")
+    placed = (
+        "particles.x",
+        "controller_0.position",
+        "avatar_0.tracked.position",
+        "avatar_0.state.goal_root",
+        "avatar_0.state.command_root",
+    )
     away = np.array([4.0, -4.0, 0.0], np.float32)
     env.set_state({name: value + away if name in placed else value for name, value in state.items()})
     for _ in range(3):

@@ -125,14 +125,14 @@ def test_the_first_pose_is_noisy_within_its_bound(make_env):
     angles = []
     for seed in range(12):
         env.reset(seed=seed)
-        quaternions = env.get_state()["drive_0.command_rotation"][0].astype(float)
+        quaternions = env.get_state()["avatar_0.state.command_rotation"][0].astype(float)
         angles.append(Rotation.from_quat(quaternions).as_rotvec())
     angles = np.array(angles)
     assert np.abs(angles).max() <= 0.2 + 1e-5 and np.abs(angles[:, 1:]).max(2).min() > 0.0
     assert not angles[:, 0].any(), "the root starts upright"
     assert angles[:, 1:].std(0).max() > 0.05
     still.reset(seed=0)
-    assert np.abs(Rotation.from_quat(still.get_state()["drive_0.command_rotation"][0]).as_rotvec()).max() < 1e-6
+    assert np.abs(Rotation.from_quat(still.get_state()["avatar_0.state.command_rotation"][0]).as_rotvec()).max() < 1e-6
 
 
 def test_a_hand_can_be_brought_to_the_target(make_env):

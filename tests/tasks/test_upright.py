@@ -74,7 +74,7 @@ def test_feet_share_the_load(make_env):
     env = make_env(STAND, root_assist=0.3, pose_noise=0.0)
     sim, loads, expected = env.batch.simulation, {}, {}
     mass, feet = sim.flesh[0].points.mass[0], [joint_index("left_ankle"), joint_index("right_ankle")]
-    pelvis = sim.avatar.joints.body.support
+    pelvis = sim.controllers[0].joints.support
     for bend in (0.0, 0.6, -0.6):
         env.reset(seed=0)
         action = still(env)
@@ -85,7 +85,7 @@ def test_feet_share_the_load(make_env):
         loads[bend] = seen(env, observation, "foot_impulses")
         ground = sim.sensors.boundary_impulse.numpy()[0, 0, 2]
         assert loads[bend].sum() == pytest.approx(ground, rel=1e-5) and (loads[bend] >= 0.0).all()
-        at = sim.avatar.joints.state.position.numpy()[0]
+        at = sim.controllers[0].state.position.numpy()[0]
         middle, distance = at[feet].mean(0) * (1.0, 1.0, 0.0), at[feet[0], 0] - at[feet[1], 0]
         center = np.average(sim.state.x.numpy()[0, : sim.avatar.num_points], axis=0, weights=mass) - middle
         held = pelvis.torque.numpy()[0] + np.cross(at[0] - middle, pelvis.force.numpy()[0])
@@ -213,7 +213,7 @@ def test_walking_is_told_along_the_way(make_env, avatar):
     turn = Rotation.from_quat(env.batch.simulation.avatar.tracked.rotation.numpy()[0, 0].astype(float))
     assert turn.apply(seen(env, observation, "way_direction")) == pytest.approx(ahead, abs=1e-5)
     assert seen(env, observation, "way_offset") == pytest.approx(0.0, abs=1e-4)
-    joints = env.batch.simulation.avatar.joints.state
+    joints = env.batch.simulation.controllers[0].state
     velocity = joints.velocity.numpy()
     velocity[0, :3] = ahead
     joints.velocity.assign(velocity)
@@ -277,7 +277,7 @@ def test_who_leaves_the_way_is_out(make_env, drift):
     env = make_env(WALK, lane=0.3, gravity=0.0, pose_noise=0.0, episode_seconds=0.6)
     env.reset(seed=0)
     state = env.batch.simulation.state
-    joints = env.batch.simulation.avatar.joints.state
+    joints = env.batch.simulation.controllers[0].state
     velocity = joints.velocity.numpy()
     velocity[0, :2] = drift
     joints.velocity.assign(velocity)

@@ -10,7 +10,7 @@ import pkgutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from piavatar_envs.avatar.body.asset import load_body
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import amass, clips, deepmimic
 from piavatar_envs.avatar.motion.hands import lay_hands_on_ground
 from piavatar_envs.avatar.motion.motion import Motion
@@ -46,7 +46,7 @@ def load_motion(name_or_path: str | Path, asset: AvatarAsset | None = None, body
         ValueError: the name is unknown, or a file is not a motion.
         FileNotFoundError: there is no such file.
     """
-    asset = load_body() if asset is None else asset
+    asset = load_asset() if asset is None else asset
     joints = (asset if body is None else body).joints
     name = str(name_or_path)
     if name in list_embedded():

@@ -1,4 +1,4 @@
-"""The paper's drive: the kinematic velocity is injected into the one velocity state, once a control step.
+"""The paper's injection: the kinematic velocity is added to the one velocity state, once a control step.
 
 Only for reproducing the paper's rows (``decoupling="paper"`` and ``"none"``): ``v += vk_new - vk_old`` with
 ``vk_new = (LBS(T_next) - LBS(T)) / control_dt``.
@@ -8,11 +8,34 @@ from __future__ import annotations
 
 import warp as wp
 
+from piavatar_envs.avatar.pose_control.bones import carried_bone
+from piavatar_envs.avatar.rotation import rigid_matrix
 from piavatar_envs.avatar.skinning import skinned_place
-from piavatar_envs.avatar.types import Body
+from piavatar_envs.avatar.types import Body, Carry, Pose
 from piavatar_envs.mpm.types import row
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
+
+
+@wp.kernel
+def bone_matrices(
+    body: Body,
+    dt: float,
+    pose: Pose,
+    next_pose: Pose,
+    carry: Carry,
+    # out
+    bone_from: wp.array2d(dtype=wp.mat44),
+    bone_step: wp.array2d(dtype=wp.mat44),
+):
+    """Write the skinning matrices of a bone, and their change in a control step over its time."""
+    e, b = wp.tid()
+    q, at = carried_bone(pose, carry, e, b)
+    q_next, at_next = carried_bone(next_pose, carry, e, b)
+    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
+    A = rigid_matrix(q, rest, at)
+    bone_from[e, b] = A
+    bone_step[e, b] = (rigid_matrix(q_next, rest, at_next) - A) / dt
 
 
 @wp.kernel

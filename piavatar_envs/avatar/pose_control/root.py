@@ -1,9 +1,11 @@
-"""The root: a bounded wrench that stands in for balance in pose control, and the anchor of the commanded pose.
+"""Root of a posed avatar: a bounded wrench in place of balance, alignment of the command, and unsupported bodies.
 
 A pose-controlled avatar does not balance itself; a six-degree-of-freedom wrench holds the commanded root instead. It is
 a rigid acceleration field over the whole body (no sag), with gravity fed forward and an implicit critically damped PD
 ``a = (w^2 (e - dt V) - 2 w V) / (1 + 2 w dt + w^2 dt^2)``. It is bounded, and it lets go for good (until reset) once
 the body has been knocked too far: pushes are survived or not.
+
+Commanded motion of a body that nothing supports must carry neither momentum nor angular momentum.
 """
 
 from __future__ import annotations
@@ -11,25 +13,49 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.critical_damping import critical_pull
-from piavatar_envs.avatar.rotation import quat_exp, quat_log
-from piavatar_envs.avatar.tracking import kabsch_rotation
-from piavatar_envs.avatar.types import Anchor, Body, Carry, Command, Drive, Held, Pose, RigidFit, Wrench
-from piavatar_envs.core.arrays import vec12
-from piavatar_envs.core.cuda_intrinsics import sum_threads12
+from piavatar_envs.avatar.rotation import finite_turn, quat_exp, quat_log
+from piavatar_envs.avatar.tracking import kabsch_rotation, spin_of
+from piavatar_envs.avatar.types import (
+    Anchor,
+    Body,
+    Carry,
+    Command,
+    Pose,
+    PoseControl,
+    RemovedMotion,
+    RigidFit,
+    RigidFits,
+    RootState,
+    Wrench,
+)
+from piavatar_envs.core.arrays import vec12, vec16
+from piavatar_envs.core.cuda_intrinsics import sum_threads12, sum_threads16
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
+def is_free(control: PoseControl, let_go: int):
+    """Return whether nothing supports a body, so that commanded motion must carry no momentum."""
+    return control.free_motion != 0 or let_go != 0
+
+
+@wp.func
+def axial(K: wp.mat33):
+    """Return ``sum a x b`` of ``K = sum a b^T``."""
+    return wp.vec3(K[1, 2] - K[2, 1], K[2, 0] - K[0, 2], K[0, 1] - K[1, 0])
+
+
+@wp.func
 def clamp_length(v: wp.vec3, limit: float):
-    """``v``, shortened to ``limit`` if it is longer."""
+    """Return ``v``, shortened to ``limit`` if it is longer."""
     return v * wp.min(1.0, limit / wp.max(wp.length(v), 1.0e-12))
 
 
 @wp.func
 def hold_root(
-    drive: Drive,
+    control: PoseControl,
     fraction: float,
     command: Command,
     pose: Pose,
@@ -38,14 +64,14 @@ def hold_root(
     mass: float,
     e: int,
     # in and out
-    held: Held,
+    root: RootState,
     # out
     wrench: Wrench,
 ):
-    """Acceleration of the body by the root wrench in this substep; its mean over the control step is accumulated."""
+    """Compute the acceleration of the body by the root wrench, and accumulate its mean over the control step."""
     wrench.linear[e] = wp.vec3(0.0)
     wrench.angular[e] = wp.vec3(0.0)
-    if drive.root_rate <= 0.0:
+    if control.root_rate <= 0.0:
         return
     G = carry.rotation[e, 0]
     q = G * pose.rotation[e, 0]
@@ -56,30 +82,30 @@ def hold_root(
     tilt_cos = wp.dot(wp.quat_rotate(q, up), wp.quat_rotate(q_command, up))
     horizontal = wp.sqrt(error[0] * error[0] + error[1] * error[1])
     if (
-        tilt_cos < drive.max_tilt_cos
-        or horizontal > drive.max_horizontal_error
-        or wp.abs(error[2]) > drive.max_height_error
+        tilt_cos < control.max_tilt_cos
+        or horizontal > control.max_horizontal_error
+        or wp.abs(error[2]) > control.max_height_error
     ):
-        held.let_go[e] = 1
-    if held.let_go[e] != 0:
+        root.let_go[e] = 1
+    if root.let_go[e] != 0:
         return
     I = whole.inertia[e]
-    a = critical_pull(drive.root_rate, drive.dt, error, whole.velocity[e]) - drive.gravity
-    a = clamp_length(a, drive.max_force)
-    torque = I * critical_pull(drive.root_rate, drive.dt, quat_log(q_command * wp.quat_inverse(q)), whole.spin[e])
-    torque = clamp_length(torque, drive.max_torque * mass)
+    a = critical_pull(control.root_rate, control.dt, error, whole.velocity[e]) - control.gravity
+    a = clamp_length(a, control.max_force)
+    torque = I * critical_pull(control.root_rate, control.dt, quat_log(q_command * wp.quat_inverse(q)), whole.spin[e])
+    torque = clamp_length(torque, control.max_torque * mass)
     if not (wp.isfinite(a) and wp.isfinite(torque)):
-        return  # the body has blown up; the substep will say so
+        return  # the MPM substep flags the failure
     wrench.linear[e] = a
     wrench.angular[e] = wp.inverse(I) * torque
-    share = 1.0 / float(drive.num_substeps)
-    held.wrench_force[e] = held.wrench_force[e] + share * mass * a
-    held.wrench_torque[e] = held.wrench_torque[e] + share * torque
+    share = 1.0 / float(control.num_substeps)
+    root.wrench_force[e] = root.wrench_force[e] + share * mass * a
+    root.wrench_torque[e] = root.wrench_torque[e] + share * torque
 
 
 @wp.func
 def bone_place(body: Body, pose: Pose, e: int, b: int):
-    """Where a pose has the centre of mass of a bone."""
+    """Return the centre of mass of a bone in a pose [m]."""
     arm = body.rest_center[row(e, body.bone_mass.shape[0]), b] - body.rest_joint[row(e, body.rest_joint.shape[0]), b]
     return pose.position[e, b] + wp.quat_rotate(pose.rotation[e, b], arm)
 
@@ -95,7 +121,7 @@ def lay_command(
     # out
     anchor: Anchor,
 ):
-    """Best rigid motion from the commanded to the tracked pose: Kabsch over the bones' centres of mass."""
+    """Fit the rigid motion from the commanded to the tracked pose: Kabsch over the bones' centres of mass."""
     r = row(e, body.bone_mass.shape[0])
     m = float(0.0)
     x = wp.vec3()
@@ -122,3 +148,64 @@ def lay_command(
         q = wp.normalize(wp.quat_from_matrix(kabsch_rotation(H)))
         anchor.rotation[e] = q
         anchor.translation[e] = mean - wp.quat_rotate(q, mean_command)
+
+
+@wp.func
+def free_motion(
+    body: Body,
+    control: PoseControl,
+    corrections: wp.array2d(dtype=vec12),
+    bones: RigidFits,
+    whole: RigidFit,
+    e: int,
+    thread: int,
+    threads: int,
+    # out
+    removed: RemovedMotion,
+    # in and out
+    wrench: Wrench,
+):
+    """Compute the rigid part that comes off the commanded motion of an unsupported body.
+
+    The kinematic step, as a whole, is moved back by the rigid motion that leaves it without momentum and angular
+    momentum: ``vk' = y + A (r + dt y)`` with ``y = vk - V`` and ``sum m r x vk' = 0``. And as the inertia changes, a
+    spinning body keeps its angular momentum, not its spin (a skater who draws in the arms).
+    """
+    r = row(e, body.bone_mass.shape[0])
+    m = float(0.0)
+    for b in range(thread, body.parent.shape[0], threads):
+        m += body.bone_mass[r, b]
+    P = wp.vec3()
+    K = wp.mat33()
+    for c in range(thread, body.chunk_bone.shape[0], threads):
+        s = corrections[e, c]
+        p = wp.vec3(s[0], s[1], s[2])
+        P += p
+        K += wp.mat33(s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11])
+        K += wp.outer(bones.center[e, body.chunk_bone[c]] - whole.center[e], p)
+    # fmt: off
+    t = sum_threads16(
+        vec16(
+            m, P[0], P[1], P[2], K[0, 0], K[0, 1], K[0, 2], K[1, 0], K[1, 1], K[1, 2], K[2, 0], K[2, 1], K[2, 2],
+            0.0, 0.0, 0.0,
+        ),
+        threads,
+    )
+    # fmt: on
+    if thread > 0:
+        return
+    K = wp.mat33(t[4], t[5], t[6], t[7], t[8], t[9], t[10], t[11], t[12])
+    I = whole.inertia[e]
+    second = wp.diag(wp.vec3(0.5 * wp.trace(I))) - I
+    A = wp.mat33()
+    w = wp.vec3()
+    moment = K
+    for _ in range(5):  # each iteration reduces the error by a factor of dt |w|
+        w -= spin_of(I, axial(moment))
+        A = finite_turn(w, control.dt)
+        moment = K + (control.dt * K + second) * wp.transpose(A)
+    removed.velocity[e] = wp.vec3(t[1], t[2], t[3]) / t[0]
+    removed.turn[e] = A
+    removed.center[e] = whole.center[e]
+    W = whole.spin[e]
+    wrench.angular[e] = wrench.angular[e] - spin_of(I, wp.trace(moment) * W - moment * W)

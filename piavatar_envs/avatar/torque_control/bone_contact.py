@@ -29,7 +29,7 @@ from piavatar_envs.avatar.skinning import motion_at
 from piavatar_envs.avatar.torque_control.dynamics import part_of, set_part, spread_motion
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, NUM_DOF
 from piavatar_envs.avatar.torque_control.tree_cholesky import begin_solution, end_solution
-from piavatar_envs.avatar.torque_control.workspace import JointBench, place_of_part, row_in_room, see_columns
+from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, place_of_part, row_in_room, see_columns
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import vec8, vector_at
 from piavatar_envs.core.cuda_intrinsics import bits_of_threads, meet_threads, most_of_threads, sum_threads6
@@ -79,7 +79,7 @@ def at_rest(body: Body, e: int, b: int, tracker: int):
 
 
 @wp.func
-def measure_bones(body: Body, e: int, thread: int, threads: int, w: JointBench):
+def measure_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
     """Find boxes that hold the points of bones, of the body as it is: another one may have been drawn."""
     for b in range(thread, BONES, threads):
         low = wp.vec3(_FAR)
@@ -93,13 +93,13 @@ def measure_bones(body: Body, e: int, thread: int, threads: int, w: JointBench):
 
 
 @wp.func
-def motion_of_bone(w: JointBench, e: int, b: int, x: wp.vec3):
+def motion_of_bone(w: TorqueWorkspace, e: int, b: int, x: wp.vec3):
     """Velocity of a bone's matter at ``x`` [m/s]."""
     return motion_at(w.moving[e, b], x - w.pose.position[e, 0])
 
 
 @wp.func
-def touch_of(body: Body, boundaries: Boundaries, w: JointBench, e: int, b: int, tracker: int, k: int) -> Touch:
+def touch_of(body: Body, boundaries: Boundaries, w: TorqueWorkspace, e: int, b: int, tracker: int, k: int) -> Touch:
     """A point of bone ``b``, by its place in the list of trackers, and boundary ``k``."""
     touch = Touch()
     touch.place = w.pose.position[e, b] + wp.quat_rotate(w.pose.rotation[e, b], at_rest(body, e, b, tracker))
@@ -127,7 +127,7 @@ def reach_along(half: wp.vec3, turn: wp.quat, n: wp.vec3):
 
 
 @wp.func
-def may_lack(boundaries: Boundaries, dt: float, w: JointBench, e: int, b: int, k: int):
+def may_lack(boundaries: Boundaries, dt: float, w: TorqueWorkspace, e: int, b: int, k: int):
     """Whether any point of a bone may be too fast for a boundary, by the box that holds them.
 
     A boundary that is no plane has other normals elsewhere: there it is by the ball around the box, and by speeds.
@@ -149,7 +149,7 @@ def may_lack(boundaries: Boundaries, dt: float, w: JointBench, e: int, b: int, k
 
 
 @wp.func
-def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: JointBench):
+def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: TorqueWorkspace):
     """Bits of the bones of which points may be too fast."""
     near = int(0)
     for b in range(thread, BONES, threads):
@@ -160,7 +160,9 @@ def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: J
 
 
 @wp.func
-def find_fastest(body: Body, ground: Ground, dt: float, e: int, thread: int, threads: int, w: JointBench) -> wp.vec2:
+def find_fastest(
+    body: Body, ground: Ground, dt: float, e: int, thread: int, threads: int, w: TorqueWorkspace
+) -> wp.vec2:
     """By how much the point is too fast that is so by most [m/s], and which: point, bone and boundary in a number.
 
     Few bones come near a boundary: the threads share the points of one after the other. The number is exact in single
@@ -206,7 +208,7 @@ def carries(body: Body, a: int, b: int):
 
 @wp.func
 def answer_at(
-    body: Body, factor: int, e: int, b: int, x: wp.vec3, thread: int, threads: int, room: wp.uint64, w: JointBench
+    body: Body, factor: int, e: int, b: int, x: wp.vec3, thread: int, threads: int, room: wp.uint64, w: TorqueWorkspace
 ) -> wp.mat33:
     """``K`` of bone ``b`` at ``x`` [1/kg], ``Y^T Y`` with ``Y = L^-T J^T``, which stays in the columns.
 
@@ -243,7 +245,9 @@ def answer_at(
 
 
 @wp.func
-def push(p: wp.vec3, b: int, own: int, factor: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench):
+def push(
+    p: wp.vec3, b: int, own: int, factor: int, e: int, thread: int, threads: int, room: wp.uint64, w: TorqueWorkspace
+):
     """Give bone ``b`` an impulse at the point that the columns are of: by ``M^-1 J^T p = L^-1 Y p``."""
     n = w.velocity.shape[0]
     wanted = w.pattern.reach[1 + b]
@@ -297,7 +301,7 @@ def stop_point(
     thread: int,
     threads: int,
     room: wp.uint64,
-    w: JointBench,
+    w: TorqueWorkspace,
 ) -> vec8:
     """Stop a point as :func:`find_fastest` names it; the impulse, and its moment about the pelvis joint."""
     boundaries = ground.boundaries
@@ -325,7 +329,7 @@ def stop_bones(
     thread: int,
     threads: int,
     room: wp.uint64,
-    w: JointBench,
+    w: TorqueWorkspace,
 ) -> vec8:
     """Let no bone go through a boundary: changes share ``own``, which the joints are about to add to their velocity.
 

@@ -59,12 +59,13 @@ pelvis, as a curriculum: at ``assist`` 1 it nearly holds the pelvis alone, at 0 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.avatar.body.device import BodyPoints
 from piavatar_envs.avatar.body.muscles import (
     FASTEST,
@@ -91,9 +92,9 @@ from piavatar_envs.avatar.torque_control.dynamics import (
 from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, put_in_place
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, JointMass, grid_inertia
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
-from piavatar_envs.avatar.torque_control.workspace import JointBench
-from piavatar_envs.avatar.types import ROOT_RATE, Body, JointState, Pose
-from piavatar_envs.core.arrays import group, vec8, vec12, vec16
+from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
+from piavatar_envs.avatar.types import ROOT_RATE, Body, JointState, Pose, allocate
+from piavatar_envs.core.arrays import group
 from piavatar_envs.core.cuda_intrinsics import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.types import Model, Scratch, State, row
@@ -165,71 +166,56 @@ class ArticulatedBody:
         chosen = np.flatnonzero(np.zeros(points.num_points) if firm is None else firm)
         self.firm = wp.array(chosen.astype(np.int32), dtype=int, device=device)
 
-        def zeros(shape, dtype):
-            return wp.zeros(shape, dtype=dtype, device=device)
-
-        bones = (n, NUM_JOINTS)
-        self.state = JointState(
-            rotation=zeros(bones, wp.quat),
-            position=zeros(bones, wp.vec3),
-            velocity=zeros((n, NUM_DOF), float),
-            outside=zeros((n, NUM_DOF), float),
-            torque=zeros(bones, wp.vec3),
-            slip=zeros((n, 1 + chosen.max(initial=0)), wp.vec3),
-        )
+        slip = 1 + int(chosen.max(initial=0))
+        self.state: JointState = allocate(JointState, n, device, velocity=NUM_DOF, outside=NUM_DOF, slip=slip)
         self.pose = group(Pose, rotation=self.state.rotation, position=self.state.position)
-        target = {"rotation": zeros(bones, wp.quat), "root": zeros(n, wp.vec3)}
-        self.target = group(Target, **target, torque=self.state.torque, factor=self._upload(np.ones(1)))
+        given = {"torque": self.state.torque, "factor": self._upload(np.ones(1))}
+        self.target = allocate(Target, n, device, **given)
         self.target.rotation.fill_(wp.quat_identity())
         self.solid = solid
         self.mass = JointMass(points, body, model)
         self._inertia = grid_inertia(points, model.grid.dx)
-        self._scratch = zeros(ALL_WORDS * points.num_points if self.threads == 1 else 0, float)
-        self.impulse = zeros((n, NUM_DOF), float)
-        self.support = group(Support, force=zeros(n, wp.vec3), torque=zeros(n, wp.vec3))
-        self._bench = self._allocate()
+        words = ALL_WORDS * points.num_points if self.threads == 1 else 0
+        self._scratch = wp.zeros(words, dtype=float, device=device)
+        self.impulse = wp.zeros((n, NUM_DOF), dtype=float, device=device)
+        self.support = allocate(Support, n, device)
+        self._workspace = self._allocate()
         without, everywhere = np.zeros((NUM_JOINTS, 3)), np.full((NUM_JOINTS, 3), UNBOUNDED)
         self.set_strength(-everywhere, everywhere, 1)
         self.set_tissue(without[:, 0], without[:, 0], -everywhere, everywhere, [])
 
-    def _allocate(self) -> JointBench:
-        """What a substep works on."""
-        n, s, mass = self.model.num_envs, self.state, self.mass
+    def _allocate(self) -> TorqueWorkspace:
+        """Return the arrays of a substep."""
+        n, s, mass, device = self.model.num_envs, self.state, self.mass, self.model.device
 
-        def zeros(dtype, *shape):
-            return wp.zeros(shape, dtype=dtype, device=self.model.device)
+        def rows(count: int, columns: int, dtype: type = float) -> wp.array:
+            return wp.zeros((count * n, columns), dtype=dtype, device=device)
 
         chunks = self.body.chunk_bone.shape[0]
-        return group(
-            JointBench,
+        return allocate(
+            TorqueWorkspace,
+            n,
+            device,
             pose=self.pose,
             velocity=s.velocity,
             outside=s.outside,
+            slip=s.slip,
+            impulse=self.impulse,
             pair_sums=mass.sums,
             records=mass.records,
             pattern=mass.pattern,
             matrix=mass.matrix,
-            diagonals=zeros(float, 2 * n, NUM_DOF),
             factors=mass.make_factors(2 * n + 1),
-            stop=zeros(float, n, NUM_JOINTS),
-            moments=zeros(vec16, n, chunks),
-            other_moments=zeros(vec12, n, chunks),
-            bones=zeros(vec16, n, NUM_JOINTS),
-            linear=zeros(wp.vec3, 3 * n, NUM_JOINTS),
-            angular=zeros(wp.vec3, 3 * n, NUM_JOINTS),
-            shares=zeros(float, 3 * n, NUM_DOF),
-            touch=zeros(float, 3 * n, NUM_DOF),
-            whole=zeros(float, n, NUM_DOF),
-            middle=zeros(wp.vec3, n, NUM_JOINTS),
-            half=zeros(wp.vec3, n, NUM_JOINTS),
-            muscle=zeros(float, n, NUM_DOF),
-            impulse=self.impulse,
-            left=zeros(float, n, NUM_DOF),
-            place=zeros(wp.mat44, n, NUM_JOINTS),
-            moving=zeros(vec8, n, NUM_JOINTS),
-            steps=zeros(vec12, n, NUM_JOINTS),
-            slip=self.state.slip,
-            pelvis=zeros(wp.vec3, n),
+            diagonals=rows(2, NUM_DOF),
+            moments=chunks,
+            other_moments=chunks,
+            linear=rows(3, NUM_JOINTS, wp.vec3),
+            angular=rows(3, NUM_JOINTS, wp.vec3),
+            shares=rows(3, NUM_DOF),
+            touch=rows(3, NUM_DOF),
+            whole=NUM_DOF,
+            muscle=NUM_DOF,
+            left=NUM_DOF,
         )
 
     def _upload(self, value: np.ndarray, dtype: type = float) -> wp.array:
@@ -245,7 +231,7 @@ class ArticulatedBody:
         """Let joints resist; see :func:`make_tissue`. To be called before anything is recorded."""
         self.tissue = make_tissue(damping, stop, lower, upper, locked, self.model.device)
         besides = np.r_[np.zeros(3), np.repeat(self._inertia + self.tissue.lock.numpy(), 3)]
-        own = self._bench.diagonals[: self.model.num_envs]
+        own = self._workspace.diagonals[: self.model.num_envs]
         own.assign(np.broadcast_to(besides.astype(np.float32), own.shape))
 
     def record_pose(self, graph: LaunchGraph, state: State) -> None:
@@ -254,7 +240,7 @@ class ArticulatedBody:
 
     def record_mass(self, graph: LaunchGraph, state: State) -> None:
         """Append: build the mass matrix where particles and joints are, if no substep does."""
-        w = self._bench
+        w = self._workspace
         graph.launch(
             sum_moments,
             (self.model.num_envs, warps_of(self.body.quarters, self.threads), self.threads),
@@ -269,11 +255,11 @@ class ArticulatedBody:
         self.mass.record_sums(graph, state, self.state.position)
         threads = int(MASS_BLOCK) if self.threads > 1 else 1
         inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure]
-        graph.launch(build_mass, (self.model.num_envs, threads), inputs, [self._bench], block_dim=threads)
+        graph.launch(build_mass, (self.model.num_envs, threads), inputs, [self._workspace], block_dim=threads)
 
     def _record_stage(self, graph: LaunchGraph, stage: wp.Kernel, inputs: list, state: State, *more: Any) -> None:
         """Append what a warp does for an environment."""
-        inputs, outputs = [*inputs, state.failure], [*more, self._bench]
+        inputs, outputs = [*inputs, state.failure], [*more, self._workspace]
         graph.launch(stage, (self.model.num_envs, self.threads), inputs, outputs, block_dim=self.threads)
 
     def record_substep(self, graph: LaunchGraph, state: State, scratch: Scratch, step: int) -> None:
@@ -286,7 +272,7 @@ class ArticulatedBody:
             step: which substep of its control step it is. The first one finds joints wherever they are; all others go
                 on from the one before.
         """
-        model, w, fit = self.model, self._bench, self.mass.is_due(step)
+        model, w, fit = self.model, self._workspace, self.mass.is_due(step)
         if step == 0:
             self.record_pose(graph, state)
         self._record_pull(graph, state)
@@ -316,7 +302,7 @@ class ArticulatedBody:
         dim = (self.model.num_envs, self._parts.start.shape[0] - 1, block)
         inputs = [self.body, self._parts, self.model.step.dt, self.model.particles.mass]
         inputs += [state.x, self.attachment, state.failure, self._scratch]
-        graph.launch(attach_flesh, dim, inputs, [state.u, state.vk, self._bench], block_dim=PART_BLOCK)
+        graph.launch(attach_flesh, dim, inputs, [state.u, state.vk, self._workspace], block_dim=PART_BLOCK)
 
     def record_end(self, graph: LaunchGraph, state: State) -> None:
         """Append what ends a control step: firm particles are put into their places on the bones as they are now.
@@ -325,14 +311,10 @@ class ArticulatedBody:
         """
         if self.firm.size == 0:
             return
-        model, w = self.model, self._bench
+        model, w = self.model, self._workspace
         inputs = [self.body, model.grid, model.boundaries, self.firm, w.place, w.pose.position, state.u, state.vk]
         inputs += [state.failure]
         graph.launch(put_in_place, model.num_envs * self.firm.size, inputs, [state.x, state.C, self.state.slip])
-
-
-if TYPE_CHECKING:
-    from piavatar_envs.avatar.pose_control.controller import AvatarDrive
 
 
 #: Longest substep with joints under torques [s].
@@ -458,45 +440,51 @@ def set_joints_in_motion(
 
 
 @wp.kernel
-def forget_slip(mask: wp.array(dtype=wp.bool), slip: wp.array2d(dtype=wp.vec3)):
-    """No particle of the masked environments has slipped."""
+def clear_slip(mask: wp.array(dtype=wp.bool), slip: wp.array2d(dtype=wp.vec3)):
+    """Clear the slip of the particles of the masked environments."""
     e, p = wp.tid()
     if mask[e]:
         slip[e, p] = wp.vec3(0.0)
 
 
-class JointDrive:
-    """What turns the joints of one avatar in every environment.
+class TorqueController:
+    """Lets torques act between the bones of one avatar in every environment.
 
     Attributes:
-        body: the joints.
+        avatar: the avatar.
+        joints: its articulated body.
         assist: of the pelvis, ``(num_envs,)``, 0 to 1; what is written here holds until it is written again.
         gains: springs and dampers of the reference adult's joints, ``(1, 23)``.
         first: the pose that bodies are on their way to when an episode begins, and reach after a control step: local
             rotations and root, as commands; None where they begin at rest. To be set before a reset is recorded.
     """
 
-    def __init__(self, points: BodyPoints, drive: AvatarDrive, settings: JointSettings) -> None:
+    def __init__(self, avatar: Avatar, points: BodyPoints, settings: JointSettings) -> None:
         """Allocate.
 
         Args:
-            points: the body as its drive was built from it.
-            drive: the avatar's, whose goals the springs pull to.
+            avatar: the avatar, whose goals the springs pull to.
+            points: the body that it was built from.
             settings: of the joints.
         """
-        n, model, muscles = drive.model.num_envs, drive.model, settings.muscles
-        self.drive = drive
+        n, model, muscles = avatar.model.num_envs, avatar.model, settings.muscles
+        self.avatar = avatar
         rows = np.zeros((n, 1 + NUM_JOINTS))
         flesh = settings.attachment[None], settings.firm
-        self.body = ArticulatedBody(points, drive.body, model, rows, rows, *flesh, settings.solid)
-        self.body.set_strength(muscles.lower, muscles.upper, n)
+        self.joints = ArticulatedBody(points, avatar.body, model, rows, rows, *flesh, settings.solid)
+        self.joints.set_strength(muscles.lower, muscles.upper, n)
         ranges = muscles.range_lower, muscles.range_upper
         locked = [joint_index(name) for name in LOCKED_JOINTS]
-        self.body.set_tissue(muscles.tissue_damping, muscles.stop, *ranges, locked)
-        goal = {"rotation": drive.state.goal_rotation, "root": drive.state.goal_root}
-        self.body.support = group(Support, force=drive.state.wrench_force, torque=drive.state.wrench_torque)
-        torques = {"torque": self.state.torque, "factor": self.body.strength.factor}
-        self.body.target = group(Target, **goal, **torques)
+        self.joints.set_tissue(muscles.tissue_damping, muscles.stop, *ranges, locked)
+        state = avatar.state
+        self.joints.support = group(Support, force=state.wrench_force, torque=state.wrench_torque)
+        self.joints.target = group(
+            Target,
+            rotation=state.goal_rotation,
+            root=state.goal_root,
+            torque=self.state.torque,
+            factor=self.joints.strength.factor,
+        )
         gains = [spring_rows(values).astype(np.float32) for values in (muscles.stiffness, muscles.damping)]
         stiffness, damping = (wp.array(values, dtype=float, device=model.device) for values in gains)
         self.gains = group(Springs, stiffness=stiffness, damping=damping)
@@ -506,11 +494,17 @@ class JointDrive:
         span = float(joints[joint_index("head"), 2] - joints[joint_index("left_foot"), 2])
         self._per_size = float(np.ptp(rest[:, 2])) / span / (REFERENCE_MASS * REFERENCE_HEIGHT)
         self.first: tuple[wp.array, wp.array] | None = None
+        self._first_pose = allocate(Pose, n, model.device)
 
     @property
-    def state(self):
-        """What a checkpoint holds."""
-        return self.body.state
+    def state(self) -> JointState:
+        """The joints' state: all that a checkpoint holds besides :attr:`assist`."""
+        return self.joints.state
+
+    @property
+    def moves_particles(self) -> bool:
+        """Whether the end of a control step puts firm particles into their places."""
+        return self.joints.firm.size > 0
 
     def release(self, joints: list[int]) -> None:
         """Take the springs from joints, by index, that torques alone shall move."""
@@ -519,48 +513,45 @@ class JointDrive:
             values[0, [1 + joint for joint in joints]] = 0.0
             array.assign(values)
 
-    def record_reset(self, graph: LaunchGraph, mask: wp.array) -> None:
-        """Append: joints of the masked environments into the pose that the drive has posed them in."""
-        s, posed = self.state, self.drive.scratch
-        graph.launch(
-            reset_joints,
-            (self.drive.model.num_envs, 1 + NUM_JOINTS),
-            [mask, posed.pose_rotation, posed.pose_position],
-            [s.rotation, s.position, s.torque, s.velocity, s.outside],
-        )
-        graph.launch(forget_slip, s.slip.shape, [mask], [s.slip])
+    def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
+        """Append: put the joints of the masked environments into the pose in which the avatar has been placed.
 
-    def record_motion(self, graph: LaunchGraph, mask: wp.array, after: Pose) -> None:
-        """Append: joints of the masked environments, reset already, reach a pose after a control step."""
-        model, body = self.drive.model, self.drive.body
-        inputs = [mask, body, model.control_dt, self.body.pose, after]
-        graph.launch(set_joints_in_motion, (model.num_envs, NUM_JOINTS), inputs, [self.state.velocity])
+        They are at rest, or on their way to :attr:`first`.
+        """
+        avatar, s = self.avatar, self.state
+        n, placed = avatar.model.num_envs, avatar.placed
+        outputs = [s.rotation, s.position, s.torque, s.velocity, s.outside]
+        graph.launch(reset_joints, (n, 1 + NUM_JOINTS), [mask, placed.rotation, placed.position], outputs)
+        graph.launch(clear_slip, s.slip.shape, [mask], [s.slip])
+        if self.first:
+            avatar.record_still_pose(graph, self.first, self._first_pose)
+            avatar.record_set_in_motion(graph, state, mask, self._first_pose)
+            inputs = [mask, avatar.body, avatar.model.control_dt, self.joints.pose, self._first_pose]
+            graph.launch(set_joints_in_motion, (n, NUM_JOINTS), inputs, [s.velocity])
 
     def record_begin(self, graph: LaunchGraph) -> None:
         """Append what begins a control step: strength and springs of the bodies as they are."""
-        drive, body = self.drive, self.body
+        avatar, joints = self.avatar, self.joints
+        avatar.record_clear_support(graph)
+        inputs = [avatar.body, self.gains, avatar.body_mass, self._per_size, self.assist, avatar.state.let_go]
         graph.launch(
             set_springs,
-            (drive.model.num_envs, 1 + NUM_JOINTS),
-            [
-                drive.body,
-                self.gains,
-                drive.body_mass,
-                self._per_size,
-                self.assist,
-                drive.state.let_go,
-                self.state.torque,
-            ],
-            [body.strength.factor, body.springs],
+            (avatar.model.num_envs, 1 + NUM_JOINTS),
+            [*inputs, self.state.torque],
+            [joints.strength.factor, joints.springs],
         )
 
-    def record_substep(self, graph: LaunchGraph, state: State, scratch: Scratch, step: int) -> None:
-        """Append what the joints do before substep ``step`` of a control step."""
-        self.body.record_substep(graph, state, scratch, step)
+    def record_before_substep(self, graph: LaunchGraph, state: State, scratch: Scratch, step: int) -> None:
+        """Append what the joints do before MPM substep ``step`` of a control step."""
+        self.joints.record_substep(graph, state, scratch, step)
 
     def record_end(self, graph: LaunchGraph, state: State) -> None:
-        """Append what ends a control step: particles of bones are in their places."""
-        self.body.record_end(graph, state)
+        """Append what ends a control step: firm particles are put into their places."""
+        self.joints.record_end(graph, state)
+
+    def arrays(self) -> dict[str, wp.array]:
+        """Return the arrays of a checkpoint, by name."""
+        return {field.name: getattr(self.state, field.name) for field in fields(self.state)} | {"assist": self.assist}
 
 
 def checked_assist(share: float | np.ndarray, num_envs: int) -> np.ndarray:

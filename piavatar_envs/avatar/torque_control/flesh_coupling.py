@@ -17,7 +17,7 @@ from piavatar_envs.avatar.part_sums import (
 from piavatar_envs.avatar.segment_sums import quarters_at_once, share_of
 from piavatar_envs.avatar.skinning import blend_back, blend_images, skinned_place
 from piavatar_envs.avatar.torque_control.dynamics import blended_motion, motion_apart
-from piavatar_envs.avatar.torque_control.workspace import JointBench
+from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import ask_ahead, int_at, matrix_at, number_at, set_vector, store_matrix, vector_at
 from piavatar_envs.core.cuda_intrinsics import environment_of, lane_of_warp, meet, threads_of_block, warp_of_block
@@ -28,7 +28,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
-def pulled_rest(body: Body, e: int, p: int, w: JointBench):
+def pulled_rest(body: Body, e: int, p: int, w: TorqueWorkspace):
     """What of the rest pose a particle is pulled to [m]: its own place; a firm one beyond, by what it was put back."""
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     if p < w.slip.shape[1]:
@@ -37,7 +37,7 @@ def pulled_rest(body: Body, e: int, p: int, w: JointBench):
 
 
 @wp.func
-def sum_part(parts: Parts, room: wp.uint64, pelvis: wp.vec3, e: int, part: int, w: JointBench):
+def sum_part(parts: Parts, room: wp.uint64, pelvis: wp.vec3, e: int, part: int, w: TorqueWorkspace):
     """Sums of the chunks of the part in the room, where places are seen from the ``pelvis``."""
     warp = warp_of_block()
     lane = lane_of_warp()
@@ -64,7 +64,7 @@ def attach_flesh(
     # in and out
     u: wp.array2d(dtype=wp.vec3),
     vk: wp.array2d(dtype=wp.vec3),
-    w: JointBench,
+    w: TorqueWorkspace,
 ):
     """Hand back, and pull every particle to its place on the bones, implicit in time and critically damped.
 

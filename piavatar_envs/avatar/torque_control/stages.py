@@ -45,7 +45,7 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import (
     store_room,
 )
 from piavatar_envs.avatar.torque_control.workspace import (
-    JointBench,
+    TorqueWorkspace,
     bring_places,
     enter_room,
     keep_motion,
@@ -82,7 +82,7 @@ class Support:
 
 
 @wp.func
-def place_bones(body: Body, e: int, thread: int, threads: int, w: JointBench):
+def place_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
     """Matrices that take the bones from rest to where they are, seen from the pelvis joint."""
     r = row(e, body.rest_joint.shape[0])
     pelvis = w.pose.position[e, 0]
@@ -91,7 +91,7 @@ def place_bones(body: Body, e: int, thread: int, threads: int, w: JointBench):
 
 
 @wp.func
-def begin(body: Body, e: int, thread: int, threads: int, w: JointBench):
+def begin(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
     """Motion and places of the bones, as passes over particles read them."""
     spread_motion(body, w.pose.position, w.velocity, e, e, thread, threads, w.moving)
     place_bones(body, e, thread, threads, w)
@@ -99,7 +99,7 @@ def begin(body: Body, e: int, thread: int, threads: int, w: JointBench):
 
 @wp.func
 def find_shares(
-    body: Body, own: int, step: int, rows: int, e: int, thread: int, threads: int, room: wp.uint64, w: JointBench
+    body: Body, own: int, step: int, rows: int, e: int, thread: int, threads: int, room: wp.uint64, w: TorqueWorkspace
 ):
     """The shares ``dq = M^-1 J^T m v`` that the joints can take of so many velocities, from the bones' momenta.
 
@@ -111,7 +111,7 @@ def find_shares(
 
 
 @wp.func
-def move_on(body: Body, dt: float, move: int, off: int, e: int, thread: int, threads: int, w: JointBench):
+def move_on(body: Body, dt: float, move: int, off: int, e: int, thread: int, threads: int, w: TorqueWorkspace):
     """Move the pose on by half a substep, first and second of the moves; by the third, fit it to the particles.
 
     That is by a share of ``dq = M^-1 J^T m way``, the way from particles to their places. It is in row ``off``, of the
@@ -130,7 +130,7 @@ def move_on(body: Body, dt: float, move: int, off: int, e: int, thread: int, thr
 
 
 @wp.func
-def pull_bones(body: Body, own: int, e: int, thread: int, threads: int, w: JointBench):
+def pull_bones(body: Body, own: int, e: int, thread: int, threads: int, w: TorqueWorkspace):
     """The joints get what the pull of the flesh has taken from the particles, with exactly its momentum."""
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     none = wp.vec3(0.0)
@@ -150,7 +150,7 @@ def limit_joints(
     e: int,
     thread: int,
     threads: int,
-    w: JointBench,
+    w: TorqueWorkspace,
 ) -> float:
     """Let muscles give no more than they have by share ``own``, and tell all threads how many would, or ``again``."""
     limited = float(0.0)
@@ -178,7 +178,7 @@ def turn_joints(
     thread: int,
     threads: int,
     room: wp.uint64,
-    w: JointBench,
+    w: TorqueWorkspace,
 ):
     """Springs, torques, tissue and what bones meet change the velocity of the joints, by share ``own``.
 
@@ -221,7 +221,7 @@ def build_mass(
     tissue: Tissue,
     failure: wp.array(dtype=int),
     # in and out
-    w: JointBench,
+    w: TorqueWorkspace,
 ):
     """The mass matrix where the bones' moments are, and its factors.
 
@@ -261,7 +261,7 @@ def begin_substep(
     body: Body,
     failure: wp.array(dtype=int),
     # in and out
-    w: JointBench,
+    w: TorqueWorkspace,
 ):
     """:func:`begin` where something else has moved the joints, or made them another body's.
 
@@ -291,7 +291,7 @@ def act(
     # in and out
     ground: Ground,
     support: Support,
-    w: JointBench,
+    w: TorqueWorkspace,
 ):
     """Take over what joints can of two velocities, that of the pull first; let them turn; move the pose on.
 

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class JointBench:
+class TorqueWorkspace:
     """What the joints work on in a substep; rows are environments', where there are several of a kind times as many."""
 
     pose: Pose
@@ -172,13 +172,13 @@ for (int n = threadIdx.x & 31; n < {3 * NUM_JOINTS}; n += 32) to[{_POSITION} + n
 __syncwarp();
 #endif
 """)
-def bring_pose(w: JointBench, e: int, room: wp.uint64):
+def bring_pose(w: TorqueWorkspace, e: int, room: wp.uint64):
     """Write the pose of an environment to the room."""
     ...
 
 
 @wp.func
-def enter_room(w: JointBench, e: int):
+def enter_room(w: TorqueWorkspace, e: int):
     """The bench with pose, motion, momenta and shares of an environment in the room of its warp.
 
     What has several rows has them as :func:`row_in_room` says; all else has one there, whatever the environment. On a
@@ -219,6 +219,6 @@ keep(near.pose.rotation, w.pose.rotation, {4 * NUM_JOINTS});
 keep(near.pose.position, w.pose.position, {3 * NUM_JOINTS});
 #endif
 """)
-def leave_room(w: JointBench, e: int, near: JointBench):
+def leave_room(w: TorqueWorkspace, e: int, near: TorqueWorkspace):
     """Write motion and pose from the room, as all threads have left them."""
     ...

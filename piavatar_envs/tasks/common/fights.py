@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from piavatar_envs.avatar.body.asset import load_body
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion.keyframes import Key, animate
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import AvatarConfig, ConfigError, SceneConfig, replace
@@ -82,7 +82,7 @@ class Stance:
         Args:
             key: the pose, at any time.
         """
-        joints = load_body().mean_body().joints
+        joints = load_asset().mean_body().joints
         keys = [dataclasses.replace(key, time=time) for time in (0.0, 1.0)]
         self.local_rotations = animate("stance", keys, joints).local_rotations[0]
 

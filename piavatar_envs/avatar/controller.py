@@ -1,0 +1,43 @@
+"""The protocol of an avatar's controller: what a control step calls, in the order in which it calls it.
+
+:class:`~piavatar_envs.avatar.pose_control.controller.PoseController` moves the flesh along a commanded pose;
+:class:`~piavatar_envs.avatar.torque_control.controller.TorqueController` lets torques act between bones.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import warp as wp
+
+from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.mpm.types import Scratch, State
+
+
+class Controller(Protocol):
+    """Moves one avatar in every environment; controllers of different avatars run in parallel."""
+
+    @property
+    def moves_particles(self) -> bool:
+        """Whether :meth:`record_end` moves particles: it must then wait for the sensors of the control step."""
+        ...
+
+    def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
+        """Append, when the particles of the masked environments have been placed: begin anew in their pose."""
+        ...
+
+    def record_begin(self, graph: LaunchGraph) -> None:
+        """Append what precedes the first substep of a control step; it uses neither particles, sensors nor failures."""
+        ...
+
+    def record_before_substep(self, graph: LaunchGraph, state: State, scratch: Scratch, step: int) -> None:
+        """Append what precedes MPM substep ``step`` of a control step: write velocities of the avatar's particles."""
+        ...
+
+    def record_end(self, graph: LaunchGraph, state: State) -> None:
+        """Append what follows the last substep of a control step."""
+        ...
+
+    def arrays(self) -> dict[str, wp.array]:
+        """Return the arrays of a checkpoint, by name."""
+        ...
