@@ -31,9 +31,9 @@ from agents.sb3.config import load_training
 from agents.sb3.workers import EnvFactory, start_workers
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.config import ConfigError, load_config, parse_assignments
+from piavatar_envs.core.rng import check_seeds
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.observations import ObservationLayout
-from piavatar_envs.envs.rng import check_seeds
 from piavatar_envs.envs.task import Task
 from piavatar_envs.render import label, side_by_side, write_video
 from piavatar_envs.render.video import check_suffix

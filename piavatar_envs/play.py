@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 import piavatar_envs  # noqa: F401 - registers the ids
-from piavatar_envs.envs.rng import check_seeds
+from piavatar_envs.core.rng import check_seeds
 from piavatar_envs.multi import load_world
 from piavatar_envs.render.video import check_suffix, write_video
 from piavatar_envs.tasks import listed_name, task_modules

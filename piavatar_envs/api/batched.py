@@ -17,8 +17,8 @@ from piavatar_envs.api.copies import check_state
 from piavatar_envs.api.seeds import checked_seed
 from piavatar_envs.avatar.torque_control.controller import checked_assist
 from piavatar_envs.core.launch_graph import available_cores
+from piavatar_envs.core.rng import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.batch_env import BatchEnv, check_count
-from piavatar_envs.envs.rng import NUM_SEEDS, check_seeds
 from piavatar_envs.envs.state import check_settings
 from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.world import check_device

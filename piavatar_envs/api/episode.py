@@ -18,9 +18,9 @@ from piavatar_envs.api.infos import failure_names, outcome, standing
 from piavatar_envs.api.picture import Pictures
 from piavatar_envs.api.seeds import checked_seed
 from piavatar_envs.config import EnvConfig
+from piavatar_envs.core.rng import NUM_SEEDS
 from piavatar_envs.envs.actions import check_actions
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.rng import NUM_SEEDS
 from piavatar_envs.envs.task import Task
 
 if TYPE_CHECKING:

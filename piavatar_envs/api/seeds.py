@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium.utils import seeding
 
-from piavatar_envs.envs.rng import check_seeds
+from piavatar_envs.core.rng import check_seeds
 
 
 def checked_seed(seed: Any) -> int:

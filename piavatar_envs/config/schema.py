@@ -6,12 +6,12 @@ What is in a world besides the ground: avatars, soft props and analytic collider
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from piavatar_envs.avatar.body.skeleton import joint_index
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.config.load import ConfigError, load_config
 from piavatar_envs.mpm.model import CFL_STABLE
 
@@ -537,3 +537,21 @@ class EnvConfig(BaseModel):
         for index, avatar in enumerate(self.scene.avatars):
             _check_control(self.control.mode, avatar.control, f"scene.avatars.{index}.")
         return self
+
+
+def select_joints(names: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the acting joints in skeleton order; all but the root if ``names`` is None.
+
+    Raises:
+        ConfigError: ``names`` has an unknown joint, a joint twice, or the root.
+    """
+    if names is None:
+        return JOINT_NAMES[1:]
+    unknown = [name for name in names if name not in JOINT_NAMES[1:]]
+    if unknown or len(set(names)) != len(names) or not names:
+        raise ConfigError(
+            f"joints={list(names)}: {unknown[0]!r} is not a joint; use some of {', '.join(JOINT_NAMES[1:])}"
+            if unknown
+            else f"joints={list(names)} must name each joint once and at least one"
+        )
+    return tuple(name for name in JOINT_NAMES if name in names)

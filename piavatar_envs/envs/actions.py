@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body.muscles import LOCKED_JOINTS
-from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log, short_of_pi, turn_about_z
 from piavatar_envs.avatar.torque_control.dynamics import Strength
 from piavatar_envs.config.load import ConfigError
@@ -116,24 +116,6 @@ class ActionSpec:
         action_map.root_step = self.root_speed * control_dt
         action_map.root_turn = self.root_turn_speed * control_dt
         return action_map
-
-
-def select_joints(names: Sequence[str] | None) -> tuple[str, ...]:
-    """Acting joints in skeleton order; all but the root if ``names`` is None.
-
-    Raises:
-        ConfigError: an unknown or repeated joint, or the root.
-    """
-    if names is None:
-        return JOINT_NAMES[1:]
-    unknown = [name for name in names if name not in JOINT_NAMES[1:]]
-    if unknown or len(set(names)) != len(names) or not names:
-        raise ConfigError(
-            f"joints={list(names)}: {unknown[0]!r} is not a joint; use some of {', '.join(JOINT_NAMES[1:])}"
-            if unknown
-            else f"joints={list(names)} must name each joint once and at least one"
-        )
-    return tuple(name for name in JOINT_NAMES if name in names)
 
 
 def check_actions(action: np.ndarray, shape: tuple[int, ...], names: Sequence[str]) -> np.ndarray:

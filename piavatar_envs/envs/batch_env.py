@@ -12,6 +12,7 @@ from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.avatar.torque_control.controller import checked_assist
 from piavatar_envs.core.launch_graph import LaunchGraph, compile_graphs
+from piavatar_envs.core.rng import NUM_SEEDS
 from piavatar_envs.envs.actions import apply_actions, apply_targets, apply_torques, follow_reference, refuse_nonfinite
 from piavatar_envs.envs.episodes import (
     EpisodeArrays,
@@ -24,7 +25,6 @@ from piavatar_envs.envs.episodes import (
     seeds_as_int32,
 )
 from piavatar_envs.envs.observer import Observer
-from piavatar_envs.envs.rng import NUM_SEEDS
 from piavatar_envs.envs.state import SETTINGS, check_arrays, check_settings, settings_rows
 from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.props import check_places

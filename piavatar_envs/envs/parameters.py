@@ -1,9 +1,9 @@
-"""What an episode has drawn, as its agents may observe it: with ``observe_parameters`` nothing that is drawn is hidden.
+"""The term of drawn parameters: with ``observe_parameters`` an agent observes every number that the episode has drawn.
 
-Parameters are written once a reset, normalised to [-1, 1] over the range they were drawn from. An agent sees the
-world's, its own avatar's, those of the others, counted on from itself, then the task's, and last the episode's clock,
-by which what has been drawn for later is known, too. Under torques an avatar's own end with what may be changed at any
-time: the help for its pelvis, as it is now.
+Parameters are stored once per reset, normalised to [-1, 1] over the range that they are drawn from. The order is: the
+world's, those of the agent's own avatar, those of the others (counted from the agent), the task's, and the episode's
+clock, which dates what is drawn for later. Under torque control an avatar's own parameters end with the current root
+assistance, which may change at any time.
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ import warp as wp
 from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.envs.episodes import EpisodeArrays
-from piavatar_envs.envs.observations import ObservationTerm, Parameter
+from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.world import Simulation
 
 wp.set_module_options({"enable_backward": False})
 
 #: Name of the term.
 PARAMETERS = "parameters"
-ASSIST = Parameter("root_assist", "-", 0.0, 1.0, "help for the pelvis from outside, as it is now")
+ASSIST = Parameter("root_assist", "-", 0.0, 1.0, "current external support of the pelvis")
 CLOCK = Parameter("clock", "-", 0.0, 1.0, "time since the reset over episode_seconds")
 
 
 class Drawn(NamedTuple):
-    """Where the number of a :class:`Parameter` is.
+    """The array that holds the number of a :class:`Parameter`.
 
     Attributes:
         values: of every environment, shape ``(num_envs,)``, float or int.
-        scale: from there to the parameter's unit.
+        scale: factor from ``values`` to the unit of the parameter.
     """
 
     values: wp.array
@@ -42,7 +43,7 @@ class Drawn(NamedTuple):
 
 
 def component(vectors: wp.array, index: int) -> wp.array:
-    """One component of an array of vectors ``(num_envs,)``, as a view; the array must outlive it."""
+    """Return a view of one component of an array of vectors ``(num_envs,)``; the array must outlive it."""
     return wp.array(
         ptr=vectors.ptr + 4 * index,
         dtype=wp.float32,
@@ -56,12 +57,13 @@ class Parameters:
     """The term :data:`PARAMETERS` of a batch.
 
     Attributes:
-        term: what an agent observes.
-        values: every parameter of every environment, normalised, shape ``(num_envs, columns)``: the world's, those of
-            each avatar, the task's. None before :meth:`connect`.
+        term: name, size and meaning.
+        values: normalised parameters, shape ``(num_envs, columns)``: the world's, those of each avatar, the task's.
+            None before :meth:`connect`.
     """
 
     def __init__(self, simulation: Simulation, task: Sequence[Parameter]) -> None:
+        """Collect the parameters of the world, of its avatars and of the task that have a range."""
         self.simulation, self._drawn = simulation, task
         world, own = simulation.randomization.parameters()
         shape = [parameter for parameter, _ in simulation.shapes.drawn(0).values()]
@@ -75,12 +77,12 @@ class Parameters:
         ]
         seen = (*self._world, *self._own, *others, *self._task, CLOCK)
         self.term = ObservationTerm(
-            PARAMETERS, len(seen), "-", "-", f"{_meaning(settings)}: {_told(seen)}", parameters=seen
+            PARAMETERS, len(seen), "-", "-", f"{_meaning(settings)}: {_listed(seen)}", parameters=seen
         )
         self.values: wp.array | None = None
 
     def connect(self, num_envs: int, values: Sequence[Drawn]) -> None:
-        """Find the numbers, when the task has allocated its own."""
+        """Find the arrays of all parameters, once the task has allocated its own."""
         simulation, count = self.simulation, len(self.simulation.avatars)
         random, device = simulation.randomization, simulation.device
         sources = [(parameter, Drawn(random.column(parameter.name))) for parameter in self._world]
@@ -99,24 +101,25 @@ class Parameters:
         self._columns = [wp.array(self._columns_of(agent, count), dtype=int, device=device) for agent in range(count)]
 
     def _columns_of(self, agent: int, count: int) -> np.ndarray:
-        """Columns of ``values`` in the order in which an agent observes them."""
+        """Return the columns of ``values`` in the order in which ``agent`` observes them."""
         world, own, task = len(self._world), len(self._own), len(self._task)
         bodies = [world + (agent + index) % count * own + np.arange(own) for index in range(count)]
         return np.concatenate([np.arange(world), *bodies, world + count * own + np.arange(task)]).astype(np.int32)
 
     def record_reset(self, graph: LaunchGraph, mask: wp.array) -> None:
-        """Append, when all has been drawn: normalise the parameters of the masked environments."""
+        """Record the launches that normalise the parameters which the masked environments have drawn."""
         for column, (parameter, _) in enumerate(self._sources):
             if parameter != ASSIST:
                 self._record(graph, mask, column)
 
     def record_settings(self, graph: LaunchGraph) -> None:
-        """Append, before anybody observes: normalise what may have been changed in any environment."""
+        """Record the launch that normalises the root assistance, which may have changed in any environment."""
         for column, (parameter, _) in enumerate(self._sources):
             if parameter == ASSIST:
                 self._record(graph, self._everywhere, column)
 
     def _record(self, graph: LaunchGraph, mask: wp.array, column: int) -> None:
+        """Record the launch that normalises one column of the masked environments."""
         parameter, drawn = self._sources[column]
         graph.launch(
             normalize if drawn.values.dtype is wp.float32 else normalize_count,
@@ -126,7 +129,7 @@ class Parameters:
         )
 
     def record_observe(self, graph: LaunchGraph, env: EpisodeArrays, agent: int) -> None:
-        """Append: write the term for ``agent``. Changes nothing else."""
+        """Record the launch that writes the term for ``agent`` and changes nothing else."""
         graph.launch(
             observe_parameters,
             (env.num_envs, self.term.size),
@@ -138,32 +141,32 @@ class Parameters:
         )  # fmt: skip
 
     def arrays(self) -> dict[str, wp.array]:
-        """Arrays of a checkpoint, by name."""
+        """Return the arrays of a checkpoint by name."""
         return {"parameters": self.values}
 
 
 def _ranging(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    """Those that have a range: the others are not drawn."""
+    """Return the parameters that have a range; the others are not drawn."""
     return tuple(parameter for parameter in parameters if parameter.low < parameter.high)
 
 
 def _meaning(settings: Sequence[Parameter]) -> str:
-    """What the term is, in a few words."""
-    return "what the episode has drawn" + ", and the help for the pelvis" * bool(settings)
+    """Describe the term in a few words."""
+    return "drawn parameters of the episode" + ", and the root assistance" * bool(settings)
 
 
-def _told(parameters: Sequence[Parameter]) -> str:
-    """Names, ranges and units, in one line."""
-    told = []
+def _listed(parameters: Sequence[Parameter]) -> str:
+    """List names, ranges and units in one line."""
+    lines = []
     for p in parameters:
         unit = "" if p.unit == "-" else f" {p.unit}"
-        told.append(f"{p.name} ({p.low:.4g} to {p.high:.4g}{unit}{', log' if p.log else ''})")
-    return "; ".join(told)
+        lines.append(f"{p.name} ({p.low:.4g} to {p.high:.4g}{unit}{', log' if p.log else ''})")
+    return "; ".join(lines)
 
 
 @wp.func
 def normalized(value: float, low: float, high: float, log: int):
-    """A parameter from its range to [-1, 1]."""
+    """Map a parameter from its range to [-1, 1]."""
     share = (value - low) / (high - low)
     if log != 0:
         share = wp.log(value / low) / wp.log(high / low)
@@ -182,7 +185,7 @@ def normalize(
     # out
     values: wp.array2d(dtype=float),
 ):
-    """A parameter of the masked environments."""
+    """Normalise a parameter of the masked environments; over ``(num_envs,)``."""
     e = wp.tid()
     if mask[e]:
         values[e, column] = normalized(scale * drawn[e], low, high, log)
@@ -200,7 +203,7 @@ def normalize_count(
     # out
     values: wp.array2d(dtype=float),
 ):
-    """The same of a whole number."""
+    """Normalise a whole number of the masked environments; over ``(num_envs,)``."""
     e = wp.tid()
     if mask[e]:
         values[e, column] = normalized(scale * float(drawn[e]), low, high, log)
@@ -218,7 +221,7 @@ def observe_parameters(
     # out
     observation: wp.array3d(dtype=float),
 ):
-    """The parameters of ``columns``, then the clock; over ``(num_envs, components)``."""
+    """Write the parameters of ``columns``, then the clock; over ``(num_envs, components)``."""
     e, n = wp.tid()
     if n < columns.shape[0]:
         observation[e, agent, start + n] = values[e, columns[n]]

@@ -14,8 +14,10 @@ import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import joint_limits
 from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
-from piavatar_envs.envs.actions import ActionSpec, select_joints
-from piavatar_envs.envs.observations import ObservationTerm, Parameter
+from piavatar_envs.config.schema import select_joints
+from piavatar_envs.envs.actions import ActionSpec
+from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 
 if TYPE_CHECKING:

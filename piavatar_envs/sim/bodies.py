@@ -39,12 +39,11 @@ from piavatar_envs.config import (
 )
 from piavatar_envs.config import replace as changed
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.envs.observations import Parameter
-from piavatar_envs.envs.rng import STREAM_PARAMETERS, generator
+from piavatar_envs.core.rng import STREAM_PARAMETERS, generator
 from piavatar_envs.mpm.materials import material_index
 from piavatar_envs.mpm.model import MaterialPoints
 from piavatar_envs.mpm.types import Model
-from piavatar_envs.sim.randomize import Randomization
+from piavatar_envs.sim.randomize import Parameter, Randomization
 
 wp.set_module_options({"enable_backward": False})
 

@@ -27,12 +27,39 @@ import warp as wp
 from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.config.schema import UNCHANGED, RandomizeConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.envs.observations import Parameter
-from piavatar_envs.envs.rng import STREAM_PARAMETERS, generator
+from piavatar_envs.core.rng import STREAM_PARAMETERS, generator
 from piavatar_envs.mpm.model import MaterialPoints
 from piavatar_envs.mpm.types import Model, row
 
 wp.set_module_options({"enable_backward": False})
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that every episode draws from a range, or that may be set to anything in it.
+
+    Attributes:
+        name: its name in the observation.
+        unit: physical unit, ``"-"`` if it has none.
+        low, high: bounds of the range, in that unit.
+        description: one line.
+        log: whether it is drawn, and observed, on a logarithmic scale.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    description: str
+    log: bool = False
+
+    def value(self, observed: float | np.ndarray) -> float | np.ndarray:
+        """Return the parameter in its unit from its observed value in [-1, 1]."""
+        share = 0.5 * (np.asarray(observed, float) + 1.0)
+        if self.log:
+            return self.low * np.exp(share * math.log(self.high / self.low))
+        return self.low + share * (self.high - self.low)
+
 
 #: Factors of a world, then those of each avatar: their settings, in the order of the columns, with what they are.
 OF_WORLD = {

@@ -17,9 +17,8 @@ from piavatar_envs.avatar.controller import Controller
 from piavatar_envs.avatar.pose_control.controller import PoseController
 from piavatar_envs.avatar.torque_control.controller import LONGEST_SUBSTEP, TorqueController
 from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig
-from piavatar_envs.config.schema import MOST_SUBSTEPS
+from piavatar_envs.config.schema import MOST_SUBSTEPS, select_joints
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.envs.actions import select_joints
 from piavatar_envs.mpm.colliders import Collider, make_boundaries, place_colliders
 from piavatar_envs.mpm.contact_sensors import clear_masked_sensors
 from piavatar_envs.mpm.memory import allocate, estimate_slots

@@ -12,9 +12,10 @@ from pydantic import Field
 
 from piavatar_envs.config import EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.envs.actions import ActionSpec, speed_within
-from piavatar_envs.envs.observations import ObservationTerm, Parameter
+from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.hits import Hits
 from piavatar_envs.tasks.common.place import PlaceRule, judge_pose, keep_place, observe_home

@@ -12,10 +12,10 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ControlConfig, EnvConfig, TorqueControlConfig
-from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import row
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.ground import Grounding
 from piavatar_envs.tasks.common.lying import first_poses, lying_rule, spawn_lying

@@ -11,10 +11,11 @@ from pydantic import Field
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import ControlConfig, EnvConfig, PoseControlConfig, SceneConfig, replace
 from piavatar_envs.config.schema import Place
-from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.rng import STREAM_BALL, generator
 from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.ball_goal import (
     GATE_TERMS,

@@ -13,9 +13,10 @@ from pydantic import Field
 from piavatar_envs.config import ConfigError, EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.config.schema import Length
 from piavatar_envs.envs.actions import ActionSpec
-from piavatar_envs.envs.observations import ObservationTerm, Parameter
+from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.leash import record_leash
 from piavatar_envs.tasks.common.pushing import Push, draw_push, find_hands, judge, observe, observe_lead

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from piavatar_envs.config import ControlConfig, EnvConfig, PropConfig, SceneConfig, TorqueControlConfig, replace
-from piavatar_envs.envs.observations import ObservationTerm, Parameter
+from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Task
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.fall import FallConfig
 from piavatar_envs.tasks.common.ground import Grounding

@@ -12,11 +12,12 @@ from pydantic import Field
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import EnvConfig
-from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.core.rng import STREAM_TASK, generator
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn, component
-from piavatar_envs.envs.rng import STREAM_TASK, generator
 from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import row
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.tasks.common.hands import write_hands
 from piavatar_envs.tasks.common.ranges import Margin, Weight
 from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance

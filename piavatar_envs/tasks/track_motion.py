@@ -17,10 +17,11 @@ from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.config import ConfigError, EnvConfig
 from piavatar_envs.envs.actions import ActionSpec
-from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_rotation, write_vector
+from piavatar_envs.envs.observations import ObservationTerm, write_rotation, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Task
 from piavatar_envs.sim.bodies import shape_parameters
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.clip import Clip, advance_reference, draw_start, read_clip
 from piavatar_envs.tasks.common.disturb import apply_impulse, draw_impulse, draw_offset

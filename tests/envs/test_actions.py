@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_limits
-from piavatar_envs.envs.actions import ActionSpec, check_actions, select_joints
+from piavatar_envs.config.schema import select_joints
+from piavatar_envs.envs.actions import ActionSpec, check_actions
 from piavatar_envs.mpm.types import FAILURE_ACTION
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.envs.rng import generator
+from piavatar_envs.core.rng import generator
 
 
 @wp.kernel

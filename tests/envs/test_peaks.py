@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.envs.observations import raise_peak
+from piavatar_envs.envs.observer import raise_peak
 
 wp.set_module_options({"enable_backward": False})
 

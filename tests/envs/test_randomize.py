@@ -12,10 +12,9 @@ import warp as wp
 
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import ASSIST, PARAMETERS
 from piavatar_envs.mpm.model import CFL_STABLE
-from piavatar_envs.sim.randomize import OF_AVATAR, OF_WORLD, draw_factors
+from piavatar_envs.sim.randomize import OF_AVATAR, OF_WORLD, Parameter, draw_factors
 from piavatar_envs.tasks import load_task
 
 RANGES = {"mass_factor": (0.5, 1.6), "stiffness_factor": (0.4, 1.5)}

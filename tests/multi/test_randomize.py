@@ -7,9 +7,8 @@ import pytest
 
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.observations import Parameter
 from piavatar_envs.envs.parameters import PARAMETERS
-from piavatar_envs.sim.randomize import OF_AVATAR
+from piavatar_envs.sim.randomize import OF_AVATAR, Parameter
 from tests.envs.test_randomize import VARIED, by_name, check_term, constants_of, factors_of
 
 #: Draws that tasks leave out by default.

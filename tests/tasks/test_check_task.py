@@ -12,8 +12,8 @@ import piavatar_envs
 from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.api.conformance import TaskError
 from piavatar_envs.config import ConfigError
+from piavatar_envs.core.rng import STREAM_TASK, generator
 from piavatar_envs.envs.observations import ObservationTerm
-from piavatar_envs.envs.rng import STREAM_TASK, generator
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks.common.spawn import record_standing
 

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Protocol
 import warp as wp
 
 from piavatar_envs.config import PropConfig, SceneConfig
-from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.core.rng import STREAM_TASK, generator
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn, component
-from piavatar_envs.envs.rng import STREAM_TASK, generator
 from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance
 

@@ -6,8 +6,8 @@ import warp as wp
 
 from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_log, turn_about_z
 from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.rng import STREAM_TASK, generator
 from piavatar_envs.envs.actions import ActionMap, keep_within
-from piavatar_envs.envs.rng import STREAM_TASK, generator
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False})

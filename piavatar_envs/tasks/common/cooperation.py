@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from piavatar_envs.envs.rng import STREAM_POSE, generator
+from piavatar_envs.core.rng import STREAM_POSE, generator
 
 if TYPE_CHECKING:
     from piavatar_envs.core.launch_graph import LaunchGraph

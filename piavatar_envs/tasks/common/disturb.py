@@ -6,7 +6,7 @@ import warp as wp
 
 from piavatar_envs.avatar.skinning import bones_of, weights_of
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.rng import STREAM_DISTURBANCE, generator
+from piavatar_envs.core.rng import STREAM_DISTURBANCE, generator
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False})

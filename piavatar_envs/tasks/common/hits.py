@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS
-from piavatar_envs.envs.observations import clear_stress, observe_stress
+from piavatar_envs.envs.observer import clear_stress, observe_stress
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.tasks.common.throws import Throws
 from piavatar_envs.tasks.common.turns import first_throw, steps_to_throw
@@ -62,12 +62,12 @@ class Hits:
     def record_outcome(self, env: BatchEnv, graph: LaunchGraph) -> None:
         """Append: costs, the metrics from the third on, and success."""
         sim = env.simulation
-        graph.launch(clear_stress, (env.num_envs, len(BODY_PARTS)), [env.observer.everybody, 0, 0], [self._stress])
+        graph.launch(clear_stress, (env.num_envs, len(BODY_PARTS)), [env.observer.all_envs, 0, 0], [self._stress])
         graph.launch(
             observe_stress,
             env.num_envs * sim.avatar.num_points,
             [
-                env.observer.everybody, sim.avatar.body, sim.model.particles, sim.state.F, self._part, 0, 0,
+                env.observer.all_envs, sim.avatar.body, sim.model.particles, sim.state.F, self._part, 0, 0,
                 1.0 / sim.flesh[0].physics.young_modulus,
             ],
             [self._stress],

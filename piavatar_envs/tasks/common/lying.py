@@ -9,7 +9,7 @@ import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.envs.rng import STREAM_POSE, STREAM_TASK, generator
+from piavatar_envs.core.rng import STREAM_POSE, STREAM_TASK, generator
 
 wp.set_module_options({"enable_backward": False})
 

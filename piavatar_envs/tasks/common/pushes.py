@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from piavatar_envs.core.rng import STREAM_BALL, STREAM_DISTURBANCE, generator
 from piavatar_envs.envs.observations import write_vector
-from piavatar_envs.envs.rng import STREAM_BALL, STREAM_DISTURBANCE, generator
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.tasks.common.throws import Throws, record_balls, throw_or_catch
 

@@ -6,8 +6,8 @@ import warp as wp
 
 from piavatar_envs.avatar.rotation import quat_exp, quat_log, turn_about_z
 from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.rng import STREAM_TASK, generator
 from piavatar_envs.envs.observations import write_vector
-from piavatar_envs.envs.rng import STREAM_TASK, generator
 from piavatar_envs.mpm.colliders import BOX, solid_distance
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.tasks.common.hands import write_hands

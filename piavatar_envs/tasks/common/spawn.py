@@ -9,7 +9,7 @@ import warp as wp
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.envs.rng import STREAM_POSE, generator
+from piavatar_envs.core.rng import STREAM_POSE, generator
 from piavatar_envs.mpm.types import row
 from piavatar_envs.sim.checks import check_beside_standing
 

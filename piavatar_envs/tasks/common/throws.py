@@ -15,7 +15,7 @@ import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.envs.rng import STREAM_BALL, generator
+from piavatar_envs.core.rng import STREAM_BALL, generator
 from piavatar_envs.sim.scene import Domain
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.envs.rng import STREAM_BALL, generator
+from piavatar_envs.core.rng import STREAM_BALL, generator
 from piavatar_envs.tasks.common.throws import MASSES, Throws, throw_or_catch
 
 wp.set_module_options({"enable_backward": False})

@@ -15,12 +15,13 @@ from pydantic import Field
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
-from piavatar_envs.envs.actions import select_joints
-from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.config.schema import select_joints
+from piavatar_envs.core.rng import STREAM_TASK, generator
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.rng import STREAM_TASK, generator
 from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.tasks.common.cooperation import record_fall_together, record_shift
 from piavatar_envs.tasks.common.fall import UNDER_TORQUES_DOC, FallConfig
 from piavatar_envs.tasks.common.fights import Referee, part_impulse_by

@@ -13,12 +13,14 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.config import EnvConfig, SceneConfig, replace
-from piavatar_envs.envs.actions import ActionSpec, select_joints, speed_within
-from piavatar_envs.envs.observations import ObservationTerm, Parameter, write_vector
+from piavatar_envs.config.schema import select_joints
+from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.envs.actions import ActionSpec, speed_within
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.rng import STREAM_BALL, generator
 from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import Sensors
+from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.ball_goal import BALL, ball_config
 from piavatar_envs.tasks.common.cooperation import record_fall_together, record_shift

@@ -11,7 +11,8 @@ from pydantic import Field
 
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key
 from piavatar_envs.config import ConfigError, EnvConfig, SceneConfig
-from piavatar_envs.envs.actions import ActionSpec, select_joints
+from piavatar_envs.config.schema import select_joints
+from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import Sensors
