@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
 
 from piavatar_envs.config import FROZEN, ConfigError, EnvConfig, FrozenDict, load_config
 from piavatar_envs.envs.task import Task
-from piavatar_envs.multi import load_world
+from piavatar_envs.multi import Game, load_game
 
 Resolved = TypeVar("Resolved", bound=BaseModel)
 
@@ -45,14 +44,14 @@ class EvaluationSettings(BaseModel):
     )
 
 
-def multi_module(env_id: str) -> ModuleType:
-    """The PettingZoo module of an id.
+def multi_game(env_id: str) -> Game:
+    """Return a game of several agents by its name.
 
     Raises:
-        ValueError: there is no such module, or PettingZoo is not installed.
+        ValueError: there is no such game.
     """
     try:
-        return load_world(env_id)
+        return load_game(env_id)
     except ImportError as error:
         raise ValueError(f"{env_id} is not importable: {error}") from error
 

@@ -262,7 +262,7 @@ def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Ev
     """
     episodes = [Episode(first_seed + env) for env in range(batch.num_envs)]
     batch.reset([episode.seed for episode in episodes])
-    told = {name: batch.task.metrics.index(name) for name in TOLD if name in batch.task.metrics}
+    told = {name: batch.task.metric_names.index(name) for name in TOLD if name in batch.task.metric_names}
     success = np.zeros((batch.num_envs, batch.num_agents), bool)
     playing = np.ones(batch.num_envs, bool)
     begin_round(agent, batch.num_envs)

@@ -25,7 +25,7 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks import runner
-from piavatar_envs.multi import listed_worlds, load_world
+from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.tasks import task_modules
 
 #: Seed of the environments and of the actions.
@@ -50,7 +50,7 @@ class Options(runner.Options):
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
     """Yield a row for each world, control mode and resolution; refused combinations say why."""
-    games = listed_worlds() if options.num_envs == 1 else {}
+    games = listed_games() if options.num_envs == 1 else ()
     worlds = options.worlds or (*task_modules(), *games)
     every = [(w, c, f) for f in options.fidelity for w in worlds for c in options.control]
     for world, control, fidelity in runner.progress(every, "baseline"):
@@ -68,7 +68,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 def _make(world: str, options: Options, **settings: Any) -> Any:
     if "/" not in world:
-        return load_world(world).parallel_env(device=options.device, **settings)
+        return load_game(world).parallel_env(device=options.device, **settings)
     if options.num_envs == 1:
         return gym.make(world, device=options.device, disable_env_checker=True, **settings).unwrapped
     return gym.make_vec(world, num_envs=options.num_envs, device=options.device, **settings).unwrapped

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from piavatar_envs.api.conformance import check_task
     from piavatar_envs.envs.task import Task
 
-__all__ = ["check_task", "register_task"]
+__all__ = ["check_task", "register_game", "register_task"]
 __version__ = "0.1.0"
 
 #: What Gymnasium calls for every id.
@@ -49,6 +49,22 @@ def register_task(env_id: str, task: type[Task] | str) -> None:
     registry.pop(env_id, None)  # without Gymnasium's warning: a notebook's cell is often run twice
     # by what a process that has not run this can import
     _register(env_id, place_of(env_id, task))
+
+
+def register_game(name: str, task: type[Task] | str) -> None:
+    """Make a task of several agents a game for :mod:`piavatar_envs.multi` and the command line; see docs/tasks.md.
+
+    Args:
+        name: a name and a version: ``"tag_v0"``. Registering it again replaces it.
+        task: a subclass of :class:`piavatar_envs.envs.task.Task`, or ``"module:Class"``, imported when it is made.
+
+    Raises:
+        TypeError: the task is neither.
+        ValueError: a name without a version, or that of a game of this package.
+    """
+    from piavatar_envs.tasks.games import add_game
+
+    add_game(name, task)
 
 
 def __getattr__(name: str) -> Any:

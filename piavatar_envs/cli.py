@@ -143,11 +143,11 @@ def registered_ids() -> list[str]:
     import gymnasium
 
     from piavatar_envs import ENTRY_POINT  # importing the package registers the ids
-    from piavatar_envs.multi import listed_worlds
+    from piavatar_envs.multi import listed_games
 
     found = gymnasium.registry.items()
     ids = [name for name, spec in found if spec.namespace == NAMESPACE or spec.entry_point == ENTRY_POINT]
-    return [*sorted(ids), *listed_worlds()]
+    return [*sorted(ids), *listed_games()]
 
 
 def describe(env_id: str) -> str:
@@ -162,7 +162,7 @@ def describe(env_id: str) -> str:
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", env_id.partition("/")[2].partition("-v")[0]).lower()
         path = Path(__file__).parent / "tasks" / f"{name}.py"
     else:
-        path = Path(__file__).parent / "multi" / f"{env_id}.py"
+        path = Path(__file__).parent / "tasks" / "games" / f"{env_id.rpartition('_v')[0]}.py"
     if not path.is_file():
         return ""
     docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 import piavatar_envs  # noqa: F401 - registers the ids
 from piavatar_envs.core.rng import check_seeds
-from piavatar_envs.multi import load_world
+from piavatar_envs.multi import load_game
 from piavatar_envs.render.video import check_suffix, write_video
 from piavatar_envs.tasks import listed_name, task_modules
 
@@ -128,7 +128,7 @@ class Together:
             ValueError: there is no such module.
             ImportError: PettingZoo is not installed.
         """
-        self.env = load_world(name, task_modules()).parallel_env(**settings)
+        self.env = load_game(name, task_modules()).parallel_env(**settings)
         self.name, self.metadata, self.render_mode = name, self.env.metadata, self.env.render_mode
         first = self.env.action_space(self.env.possible_agents[0])
         self.action_space = gymnasium.vector.utils.batch_space(first, len(self.env.possible_agents))

@@ -199,7 +199,7 @@ def test_modules_of_several_agents_are_played_too(name):
     rollout = play.play(name, agent="zero", steps=3, overrides={"fidelity": "tiny"})
     assert rollout.steps == 3 and len(rollout.returns) == 1 and not rollout.failures
     assert {"agent_0.success", "agent_1.reward_terms.control"} <= set(rollout.metrics)
-    with pytest.raises(ValueError, match=r"unknown world 'sumo_v9'.*sumo_v0"):
+    with pytest.raises(ValueError, match=r"unknown game 'sumo_v9'.*sumo_v0"):
         play.play("sumo_v9", steps=1)
 
 

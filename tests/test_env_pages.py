@@ -16,7 +16,7 @@ from piavatar_envs.config import FROZEN, ControlConfig, EnvConfig, PoseControlCo
 from piavatar_envs.config.load import setting_keys
 from piavatar_envs.config.schema import AvatarConfig, ColliderConfig, PropConfig, SceneConfig
 from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.task import Metric, Task, Term
 from piavatar_envs.mpm.types import FAILURE_NAMES
 from scripts.pages import markdown, pictures
 from scripts.pages.entries import ROOT, Entry, Facts, entries, gather
@@ -192,12 +192,9 @@ class MadeUp(Task):
     Config = MadeUpConfig
     description = "made up"
     summary = "A task that is made up."
-    reward_terms = ("near",)
-    reward_docs = {"near": "of being near"}  # noqa: RUF012
-    metrics = ("distance",)
-    metric_docs = {"distance": "a distance [m]"}  # noqa: RUF012
-    cost_terms = ("force",)
-    cost_docs = {"force": "of pressing"}  # noqa: RUF012
+    rewards = (Term("near", "of being near"),)
+    metrics = (Metric("distance", "m", "a distance"),)
+    costs = (Term("force", "of pressing"),)
     success_doc = "it is near"
 
 
@@ -240,10 +237,10 @@ def test_every_gap_is_found(facts):
 
     assert found(summary="") == ["MadeUp.summary is empty"]
     assert found(success_doc="") == ["MadeUp.success_doc is empty"]
-    assert found(reward_terms=("near", "far")) == ["MadeUp.reward_docs lacks 'far'"]
-    assert found(cost_docs={"force": " "}) == ["MadeUp.cost_docs lacks 'force'"]
-    assert found(cost_terms=()) == ["MadeUp.cost_docs explains 'force', which there is not"]
-    assert found(metric_docs={}) == ["MadeUp.metric_docs lacks 'distance'", "info['distance'] is not explained"]
+    assert found(rewards=(Term("far"),)) == ["MadeUp.rewards: far has no description"]
+    assert found(costs=(Term("force", " "),)) == ["MadeUp.costs: force has no description"]
+    assert found(metrics=(Metric("distance"),)) == ["MadeUp.metrics: distance has no description"]
+    assert found(metrics=()) == ["info['distance'] is not explained"]
     mute = ObservationLayout([ObservationTerm("height", 1, "m", "world", "")])
     assert found(replace(facts, layout=mute)) == ["observation term height has no description"]
     assert found(replace(facts, info={"novel": 1})) == ["info['novel'] is not explained"]

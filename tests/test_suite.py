@@ -162,9 +162,9 @@ def test_reward_is_the_sum_of_its_terms(make_env, env_id):
     for _, reward, terminated, truncated, info in rollout(env, 30, seed=2)[1:]:
         assert type(reward) is float and type(terminated) is bool and type(truncated) is bool
         terms = info["reward_terms"]
-        assert tuple(terms) == task.reward_terms and np.isfinite(list(terms.values())).all()
+        assert tuple(terms) == task.reward_names and np.isfinite(list(terms.values())).all()
         assert reward == pytest.approx(sum(terms.values()), abs=1e-6)
-        assert set(task.metrics) <= set(info) and all(np.isfinite(info[name]) for name in task.metrics)
+        assert set(task.metric_names) <= set(info) and all(np.isfinite(info[name]) for name in task.metric_names)
         # the shaping is at most one; what an action costs is all that is negative
         assert -env.config.control_cost <= reward <= 1.0
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
-from agents.config import MOST_RUNS, EvaluationSettings, load_resolved, multi_module
+from agents.config import MOST_RUNS, EvaluationSettings, load_resolved, multi_game
 from agents.sb3.ppo import PPOSettings
 from agents.sb3.sac import SACSettings
 from agents.sb3.selfplay import SelfPlaySettings
@@ -98,5 +98,5 @@ def env_config(config: TrainingConfig) -> EnvConfig:
 
 
 def _env_class(config: TrainingConfig) -> type[EnvConfig]:
-    task = multi_module(config.env_id).TASK if config.is_multi else load_task(config.env_id)
+    task = multi_game(config.env_id).TASK if config.is_multi else load_task(config.env_id)
     return task.Config

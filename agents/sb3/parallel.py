@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from piavatar_envs.config import ConfigError, EnvConfig
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.multi import load_game
 
 if TYPE_CHECKING:
     from pettingzoo import ParallelEnv
@@ -133,13 +134,13 @@ class WorldFactory:
     """Makes one world, in whichever process calls it.
 
     Attributes:
-        module: that has ``parallel_env``.
+        game: its name, or a module that has ``parallel_env``.
         settings: of the world.
         device: Warp's.
         render_mode: None or ``"rgb_array"``.
     """
 
-    module: str
+    game: str
     settings: dict[str, Any]
     device: str = "cpu"
     render_mode: str | None = None
@@ -147,7 +148,8 @@ class WorldFactory:
     def __call__(self) -> World:
         """The world."""
         quiet_warp()
-        make: Callable[..., ParallelEnv] = importlib.import_module(self.module).parallel_env
+        game = importlib.import_module(self.game) if "." in self.game else load_game(self.game)
+        make: Callable[..., ParallelEnv] = game.parallel_env
         return World(make(config=self.settings, device=self.device, render_mode=self.render_mode))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from agents.config import multi_module
+from agents.config import multi_game
 from agents.sb3.config import TrainingConfig
 from agents.sb3.parallel import World, WorldFactory
 from piavatar_envs.api.sb3 import SB3VecEnv
@@ -46,7 +46,7 @@ class EnvFactory:
 def factory(config: TrainingConfig, device: str = "cpu") -> EnvFactory | WorldFactory:
     """What makes the environments of a training run: worlds, where there are several agents."""
     if config.is_multi:
-        return WorldFactory(multi_module(config.env_id).__name__, dict(config.env), device)
+        return WorldFactory(multi_game(config.env_id).name, dict(config.env), device)
     return EnvFactory(config.env_id, dict(config.env), device)
 
 

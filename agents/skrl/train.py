@@ -23,7 +23,7 @@ from skrl.trainers.torch import SequentialTrainer
 
 from agents.batch_training import BatchTraining, Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, check_finite, random_states, seed_all, set_random_states
-from agents.config import multi_module
+from agents.config import multi_game
 from agents.evaluate import Agent
 from agents.files import write_config, write_whole
 from agents.report import Curve
@@ -49,7 +49,7 @@ def find_world(env_id: str) -> type[Task]:
     Raises:
         ValueError: there is no such world, or PettingZoo is not installed.
     """
-    return multi_module(env_id).TASK
+    return multi_game(env_id).TASK
 
 
 class Worlds(AvatarSkrlMultiEnv):

@@ -23,7 +23,7 @@ from agents.sb3.policy import policy_agent
 from agents.sb3.train import train
 from agents.sb3.workers import factory, prepare, start_workers
 from benchmarks import runner
-from piavatar_envs.multi import listed_worlds
+from piavatar_envs.multi import listed_games
 from piavatar_envs.tasks import task_modules
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,7 +53,7 @@ class Options(runner.Options):
 
 def every_environment() -> list[str]:
     """Registered ids, then modules of several agents."""
-    return [*task_modules(), *listed_worlds()]
+    return [*task_modules(), *listed_games()]
 
 
 def training_config(env_id: str, options: Options) -> TrainingConfig:

@@ -23,7 +23,7 @@ from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
 from piavatar_envs.sim.world import GRID_PER_HEIGHT, record_control_step
-from piavatar_envs.tasks.common.disturb import apply_impulse
+from piavatar_envs.tasks.track_motion import apply_impulse
 
 DENSITY = 1000.0
 LOWER, UPPER = (-1.6, -1.6, -0.7), (1.6, 1.6, 2.6)  # room enough for bodies that come apart

@@ -30,8 +30,8 @@ State = dict[str, np.ndarray]
 
 #: Numbers behind the last row in which is seen what a task writes beyond its columns, and what stands there until then.
 SPARE, UNTOUCHED = 8, -1.2345678e30
-#: Arrays of the batch whose last dimension are a task's names, and how these are called.
-NAMED = {"terms": "reward_terms", "cost_terms": "cost_terms", "metrics": "metrics"}
+#: Arrays of the batch by name, and the attributes of a task that declare their columns.
+NAMED = {"terms": "rewards", "cost_terms": "costs", "metrics": "metrics"}
 
 
 class FiniteWatch:
@@ -52,7 +52,8 @@ class FiniteWatch:
         def outcome(env: EpisodeArrays, graph: LaunchGraph) -> None:
             record_outcome(env, graph)
             for name, declared in NAMED.items():
-                self._note(env, graph, getattr(env, name), getattr(task, declared), 0, range(env.num_agents))
+                names = [one.name for one in getattr(task, declared)]
+                self._note(env, graph, getattr(env, name), names, 0, range(env.num_agents))
 
         def observe(env: EpisodeArrays, graph: LaunchGraph, agent: int, start: int) -> None:
             record_observe(env, graph, agent, start)
@@ -82,7 +83,7 @@ class FiniteWatch:
         return [name for names, found in self._found.items() for name, n in zip(names, found.numpy(), strict=True) if n]
 
     def beyond(self) -> dict[str, tuple[int, int]]:
-        """Of ``reward_terms``, ``cost_terms`` and ``metrics``, those of which the task writes more than it declares.
+        """Of ``rewards``, ``costs`` and ``metrics``, those of which the task writes more than it declares.
 
         What is written beyond a row is the next one's, where nobody can tell it from what that row's agent has written;
         it is seen behind the last agent of the last environment.
@@ -328,7 +329,7 @@ class Trial:
     def _place(self, name: str, at: tuple[int, ...], env: int | None) -> str:
         """What an element of a run is called."""
         task, what = self.many.task, name
-        names = {"terms": task.reward_terms, "cost_terms": task.cost_terms, "metrics": task.metrics}.get(name, ())
+        names = {"terms": task.reward_names, "cost_terms": task.cost_names, "metrics": task.metric_names}.get(name, ())
         if name in ("start", "observation"):
             what = f"observation {component(self.many, at[3])}"
         elif names:  # without there is a column that means nothing

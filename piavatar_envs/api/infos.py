@@ -41,11 +41,11 @@ def outcome(read: Reader, task: Task, agent: int) -> dict[str, Any]:
         values = read(array_of)[:, agent] if names else None
         return {name: values[:, index] for index, name in enumerate(names)}
 
-    found: dict[str, Any] = named(task.metrics, lambda batch: batch.metrics)
-    found["reward_terms"] = named(task.reward_terms, lambda batch: batch.terms)
-    if task.cost_terms:
+    found: dict[str, Any] = named(task.metric_names, lambda batch: batch.metrics)
+    found["reward_terms"] = named(task.reward_names, lambda batch: batch.terms)
+    if task.costs:
         found["cost"] = read(lambda batch: batch.cost)[:, agent]
-        found["cost_terms"] = named(task.cost_terms, lambda batch: batch.cost_terms)
+        found["cost_terms"] = named(task.cost_names, lambda batch: batch.cost_terms)
     return found
 
 

@@ -170,7 +170,7 @@ class AvatarRslEnv(Copied, BatchedView, VecEnv):
         done = step_and_reset(self.episodes, actions[:, None])
         extras = {
             "time_outs": done.truncated[:, 0],
-            "log": means(done.infos, self.episodes.task.metrics),
+            "log": means(done.infos, self.episodes.task.metric_names),
             "final_observations": self.grouped(done.final_observation),
             "info": done.infos[0],
         }

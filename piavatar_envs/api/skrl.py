@@ -124,7 +124,7 @@ class AvatarSkrlEnv(Copied, BatchedView):
             **done.infos[0],
             "final_obs": {"policy": self._seen(done.final_observation)},
             "_final_obs": done.ended,
-            "episode": means(done.infos, self.episodes.task.metrics),
+            "episode": means(done.infos, self.episodes.task.metric_names),
         }
         outcome = done.reward[:, 0], done.terminated[:, 0], done.truncated[:, 0]
         return {"policy": self._seen(done.observation)}, *outcome, info
@@ -259,7 +259,7 @@ class AvatarSkrlMultiEnv(Copied, BatchedView):
             "final_obs": self._seen(done.final_observation),
             "final_state": done.final_observation.flatten(1),
             "_final_obs": done.ended,
-            "episode": means(done.infos, self.episodes.task.metrics),
+            "episode": means(done.infos, self.episodes.task.metric_names),
         }
 
     def state(self) -> Array:

@@ -17,6 +17,7 @@ from piavatar_envs.envs.actions import apply_actions, apply_targets, apply_torqu
 from piavatar_envs.envs.episodes import (
     EpisodeArrays,
     begin_episode,
+    clear_words,
     count_episodes,
     end_agent,
     end_step,
@@ -88,11 +89,12 @@ class BatchEnv(EpisodeArrays):
             for controller in simulation.controllers:
                 controller.release([joint_index(name) for name in self.action_spec.joints])
         self.observer = Observer(simulation, task)
-        names = len(task.reward_terms), len(task.cost_terms), len(task.metrics)
+        names = len(task.rewards), len(task.costs), len(task.metrics)
         max_steps = max(1, round(task.config.episode_seconds / task.config.physics.control_dt))
         super().__init__(simulation, self.observer.layout, self.action_spec.size, names, max_steps, seed)
         self.action_map = self.action_spec.upload(self.config.physics.control_dt, task.limits(), self.device)
         self.restarts = 0
+        task.allocate_declared(self)
         task.allocate(self)
         self.observer.connect(self)
         self.reset_graph = LaunchGraph(self.device, condition=self.begins)
@@ -115,6 +117,8 @@ class BatchEnv(EpisodeArrays):
         clocks, flags = [self.step_count, self.head_start], [self.terminated, self.truncated, self.success, self.alive]
         graph.launch(begin_episode, (n, self.num_agents), [self.mask], [*clocks, *flags, self.begins])
         sim.record_draws(graph, self.mask, self.seed, self.episode)
+        for words in self.task.cleared_words():
+            graph.launch(clear_words, words.shape, [self.mask], [words])
         self.task.record_reset(self, graph)
         sim.record_reset(graph, self.mask)
         self.observer.record_reset(graph, self.mask)

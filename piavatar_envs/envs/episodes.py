@@ -93,6 +93,18 @@ def seeds_as_int32(seeds: np.ndarray) -> np.ndarray:
 
 
 @wp.kernel
+def clear_words(
+    mask: wp.array(dtype=wp.bool),
+    # out
+    words: wp.array2d(dtype=int),
+):
+    """Zero an array, read as 32-bit words, in the masked environments."""
+    e, n = wp.tid()
+    if mask[e]:
+        words[e, n] = 0
+
+
+@wp.kernel
 def count_episodes(
     mask: wp.array(dtype=wp.bool),
     new_seed: wp.array(dtype=int),

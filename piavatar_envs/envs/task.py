@@ -1,12 +1,13 @@
-"""What a task is: a configuration, where bodies start, what they shall do, what it is worth.
+"""The interface of a task: its settings, its scene, and the launches that reset, judge and observe it.
 
-A task records kernel launches into the graphs of the :class:`~piavatar_envs.envs.batch_env.BatchEnv`; it never sees
-single environments, and nothing it does leaves the device.
+A task records kernel launches into the graphs of the :class:`~piavatar_envs.envs.batch_env.BatchEnv`. Every launch
+covers all environments, and nothing that a task does leaves the device.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -17,17 +18,16 @@ from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConf
 from piavatar_envs.config.schema import select_joints
 from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 
 if TYPE_CHECKING:
     from piavatar_envs.core.launch_graph import LaunchGraph
     from piavatar_envs.envs.episodes import EpisodeArrays
-    from piavatar_envs.envs.parameters import Drawn
     from piavatar_envs.render.scene import Marker
 
-
-#: What ``info`` says of every environment, and what views of it add; no metric can have these names.
+#: Keys of every environment's ``info`` and of its views; no metric can have these names.
 NAMES_OF_INFO = (
     "success", "failure", "root_force", "root_torque", "root_let_go", "reward_terms", "cost", "cost_terms",
     "final_info", "final_obs", "final_state", "episode", "is_success", "terminal_observation", "TimeLimit.truncated",
@@ -35,44 +35,96 @@ NAMES_OF_INFO = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Term:
+    """A named part of the reward or of the cost.
+
+    Attributes:
+        name: key in ``info["reward_terms"]`` or ``info["cost_terms"]``.
+        description: its value, with the settings that shape it (Markdown, for the task's page).
+    """
+
+    name: str
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number in ``info`` that is neither reward nor cost.
+
+    Attributes:
+        name: key in ``info``.
+        unit: physical unit, ``"-"`` for none.
+        description: one line.
+    """
+
+    name: str
+    unit: str = "-"
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class TaskArray:
+    """An array of a task, which becomes its attribute ``name``, of shape ``(num_envs, *shape)``.
+
+    Attributes:
+        name: of the attribute, and in a saved state.
+        dtype: Warp type of an element.
+        shape: sizes after the first; a name stands for the setting of that name.
+        cleared: whether an episode begins with zeros.
+        drawn: the meaning of its components where episodes draw them, for ``observe_parameters``.
+    """
+
+    name: str
+    dtype: Any = float
+    shape: tuple[int | str, ...] = ()
+    cleared: bool = False
+    drawn: tuple[Parameter, ...] = ()
+
+
 class Task:
-    """Base of all tasks; a task subclasses it once.
+    """Base of all tasks.
 
     Class attributes:
-        Config: the task's configuration class.
+        Config: class of the settings.
         description: one line for listings.
-        observation_terms: what the task adds to the observation.
-        reward_terms: names of the reward's terms; the reward is their sum.
-        metrics: names of other numbers reported in ``info``.
-        observes_contact: whether agents feel the impulses of other bodies on their body parts.
-        observes_others: whether agents see each other.
+        observation_terms: terms that the task adds to the observation.
+        rewards: terms of the reward, which is their sum.
+        costs: terms of ``info["cost"]``, for constrained learning; not part of the reward.
+        metrics: other numbers in ``info``.
+        state_arrays: arrays that a saved state holds.
+        scratch_arrays: arrays that every step computes anew.
+        observes_contact: whether agents observe the impulses of other bodies on their body parts.
+        observes_others: whether agents observe each other.
         targets_about_reference: whether, under ``control="pd"``, targets are counted from the reference pose; else from
             the rest pose.
-        camera_position, camera_target: the eye and what it looks at [m], from the ground below the agents' middle, or
-            from the origin if the camera does not follow them (``camera_follows``).
-        cost_terms: names of what is summed in ``info["cost"]``, for constrained learning; not part of the reward.
+        camera_position, camera_target: the eye and the point that it looks at [m], from the ground below the agents'
+            middle, or from the origin if the camera does not follow them (``camera_follows``).
+        reward_names, cost_names, metric_names: names of the terms and metrics; derived.
 
     Class attributes for the task's page in ``docs/envs`` (Markdown; ``python -m scripts.env_pages`` writes it):
-        summary: a paragraph: what happens, and what a good agent does.
-        reward_docs, metric_docs, cost_docs: what each of the names above means, with its unit and its settings.
-        success_doc: when ``info["success"]`` is True.
-        termination_doc: what else terminates an episode than a root that lets go and a failure; empty for nothing.
-        history: version and what was new in it, the newest first.
-        picture_seconds: moment of the picture [s]; picture_actions: how the avatars acted until then: ``"zero"``,
-            ``"random"`` or constant actions by component name; picture_settings: settings other than the defaults.
+        summary: a paragraph: the situation, and what a good agent does.
+        success_doc: the condition of ``info["success"]``.
+        termination_doc: conditions that terminate an episode, besides a root that lets go and a failure; may be empty.
+        history: versions and what each changed, the newest first.
+        picture_seconds: moment of the picture [s].
+        picture_actions: how the avatars act until then: ``"zero"``, ``"random"`` or constant actions by component name.
+        picture_settings: settings of the picture other than the defaults.
 
     Attributes:
         config: the settings.
-        joints: names of those that act.
-        scene: what is in the world.
+        joints: names of the joints that act.
+        scene: avatars, props and colliders.
     """
 
     Config: ClassVar[type[EnvConfig]] = EnvConfig
     description: ClassVar[str] = ""
     observation_terms: ClassVar[tuple[ObservationTerm, ...]] = ()
-    reward_terms: ClassVar[tuple[str, ...]] = ()
-    metrics: ClassVar[tuple[str, ...]] = ()
-    cost_terms: ClassVar[tuple[str, ...]] = ()
+    rewards: ClassVar[tuple[Term, ...]] = ()
+    costs: ClassVar[tuple[Term, ...]] = ()
+    metrics: ClassVar[tuple[Metric, ...]] = ()
+    state_arrays: ClassVar[tuple[TaskArray, ...]] = ()
+    scratch_arrays: ClassVar[tuple[TaskArray, ...]] = ()
 
     observes_contact: ClassVar[bool] = False
     observes_others: ClassVar[bool] = False
@@ -82,10 +134,11 @@ class Task:
     camera_target: tuple[float, float, float] = (0.0, -0.04, 0.86)
     camera_follows: bool = True
 
+    reward_names: ClassVar[tuple[str, ...]] = ()
+    cost_names: ClassVar[tuple[str, ...]] = ()
+    metric_names: ClassVar[tuple[str, ...]] = ()
+
     summary: ClassVar[str] = ""
-    reward_docs: ClassVar[Mapping[str, str]] = {}
-    metric_docs: ClassVar[Mapping[str, str]] = {}
-    cost_docs: ClassVar[Mapping[str, str]] = {}
     success_doc: ClassVar[str] = ""
     termination_doc: ClassVar[str] = ""
     history: ClassVar[tuple[tuple[str, str], ...]] = (("v0", "first version"),)
@@ -93,47 +146,57 @@ class Task:
     picture_actions: ClassVar[str | Mapping[str, float]] = "random"
     picture_settings: ClassVar[Mapping[str, Any]] = {}
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Check the declarations and derive the names.
+
+        Raises:
+            ValueError: a declaration of another type, or a name that is no name, is given twice or is taken.
+        """
+        super().__init_subclass__(**kwargs)
+        cls.reward_names = cls._names("rewards", Term)
+        cls.cost_names = cls._names("costs", Term)
+        cls.metric_names = cls._names("metrics", Metric, NAMES_OF_INFO, "info has that key anyway")
+        taken = (*dir(cls), "config", "joints", "scene")
+        state = cls._names("state_arrays", TaskArray, taken, "the task has that attribute")
+        cls._names("scratch_arrays", TaskArray, (*taken, *state), "the task has that attribute or array")
+
+    @classmethod
+    def _names(cls, what: str, kind: type, taken: Sequence[str] = (), reason: str = "") -> tuple[str, ...]:
+        """Return the names of what the attribute ``what`` declares.
+
+        Raises:
+            ValueError: see :meth:`__init_subclass__`.
+        """
+        declared, where = getattr(cls, what), f"{cls.__name__}.{what}"
+        example = f"{what} = ({kind.__name__}({'...' if kind is TaskArray else chr(34) + 'near' + chr(34) + ', ...'}),)"
+        if not isinstance(declared, tuple) or not all(isinstance(one, kind) for one in declared):
+            raise ValueError(f"{where}={declared!r} is no tuple of {kind.__name__}; write {example}")
+        names = tuple(one.name for one in declared)
+        for index, name in enumerate(names):
+            if not isinstance(name, str) or not name or name.startswith("_"):
+                raise ValueError(f"{where} has {name!r}; a name is a string that does not begin with an underscore")
+            if name in names[:index]:
+                raise ValueError(f"{where} has {name!r} twice; rename one of them")
+            if name in taken:
+                raise ValueError(f"{where} has {name!r}, but {reason}; choose another name")
+        return names
+
     def __init__(self, config: EnvConfig) -> None:
-        """Settle what is in the world.
+        """Build the scene.
 
         Raises:
             ConfigError: settings that do not fit the task.
-            ValueError: names of its terms or metrics that cannot be told apart in ``info``.
         """
-        self._check_names()
         self.config = config
         self.joints = select_joints(config.joints)
         self.scene = self.build_scene()
-        self._move_camera()
+        self._place_camera()
 
-    def _check_names(self) -> None:
-        """See that every number in ``info`` has a name of its own.
-
-        Raises:
-            ValueError: one has not.
-        """
-        for what in ("reward_terms", "cost_terms", "metrics"):
-            names, where = getattr(self, what), f"{type(self).__name__}.{what}"
-            if isinstance(names, str):
-                raise ValueError(f"{where}={names!r} is one string; give a tuple of names: ({names!r},)")
-            for index, name in enumerate(names):
-                if not isinstance(name, str) or not name or name.startswith("_"):
-                    raise ValueError(f"{where} has {name!r}; a name is a string that does not begin with an underscore")
-                if name in names[:index]:
-                    raise ValueError(
-                        f"{where} has {name!r} twice, of which info would keep the last; call one otherwise"
-                    )
-                if what == "metrics" and name in NAMES_OF_INFO:
-                    raise ValueError(
-                        f"{where} has {name!r}, which info has anyway, besides {', '.join(NAMES_OF_INFO)}; call it "
-                        "otherwise"
-                    )
-
-    def _move_camera(self) -> None:
-        """To where the settings of pictures have it, if they do.
+    def _place_camera(self) -> None:
+        """Let the settings of pictures, where they are given, replace the task's camera.
 
         Raises:
-            ConfigError: it would look at where it is.
+            ConfigError: the camera would look at its own place.
         """
         for name in ("camera_position", "camera_target", "camera_follows"):
             chosen = getattr(self.config.render, name)
@@ -144,7 +207,7 @@ class Task:
             raise ConfigError(f"render.camera_position={place} is where it looks; move it or render.camera_target")
 
     def build_scene(self) -> SceneConfig:
-        """What is in the world: the configured scene and what the task adds to it.
+        """Return the configured scene with what the task adds to it.
 
         Raises:
             ConfigError: the configured scene does not fit the task.
@@ -160,7 +223,7 @@ class Task:
         return tuple(f"agent_{index}" for index in range(len(self.scene.avatars)))
 
     def alone(self) -> Task:
-        """The task itself, if it has one agent.
+        """Return the task itself, if it has one agent.
 
         Raises:
             ValueError: it has several.
@@ -174,62 +237,93 @@ class Task:
         return self
 
     def terms(self) -> tuple[ObservationTerm, ...]:
-        """What the task adds to the observation."""
+        """Return the terms that the task adds to the observation under its settings."""
         return self.observation_terms
 
     def observed_props(self) -> tuple[str, ...]:
-        """Names of the props that agents see."""
+        """Return the names of the props that agents observe."""
         return tuple(prop.name for prop in self.scene.props)
 
     def prop_places(self) -> Mapping[str, Sequence[Sequence[float]]]:
-        """Where episodes may put props, of those that :meth:`record_reset` places, by name.
+        """Return, by name of a prop, corners of the region in which episodes may put its middle, each x, y, z [m].
 
-        Corners of what holds the middles [m], each x, y, z. What would begin outside the domain is refused when the
-        environment is built; where the scene has its props is looked at anyway.
+        Covers props that :meth:`record_reset` places. An environment is refused when one would begin outside the
+        domain; the places that the scene gives are checked anyway.
         """
         return {}
 
     def drawn(self) -> tuple[Parameter, ...]:
-        """Numbers that the task draws for each episode and that ``observe_parameters`` shows.
+        """Return the numbers that the task draws for each episode, for ``observe_parameters``.
 
-        All that changes what will happen, but the bodies' first poses and places, which agents see anyway; also what
-        the task's own terms tell.
+        They include all that changes the episode except the first poses and places of bodies, which are observed
+        anyway, and also numbers that the task's own terms contain. By default, those of the declared arrays.
         """
-        return ()
+        return tuple(parameter for array in self._declared_arrays() for parameter in array.drawn)
 
     def drawn_values(self, env: EpisodeArrays) -> tuple[Drawn, ...]:
-        """Where those numbers are, in the order of :meth:`drawn`; called once, after :meth:`allocate`."""
-        return ()
+        """Return the arrays of these numbers, in the order of :meth:`drawn`; called once, after :meth:`allocate`."""
+        return tuple(
+            Drawn(values if len(array.drawn) == 1 else component(values, index))
+            for array in self._declared_arrays()
+            for values in [getattr(self, array.name)]
+            for index in range(len(array.drawn))
+        )
+
+    def _declared_arrays(self) -> tuple[TaskArray, ...]:
+        return (*self.state_arrays, *self.scratch_arrays)
 
     def action_spec(self) -> ActionSpec:
-        """Joints that act, and whether the root does."""
+        """Return the joints that act, and whether the root does."""
         return ActionSpec(self.joints, joint_speed=self.config.control.joint_speed_limit)
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of the joints' rotation vectors [rad], each ``(22, 3)``."""
+        """Return the bounds of the joints' rotation vectors [rad], each ``(22, 3)``."""
         return joint_limits()
 
     def domain(self) -> Domain:
-        """Where particles may go."""
+        """Return the box in which particles may move."""
         return Domain().around([avatar.position for avatar in self.scene.avatars])
 
     def impulses(self) -> dict[str, float]:
-        """Greatest impulse that the task gives a bone at once [N s], by joint: substeps are short enough for it."""
+        """Return the greatest impulse that the task gives a bone at once [N s], by joint; it bounds the time step."""
         return {}
+
+    def allocate_declared(self, env: EpisodeArrays) -> None:
+        """Create the declared arrays as attributes."""
+        for array in self._declared_arrays():
+            sizes = [getattr(self.config, size) if isinstance(size, str) else size for size in array.shape]
+            setattr(self, array.name, wp.zeros((env.num_envs, *sizes), dtype=array.dtype, device=env.device))
 
     def allocate(self, env: EpisodeArrays) -> None:
-        """Create the task's arrays."""
+        """Create kernel constants, and arrays of other shapes than :class:`TaskArray` has; the declared ones exist."""
 
     def arrays(self) -> dict[str, wp.array]:
-        """Arrays of the task that a checkpoint must hold."""
-        return {}
+        """Return the arrays that a saved state holds, by name."""
+        return {array.name: getattr(self, array.name) for array in self.state_arrays}
+
+    def cleared_words(self) -> list[wp.array]:
+        """Return the arrays declared ``cleared`` as 32-bit words, each ``(num_envs, words)``; they share the memory.
+
+        Raises:
+            ValueError: an array of another type, such as bool.
+        """
+        found = []
+        for declared in self._declared_arrays():
+            if declared.cleared:
+                array = getattr(self, declared.name)
+                size = wp.types.type_size_in_bytes(array.dtype)
+                if size % 4:
+                    raise ValueError(f"{declared.name} has elements of {size} byte; cleared takes multiples of 4")
+                shape = array.shape[0], size // 4 * array.size // array.shape[0]
+                found.append(wp.array(ptr=array.ptr, shape=shape, dtype=int, device=array.device))
+        return found
 
     def record_reset(self, env: EpisodeArrays, graph: LaunchGraph) -> None:
         """Append: for environments of ``env.mask``, write the avatars' first commanded poses and draw the task.
 
         Props and colliders start where the scene says, unless this writes other places into
-        ``env.simulation.props.spawn`` (and ``.density``) or ``env.simulation.collider_spawn``.
-        How fast they will be then, or later, ``top_speed`` in the scene says: substeps are short enough for it.
+        ``env.simulation.props.spawn`` (and ``.density``) or ``env.simulation.collider_spawn``. The setting
+        ``top_speed`` in the scene bounds their speed, then and later; the time step is short enough for it.
 
         Raises:
             NotImplementedError: a task that does not define it.
@@ -237,9 +331,9 @@ class Task:
         raise NotImplementedError(f"{type(self).__name__} must define record_reset(env, graph)")
 
     def record_references(self, env: EpisodeArrays, graph: LaunchGraph) -> list[tuple[wp.array, wp.array]]:
-        """Append what comes before the physics; return the pose that actions are added to, of every avatar.
+        """Append launches that precede the physics; return the pose that actions are added to, of every avatar.
 
-        A pose is its local rotations and its root; by default what was commanded last.
+        A pose is its local rotations and its root; by default the pose commanded last.
         """
         states = [avatar.state for avatar in env.simulation.avatars]
         return [(state.command_rotation, state.command_root) for state in states]
@@ -258,8 +352,8 @@ class Task:
     def markers(
         self, env: EpisodeArrays, index: int
     ) -> Sequence[tuple[np.ndarray, float, tuple[float, float, float]] | Marker]:
-        """Things to draw for environment ``index``: ``(position [m], radius [m], rgb)`` spheres, or what renders them.
+        """Return marks to draw for environment ``index``: spheres ``(position [m], radius [m], rgb)``, or markers.
 
-        Whoever draws has the renderer; a task imports it here and nowhere else.
+        Markers of the renderer are imported here and nowhere else in a task, so that a task needs no renderer.
         """
         return []

@@ -1,45 +1,76 @@
-"""Worlds of several agents: one PettingZoo module each, such as ``piavatar_envs.tasks.games.sumo`` (extra ``multi``).
+"""PettingZoo environments of the games in :mod:`piavatar_envs.tasks.games` (extra ``multi``).
 
-A new file ``<name>_v<N>.py`` with a ``TASK``, a ``parallel_env`` and an ``env`` is found and tested without being
-listed anywhere. Importing this package imports none of them.
+Every game is built by its name, ``parallel_env("sumo_v0")``. Those of this package also have modules here, in the style
+of PettingZoo: ``from piavatar_envs.multi import sumo_v0``. Importing this package imports none of them.
 """
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
-import re
 from collections.abc import Iterable
-from types import ModuleType
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-from piavatar_envs.tasks import instead_of
+from piavatar_envs.tasks.games import listed_games, load_game_task
 
-_MODULE = re.compile(r"[a-z0-9_]+_v\d+")
+if TYPE_CHECKING:
+    from piavatar_envs.api.pettingzoo import AECEnv, AvatarParallelEnv
+    from piavatar_envs.envs.task import Task
 
-
-def multi_modules() -> tuple[str, ...]:
-    """Dotted names of all modules, such as ``piavatar_envs.tasks.games.sumo``. Imports nothing."""
-    names = sorted(module.name for module in pkgutil.iter_modules(__path__))
-    return tuple(f"{__name__}.{name}" for name in names if _MODULE.fullmatch(name))
-
-
-def listed_worlds() -> dict[str, str]:
-    """Listed name -> dotted name of the module: ``sumo_v0`` for ``piavatar_envs.tasks.games.sumo``. Imports nothing."""
-    return {path.rpartition(".")[2]: path for path in multi_modules()}
+__all__ = ["Game", "env", "listed_games", "load_game", "parallel_env"]
 
 
-def load_world(name: str, others: Iterable[str] = ()) -> ModuleType:
-    """The module of a world by its listed name, such as ``sumo_v0``.
+@dataclass(frozen=True)
+class Game:
+    """A game with the members of a PettingZoo module.
+
+    Attributes:
+        name: such as ``sumo_v0``.
+        TASK: its task.
+    """
+
+    name: str
+    TASK: type[Task]
+
+    def parallel_env(self, **settings: Any) -> AvatarParallelEnv:
+        """Build the game; for the settings see :class:`~piavatar_envs.api.pettingzoo.AvatarParallelEnv`.
+
+        Raises:
+            ImportError: PettingZoo is not installed.
+        """
+        from piavatar_envs.api.pettingzoo import AvatarParallelEnv
+
+        return AvatarParallelEnv(self.TASK, name=self.name, **settings)
+
+    def env(self, **settings: Any) -> AECEnv:
+        """Build the same game for PettingZoo's turn-based API.
+
+        Raises:
+            ImportError: PettingZoo is not installed.
+        """
+        from piavatar_envs.api.pettingzoo import parallel_to_aec
+
+        return parallel_to_aec(self.parallel_env(**settings))
+
+
+def load_game(name: str, others: Iterable[str] = ()) -> Game:
+    """Return a game by its name.
 
     Args:
-        name: of the world.
-        others: what else may be asked for where the name was given.
+        name: such as ``sumo_v0``; ``"module:name"`` imports the module first, which registers it.
+        others: other names that were possible, for the message.
 
     Raises:
-        ImportError: PettingZoo is not installed.
-        ValueError: there is no such world.
+        ImportError: a module cannot be imported.
+        ValueError: there is no such game.
     """
-    known = listed_worlds()
-    if name not in known:
-        raise ValueError(f"unknown world {name!r}; {instead_of(name, [*known, *others])}")
-    return importlib.import_module(known[name])
+    return Game(name.rpartition(":")[2], load_game_task(name, others))
+
+
+def parallel_env(name: str, **settings: Any) -> AvatarParallelEnv:
+    """Build the game ``name``; see :func:`load_game` and :meth:`Game.parallel_env`."""
+    return load_game(name).parallel_env(**settings)
+
+
+def env(name: str, **settings: Any) -> AECEnv:
+    """Build the game ``name`` for PettingZoo's turn-based API; see :func:`load_game` and :meth:`Game.env`."""
+    return load_game(name).env(**settings)

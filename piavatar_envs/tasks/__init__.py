@@ -14,17 +14,18 @@ if TYPE_CHECKING:
     from piavatar_envs.envs.task import Task
 
 NAMESPACE = "PIAvatar"
-#: What the module of a world of several agents may be named with.
+#: Prefix of the modules of games.
 _MULTI = "piavatar_envs.multi."
+_VERSION = re.compile(r"[-_]v\d+$")
 
 
 def task_modules() -> dict[str, str]:
-    """Registered id -> module name: ``PIAvatar/TrackMotion-v0`` for ``track_motion``. Imports nothing."""
+    """Return registered ids -> module names: ``PIAvatar/TrackMotion-v0`` for ``track_motion``. Imports nothing."""
     names = sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.ispkg)
     return {f"{NAMESPACE}/{''.join(part.capitalize() for part in name.split('_'))}-v0": name for name in names}
 
 
-#: Tasks from elsewhere by id: classes, or where they are, see :func:`add_task`.
+#: Tasks from elsewhere by id, see :func:`add_task`.
 _added: dict[str, type[Task] | str] = {}
 
 
@@ -32,8 +33,8 @@ def add_task(env_id: str, task: type[Task] | str) -> None:
     """Let :func:`load_task` find a task that is not of this package.
 
     Args:
-        env_id: a namespace of your own, a name and a version: ``"Mine/Hop-v0"``. A task that has it already gives way.
-        task: its class, or ``"module:Class"`` to be imported when it is first asked for.
+        env_id: a namespace of your own, a name and a version: ``"Mine/Hop-v0"``. A task that has it is replaced.
+        task: its class, or ``"module:Class"``, imported when it is first needed.
 
     Raises:
         TypeError: the task is neither.
@@ -43,13 +44,22 @@ def add_task(env_id: str, task: type[Task] | str) -> None:
         raise ValueError(f"{env_id!r} must be a namespace, a name and a version, such as 'Mine/Hop-v0'")
     if env_id.startswith(f"{NAMESPACE}/"):
         raise ValueError(f"{env_id!r} is in the namespace of this package; use one of your own: 'Mine/Hop-v0'")
-    if not (_is_task(task) or (isinstance(task, str) and ":" in task)):
-        raise TypeError(f"{env_id}: {task!r} is neither a subclass of Task nor 'module:Class'")
+    check_task_class(env_id, task)
     _added[env_id] = task
 
 
+def check_task_class(name: str, task: type[Task] | str) -> None:
+    """Refuse what cannot be registered as the task ``name``.
+
+    Raises:
+        TypeError: the task is neither a class of a task nor ``"module:Class"``.
+    """
+    if not (_is_task(task) or (isinstance(task, str) and ":" in task)):
+        raise TypeError(f"{name}: {task!r} is neither a subclass of Task nor 'module:Class'")
+
+
 def place_of(env_id: str, task: type[Task] | str) -> str:
-    """What another process can :func:`load_task` by: ``"module:Class"``, or the id of a class that no import gives."""
+    """Return the name by which another process loads a task: ``"module:Class"``, or the id if no import gives it."""
     if isinstance(task, str):
         return task
     importable = task.__module__ != "__main__" and task.__qualname__.isidentifier()
@@ -57,16 +67,16 @@ def place_of(env_id: str, task: type[Task] | str) -> str:
 
 
 def listed_name(name: str) -> str:
-    """An environment's name as ``piavatar_envs list`` has it: ``Reach-v0`` gets its namespace, a module loses its.
+    """Return an environment's name as ``piavatar_envs list`` shows it.
 
-    Any other name is given back as it is.
+    ``Reach-v0`` gets its namespace, the module of a game loses its package, and any other name stays as it is.
     """
     full = f"{NAMESPACE}/{name}"
     return full if full in task_modules() else name.removeprefix(_MULTI)
 
 
 def load_task(task: str | type[Task]) -> type[Task]:
-    """The class of a task.
+    """Return the class of a task.
 
     Args:
         task: its id, for the tasks of this package with or without the namespace; ``"module:id"`` imports the module
@@ -90,7 +100,8 @@ def load_task(task: str | type[Task]) -> type[Task]:
     if full in modules:
         return importlib.import_module(f"{__name__}.{modules[full]}").TASK
     if full not in _added:
-        if not module and name.isidentifier() and find_spec(f"piavatar_envs.multi.{name}"):
+        games = find_spec(f"{__name__}.games.{_VERSION.sub('', name)}") if name.isidentifier() else None
+        if not module and games:
             raise ValueError(
                 f"task={task!r} has several agents: use piavatar_envs.multi.{name}.parallel_env(), or its TASK"
             )
@@ -99,7 +110,7 @@ def load_task(task: str | type[Task]) -> type[Task]:
 
 
 def load_registered(task: str | type[Task], registered: Sequence[str] | None) -> type[Task]:
-    """The class of the task of an environment that may be made by its id.
+    """Return the class of the task of an environment that may be made by its id.
 
     Args:
         task: as for :func:`load_task`.
@@ -123,16 +134,16 @@ def load_registered(task: str | type[Task], registered: Sequence[str] | None) ->
 
 
 def how_to_name(env_id: str) -> str:
-    """What to say to whoever names a task of their own, such as ``env_id``, that nobody has registered."""
+    """Return advice on naming a task from elsewhere, such as ``env_id``, that is not registered."""
     return f"a task of your own is named with the module that registers it, such as my_tasks:{env_id}"
 
 
 def instead_of(name: str, known: Iterable[str]) -> str:
-    """What to say to whoever asks for an environment that there is not: which one is close to it, or all there are.
+    """Return advice on an unknown name: the known one that is close to it, or all of them.
 
     Args:
-        name: what was asked for; with a namespace that is not this package's, it may be a task of one's own.
-        known: what there is.
+        name: the unknown name; with a namespace that is not this package's, it may be a task from elsewhere.
+        known: the known names.
     """
     own = "/" in name and ":" not in name and not name.startswith(f"{NAMESPACE}/")
     how = [how_to_name(name)] if own else []
@@ -144,13 +155,13 @@ def instead_of(name: str, known: Iterable[str]) -> str:
 
 
 def _stem(name: str) -> str:
-    """A name without what all names have: ``PIAvatar/PushBox-v0`` and ``push_box_v0`` are both ``pushbox``."""
-    return re.sub(r"[-_]v\d+$", "", re.split(r"[/:.]", name)[-1]).replace("_", "").lower()
+    """Return a name without namespace and version: ``PIAvatar/PushBox-v0`` and ``push_box_v0`` are ``pushbox``."""
+    return _VERSION.sub("", re.split(r"[/:.]", name)[-1]).replace("_", "").lower()
 
 
 def _is_task(task: object) -> bool:
     if not isinstance(task, type):
         return False
-    from piavatar_envs.envs.task import Task  # whoever has a subclass has imported it
+    from piavatar_envs.envs.task import Task  # a subclass exists, so this is imported already
 
     return issubclass(task, Task)

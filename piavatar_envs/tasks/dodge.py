@@ -1,31 +1,49 @@
-"""Dodge: balls are thrown at the avatar; a good one stands as it was told, and still is not hit."""
+"""Dodge: stand still in the rest pose, and avoid thrown balls."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import ClassVar
 
 import numpy as np
 import warp as wp
 from pydantic import Field
 
+from piavatar_envs.avatar.body.skeleton import BODY_PARTS
+from piavatar_envs.avatar.rotation import quat_exp, quat_log
+from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import EnvConfig, PropConfig, SceneConfig, replace
+from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec, speed_within
-from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.observer import clear_stress, observe_stress
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
+from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
-from piavatar_envs.tasks.common.hits import Hits
-from piavatar_envs.tasks.common.place import PlaceRule, judge_pose, keep_place, observe_home
 from piavatar_envs.tasks.common.ranges import DistanceRange, Margin, MassRange, SpeedRange, Weight, check_ranges
-from piavatar_envs.tasks.common.spawn import record_standing
-from piavatar_envs.tasks.common.throws import make_throws, record_balls, throwing_domain, thrown_speed, waiting_places
-from piavatar_envs.tasks.common.turns import observe_throws, throw_balls
+from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
+from piavatar_envs.tasks.common.spawn import pelvis_at, record_standing
+from piavatar_envs.tasks.common.thrown_balls import (
+    MASSES,
+    Throws,
+    make_throws,
+    record_balls,
+    throw_or_catch,
+    throwing_domain,
+    thrown_speed,
+    waiting_places,
+)
+
+wp.set_module_options({"enable_backward": False})
 
 #: Speed of the root at action 1 [m/s].
 ROOT_SPEED = 1.5
+#: Index of the first throw's time in the stream of the balls, before their masses; the throws come after those.
+_TIME = wp.constant(0)
+#: Body parts whose stress counts, the first of ``BODY_PARTS``: all but the legs, whose soles the floor strains.
+_ABOVE_LEGS = wp.constant(list(BODY_PARTS).index("left_leg"))
 
 
 class DodgeConfig(EnvConfig):
@@ -53,39 +71,240 @@ class DodgeConfig(EnvConfig):
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 
+@wp.struct
+class Rule:
+    """Constants of the place to keep, of its reward, and of hits and their costs."""
+
+    place: wp.vec3  # x, y [m] and yaw [rad]
+    range: float  # of the commanded root about the place [m]
+    pose_margin: float  # [rad]
+    place_margin: float  # [m]
+    control_cost: float
+    first_ball: int  # subject of the first ball; the avatar is subject 0
+    hit_impulse: float  # [N s]
+    impulse_scale: float  # [N s]
+    stress_limit: float  # [young_modulus]
+
+
+@wp.kernel
+def keep_place(
+    rule: Rule,
+    body: Body,
+    command_root: wp.array(dtype=wp.vec3),
+    # out
+    reference_root: wp.array(dtype=wp.vec3),
+):
+    """Clamp the commanded root to its range about the place."""
+    e = wp.tid()
+    center = pelvis_at(rule.place, body, e)
+    out = command_root[e] - center
+    out[2] = 0.0
+    distance = wp.length(out)
+    excess = wp.max(distance - rule.range, 0.0) / wp.max(distance, 1.0e-6)
+    reference_root[e] = command_root[e] - excess * out
+
+
+@wp.func
+def first_throw(throws: Throws, seed: int, episode: int):
+    """Return the control step of an episode's first throw, in the first half of an interval."""
+    random = generator(seed, episode, STREAM_BALL, _TIME)
+    return wp.randi(random, 1, throws.interval // 2 + 2)
+
+
+@wp.func
+def steps_to_throw(throws: Throws, first: int, step: int, ball: int):
+    """Return the control steps from ``step`` to the next throw of a ball; 0 if it is thrown in this one."""
+    period = throws.interval * throws.num_balls
+    wait = (first + ball * throws.interval - step) % period
+    return wp.where(wait < 0, wait + period, wait)
+
+
+@wp.kernel
+def throw_balls(
+    throws: Throws,
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    failure: wp.array(dtype=int),
+    joints: wp.array2d(dtype=wp.vec3),
+    ball_position: wp.array2d(dtype=wp.vec3),
+    ball_velocity: wp.array2d(dtype=wp.vec3),
+    # out
+    placed: wp.array2d(dtype=wp.bool),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+):
+    """Flag the balls that are placed before this step, over ``(E, num_balls)``.
+
+    A ball whose time has come is thrown from the front at the present place of chest and head. A ball that has flown
+    past is caught, and waits.
+    """
+    e, ball = wp.tid()
+    placed[e, ball] = False
+    if failure[e] != 0:
+        return
+    first = first_throw(throws, seed[e], episode[e])
+    due = steps_to_throw(throws, first, step_count[e], ball) == 0
+    number = (step_count[e] - first) // throws.interval
+    random = generator(seed[e], episode[e], STREAM_BALL, MASSES + throws.num_balls + number)
+    placed[e, ball] = throw_or_catch(
+        throws, due, random, e, ball, joints, ball_position, ball_velocity, position, velocity, spin
+    )
+
+
+@wp.kernel
+def judge_pose(
+    rule: Rule,
+    body: Body,
+    local: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    action: wp.array3d(dtype=float),
+    # out
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+):
+    """Reward standing in the rest pose and in the place."""
+    e = wp.tid()
+    bones = local.shape[1]
+    angle = wp.length(quat_log(wp.quat_inverse(quat_exp(wp.vec3(0.0, 0.0, rule.place[2]))) * local[e, 0]))
+    for b in range(1, bones):
+        angle += wp.length(quat_log(local[e, b]))
+    angle /= float(bones)
+    off = position[e, 0] - pelvis_at(rule.place, body, e)
+    distance = wp.length(wp.vec2(off[0], off[1]))
+    terms[e, 0, 0] = 0.6 * tolerance(angle, 0.05, rule.pose_margin)
+    terms[e, 0, 1] = 0.4 * tolerance(distance, 0.02, rule.place_margin)
+    terms[e, 0, 2] = -rule.control_cost * mean_square_action(action, e, 0)
+    metrics[e, 0, 0] = wp.degrees(angle)
+    metrics[e, 0, 1] = distance
+
+
+@wp.kernel
+def judge_hits(
+    rule: Rule,
+    throws: Throws,
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    sensors: Sensors,
+    stress: wp.array3d(dtype=float),
+    # in and out
+    struck: wp.array2d(dtype=int),
+    hits: wp.array(dtype=int),
+    # out
+    cost_terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
+):
+    """Count and cost hits, each ball once a throw. The step counter is still the one of the throw."""
+    e = wp.tid()
+    first = first_throw(throws, seed[e], episode[e])
+    total = float(0.0)
+    missed = bool(True)
+    for ball in range(throws.num_balls):
+        size = wp.length(sensors.pair_impulse[e, rule.first_ball + ball])
+        total += size
+        if steps_to_throw(throws, first, step_count[e], ball) == 0:
+            struck[e, ball] = 0
+        if struck[e, ball] == 0 and size > rule.hit_impulse:
+            struck[e, ball] = 1
+            hits[e] = hits[e] + 1
+        missed = missed and struck[e, ball] == 0
+    peak = float(0.0)
+    for part in range(_ABOVE_LEGS):
+        peak = wp.max(peak, stress[e, 0, part])
+    cost_terms[e, 0, 0] = total / rule.impulse_scale
+    cost_terms[e, 0, 1] = wp.max(peak / rule.stress_limit - 1.0, 0.0)
+    metrics[e, 0, 2] = total
+    metrics[e, 0, 3] = peak
+    metrics[e, 0, 4] = float(hits[e])
+    success[e, 0] = missed
+
+
+@wp.kernel
+def observe_throws(
+    throws: Throws,
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    density: wp.array2d(dtype=float),
+    control_dt: float,
+    agent: int,
+    start: int,
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Write the time to the next throw of every ball [s], then their masses [kg]; over ``(E, num_balls)``."""
+    e, ball = wp.tid()
+    first = first_throw(throws, seed[e], episode[e])
+    steps = steps_to_throw(throws, first, step_count[e], ball)
+    observation[e, agent, start + ball] = control_dt * float(steps)
+    observation[e, agent, start + throws.num_balls + ball] = throws.volume * density[e, ball]
+
+
+@wp.kernel
+def observe_place(
+    rule: Rule,
+    body: Body,
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Write the place from the pelvis."""
+    e = wp.tid()
+    way = pelvis_at(rule.place, body, e) - position[e, 0]
+    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(rotation[e, 0]), way))
+
+
 class DodgeTask(Task):
-    """Stand in one's place, and get out of the way of balls."""
+    """Stand still in the rest pose, and avoid the balls."""
 
     Config = DodgeConfig
-    description = "stand still, and get out of the way of balls that are thrown at chest and head"
-    reward_terms = ("pose", "place", "control")
-    cost_terms = ("impulse", "stress")
-    metrics = ("rotation_error_deg", "root_error", "impulse", "stress", "hits")
+    description = "stand still, and avoid balls that are thrown at chest and head"
+    rewards = (
+        Term(
+            "pose",
+            "0.6 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian that "
+            "has fallen to 0.06 after another `pose_margin`",
+        ),
+        Term(
+            "place",
+            "0.4 while the pelvis is within 0.02 m of its place; beyond it a Gaussian that has fallen to 0.04 after "
+            "another `place_margin`",
+        ),
+        CONTROL,
+    )
+    costs = (
+        Term("impulse", "the metric `impulse` over `impulse_scale`"),
+        Term("stress", "excess of the metric `stress` over `stress_limit`, divided by `stress_limit`"),
+    )
+    metrics = (
+        Metric("rotation_error_deg", "deg", "mean angle of the joints from the rest pose"),
+        Metric("root_error", "m", "horizontal distance of the pelvis from its place"),
+        Metric("impulse", "N s", "impulse of the balls on the body in this step, magnitudes summed over the balls"),
+        Metric("stress", "young_modulus", "peak von Mises stress in head, trunk and arms"),
+        Metric("hits", "-", "throws that have hit in this episode"),
+    )
+    state_arrays = (
+        TaskArray("struck", int, ("num_balls",), cleared=True),  # 1 for a ball that has hit since it was thrown
+        TaskArray("hits", int, cleared=True),
+    )
+    scratch_arrays = (
+        TaskArray("reference_root", wp.vec3),
+        TaskArray("placed", wp.bool, ("num_balls",)),
+        TaskArray("stress", float, (1, len(BODY_PARTS))),
+    )
 
     summary = """Every `throw_interval` one of `num_balls` soft balls is thrown at the avatar's chest or head, from
-somewhere before it: `throw_distance` away and up to `throw_angle` off the front. In the first half of the first
-interval the first one comes; a ball that has flown past is caught and waits behind the avatar for its turn. The reward
-is for standing still in the rest pose; being hit takes nothing off it, but has a `cost` of its own, as in constrained
-(safe) reinforcement learning: of all that are hardly hit, a good agent is the one that stands best. Doing nothing earns
-all the reward, and every ball hits. The root can be steered up to `root_range` from its place."""
-    reward_docs: ClassVar[Mapping[str, str]] = {
-        "pose": "0.6 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian "
-        "that has fallen to 0.06 after another `pose_margin`",
-        "place": "0.4 while the pelvis is within 0.02 m of its place; beyond it a Gaussian that has fallen to 0.04 "
-        "after another `place_margin`",
-        "control": "`-control_cost` times the mean of the squared action components",
-    }
-    metric_docs: ClassVar[Mapping[str, str]] = {
-        "rotation_error_deg": "mean angle of the joints from the rest pose [deg]",
-        "root_error": "horizontal distance of the pelvis from its place [m]",
-        "impulse": "impulse of the balls on the body in this step, magnitudes summed over the balls [N s]",
-        "stress": "peak von Mises stress in head, trunk and arms [young_modulus]",
-        "hits": "throws that have hit in this episode [-]",
-    }
-    cost_docs: ClassVar[Mapping[str, str]] = {
-        "impulse": "the metric `impulse` over `impulse_scale`",
-        "stress": "how far the metric `stress` exceeds `stress_limit`, over `stress_limit`",
-    }
+`throw_distance` away and up to `throw_angle` off the front. The first throw comes in the first half of the first
+interval; a ball that has flown past is caught and waits behind the avatar for its next throw. The reward is for
+standing still in the rest pose. A hit takes nothing off the reward, but has a `cost` of its own, as in constrained
+(safe) reinforcement learning: among agents that are rarely hit, a good one stands best. An agent that does nothing
+earns all the reward, and every ball hits it. The root can be steered up to `root_range` from its place."""
     success_doc = "no ball has hit since it was thrown, with more than `hit_impulse` in one step"
     picture_seconds = 0.9
     picture_actions = "zero"
@@ -111,17 +330,14 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
     def terms(self) -> tuple[ObservationTerm, ...]:
         balls = self.config.num_balls
         return (
-            ObservationTerm("time_to_throw", balls, "s", "-", "time until each ball is thrown next"),
+            ObservationTerm("time_to_throw", balls, "s", "-", "time until the next throw of each ball"),
             ObservationTerm("ball_mass", balls, "kg", "-", "mass of each ball"),
-            ObservationTerm("place_position", 3, "m", "root", "where the pelvis belongs, from where it is"),
+            ObservationTerm("place_position", 3, "m", "root", "the pelvis' place in the rest pose, from the pelvis"),
         )
 
     def drawn(self) -> tuple[Parameter, ...]:
-        mass = self.config.ball_mass
-        return tuple(
-            Parameter(f"ball_{index}_mass", "kg", *mass, f"mass of ball {index}")
-            for index in range(self.config.num_balls)
-        )
+        mass, balls = self.config.ball_mass, range(self.config.num_balls)
+        return tuple(Parameter(f"ball_{index}_mass", "kg", *mass, f"mass of ball {index}") for index in balls)
 
     def drawn_values(self, env) -> tuple[Drawn, ...]:
         density = env.simulation.props.density
@@ -136,74 +352,51 @@ all the reward, and every ball hits. The root can be steered up to `root_range` 
         return throwing_domain(self.config, self.place)
 
     def allocate(self, env) -> None:
-        n, device, config = env.num_envs, env.device, self.config
-        self.throws, self.rule = make_throws(config, self.place, self.waiting, env), PlaceRule()
-        rule = self.rule
-        # the action comes on top of what is kept within the range
-        step = self.action_spec().greatest_speed * config.physics.control_dt
-        rule.place, rule.range = wp.vec3(*self.place), config.root_range - step
-        rule.pose_margin, rule.place_margin = config.pose_margin, config.place_margin
-        rule.control_cost = config.control_cost
-        self.reference_root = wp.zeros(n, dtype=wp.vec3, device=device)
-        self.placed = wp.zeros((n, config.num_balls), dtype=wp.bool, device=device)
-        self.hits = Hits(env, self.throws)
-
-    def arrays(self) -> dict[str, wp.array]:
-        return self.hits.arrays()
+        config = self.config
+        self.throws = make_throws(config, self.place, self.waiting, env)
+        # the action comes on top of the clamped root
+        reach = config.root_range - self.action_spec().greatest_speed * config.physics.control_dt
+        self.rule = fill(Rule(), config, place=wp.vec3(*self.place), range=reach, first_ball=env.num_agents)
+        self.part = wp.array(env.simulation.flesh[0].part, dtype=int, device=env.device)
 
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
         record_balls(env, graph, self.throws)
-        self.hits.record_reset(env, graph)
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         avatar, props = env.simulation.avatar, env.simulation.props
-        graph.launch(
-            keep_place,
-            env.num_envs,
-            [self.rule, avatar.body, avatar.state.command_root],
-            [self.reference_root],
-        )
+        inputs = [self.rule, avatar.body, avatar.state.command_root]
+        graph.launch(keep_place, env.num_envs, inputs, [self.reference_root])
+        clocks, now, spawn = [env.seed, env.episode, env.step_count, env.failure], props.state, props.spawn
         graph.launch(
             throw_balls,
             self.placed.shape,
-            [
-                self.throws, env.seed, env.episode, env.step_count, env.failure, avatar.tracked.position,
-                props.state.position, props.state.velocity,
-            ],
-            [self.placed, props.spawn.position, props.spawn.velocity, props.spawn.spin],
-        )  # fmt: skip
+            [self.throws, *clocks, avatar.tracked.position, now.position, now.velocity],
+            [self.placed, spawn.position, spawn.velocity, spawn.spin],
+        )
         for ball in range(self.config.num_balls):
             props.record_place(graph, env.simulation.state, self.placed[:, ball], ball)
         return [(avatar.state.command_rotation, self.reference_root)]
 
     def record_outcome(self, env, graph) -> None:
-        avatar = env.simulation.avatar
-        graph.launch(
-            judge_pose,
-            env.num_envs,
-            [self.rule, avatar.body, avatar.tracked.local, avatar.tracked.position, env.action],
-            [env.terms, env.metrics],
-        )
-        self.hits.record_outcome(env, graph)
+        sim, avatar, tracked = env.simulation, env.simulation.avatar, env.simulation.avatar.tracked
+        inputs = [self.rule, avatar.body, tracked.local, tracked.position, env.action]
+        graph.launch(judge_pose, env.num_envs, inputs, [env.terms, env.metrics])
+        graph.launch(clear_stress, (env.num_envs, len(BODY_PARTS)), [env.observer.all_envs, 0, 0], [self.stress])
+        per_modulus = 1.0 / sim.flesh[0].physics.young_modulus
+        inputs = [env.observer.all_envs, avatar.body, sim.model.particles, sim.state.F, self.part, 0, 0, per_modulus]
+        graph.launch(observe_stress, env.num_envs * avatar.num_points, inputs, [self.stress])
+        inputs = [self.rule, self.throws, env.seed, env.episode, env.step_count, sim.sensors, self.stress]
+        outputs = [self.struck, self.hits, env.cost_terms, env.metrics, env.success]
+        graph.launch(judge_hits, env.num_envs, inputs, outputs)
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
-        avatar, balls = env.simulation.avatar, self.config.num_balls
-        graph.launch(
-            observe_throws,
-            self.placed.shape,
-            [
-                self.throws, env.seed, env.episode, env.step_count, env.simulation.props.density,
-                self.config.physics.control_dt, agent, start,
-            ],
-            [env.observation],
-        )  # fmt: skip
-        graph.launch(
-            observe_home,
-            env.num_envs,
-            [self.rule, avatar.body, agent, start + 2 * balls, avatar.tracked.rotation, avatar.tracked.position],
-            [env.observation],
-        )
+        avatar, dt = env.simulation.avatar, self.config.physics.control_dt
+        inputs = [self.throws, env.seed, env.episode, env.step_count, env.simulation.props.density, dt, agent, start]
+        graph.launch(observe_throws, self.placed.shape, inputs, [env.observation])
+        start += 2 * self.config.num_balls
+        inputs = [self.rule, avatar.body, agent, start, avatar.tracked.rotation, avatar.tracked.position]
+        graph.launch(observe_place, env.num_envs, inputs, [env.observation])
 
 
 TASK = DodgeTask

@@ -1,64 +1,147 @@
-"""GetUp: from lying on the ground, face down or face up, to standing."""
+"""GetUp: stand up from lying on the ground, face down or face up."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
 
+import numpy as np
 import warp as wp
 from pydantic import Field
 
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
+from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ControlConfig, EnvConfig, TorqueControlConfig
-from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.task import Task
+from piavatar_envs.core.rng import STREAM_POSE, STREAM_TASK, generator
+from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.types import row
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
-from piavatar_envs.tasks.common.ground import Grounding
-from piavatar_envs.tasks.common.lying import first_poses, lying_rule, spawn_lying
 from piavatar_envs.tasks.common.ranges import Margin, Weight
-from piavatar_envs.tasks.common.rising import RISING_DOCS, RISING_TERMS, record_rising_outcome
+from piavatar_envs.tasks.common.rewards import CONTROL, tolerance
+from piavatar_envs.tasks.common.spawn import Grounding
 from piavatar_envs.tasks.common.upright import (
-    METRIC_DOCS,
-    METRICS,
     STANDING_DOC,
+    STANDING_METRICS,
     UPRIGHT_TERMS,
+    Still,
     StillConfig,
+    Upright,
     UprightConfig,
+    mean_angle,
+    posture_of,
     record_observe_upright,
-    still_rule,
-    upright_rule,
+    restfulness,
+    stillness,
+    write_standing,
 )
 
 wp.set_module_options({"enable_backward": False})
 
-#: How far the assisted pelvis is led: upwards [m] and towards upright [rad].
+_HALF = wp.constant(np.pi)
+_LEFT, _RIGHT = wp.constant(joint_index("left_ankle")), wp.constant(joint_index("right_ankle"))
+_FEET_BOUND = wp.constant(0.25)
+_HELD = wp.constant(len(STANDING_METRICS))
+#: Lead of the assisted pelvis' target: upwards [m] and towards upright [rad].
 LEAD, LEAD_TURN = wp.constant(0.15), wp.constant(0.3)
-#: Room to each side, besides what a fall takes: bodies that have got up seldom stand still at once [m].
+#: Room to each side, besides that of a fall: bodies that have got up seldom stand still at once [m].
 ASIDE = 3.0
+
+#: Turns about x from the rest pose [rad], of left and right joints alike; of the pelvis from upright.
+_Pose = Mapping[str, float]
+#: The arms lie beside the chest. Face down, the toes are pointed and the head is raised off the nose; face up, the
+#: heels touch the ground.
+_FACE_DOWN: _Pose = {"pelvis": 0.5 * np.pi, "shoulder": 0.4, "ankle": 0.8, "neck": -0.2, "head": -0.2}
+_FACE_UP: _Pose = {"pelvis": -0.5 * np.pi, "shoulder": 0.4, "hip": 0.09}
+_ON_ALL_FOURS: _Pose = {"pelvis": 1.4, "hip": -1.48, "knee": 1.66, "ankle": 0.79, "shoulder": -1.4}
+_ON_A_KNEE: _Pose = {
+    "left_hip": -1.57, "left_knee": 1.57, "right_knee": 1.57, "right_ankle": -0.35,
+}  # fmt: skip
+_SITTING: _Pose = {"pelvis": -0.61, "hip": -1.83, "knee": 1.92, "spine1": 0.35, "spine2": 0.35, "shoulder": -0.35}
+_SQUATTING: _Pose = {
+    "pelvis": 0.35, "hip": -2.0, "knee": 2.18, "ankle": -0.35, "spine1": 0.17, "spine2": 0.17, "shoulder": -1.0,
+}  # fmt: skip
+_HALF_UP: _Pose = {"pelvis": 0.35, "hip": -1.31, "knee": 1.4, "ankle": -0.35, "spine1": 0.09, "shoulder": -0.7}
+#: From face down and from face up: lying, and poses on the way to standing.
+_WAYS = ((_FACE_DOWN, _ON_ALL_FOURS, _ON_A_KNEE, _HALF_UP), (_FACE_UP, _SITTING, _SQUATTING, _HALF_UP))
 
 
 class GetUpConfig(EnvConfig):
     """Settings of GetUp."""
 
     control: ControlConfig = Field(default_factory=TorqueControlConfig, description="how actions move the body")
-    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
-    still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
+    upright: UprightConfig = Field(default_factory=UprightConfig, description="limit and margins of being upright")
+    still: StillConfig = Field(default_factory=StillConfig, description="margins of the rewards of standing still")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
-    hold_seconds: Margin = Field(1.0, description="how long it must stand [s]")
+    hold_seconds: Margin = Field(1.0, description="time to stand for a success [s]")
     face_up: float = Field(0.5, ge=0.0, le=1.0, description="share of episodes that begin face up [-]")
     halfway: float = Field(
         0.0, ge=0.0, le=1.0, description="share of episodes that begin on the way up, as a curriculum [-]"
     )
     feet_margin: Margin = Field(
         0.6,
-        description="how much further off the pelvis than in standing feet have a reward of 0.1, in its heights [-]",
+        description="horizontal distance of the feet from the pelvis, beyond a quarter, with a reward of 0.1 [heights]",
     )
     control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle off the lying pose [rad]")
+
+
+@wp.struct
+class Lying:
+    """Constants of the first poses."""
+
+    face_up: float  # share of face up
+    halfway: float  # share of those on the way up
+    pose_noise: float  # greatest joint angle off the pose [rad]
+
+
+def first_poses(device: str) -> wp.array:
+    """Return rotation vectors [rad] from face down and face up, ``(2, poses, bones)``; the first of each lies."""
+    turns = np.zeros((len(_WAYS), len(_WAYS[0]), NUM_JOINTS, 3), np.float32)
+    for side, way in enumerate(_WAYS):
+        for index, pose in enumerate(way):
+            for joint, name in enumerate(JOINT_NAMES):
+                turns[side, index, joint, 0] = pose.get(name, pose.get(name.partition("_")[2], 0.0))
+    return wp.array(turns, dtype=wp.vec3, device=device)
+
+
+@wp.kernel
+def spawn_lying(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    rule: Lying,
+    lower: wp.array(dtype=wp.vec3),
+    upper: wp.array(dtype=wp.vec3),
+    poses: wp.array3d(dtype=wp.vec3),
+    place: wp.vec3,
+    # out
+    command_rotation: wp.array2d(dtype=wp.quat),
+    command_root: wp.array(dtype=wp.vec3),
+    lies_up: wp.array(dtype=float),
+):
+    """Draw one of :func:`first_poses`, over ``place`` (x, y [m]), turned about the vertical; over ``(E, bones)``."""
+    e, b = wp.tid()
+    if not mask[e]:
+        return
+    random = generator(seed[e], episode[e], STREAM_TASK, 0)
+    side = wp.where(wp.randf(random) < rule.face_up, 1, 0)
+    turn = wp.randf(random, -_HALF, _HALF)
+    pose = int(0)
+    if wp.randf(random) < rule.halfway:
+        pose = wp.randi(random, 1, poses.shape[1])
+    v = poses[side, pose, b]
+    if b == 0:
+        command_rotation[e, b] = quat_exp(wp.vec3(0.0, 0.0, turn)) * quat_exp(v)
+        command_root[e] = wp.vec3(place[0], place[1], 0.0)
+        lies_up[e] = float(side)
+        return
+    random = generator(seed[e], episode[e], STREAM_POSE, b)
+    v += rule.pose_noise * wp.vec3(
+        wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0)
+    )
+    command_rotation[e, b] = quat_exp(wp.max(lower[b], wp.min(v, upper[b])))
 
 
 @wp.kernel
@@ -70,9 +153,9 @@ def lead_up(
     reference_rotation: wp.array2d(dtype=wp.quat),
     reference_root: wp.array(dtype=wp.vec3),
 ):
-    """Where assistance pulls the pelvis: from where it is a little upwards and towards upright, no higher than that.
+    """Lead the assisted pelvis from its place upwards and towards upright; over ``(E, bones)``.
 
-    The joints' references are those of the rest pose. Over ``(E, bones)``.
+    The target is no higher than the pelvis in the rest pose, which is the reference of the joints.
     """
     e, b = wp.tid()
     if b > 0:
@@ -89,23 +172,54 @@ def lead_up(
     reference_rotation[e, 0] = wp.normalize(quat_exp(turn * axis) * q)
 
 
+@wp.func
+def feet_off(body: Body, e: int, position: wp.array2d(dtype=wp.vec3)):
+    """Return the mean horizontal distance of the ankles from the pelvis, over its height in the rest pose."""
+    at = position[e, 0]
+    left, right = position[e, _LEFT] - at, position[e, _RIGHT] - at
+    apart = 0.5 * (wp.length(wp.vec2(left[0], left[1])) + wp.length(wp.vec2(right[0], right[1])))
+    return apart / body.rest_joint[row(e, body.rest_joint.shape[0]), 0][2]
+
+
 @wp.kernel
-def forget_hold(
-    mask: wp.array(dtype=wp.bool),
+def judge_rising(
+    rule: Upright,
+    still: Still,
+    feet_margin: float,
+    body: Body,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    local: wp.array2d(dtype=wp.quat),
+    action: wp.array3d(dtype=float),
     # out
-    held: wp.array(dtype=int),
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
 ):
-    """Nobody stands yet in the masked environments."""
+    """Reward getting up and standing still, wherever that is.
+
+    The height of the head alone misleads: it is greater in the splits than in a squat, and would have to fall on the
+    way up. So the heights of head and pelvis count, and feet under the pelvis. Pose and stillness count only where the
+    body stands, or bending the knees would cost more than it gains.
+    """
     e = wp.tid()
-    if mask[e]:
-        held[e] = 0
+    now = posture_of(rule, body, e, rotation, position)
+    speed = wp.length(velocity[e, 0])
+    angle = mean_angle(local, e)
+    stands = now.high * now.straight
+    high = wp.sqrt(wp.clamp(now.head, 0.0, 1.0) * wp.clamp(now.pelvis, 0.0, 1.0))
+    terms[e, 0, 0] = 0.5 * high
+    terms[e, 0, 1] = 0.2 * tolerance(feet_off(body, e, position), _FEET_BOUND, feet_margin)
+    terms[e, 0, 2] = 0.15 * stands * stillness(still, speed)
+    terms[e, 0, 3] = 0.15 * stands * restfulness(still, angle)
+    write_standing(rule, now, speed, e, action, terms, metrics, success)
 
 
 @wp.kernel
 def judge_hold(
     steps: int,
     control_dt: float,
-    metric: int,
     failure: wp.array(dtype=int),
     # in and out: success is standing, and becomes having stood long enough
     held: wp.array(dtype=int),
@@ -113,109 +227,118 @@ def judge_hold(
     # out
     metrics: wp.array3d(dtype=float),
 ):
-    """How long the avatar has been standing without a break."""
+    """Count the control steps for which the avatar has been standing without a break."""
     e = wp.tid()
     if failure[e] == 0:
         held[e] = wp.where(success[e, 0], held[e] + 1, 0)
     success[e, 0] = held[e] >= steps
-    metrics[e, 0, metric] = control_dt * float(held[e])
+    metrics[e, 0, _HELD] = control_dt * float(held[e])
+
+
+_STANDING = (
+    "times a share of standing: 1 while the head is no lower than 0.95 of its height in the rest pose and the chest "
+    "tilts by at most 0.1 rad; beyond them Gaussians that have fallen to 0.1 after another `upright.height_margin` of "
+    "that height and after another `upright.tilt_margin`"
+)
 
 
 class GetUpTask(Task):
     """Stand up."""
 
     Config = GetUpConfig
-    description = "from lying on the ground, face down or up, to standing"
+    description = "stand up from lying on the ground, face down or up"
     observation_terms = UPRIGHT_TERMS
-    reward_terms = RISING_TERMS
-    metrics = (*METRICS, "held_seconds")
+    rewards = (
+        Term(
+            "height",
+            "0.5 times the geometric mean of the heights of head and pelvis over those in the rest pose, each at most "
+            "1",
+        ),
+        Term(
+            "feet",
+            "0.2 while both ankles are, on average and horizontally, within 0.25 of the pelvis' height in the rest "
+            "pose from the pelvis; beyond it a Gaussian that has fallen to 0.02 after another `feet_margin` of it",
+        ),
+        Term(
+            "still",
+            "0.15 while the pelvis is no faster than 0.05 m/s; beyond it a Gaussian that has fallen to 0.015 after "
+            f"another `still.speed_margin`; all {_STANDING}",
+        ),
+        Term(
+            "pose",
+            "0.15 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian that "
+            "has fallen to 0.015 after another `still.pose_margin`; all as `still`",
+        ),
+        CONTROL,
+    )
+    metrics = (*STANDING_METRICS, Metric("held_seconds", "s", "time of standing without a break"))
+    state_arrays = (TaskArray("held", int, cleared=True),)  # control steps of standing without a break
+    scratch_arrays = (
+        TaskArray(
+            "lies_up",
+            drawn=(Parameter("face_up", "-", 0.0, 1.0, "1 if the episode began face up or on the way up from there"),),
+        ),
+        TaskArray("reference_rotation", wp.quat, (NUM_JOINTS,)),
+        TaskArray("reference_root", wp.vec3),
+    )
 
     camera_position = (2.4, -3.6, 1.6)
     camera_target = (0.0, 0.0, 0.78)
 
     summary = """The avatar lies on the ground, face down or face up (`face_up`), turned about the vertical at random,
-its arms beside it, its joints up to `pose_noise` off that pose; or (`halfway`, a curriculum) it is on the way up from
-there: on all fours or on a knee, sitting or squatting, or half up. It shall stand up by the strength
-of its joints, to the rest pose, and stay there for `hold_seconds`. Nothing but the clock ends an episode; a fall costs
-time. Where it stands in the end does not matter. `root_assist` helps here in its own way: it leads the pelvis, from
-wherever it is, upwards and towards upright. With `control="pose"` the root wrench keeps the pelvis where it lies, and
-there is nothing to be learnt."""
-    reward_docs: ClassVar[Mapping[str, str]] = RISING_DOCS
-    metric_docs: ClassVar[Mapping[str, str]] = {
-        **METRIC_DOCS,
-        "held_seconds": "how long it has been standing without a break [s]",
-    }
+its arms beside it, its joints up to `pose_noise` off that pose. A share of episodes, `halfway`, begins on the way up
+instead, as a curriculum: on all fours or on a knee, sitting or squatting, or half up. The avatar must stand up to the
+rest pose by the strength of its joints, and stay there for `hold_seconds`. Only the clock ends an episode; a fall costs
+time. The place where it stands in the end does not matter. Here `root_assist` leads the pelvis upwards and towards
+upright, from wherever it is. With `control="pose"` the root wrench keeps the pelvis where it lies, and there is nothing
+to learn."""
     success_doc = f"for `hold_seconds` without a break {STANDING_DOC}"
     picture_seconds = 1.0
     picture_actions = "zero"
 
     config: GetUpConfig
 
-    def drawn(self) -> tuple[Parameter, ...]:
-        return (
-            Parameter(
-                "face_up", "-", 0.0, 1.0, "1 if the episode began face up, or on the way up from there; 0 if face down"
-            ),
-        )
-
-    def drawn_values(self, env) -> tuple[Drawn, ...]:
-        return (Drawn(self.lies_up),)
-
     def domain(self) -> Domain:
         places = [avatar.position for avatar in self.scene.avatars]
         return Domain().around([(x + way, y + way) for x, y, *_ in places for way in (-ASIDE, ASIDE)])
 
     def allocate(self, env) -> None:
-        n, device, config = env.num_envs, env.device, self.config
-        self.rule, self.still = upright_rule(config.upright, config.control_cost), still_rule(config.still)
+        config = self.config
+        self.rule, self.still = fill(Upright(), config.upright, config), fill(Still(), config.still)
+        self.lying, self.poses = fill(Lying(), config), first_poses(env.device)
         self.grounding = Grounding(env)
         self.steps = max(1, round(config.hold_seconds / config.physics.control_dt))
-        self.held = wp.zeros(n, dtype=int, device=device)
-        self.lies_up = wp.zeros(n, dtype=float, device=device)
-        self.reference_rotation = wp.zeros((n, NUM_JOINTS), dtype=wp.quat, device=device)
-        self.reference_root = wp.zeros(n, dtype=wp.vec3, device=device)
-        self.poses = first_poses(device)
-
-    def arrays(self) -> dict[str, wp.array]:
-        return {"held": self.held}
 
     def record_reset(self, env, graph) -> None:
-        state, avatar = env.simulation.avatar.state, self.scene.avatars[0]
-        limits, config = env.action_map, self.config
-        rule = lying_rule(config.face_up, config.halfway, config.pose_noise)
+        state, limits = env.simulation.avatar.state, env.action_map
+        place = wp.vec3(*self.scene.avatars[0].position, 0.0)
         graph.launch(
             spawn_lying,
             (env.num_envs, NUM_JOINTS),
-            [
-                env.mask, env.seed, env.episode, rule, limits.lower, limits.upper, self.poses,
-                wp.vec3(*avatar.position, 0.0),
-            ],
+            [env.mask, env.seed, env.episode, self.lying, limits.lower, limits.upper, self.poses, place],
             [state.command_rotation, state.command_root, self.lies_up],
-        )  # fmt: skip
+        )
         self.grounding.record_reset(env, graph)
-        graph.launch(forget_hold, env.num_envs, [env.mask], [self.held])
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         if env.control == "pose":
             return super().record_references(env, graph)
-        avatar = env.simulation.avatar
-        graph.launch(
-            lead_up,
-            (env.num_envs, NUM_JOINTS),
-            [avatar.body, avatar.tracked.rotation, avatar.tracked.position],
-            [self.reference_rotation, self.reference_root],
-        )
-        return [(self.reference_rotation, self.reference_root)]
+        avatar, reference = env.simulation.avatar, (self.reference_rotation, self.reference_root)
+        inputs = [avatar.body, avatar.tracked.rotation, avatar.tracked.position]
+        graph.launch(lead_up, (env.num_envs, NUM_JOINTS), inputs, list(reference))
+        return [reference]
 
     def record_outcome(self, env, graph) -> None:
-        record_rising_outcome(env, graph, self.rule, self.still, self.config.feet_margin)
-        dt = self.config.physics.control_dt
+        avatar, t, config = env.simulation.avatar, env.simulation.avatar.tracked, self.config
+        tracked = [t.rotation, t.position, t.velocity, t.local]
         graph.launch(
-            judge_hold,
+            judge_rising,
             env.num_envs,
-            [self.steps, dt, len(METRICS), env.failure],
-            [self.held, env.success, env.metrics],
+            [self.rule, self.still, config.feet_margin, avatar.body, *tracked, env.action],
+            [env.terms, env.metrics, env.success],
         )
+        inputs = [self.steps, config.physics.control_dt, env.failure]
+        graph.launch(judge_hold, env.num_envs, inputs, [self.held, env.success, env.metrics])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         record_observe_upright(env, graph, agent, start)

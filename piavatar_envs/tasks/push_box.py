@@ -10,21 +10,30 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
+from piavatar_envs.avatar.rotation import quat_exp, quat_log, turn_about_z
+from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ConfigError, EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.config.schema import Length
+from piavatar_envs.core.rng import STREAM_TASK, generator
+from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec
-from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
+from piavatar_envs.mpm.colliders import BOX, solid_distance
+from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
-from piavatar_envs.tasks.common.leash import record_leash
-from piavatar_envs.tasks.common.pushing import Push, draw_push, find_hands, judge, observe, observe_lead
+from piavatar_envs.tasks.common.hands import write_hands
 from piavatar_envs.tasks.common.ranges import DistanceRange, Margin, MassRange, Weight, check_ranges
-from piavatar_envs.tasks.common.spawn import record_standing
+from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
+from piavatar_envs.tasks.common.root_command import record_root_clamp
+from piavatar_envs.tasks.common.spawn import forward_of, record_standing
 
 if TYPE_CHECKING:
     from piavatar_envs.render.scene import Marker
+
+wp.set_module_options({"enable_backward": False})
 
 #: Name of the box among the props; it is the first.
 NAME = "box"
@@ -35,10 +44,12 @@ UPPER_BODY = (
 )
 #: Speeds of the root at action 1 [m/s] and [rad/s].
 WALK, TURN = 1.0, 1.5
-#: How far the command may be ahead of the body [m] and [rad]: a pull of some 600 N at most.
-LEASH, LEASH_TURN = 0.1, 0.3
-#: How far the body reaches in its first pose, with hands and feet [m], and behind a box that it pushes.
+#: Greatest lead of the commanded root on the body [m] and [rad]: a pull of some 600 N.
+ROOT_LEAD, ROOT_TURN_LEAD = 0.1, 0.3
+#: Reach of the body in its first pose, with hands and feet, and its room behind a box that it pushes [m].
 REACH, BEHIND = 0.4, 0.4
+#: Least margin of the reward, for a box that starts at its target [m].
+LEAST_MARGIN = wp.constant(0.1)
 
 
 class PushBoxConfig(EnvConfig):
@@ -63,6 +74,151 @@ class PushBoxConfig(EnvConfig):
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 
+@wp.struct
+class Push:
+    """Constants of the task, as in the settings. Ranges are a lower and an upper bound."""
+
+    box: int  # index among the props
+    pair: int  # sensor of the avatar with the box
+    volume: float  # [m^3]
+    place: wp.vec3  # of the avatar at the start: x, y [m] and yaw [rad]
+    box_half_size: wp.vec3
+    box_mass: wp.vec2
+    box_distance: wp.vec2
+    box_turn: float
+    target_distance: wp.vec2
+    target_angle: float
+    target_radius: float
+    hand_margin: float
+    control_cost: float
+
+
+@wp.kernel
+def draw_push(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    push: Push,
+    # out
+    position: wp.array2d(dtype=wp.vec3),
+    rotation: wp.array2d(dtype=wp.quat),
+    density: wp.array2d(dtype=float),
+    target: wp.array(dtype=wp.vec3),
+    way: wp.array(dtype=float),
+):
+    """Draw a box in front of the avatar, its mass, its target, and the distance between them [m]."""
+    e = wp.tid()
+    if not mask[e]:
+        return
+    random = generator(seed[e], episode[e], STREAM_TASK, 0)
+    out = wp.randf(random, push.box_distance[0], push.box_distance[1]) * forward_of(push.place[2])
+    at = wp.vec3(push.place[0] + out[0], push.place[1] + out[1], push.box_half_size[2])
+    position[e, push.box] = at
+    turn = push.place[2] + wp.randf(random, -push.box_turn, push.box_turn)
+    rotation[e, push.box] = quat_exp(wp.vec3(0.0, 0.0, turn))
+    density[e, push.box] = wp.randf(random, push.box_mass[0], push.box_mass[1]) / push.volume
+    way[e] = wp.randf(random, push.target_distance[0], push.target_distance[1])
+    to = at + way[e] * forward_of(push.place[2] + wp.randf(random, -push.target_angle, push.target_angle))
+    target[e] = wp.vec3(to[0], to[1], 0.0)
+
+
+@wp.kernel
+def find_hands(
+    body: Body,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    # out
+    hands: wp.array2d(dtype=wp.vec3),
+):
+    """Find the middles of both hands in the world."""
+    e = wp.tid()
+    write_hands(body, e, rotation, position, hands)
+
+
+@wp.func
+def to_go(box: wp.vec3, target: wp.vec3):
+    """Return the horizontal vector from the box to the target [m]."""
+    return wp.vec3(target[0] - box[0], target[1] - box[1], 0.0)
+
+
+@wp.kernel
+def judge(
+    push: Push,
+    box_position: wp.array2d(dtype=wp.vec3),
+    box_rotation: wp.array2d(dtype=wp.quat),
+    box_velocity: wp.array2d(dtype=wp.vec3),
+    hands: wp.array2d(dtype=wp.vec3),
+    target: wp.array(dtype=wp.vec3),
+    way: wp.array(dtype=float),
+    sensors: Sensors,
+    action: wp.array3d(dtype=float),
+    # out
+    terms: wp.array3d(dtype=float),
+    metrics: wp.array3d(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
+):
+    """Reward a box near its target and hands near the box."""
+    e = wp.tid()
+    distance = wp.length(to_go(box_position[e, push.box], target[e]))
+    near = float(0.0)
+    for hand in range(2):
+        p = wp.quat_rotate_inv(box_rotation[e, push.box], hands[e, hand] - box_position[e, push.box])
+        gap = wp.max(solid_distance(BOX, push.box_half_size, p)[3], 0.0)
+        near += 0.5 * tolerance(gap, 0.1, push.hand_margin)
+        metrics[e, 0, 1 + hand] = gap
+    terms[e, 0, 0] = 0.8 * tolerance(distance, push.target_radius, wp.max(way[e] - push.target_radius, LEAST_MARGIN))
+    terms[e, 0, 1] = 0.2 * near
+    terms[e, 0, 2] = -push.control_cost * mean_square_action(action, e, 0)
+    metrics[e, 0, 0] = distance
+    metrics[e, 0, 3] = wp.length(box_velocity[e, push.box])
+    metrics[e, 0, 4] = wp.length(sensors.pair_impulse[e, push.pair])
+    success[e, 0] = distance <= push.target_radius
+
+
+@wp.kernel
+def observe(
+    push: Push,
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    box_position: wp.array2d(dtype=wp.vec3),
+    density: wp.array2d(dtype=float),
+    hands: wp.array2d(dtype=wp.vec3),
+    target: wp.array(dtype=wp.vec3),
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Write all but the last of ``PushBoxTask.observation_terms`` from component ``start``."""
+    e = wp.tid()
+    to_root = wp.quat_inverse(rotation[e, 0])
+    box = box_position[e, push.box]
+    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, target[e] - position[e, 0]))
+    write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, to_go(box, target[e])))
+    write_vector(observation, e, agent, start + 6, wp.quat_rotate(to_root, box - hands[e, 0]))
+    write_vector(observation, e, agent, start + 9, wp.quat_rotate(to_root, box - hands[e, 1]))
+    observation[e, agent, start + 12] = push.volume * density[e, push.box]
+
+
+@wp.kernel
+def observe_lead(
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    command_rotation: wp.array2d(dtype=wp.quat),
+    command_root: wp.array(dtype=wp.vec3),
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Write the command's lead on the pelvis: to its left and backwards [m], and its turn [rad]."""
+    e = wp.tid()
+    heading = turn_about_z(rotation[e, 0])
+    lead = wp.quat_rotate_inv(heading, command_root[e] - position[e, 0])
+    turn = quat_log(turn_about_z(command_rotation[e, 0]) * wp.quat_inverse(heading))
+    write_vector(observation, e, agent, start, wp.vec3(lead[0], lead[1], turn[2]))
+
+
 class PushBoxTask(Task):
     """Push the box to the target."""
 
@@ -76,32 +232,38 @@ class PushBoxTask(Task):
         ObservationTerm("box_mass", 1, "kg", "-", "mass of the box"),
         ObservationTerm("command_lead", 3, "m, rad", "root", "x, y and yaw of the commanded root from the tracked one"),
     )
-    reward_terms = ("push", "hands", "control")
-    metrics = ("distance", "left_hand_gap", "right_hand_gap", "box_speed", "push_impulse")
+    rewards = (
+        Term(
+            "push",
+            "0.8 while `distance` is at most `target_radius`; beyond it a Gaussian that has fallen to 0.08 at the "
+            "distance where the box started",
+        ),
+        Term(
+            "hands",
+            "0.1 for each hand within 0.1 m of the box's surface; beyond it a Gaussian that has fallen to 0.01 after "
+            "another `hand_margin`",
+        ),
+        CONTROL,
+    )
+    metrics = (
+        Metric("distance", "m", "horizontal distance of the box's middle from the target"),
+        Metric("left_hand_gap", "m", "from the middle of the left hand to the box's surface"),
+        Metric("right_hand_gap", "m", "from the middle of the right hand to the box's surface"),
+        Metric("box_speed", "m/s", "speed of the box"),
+        Metric("push_impulse", "N s", "impulse between body and box in this step"),
+    )
+    state_arrays = (TaskArray("target", wp.vec3), TaskArray("way"))
+    scratch_arrays = (TaskArray("hands", wp.vec3, (2,)),)
 
     camera_position = (3.0, -2.5, 1.75)
     camera_target = (0.0, -0.55, 0.65)
 
-    summary = """A soft box stands before the avatar, turned a little (`box_turn`) and of a mass that is drawn from
-`box_mass` and observed. Within `target_angle` of straight ahead, `target_distance` from the box, a place on the floor
-is marked: the box shall stand there. The avatar walks as root actions say, up to 1 m/s and 1.5 rad/s, its legs carried
-along; trunk and arms act. It has to get behind the box, bend over it, push it with hands and body in the right
-direction, and stop in time: the box slides on with friction `box_friction`. What blocks the body holds back the command
-of the root, too: before each action it is brought back to within 0.1 m and 0.3 rad of the body."""
-    reward_docs: ClassVar[Mapping[str, str]] = {
-        "push": "0.8 while `distance` is at most `target_radius`; beyond it a Gaussian that has fallen to 0.08 at the "
-        "distance where the box started",
-        "hands": "0.1 for each hand within 0.1 m of the box's surface; beyond it a Gaussian that has fallen to 0.01 "
-        "after another `hand_margin`",
-        "control": "`-control_cost` times the mean of the squared action components",
-    }
-    metric_docs: ClassVar[Mapping[str, str]] = {
-        "distance": "horizontal distance of the box's middle from the target [m]",
-        "left_hand_gap": "from the middle of the left hand to the box's surface [m]",
-        "right_hand_gap": "from the middle of the right hand to the box's surface [m]",
-        "box_speed": "speed of the box [m/s]",
-        "push_impulse": "impulse between body and box in this step [N s]",
-    }
+    summary = """A soft box stands in front of the avatar, turned at random by up to `box_turn`; its mass is drawn from
+`box_mass` and observed. Its target is a place on the floor at a `target_distance` from the box, within `target_angle`
+of straight ahead. The avatar moves as root actions say, at up to 1 m/s and 1.5 rad/s, its legs carried along; trunk and
+arms act. A good agent gets behind the box, bends over it, pushes it with hands and body in the right direction, and
+stops in time: the box slides on with friction `box_friction`. A blocked body also holds back the root command: before
+each action the command is clamped to within 0.1 m and 0.3 rad of the body."""
     success_doc = "`distance` is at most `target_radius`"
     picture_seconds = 1.6
     picture_actions: ClassVar[Mapping[str, float]] = {
@@ -143,7 +305,7 @@ of the root, too: before each action it is brought back to within 0.1 m and 0.3 
         return {NAME: [(*self._ahead(distance), height) for distance in self.config.box_distance]}
 
     def _ahead(self, distance: float, angle: float = 0.0) -> tuple[float, float]:
-        """What is ``distance`` [m] before the avatar's place, ``angle`` [rad] from straight ahead."""
+        """Return the point ``distance`` [m] in front of the avatar's place, ``angle`` [rad] from straight ahead."""
         x, y, yaw = self.place
         return x + distance * math.sin(yaw + angle), y - distance * math.cos(yaw + angle)
 
@@ -161,7 +323,7 @@ of the root, too: before each action it is brought back to within 0.1 m and 0.3 
         return ActionSpec(self.joints, root=True, joint_speed=joint_speed, root_speed=WALK, root_turn_speed=TURN)
 
     def domain(self) -> Domain:
-        """Room for the body wherever it may have to push from."""
+        """Include every place from which the body may have to push."""
         config, (x, y, _) = self.config, self.place
         box = np.array(self._ahead(config.box_distance[1]))
         spread = np.linspace(-config.target_angle, config.target_angle, 9)
@@ -169,34 +331,19 @@ of the root, too: before each action it is brought back to within 0.1 m and 0.3 
         return Domain().around([(x, y), *(box + (config.target_distance[1] - BEHIND) * ways).tolist()])
 
     def allocate(self, env) -> None:
-        n, device, config, push = env.num_envs, env.device, self.config, Push()
-        simulation = env.simulation
-        push.box, push.pair = simulation.props.index(NAME), simulation.subjects.names.index(NAME)
-        push.half_size, push.volume = wp.vec3(*config.box_half_size), float(simulation.props.volume[push.box])
-        push.place, push.mass, push.turn = wp.vec3(*self.place), wp.vec2(*config.box_mass), config.box_turn
-        push.distance, push.way = wp.vec2(*config.box_distance), wp.vec2(*config.target_distance)
-        push.angle, push.reached = config.target_angle, config.target_radius
-        push.hand_margin, push.control_cost = config.hand_margin, config.control_cost
-        self.push = push
-        self.target = wp.zeros(n, dtype=wp.vec3, device=device)
-        self.way = wp.zeros(n, dtype=float, device=device)
-        self.hands = wp.zeros((n, 2), dtype=wp.vec3, device=device)
-
-    def arrays(self) -> dict[str, wp.array]:
-        return {"target": self.target, "way": self.way}
+        props, subjects = env.simulation.props, env.simulation.subjects
+        box = props.index(NAME)
+        constants = {"box": box, "pair": subjects.names.index(NAME), "volume": float(props.volume[box])}
+        self.push = fill(Push(), self.config, place=wp.vec3(*self.place), **constants)
 
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
-        props = env.simulation.props
-        graph.launch(
-            draw_push,
-            env.num_envs,
-            [env.mask, env.seed, env.episode, self.push],
-            [props.spawn.position, props.spawn.rotation, props.density, self.target, self.way],
-        )
+        spawn, density = env.simulation.props.spawn, env.simulation.props.density
+        outputs = [spawn.position, spawn.rotation, density, self.target, self.way]
+        graph.launch(draw_push, env.num_envs, [env.mask, env.seed, env.episode, self.push], outputs)
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
-        return record_leash(env, graph, LEASH, LEASH_TURN)
+        return record_root_clamp(env, graph, ROOT_LEAD, ROOT_TURN_LEAD)
 
     def _record_hands(self, env, graph) -> None:
         avatar = env.simulation.avatar
@@ -206,33 +353,18 @@ of the root, too: before each action it is brought back to within 0.1 m and 0.3 
     def record_outcome(self, env, graph) -> None:
         self._record_hands(env, graph)
         box = env.simulation.props.state
-        graph.launch(
-            judge,
-            env.num_envs,
-            [
-                self.push, box.position, box.rotation, box.velocity, self.hands, self.target, self.way,
-                env.simulation.sensors, env.action,
-            ],
-            [env.terms, env.metrics, env.success],
-        )  # fmt: skip
+        seen = [box.position, box.rotation, box.velocity, self.hands, self.target, self.way, env.simulation.sensors]
+        graph.launch(judge, env.num_envs, [self.push, *seen, env.action], [env.terms, env.metrics, env.success])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_hands(env, graph)
         avatar, props = env.simulation.avatar, env.simulation.props
         here = [avatar.tracked.rotation, avatar.tracked.position]
-        graph.launch(
-            observe,
-            env.num_envs,
-            [self.push, agent, start, *here, props.state.position, props.density, self.hands, self.target],
-            [env.observation],
-        )
+        inputs = [self.push, agent, start, *here, props.state.position, props.density, self.hands, self.target]
+        graph.launch(observe, env.num_envs, inputs, [env.observation])
         last = start + sum(term.size for term in self.observation_terms[:-1])
-        graph.launch(
-            observe_lead,
-            env.num_envs,
-            [agent, last, *here, avatar.state.command_rotation, avatar.state.command_root],
-            [env.observation],
-        )
+        inputs = [agent, last, *here, avatar.state.command_rotation, avatar.state.command_root]
+        graph.launch(observe_lead, env.num_envs, inputs, [env.observation])
 
     def markers(self, env, index: int) -> list[Marker]:
         from piavatar_envs.render.scene import Ring

@@ -1,4 +1,4 @@
-"""PushRecovery: keep one's balance while soft balls, light and heavy, push from anywhere at any moment."""
+"""PushRecovery: keep balance while soft balls, light and heavy, push from any side at any moment."""
 
 from __future__ import annotations
 
@@ -6,46 +6,55 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import warp as wp
 from pydantic import Field
 
 from piavatar_envs.config import ControlConfig, EnvConfig, PropConfig, SceneConfig, TorqueControlConfig, replace
-from piavatar_envs.envs.observations import ObservationTerm
+from piavatar_envs.core.rng import STREAM_BALL, STREAM_DISTURBANCE, generator
+from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.task import Metric, TaskArray
+from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.fall import FallConfig
-from piavatar_envs.tasks.common.ground import Grounding
-from piavatar_envs.tasks.common.pushes import Pushes
 from piavatar_envs.tasks.common.ranges import DistanceRange, MassRange, SpeedRange, Weight, check_ranges
-from piavatar_envs.tasks.common.throws import make_throws, throwing_domain, thrown_speed, waiting_places
+from piavatar_envs.tasks.common.thrown_balls import (
+    Throws,
+    make_throws,
+    record_balls,
+    throw_or_catch,
+    throwing_domain,
+    thrown_speed,
+    waiting_places,
+)
 from piavatar_envs.tasks.common.upright import (
-    FALL_DOC,
-    METRIC_DOCS,
-    METRICS,
-    REWARD_DOCS,
-    REWARD_TERMS,
     STANDING_DOC,
+    STANDING_METRICS,
     UPRIGHT_TERMS,
+    StandingTask,
     StillConfig,
     UprightConfig,
-    record_fall,
     record_observe_upright,
-    record_standing_outcome,
-    still_rule,
-    upright_rule,
 )
 
+wp.set_module_options({"enable_backward": False})
+
 BALL = "ball"
+#: The ball is the only one: prop 0, and the subject after the avatar.
+_BALL, _SUBJECT = wp.constant(0), wp.constant(1)
+#: Index of the first throw in the stream of the ball, after the draw of its mass.
+_THROWS = wp.constant(2)
+_FIRST_METRIC = wp.constant(len(STANDING_METRICS))
 
 
 class PushRecoveryConfig(EnvConfig):
     """Settings of PushRecovery."""
 
     control: ControlConfig = Field(default_factory=TorqueControlConfig, description="how actions move the body")
-    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
-    still: StillConfig = Field(default_factory=StillConfig, description="where rewards of standing still end")
-    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
+    upright: UprightConfig = Field(default_factory=UprightConfig, description="limit and margins of being upright")
+    still: StillConfig = Field(default_factory=StillConfig, description="margins of the rewards of standing still")
+    fall: FallConfig = Field(default_factory=FallConfig, description="limits of a fall")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     ball_radius: float = Field(0.1, ge=0.06, le=0.2, description="radius of the ball [m]")
     ball_mass: MassRange = Field((0.5, 8.0), description="range of its mass, uniform in its log [kg]")
@@ -62,39 +71,140 @@ class PushRecoveryConfig(EnvConfig):
 
     @property
     def num_balls(self) -> int:
-        """Balls that are thrown: always the same one."""
+        """Number of balls: every throw is of the same one."""
         return 1
 
 
-class PushRecoveryTask(Task):
-    """Stand still in the rest pose, whatever pushes."""
+@wp.func
+def moment_of(throws: Throws, seed: int, episode: int, number: int):
+    """Return the control step of a push: one in the first half of every interval, never in its first step."""
+    random = generator(seed, episode, STREAM_DISTURBANCE, number)
+    return number * throws.interval + wp.randi(random, 1, throws.interval // 2 + 2)
+
+
+@wp.kernel
+def throw_push(
+    throws: Throws,
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    failure: wp.array(dtype=int),
+    joints: wp.array2d(dtype=wp.vec3),
+    ball_position: wp.array2d(dtype=wp.vec3),
+    ball_velocity: wp.array2d(dtype=wp.vec3),
+    # out
+    placed: wp.array(dtype=wp.bool),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    spin: wp.array2d(dtype=wp.vec3),
+):
+    """Flag whether the ball is placed before this step: thrown if its moment has come, caught if it flies on."""
+    e = wp.tid()
+    placed[e] = False
+    if failure[e] != 0:
+        return
+    number = step_count[e] // throws.interval
+    due = step_count[e] == moment_of(throws, seed[e], episode[e], number)
+    random = generator(seed[e], episode[e], STREAM_BALL, _THROWS + number)
+    placed[e] = throw_or_catch(
+        throws, due, random, e, _BALL, joints, ball_position, ball_velocity, position, velocity, spin
+    )
+
+
+@wp.kernel
+def begin_push(
+    placed: wp.array(dtype=wp.bool),
+    velocity: wp.array2d(dtype=wp.vec3),
+    # in and out
+    flying: wp.array(dtype=int),
+    push: wp.array(dtype=wp.vec3),
+):
+    """Set a ball that has just been placed to flying, with no impulse yet, if it was thrown; to waiting if caught."""
+    e = wp.tid()
+    if placed[e]:
+        flying[e] = 0
+        if wp.length_sq(velocity[e, _BALL]) > 0.0:
+            flying[e] = 1
+            push[e] = wp.vec3(0.0)
+
+
+@wp.kernel
+def judge_push(
+    least: float,
+    sensors: Sensors,
+    # in and out
+    push: wp.array(dtype=wp.vec3),
+    strongest: wp.array(dtype=float),
+    success: wp.array2d(dtype=wp.bool),
+    # out
+    metrics: wp.array3d(dtype=float),
+):
+    """Sum the impulses of the last throw, write the metrics, and require a push of ``least`` [N s] for success."""
+    e = wp.tid()
+    impulse = sensors.pair_impulse[e, _SUBJECT]
+    push[e] = push[e] + impulse
+    strongest[e] = wp.max(strongest[e], wp.length(push[e]))
+    metrics[e, 0, _FIRST_METRIC] = wp.length(impulse)
+    metrics[e, 0, _FIRST_METRIC + 1] = wp.length(push[e])
+    metrics[e, 0, _FIRST_METRIC + 2] = strongest[e]
+    success[e, 0] = success[e, 0] and strongest[e] >= least
+
+
+@wp.kernel
+def observe_push(
+    agent: int,
+    start: int,
+    rotation: wp.array2d(dtype=wp.quat),
+    position: wp.array2d(dtype=wp.vec3),
+    velocity: wp.array2d(dtype=wp.vec3),
+    flying: wp.array(dtype=int),
+    ball_position: wp.array2d(dtype=wp.vec3),
+    ball_velocity: wp.array2d(dtype=wp.vec3),
+    # out
+    observation: wp.array3d(dtype=float),
+):
+    """Write the ball's position and velocity relative to the pelvis while it flies; else zeros."""
+    e = wp.tid()
+    way = wp.vec3(0.0)
+    speed = wp.vec3(0.0)
+    if flying[e] != 0:
+        way = wp.quat_rotate_inv(rotation[e, 0], ball_position[e, _BALL] - position[e, 0])
+        speed = wp.quat_rotate_inv(rotation[e, 0], ball_velocity[e, _BALL] - velocity[e, 0])
+    write_vector(observation, e, agent, start, way)
+    write_vector(observation, e, agent, start + 3, speed)
+
+
+class PushRecoveryTask(StandingTask):
+    """Stand still in the rest pose under pushes."""
 
     Config = PushRecoveryConfig
-    description = "keep one's balance while soft balls of 0.5 to 8 kg push from anywhere"
+    description = "keep balance while soft balls of 0.5 to 8 kg push from any side"
     observation_terms = (
         *UPRIGHT_TERMS,
         ObservationTerm("ball_position", 3, "m", "root", "the ball, from its throw until it is caught; else zeros"),
         ObservationTerm("ball_velocity", 3, "m/s", "root", "its velocity relative to the pelvis, likewise"),
     )
-    reward_terms = REWARD_TERMS
-    metrics = (*METRICS, "impulse", "push_impulse", "strongest_push")
+    metrics = (
+        *STANDING_METRICS,
+        Metric("impulse", "N s", "size of the ball's impulse on the body in this step"),
+        Metric("push_impulse", "N s", "size of its impulse since it was last thrown"),
+        Metric("strongest_push", "N s", "greatest `push_impulse` of the episode so far"),
+    )
+    state_arrays = (
+        TaskArray("flying", int, cleared=True),  # 1 from a throw until the ball is caught
+        TaskArray("push", wp.vec3, cleared=True),  # impulse on the body since the last throw [N s]
+        TaskArray("strongest", cleared=True),  # greatest size of that in the episode [N s]
+    )
+    scratch_arrays = (TaskArray("placed", wp.bool),)
 
-    summary = """The avatar stands by the strength of its own joints, as in Stand, and once in every `throw_interval`,
-at a random moment of its first half, a soft ball is thrown at its trunk, between pelvis and chest, from a random
-direction and `throw_distance` away. A ball weighs the same for an episode, anything in the range `ball_mass`, which is
-drawn uniformly in its logarithm; the heaviest at the greatest speed carries 40 N s, which would set the whole body in
-motion by half a metre a second. The ball is seen while it flies, its mass is not. It pushes by contact like anything
-else, and may come to lie before the feet; one that has flown past is caught and waits. `info["strongest_push"]` is the
-greatest impulse of the episode so far: of all episodes, the share that lasts may be told by it."""
-    reward_docs: ClassVar[Mapping[str, str]] = REWARD_DOCS
-    metric_docs: ClassVar[Mapping[str, str]] = {
-        **METRIC_DOCS,
-        "impulse": "size of the ball's impulse on the body in this step [N s]",
-        "push_impulse": "size of its impulse since it was thrown last [N s]",
-        "strongest_push": "greatest `push_impulse` of the episode so far [N s]",
-    }
+    summary = """The avatar stands by the strength of its own joints, as in Stand. Once in every `throw_interval`, at a
+random moment of its first half, a soft ball is thrown at its trunk, between pelvis and chest, from a random direction
+and `throw_distance` away. The ball keeps its mass for an episode; it is drawn from `ball_mass`, uniformly in its
+logarithm. The heaviest ball at the greatest speed carries 40 N s, which would set the whole body in motion at half a
+metre a second. The ball is observed while it flies, its mass is not. It pushes by contact like anything else and may
+come to lie in front of the feet; a ball that has flown past is caught and waits. `info["strongest_push"]` is the
+greatest impulse of the episode so far: sorted by it, episodes show which pushes the avatar survives."""
     success_doc = f"{STANDING_DOC}, and a throw has pushed with at least `hit_impulse`"
-    termination_doc = FALL_DOC
     picture_seconds = 0.47
     picture_actions = "zero"
     picture_settings: ClassVar[Mapping[str, Any]] = {"throw_interval": 0.8, "root_assist": 0.1}
@@ -122,36 +232,44 @@ greatest impulse of the episode so far: of all episodes, the share that lasts ma
         return (Parameter("ball_mass", "kg", *self.config.ball_mass, "mass of the ball", log=True),)
 
     def drawn_values(self, env) -> tuple[Drawn, ...]:
-        return (Drawn(env.simulation.props.density[:, 0], self.pushes.throws.volume),)
+        return (Drawn(env.simulation.props.density[:, 0], self.throws.volume),)
 
     def domain(self) -> Domain:
         return throwing_domain(self.config, self.place)
 
     def allocate(self, env) -> None:
-        self.rule = upright_rule(self.config.upright, self.config.control_cost)
-        self.still = still_rule(self.config.still)
-        self.grounding = Grounding(env)
-        throws = make_throws(self.config, self.place, self.waiting, env, aim=("pelvis", "spine3"), log_mass=True)
-        self.pushes = Pushes(env, throws)
-
-    def arrays(self) -> dict:
-        return self.pushes.arrays()
+        super().allocate(env)
+        self.throws = make_throws(self.config, self.place, self.waiting, env, aim=("pelvis", "spine3"), log_mass=True)
 
     def record_reset(self, env, graph) -> None:
-        self.grounding.record_standing(env, graph, self.config.pose_noise)
-        self.pushes.record_reset(env, graph)
+        super().record_reset(env, graph)
+        record_balls(env, graph, self.throws)
 
-    def record_references(self, env, graph) -> list:
-        self.pushes.record_throw(env, graph)
+    def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
+        props, tracked = env.simulation.props, env.simulation.avatar.tracked
+        now, spawn = props.state, props.spawn
+        clocks = [env.seed, env.episode, env.step_count, env.failure]
+        graph.launch(
+            throw_push,
+            env.num_envs,
+            [self.throws, *clocks, tracked.position, now.position, now.velocity],
+            [self.placed, spawn.position, spawn.velocity, spawn.spin],
+        )
+        graph.launch(begin_push, env.num_envs, [self.placed, spawn.velocity], [self.flying, self.push])
+        props.record_place(graph, env.simulation.state, self.placed, 0)
         return super().record_references(env, graph)
 
     def record_outcome(self, env, graph) -> None:
-        record_standing_outcome(env, graph, self.rule, self.still)
-        self.pushes.record_outcome(env, graph, len(METRICS), self.config.hit_impulse)
-        record_fall(env, graph, self.config.fall)
+        super().record_outcome(env, graph)
+        inputs = [self.config.hit_impulse, env.simulation.sensors]
+        graph.launch(judge_push, env.num_envs, inputs, [self.push, self.strongest, env.success, env.metrics])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
-        self.pushes.record_observe(env, graph, agent, record_observe_upright(env, graph, agent, start))
+        start = record_observe_upright(env, graph, agent, start)
+        tracked, ball = env.simulation.avatars[agent].tracked, env.simulation.props.state
+        here = [tracked.rotation, tracked.position, tracked.velocity]
+        inputs = [agent, start, *here, self.flying, ball.position, ball.velocity]
+        graph.launch(observe_push, env.num_envs, inputs, [env.observation])
 
 
 TASK = PushRecoveryTask

@@ -13,27 +13,28 @@ from piavatar_envs.avatar.body.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_i
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.kinematics import pose_body
 from piavatar_envs.avatar.motion import load_motion
-from piavatar_envs.avatar.rotation import quat_log
+from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_log, turn_about_z
+from piavatar_envs.avatar.skinning import bones_of, weights_of
 from piavatar_envs.avatar.torque_control.controller import TorqueController
+from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ConfigError, EnvConfig
-from piavatar_envs.envs.actions import ActionSpec
+from piavatar_envs.core.rng import STREAM_DISTURBANCE, STREAM_TASK, generator
+from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.actions import ActionMap, ActionSpec, keep_within
 from piavatar_envs.envs.observations import ObservationTerm, write_rotation, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
+from piavatar_envs.mpm.types import row
 from piavatar_envs.sim.bodies import shape_parameters
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
-from piavatar_envs.tasks.common.clip import Clip, advance_reference, draw_start, read_clip
-from piavatar_envs.tasks.common.disturb import apply_impulse, draw_impulse, draw_offset
 from piavatar_envs.tasks.common.ranges import Margin, Weight
-from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance
+from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
 
 wp.set_module_options({"enable_backward": False})
 
-#: Bones that impulses strike: heavy enough that a few N s push instead of tearing.
+#: Bones that impulses strike: heavy enough not to be torn off by a few N s.
 STRUCK = ("pelvis", "spine2", "spine3", "head", "left_shoulder", "right_shoulder", "left_hip", "right_hip", "left_knee")
-
-
 #: Legs of the longest-legged random body, over those of the mean one.
 LONGEST_LEGS = 1.3
 
@@ -51,6 +52,183 @@ class TrackMotionConfig(EnvConfig):
     control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
 
 
+@wp.struct
+class Clip:
+    """A motion at the control rate, and constants of its reward."""
+
+    rotation: wp.array2d(dtype=wp.quat)  # (frames, 22) local
+    root: wp.array(dtype=wp.vec3)  # (frames,) [m]
+    pelvis_height: float  # of the body that the clip was loaded for, at rest [m]
+    starts: int  # an episode begins at a frame below this
+    success_distance: float
+    fail_distance: float
+    control_cost: float
+
+
+@wp.func
+def frame_of(clip: Clip, start: int, step: int):
+    """Return the frame after ``step`` steps, within the clip whatever a restored state holds; the last one is held."""
+    return wp.clamp(start + step, 0, clip.root.shape[0] - 1)
+
+
+@wp.func
+def root_of(clip: Clip, body: Body, e: int, frame: int):
+    """Return the clip's root, scaled by the length of the body's legs."""
+    height = body.rest_joint[row(e, body.rest_joint.shape[0]), 0][2]
+    return (height / clip.pelvis_height) * clip.root[frame]
+
+
+@wp.kernel
+def draw_start(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    clip: Clip,
+    body: Body,
+    # out
+    start: wp.array(dtype=int),
+    origin: wp.array(dtype=wp.vec3),
+    command_rotation: wp.array2d(dtype=wp.quat),
+    command_root: wp.array(dtype=wp.vec3),
+):
+    """Draw the frame at which the episode enters the clip; the body starts in its pose, over the world's origin."""
+    e, b = wp.tid()
+    if not mask[e]:
+        return
+    random = generator(seed[e], episode[e], STREAM_TASK, 0)
+    first = wp.randi(random, 0, clip.starts)
+    command_rotation[e, b] = clip.rotation[first, b]
+    if b == 0:
+        start[e] = first
+        at = root_of(clip, body, e, first)
+        origin[e] = wp.vec3(at[0], at[1], 0.0)
+        command_root[e] = wp.vec3(0.0, 0.0, at[2])
+
+
+@wp.kernel
+def advance_reference(
+    clip: Clip,
+    body: Body,
+    action_map: ActionMap,
+    start: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    command_rotation: wp.array2d(dtype=wp.quat),
+    command_root: wp.array(dtype=wp.vec3),
+    # out
+    reference_rotation: wp.array2d(dtype=wp.quat),
+    reference_root: wp.array(dtype=wp.vec3),
+):
+    """Add the clip's increment of this step to the command.
+
+    Joint limits hold for the sum, or a swinging clip would carry the actions' part past them; they are widened to the
+    clip's own pose.
+    """
+    e, b = wp.tid()
+    now = frame_of(clip, start[e], step_count[e])
+    after = frame_of(clip, start[e], step_count[e] + 1)
+    step = wp.quat_inverse(clip.rotation[now, b]) * clip.rotation[after, b]
+    q = wp.normalize(command_rotation[e, b] * step)
+    own = quat_log(clip.rotation[after, b])
+    if action_map.offset[b] >= 0 and wp.length(own) < MAX_ANGLE:
+        q = keep_within(q, action_map.lower[b], action_map.upper[b], own)
+    reference_rotation[e, b] = q
+    if b == 0:
+        turn = turn_about_z(command_rotation[e, 0] * wp.quat_inverse(clip.rotation[now, 0]))
+        way = root_of(clip, body, e, after) - root_of(clip, body, e, now)
+        reference_root[e] = command_root[e] + wp.quat_rotate(turn, way)
+
+
+@wp.kernel
+def read_clip(
+    clip: Clip,
+    body: Body,
+    start: wp.array(dtype=int),
+    origin: wp.array(dtype=wp.vec3),
+    step_count: wp.array(dtype=int),
+    # out
+    rotation: wp.array2d(dtype=wp.quat),
+    root: wp.array(dtype=wp.vec3),
+):
+    """Read the clip's pose one step ahead of the step counter."""
+    e, b = wp.tid()
+    frame = frame_of(clip, start[e], step_count[e] + 1)
+    rotation[e, b] = clip.rotation[frame, b]
+    if b == 0:
+        root[e] = root_of(clip, body, e, frame) - origin[e]
+
+
+@wp.func
+def offset_of(seed: int, episode: int, interval: int):
+    """Return the steps of the first interval that are over when an episode begins."""
+    random = generator(seed, episode, STREAM_DISTURBANCE, 0)
+    return wp.randi(random, 0, interval)
+
+
+@wp.kernel
+def draw_offset(
+    mask: wp.array(dtype=wp.bool),
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    interval: int,
+    # out
+    offset: wp.array(dtype=int),
+):
+    """Write the offset of the first impulse, to be observed, in the masked environments."""
+    e = wp.tid()
+    if mask[e]:
+        offset[e] = offset_of(seed[e], episode[e], interval)
+
+
+@wp.kernel
+def draw_impulse(
+    seed: wp.array(dtype=int),
+    episode: wp.array(dtype=int),
+    step_count: wp.array(dtype=int),
+    interval: int,
+    magnitude: float,
+    bones: wp.array(dtype=int),
+    # out
+    impulse: wp.array(dtype=wp.vec3),
+    struck: wp.array(dtype=int),
+):
+    """Draw an impulse [N s] on one of ``bones`` every ``interval`` steps, at the episode's offset; else none."""
+    e = wp.tid()
+    impulse[e] = wp.vec3(0.0)
+    struck[e] = bones[0]
+    step = step_count[e] + offset_of(seed[e], episode[e], interval)
+    if magnitude <= 0.0 or step % interval != interval - 1:
+        return
+    random = generator(seed[e], episode[e], STREAM_DISTURBANCE, 1 + step)
+    direction = wp.sample_unit_sphere_surface(random)
+    impulse[e] = magnitude * wp.randf(random, 0.3, 1.0) * direction
+    struck[e] = bones[wp.randi(random, 0, bones.shape[0])]
+
+
+@wp.kernel
+def apply_impulse(
+    body: Body,
+    impulse: wp.array(dtype=wp.vec3),
+    struck: wp.array(dtype=int),
+    failure: wp.array(dtype=int),
+    # in and out
+    u: wp.array2d(dtype=wp.vec3),
+):
+    """Distribute an impulse over the particles of the struck bone by their skinning weights; its sum is exact."""
+    e, p = wp.tid()
+    if failure[e] != 0:
+        return
+    b = struck[e]
+    bones = bones_of(body.skin, p)
+    weights = weights_of(body.skin, p)
+    share = float(0.0)
+    for n in range(4):
+        if bones[n] == b:
+            share += weights[n]
+    if share > 0.0:
+        mass = body.bone_mass[row(e, body.bone_mass.shape[0]), b]
+        u[e, body.first + p] = u[e, body.first + p] + (share / mass) * impulse[e]
+
+
 @wp.kernel
 def judge(
     clip: Clip,
@@ -66,7 +244,7 @@ def judge(
     success: wp.array2d(dtype=wp.bool),
     terminated: wp.array2d(dtype=wp.bool),
 ):
-    """Reward of following in position and rotation, and its cost."""
+    """Reward positions and rotations close to the clip's."""
     e = wp.tid()
     bones = local.shape[1]
     distance = float(0.0)
@@ -81,8 +259,8 @@ def judge(
     metrics[e, 0, 1] = wp.degrees(angle)
     metrics[e, 0, 2] = wp.length(position[e, 0] - clip_position[e, 0])
     metrics[e, 0, 3] = wp.length(impulse[e])
-    success[e, 0] = distance <= clip.success
-    terminated[e, 0] = distance > clip.fail
+    success[e, 0] = distance <= clip.success_distance
+    terminated[e, 0] = distance > clip.fail_distance
 
 
 @wp.kernel
@@ -98,7 +276,7 @@ def observe(
     # out
     observation: wp.array3d(dtype=float),
 ):
-    """Terms of ``TrackMotionTask.observation_terms``."""
+    """Write ``TrackMotionTask.observation_terms`` from component ``start``."""
     e, b = wp.tid()
     bones = rotation.shape[1]
     to_root = wp.quat_inverse(rotation[e, 0])
@@ -118,31 +296,45 @@ class TrackMotionTask(Task):
     Config = TrackMotionConfig
     description = "follow a clip while impulses from random directions disturb the body"
     observation_terms = (
-        ObservationTerm("reference_positions", 3 * NUM_JOINTS, "m", "root", "the clip's next joints from one's own"),
+        ObservationTerm("reference_positions", 3 * NUM_JOINTS, "m", "root", "the clip's next joints from the avatar's"),
         ObservationTerm("reference_root", 6, "-", "root", "the clip's next pelvis orientation, two columns"),
         ObservationTerm("reference_turns", 3 * NUM_ACTUATED, "rad", "bone", "rotation vectors to the clip's next pose"),
     )
-    reward_terms = ("position", "rotation", "control")
+    rewards = (
+        Term("position", "0.6 while `mpjpe` is at most 0.01 m; beyond it a Gaussian that has fallen to 0.06 at 0.31 m"),
+        Term(
+            "rotation",
+            "0.4 while the mean rotation error of the joints is at most 0.01 rad; beyond it a Gaussian that has fallen "
+            "to 0.04 at 0.51 rad",
+        ),
+        CONTROL,
+    )
+    metrics = (
+        Metric("mpjpe", "m", "mean distance of the joints from the clip's, in the world"),
+        Metric("rotation_error_deg", "deg", "mean angle between the joints' local rotations and the clip's"),
+        Metric("root_error", "m", "distance of the pelvis from the clip's"),
+        Metric("impulse", "N s", "impulse that struck the body in this step, 0 for none"),
+    )
+    state_arrays = (TaskArray("start", int), TaskArray("origin", wp.vec3))
+    scratch_arrays = (
+        TaskArray("reference_rotation", wp.quat, (NUM_JOINTS,)),
+        TaskArray("reference_root", wp.vec3),
+        TaskArray("clip_rotation", wp.quat, (NUM_JOINTS,)),
+        TaskArray("clip_root", wp.vec3),
+        TaskArray("clip_world", wp.quat, (NUM_JOINTS,)),
+        TaskArray("clip_position", wp.vec3, (NUM_JOINTS,)),
+        TaskArray("still", wp.vec3, (NUM_JOINTS,)),
+        TaskArray("impulse", wp.vec3),
+        TaskArray("struck", int),
+        TaskArray("offset", int),
+    )
     targets_about_reference = True
-    metrics = ("mpjpe", "rotation_error_deg", "root_error", "impulse")
 
-    summary = """The avatar moves as a clip does, and every `impulse_interval` an impulse of 0.3 to 1 times `impulse`
-and of random direction strikes its trunk, head, shoulders, hips or left knee. Actions are added to the clip's own
-increments: with zero actions the commanded pose is the clip's, and what an impulse disturbs comes back only as firmly
-as `tone` and the root wrench pull. A good agent steers against the disturbance and stays on the clip. With
-`control="torque"` or `"pd"` nothing but the joints moves the body, which begins with the clip's own velocity."""
-    reward_docs: ClassVar[Mapping[str, str]] = {
-        "position": "0.6 while `mpjpe` is at most 0.01 m; beyond it a Gaussian that has fallen to 0.06 at 0.31 m",
-        "rotation": "0.4 while the mean rotation error of the joints is at most 0.01 rad; beyond it a Gaussian that "
-        "has fallen to 0.04 at 0.51 rad",
-        "control": "`-control_cost` times the mean of the squared action components",
-    }
-    metric_docs: ClassVar[Mapping[str, str]] = {
-        "mpjpe": "mean distance of the joints from the clip's, in the world [m]",
-        "rotation_error_deg": "mean angle between the joints' local rotations and the clip's [deg]",
-        "root_error": "distance of the pelvis from the clip's [m]",
-        "impulse": "impulse that struck the body in this step, 0 for none [N s]",
-    }
+    summary = """The reference pose follows a clip, and every `impulse_interval` an impulse of 0.3 to 1 times `impulse`
+and of random direction strikes trunk, head, shoulders, hips or left knee. Actions are added to the clip's own
+increments: with zero actions the commanded pose is the clip's, and a disturbance decays only as firmly as `tone` and
+the root wrench pull. A good agent steers against the disturbance and stays on the clip. With `control="torque"` or
+`"pd"` only the joints move the body, which begins with the clip's own velocity."""
     success_doc = "`mpjpe` is at most `success_distance`"
     termination_doc = "`mpjpe` exceeds `fail_distance`"
     picture_seconds = 1.5
@@ -185,7 +377,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         return ActionSpec(self.joints, root=self.config.root_action, joint_speed=speed)
 
     def domain(self) -> Domain:
-        """The default box, moved along the clip; random bodies may take longer steps than the one it was loaded for."""
+        """Move the default box along the clip; random bodies may take longer steps than the body of the clip."""
         ways = [
             self.roots[s : s + len(self.roots) - self.starts + 1, :2] - self.roots[s, :2] for s in range(self.starts)
         ]
@@ -196,36 +388,24 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         return Domain(lower, upper)
 
     def impulses(self) -> dict[str, float]:
-        """On any of the bones that are struck."""
+        """Return the impulse on any of the bones in :data:`STRUCK`."""
         return dict.fromkeys(STRUCK, self.config.impulse)
 
     def allocate(self, env) -> None:
-        n, device = env.num_envs, env.device
-
-        def zeros(shape, dtype):
-            return wp.zeros(shape, dtype=dtype, device=device)
-
-        clip = Clip()
+        device = env.device
         xyzw = np.ascontiguousarray(self.rotations[..., [1, 2, 3, 0]], np.float32)
-        clip.rotation = wp.array(xyzw, dtype=wp.quat, device=device)
-        clip.root = wp.array(self.roots.astype(np.float32), dtype=wp.vec3, device=device)
-        clip.pelvis_height = self.pelvis_height
-        clip.starts, clip.success, clip.fail = self.starts, self.config.success_distance, self.config.fail_distance
-        clip.control_cost = self.config.control_cost
-        self.clip = clip
-        self.start, self.origin = zeros(n, int), zeros(n, wp.vec3)
-        self.reference_rotation, self.reference_root = zeros((n, NUM_JOINTS), wp.quat), zeros(n, wp.vec3)
-        self.clip_rotation, self.clip_root = zeros((n, NUM_JOINTS), wp.quat), zeros(n, wp.vec3)
-        self.clip_world, self.clip_position = zeros((n, NUM_JOINTS), wp.quat), zeros((n, NUM_JOINTS), wp.vec3)
-        self.still = zeros((n, NUM_JOINTS), wp.vec3)
+        self.clip = fill(
+            Clip(),
+            self.config,
+            rotation=wp.array(xyzw, dtype=wp.quat, device=device),
+            root=wp.array(self.roots.astype(np.float32), dtype=wp.vec3, device=device),
+            pelvis_height=self.pelvis_height,
+            starts=self.starts,
+        )
         controller = env.simulation.controllers[0]
         if isinstance(controller, TorqueController):  # torques could not reach the clip's speed at once
             controller.first = self.clip_rotation, self.clip_root
-        self.impulse, self.struck, self.offset = zeros(n, wp.vec3), zeros(n, int), zeros(n, int)
         self.bones = wp.array([joint_index(name) for name in STRUCK], dtype=int, device=device)
-
-    def arrays(self) -> dict[str, wp.array]:
-        return {"start": self.start, "origin": self.origin}
 
     def record_reset(self, env, graph) -> None:
         drive = env.simulation.avatar.state
@@ -266,7 +446,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         return [(self.reference_rotation, self.reference_root)]
 
     def _record_next_pose(self, env, graph) -> None:
-        """Append: the clip's pose one step ahead of the counter."""
+        """Append: read the clip's pose one step ahead of the counter."""
         graph.launch(
             read_clip,
             (env.num_envs, NUM_JOINTS),
@@ -275,7 +455,7 @@ as `tone` and the root wrench pull. A good agent steers against the disturbance 
         )
 
     def _record_clip(self, env, graph) -> None:
-        """Append: that pose, and where it has the bones in the world."""
+        """Append: read that pose, and find its bones in the world."""
         n = env.num_envs
         self._record_next_pose(env, graph)
         avatar = env.simulation.avatar

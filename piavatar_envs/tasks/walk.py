@@ -1,4 +1,4 @@
-"""Walk: go straight ahead at a given speed, on one's own feet, one after the other."""
+"""Walk: go straight ahead at a given speed, by the strength of the joints, one foot after the other."""
 
 from __future__ import annotations
 
@@ -12,82 +12,79 @@ from pydantic import Field
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ControlConfig, EnvConfig, TorqueControlConfig
+from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
+from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.sim.scene import Domain
-from piavatar_envs.tasks.common.ease import EASE_DOC, ease_rule, record_ease
 from piavatar_envs.tasks.common.fall import FallConfig, is_down
 from piavatar_envs.tasks.common.gait import (
-    GAIT_DOC,
+    GAIT_REWARD,
     GAIT_TERM,
+    POSTURE_COST,
     Gait,
     GaitConfig,
     check_gait,
     gait_rule,
     hang_arms,
-    record_observe_gait,
-    stepped,
+    left_load,
+    load_in_turn,
+    phase_of,
+    posture_excess,
+    step_in_turn,
     swing_arms,
-    turn_taken,
-    weigh_feet,
 )
-from piavatar_envs.tasks.common.ground import Grounding, forward_of
-from piavatar_envs.tasks.common.place import PlaceRule, home
 from piavatar_envs.tasks.common.ranges import Margin, Weight
-from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance
-from piavatar_envs.tasks.common.spawn import record_standing
+from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
+from piavatar_envs.tasks.common.spawn import Grounding, forward_of, pelvis_at, record_standing
 from piavatar_envs.tasks.common.upright import (
     FALL_DOC,
-    METRIC_DOCS,
+    STANDING_METRICS,
     UPRIGHT_TERMS,
     Upright,
     UprightConfig,
-    lead_of_left_foot,
     posture_of,
     record_observe_upright,
     tilt_of,
-    upright_rule,
     write_posture,
 )
 
 wp.set_module_options({"enable_backward": False})
 
-#: Mean speed over the target's that no walker shall exceed: the domain ends there.
+#: Mean speed over the target's that no walker exceeds: the domain ends there.
 FASTEST = 1.5
-#: Mean speed over the target's that is asked for: the pace, and what succeeds.
+#: Mean speed over the target's that a success needs, and that the pace has.
 _PACE = wp.constant(0.9)
-#: Components of what is observed of the way.
-_WAY_SIZE = 4
 
 
 class WalkConfig(EnvConfig):
     """Settings of Walk."""
 
     control: ControlConfig = Field(default_factory=TorqueControlConfig, description="how actions move the body")
-    upright: UprightConfig = Field(default_factory=UprightConfig, description="what counts as standing")
-    gait: GaitConfig = Field(default_factory=GaitConfig, description="feet that bear the body in turn")
-    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall")
+    upright: UprightConfig = Field(default_factory=UprightConfig, description="limit and margins of being upright")
+    gait: GaitConfig = Field(default_factory=GaitConfig, description="feet that bear the body in turn, by a clock")
+    fall: FallConfig = Field(default_factory=FallConfig, description="limits of a fall")
     episode_seconds: float = Field(10.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
-    target_speed: float = Field(1.0, gt=0.0, le=5.0, description="how fast to go [m/s]")
-    lane: float = Field(1.0, gt=0.0, le=2.0, description="distance aside of the way at which the episode ends [m]")
+    target_speed: float = Field(1.0, gt=0.0, le=5.0, description="speed ahead [m/s]")
+    lane: float = Field(1.0, gt=0.0, le=2.0, description="distance from the way at which the episode ends [m]")
     most_behind: float | None = Field(
         1.5,
         gt=0.0,
         le=1000.0,
         description="distance behind the pace at which the episode ends; None: there is no pace [m]",
     )
-    heading_margin: Margin = Field(0.8, description="angle off the way at which the reward is 0.1 [rad]")
+    heading_margin: Margin = Field(0.8, description="angle from the way at which the reward is 0.1 [rad]")
     control_cost: Weight = Field(0.05, description="weight of the mean squared action [-]")
-    ease_cost: Weight = Field(0.0, description="weight of how far joints are bent beyond what people do [1/rad^2]")
+    posture_cost: Weight = Field(0.0, description="weight of the joints' excess over a human gait's [1/rad^2]")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
 
 
 @wp.struct
 class Way:
-    """Constants of the way, and of falling on it."""
+    """Constants of the way, and of a fall on it."""
 
-    start: PlaceRule  # where it begins: only its place is used
-    speed: float  # [m/s]
+    start: wp.vec3  # x, y [m] and yaw [rad]
+    target_speed: float  # [m/s]
     lane: float  # [m]
     most_behind: float  # [m]
     length: float  # [m]
@@ -100,9 +97,9 @@ class Way:
 
 @wp.func
 def way_gone(way: Way, body: Body, e: int, pelvis: wp.vec3):
-    """How far along the way and how far to its left a pelvis is [m]."""
-    off = pelvis - home(way.start, body, e)
-    ahead = forward_of(way.start.place[2])
+    """Return the distances of a pelvis along the way and to its left [m]."""
+    off = pelvis - pelvis_at(way.start, body, e)
+    ahead = forward_of(way.start[2])
     left = wp.cross(wp.vec3(0.0, 0.0, 1.0), ahead)
     return wp.vec2(wp.dot(off, ahead), wp.dot(off, left))
 
@@ -114,20 +111,22 @@ def judge_walk(
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
     velocity: wp.array2d(dtype=wp.vec3),
+    local: wp.array2d(dtype=wp.quat),
+    sensors: Sensors,
+    x: wp.array2d(dtype=wp.vec3),
     step_count: wp.array(dtype=int),
     action: wp.array3d(dtype=float),
-    left_load: wp.array(dtype=float),
     # out
     terms: wp.array3d(dtype=float),
     metrics: wp.array3d(dtype=float),
     success: wp.array2d(dtype=wp.bool),
     terminated: wp.array2d(dtype=wp.bool),
 ):
-    """Reward of going ahead upright and foot by foot, and its cost. The step counter has not moved yet."""
+    """Reward going ahead upright and foot by foot. The step counter has not moved yet."""
     e = wp.tid()
     rule = way.upright
     now = posture_of(rule, body, e, rotation, position)
-    ahead = forward_of(way.start.place[2])
+    ahead = forward_of(way.start[2])
     speed = wp.dot(velocity[e, 0], ahead)
     facing = wp.quat_rotate(rotation[e, 0], wp.vec3(0.0, -1.0, 0.0))
     facing[2] = 0.0
@@ -135,25 +134,28 @@ def judge_walk(
     gone = way_gone(way, body, e, position[e, 0])
     time = way.control_dt * float(step_count[e] + 1)
     mean_speed = gone[0] / time
-    in_turn = turn_taken(way.gait, step_count[e], left_load[e])
-    lead = lead_of_left_foot(position, e, ahead)
-    stride = in_turn * (0.5 + 0.5 * stepped(way.gait, step_count[e], lead))
+    stride = float(0.0)
+    if way.gait.worth > 0.0:
+        in_turn = load_in_turn(way.gait, step_count[e], left_load(way.gait, body, position, sensors, x, e))
+        stride = in_turn * (0.5 + 0.5 * step_in_turn(way.gait, step_count[e], position, e, ahead))
     hips_straight = tolerance(tilt_of(rotation[e, 0]), 0.1, rule.tilt_margin)
-    fast = now.high * tolerance(wp.abs(speed - way.speed), 0.1 * way.speed, way.speed)
+    fast = now.high * tolerance(wp.abs(speed - way.target_speed), 0.1 * way.target_speed, way.target_speed)
     terms[e, 0, 0] = (0.7 - way.gait.worth) * fast
     terms[e, 0, 1] = way.gait.worth * now.high * stride * hips_straight
     terms[e, 0, 2] = 0.1 * now.high * tolerance(off_way, 0.1, way.heading_margin)
     terms[e, 0, 3] = 0.1 * now.high
     terms[e, 0, 4] = 0.1 * now.straight
     terms[e, 0, 5] = -rule.control_cost * mean_square_action(action, e, 0)
+    if way.gait.posture_cost > 0.0:
+        terms[e, 0, 6] = -way.gait.posture_cost * posture_excess(way.gait, local, e)
     write_posture(now, e, metrics)
     metrics[e, 0, 3] = speed
     metrics[e, 0, 4] = mean_speed
     metrics[e, 0, 5] = gone[0]
     standing = now.head >= rule.stand_head
-    success[e, 0] = standing and mean_speed >= _PACE * way.speed and gone[0] >= way.speed
+    success[e, 0] = standing and mean_speed >= _PACE * way.target_speed and gone[0] >= way.target_speed
     fallen = is_down(wp.vec2(now.head, now.pelvis), way.least)
-    behind = _PACE * way.speed * time - gone[0] > way.most_behind
+    behind = _PACE * way.target_speed * time - gone[0] > way.most_behind
     terminated[e, 0] = fallen or behind or wp.abs(gone[1]) > way.lane or wp.abs(gone[0]) > way.length
 
 
@@ -165,65 +167,80 @@ def observe_walk(
     start: int,
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
+    step_count: wp.array(dtype=int),
     # out
     observation: wp.array3d(dtype=float),
 ):
-    """The way's direction and the distance from it, from component ``start``."""
+    """Write the way's direction, the distance from it and, with a clock, its phase from component ``start``."""
     e = wp.tid()
-    write_vector(observation, e, agent, start, wp.quat_rotate_inv(rotation[e, 0], forward_of(way.start.place[2])))
+    write_vector(observation, e, agent, start, wp.quat_rotate_inv(rotation[e, 0], forward_of(way.start[2])))
     observation[e, agent, start + 3] = way_gone(way, body, e, position[e, 0])[1]
+    if way.gait.worth > 0.0:
+        phase = phase_of(way.gait, float(step_count[e]))
+        observation[e, agent, start + 4] = wp.sin(phase)
+        observation[e, agent, start + 5] = wp.cos(phase)
 
 
 class WalkTask(Task):
     """Walk straight ahead."""
 
     Config = WalkConfig
-    description = "walk straight ahead at 1 m/s by the strength of one's own joints"
+    description = "walk straight ahead at 1 m/s by the strength of the joints"
     observation_terms = (
         *UPRIGHT_TERMS,
-        ObservationTerm("way_direction", 3, "-", "root", "where to go: a unit vector"),
+        ObservationTerm("way_direction", 3, "-", "root", "direction of the way: a unit vector"),
         ObservationTerm("way_offset", 1, "m", "world", "distance of the pelvis from the way, to the left"),
     )
-    reward_terms = ("speed", "gait", "heading", "height", "upright", "control", "ease")
-    metrics = ("head_height", "pelvis_height", "tilt_deg", "speed", "mean_speed", "distance")
+    rewards = (
+        Term(
+            "speed",
+            "0.7 - `gait.worth` while the pelvis moves ahead at `target_speed` within a tenth of it; beyond that a "
+            "Gaussian that has fallen to a tenth after another `target_speed`; all times `height` / 0.1",
+        ),
+        GAIT_REWARD,
+        Term(
+            "heading",
+            "0.1 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.01 after "
+            "another `heading_margin`; all times `height` / 0.1",
+        ),
+        Term(
+            "height",
+            "0.1 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that has "
+            "fallen to 0.01 after another `upright.height_margin` of that height",
+        ),
+        Term(
+            "upright",
+            "0.1 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.01 after another "
+            "`upright.tilt_margin`",
+        ),
+        CONTROL,
+        POSTURE_COST,
+    )
+    metrics = (
+        *STANDING_METRICS[:3],
+        Metric("speed", "m/s", "speed of the pelvis ahead"),
+        Metric("mean_speed", "m/s", "distance over the time of the episode so far"),
+        Metric("distance", "m", "distance that the pelvis has come ahead"),
+    )
+    scratch_arrays = (TaskArray("reference_rotation", wp.quat, (NUM_JOINTS,)),)
 
-    summary = """The avatar stands on the ground with its joints a little bent at random (`pose_noise`) and shall walk
-straight ahead at `target_speed`, where it faces at first; nothing holds it but what its joints can do. Faster is no
-better than slower, and who falls behind a pace of 0.9 of the target, by `most_behind`, is out. The way is as long as
-one comes in an episode at 1.5 times the target; it ends at `lane` to either side. (With `control="pose"` nothing moves
-the pelvis: that is for poses, not for walking.)
+    summary = """The avatar stands on the ground with its joints slightly bent at random (`pose_noise`) and must walk
+straight ahead at `target_speed`, in its first heading; only its joints hold it up. Faster is no better than slower, and
+an avatar that falls behind a pace of 0.9 of the target by `most_behind` is out. The way is as long as an episode at 1.5
+times the target; `lane` bounds it to either side. (With `control="pose"` nothing moves the pelvis: that is for poses,
+not for walking.)
 
-Feet shall bear the body in turn and pass each other, by a clock that begins with the episode. The avatar sees it in
-two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. With it arms hang, and swing
-against the legs: those that do not act, and under `control="pd"` the pose that is asked for at action 0 (upper arms 34
-degrees lower than at rest, elbows stretched by 29, though actions reach but 20). With `gait.worth=0` there is no
-clock, and how it gets ahead is its own affair: hopping on both feet does."""
-    reward_docs: ClassVar[Mapping[str, str]] = {
-        "speed": "0.7 - `gait.worth` while the pelvis moves ahead at `target_speed` give or take a tenth; "
-        "beyond it a Gaussian that has fallen to a tenth after another `target_speed`; all times `height` / 0.1",
-        "gait": f"`gait.worth` {GAIT_DOC}; all times `height` / 0.1, and less where the pelvis tilts, as `upright` is "
-        "where the chest does",
-        "heading": "0.1 while the pelvis faces the way within 0.1 rad; beyond it a Gaussian that has fallen to 0.01 "
-        "after another `heading_margin`; all times `height` / 0.1",
-        "height": "0.1 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that "
-        "has fallen to 0.01 after another `upright.height_margin` of that height",
-        "upright": "0.1 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.01 after "
-        "another `upright.tilt_margin`",
-        "control": "`-control_cost` times the mean of the squared action components",
-        "ease": EASE_DOC,
-    }
-    metric_docs: ClassVar[Mapping[str, str]] = {
-        **METRIC_DOCS,
-        "speed": "of the pelvis ahead [m/s]",
-        "mean_speed": "distance over the time of the episode so far [m/s]",
-        "distance": "that the pelvis has come ahead [m]",
-    }
+Feet are rewarded for bearing the body in turn and passing each other, by a clock that begins with the episode. It is
+observed as two numbers, `gait_phase`: its sine, positive while the left foot bears, and its cosine. With the clock,
+arms that do not act hang and swing against the legs; under `control="pd"` so does the reference pose of action 0
+(upper arms 34 degrees lower than at rest, elbows stretched by 29, although actions reach only 20). With
+`gait.worth=0` there is no clock, and any way to get ahead counts, such as hopping on both feet."""
     success_doc = (
-        f"`mean_speed` is at least {_PACE} `target_speed`, over at least as many metres as the target goes in a "
-        "second, and the head is no lower than `upright.stand_head` of its height in the rest pose"
+        f"`mean_speed` is at least {_PACE} `target_speed`, over at least the distance of one second at the target, and "
+        "the head is no lower than `upright.stand_head` of its height in the rest pose"
     )
     termination_doc = (
-        f"{FALL_DOC};\n- the pelvis is more than `lane` aside of the way, or beyond its end;\n- the pelvis is "
+        f"{FALL_DOC};\n- the pelvis is more than `lane` to the side of the way, or beyond its end;\n- the pelvis is "
         f"more than `most_behind` behind a pace of {_PACE} `target_speed`, unless that is None"
     )
     picture_seconds = 0.3
@@ -236,7 +253,6 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
 
     def __init__(self, config: WalkConfig) -> None:
         super().__init__(config)
-        #: whether there is a clock
         self.clocked = config.gait.worth > 0.0
         self.targets_about_reference = self.clocked and config.control.mode != "pose"
         check_gait(config.gait, config.target_speed, config.physics.control_dt)
@@ -245,7 +261,7 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
         return (*self.observation_terms, GAIT_TERM) if self.clocked else self.observation_terms
 
     def domain(self) -> Domain:
-        """Room on the whole way and beside it."""
+        """Include the whole way and its sides."""
         x, y, yaw = self._place()
         ahead = np.array([np.sin(yaw), -np.cos(yaw)]) * self._length()
         return Domain().around([(x, y), (x + ahead[0], y + ahead[1])])
@@ -258,23 +274,24 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
         return FASTEST * self.config.target_speed * self.config.episode_seconds
 
     def allocate(self, env) -> None:
-        config, way, start = self.config, Way(), PlaceRule()
+        config, dt, points = self.config, self.config.physics.control_dt, env.simulation.flesh[0].points
         self.grounding = Grounding(env)
-        self.reference_rotation = wp.zeros((env.num_envs, NUM_JOINTS), dtype=wp.quat, device=env.device)
-        start.place = wp.vec3(*self._place())
-        way.start, way.speed, way.lane, way.length = start, config.target_speed, config.lane, self._length()
-        way.most_behind = np.inf if config.most_behind is None else config.most_behind
-        way.heading_margin, way.control_dt = config.heading_margin, config.physics.control_dt
-        way.least, way.upright = config.fall.least, upright_rule(config.upright, config.control_cost)
-        points = env.simulation.flesh[0].points
-        way.gait = gait_rule(config.gait, config.target_speed, config.physics.control_dt, points, env.device)
-        self.left_load = wp.zeros(env.num_envs, dtype=float, device=env.device)
-        self.way, self.ease = way, ease_rule(config.ease_cost, env.device)
+        self.way = fill(
+            Way(),
+            config,
+            config.fall,
+            start=wp.vec3(*self._place()),
+            most_behind=np.inf if config.most_behind is None else config.most_behind,
+            length=self._length(),
+            control_dt=dt,
+            upright=fill(Upright(), config.upright, config),
+            gait=gait_rule(config.gait, config.target_speed, config.posture_cost, dt, points, env.device),
+        )
 
     def record_reset(self, env, graph) -> None:
+        command = env.simulation.avatar.state.command_rotation
         record_standing(env, graph, self.config.pose_noise)
         if self.targets_about_reference:
-            command = env.simulation.avatar.state.command_rotation
             graph.launch(hang_arms, command.shape, [env.mask, self.way.gait], [command])
         self.grounding.record_reset(env, graph)
 
@@ -287,34 +304,16 @@ clock, and how it gets ahead is its own affair: hopping on both feet does."""
         return [(reference, state.command_root)]
 
     def record_outcome(self, env, graph) -> None:
-        avatar = env.simulation.avatar
-        t, sim = avatar.tracked, env.simulation
-        if self.clocked:
-            inputs = [self.way.gait, avatar.body, t.position, sim.sensors, sim.state.x]
-            graph.launch(weigh_feet, env.num_envs, inputs, [self.left_load])
-        graph.launch(
-            judge_walk,
-            env.num_envs,
-            [
-                self.way, avatar.body, t.rotation, t.position, t.velocity, env.step_count, env.action,
-                self.left_load,
-            ],
-            [env.terms, env.metrics, env.success, env.terminated],
-        )  # fmt: skip
-        if self.config.ease_cost > 0.0:
-            record_ease(env, graph, self.ease, self.reward_terms.index("ease"))
+        sim, avatar, t = env.simulation, env.simulation.avatar, env.simulation.avatar.tracked
+        tracked = [t.rotation, t.position, t.velocity, t.local]
+        inputs = [self.way, avatar.body, *tracked, sim.sensors, sim.state.x, env.step_count, env.action]
+        graph.launch(judge_walk, env.num_envs, inputs, [env.terms, env.metrics, env.success, env.terminated])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
-        avatar = env.simulation.avatars[agent]
-        at = record_observe_upright(env, graph, agent, start)
-        graph.launch(
-            observe_walk,
-            env.num_envs,
-            [self.way, avatar.body, agent, at, avatar.tracked.rotation, avatar.tracked.position],
-            [env.observation],
-        )
-        if self.clocked:
-            record_observe_gait(env, graph, self.way.gait, agent, at + _WAY_SIZE)
+        avatar, tracked = env.simulation.avatars[agent], env.simulation.avatars[agent].tracked
+        start = record_observe_upright(env, graph, agent, start)
+        inputs = [self.way, avatar.body, agent, start, tracked.rotation, tracked.position, env.step_count]
+        graph.launch(observe_walk, env.num_envs, inputs, [env.observation])
 
 
 TASK = WalkTask

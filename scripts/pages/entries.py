@@ -1,15 +1,12 @@
-"""What has a page: the registered Gymnasium ids and the PettingZoo modules, and what is read off them.
+"""Environments that have a page: the registered Gymnasium ids and the games; and the facts on a page.
 
-Sizes, names and the keys of ``info`` come from an environment that was built and stepped once, so that a page cannot
-promise what the code does not do. Its resolution does not matter for them; pages state the default settings.
+Sizes, names and the keys of ``info`` come from an environment that is built and stepped once, so that a page agrees
+with the code. The resolution does not matter for them; pages state the default settings.
 """
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import inspect
-import pkgutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +20,9 @@ from piavatar_envs.config import EnvConfig
 from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.observations import ObservationLayout
 from piavatar_envs.envs.task import Task
+from piavatar_envs.multi import load_game
 from piavatar_envs.tasks import load_task, task_modules
+from piavatar_envs.tasks.games import game_modules
 
 ROOT = Path(__file__).resolve().parents[2]
 MULTI = "piavatar_envs.multi"
@@ -53,19 +52,19 @@ class Entry:
     def make(self, **settings: Any) -> Any:
         """Build the environment: a ``gymnasium.Env`` without wrappers, or a ``pettingzoo.ParallelEnv``."""
         if self.multi:
-            return importlib.import_module(self.title).parallel_env(**settings)
+            return load_game(self.name).parallel_env(**settings)
         return gymnasium.make(self.title, **settings).unwrapped
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What a page states about an environment.
+    """Facts on the page of an environment.
 
     Attributes:
         task: the task at its default settings.
         layout: of the flat observation.
         agents: names of the agents; empty for a Gymnasium environment.
-        reset_info, info: what an agent's ``info`` held after a reset, and after a step.
+        reset_info, info: an agent's ``info`` after a reset, and after a step.
     """
 
     task: Task
@@ -81,31 +80,27 @@ class Facts:
 
     @property
     def actions(self) -> ActionSpec:
-        """What acts at the default settings."""
+        """The action at the default settings."""
         return self.task.action_spec().under(self.config.control.mode)
 
 
 def single_entries() -> list[Entry]:
-    """One for each registered Gymnasium id."""
+    """Return one for each registered Gymnasium id."""
     return [Entry(name, env_id, load_task(env_id)) for env_id, name in task_modules().items()]
 
 
 def multi_entries() -> list[Entry]:
-    """One for each PettingZoo module; none where the package is missing."""
-    if importlib.util.find_spec(MULTI) is None:
-        return []
-    package = importlib.import_module(MULTI)
-    names = sorted(m.name for m in pkgutil.iter_modules(package.__path__) if "_v" in m.name)
-    return [Entry(name, f"{MULTI}.{name}", importlib.import_module(f"{MULTI}.{name}").TASK, True) for name in names]
+    """Return one for each game of this package."""
+    return [Entry(name, f"{MULTI}.{name}", load_game(name).TASK, True) for name in game_modules()]
 
 
 def entries() -> list[Entry]:
-    """Everything that has a page."""
+    """Return everything that has a page."""
     return single_entries() + multi_entries()
 
 
 def gather(entry: Entry, env: Any) -> Facts:
-    """Facts of an environment that ``entry`` made, whatever its resolution; it is reset and stepped once."""
+    """Reset and step an environment of ``entry``, at any resolution, and return its facts."""
     _, reset_info = env.reset(seed=0)
     _, _, _, _, info = step(env, np.zeros(env.batch.action_spec.size, np.float32))
     agents = tuple(env.possible_agents) if entry.multi else ()
@@ -115,7 +110,7 @@ def gather(entry: Entry, env: Any) -> Facts:
 
 
 def step(env: Any, action: np.ndarray) -> tuple:
-    """A step of either kind of environment; every agent takes the same action."""
+    """Step either kind of environment; every agent takes the same action."""
     if isinstance(env, gymnasium.Env):
         return env.step(action)
     return env.step({agent: action for agent in env.agents})

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
+from piavatar_envs.envs.task import Term
 from piavatar_envs.mpm.types import FAILURE_NAMES
 from scripts.pages.actions import actions_section
 from scripts.pages.entries import ROOT, Entry, Facts
@@ -169,21 +170,21 @@ def _parameters(facts: Facts) -> str:
     return page(["## Parameters", text, told])
 
 
-def _named(docs: Mapping[str, str], names: Sequence[str]) -> list[tuple[str, str]]:
-    return [(code(name), docs.get(name, "")) for name in names]
+def _described(terms: Sequence[Term]) -> list[tuple[str, str]]:
+    return [(code(term.name), term.description) for term in terms]
 
 
 def _reward(entry: Entry) -> str:
-    rows = _named(entry.task.reward_docs, entry.task.reward_terms)
+    rows = _described(entry.task.rewards)
     return page(["## Reward", "The sum of", table(("term", "value"), rows)])
 
 
 def _costs(entry: Entry) -> str:
     task = entry.task
-    if not task.cost_terms:
+    if not task.costs:
         return ""
     text = '`info["cost"]`, for constrained learning and not part of the reward, is the sum of'
-    return page(["## Costs", text, table(("term", "value"), _named(task.cost_docs, task.cost_terms))])
+    return page(["## Costs", text, table(("term", "value"), _described(task.costs))])
 
 
 def _episode(entry: Entry, facts: Facts) -> str:
@@ -211,7 +212,7 @@ def _episode(entry: Entry, facts: Facts) -> str:
 
 def info_docs(entry: Entry) -> dict[str, str]:
     """Meaning of every key of ``info`` that is known."""
-    return INFO_DOCS | dict(entry.task.metric_docs)
+    return INFO_DOCS | {one.name: f"{one.description} [{one.unit}]" for one in entry.task.metrics}
 
 
 def _info(entry: Entry, facts: Facts) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 from agents.sb3.config import TrainingConfig, load_training
+from piavatar_envs.multi import load_game
 
 TINY: dict[str, Any] = {
     "env": {"fidelity": "tiny", "episode_seconds": 0.5},
@@ -56,5 +59,11 @@ def tiny() -> TrainingConfig:
 @pytest.fixture
 def games(monkeypatch) -> None:
     """Let the toy worlds in ``games/`` be those that a configuration may name."""
-    names = tuple(f"tests.agents.games.{name}_v0" for name in ("auction", "ledger", "rendezvous"))
-    monkeypatch.setattr("piavatar_envs.multi.multi_modules", lambda: names)
+
+    def load(name: str) -> Any:
+        if name not in ("auction_v0", "ledger_v0", "rendezvous_v0"):
+            return load_game(name)
+        module = f"tests.agents.games.{name}"
+        return SimpleNamespace(name=module, **vars(importlib.import_module(module)))
+
+    monkeypatch.setattr("agents.config.load_game", load)

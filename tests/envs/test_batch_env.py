@@ -46,7 +46,7 @@ def test_environment_i_is_the_single_environment_of_seed_plus_i(make_env, make_b
                 assert equal(np.float32(reward), outcome["reward"][i, 0]), where
                 assert (terminated, truncated) == (outcome["terminated"][i, 0], outcome["truncated"][i]), where
                 assert info["success"] == outcome["success"][i, 0]
-                metrics = [info[name] for name in batch.task.metrics]
+                metrics = [info[name] for name in batch.task.metric_names]
                 assert equal(np.float32(metrics), outcome["metrics"][i, 0]), where
     batch.action.zero_()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import re
 from typing import Annotated, Literal, get_args, get_origin
@@ -11,7 +10,7 @@ import pytest
 
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.config.errors import entry_of, models_of
-from piavatar_envs.multi import multi_modules
+from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.tasks import load_task, task_modules
 
 
@@ -25,7 +24,7 @@ def configs() -> list[type[EnvConfig]]:
     """Of all tasks and games."""
     found = [load_task(env_id).Config for env_id in task_modules()]
     if importlib.util.find_spec("pettingzoo"):
-        found += [importlib.import_module(name).TASK.Config for name in multi_modules()]
+        found += [load_game(name).TASK.Config for name in listed_games()]
     return found
 
 

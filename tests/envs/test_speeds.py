@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import math
 
@@ -12,7 +11,7 @@ import pytest
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.mpm.model import choose_num_substeps
-from piavatar_envs.multi import multi_modules
+from piavatar_envs.multi import listed_games, load_game
 from piavatar_envs.sim.checks import STRUCK, lever
 from piavatar_envs.sim.world import Simulation
 from piavatar_envs.tasks import load_task, task_modules
@@ -34,7 +33,7 @@ def substep_way(simulation: Simulation, speed: float) -> float:
 def test_no_default_has_other_substeps_than_its_waves_ask_for(device):
     tasks = [load_task(env_id) for env_id in task_modules()]
     if importlib.util.find_spec("pettingzoo"):
-        tasks += [importlib.import_module(name).TASK for name in multi_modules()]
+        tasks += [load_game(name).TASK for name in listed_games()]
     found = {}
     for cls in tasks:
         task = cls(load_config(cls.Config))

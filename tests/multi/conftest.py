@@ -1,14 +1,14 @@
-"""Fixtures for worlds of several agents: tests run over every module in ``piavatar_envs.multi``; none is listed."""
+"""Fixtures for games of several agents: tests run over every game of the package; none is listed."""
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 
 import numpy as np
 import pytest
 
-from piavatar_envs.multi import multi_modules
+from piavatar_envs.multi import load_game
+from piavatar_envs.tasks.games import game_modules
 from tests.conftest import only_one_process
 
 if importlib.util.find_spec("pettingzoo") is None:
@@ -16,41 +16,40 @@ if importlib.util.find_spec("pettingzoo") is None:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """A test that asks for ``module_name`` runs on every world."""
-    if "module_name" in metafunc.fixturenames:
-        names = multi_modules()
-        metafunc.parametrize("module_name", names, ids=[name.rpartition(".")[2] for name in names])
+    """Run tests with ``game_name`` on every game."""
+    if "game_name" in metafunc.fixturenames:
+        metafunc.parametrize("game_name", game_modules())
 
 
 @pytest.fixture(scope="session")
-def worlds(device):
-    """The modules, by name, their kernels compiled; parallel workers would race each other's files."""
+def games(device):
+    """The games, by name, their kernels compiled; parallel workers would race each other's files."""
     import warp as wp
 
     with only_one_process("kernels"):
-        modules = {name: importlib.import_module(name) for name in multi_modules()}
+        found = {name: load_game(name) for name in game_modules()}
         wp.force_load(device)
-    return modules
+    return found
 
 
 @pytest.fixture(scope="session")
-def make_world(device, worlds):
-    """A maker of parallel worlds, ``make_world(module_name, **settings)``, tiny unless told otherwise.
+def make_game(device, games):
+    """A maker of parallel environments of games, ``make_game(game_name, **settings)``, tiny unless told otherwise.
 
     The same settings give the same object, because building takes longer than a test: begin with a reset. ``twin=1``
     gives another one of the same settings.
     """
     made = {}
 
-    def make(module_name: str, twin: int = 0, **settings):
-        key = (module_name, twin, repr(sorted(settings.items())))
+    def make(game_name: str, twin: int = 0, **settings):
+        key = (game_name, twin, repr(sorted(settings.items())))
         if key not in made:
-            made[key] = worlds[module_name].parallel_env(device=device, **{"fidelity": "tiny", **settings})
+            made[key] = games[game_name].parallel_env(device=device, **{"fidelity": "tiny", **settings})
         return made[key]
 
     yield make
-    for world in made.values():
-        world.close()
+    for game in made.values():
+        game.close()
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import importlib
 import pickle
 import subprocess
 import sys
@@ -15,7 +16,8 @@ import numpy as np
 import pettingzoo.test as official
 import pytest
 
-from piavatar_envs.multi import listed_worlds, load_world, multi_modules
+from piavatar_envs.multi import listed_games, load_game
+from piavatar_envs.tasks.games import game_modules
 
 #: PettingZoo's complaints that are wanted: these observations have no honest limits.
 UNBOUNDED = r"Agent's (minimum|maximum) observation space value is -?infinity.*"
@@ -33,59 +35,57 @@ def strict():
         yield
 
 
-def fresh(worlds, module_name, device):
+def fresh(games, game_name, device):
     """The module with quick settings, as PettingZoo's tests want it; wrappers of the AEC view included."""
     settings = {"fidelity": "tiny", "device": device}
-    module = worlds[module_name]
+    module = games[game_name]
     return types.SimpleNamespace(
         parallel_env=functools.partial(module.parallel_env, **settings), env=functools.partial(module.env, **settings)
     )
 
 
-def test_worlds_are_found():
-    assert {"piavatar_envs.multi.sumo_v0", "piavatar_envs.multi.boxing_v0"} <= set(multi_modules())
-    assert "piavatar_envs.tasks.common.fights" not in multi_modules()
-    assert list(listed_worlds().values()) == list(multi_modules())
-    assert load_world("sumo_v0").__name__ == listed_worlds()["sumo_v0"] == "piavatar_envs.multi.sumo_v0"
-    with pytest.raises(ValueError, match=r"unknown world 'sumo_v9'; did you mean sumo_v0\?"):
-        load_world("sumo_v9")
+def test_games_are_found():
+    assert {"sumo_v0", "boxing_v0"} <= set(listed_games()) and set(game_modules()) <= set(listed_games())
+    assert load_game("sumo_v0").TASK is importlib.import_module("piavatar_envs.multi.sumo_v0").TASK
+    with pytest.raises(ValueError, match=r"'sumo_v9'; did you mean sumo_v0\?"):
+        load_game("sumo_v9")
     with pytest.raises(ValueError, match=r"did you mean PIAvatar/Reach-v0\?"):
-        load_world("raech", ["PIAvatar/Reach-v0"])
+        load_game("raech", ["PIAvatar/Reach-v0"])
 
 
-def test_listing_the_worlds_is_light():
+def test_listing_the_games_is_light():
     code = """
 import sys
-from piavatar_envs.multi import multi_modules
-assert multi_modules()
+from piavatar_envs.multi import listed_games
+assert listed_games()
 print([name for name in ("pettingzoo", "warp", "torch", "pyvista") if name in sys.modules])
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert run.stdout.strip() == "[]", run.stdout + run.stderr
 
 
-def test_pettingzoos_parallel_test(worlds, module_name, device, strict, capsys):
-    official.parallel_api_test(fresh(worlds, module_name, device).parallel_env(max_cycles=12), num_cycles=15)
+def test_pettingzoos_parallel_test(games, game_name, device, strict, capsys):
+    official.parallel_api_test(fresh(games, game_name, device).parallel_env(max_cycles=12), num_cycles=15)
     assert "Passed Parallel API test" in capsys.readouterr().out
 
 
-def test_pettingzoos_aec_test(worlds, module_name, device, strict, capsys):
-    official.api_test(fresh(worlds, module_name, device).env(max_cycles=8), num_cycles=30)
+def test_pettingzoos_aec_test(games, game_name, device, strict, capsys):
+    official.api_test(fresh(games, game_name, device).env(max_cycles=8), num_cycles=30)
     assert "Passed API test" in capsys.readouterr().out
 
 
-def test_pettingzoos_seed_tests(worlds, module_name, device):
-    module = fresh(worlds, module_name, device)
+def test_pettingzoos_seed_tests(games, game_name, device):
+    module = fresh(games, game_name, device)
     official.seed_test(module.env, num_cycles=5)
     official.parallel_seed_test(module.parallel_env, num_cycles=2)
 
 
-def test_pettingzoos_clock_test(worlds, module_name, device):
-    official.max_cycles_test(fresh(worlds, module_name, device))
+def test_pettingzoos_clock_test(games, game_name, device):
+    official.max_cycles_test(fresh(games, game_name, device))
 
 
-def test_same_seed_and_actions_give_the_same_run(make_world, play, same, module_name):
-    world, twin = make_world(module_name), make_world(module_name, twin=1)
+def test_same_seed_and_actions_give_the_same_run(make_game, play, same, game_name):
+    world, twin = make_game(game_name), make_game(game_name, twin=1)
     runs = []
     for env in (world, twin, world):
         env.reset(seed=9)
@@ -97,11 +97,11 @@ def test_same_seed_and_actions_give_the_same_run(make_world, play, same, module_
     assert same(runs[0], runs[1]) and same(runs[0], runs[2])
 
 
-def test_seeds_and_episodes_differ(make_world, module_name, worlds, device):
-    world = make_world(module_name)
+def test_seeds_and_episodes_differ(make_game, game_name, games, device):
+    world = make_game(game_name)
     starts = {f"seed {seed}": world.reset(seed=seed)[0] for seed in (0, 1, 2)}
     starts |= {f"episode {n} of seed 2": world.reset()[0] for n in (1, 2)}
-    module = fresh(worlds, module_name, device)
+    module = fresh(games, game_name, device)
     starts |= {f"unseeded {n}": module.parallel_env().reset()[0] for n in (0, 1)}
     names = list(starts)
     for i, a in enumerate(names):
@@ -110,9 +110,9 @@ def test_seeds_and_episodes_differ(make_world, module_name, worlds, device):
                 assert np.abs(starts[a][agent] - starts[b][agent]).max() > 1e-4, f"{a} is {b} for {agent}"
 
 
-def test_agents_differ_at_the_start(make_world, module_name):
+def test_agents_differ_at_the_start(make_game, game_name):
     """They draw apart: a world whose agents begin alike teaches them less."""
-    world = make_world(module_name)
+    world = make_game(game_name)
     observations, _ = world.reset(seed=0)
     joints = world.observation_layout["joint_rotations"].slice
     first, *others = (observation[joints] for observation in observations.values())
@@ -120,13 +120,13 @@ def test_agents_differ_at_the_start(make_world, module_name):
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32, "one", 1.5])
-def test_what_is_no_seed_is_refused(make_world, module_name, seed):
+def test_what_is_no_seed_is_refused(make_game, game_name, seed):
     with pytest.raises((ValueError, gymnasium.error.Error)):
-        make_world(module_name).reset(seed=seed)
+        make_game(game_name).reset(seed=seed)
 
 
-def test_observations_are_finite_and_none_is_constant(make_world, play, module_name):
-    world = make_world(module_name)
+def test_observations_are_finite_and_none_is_constant(make_game, play, game_name):
+    world = make_game(game_name)
     rng, seen = np.random.default_rng(0), {name: [] for name in world.possible_agents}
     for seed in range(4):
         rows = [world.reset(seed=seed), *play(world, 20, rng)]
@@ -143,9 +143,9 @@ def test_observations_are_finite_and_none_is_constant(make_world, play, module_n
 
 
 @pytest.mark.parametrize("kind", ["uniform", "corners", "held corners"])
-def test_no_failure_under_full_actions(make_world, module_name, kind):
+def test_no_failure_under_full_actions(make_game, game_name, kind):
     """And nothing that is not finite; who is out does not act, and a new episode begins when all are."""
-    world, rng = make_world(module_name), np.random.default_rng(0)
+    world, rng = make_game(game_name), np.random.default_rng(0)
     world.reset(seed=0)
     size, actions = world.action_space(world.possible_agents[0]).shape, {}
     for step in range(40):
@@ -162,8 +162,8 @@ def test_no_failure_under_full_actions(make_world, module_name, kind):
             assert np.isfinite(observations[name]).all() and np.isfinite(rewards[name])
 
 
-def test_state_is_what_all_see(make_world, play, module_name):
-    world = make_world(module_name)
+def test_state_is_what_all_see(make_game, play, game_name):
+    world = make_game(game_name)
     observations, _ = world.reset(seed=0)
     assert np.array_equal(world.state(), np.concatenate([observations[name] for name in world.possible_agents]))
     assert world.state_space.contains(world.state())
@@ -172,9 +172,9 @@ def test_state_is_what_all_see(make_world, play, module_name):
     assert not np.array_equal(before, world.state()) and np.isfinite(before).all()
 
 
-def test_a_copy_goes_on_as_the_original(make_world, play, same, module_name):
+def test_a_copy_goes_on_as_the_original(make_game, play, same, game_name):
     """By both ways, over the end of the episode; also where an agent has left, and where nobody plays any more."""
-    world = make_world(module_name, max_cycles=6)
+    world = make_game(game_name, max_cycles=6)
     assert copy.deepcopy(world).agents == world.agents
     for steps in (2, 4, 6):
         world.reset(seed=3)
@@ -191,16 +191,16 @@ def test_a_copy_goes_on_as_the_original(make_world, play, same, module_name):
         assert same(runs[0], runs[1]) and same(runs[0], runs[2])
 
 
-def test_a_copy_of_what_was_never_reset_needs_one(worlds, module_name, device):
-    world = fresh(worlds, module_name, device).parallel_env()
+def test_a_copy_of_what_was_never_reset_needs_one(games, game_name, device):
+    world = fresh(games, game_name, device).parallel_env()
     for other in (copy.deepcopy(world), pickle.loads(pickle.dumps(world))):
         with pytest.raises(gymnasium.error.ResetNeeded):
             other.step({})
         assert other.reset(seed=1) and other.agents == other.possible_agents
 
 
-def test_the_aec_view_is_copied(worlds, module_name, device, same):
-    env = fresh(worlds, module_name, device).env(max_cycles=4)
+def test_the_aec_view_is_copied(games, game_name, device, same):
+    env = fresh(games, game_name, device).env(max_cycles=4)
     env.reset(seed=1)
     env.step(np.zeros(env.action_space(env.agent_selection).shape, np.float32))
     runs = []
@@ -213,8 +213,8 @@ def test_the_aec_view_is_copied(worlds, module_name, device, same):
     assert same(runs[0], runs[2]) and same(runs[1], runs[2])
 
 
-def test_spaces_belong_to_the_agents(make_world, module_name):
-    world = make_world(module_name)
+def test_spaces_belong_to_the_agents(make_game, game_name):
+    world = make_game(game_name)
     for spaces, space in (
         (world.action_spaces, world.action_space),
         (world.observation_spaces, world.observation_space),
@@ -224,15 +224,15 @@ def test_spaces_belong_to_the_agents(make_world, module_name):
     assert len(world.action_names) == world.action_space(world.possible_agents[0]).shape[0]
 
 
-def test_metadata(make_world, module_name):
-    metadata = make_world(module_name).metadata
-    assert metadata["name"] == module_name.rpartition(".")[2] == str(make_world(module_name))
+def test_metadata(make_game, game_name):
+    metadata = make_game(game_name).metadata
+    assert metadata["name"] == game_name.rpartition(".")[2] == str(make_game(game_name))
     assert metadata["render_modes"] == ["rgb_array", "human"] and metadata["is_parallelizable"]
-    assert metadata["render_fps"] == 30 and make_world(module_name, control_dt=0.02).metadata["render_fps"] == 50
+    assert metadata["render_fps"] == 30 and make_game(game_name, control_dt=0.02).metadata["render_fps"] == 50
 
 
-def test_dictionary_is_the_flat_vector_by_name(make_world, play, same, module_name):
-    flat, named = make_world(module_name), make_world(module_name, obs_mode="dict")
+def test_dictionary_is_the_flat_vector_by_name(make_game, play, same, game_name):
+    flat, named = make_game(game_name), make_game(game_name, obs_mode="dict")
     rows = [(env.reset(seed=8), *play(env, 3, np.random.default_rng(1))) for env in (flat, named)]
     for (vectors, *_), (terms, *_) in zip(*rows, strict=True):
         for name, vector in vectors.items():
@@ -241,8 +241,8 @@ def test_dictionary_is_the_flat_vector_by_name(make_world, play, same, module_na
     assert same(flat.state(), named.state())
 
 
-def test_what_a_step_tells(make_world, play, module_name):
-    world, task = make_world(module_name), make_world(module_name).batch.task
+def test_what_a_step_tells(make_game, play, game_name):
+    world, task = make_game(game_name), make_game(game_name).batch.task
     _, infos = world.reset(seed=1)
     assert set(infos) == set(world.possible_agents) and all(info["failure"] is None for info in infos.values())
     for observations, rewards, terminations, truncations, infos in play(world, 15, np.random.default_rng(2)):
@@ -251,17 +251,17 @@ def test_what_a_step_tells(make_world, play, module_name):
         for name, info in infos.items():
             assert type(rewards[name]) is float and type(terminations[name]) is bool and type(truncations[name]) is bool
             terms = info["reward_terms"]
-            assert tuple(terms) == task.reward_terms and np.isfinite(list(terms.values())).all()
+            assert tuple(terms) == task.reward_names and np.isfinite(list(terms.values())).all()
             assert rewards[name] == pytest.approx(sum(terms.values()), abs=1e-5)
-            assert all(np.isfinite(info[metric]) for metric in task.metrics)
+            assert all(np.isfinite(info[metric]) for metric in task.metric_names)
             assert type(info["success"]) is bool and info["failure"] is None and type(info["root_let_go"]) is bool
             assert info["root_force"].shape == info["root_torque"].shape == (3,)
-            assert ("cost" in info) == bool(task.cost_terms)
+            assert ("cost" in info) == bool(task.cost_names)
 
 
-def test_every_agent_is_told_its_own(make_world, module_name):
+def test_every_agent_is_told_its_own(make_game, game_name):
     """Only one acts: only its action costs, and what holds the two differs."""
-    world = make_world(module_name)
+    world = make_game(game_name)
     first, second, *_ = world.possible_agents
     world.reset(seed=0)
     actions = {name: np.zeros(world.action_space(name).shape) for name in world.agents}
@@ -282,8 +282,8 @@ def arrays_in(value) -> list[np.ndarray]:
     return [value] if isinstance(value, np.ndarray) and value.ndim else []
 
 
-def test_returned_arrays_are_the_callers(make_world, play, same, module_name):
-    world = make_world(module_name)
+def test_returned_arrays_are_the_callers(make_game, play, same, game_name):
+    world = make_game(game_name)
     internal = [array.numpy() for array in (*world.batch.arrays().values(), world.batch.observation)]
     returned = arrays_in([world.reset(seed=1), *play(world, 3), world.state(), world.set_state(world.get_state())])
     for i, a in enumerate(returned):
@@ -298,8 +298,8 @@ def test_returned_arrays_are_the_callers(make_world, play, same, module_name):
     assert same([row[0] for row in untouched[1:]], [row[0] for row in again])
 
 
-def test_actions_are_not_written_to(make_world, module_name):
-    world = make_world(module_name)
+def test_actions_are_not_written_to(make_game, game_name):
+    world = make_game(game_name)
     world.reset(seed=0)
     actions = {name: np.full(world.action_space(name).shape, 3.0, np.float32) for name in world.agents}
     world.step(actions)
@@ -338,8 +338,8 @@ def spoiled(world, how: str) -> dict[str, np.ndarray]:
         ("no dictionary", "actions are a list; give a dictionary of one for each of agent_0, agent_1"),
     ],
 )
-def test_bad_actions_are_refused_before_anything_changes(make_world, module_name, how, told):
-    world = make_world(module_name)
+def test_bad_actions_are_refused_before_anything_changes(make_game, game_name, how, told):
+    world = make_game(game_name)
     world.reset(seed=0)
     before, state = world.get_state(), world.state()
     with pytest.raises(ValueError, match=told.replace("LAST", world.agents[-1])):
@@ -349,8 +349,8 @@ def test_bad_actions_are_refused_before_anything_changes(make_world, module_name
     assert np.array_equal(world.state(), state) and world.agents == world.possible_agents
 
 
-def test_nothing_goes_before_the_first_reset_or_after_the_end(worlds, module_name, device, play):
-    world = fresh(worlds, module_name, device).parallel_env(max_cycles=2, render_mode="rgb_array")
+def test_nothing_goes_before_the_first_reset_or_after_the_end(games, game_name, device, play):
+    world = fresh(games, game_name, device).parallel_env(max_cycles=2, render_mode="rgb_array")
     assert world.agents == []
     for call in (lambda: world.step({}), world.render):
         with pytest.raises(gymnasium.error.ResetNeeded):
@@ -376,20 +376,20 @@ def test_nothing_goes_before_the_first_reset_or_after_the_end(worlds, module_nam
         ({"scene": {"avatars": [{"yaw": 0.0}] * 9}}, "scene.avatars has 9 entries"),
     ],
 )
-def test_bad_settings_are_refused_in_one_line(worlds, module_name, device, settings, told):
+def test_bad_settings_are_refused_in_one_line(games, game_name, device, settings, told):
     with pytest.raises(ValueError) as caught:
-        worlds[module_name].parallel_env(**{"fidelity": "tiny", "device": device, **settings})
+        games[game_name].parallel_env(**{"fidelity": "tiny", "device": device, **settings})
     assert told in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_max_cycles_wins_over_episode_seconds(worlds, module_name, device):
-    world = fresh(worlds, module_name, device).parallel_env(max_cycles=7, episode_seconds=3.0)
+def test_max_cycles_wins_over_episode_seconds(games, game_name, device):
+    world = fresh(games, game_name, device).parallel_env(max_cycles=7, episode_seconds=3.0)
     assert world.batch.max_steps == 7
-    assert fresh(worlds, module_name, device).parallel_env(episode_seconds=3.0).batch.max_steps == 90
+    assert fresh(games, game_name, device).parallel_env(episode_seconds=3.0).batch.max_steps == 90
 
 
-def test_a_run_taken_up_again_is_the_same(make_world, play, same, module_name):
-    world, other = make_world(module_name), make_world(module_name, twin=1)
+def test_a_run_taken_up_again_is_the_same(make_game, play, same, game_name):
+    world, other = make_game(game_name), make_game(game_name, twin=1)
     world.reset(seed=6)
     world.reset()
     play(world, 8, np.random.default_rng(0))
@@ -405,8 +405,8 @@ def test_a_run_taken_up_again_is_the_same(make_world, play, same, module_name):
         assert same(target.reset(), start)
 
 
-def test_a_failure_is_the_end_for_all(make_world, play, module_name):
-    world = make_world(module_name)
+def test_a_failure_is_the_end_for_all(make_game, play, game_name):
+    world = make_game(game_name)
     world.reset(seed=0)
     state = world.get_state()
     state["particles.u"][0, 0] = 1e6
@@ -420,9 +420,9 @@ def test_a_failure_is_the_end_for_all(make_world, play, module_name):
     assert world.set_state(failed) == {} and world.agents == []
 
 
-def test_pictures(worlds, module_name, device, play):
+def test_pictures(games, game_name, device, play):
     pytest.importorskip("pyvista")
-    module = fresh(worlds, module_name, device)
+    module = fresh(games, game_name, device)
     settings = {"render_mode": "rgb_array", "render.width": 64, "render.height": 48}
     world = module.parallel_env(**settings)
     world.reset(seed=0)
@@ -440,17 +440,17 @@ def test_pictures(worlds, module_name, device, play):
     assert not np.array_equal(frames[0], frames[1]) and not np.array_equal(frames[2], frames[-1])
 
 
-def test_pettingzoos_render_test(worlds, module_name, device):
+def test_pettingzoos_render_test(games, game_name, device):
     """Of both modes: pictures are arrays, the live view returns nothing."""
     pytest.importorskip("pyvista")
     pytest.importorskip("viser")
     settings = {"render.width": 64, "render.height": 48}
-    official.render_test(functools.partial(fresh(worlds, module_name, device).env, **settings))
+    official.render_test(functools.partial(fresh(games, game_name, device).env, **settings))
 
 
-def test_a_world_is_watched(worlds, module_name, device, play):
+def test_a_world_is_watched(games, game_name, device, play):
     pytest.importorskip("viser")
-    world = fresh(worlds, module_name, device).parallel_env(render_mode="human")
+    world = fresh(games, game_name, device).parallel_env(render_mode="human")
     world.reset(seed=0)
     view = world._episode._live.view
     bodies = [f"/world/body_{index}" for index in range(len(world.possible_agents))]
@@ -462,14 +462,14 @@ def test_a_world_is_watched(worlds, module_name, device, play):
     assert view._closed
 
 
-def test_no_picture_without_a_render_mode(make_world, module_name):
-    world = make_world(module_name)
+def test_no_picture_without_a_render_mode(make_game, game_name):
+    world = make_game(game_name)
     world.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode"):
         assert world.render() is None
 
 
-@pytest.mark.parametrize("module", ["piavatar_envs.api.pettingzoo", *multi_modules()])
+@pytest.mark.parametrize("module", ["piavatar_envs.api.pettingzoo", "piavatar_envs.multi.sumo_v0"])
 def test_pettingzoo_is_missing_with_its_remedy(module):
     code = f"""
 import sys

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index
 from piavatar_envs.mpm.types import Sensors
 
-BOXING = "piavatar_envs.multi.boxing_v0"
+BOXING = "boxing_v0"
 PARTS = tuple(BODY_PARTS)
 LEAST, POINTS = 1.5, (1.0, 0.4)
 
@@ -63,18 +63,18 @@ def expected(strength: float, full: float) -> float:
 
 @pytest.mark.parametrize("strength", [0.5, 1.5, 2.0, 2.9, 3.0, 30.0])
 @pytest.mark.parametrize(("target", "full"), [("head", POINTS[0]), ("torso", POINTS[1]), ("left_leg", 0.0)])
-def test_a_blow_is_worth_what_it_strikes_and_how_hard(worlds, device, strength, target, full):
+def test_a_blow_is_worth_what_it_strikes_and_how_hard(games, device, strength, target, full):
     for arm in ("left_arm", "right_arm"):
         assert Scorer(device).blow(strength, target, arm) == pytest.approx(expected(strength, full), abs=1e-6)
 
 
-def test_only_what_the_arms_have_felt_counts(worlds, device):
+def test_only_what_the_arms_have_felt_counts(games, device):
     assert Scorer(device).blow(9.0, felt=2.0) == pytest.approx(expected(2.0, 1.0), abs=1e-6)
     assert Scorer(device).blow(9.0, arm="left_leg") == 0.0
     assert Scorer(device).blow(9.0, arm="head") == 0.0
 
 
-def test_a_contact_counts_once_by_its_strongest_step(worlds, device):
+def test_a_contact_counts_once_by_its_strongest_step(games, device):
     scorer = Scorer(device)
     strengths = [2.0, 2.6, 2.2, 1.0, 2.4, 2.8, 0.7, 2.3, 0.0, 3.5]
     gained = [scorer.blow(strength) for strength in strengths]
@@ -85,12 +85,12 @@ def test_a_contact_counts_once_by_its_strongest_step(worlds, device):
     assert scorer.tally.score.numpy()[0] == pytest.approx([sum(gained), 0.0], abs=1e-6)
 
 
-def test_leaning_scores_once(worlds, device):
+def test_leaning_scores_once(games, device):
     scorer = Scorer(device)
     assert sum(scorer.blow(2.5) for _ in range(30)) == pytest.approx(expected(2.5, 1.0), abs=1e-6)
 
 
-def test_a_blow_belongs_to_who_struck_it(worlds, device):
+def test_a_blow_belongs_to_who_struck_it(games, device):
     scorer = Scorer(device, agents=3)
     points = scorer.count({
         (2, "head", 0): (3.0, 0.0, 0.0), (0, "left_arm", 2): (-3.0, 0.0, 0.0),
@@ -102,7 +102,7 @@ def test_a_blow_belongs_to_who_struck_it(worlds, device):
     assert points == pytest.approx(wanted, abs=1e-6)
 
 
-def test_nobody_scores_who_is_out_or_on_who_is_out(worlds, device):
+def test_nobody_scores_who_is_out_or_on_who_is_out(games, device):
     for out in (0, 1):
         scorer = Scorer(device)
         scorer.alive[0, out] = False
@@ -115,7 +115,7 @@ def test_nobody_scores_who_is_out_or_on_who_is_out(worlds, device):
 def straight_right() -> tuple[np.ndarray, np.ndarray]:
     """Local rotations on guard and at the end of a straight right at the head, wxyz ``(22, 4)``."""
     from piavatar_envs.avatar.motion.keyframes import Arm
-    from piavatar_envs.tasks.common.fights import Stance
+    from piavatar_envs.tasks.common.multi_agent import Stance
     from piavatar_envs.tasks.games.boxing import STANCE
 
     turns = {**STANCE.turns, "spine2": (5.0, 0.0, 14.0), "spine3": (0.0, 0.0, 14.0)}
@@ -143,8 +143,8 @@ def strike(world, steps: int = 20) -> list[tuple]:
 SOFT = {"pose_noise": 0.0, "place_noise": 0.0, "blow_impulse": 0.12}
 
 
-def test_a_straight_right_scores(make_world):
-    world = make_world(BOXING, **SOFT)
+def test_a_straight_right_scores(make_game):
+    world = make_game(BOXING, **SOFT)
     world.reset(seed=0)
     log = strike(world)
     hits = [row[4]["agent_0"]["reward_terms"]["hit"] for row in log]
@@ -155,11 +155,11 @@ def test_a_straight_right_scores(make_world):
         assert row[4]["agent_0"]["given_impulse"] == row[4]["agent_1"]["taken_impulse"]
     assert sum(hits) > log[-1][4]["agent_1"]["score"]
     world.reset()
-    assert not world.batch.task.tally.score.numpy().any() and not world.batch.task.tally.peak.numpy().any()
+    assert not world.batch.task.score.numpy().any() and not world.batch.task.peak.numpy().any()
 
 
-def test_a_bout_is_taken_up_again_in_mid_blow(make_world, same):
-    world, other = (make_world(BOXING, twin=n, **SOFT) for n in (0, 1))
+def test_a_bout_is_taken_up_again_in_mid_blow(make_game, same):
+    world, other = (make_game(BOXING, twin=n, **SOFT) for n in (0, 1))
     world.reset(seed=0)
     impulses = [row[4]["agent_0"]["given_impulse"] for row in strike(world)]
     # a moment in touch, and still in touch a step later: another blow, to who forgets the first
@@ -180,8 +180,8 @@ def test_a_bout_is_taken_up_again_in_mid_blow(make_world, same):
 @pytest.mark.parametrize(
     ("score", "winner"), [((2.0, 1.0), 0), ((0.0, 0.5), 1), ((1.0, 1.0), None), ((0.0, 0.0), None)]
 )
-def test_points_decide_when_the_clock_runs_out(make_world, play, score, winner):
-    world = make_world(BOXING, max_cycles=3)
+def test_points_decide_when_the_clock_runs_out(make_game, play, score, winner):
+    world = make_game(BOXING, max_cycles=3)
     world.reset(seed=0)
     state = world.get_state()
     state["task.score"][0] = score
@@ -192,8 +192,8 @@ def test_points_decide_when_the_clock_runs_out(make_world, play, score, winner):
     assert [info["success"] for info in rows[-1][4].values()] == [winner == 0, winner == 1]
 
 
-def test_a_knock_down_ends_the_bout(make_world, play):
-    world = make_world(BOXING)
+def test_a_knock_down_ends_the_bout(make_game, play):
+    world = make_game(BOXING)
     world.reset(seed=0)
     state = world.get_state()
     state["task.score"][0] = (3.0, 0.0)  # points do not help who is down
@@ -207,8 +207,8 @@ def test_a_knock_down_ends_the_bout(make_world, play):
     assert infos["agent_0"]["reward_terms"]["win"] == infos["agent_1"]["reward_terms"]["down"] == 0.0
 
 
-def test_points_do_not_help_who_is_down_at_the_gong(make_world, play):
-    world = make_world(BOXING, max_cycles=1)
+def test_points_do_not_help_who_is_down_at_the_gong(make_game, play):
+    world = make_game(BOXING, max_cycles=1)
     world.reset(seed=0)
     state = world.get_state()
     state["task.score"][0] = (3.0, 0.0)
@@ -220,8 +220,8 @@ def test_points_do_not_help_who_is_down_at_the_gong(make_world, play):
     assert not any(info["success"] for info in infos.values())
 
 
-def test_among_three_the_bout_goes_on(make_world, play):
-    world = make_world(BOXING, num_agents=3)
+def test_among_three_the_bout_goes_on(make_game, play):
+    world = make_game(BOXING, num_agents=3)
     world.reset(seed=0)
     state = world.get_state()
     state["avatar_0.state.let_go"][:] = 1
@@ -232,9 +232,9 @@ def test_among_three_the_bout_goes_on(make_world, play):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_the_ropes_hold(make_world, play, count):
+def test_the_ropes_hold(make_game, play, count):
     """Walking backwards for as long as it takes: nobody leaves the ring, nobody falls, nothing fails."""
-    world = make_world(BOXING, num_agents=count, ring_size=2.2)
+    world = make_game(BOXING, num_agents=count, ring_size=2.2)
     world.reset(seed=0)
     rows = play(world, 40, **{"root.y": 1.0})
     assert len(world.agents) == count and rows[-1][4]["agent_0"]["failure"] is None
@@ -244,9 +244,9 @@ def test_the_ropes_hold(make_world, play, count):
 
 
 @pytest.mark.parametrize("control", ["pd", "torque"])
-def test_the_ropes_hold_who_is_thrown_into_them(make_world, play, control):
+def test_the_ropes_hold_who_is_thrown_into_them(make_game, play, control):
     """Also where nothing holds a body up, which needs more room to fall where there are no ropes."""
-    world = make_world(BOXING, ring_size=2.2, control=control, **{"fall.fall_head": 0.0, "fall.fall_pelvis": 0.0})
+    world = make_game(BOXING, ring_size=2.2, control=control, **{"fall.fall_head": 0.0, "fall.fall_pelvis": 0.0})
     world.reset(seed=0)
     state, body = world.get_state(), world.batch.simulation.avatars[0].body
     state["particles.u"][0, body.first : body.first + body.count] = [0.0, 3.0, 0.0]  # away from the middle
@@ -259,6 +259,6 @@ def test_the_ropes_hold_who_is_thrown_into_them(make_world, play, control):
     assert 1.1 - dx < max(farthest) < 1.1 + 0.5 * dx
 
 
-def test_impossible_rings_are_refused(make_world):
+def test_impossible_rings_are_refused(make_game):
     with pytest.raises(ValueError, match=r"num_agents=8 .* need a ring of .* use ring_size >= 3.5"):
-        make_world(BOXING, num_agents=8)
+        make_game(BOXING, num_agents=8)

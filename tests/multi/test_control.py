@@ -7,9 +7,9 @@ import pytest
 
 
 @pytest.mark.parametrize("control", ["pd", "torque"])
-def test_a_run_repeats_and_agents_that_fall_stay_in(make_world, play, module_name, control):
+def test_a_run_repeats_and_agents_that_fall_stay_in(make_game, play, game_name, control):
     """Nothing lets go of a root that nothing holds; agents leave by their task's rules only."""
-    world = make_world(module_name, control=control)
+    world = make_game(game_name, control=control)
     runs = []
     for _ in range(2):
         world.reset(seed=3)

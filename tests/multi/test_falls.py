@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 
-SUMO, BOXING = "piavatar_envs.multi.sumo_v0", "piavatar_envs.multi.boxing_v0"
-HIGH_FIVE, PASS_BALL = "piavatar_envs.multi.high_five_v0", "piavatar_envs.multi.pass_ball_v0"
+SUMO, BOXING = "sumo_v0", "boxing_v0"
+HIGH_FIVE, PASS_BALL = "high_five_v0", "pass_ball_v0"
 #: Rings too wide to be left by falling.
 WIDE = {SUMO: {"ring_radius": 4.0}, BOXING: {"ring_size": 8.0}}
 STILL = {"pose_noise": 0.0, "place_noise": 0.0}
@@ -44,9 +44,9 @@ def still(world) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("shape", [{}, {"shape.randomize": True}], ids=["mean", "random"])
 @pytest.mark.parametrize("module", [SUMO, BOXING])
-def test_who_falls_loses_and_who_stands_wins(make_world, module, shape):
+def test_who_falls_loses_and_who_stands_wins(make_game, module, shape):
     """In the very step in which the heights say so, without a root that lets go."""
-    world = make_world(module, control="pd", **WIDE[module], **STILL, **shape)
+    world = make_game(module, control="pd", **WIDE[module], **STILL, **shape)
     world.reset(seed=4)
     help_only(world, 1)
     for _ in range(90):
@@ -65,9 +65,9 @@ def test_who_falls_loses_and_who_stands_wins(make_world, module, shape):
 
 
 @pytest.mark.parametrize("module", [SUMO, BOXING])
-def test_limp_bodies_go_down_and_stay_out(make_world, module):
+def test_limp_bodies_go_down_and_stay_out(make_game, module):
     """Three without torques: each is out for good from the step in which it is down, and the first two win nothing."""
-    world = make_world(module, control="torque", num_agents=3, **WIDE[module])
+    world = make_game(module, control="torque", num_agents=3, **WIDE[module])
     world.reset(seed=1)
     help_only(world, 2)
     out = []
@@ -82,9 +82,9 @@ def test_limp_bodies_go_down_and_stay_out(make_world, module):
 
 
 @pytest.mark.parametrize("module", [HIGH_FIVE, PASS_BALL])
-def test_where_all_have_one_aim_a_fall_is_the_end_for_all(make_world, module):
+def test_where_all_have_one_aim_a_fall_is_the_end_for_all(make_game, module):
     slow = {"serve_speed": (0.2, 0.25), "dead_speed": 1e-6} if module == PASS_BALL else {}  # a ball that stays in play
-    world = make_world(module, control="pd", episode_seconds=5.0, **slow)
+    world = make_game(module, control="pd", episode_seconds=5.0, **slow)
     world.reset(seed=2)
     help_only(world, 0)
     count = len(world.agents)
@@ -99,8 +99,8 @@ def test_where_all_have_one_aim_a_fall_is_the_end_for_all(make_world, module):
 
 
 @pytest.mark.parametrize("module", [SUMO, BOXING, HIGH_FIVE, PASS_BALL])
-def test_where_a_wrench_holds_the_root_no_posture_is_a_fall(make_world, play, module):
-    world = make_world(module, **{"fall.fall_head": 0.9999, "fall.fall_pelvis": 0.9999})
+def test_where_a_wrench_holds_the_root_no_posture_is_a_fall(make_game, play, module):
+    world = make_game(module, **{"fall.fall_head": 0.9999, "fall.fall_pelvis": 0.9999})
     world.reset(seed=0)
     rows = play(world, 5)
     assert any(is_down(world, agent) for agent in range(2)), "a body sags by a little"
@@ -108,9 +108,9 @@ def test_where_a_wrench_holds_the_root_no_posture_is_a_fall(make_world, play, mo
 
 
 @pytest.mark.parametrize("module", [SUMO, BOXING])
-def test_to_kneel_and_to_reach_the_ground_is_to_be_down_and_to_duck_is_not(make_world, module):
+def test_to_kneel_and_to_reach_the_ground_is_to_be_down_and_to_duck_is_not(make_game, module):
     """Of the mean body, as geometry has it: legs and a straight trunk that leans forwards by any angle."""
-    world = make_world(module)
+    world = make_game(module)
     fall, body = world.config.fall, load_asset().mean_body()
     joint = {name: body.joints[joint_index(name)].astype(float) for name in ("head", "pelvis", "left_knee", "left_hip")}
     arm = [body.joints[joint_index(f"left_{name}")].astype(float) for name in ("shoulder", "elbow", "wrist")]

@@ -14,12 +14,12 @@ from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.multi import high_five_v0
 from piavatar_envs.tasks.games import high_five as slap
 
-FIVE = "piavatar_envs.multi.high_five_v0"
+FIVE = "high_five_v0"
 SIDES = ("left", "right")
 
 
 @pytest.fixture(scope="module")
-def pairs(device, worlds):
+def pairs(device, games):
     """Eight worlds at once."""
     return BatchEnv(high_five_v0.TASK(load_config(high_five_v0.TASK.Config, None, {"fidelity": "tiny"})), 8, device)
 
@@ -210,8 +210,8 @@ def test_what_counts(device, why, success, ended):
     assert terms.numpy()[0, :, 1].tolist() == [7.0 * success] * 2
 
 
-def test_they_stand_face_to_face_and_a_little_apart(make_world):
-    world = make_world(FIVE, place_noise=0.1, spacing=0.9)
+def test_they_stand_face_to_face_and_a_little_apart(make_game):
+    world = make_game(FIVE, place_noise=0.1, spacing=0.9)
     ways = []
     for seed in range(12):
         world.reset(seed=seed)
@@ -226,9 +226,9 @@ def test_they_stand_face_to_face_and_a_little_apart(make_world):
     assert np.abs(spread).max() <= 0.2 + 1e-3 and np.ptp(spread, axis=0)[:2].min() > 0.1
 
 
-def test_what_is_observed_is_where_the_hands_are(make_world, play):
+def test_what_is_observed_is_where_the_hands_are(make_game, play):
     """Each from its own pelvis, of the hand that is drawn for the episode."""
-    world = make_world(FIVE, hand="random", impulse=(0.5, 2.0))
+    world = make_game(FIVE, hand="random", impulse=(0.5, 2.0))
     batch, sides, weakest = world.batch, set(), []
     for seed in range(8):
         world.reset(seed=seed)
@@ -250,9 +250,9 @@ def test_what_is_observed_is_where_the_hands_are(make_world, play):
     assert sides == {0, 1} and 0.5 <= min(weakest) < 0.9 and 1.6 < max(weakest) <= 2.0
 
 
-def test_what_does_not_vary_is_not_observed(make_world):
-    fixed = set(make_world(FIVE).observation_layout)
-    assert set(make_world(FIVE, hand="random", impulse=(0.5, 2.0)).observation_layout) - fixed == {
+def test_what_does_not_vary_is_not_observed(make_game):
+    fixed = set(make_game(FIVE).observation_layout)
+    assert set(make_game(FIVE, hand="random", impulse=(0.5, 2.0)).observation_layout) - fixed == {
         "hand_side",
         "least_impulse",
     }
@@ -268,8 +268,8 @@ def test_the_hands_arm_acts(hand, arms):
     assert len(acting) < NUM_JOINTS
 
 
-def test_when_one_falls_it_is_over_for_both(make_world, play):
-    world = make_world(FIVE)
+def test_when_one_falls_it_is_over_for_both(make_game, play):
+    world = make_game(FIVE)
     world.reset(seed=0)
     state = world.get_state()
     state["avatar_1.state.let_go"][:] = 1

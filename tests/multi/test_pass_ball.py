@@ -15,7 +15,7 @@ from piavatar_envs.multi import pass_ball_v0
 from piavatar_envs.tasks.games import pass_ball as passing
 from tests.multi.kicker import Kicker
 
-PASS = "piavatar_envs.multi.pass_ball_v0"
+PASS = "pass_ball_v0"
 
 
 def flat(a: np.ndarray, b: np.ndarray) -> float:
@@ -72,7 +72,7 @@ class Scorer:
             self.touched, self.left = True, ball
         after = (self.passer + 1) % self.agents
         arrived = flat(ball, at[after]) <= self.config.reach or bool(contact[after])
-        passed = self.touched and arrived and flat(ball, self.left) >= self.config.sent
+        passed = self.touched and arrived and flat(ball, self.left) >= self.config.least_pass
         if passed:
             self.passes, self.passer, self.touched, self.left = self.passes + 1, after, bool(contact[after]), ball
         self.way = flat(ball, self.left) if self.touched else 0.0
@@ -81,7 +81,7 @@ class Scorer:
 
 
 @pytest.fixture(scope="module")
-def circle(device, worlds):
+def circle(device, games):
     """Four worlds at once, in which a single pass is a success."""
     config = load_config(pass_ball_v0.TASK.Config, None, {"fidelity": "tiny", "goal_passes": 1, "progress_weight": 3.0})
     return BatchEnv(pass_ball_v0.TASK(config), 4, device)
@@ -194,7 +194,7 @@ def test_whose_turn_it_is(device, story, steps):
 
     rule, play, sensors = passing.PassRule(), passing.Play(), Sensors()
     rule.subject, rule.reach, rule.fetch, rule.rim, rule.goal_passes = 3, 0.3, 9.0, 9.0, 1
-    rule.sent, rule.progress_weight, rule.pass_bonus = 0.5, 1.0, 5.0
+    rule.least_pass, rule.progress_weight, rule.pass_bonus = 0.5, 1.0, 5.0
     play.passer, play.touched, play.passes, play.gap = *(array(1, int) for _ in range(3)), array(1)
     play.left = array(1, wp.vec3)
     play.gap.fill_(-1.0)
@@ -232,8 +232,8 @@ def test_whose_turn_it_is(device, story, steps):
         ((0.5, 1.2, 0.11), (0.5, 0.5, 0.0), False),  # not yet
     ],
 )
-def test_a_ball_that_nobody_can_play_ends_it_for_all(make_world, play, where, velocity, over):
-    world = make_world(PASS)
+def test_a_ball_that_nobody_can_play_ends_it_for_all(make_game, play, where, velocity, over):
+    world = make_game(PASS)
     assert world.batch.task.rim == pytest.approx(0.8 / np.sin(np.pi / 3) + 0.5)
     world.reset(seed=0)
     put_ball(world, where, velocity)
@@ -242,9 +242,9 @@ def test_a_ball_that_nobody_can_play_ends_it_for_all(make_world, play, where, ve
     assert all(info["failure"] is None and not info["root_let_go"] for info in infos.values())
 
 
-def test_roots_stay_near_their_places(make_world, play):
+def test_roots_stay_near_their_places(make_game, play):
     """However long they are sent forwards, or to the side; and they come back."""
-    world = make_world(PASS, roam=0.25, dead_speed=1e-6)
+    world = make_game(PASS, root_range=0.25, dead_speed=1e-6)
     places = np.array([avatar.position for avatar in world.batch.task.scene.avatars])
     for command in ({"root.y": -1.0}, {"root.x": 1.0}, {"root.x": -1.0, "root.y": -1.0}):
         world.reset(seed=1)
@@ -260,8 +260,8 @@ def test_roots_stay_near_their_places(make_world, play):
 
 
 @pytest.mark.parametrize("agents", [2, 4])
-def test_any_number_stands_around_the_circle(make_world, play, agents):
-    world = make_world(PASS, num_agents=agents, spacing=1.4)
+def test_any_number_stands_around_the_circle(make_game, play, agents):
+    world = make_game(PASS, num_agents=agents, spacing=1.4)
     world.reset(seed=0)
     at = pelvises(world.batch)
     neighbours = np.linalg.norm(at - np.roll(at, -1, axis=0), axis=1)
@@ -277,8 +277,8 @@ def test_any_number_stands_around_the_circle(make_world, play, agents):
     assert len(play(world, 3)) == 3
 
 
-def test_when_one_falls_it_is_over_for_all(make_world, play):
-    world = make_world(PASS)
+def test_when_one_falls_it_is_over_for_all(make_game, play):
+    world = make_game(PASS)
     world.reset(seed=0)
     state = world.get_state()
     state["avatar_2.state.let_go"][:] = 1

@@ -16,14 +16,14 @@ DRAWN = {"high_five_v0": {"hand": "random", "impulse": (1.0, 2.0)}}
 
 
 @pytest.fixture(scope="session")
-def make_crowd(worlds, device):
-    """A maker of batches of a world, ``make_crowd(module_name, num_envs)``, with everything random and told."""
+def make_crowd(games, device):
+    """A maker of batches of a world, ``make_crowd(game_name, num_envs)``, with everything random and told."""
     made = {}
 
-    def make(module_name: str, num_envs: int, **settings) -> BatchEnv:
-        key = (module_name, num_envs, repr(sorted(settings.items())))
+    def make(game_name: str, num_envs: int, **settings) -> BatchEnv:
+        key = (game_name, num_envs, repr(sorted(settings.items())))
         if key not in made:
-            task = worlds[module_name].TASK
+            task = games[game_name].TASK
             given = {"fidelity": "tiny", "observe_parameters": True, "shape.randomize": True, **VARIED, **settings}
             made[key] = BatchEnv(task(load_config(task.Config, None, given)), num_envs, device)
         return made[key]
@@ -31,17 +31,17 @@ def make_crowd(worlds, device):
     return make
 
 
-def test_parameters_are_what_was_drawn(make_crowd, module_name):
-    settings = DRAWN.get(module_name.rpartition(".")[2], {})
-    batch = make_crowd(module_name, 4, **settings)
+def test_parameters_are_what_was_drawn(make_crowd, game_name):
+    settings = DRAWN.get(game_name.rpartition(".")[2], {})
+    batch = make_crowd(game_name, 4, **settings)
     batch.reset(seeds=[11, 12, 13, 14])
     assert len(batch.task.drawn()) == len(batch.task.drawn_values(batch))
     assert all(isinstance(parameter, Parameter) for parameter in batch.task.drawn())
     check_term(batch, np.array([False, True, False, True]))
 
 
-def test_avatars_draw_apart_and_each_has_its_own(make_crowd, module_name):
-    batch = make_crowd(module_name, 4)
+def test_avatars_draw_apart_and_each_has_its_own(make_crowd, game_name):
+    batch = make_crowd(game_name, 4)
     batch.reset(seeds=[1, 2, 3, 4])
     factors, physics = factors_of(batch), batch.config.physics
     for name in OF_AVATAR:
@@ -59,8 +59,8 @@ def test_avatars_draw_apart_and_each_has_its_own(make_crowd, module_name):
         assert own["mu"] == pytest.approx(expected, rel=1e-5)
 
 
-def test_agents_are_told_of_the_others_in_order(make_crowd, module_name):
-    batch = make_crowd(module_name, 4)
+def test_agents_are_told_of_the_others_in_order(make_crowd, game_name):
+    batch = make_crowd(game_name, 4)
     batch.reset(seeds=[1, 2, 3, 4])
     told = [by_name(batch, agent) for agent in range(batch.num_agents)]
     for agent, mine in enumerate(told):
@@ -70,8 +70,8 @@ def test_agents_are_told_of_the_others_in_order(make_crowd, module_name):
                 assert np.array_equal(mine[f"other_{index}_{name}"], theirs[name])
 
 
-def test_world_i_is_the_single_world_of_seed_plus_i(make_crowd, module_name, equal):
-    crowd, single, seed = make_crowd(module_name, 4), make_crowd(module_name, 1), 21
+def test_world_i_is_the_single_world_of_seed_plus_i(make_crowd, game_name, equal):
+    crowd, single, seed = make_crowd(game_name, 4), make_crowd(game_name, 1), 21
     rng, steps = np.random.default_rng(0), 8
     actions = rng.uniform(-1.0, 1.0, (2, steps, *crowd.action.shape)).astype(np.float32)
     rows = []
@@ -94,8 +94,8 @@ def test_world_i_is_the_single_world_of_seed_plus_i(make_crowd, module_name, equ
         batch.action.zero_()
 
 
-def test_the_term_is_told_by_name(make_world, module_name):
-    world = make_world(module_name, observe_parameters=True, obs_mode="dict", mass_factor=(0.5, 2.0))
+def test_the_term_is_told_by_name(make_game, game_name):
+    world = make_game(game_name, observe_parameters=True, obs_mode="dict", mass_factor=(0.5, 2.0))
     observations, _ = world.reset(seed=3)
     names = [parameter.name for parameter in world.observation_layout[PARAMETERS].parameters]
     assert names[:2] == ["mass_factor", "other_0_mass_factor"] and names[-1] == "clock"

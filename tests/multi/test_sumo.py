@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 
-SUMO = "piavatar_envs.multi.sumo_v0"
+SUMO = "sumo_v0"
 STILL = {"pose_noise": 0.0, "place_noise": 0.0}
 
 
@@ -31,8 +31,8 @@ def knock_down(world, *agents: int) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
-def test_they_stand_on_a_circle_and_face_its_middle(make_world, play, count):
-    world = make_world(SUMO, num_agents=count, **STILL)
+def test_they_stand_on_a_circle_and_face_its_middle(make_game, play, count):
+    world = make_game(SUMO, num_agents=count, **STILL)
     observations, _ = world.reset(seed=0)
     assert list(observations) == world.possible_agents == [f"agent_{index}" for index in range(count)]
     at = pelvises(world)[:, :2]
@@ -51,9 +51,9 @@ def test_they_stand_on_a_circle_and_face_its_middle(make_world, play, count):
 
 
 @pytest.mark.parametrize("settings", [{}, {"shape.randomize": True}], ids=str)
-def test_feet_are_on_the_ground_whatever_the_body(make_world, settings):
+def test_feet_are_on_the_ground_whatever_the_body(make_game, settings):
     """In the crouch no particle of a body lies deeper than in its rest pose, and some lies as deep."""
-    world = make_world(SUMO, **STILL, **settings)
+    world = make_game(SUMO, **STILL, **settings)
     for seed in range(3):
         world.reset(seed=seed)
         x = world.batch.simulation.state.x.numpy()[0]
@@ -63,8 +63,8 @@ def test_feet_are_on_the_ground_whatever_the_body(make_world, settings):
             assert pelvises(world)[agent, 2] < flesh.points.joints[0, 0, 2] - 0.05, "it crouches"
 
 
-def test_walking_out_of_the_ring_loses_and_the_last_one_in_wins(make_world, play):
-    world = make_world(SUMO, ring_radius=0.8, **STILL)
+def test_walking_out_of_the_ring_loses_and_the_last_one_in_wins(make_game, play):
+    world = make_game(SUMO, ring_radius=0.8, **STILL)
     world.reset(seed=0)
     rim = []
     while world.agents and len(rim) < 40:
@@ -82,8 +82,8 @@ def test_walking_out_of_the_ring_loses_and_the_last_one_in_wins(make_world, play
     assert not infos["agent_0"]["root_let_go"]
 
 
-def test_who_is_down_is_out(make_world, play):
-    world = make_world(SUMO, **STILL)
+def test_who_is_down_is_out(make_game, play):
+    world = make_game(SUMO, **STILL)
     world.reset(seed=0)
     knock_down(world, 1)
     [(_, rewards, terminations, _, infos)] = play(world, 1)
@@ -91,8 +91,8 @@ def test_who_is_down_is_out(make_world, play):
     assert rewards["agent_0"] > 9.0 and rewards["agent_1"] < -9.0 and all(terminations.values())
 
 
-def test_when_all_go_out_at_once_nobody_wins(make_world, play):
-    world = make_world(SUMO, **STILL)
+def test_when_all_go_out_at_once_nobody_wins(make_game, play):
+    world = make_game(SUMO, **STILL)
     world.reset(seed=0)
     knock_down(world, 0, 1)
     [(_, rewards, terminations, _, infos)] = play(world, 1)
@@ -100,8 +100,8 @@ def test_when_all_go_out_at_once_nobody_wins(make_world, play):
     assert all(reward < -9.0 for reward in rewards.values())
 
 
-def test_nobody_wins_by_a_failure(make_world, play):
-    world = make_world(SUMO, **STILL)
+def test_nobody_wins_by_a_failure(make_game, play):
+    world = make_game(SUMO, **STILL)
     world.reset(seed=0)
     state = world.get_state()
     state["avatar_1.state.let_go"][:] = 1
@@ -113,23 +113,23 @@ def test_nobody_wins_by_a_failure(make_world, play):
     assert max(np.abs(list(rewards.values()))) < 0.1, "nobody is to blame"
 
 
-def test_the_clock_makes_it_a_draw(make_world, play):
-    world = make_world(SUMO, max_cycles=4)
+def test_the_clock_makes_it_a_draw(make_game, play):
+    world = make_game(SUMO, max_cycles=4)
     world.reset(seed=0)
     *_, (_, rewards, terminations, truncations, infos) = play(world, 9)
     assert all(truncations.values()) and not any(terminations.values())
     assert not any(info["success"] for info in infos.values()) and max(np.abs(list(rewards.values()))) < 0.1
 
 
-def test_one_alone_cannot_win(make_world, play):
-    world = make_world(SUMO, num_agents=1, max_cycles=5)
+def test_one_alone_cannot_win(make_game, play):
+    world = make_game(SUMO, num_agents=1, max_cycles=5)
     world.reset(seed=0)
     rows = play(world, 9)
     assert len(rows) == 5 and rows[-1][3] == {"agent_0": True} and not rows[-1][4]["agent_0"]["success"]
 
 
-def test_the_world_goes_on_without_those_who_are_out(make_world, play, same):
-    world = make_world(SUMO, num_agents=4)
+def test_the_world_goes_on_without_those_who_are_out(make_game, play, same):
+    world = make_game(SUMO, num_agents=4)
     world.reset(seed=0)
     play(world, 2)
     knock_down(world, 1)
@@ -163,8 +163,8 @@ def test_the_world_goes_on_without_those_who_are_out(make_world, play, same):
     assert infos["agent_2"]["success"] and not world.agents
 
 
-def test_rewards_are_those_of_numpy(make_world, play):
-    world = make_world(SUMO, num_agents=4, push_weight=0.5)
+def test_rewards_are_those_of_numpy(make_game, play):
+    world = make_game(SUMO, num_agents=4, push_weight=0.5)
     world.reset(seed=3)
     radius = world.config.ring_radius
     rng = np.random.default_rng(0)
@@ -181,8 +181,8 @@ def test_rewards_are_those_of_numpy(make_world, play):
             assert terms["win"] == terms["out"] == 0.0
 
 
-def test_the_ring_is_seen(make_world, play):
-    world = make_world(SUMO)
+def test_the_ring_is_seen(make_game, play):
+    world = make_game(SUMO)
     observations, _ = world.reset(seed=4)
     rng = np.random.default_rng(0)
     for _ in range(6):
@@ -195,9 +195,9 @@ def test_the_ring_is_seen(make_world, play):
         [(observations, *_)] = play(world, 1, rng)
 
 
-def test_a_push_moves_who_does_not_push_back(make_world, device):
+def test_a_push_moves_who_does_not_push_back(make_game, device):
     """One walks forward, the other does nothing: it is pushed out of the ring and stands all the while."""
-    world = make_world(SUMO, ring_radius=0.9, **STILL)
+    world = make_game(SUMO, ring_radius=0.9, **STILL)
     world.reset(seed=0)
     pushed, lead = [], []
     while world.agents and len(pushed) < 60:
@@ -213,14 +213,14 @@ def test_a_push_moves_who_does_not_push_back(make_world, device):
         lead.append(np.linalg.norm((drive.command_root.numpy()[0] - pelvises(world)[0])[:2]))
     assert infos["agent_0"]["success"] and not infos["agent_1"]["root_let_go"]
     assert max(pushed) > 10.0
-    # a step of the root beyond the leash, and what contact took back in this step
+    # a step of the root beyond the limit of its lead, and what contact took back in this step
     step = world.config.root_speed * world.config.physics.control_dt
-    assert world.config.leash < max(lead) < world.config.leash + 2.5 * step
+    assert world.config.root_lead_limit < max(lead) < world.config.root_lead_limit + 2.5 * step
 
 
-def test_a_body_that_is_pushed_is_not_carried_further_by_its_leash(make_world, play):
+def test_a_body_that_is_pushed_is_not_carried_further_by_its_command(make_game, play):
     """A push of 1 m/s, no action: what moves the body must not come back as a motion of its own."""
-    world = make_world(SUMO, num_agents=1, **STILL)
+    world = make_game(SUMO, num_agents=1, **STILL)
     world.reset(seed=0)
     start = pelvises(world)[0]
     state = world.get_state()
@@ -246,18 +246,18 @@ def run(world, actions: dict[str, np.ndarray], steps: int) -> tuple[np.ndarray, 
     return np.array(seen), np.array(paid)
 
 
-def test_it_is_fair(make_world):
+def test_it_is_fair(make_game):
     """Swap places and actions, and results are swapped: up to round-off, for contact is added up in another order."""
     places = [{"position": (0.1, 0.5), "yaw": 0.2}, {"position": (-0.05, -0.45), "yaw": 3.0}]
-    worlds = [make_world(SUMO, scene={"avatars": order}, **STILL) for order in (places, places[::-1])]
+    games = [make_game(SUMO, scene={"avatars": order}, **STILL) for order in (places, places[::-1])]
     rng, steps = np.random.default_rng(0), 15
-    size = worlds[0].action_space("agent_0").shape
+    size = games[0].action_space("agent_0").shape
     one, two = (rng.uniform(-1.0, 1.0, (steps, *size)) for _ in range(2))
     for actions in (one, two):
-        actions[:, worlds[0].action_names.index("root.y")] = -1.0  # into each other
-    seen, paid = run(worlds[0], {"agent_0": one, "agent_1": two}, steps)
-    swapped_seen, swapped_paid = run(worlds[1], {"agent_0": two, "agent_1": one}, steps)
-    contact = worlds[0].observation_layout["contact_impulse"].slice
+        actions[:, games[0].action_names.index("root.y")] = -1.0  # into each other
+    seen, paid = run(games[0], {"agent_0": one, "agent_1": two}, steps)
+    swapped_seen, swapped_paid = run(games[1], {"agent_0": two, "agent_1": one}, steps)
+    contact = games[0].observation_layout["contact_impulse"].slice
     assert np.abs(seen[..., contact]).max() > 5.0, "they must have met"
     assert np.abs(seen[:, 0] - seen[:, 1]).max() > 0.1, "the two must differ"
     assert swapped_paid[:, ::-1] == pytest.approx(paid, abs=1e-3)
@@ -265,8 +265,8 @@ def test_it_is_fair(make_world):
     assert np.abs(swapped_seen[:, ::-1] - seen)[..., contact].max() < 0.5
 
 
-def test_a_bout_is_taken_up_again_in_the_clinch(make_world, play, same):
-    world, other = make_world(SUMO), make_world(SUMO, twin=1)
+def test_a_bout_is_taken_up_again_in_the_clinch(make_game, play, same):
+    world, other = make_game(SUMO), make_game(SUMO, twin=1)
     world.reset(seed=2)
     rows = play(world, 12, np.random.default_rng(0), **{"root.y": -1.0})
     assert rows[-1][4]["agent_0"]["push_impulse"] > 1.0
@@ -279,8 +279,8 @@ def test_a_bout_is_taken_up_again_in_the_clinch(make_world, play, same):
 
 
 @pytest.mark.parametrize("walls", [True, False])
-def test_the_walls_keep_who_is_thrown_out(make_world, play, walls):
-    world = make_world(SUMO, num_agents=4, scene={"walls": walls})
+def test_the_walls_keep_who_is_thrown_out(make_game, play, walls):
+    world = make_game(SUMO, num_agents=4, scene={"walls": walls})
     world.reset(seed=0)
     state = world.get_state()
     state["avatar_1.state.let_go"][:] = 1
@@ -301,10 +301,10 @@ def test_the_walls_keep_who_is_thrown_out(make_world, play, walls):
         assert rows[-1][4]["agent_0"]["failure"] == "out_of_grid"
 
 
-def test_a_batch_is_as_many_worlds(make_world, same, device):
+def test_a_batch_is_as_many_worlds(make_game, same, device):
     from piavatar_envs.envs.batch_env import BatchEnv
 
-    single, seed, steps = make_world(SUMO), 3, 8
+    single, seed, steps = make_game(SUMO), 3, 8
     batch = BatchEnv(type(single.batch.task)(single.config), 2, device)
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1.0, 1.0, (steps, *batch.action.shape)).astype(np.float32)
@@ -333,12 +333,12 @@ def test_a_batch_is_as_many_worlds(make_world, same, device):
         ({"num_agents": 3, "scene": {"avatars": [{}, {}]}}, "2 entries and num_agents=3"),
     ],
 )
-def test_impossible_rings_are_refused(make_world, settings, told):
+def test_impossible_rings_are_refused(make_game, settings, told):
     with pytest.raises(ValueError, match=told):
-        make_world(SUMO, **settings)
+        make_game(SUMO, **settings)
 
 
-def test_upper_body_acts_and_the_legs_do_not(make_world):
-    joints = {name.partition(".")[0] for name in make_world(SUMO).action_names}
+def test_upper_body_acts_and_the_legs_do_not(make_game):
+    joints = {name.partition(".")[0] for name in make_game(SUMO).action_names}
     assert "root" in joints and joint_index("spine1") and not any("hip" in name or "knee" in name for name in joints)
-    assert len(make_world(SUMO, joints=None).action_names) == 66
+    assert len(make_game(SUMO, joints=None).action_names) == 66

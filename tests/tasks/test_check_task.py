@@ -14,7 +14,7 @@ from piavatar_envs.api.conformance import TaskError
 from piavatar_envs.config import ConfigError
 from piavatar_envs.core.rng import STREAM_TASK, generator
 from piavatar_envs.envs.observations import ObservationTerm
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.task import Metric, Task, Term
 from piavatar_envs.tasks.common.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
@@ -93,8 +93,8 @@ class Honest(Task):
     """A goal that is drawn, and a count that goes on."""
 
     observation_terms = (ObservationTerm("goal", 1, "m", "world", "-"), ObservationTerm("passed", 1, "s", "-", "-"))
-    reward_terms = ("off",)
-    metrics = ("passed",)
+    rewards = (Term("off"),)
+    metrics = (Metric("passed", "s"),)
     fault = 0
 
     def allocate(self, env):

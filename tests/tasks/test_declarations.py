@@ -7,9 +7,9 @@ import pytest
 import warp as wp
 
 from piavatar_envs.api.conformance import FiniteWatch, TaskError, check_task
-from piavatar_envs.config import load_config
+from piavatar_envs.config import EnvConfig, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
-from piavatar_envs.envs.task import NAMES_OF_INFO, Task
+from piavatar_envs.envs.task import NAMES_OF_INFO, Metric, Task, TaskArray, Term
 from piavatar_envs.tasks.common.spawn import record_standing
 
 wp.set_module_options({"enable_backward": False})
@@ -38,11 +38,11 @@ def write_flat(columns: int, terms: wp.array(dtype=float), costs: wp.array(dtype
 
 
 class Plain(Task):
-    """Writes as many columns of each as it is told."""
+    """Writes as many columns of each as ``columns`` says."""
 
-    reward_terms = ("near", "control")
-    cost_terms = ("hits",)
-    metrics = ("off",)
+    rewards = (Term("near"), Term("control"))
+    costs = (Term("hits"),)
+    metrics = (Metric("off", "m"),)
     columns = (2, 1, 1)
 
     def record_reset(self, env, graph):
@@ -58,41 +58,86 @@ def made(**declared) -> Task:
 
 
 @pytest.mark.parametrize(
-    ("declared", "told"),
+    ("what", "declared", "reason"),
     [
-        ({"reward_terms": ("near", "far", "near")}, r"Own\.reward_terms has 'near' twice, .* call one otherwise"),
-        ({"cost_terms": ("hits", "hits")}, r"Own\.cost_terms has 'hits' twice"),
-        ({"metrics": ("off", "off")}, r"Own\.metrics has 'off' twice"),
-        ({"metrics": ("off", "success")}, r"Own\.metrics has 'success', which info has anyway, .* call it otherwise"),
-        ({"metrics": ("_off",)}, r"Own\.metrics has '_off'; a name is a string that does not begin with an underscore"),
-        ({"reward_terms": ("near", 1)}, r"Own\.reward_terms has 1; a name is a string"),
-        ({"reward_terms": "near"}, r"Own\.reward_terms='near' is one string; give a tuple of names: \('near',\)"),
+        ("rewards", (Term("near"), Term("far"), Term("near")), "'near' twice"),
+        ("costs", (Term("hits"), Term("hits")), "'hits' twice"),
+        ("metrics", (Metric("off"), Metric("off")), "'off' twice"),
+        ("metrics", (Metric("off"), Metric("success")), "'success'.* choose another"),
+        ("metrics", (Metric("_off"),), "'_off'.* underscore"),
+        ("rewards", (Term(1),), "1; a name is a string"),
+        ("rewards", ("near",), r"'near'.* no tuple of Term"),
+        ("rewards", "near", r"'near'.* no tuple of Term"),
+        ("state_arrays", (TaskArray("goal"), TaskArray("goal")), "'goal' twice"),
+        ("state_arrays", (TaskArray("config"),), "'config'.* choose another"),
     ],
 )
-def test_names_that_info_would_lose_are_refused(declared, told):
-    with pytest.raises(ValueError, match=told):
-        made(**declared)
+def test_declarations_that_info_or_the_task_would_lose_are_refused(what, declared, reason):
+    with pytest.raises(ValueError, match=rf"Own\.{what}.*{reason}"):
+        made(**{what: declared})
+
+
+def test_an_array_is_declared_once():
+    with pytest.raises(ValueError, match=r"'goal'.* choose another"):
+        made(state_arrays=(TaskArray("goal"),), scratch_arrays=(TaskArray("goal"),))
 
 
 def test_a_name_may_be_a_reward_and_a_metric():
-    made(reward_terms=("near", "success"), metrics=("near",))
+    task = made(rewards=(Term("near"), Term("success")), metrics=(Metric("near"),))
+    assert task.reward_names == ("near", "success") and task.metric_names == ("near",) and task.cost_names == ("hits",)
+
+
+@wp.kernel
+def count_steps(steps: wp.array(dtype=int), peaks: wp.array2d(dtype=wp.vec2), seen: wp.array(dtype=float)):
+    e = wp.tid()
+    steps[e] = steps[e] + 1
+    peaks[e, 1] = peaks[e, 1] + wp.vec2(1.0, 2.0)
+    seen[e] = seen[e] + 1.0
+
+
+class Counting(Plain):
+    """Counts its steps in declared arrays."""
+
+    Config = type("CountingConfig", (EnvConfig,), {"__annotations__": {"lanes": int}, "lanes": 3})
+    state_arrays = (TaskArray("steps", int, cleared=True), TaskArray("peaks", wp.vec2, ("lanes",), cleared=True))
+    scratch_arrays = (TaskArray("seen"),)
+
+    def record_outcome(self, env, graph):
+        super().record_outcome(env, graph)
+        graph.launch(count_steps, env.num_envs, [self.steps, self.peaks, self.seen])
+
+
+def test_declared_arrays_are_allocated_saved_and_cleared_where_episodes_begin(device):
+    task = Counting(load_config(Counting.Config, None, {"fidelity": "tiny"}))
+    batch = BatchEnv(task, 2, device)
+    batch.reset(seeds=[0, 1])
+    batch.step()
+    batch.step()
+    state = batch.get_state()
+    assert {name for name in state if name.startswith("task.")} == {"task.steps", "task.peaks"}
+    assert task.peaks.shape == (2, 3) and task.peaks.numpy()[:, 1].tolist() == [[2.0, 4.0]] * 2
+    batch.reset(env_mask=np.array([True, False]))
+    assert task.steps.numpy().tolist() == [0, 2] and task.peaks.numpy()[:, 1].tolist() == [[0.0, 0.0], [2.0, 4.0]]
+    assert task.seen.numpy().tolist() == [2.0, 2.0], "not declared cleared"
+    batch.set_state(state)
+    assert task.steps.numpy().tolist() == [2, 2]
 
 
 def test_no_metric_can_take_a_name_of_info(make_env, env_id):
     env = make_env(env_id)
     env.reset(seed=0)
     info = env.step(np.zeros(env.action_space.shape))[4]
-    assert set(info) - set(env.batch.task.metrics) <= set(NAMES_OF_INFO)
+    assert set(info) - set(env.batch.task.metric_names) <= set(NAMES_OF_INFO)
 
 
 @pytest.mark.parametrize(
     ("declared", "found"),
     [
         ({}, {}),
-        ({"columns": (3, 1, 1)}, {"reward_terms": (2, 3)}),
-        ({"columns": (1, 4, 2)}, {"cost_terms": (1, 4), "metrics": (1, 2)}),
-        ({"columns": (2, 1, 1), "cost_terms": ()}, {"cost_terms": (0, 1)}),
-        ({"columns": (2, 0, 1), "cost_terms": ()}, {}),
+        ({"columns": (3, 1, 1)}, {"rewards": (2, 3)}),
+        ({"columns": (1, 4, 2)}, {"costs": (1, 4), "metrics": (1, 2)}),
+        ({"columns": (2, 1, 1), "costs": ()}, {"costs": (0, 1)}),
+        ({"columns": (2, 0, 1), "costs": ()}, {}),
     ],
 )
 def test_columns_beyond_those_declared_are_seen(device, declared, found):
@@ -108,7 +153,7 @@ def test_columns_beyond_those_declared_are_seen(device, declared, found):
 
 
 def test_check_task_tells_what_is_written_beyond_the_names(device):
-    told = "reward_terms declares 2 names, and 3 columns are written: .* name them, or write fewer"
+    told = "rewards declares 2 names, and 3 columns are written: .* name them, or write fewer"
     with pytest.raises(TaskError, match=told):
         check_task(type("Wide", (Plain,), {"columns": (3, 1, 1)}), steps=4, device=device)
     check_task(Plain, steps=4, device=device)
@@ -126,5 +171,5 @@ class Flat(Plain):
 
 def test_a_task_may_reshape_its_arrays(device):
     check_task(Flat, steps=4, device=device)
-    with pytest.raises(TaskError, match="reward_terms declares 2 names, and 4 columns are written"):
+    with pytest.raises(TaskError, match="rewards declares 2 names, and 4 columns are written"):
         check_task(type("Wide", (Flat,), {"columns": (4, 1, 1)}), steps=4, device=device)

@@ -15,7 +15,7 @@ GRAVITY = 9.81
 
 def ball(batch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mass [kg], centre [m] and velocity [m/s] of every environment's ball, from the particles."""
-    prop = batch.simulation.props.props[batch.task.goal.index]
+    prop = batch.simulation.props.props[batch.task.index]
     own, state = slice(prop.first, prop.first + prop.count), batch.simulation.state
     mass = batch.simulation.model.particles.mass.numpy()[:, own].astype(float)
     share = mass / mass.sum(1, keepdims=True)
@@ -112,7 +112,7 @@ def test_a_nod_in_time_sends_the_ball_forward(make_batch):
     _, _, v = ball(batch)
     assert not batch.failure.numpy().any()
     assert -v[0, 1] > 3.0 > 2.0 > -v[1, 1], v
-    promise = batch.task.goal.course.best.numpy()[:, 1]
+    promise = batch.task.course.best.numpy()[:, 1]
     assert promise[0] > promise[1] + 0.2
 
 

@@ -14,7 +14,7 @@ FEET = ("left_foot", "right_foot")
 
 
 def ball_particles(batch) -> slice:
-    prop = batch.simulation.props.props[batch.task.goal.index]
+    prop = batch.simulation.props.props[batch.task.index]
     return slice(prop.first, prop.first + prop.count)
 
 
@@ -54,7 +54,7 @@ def test_masses_are_uniform_in_their_logarithm_and_observed(make_batch):
         batch.step()
         assert batch.metrics.numpy()[:, 0, 2] == pytest.approx(mass, rel=1e-5)
         masses.append(mass)
-        places.append(batch.simulation.props.spawn.position.numpy()[:, batch.task.goal.index])
+        places.append(batch.simulation.props.spawn.position.numpy()[:, batch.task.index])
     low, high = np.log(batch.config.ball_mass)
     share = (np.log(np.concatenate(masses)) - low) / (high - low)
     # Kolmogorov-Smirnov: the 0.1 % quantile of the distance is 1.95 / sqrt(n)
@@ -98,7 +98,7 @@ def test_a_kick_sends_heavier_balls_off_slower(make_batch):
     batch = make_batch(KICK, 3, fidelity="coarse", pose_noise=0.0, ball_jitter=0.0)
     batch.reset(seeds=range(3))
     # balls of other masses than those drawn
-    props, density = batch.simulation.props, np.array([[0.3], [1.5], [7.0]]) / batch.task.goal.gate.ball_volume
+    props, density = batch.simulation.props, np.array([[0.3], [1.5], [7.0]]) / batch.task.gate.ball_volume
     props.density.assign(density.astype(np.float32))
     graph = LaunchGraph(batch.device)
     props.record_reset(graph, batch.simulation.state, batch.mask)
@@ -106,7 +106,7 @@ def test_a_kick_sends_heavier_balls_off_slower(make_batch):
     speed = kick(batch)
     assert not batch.failure.numpy().any()
     assert speed[0] > 1.2 * speed[1] > 1.2**2 * speed[2] and speed[2] > 0.8, speed
-    assert batch.task.goal.course.best.numpy()[:, 0].min() > 0.9, "the foot was at the ball"
+    assert batch.task.course.best.numpy()[:, 0].min() > 0.9, "the foot was at the ball"
 
 
 @pytest.mark.parametrize(("aside", "through"), [(0.0, True), (0.3, True), (0.5, False)])

@@ -240,7 +240,7 @@ def test_a_script_pushes_the_box_to_its_target(make_env, seed):
 
 
 def test_what_blocks_the_body_holds_its_command_back(make_env):
-    """Backwards into a wall: without the leash the command would run away, and the root would let go."""
+    """Backwards into a wall: without the clamp the command would run away, and the root would let go."""
     wall = {"name": "wall", "kind": "box", "size": [1.0, 0.1, 1.0], "position": [0.0, 0.45, 1.0]}
     env = make_env(PUSH, **STRAIGHT, **{"scene.colliders": [wall]})
     env.reset(seed=0)

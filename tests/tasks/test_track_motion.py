@@ -21,7 +21,7 @@ def follow(env, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
     for _ in range(round(seconds / env.config.physics.control_dt)):
         _, reward, terminated, _, info = env.step(np.zeros(env.action_space.shape))
         assert not terminated and info["failure"] is None
-        rows.append({**{name: info[name] for name in env.batch.task.metrics}, "reward": reward})
+        rows.append({**{name: info[name] for name in env.batch.task.metric_names}, "reward": reward})
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 

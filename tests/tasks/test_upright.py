@@ -134,13 +134,13 @@ def test_pushes_come_at_random_moments_from_everywhere_and_are_weighed(make_env)
     interval = round(0.7 / env.config.physics.control_dt)
     for seed in range(4):
         observation, _ = env.reset(seed=seed)
-        masses.append(env.batch.simulation.props.density.numpy()[0, 0] * env.batch.task.pushes.throws.volume)
+        masses.append(env.batch.simulation.props.density.numpy()[0, 0] * env.batch.task.throws.volume)
         total, strongest, flew = np.zeros(3), 0.0, False
         for step in range(5 * interval):
-            before = env.batch.task.pushes.push.numpy()[0].copy()
+            before = env.batch.task.push.numpy()[0].copy()
             observation, *_, info = env.step(still(env))
             spawn = env.batch.simulation.props.spawn
-            thrown = bool(env.batch.task.pushes._placed.numpy()[0]) and spawn.velocity.numpy()[0, 0].any()
+            thrown = bool(env.batch.task.placed.numpy()[0]) and spawn.velocity.numpy()[0, 0].any()
             if thrown:
                 at, way = spawn.position.numpy()[0, 0], spawn.velocity.numpy()[0, 0]
                 azimuths.append(np.arctan2(at[0], -at[1]))
@@ -159,7 +159,7 @@ def test_pushes_come_at_random_moments_from_everywhere_and_are_weighed(make_env)
             assert info["impulse"] == pytest.approx(np.linalg.norm(impulse), rel=1e-4, abs=1e-6)
             assert info["push_impulse"] == pytest.approx(np.linalg.norm(total), rel=1e-3, abs=1e-3)
             assert info["strongest_push"] == pytest.approx(strongest, rel=1e-3, abs=1e-3)
-            flying = bool(env.batch.task.pushes.flying.numpy()[0])
+            flying = bool(env.batch.task.flying.numpy()[0])
             ball = seen(env, observation, "ball_position"), seen(env, observation, "ball_velocity")
             assert flying == ball[0].any() and (flying or not ball[1].any())
             if flying:

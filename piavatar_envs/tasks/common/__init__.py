@@ -1,1 +1,1 @@
-"""TODO."""
+"""Parts that several tasks share: first poses, falls, standing, gaits, balls and gates, thrown balls, rewards."""

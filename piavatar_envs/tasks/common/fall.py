@@ -1,11 +1,9 @@
-"""What counts as a fall where nothing holds the root: head or pelvis too low.
-
-Heights are shares of those in the rest pose of the body at hand, so that they mean the same for small and tall ones.
-"""
+"""Falls: a head or a pelvis that is too low. Heights are shares of those in the body's own rest pose."""
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import warp as wp
 from pydantic import BaseModel, Field
@@ -15,13 +13,17 @@ from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import FROZEN, EnvConfig
 from piavatar_envs.mpm.types import row
 
+if TYPE_CHECKING:
+    from piavatar_envs.core.launch_graph import LaunchGraph
+    from piavatar_envs.envs.episodes import EpisodeArrays
+
 wp.set_module_options({"enable_backward": False})
 
 _HEAD = wp.constant(joint_index("head"))
 
 
 class FallConfig(BaseModel):
-    """How low is too low."""
+    """Heights below which an avatar has fallen."""
 
     model_config = FROZEN
 
@@ -30,24 +32,21 @@ class FallConfig(BaseModel):
 
     @property
     def least(self) -> wp.vec2:
-        """Shares of head and pelvis below which somebody has fallen."""
+        """The least shares of head and pelvis."""
         return wp.vec2(self.fall_head, self.fall_pelvis)
 
 
-#: When somebody has fallen, by the settings of a section ``fall``.
+#: The condition of a fall, by the settings of a section ``fall``.
 FALLEN_DOC = (
     "its head is lower than `fall.fall_head`, or its pelvis lower than `fall.fall_pelvis`, of its height in the rest "
     "pose (of the mean body 1.46 and 0.91 m)"
 )
-#: What ends episodes, or the part of an agent in them, where :func:`least_heights` are asked of it.
+#: The condition under torques, by :func:`least_heights`.
 UNDER_TORQUES_DOC = f'under `control="pd"` or `"torque"` an avatar falls: {FALLEN_DOC}'
 
 
 def least_heights(config: EnvConfig, fall: FallConfig) -> wp.vec2:
-    """Shares of head and pelvis below which somebody has fallen, who moves the joints by torques.
-
-    Where a wrench holds the root, its letting go is the fall, and no posture is.
-    """
+    """Return the least shares of head and pelvis; minus infinity where a wrench holds the root, which then lets go."""
     if config.control.mode == "pose":
         return wp.vec2(-math.inf, -math.inf)
     return fall.least
@@ -55,7 +54,7 @@ def least_heights(config: EnvConfig, fall: FallConfig) -> wp.vec2:
 
 @wp.func
 def heights_of(body: Body, e: int, position: wp.array2d(dtype=wp.vec3)):
-    """Heights of head and pelvis over those in the rest pose."""
+    """Return the heights of head and pelvis over those in the rest pose."""
     r = row(e, body.rest_joint.shape[0])
     head = position[e, _HEAD][2] / body.rest_joint[r, _HEAD][2]
     return wp.vec2(head, position[e, 0][2] / body.rest_joint[r, 0][2])
@@ -63,5 +62,24 @@ def heights_of(body: Body, e: int, position: wp.array2d(dtype=wp.vec3)):
 
 @wp.func
 def is_down(heights: wp.vec2, least: wp.vec2):
-    """Whether head or pelvis are too low."""
+    """Return whether head or pelvis are too low."""
     return heights[0] < least[0] or heights[1] < least[1]
+
+
+@wp.kernel
+def find_fall(
+    least: wp.vec2,
+    body: Body,
+    position: wp.array2d(dtype=wp.vec3),
+    # out
+    terminated: wp.array2d(dtype=wp.bool),
+):
+    """Terminate environments whose head or pelvis are lower than ``least``."""
+    e = wp.tid()
+    terminated[e, 0] = is_down(heights_of(body, e, position), least)
+
+
+def record_fall(env: EpisodeArrays, graph: LaunchGraph, config: FallConfig) -> None:
+    """Append: terminate environments whose only avatar has fallen."""
+    avatar = env.simulation.avatar
+    graph.launch(find_fall, env.num_envs, [config.least, avatar.body, avatar.tracked.position], [env.terminated])

@@ -1,4 +1,4 @@
-"""Where hands are: in the middle of their flesh, which no joint marks."""
+"""Middles of the hands: no joint marks them, so they are the centres of the hands' flesh."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LEFT_WRIST, RIGHT_WRIST = wp.constant(joint_index("left_wrist")), wp.constant(jo
 
 @wp.func
 def flesh_middle(body: Body, e: int, b: int, rotation: wp.array2d(dtype=wp.quat), position: wp.array2d(dtype=wp.vec3)):
-    """Middle of a bone's flesh [m], carried by the tracked joint."""
+    """Return the middle of a bone's flesh [m], carried by the tracked joint."""
     arm = body.rest_center[row(e, body.rest_center.shape[0]), b]
     arm -= body.rest_joint[row(e, body.rest_joint.shape[0]), b]
     return position[e, b] + wp.quat_rotate(rotation[e, b], arm)
@@ -30,6 +30,6 @@ def write_hands(
     # out
     hands: wp.array2d(dtype=wp.vec3),
 ):
-    """Middles of the left and the right hand [m]."""
+    """Write the middles of the left and the right hand [m]."""
     hands[e, 0] = flesh_middle(body, e, LEFT_WRIST, rotation, position)
     hands[e, 1] = flesh_middle(body, e, RIGHT_WRIST, rotation, position)

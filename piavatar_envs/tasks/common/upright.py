@@ -1,8 +1,7 @@
-"""Standing upright by one's own strength: what is seen of it, and what it is worth."""
+"""Standing upright by the strength of the joints: its observation, its rewards, and the base of tasks that stand."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import warp as wp
@@ -12,15 +11,18 @@ from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.rotation import quat_log
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import FROZEN
+from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
+from piavatar_envs.envs.task import Metric, Task, Term
 from piavatar_envs.mpm.types import Sensors
-from piavatar_envs.tasks.common.fall import FALLEN_DOC, FallConfig, heights_of, is_down
+from piavatar_envs.tasks.common.fall import FALLEN_DOC, heights_of, record_fall
 from piavatar_envs.tasks.common.ranges import Margin
-from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance
+from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
+from piavatar_envs.tasks.common.spawn import Grounding
 
 if TYPE_CHECKING:
     from piavatar_envs.core.launch_graph import LaunchGraph
-    from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.envs.episodes import EpisodeArrays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,40 +30,46 @@ _CHEST = wp.constant(joint_index("spine3"))
 _LEFT, _RIGHT = wp.constant(joint_index("left_ankle")), wp.constant(joint_index("right_ankle"))
 
 UPRIGHT_TERMS = (
-    ObservationTerm("gravity_direction", 3, "-", "root", "where down is: a unit vector"),
+    ObservationTerm("gravity_direction", 3, "-", "root", "direction of gravity: a unit vector"),
     ObservationTerm(
-        "foot_impulses",
-        2,
-        "N s",
-        "-",
-        "what left and right foot bear of the ground's upward impulse in the last step",
+        "foot_impulses", 2, "N s", "-", "shares of left and right foot in the ground's upward impulse of the last step"
     ),
 )
-REWARD_TERMS = ("height", "upright", "still", "pose", "control")
-REWARD_DOCS: Mapping[str, str] = {
-    "height": "0.3 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that has "
-    "fallen to 0.03 after another `upright.height_margin` of that height",
-    "upright": "0.3 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.03 after "
-    "another `upright.tilt_margin`",
-    "still": "0.2 while the pelvis is no faster than 0.05 m/s; beyond it a Gaussian that has fallen to 0.02 after "
-    "another `still.speed_margin`; all times `height` / 0.3",
-    "pose": "0.2 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian that "
-    "has fallen to 0.02 after another `still.pose_margin`; all times `height` / 0.3",
-    "control": "`-control_cost` times the mean of the squared action components",
-}
-METRICS = ("head_height", "pelvis_height", "tilt_deg", "speed")
-METRIC_DOCS: Mapping[str, str] = {
-    "head_height": "height of the head joint over that in the rest pose [-]",
-    "pelvis_height": "height of the pelvis joint over that in the rest pose [-]",
-    "tilt_deg": "angle of the chest from the vertical, as it is in the rest pose [deg]",
-    "speed": "speed of the pelvis [m/s]",
-}
+STANDING_REWARDS = (
+    Term(
+        "height",
+        "0.3 while the head is no lower than 0.95 of its height in the rest pose; below it a Gaussian that has fallen "
+        "to 0.03 after another `upright.height_margin` of that height",
+    ),
+    Term(
+        "upright",
+        "0.3 while the chest tilts by at most 0.1 rad; beyond it a Gaussian that has fallen to 0.03 after another "
+        "`upright.tilt_margin`",
+    ),
+    Term(
+        "still",
+        "0.2 while the pelvis is no faster than 0.05 m/s; beyond it a Gaussian that has fallen to 0.02 after another "
+        "`still.speed_margin`; all times `height` / 0.3",
+    ),
+    Term(
+        "pose",
+        "0.2 while the mean angle of the joints from the rest pose is at most 0.05 rad; beyond it a Gaussian that has "
+        "fallen to 0.02 after another `still.pose_margin`; all times `height` / 0.3",
+    ),
+    CONTROL,
+)
+STANDING_METRICS = (
+    Metric("head_height", "-", "height of the head joint over that in the rest pose"),
+    Metric("pelvis_height", "-", "height of the pelvis joint over that in the rest pose"),
+    Metric("tilt_deg", "deg", "angle of the chest from the vertical, relative to the rest pose"),
+    Metric("speed", "m/s", "speed of the pelvis"),
+)
 STANDING_DOC = "the head is no lower than `upright.stand_head` of its height in the rest pose"
 FALL_DOC = f"the avatar falls: {FALLEN_DOC}"
 
 
 class UprightConfig(BaseModel):
-    """What counts as standing, and where the rewards of height and tilt end."""
+    """Limit of standing, and margins of the rewards of height and tilt."""
 
     model_config = FROZEN
 
@@ -71,7 +79,7 @@ class UprightConfig(BaseModel):
 
 
 class StillConfig(BaseModel):
-    """Where the rewards of standing still in the rest pose end."""
+    """Margins of the rewards of standing still in the rest pose."""
 
     model_config = FROZEN
 
@@ -99,7 +107,7 @@ class Still:
 
 @wp.struct
 class Posture:
-    """How a body stands now."""
+    """Heights and tilt of a body."""
 
     head: float  # height over that in the rest pose
     pelvis: float  # likewise
@@ -108,24 +116,9 @@ class Posture:
     straight: float  # reward of the tilt, in [0, 1]
 
 
-def upright_rule(config: UprightConfig, control_cost: float) -> Upright:
-    """Kernel argument."""
-    rule = Upright()
-    rule.stand_head, rule.height_margin, rule.tilt_margin = config.stand_head, config.height_margin, config.tilt_margin
-    rule.control_cost = control_cost
-    return rule
-
-
-def still_rule(config: StillConfig) -> Still:
-    """Kernel argument."""
-    rule = Still()
-    rule.speed_margin, rule.pose_margin = config.speed_margin, config.pose_margin
-    return rule
-
-
 @wp.func
 def tilt_of(rotation: wp.quat):
-    """Angle of a bone from the vertical, as it is in the rest pose [rad]."""
+    """Return the angle of a bone from the vertical, relative to the rest pose [rad]."""
     up = wp.quat_rotate(rotation, wp.vec3(0.0, 0.0, 1.0))
     return wp.acos(wp.clamp(up[2], -1.0, 1.0))
 
@@ -134,7 +127,7 @@ def tilt_of(rotation: wp.quat):
 def posture_of(
     rule: Upright, body: Body, e: int, rotation: wp.array2d(dtype=wp.quat), position: wp.array2d(dtype=wp.vec3)
 ):
-    """Heights and tilt of a body, and what they are worth."""
+    """Return heights and tilt of a body, and their rewards."""
     now = Posture()
     heights = heights_of(body, e, position)
     now.head = heights[0]
@@ -147,7 +140,7 @@ def posture_of(
 
 @wp.func
 def mean_angle(local: wp.array2d(dtype=wp.quat), e: int):
-    """Of all joints but the pelvis, from the rest pose [rad]."""
+    """Return the mean angle of all joints but the pelvis from the rest pose [rad]."""
     total = float(0.0)
     for b in range(1, local.shape[1]):
         total += wp.length(quat_log(local[e, b]))
@@ -156,7 +149,7 @@ def mean_angle(local: wp.array2d(dtype=wp.quat), e: int):
 
 @wp.func
 def write_posture(now: Posture, e: int, metrics: wp.array3d(dtype=float)):
-    """The first three of :data:`METRICS`."""
+    """Write the first three of :data:`STANDING_METRICS`."""
     metrics[e, 0, 0] = now.head
     metrics[e, 0, 1] = now.pelvis
     metrics[e, 0, 2] = wp.degrees(now.tilt)
@@ -164,13 +157,13 @@ def write_posture(now: Posture, e: int, metrics: wp.array3d(dtype=float)):
 
 @wp.func
 def stillness(still: Still, speed: float):
-    """1 while the pelvis hardly moves [m/s], and less the faster it is."""
+    """Return 1 while the pelvis hardly moves [m/s], less the faster it is."""
     return tolerance(speed, 0.05, still.speed_margin)
 
 
 @wp.func
 def restfulness(still: Still, angle: float):
-    """1 while the joints are hardly off the rest pose on average [rad], and less the more they are."""
+    """Return 1 while the mean angle of the joints from the rest pose [rad] is small, less the greater it is."""
     return tolerance(angle, 0.05, still.pose_margin)
 
 
@@ -186,7 +179,7 @@ def write_standing(
     metrics: wp.array3d(dtype=float),
     success: wp.array2d(dtype=wp.bool),
 ):
-    """All of :data:`METRICS`, whether it stands, and the last reward term, what acting costs."""
+    """Write :data:`STANDING_METRICS`, success, and the last reward term, the cost of acting."""
     terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
     write_posture(now, e, metrics)
     metrics[e, 0, 3] = speed
@@ -208,7 +201,7 @@ def judge_standing(
     metrics: wp.array3d(dtype=float),
     success: wp.array2d(dtype=wp.bool),
 ):
-    """Reward of standing still in the rest pose, wherever, and its cost."""
+    """Reward standing still in the rest pose, wherever that is."""
     e = wp.tid()
     now = posture_of(rule, body, e, rotation, position)
     speed = wp.length(velocity[e, 0])
@@ -220,24 +213,11 @@ def judge_standing(
     write_standing(rule, now, speed, e, action, terms, metrics, success)
 
 
-@wp.kernel
-def find_fall(
-    least: wp.vec2,
-    body: Body,
-    position: wp.array2d(dtype=wp.vec3),
-    # out
-    terminated: wp.array2d(dtype=wp.bool),
-):
-    """Terminate whose head or pelvis are lower than ``least``."""
-    e = wp.tid()
-    terminated[e, 0] = is_down(heights_of(body, e, position), least)
-
-
 @wp.func
 def foot_share(left: wp.vec3, right: wp.vec3, impulse: wp.vec3, moment: wp.vec3):
-    """Share of the left foot, from 0 to 1, of an upward impulse whose moment about the origin is given [N m s].
+    """Return the left foot's share, from 0 to 1, of an upward impulse with a given moment about the origin [N m s].
 
-    Where only two points bear, levers share the load: the centre of pressure ``(-M_y, M_x) / J_z`` lies between them.
+    Two points bear by their levers: the centre of pressure ``(-M_y, M_x) / J_z`` lies between them.
     """
     if impulse[2] < 1.0e-6:
         return 0.5
@@ -248,15 +228,9 @@ def foot_share(left: wp.vec3, right: wp.vec3, impulse: wp.vec3, moment: wp.vec3)
 
 @wp.func
 def left_foot_share(position: wp.array2d(dtype=wp.vec3), sensors: Sensors, e: int, agent: int):
-    """What the left foot bears of the ground's upward impulse in the last step, from 0 to 1."""
+    """Return the left foot's share in the ground's upward impulse of the last step, from 0 to 1."""
     moment = sensors.boundary_moment[e, agent]
     return foot_share(position[e, _LEFT], position[e, _RIGHT], sensors.boundary_impulse[e, agent], moment)
-
-
-@wp.func
-def lead_of_left_foot(position: wp.array2d(dtype=wp.vec3), e: int, ahead: wp.vec3):
-    """How far ahead of the right ankle the left one is [m]."""
-    return wp.dot(position[e, _LEFT] - position[e, _RIGHT], ahead)
 
 
 @wp.kernel
@@ -269,7 +243,7 @@ def observe_upright(
     # out
     observation: wp.array3d(dtype=float),
 ):
-    """Terms of :data:`UPRIGHT_TERMS`, from component ``start``."""
+    """Write :data:`UPRIGHT_TERMS` from component ``start``."""
     e = wp.tid()
     write_vector(observation, e, agent, start, wp.quat_rotate_inv(rotation[e, 0], wp.vec3(0.0, 0.0, -1.0)))
     upward = sensors.boundary_impulse[e, agent][2]
@@ -278,26 +252,8 @@ def observe_upright(
     observation[e, agent, start + 4] = (1.0 - share) * upward
 
 
-def record_standing_outcome(env: BatchEnv, graph: LaunchGraph, rule: Upright, still: Still) -> None:
-    """Append: terms, metrics and success of standing."""
-    avatar = env.simulation.avatar
-    t = avatar.tracked
-    graph.launch(
-        judge_standing,
-        env.num_envs,
-        [rule, still, avatar.body, t.rotation, t.position, t.velocity, t.local, env.action],
-        [env.terms, env.metrics, env.success],
-    )
-
-
-def record_fall(env: BatchEnv, graph: LaunchGraph, config: FallConfig) -> None:
-    """Append: terminate environments whose avatar has fallen."""
-    avatar = env.simulation.avatar
-    graph.launch(find_fall, env.num_envs, [config.least, avatar.body, avatar.tracked.position], [env.terminated])
-
-
-def record_observe_upright(env: BatchEnv, graph: LaunchGraph, agent: int, start: int) -> int:
-    """Append: write :data:`UPRIGHT_TERMS` from component ``start``; returns the one after them."""
+def record_observe_upright(env: EpisodeArrays, graph: LaunchGraph, agent: int, start: int) -> int:
+    """Append: write :data:`UPRIGHT_TERMS` from component ``start``; return the component after them."""
     tracked = env.simulation.avatars[agent].tracked
     graph.launch(
         observe_upright,
@@ -306,3 +262,34 @@ def record_observe_upright(env: BatchEnv, graph: LaunchGraph, agent: int, start:
         [env.observation],
     )
     return start + sum(term.size for term in UPRIGHT_TERMS)
+
+
+class StandingTask(Task):
+    """Base of tasks that stand still in the rest pose; settings have sections ``upright``, ``still`` and ``fall``."""
+
+    observation_terms = UPRIGHT_TERMS
+    rewards = STANDING_REWARDS
+    metrics = STANDING_METRICS
+    success_doc = STANDING_DOC
+    termination_doc = FALL_DOC
+
+    def allocate(self, env) -> None:
+        self.rule = fill(Upright(), self.config.upright, self.config)
+        self.still = fill(Still(), self.config.still)
+        self.grounding = Grounding(env)
+
+    def record_reset(self, env, graph) -> None:
+        self.grounding.record_standing(env, graph, self.config.pose_noise)
+
+    def record_outcome(self, env, graph) -> None:
+        avatar, t = env.simulation.avatar, env.simulation.avatar.tracked
+        graph.launch(
+            judge_standing,
+            env.num_envs,
+            [self.rule, self.still, avatar.body, t.rotation, t.position, t.velocity, t.local, env.action],
+            [env.terms, env.metrics, env.success],
+        )
+        record_fall(env, graph, self.config.fall)
+
+    def record_observe(self, env, graph, agent: int, start: int) -> None:
+        record_observe_upright(env, graph, agent, start)

@@ -1,7 +1,4 @@
-"""Kernels of HighFive: where the hands are, and whether they have slapped.
-
-HighFive: two avatars face each other and slap one hand each, high up and neither too softly nor too hard.
-"""
+"""HighFive: two avatars face each other and slap one hand each, high up and neither too softly nor too hard."""
 
 from __future__ import annotations
 
@@ -17,34 +14,33 @@ from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
 from piavatar_envs.config.schema import select_joints
 from piavatar_envs.core.rng import STREAM_TASK, generator
+from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.sim.randomize import Parameter
-from piavatar_envs.tasks.common.cooperation import record_fall_together, record_shift
 from piavatar_envs.tasks.common.fall import UNDER_TORQUES_DOC, FallConfig
-from piavatar_envs.tasks.common.fights import Referee, part_impulse_by
 from piavatar_envs.tasks.common.hands import LEFT_WRIST, RIGHT_WRIST, flesh_middle
+from piavatar_envs.tasks.common.multi_agent import Referee, part_impulse_by
 from piavatar_envs.tasks.common.ranges import ImpulseRange, Margin, Weight, check_ranges
-from piavatar_envs.tasks.common.rewards import mean_square_action, tolerance
-from piavatar_envs.tasks.common.spawn import record_standing
+from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action, tolerance
+from piavatar_envs.tasks.common.spawn import record_shift, record_standing
 
 wp.set_module_options({"enable_backward": False})
 
-
 _LEFT_ARM = wp.constant(list(BODY_PARTS).index("left_arm"))
-#: Way that a hand which points straight down instead of straight up seems to have to go [m].
+#: Added to the way to go of a hand that points straight down instead of straight up [m].
 _TURN = wp.constant(0.4)
 
 
 @wp.struct
 class SlapRule:
-    """Constants of what counts as a slap, and what it is worth."""
+    """Constants of a slap and its reward, as in the settings."""
 
-    window: float
+    impulse_window: float
     reach: float
-    height: float
+    least_height: float
     upright: float
     margin: float
     approach_weight: float
@@ -54,7 +50,7 @@ class SlapRule:
 
 @wp.struct
 class Hands:
-    """The hands that the two shall raise, in the world; ``(num_envs, 2)``."""
+    """The hands to raise, in the world; ``(num_envs, 2)``."""
 
     middle: wp.array2d(dtype=wp.vec3)  # of the flesh [m]
     direction: wp.array2d(dtype=wp.vec3)  # unit vector from the wrist to the middle
@@ -72,7 +68,7 @@ def draw_slap(
     side: wp.array(dtype=int),
     least: wp.array(dtype=float),
 ):
-    """Which hands (0 left, 1 right) and the weakest slap that counts [N s], each between two bounds."""
+    """Draw the hands (0 left, 1 right) and the weakest slap that counts [N s], each between two bounds."""
     e = wp.tid()
     if mask[e]:
         random = generator(seed[e], episode[e], STREAM_TASK, 0)
@@ -91,7 +87,7 @@ def locate_hand(
     # out
     hands: Hands,
 ):
-    """Find the hand that an agent shall raise."""
+    """Find the hand that an agent has to raise."""
     e = wp.tid()
     wrist = wp.where(side[e] == 0, LEFT_WRIST, RIGHT_WRIST)
     middle = flesh_middle(body, e, wrist, rotation, position)
@@ -102,7 +98,7 @@ def locate_hand(
 
 @wp.func
 def arm_impulse(sensors: Sensors, e: int, agent: int, side: int):
-    """Impulse of the other agent on the arm that an agent shall raise [N s]."""
+    """Return the impulse of the other agent on the arm that an agent has to raise [N s]."""
     return wp.length(part_impulse_by(sensors, e, agent, _LEFT_ARM + side, 1 - agent))
 
 
@@ -120,17 +116,17 @@ def judge(
     success: wp.array2d(dtype=wp.bool),
     terminated: wp.array2d(dtype=wp.bool),
 ):
-    """The same for both: how far the hands still have to go, and whether they have slapped."""
+    """Reward both agents alike, by the way that the hands have to go and by the slap."""
     e = wp.tid()
     distance = wp.length(hands.middle[e, 0] - hands.middle[e, 1])
     height = wp.min(hands.middle[e, 0][2], hands.middle[e, 1][2])
     upright = wp.min(hands.direction[e, 0][2], hands.direction[e, 1][2])
-    # what has struck only one of the two arms is no slap
+    # an impulse on only one of the two arms is no slap
     impulse = wp.min(arm_impulse(sensors, e, 0, side[e]), arm_impulse(sensors, e, 1, side[e]))
-    placed = distance <= rule.reach and height >= rule.height and upright >= rule.upright
-    too_hard = impulse > rule.window * least[e]
+    placed = distance <= rule.reach and height >= rule.least_height and upright >= rule.upright
+    too_hard = impulse > rule.impulse_window * least[e]
     done = placed and impulse >= least[e] and not too_hard
-    to_go = distance + wp.max(rule.height - height, 0.0) + 0.5 * _TURN * wp.max(rule.upright - upright, 0.0)
+    to_go = distance + wp.max(rule.least_height - height, 0.0) + 0.5 * _TURN * wp.max(rule.upright - upright, 0.0)
     control = 0.5 * (mean_square_action(action, e, 0) + mean_square_action(action, e, 1))
     for agent in range(2):
         terms[e, agent, 0] = rule.approach_weight * tolerance(to_go, rule.reach, rule.margin)
@@ -155,7 +151,7 @@ def observe_hands(
     # out
     observation: wp.array3d(dtype=float),
 ):
-    """The terms of ``HighFiveTask.observation_terms``, from component ``start``."""
+    """Write ``HighFiveTask.observation_terms`` from component ``start``."""
     e = wp.tid()
     to_root = wp.quat_inverse(rotation[e, 0])
     own = hands.middle[e, agent]
@@ -176,7 +172,7 @@ def observe_draws(
     # out
     observation: wp.array3d(dtype=float),
 ):
-    """What was drawn for the episode; -1 where it has no place in the observation."""
+    """Write the drawn hand and impulse; a component of -1 is not observed."""
     e = wp.tid()
     if side_at >= 0:
         observation[e, agent, side_at] = 2.0 * float(side[e]) - 1.0
@@ -194,7 +190,7 @@ class HighFiveConfig(EnvConfig):
 
     episode_seconds: float = Field(2.5, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     joints: tuple[str, ...] | None = Field(None, description="joints that act; null for the spine and the hand's arm")
-    hand: Literal["left", "right", "random"] = Field("right", description="hand that each of them shall raise")
+    hand: Literal["left", "right", "random"] = Field("right", description="hand that each of them has to raise")
     spacing: float = Field(0.8, ge=0.5, le=2.0, description="between the two, where the scene does not place them [m]")
     place_noise: float = Field(0.05, ge=0.0, le=0.3, description="greatest displacement of each along x and y [m]")
     pose_noise: float = Field(0.1, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
@@ -209,11 +205,11 @@ class HighFiveConfig(EnvConfig):
     upright: float = Field(
         0.5, ge=-1.0, le=1.0, description="least upward part of both hands' directions for a slap to count [-]"
     )
-    margin: Margin = Field(0.8, description="way to go beyond reach at which the reward has fallen to 0.1 [m]")
+    margin: Margin = Field(0.8, description="way to go, beyond `reach`, at which the reward has fallen to 0.1 [m]")
     approach_weight: Weight = Field(0.2, description="greatest reward of a step without a slap [-]")
     slap_bonus: Weight = Field(20.0, description="reward of a slap that counts [-]")
     control_cost: Weight = Field(0.02, description="weight of the mean squared action [-]")
-    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall under torques")
+    fall: FallConfig = Field(default_factory=FallConfig, description="limits of a fall under torques")
 
 
 class HighFiveTask(Task):
@@ -224,40 +220,43 @@ class HighFiveTask(Task):
     observation_terms = (
         ObservationTerm("own_hand", 3, "m", "root", "middle of the hand to raise, from the pelvis"),
         ObservationTerm("own_hand_direction", 3, "-", "root", "unit vector from its wrist to its middle"),
-        ObservationTerm("partner_hand", 3, "m", "root", "middle of the partner's hand, from that of one's own"),
+        ObservationTerm("partner_hand", 3, "m", "root", "middle of the partner's hand, from that of the own hand"),
         ObservationTerm("partner_hand_velocity", 3, "m/s", "root", "velocity of the partner's hand"),
     )
-    reward_terms = ("approach", "slap", "control")
-    metrics = ("distance", "hand_height", "hand_upright", "slap_impulse")
+    rewards = (
+        Term(
+            "approach",
+            "`approach_weight` while the way to go is at most `reach`; beyond it a Gaussian that has fallen to a tenth "
+            "at `reach + margin`. The way is `distance`, plus the deficit of `hand_height` to `least_height`, plus 0.2 "
+            "m times the deficit of `hand_upright` to `upright`",
+        ),
+        Term("slap", "`slap_bonus` in the step that is a success"),
+        Term("control", f"{CONTROL.description} of both agents"),
+    )
+    metrics = (
+        Metric("distance", "m", "between the middles of the two hands"),
+        Metric("hand_height", "m", "height of the lower hand"),
+        Metric("hand_upright", "-", "upward part of the unit vector from wrist to hand, the lesser of the two"),
+        Metric("slap_impulse", "N s", "impulse between the arms in this step, the lesser of those on the two arms"),
+    )
+    state_arrays = (TaskArray("side", int), TaskArray("least"))
+    scratch_arrays = tuple(TaskArray(name, wp.vec3, (2,)) for name in ("middle", "direction", "velocity"))
     observes_contact = True
     observes_others = True
     camera_position = (2.9, -0.9, 1.75)
     camera_target = (0.0, 0.0, 0.95)
 
     summary = """Two avatars stand face to face, `spacing` apart and each displaced by up to `place_noise`, with their
-arms down. Each shall raise its `hand` and slap the other's. It is a high five when the impulse of arm on arm, summed
-over one control step, is at least `impulse` and at most `impulse_window` times that, while the hands are within
-`reach` of each other, both `least_height` or higher and both pointing up (`upright`). Both agents are paid the same.
-Holding the hands together is not enough: they must swing, at the same moment."""
-    reward_docs: ClassVar[Mapping[str, str]] = {
-        "approach": "`approach_weight` while the way to go is at most `reach`; beyond it a Gaussian that has fallen to "
-        "a tenth at `reach + margin`. The way is `distance`, plus what `hand_height` lacks of `least_height`, plus "
-        "0.2 m times what `hand_upright` lacks of `upright`",
-        "slap": "`slap_bonus` in the step that is a success",
-        "control": "`-control_cost` times the mean of the squared action components of both agents",
-    }
-    metric_docs: ClassVar[Mapping[str, str]] = {
-        "distance": "between the middles of the two hands [m]",
-        "hand_height": "height of the lower hand [m]",
-        "hand_upright": "upward part of the unit vector from wrist to hand, the lesser of the two [-]",
-        "slap_impulse": "impulse between the arms in this step, the lesser of what the two have felt [N s]",
-    }
+arms down. Each has to raise its `hand` and slap the other's. It is a high five when the impulse of arm on arm, summed
+over one control step, is at least `impulse` and at most `impulse_window` times that, while the hands are within `reach`
+of each other, both `least_height` or higher and both pointing up (`upright`). Both agents get the same reward. Holding
+the hands together is not enough: they must swing, at the same moment."""
     success_doc = (
         "`slap_impulse` is between the episode's `impulse` and `impulse_window` times that, while `distance` is at "
         "most `reach`, `hand_height` at least `least_height` and `hand_upright` at least `upright`"
     )
     termination_doc = (
-        "both agents' ends with a success, with a blow above the upper bound, and when either falls;\n- "
+        "both agents at once: with a success, with a blow above the upper bound, and when either falls;\n- "
         f"{UNDER_TORQUES_DOC}"
     )
     picture_seconds = 0.3
@@ -302,60 +301,34 @@ Holding the hands together is not enough: they must swing, at the same moment.""
         return Drawn(self.side), Drawn(self.least)
 
     def allocate(self, env) -> None:
-        n, device = env.num_envs, env.device
-        config, rule, hands = self.config, SlapRule(), Hands()
-        rule.window, rule.reach, rule.height = config.impulse_window, config.reach, config.least_height
-        rule.upright, rule.margin, rule.approach_weight = config.upright, config.margin, config.approach_weight
-        rule.slap_bonus, rule.control_cost = config.slap_bonus, config.control_cost
-        hands.middle, hands.direction, hands.velocity = (
-            wp.zeros((n, 2), dtype=wp.vec3, device=device) for _ in range(3)
-        )
-        self.rule, self.hands, self.referee = rule, hands, Referee(env, config.fall)
-        self.side, self.least = wp.zeros(n, dtype=int, device=device), wp.zeros(n, dtype=float, device=device)
-
-    def arrays(self) -> dict[str, wp.array]:
-        return {"side": self.side, "least": self.least}
+        self.rule, self.hands = fill(SlapRule(), self.config), fill(Hands(), self)
+        self.referee = Referee(env, self.config.fall)
 
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
         record_shift(env, graph, self.config.place_noise)
-        graph.launch(
-            draw_slap,
-            env.num_envs,
-            [env.mask, env.seed, env.episode, wp.vec2i(*self.sides), wp.vec2(*self.config.impulse)],
-            [self.side, self.least],
-        )
+        bounds = [wp.vec2i(*self.sides), wp.vec2(*self.config.impulse)]
+        inputs = [env.mask, env.seed, env.episode, *bounds]
+        graph.launch(draw_slap, env.num_envs, inputs, [self.side, self.least])
 
     def _record_hands(self, env, graph) -> None:
         for agent, avatar in enumerate(env.simulation.avatars):
-            tracked = avatar.tracked
-            graph.launch(
-                locate_hand,
-                env.num_envs,
-                [agent, avatar.body, self.side, tracked.rotation, tracked.position, tracked.velocity],
-                [self.hands],
-            )
+            t = avatar.tracked
+            inputs = [agent, avatar.body, self.side, t.rotation, t.position, t.velocity]
+            graph.launch(locate_hand, env.num_envs, inputs, [self.hands])
 
     def record_outcome(self, env, graph) -> None:
         self._record_hands(env, graph)
-        graph.launch(
-            judge,
-            env.num_envs,
-            [self.rule, self.side, self.least, self.hands, env.simulation.sensors, env.action],
-            [env.terms, env.metrics, env.success, env.terminated],
-        )
+        inputs = [self.rule, self.side, self.least, self.hands, env.simulation.sensors, env.action]
+        graph.launch(judge, env.num_envs, inputs, [env.terms, env.metrics, env.success, env.terminated])
         self.referee.record(env, graph)
-        record_fall_together(env, graph, self.referee.out)
+        self.referee.record_shared_end(env, graph)
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_hands(env, graph)
         tracked = env.simulation.avatars[agent].tracked
-        graph.launch(
-            observe_hands,
-            env.num_envs,
-            [agent, start, tracked.rotation, tracked.position, self.hands],
-            [env.observation],
-        )
+        inputs = [agent, start, tracked.rotation, tracked.position, self.hands]
+        graph.launch(observe_hands, env.num_envs, inputs, [env.observation])
         at = [env.layout[name].slice.start if name in env.layout else -1 for name in ("hand_side", "least_impulse")]
         graph.launch(observe_draws, env.num_envs, [agent, *at, self.side, self.least], [env.observation])
 

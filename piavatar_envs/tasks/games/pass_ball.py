@@ -1,12 +1,6 @@
-"""Kernels of PassBall: how the ball is served, whose turn it is, what is a pass.
-
-PassBall: a ball goes round a circle of avatars, each of whom sends it on to the next.
-"""
+"""PassBall: a circle of avatars passes a ball around, each to the next."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
-from typing import ClassVar
 
 import numpy as np
 import warp as wp
@@ -15,25 +9,23 @@ from pydantic import Field
 from piavatar_envs.config import EnvConfig, SceneConfig, replace
 from piavatar_envs.config.schema import select_joints
 from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec, speed_within
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
-from piavatar_envs.envs.task import Task
+from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
-from piavatar_envs.tasks.common.ball_goal import BALL, ball_config
-from piavatar_envs.tasks.common.cooperation import record_fall_together, record_shift
+from piavatar_envs.tasks.common.ball_goal import BALL, FEET_TERMS, ball_config, observe_feet
 from piavatar_envs.tasks.common.fall import UNDER_TORQUES_DOC, FallConfig
-from piavatar_envs.tasks.common.fights import Referee, on_circle
-from piavatar_envs.tasks.common.leash import held_back, record_leash
+from piavatar_envs.tasks.common.multi_agent import Referee, on_circle
 from piavatar_envs.tasks.common.ranges import Margin, MassRange, SpeedRange, Weight, check_ranges
-from piavatar_envs.tasks.common.rewards import mean_square_action
-from piavatar_envs.tasks.common.spawn import record_standing
-from piavatar_envs.tasks.kick_ball import observe_feet
+from piavatar_envs.tasks.common.rewards import CONTROL, mean_square_action
+from piavatar_envs.tasks.common.root_command import clamp_to_circle, record_root_clamp
+from piavatar_envs.tasks.common.spawn import record_shift, record_standing
 
 wp.set_module_options({"enable_backward": False})
-
 
 #: Impulse of ball and body in a control step above which they have touched [N s].
 TOUCH = wp.constant(1.0e-3)
@@ -41,7 +33,7 @@ TOUCH = wp.constant(1.0e-3)
 
 @wp.struct
 class Serve:
-    """Constants of how the ball comes into play, from the middle of the circle."""
+    """Constants of the serve from the middle of the circle."""
 
     prop: int
     radius: float  # of the ball [m]
@@ -56,11 +48,11 @@ class Serve:
 class PassRule:
     """Constants of the game."""
 
-    subject: int  # the ball among the subjects of the world
+    subject: int  # the ball among the subjects of the scene
     ball_volume: float  # [m^3]
     reach: float  # distance from a pelvis at which the ball has arrived [m]
-    sent: float  # how far it must have come from where the passer touched it last [m]
-    fetch: float  # and at which a slow ball can still be fetched [m]
+    least_pass: float  # least way of a pass from the passer's last touch [m]
+    fetch: float  # distance from a pelvis at which a slow ball can still be fetched [m]
     rim: float  # distance from the origin at which the ball is out [m]
     dead_speed: float  # [m/s]
     goal_passes: int
@@ -71,14 +63,14 @@ class PassRule:
 
 @wp.struct
 class Play:
-    """How the game stands in every environment; all of it belongs into a checkpoint."""
+    """State of the game in every environment."""
 
-    passer: wp.array(dtype=int)  # (num_envs,) whose turn it is
-    touched: wp.array(dtype=int)  # (num_envs,) whether they have touched the ball in this turn
-    passes: wp.array(dtype=int)  # (num_envs,) completed
-    left: wp.array(dtype=wp.vec3)  # (num_envs,) where the ball was when they touched it last [m], if they have
-    gap: wp.array(dtype=float)  # (num_envs,) from the ball to where it shall go [m]; negative: not yet known
-    contact: wp.array2d(dtype=int)  # (num_envs, num_agents) whether one touched the ball in the last step
+    passer: wp.array(dtype=int)  # (num_envs,) the agent whose turn it is
+    touched: wp.array(dtype=int)  # (num_envs,) 1 if the passer has touched the ball in this turn
+    passes: wp.array(dtype=int)  # (num_envs,) completed passes
+    left: wp.array(dtype=wp.vec3)  # (num_envs,) place of the ball at the passer's last touch [m], if there was one
+    gap: wp.array(dtype=float)  # (num_envs,) from the ball to its receiver [m]; negative: not yet known
+    contact: wp.array2d(dtype=int)  # (num_envs, num_agents) 1 for a touch in the last step
     touches: wp.array2d(dtype=int)  # (num_envs, num_agents) so far
 
 
@@ -96,7 +88,7 @@ def serve_ball(
     density: wp.array2d(dtype=float),
     play: Play,
 ):
-    """A ball that rolls from the middle of ``places`` towards one of them, in the masked environments."""
+    """Roll a ball from the middle of ``places`` towards one of them, in the masked environments."""
     e = wp.tid()
     if not mask[e]:
         return
@@ -115,13 +107,7 @@ def serve_ball(
     spin[e, serve.prop] = (speed / serve.radius) * wp.cross(up, way)
     density[e, serve.prop] = wp.exp(wp.randf(random, serve.light, serve.heavy))
     play.passer[e] = first
-    play.touched[e] = 0
-    play.passes[e] = 0
-    play.left[e] = wp.vec3()
     play.gap[e] = -1.0
-    for agent in range(agents):
-        play.contact[e, agent] = 0
-        play.touches[e, agent] = 0
 
 
 @wp.kernel
@@ -132,32 +118,32 @@ def keep_near(
     # out
     reference_root: wp.array(dtype=wp.vec3),
 ):
-    """The commanded root, no farther from its place than it may be before it acts."""
+    """Clamp the commanded root to within ``reach`` [m] of its place."""
     e = wp.tid()
-    reference_root[e] = held_back(command_root[e], place, reach)
+    reference_root[e] = clamp_to_circle(command_root[e], place, reach)
 
 
 @wp.func
 def flat_distance(a: wp.vec3, b: wp.vec3):
-    """Length of the horizontal part of ``a - b``."""
+    """Return the length of the horizontal part of ``a - b``."""
     return wp.length(wp.vec2(a[0] - b[0], a[1] - b[1]))
 
 
 @wp.func
 def goes_to(play: Play, e: int, agents: int):
-    """Who shall have the ball next: the passer until they have touched it, then the one after them."""
+    """Return the ball's receiver: the passer until it has touched the ball, then the next agent."""
     return (play.passer[e] + play.touched[e]) % agents
 
 
 @wp.func
 def way_come(play: Play, e: int, ball: wp.vec3):
-    """How far the ball has come from where the passer touched it last [m]; 0 before they have."""
+    """Return the ball's distance from its place at the passer's last touch [m]; 0 before that."""
     return wp.where(play.touched[e] == 1, flat_distance(ball, play.left[e]), 0.0)
 
 
 @wp.func
 def update_touches(rule: PassRule, sensors: Sensors, e: int, play: Play):
-    """Book who touches the ball; a touch counts when it begins."""
+    """Update contacts with the ball; a touch counts when it begins."""
     for agent in range(play.contact.shape[1]):
         impulse = sensors.pair_impulse[e, agent * sensors.boundary_impulse.shape[1] + rule.subject]
         touching = wp.where(wp.length(impulse) > TOUCH, 1, 0)
@@ -182,7 +168,7 @@ def judge(
     success: wp.array2d(dtype=wp.bool),
     terminated: wp.array2d(dtype=wp.bool),
 ):
-    """Follow the game: a step's progress, passes, and a ball that nobody can play any more."""
+    """Advance the game: reward progress and passes, and end it when no agent can reach the ball."""
     e = wp.tid()
     agents = pelvis.shape[1]
     update_touches(rule, sensors, e, play)
@@ -194,8 +180,8 @@ def judge(
         play.touched[e] = 1
         play.left[e] = ball[e]
     arrived = flat_distance(ball[e], pelvis[e, receiver]) <= rule.reach or play.contact[e, receiver] == 1
-    # feet that meet around a ball, and tap or hold it, send it nowhere
-    passed = play.touched[e] == 1 and arrived and way_come(play, e, ball[e]) >= rule.sent
+    # feet that meet around a ball, and tap or hold it, do not pass it
+    passed = play.touched[e] == 1 and arrived and way_come(play, e, ball[e]) >= rule.least_pass
     if passed:
         play.passes[e] += 1
         play.passer[e] = receiver
@@ -234,7 +220,7 @@ def observe_game(
     # out
     observation: wp.array3d(dtype=float),
 ):
-    """How the game stands, from component ``start``; agents are counted on from oneself."""
+    """Write the state of the game from component ``start``; agents are counted on from the observing one."""
     e = wp.tid()
     agents = pelvis.shape[1]
     to_root = wp.quat_inverse(rotation[e, 0])
@@ -244,7 +230,7 @@ def observe_game(
     write_vector(observation, e, agent, start, wp.quat_rotate(to_root, to - own))
     write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, to - ball[e]))
     write_vector(observation, e, agent, start + 6, wp.quat_rotate(to_root, home))
-    # a tenth and ten times the mass differ as much: what a kick does to them does, too
+    # a tenth and ten times the mass differ by as much, as the effects of a kick do
     observation[e, agent, start + 9] = wp.log10(density[e] * rule.ball_volume)
     observation[e, agent, start + 10] = float(play.touched[e])
     observation[e, agent, start + 11] = way_come(play, e, ball[e])
@@ -254,7 +240,7 @@ def observe_game(
 
 
 JOINTS = tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle") for side in ("left", "right"))
-#: How far beyond the avatars' circle the ball is still in play, and how far behind it the walls are [m].
+#: Distance beyond the avatars' circle to which the ball is in play, and to the walls [m].
 RIM, ROOM = 0.5, 1.3
 
 
@@ -266,64 +252,77 @@ class PassBallConfig(EnvConfig):
     spacing: float = Field(1.6, ge=1.2, le=4.0, description="between neighbours on the circle [m]")
     joints: tuple[str, ...] | None = Field(JOINTS, description="joints that act, besides the root; null for all 21")
     root_speed: float = Field(1.5, gt=0.0, le=5.0, description="speed of the root at action 1 [m/s]")
-    roam: float = Field(0.4, ge=0.0, le=1.0, description="how far the root may be steered from its place [m]")
-    leash: float = Field(
+    root_range: float = Field(0.4, ge=0.0, le=1.0, description="how far the root may be steered from its place [m]")
+    root_lead_limit: float = Field(
         0.12, gt=0.0, le=0.4, description="greatest lead of the commanded root on the body before an action [m]"
     )
-    leash_turn: float = Field(0.5, gt=0.0, le=1.5, description="greatest lead in turning before an action [rad]")
+    root_turn_lead_limit: float = Field(
+        0.5, gt=0.0, le=1.5, description="greatest lead in turning before an action [rad]"
+    )
     ball_mass: MassRange = Field((0.4, 2.0), description="range of the ball's mass, uniform in its log [kg]")
     ball_radius: float = Field(0.11, ge=0.06, le=0.3, description="radius of the ball [m]")
     serve_speed: SpeedRange = Field((1.0, 1.6), description="range of the ball's speed at the start [m/s]")
     serve_angle: float = Field(0.15, ge=0.0, le=0.5, description="greatest angle off the way to the first passer [rad]")
     reach: float = Field(0.4, gt=0.1, le=1.0, description="distance from a pelvis at which the ball has arrived [m]")
-    sent: float = Field(
-        0.5, ge=0.0, le=2.0, description="how far a pass must go from where the passer touched the ball last [m]"
+    least_pass: float = Field(
+        0.5, ge=0.0, le=2.0, description="least way of a pass from the passer's last touch of the ball [m]"
     )
     dead_speed: Margin = Field(0.1, description="horizontal speed below which a ball out of reach is dead [m/s]")
     goal_passes: int = Field(2, ge=1, le=1000, description="passes that count as a success [-]")
-    progress_weight: Weight = Field(1.0, description="reward for a metre of the ball's way to its goal [1/m]")
+    progress_weight: Weight = Field(1.0, description="reward for a metre of the ball's way to its receiver [1/m]")
     pass_bonus: Weight = Field(2.0, description="reward of a completed pass [-]")
     control_cost: Weight = Field(0.01, description="weight of the mean squared action [-]")
-    fall: FallConfig = Field(default_factory=FallConfig, description="what counts as a fall under torques")
+    fall: FallConfig = Field(default_factory=FallConfig, description="limits of a fall under torques")
     pose_noise: float = Field(0.05, ge=0.0, le=0.5, description="greatest joint angle of the first pose [rad]")
     place_noise: float = Field(0.05, ge=0.0, le=0.3, description="greatest displacement of each along x and y [m]")
 
 
 class PassBallTask(Task):
-    """Send the ball on to the next."""
+    """Pass the ball to the next agent."""
 
     Config = PassBallConfig
-    description = "avatars on a circle send a ball of unknown mass on to each other, in turn"
-    reward_terms = ("progress", "pass", "control")
-    metrics = ("passes", "touches", "distance", "ball_speed")
+    description = "avatars on a circle pass a ball of unknown mass to each other, in turn"
+    rewards = (
+        Term(
+            "progress",
+            "`progress_weight` times the metres that the ball has come nearer, horizontally, to its receiver: the "
+            "passer until it has touched the ball, then the next agent",
+        ),
+        Term("pass", "`pass_bonus` in the step that completes a pass"),
+        CONTROL,
+    )
+    metrics = (
+        Metric("passes", "-", "completed passes so far"),
+        Metric("touches", "-", "number of touches of the ball that the agent has begun so far"),
+        Metric("distance", "m", "horizontal distance of the ball from its receiver's pelvis"),
+        Metric("ball_speed", "m/s", "speed of the ball"),
+    )
+    state_arrays = (
+        TaskArray("passer", int),
+        TaskArray("touched", int, cleared=True),
+        TaskArray("passes", int, cleared=True),
+        TaskArray("left", wp.vec3, cleared=True),
+        TaskArray("gap"),
+        TaskArray("contact", int, ("num_agents",), cleared=True),
+        TaskArray("touches", int, ("num_agents",), cleared=True),
+    )
     observes_contact = True
     observes_others = True
     camera_position = (3.9, 2.7, 2.4)
     camera_target = (0.0, 0.0, 0.65)
     camera_follows = False
 
-    summary = """`num_agents` avatars stand around a circle, `spacing` apart and facing its middle. From there a soft
-ball of 0.4 to 2 kg (`ball_mass`) rolls towards one of them, the first passer, who shall kick or push it on to the next,
-counterclockwise from above, whose turn it then is. A pass is complete when the ball, after the passer has touched it,
-comes within `reach` of the next one's pelvis or touches them, and is at least `sent` from where the passer touched it
-last: it must be sent, not carried, and not held by feet that meet around it. Legs and root act; a root goes no farther
-than `roam` from its place. All are paid alike, but for the cost of their actions."""
-    reward_docs: ClassVar[Mapping[str, str]] = {
-        "progress": "`progress_weight` times the metres that the ball has come nearer, horizontally, to whoever shall "
-        "have it: the passer until they have touched it, then the next",
-        "pass": "`pass_bonus` in the step that completes a pass",
-        "control": "`-control_cost` times the mean of the agent's own squared action components",
-    }
-    metric_docs: ClassVar[Mapping[str, str]] = {
-        "passes": "completed passes so far [-]",
-        "touches": "how often the agent has begun to touch the ball so far [-]",
-        "distance": "horizontally from the ball to the pelvis of whoever shall have it [m]",
-        "ball_speed": "speed of the ball [m/s]",
-    }
-    success_doc = "there have been `goal_passes` passes"
+    summary = """`num_agents` avatars stand on a circle, `spacing` apart and facing its middle. From there a soft ball
+of 0.4 to 2 kg (`ball_mass`) rolls towards one of them, the first passer. It has to kick or push the ball to the next
+agent, counterclockwise from above, whose turn it then is. A pass is complete when the ball, after the passer has
+touched it, comes within `reach` of the next one's pelvis or touches that avatar, at least `least_pass` from its place
+at the passer's last touch: the ball must roll, not be carried or held by feet that meet around it. Legs and root act; a
+root goes no farther than `root_range` from its place. All agents get the same reward, except for the cost of their
+actions."""
+    success_doc = "`passes` is at least `goal_passes`"
     termination_doc = (
-        "all agents' ends when the ball is slower than `dead_speed` and farther than `reach + roam` from everybody, "
-        "when it is 0.5 m outside the circle, and when one of them falls;\n- "
+        "all agents at once: when the ball is slower than `dead_speed` and farther than `reach + root_range` from "
+        "every agent, when it is 0.5 m outside the circle, and when an avatar falls;\n- "
         f"{UNDER_TORQUES_DOC}"
     )
     picture_seconds = 0.4
@@ -347,15 +346,14 @@ than `roam` from its place. All are paid alike, but for the cost of their action
     def terms(self) -> tuple[ObservationTerm, ...]:
         agents = len(self.scene.avatars)
         return (
-            ObservationTerm("receiver", 3, "m", "root", "pelvis of whoever shall have the ball, from one's own"),
+            ObservationTerm("receiver", 3, "m", "root", "pelvis of the ball's receiver, from the agent's own"),
             ObservationTerm("receiver_from_ball", 3, "m", "root", "the same from the ball"),
-            ObservationTerm("place", 3, "m", "root", "one's place, from the pelvis, horizontally"),
+            ObservationTerm("place", 3, "m", "root", "the agent's place, from the pelvis, horizontally"),
             ObservationTerm("ball_mass", 1, "-", "-", "decimal logarithm of the ball's mass in kg"),
             ObservationTerm("touched", 1, "-", "-", "1 if the passer has touched the ball in this turn"),
-            ObservationTerm("way", 1, "m", "-", "how far the ball has come from there, horizontally; 0 before"),
-            ObservationTerm("turn", agents, "-", "-", "1 for the passer, counted on from oneself"),
-            ObservationTerm("ball_from_left_foot", 3, "m", "root", "the ball from the left foot's ball"),
-            ObservationTerm("ball_from_right_foot", 3, "m", "root", "the ball from the right foot's ball"),
+            ObservationTerm("way", 1, "m", "-", "horizontal way of the ball since that touch; 0 before"),
+            ObservationTerm("turn", agents, "-", "-", "1 for the passer, counted on from the observing agent"),
+            *FEET_TERMS,
         )
 
     def drawn(self) -> tuple[Parameter, ...]:
@@ -366,7 +364,7 @@ than `roam` from its place. All are paid alike, but for the cost of their action
 
     def action_spec(self) -> ActionSpec:
         config = self.config
-        speed = speed_within(config.roam, config.root_speed, config.physics.control_dt)
+        speed = speed_within(config.root_range, config.root_speed, config.physics.control_dt)
         return ActionSpec(self.joints, root=True, joint_speed=config.control.joint_speed_limit, root_speed=speed)
 
     def domain(self) -> Domain:
@@ -375,46 +373,38 @@ than `roam` from its place. All are paid alike, but for the cost of their action
         return Domain((-side, -side, box.lower[2]), (side, side, box.upper[2]))
 
     def allocate(self, env) -> None:
-        n, device, config, props = env.num_envs, env.device, self.config, env.simulation.props
+        config, props = self.config, env.simulation.props
         self.index = props.index(BALL)
-        volume, serve, rule, play = float(props.volume[self.index]), Serve(), PassRule(), Play()
-        serve.prop, serve.radius, serve.spread = self.index, config.ball_radius, config.serve_angle
-        serve.slow, serve.fast = config.serve_speed
-        serve.light, serve.heavy = (float(np.log(mass / volume)) for mass in config.ball_mass)
-        rule.subject, rule.ball_volume = env.simulation.subjects.names.index(BALL), volume
-        rule.reach, rule.fetch, rule.rim = config.reach, config.reach + config.roam, self.rim
-        rule.sent, rule.dead_speed, rule.goal_passes = config.sent, config.dead_speed, config.goal_passes
-        rule.progress_weight, rule.pass_bonus = config.progress_weight, config.pass_bonus
-        rule.control_cost = config.control_cost
-        for name in ("passer", "touched", "passes"):
-            setattr(play, name, wp.zeros(n, dtype=int, device=device))
-        play.left = wp.zeros(n, dtype=wp.vec3, device=device)
-        play.gap = wp.zeros(n, dtype=float, device=device)
-        play.contact, play.touches = (wp.zeros((n, env.num_agents), dtype=int, device=device) for _ in range(2))
-        self.serve, self.rule, self.play, self.referee = serve, rule, play, Referee(env, self.config.fall)
+        volume, (slow, fast) = float(props.volume[self.index]), config.serve_speed
+        light, heavy = (float(np.log(mass / volume)) for mass in config.ball_mass)
+        self.serve = fill(
+            Serve(), prop=self.index, radius=config.ball_radius, spread=config.serve_angle, slow=slow, fast=fast,
+            light=light, heavy=heavy,
+        )  # fmt: skip
+        subject, fetch = env.simulation.subjects.names.index(BALL), config.reach + config.root_range
+        self.rule = fill(PassRule(), config, subject=subject, ball_volume=volume, fetch=fetch, rim=self.rim)
+        self.play, self.referee = fill(Play(), self), Referee(env, config.fall)
         places = [(*avatar.position, 0.0) for avatar in self.scene.avatars]
-        self.places = wp.array(places, dtype=wp.vec3, device=device)
-        self.reference_root = [wp.zeros(n, dtype=wp.vec3, device=device) for _ in places]
+        self.places = wp.array(places, dtype=wp.vec3, device=env.device)
+        self.reference_root = [wp.zeros(env.num_envs, dtype=wp.vec3, device=env.device) for _ in places]
 
-    def arrays(self) -> dict[str, wp.array]:
-        names = ("passer", "touched", "passes", "left", "gap", "contact", "touches")
-        return {name: getattr(self.play, name) for name in names}
+    def _ball(self, env, name: str) -> wp.array:
+        """Return the ball's column of the tracked props' array ``name``."""
+        return getattr(env.simulation.props.state, name)[:, self.index]
 
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
         record_shift(env, graph, self.config.place_noise)
-        props = env.simulation.props
-        graph.launch(
-            serve_ball,
-            env.num_envs,
-            [env.mask, env.seed, env.episode, self.serve, self.places],
-            [props.spawn.position, props.spawn.velocity, props.spawn.spin, props.density, self.play],
-        )
+        spawn, density = env.simulation.props.spawn, env.simulation.props.density
+        inputs = [env.mask, env.seed, env.episode, self.serve, self.places]
+        outputs = [spawn.position, spawn.velocity, spawn.spin, density, self.play]
+        graph.launch(serve_ball, env.num_envs, inputs, outputs)
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
-        references = record_leash(env, graph, self.config.leash, self.config.leash_turn)
-        # the action comes on top of what is kept within reach
-        reach = self.config.roam - self.action_spec().greatest_speed * self.config.physics.control_dt
+        config = self.config
+        references = record_root_clamp(env, graph, config.root_lead_limit, config.root_turn_lead_limit)
+        # the action comes on top of the clamped root
+        reach = config.root_range - self.action_spec().greatest_speed * config.physics.control_dt
         kept = []
         for (rotation, root), own, avatar in zip(references, self.reference_root, self.scene.avatars, strict=True):
             graph.launch(keep_near, env.num_envs, [wp.vec3(*avatar.position, 0.0), reach, root], [own])
@@ -423,36 +413,21 @@ than `roam` from its place. All are paid alike, but for the cost of their action
 
     def record_outcome(self, env, graph) -> None:
         self.referee.record(env, graph)
-        state, sim = env.simulation.props.state, env.simulation
-        graph.launch(
-            judge,
-            env.num_envs,
-            [
-                self.rule, state.position[:, self.index], state.velocity[:, self.index], self.referee.pelvis,
-                sim.sensors, env.action,
-            ],
-            [self.play, env.terms, env.metrics, env.success, env.terminated],
-        )  # fmt: skip
-        record_fall_together(env, graph, self.referee.out)
+        ball = [self._ball(env, "position"), self._ball(env, "velocity")]
+        inputs = [self.rule, *ball, self.referee.pelvis, env.simulation.sensors, env.action]
+        outputs = [self.play, env.terms, env.metrics, env.success, env.terminated]
+        graph.launch(judge, env.num_envs, inputs, outputs)
+        self.referee.record_shared_end(env, graph)
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self.referee.record(env, graph)
-        props, tracked = env.simulation.props, env.simulation.avatars[agent].tracked
-        ball = props.state.position[:, self.index]
+        tracked, ball = env.simulation.avatars[agent].tracked, self._ball(env, "position")
+        density = env.simulation.props.density[:, self.index]
         place = wp.vec3(*self.scene.avatars[agent].position, 0.0)
-        graph.launch(
-            observe_game,
-            env.num_envs,
-            [
-                self.rule, agent, start, tracked.rotation, self.referee.pelvis, ball, props.density[:, self.index],
-                place, self.play,
-            ],
-            [env.observation],
-        )  # fmt: skip
-        feet = env.layout["ball_from_left_foot"].slice.start
-        graph.launch(
-            observe_feet, env.num_envs, [agent, feet, tracked.rotation, tracked.position, ball], [env.observation]
-        )
+        inputs = [agent, start, tracked.rotation, self.referee.pelvis, ball, density, place, self.play]
+        graph.launch(observe_game, env.num_envs, [self.rule, *inputs], [env.observation])
+        inputs = [agent, env.layout[FEET_TERMS[0].name].slice.start, tracked.rotation, tracked.position, ball]
+        graph.launch(observe_feet, env.num_envs, inputs, [env.observation])
 
 
 TASK = PassBallTask

@@ -7,8 +7,7 @@ import pytest
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
-from piavatar_envs.tasks.common.disturb import apply_impulse, draw_impulse
-from piavatar_envs.tasks.track_motion import STRUCK
+from piavatar_envs.tasks.track_motion import STRUCK, apply_impulse, draw_impulse
 
 TRACK = "PIAvatar/TrackMotion-v0"
 

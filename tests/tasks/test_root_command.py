@@ -1,4 +1,4 @@
-"""The leash: a command waits for a body that something blocks, and what pushes the body is not doubled."""
+"""The commanded root waits for a body that something blocks, and an external pull is not doubled."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.tasks.common.leash import leash_root
+from piavatar_envs.tasks.common.root_command import clamp_root
 
-LENGTH, TURN = 0.2, 0.4
+LEAD, TURN = 0.2, 0.4
 
 
-def leashed(device, rotation, position, command_rotation, command_root, let_go=None):
+def clamped(device, rotation, position, command_rotation, command_root, let_go=None):
     """The commands after the kernel, quaternions ``xyzw``."""
     n = len(position)
     bones = [np.asarray(a, np.float32)[:, None] for a in (rotation, position, command_rotation)]
@@ -21,7 +21,7 @@ def leashed(device, rotation, position, command_rotation, command_root, let_go=N
     )
     root = wp.array(np.asarray(command_root, np.float32), dtype=wp.vec3, device=device)
     down = wp.array(np.zeros(n) if let_go is None else let_go, dtype=int, device=device)
-    wp.launch(leash_root, n, [LENGTH, TURN, rotations, positions, down, commands, root], device=device)
+    wp.launch(clamp_root, n, [LEAD, TURN, rotations, positions, down, commands, root], device=device)
     return commands.numpy()[:, 0].astype(float), root.numpy().astype(float)
 
 
@@ -44,15 +44,15 @@ def case():
     return body, position, command, root, ahead
 
 
-def test_no_command_is_farther_ahead_than_the_leash(device, case):
+def test_no_command_leads_by_more_than_the_limits(device, case):
     body, position, command, root, ahead = case
-    turned, moved = leashed(device, body.as_quat(), position, command.as_quat(), root)
+    turned, moved = clamped(device, body.as_quat(), position, command.as_quat(), root)
     way, before = (moved - position)[:, :2], (root - position)[:, :2]
-    length, far = np.linalg.norm(before, axis=1), np.linalg.norm(before, axis=1) > LENGTH
+    length, far = np.linalg.norm(before, axis=1), np.linalg.norm(before, axis=1) > LEAD
     assert 20 < far.sum() < len(far) - 20, "the case must have both"
-    assert np.linalg.norm(way, axis=1) == pytest.approx(np.minimum(length, LENGTH), abs=1e-5)
+    assert np.linalg.norm(way, axis=1) == pytest.approx(np.minimum(length, LEAD), abs=1e-5)
     # along the line to the body, and no further than needed
-    assert way == pytest.approx(before * np.minimum(1.0, LENGTH / length)[:, None], abs=1e-5)
+    assert way == pytest.approx(before * np.minimum(1.0, LEAD / length)[:, None], abs=1e-5)
     assert moved[:, 2] == pytest.approx(root[:, 2], abs=1e-6)
     lead = heading(Rotation.from_quat(turned) * command.inv()) + ahead
     assert lead == pytest.approx(np.clip(ahead, -TURN, TURN), abs=1e-4)
@@ -61,13 +61,13 @@ def test_no_command_is_farther_ahead_than_the_leash(device, case):
 def test_a_tilted_command_keeps_its_tilt(device):
     lean = Rotation.from_rotvec([0.3, 0.0, 0.0])
     command = Rotation.from_rotvec([0.0, 0.0, 1.5]) * lean
-    turned, _ = leashed(device, [[0, 0, 0, 1]], np.zeros((1, 3)), [command.as_quat()], np.zeros((1, 3)))
+    turned, _ = clamped(device, [[0, 0, 0, 1]], np.zeros((1, 3)), [command.as_quat()], np.zeros((1, 3)))
     expected = Rotation.from_rotvec([0.0, 0.0, TURN]) * lean
     assert (Rotation.from_quat(turned[0]) * expected.inv()).magnitude() < 1e-5
 
 
-def test_a_root_that_has_let_go_needs_no_leash(device, case):
+def test_a_root_that_has_let_go_is_not_clamped(device, case):
     body, position, command, root, _ = case
-    turned, moved = leashed(device, body.as_quat(), position, command.as_quat(), root, np.ones(len(root)))
+    turned, moved = clamped(device, body.as_quat(), position, command.as_quat(), root, np.ones(len(root)))
     assert np.array_equal(turned, command.as_quat().astype(np.float32).astype(float))
     assert moved == pytest.approx(root, abs=1e-6)

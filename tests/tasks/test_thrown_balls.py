@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.tasks.common.throws import (
+from piavatar_envs.tasks.common.thrown_balls import (
     CLEARANCE,
     HEIGHT,
     Throws,

@@ -1,7 +1,7 @@
 """Balls that are thrown at an avatar, caught where they have flown past, and thrown again.
 
-A throw depends on the episode's seed, its number and where the body is then; nothing has to be remembered for it. When
-balls are thrown is said in ``turns.py`` and ``pushes.py``.
+A throw depends on the episode's seed, its number and the present pose of the body, so it needs no state. The tasks say
+when balls are thrown.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import warp as wp
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.core.structs import fill
 from piavatar_envs.sim.scene import Domain
 
 if TYPE_CHECKING:
     from piavatar_envs.config import PhysicsConfig
     from piavatar_envs.core.launch_graph import LaunchGraph
-    from piavatar_envs.envs.batch_env import BatchEnv
+    from piavatar_envs.envs.episodes import EpisodeArrays
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,16 +32,16 @@ HEIGHT = (1.0, 1.5)
 OUTWARDS = wp.constant(0.2)
 #: Greatest angular velocity of a throw about each axis [rad/s].
 MAX_SPIN = wp.constant(6.0)
-#: Distance from every joint that a ball keeps where it is thrown: a hand's or a foot's length and its own radius [m].
+#: Least distance of a throw's origin from every joint: a hand's or a foot's length and the ball's radius [m].
 CLEARANCE = wp.constant(0.4)
-#: Longest way from where a ball is thrown, out of the body's reach, to where the body has gone [m].
+#: Longest way from a throw's origin, out of the body's reach, to the body wherever it has moved [m].
 REACH = 2.5
-#: Of the balls' masses the first draw in their stream, one a ball; the draws around them are the schedule's.
+#: Index of the first ball's mass in the stream of the balls; the draws before and after the masses are the schedule's.
 MASSES = wp.constant(1)
 
 
 class ThrowConfig(Protocol):
-    """What the configuration of a task that throws balls has. Ranges are a lower and an upper bound."""
+    """Settings of a task that throws balls. Ranges are a lower and an upper bound."""
 
     physics: PhysicsConfig
     num_balls: int
@@ -59,7 +60,7 @@ class Throws:
 
     num_balls: int  # they are props 0 ... num_balls - 1
     interval: int  # control steps between two throws
-    place: wp.vec3  # where the avatar belongs: x, y [m] and yaw [rad]
+    place: wp.vec3  # of the avatar: x, y [m] and yaw [rad]
     distance: wp.vec2  # of the origins from there [m]
     height: wp.vec2  # of the origins [m]
     angle: float  # greatest azimuth of the origins from the front [rad]
@@ -68,30 +69,30 @@ class Throws:
     spread: float  # greatest distance of the aim from that line, along each axis [m]
     gravity: float  # [m/s^2]
     mass: wp.vec2  # [kg]
-    log_mass: int  # whether it is drawn uniformly in its logarithm
+    log_mass: int  # 1 if masses are drawn uniformly in their logarithm
     volume: float  # of a ball [m^3]
     reach: float  # distance from the place beyond which balls are caught [m]
-    rest: wp.array(dtype=wp.vec3)  # (num_balls,) where balls wait [m]
+    rest: wp.array(dtype=wp.vec3)  # (num_balls,) waiting places [m]
 
 
 def catching_distance(config: ThrowConfig) -> float:
-    """Distance from the avatar's place beyond which a ball that flies on is caught [m]."""
+    """Return the distance from the avatar's place beyond which a ball that flies on is caught [m]."""
     return config.throw_distance[1] + 0.1
 
 
 def thrown_speed(config: ThrowConfig) -> float:
-    """Greatest speed of any part of a ball as it is thrown [m/s]: slow ones are thrown high, to come as far."""
+    """Return the greatest speed of any part of a thrown ball [m/s]; slow throws start upwards, to reach as far."""
     way = math.hypot(max(config.throw_distance[1], REACH) + math.sqrt(3.0) * config.aim_spread, HEIGHT[1])
     rising = (speed + 0.5 * config.physics.gravity * way / speed for speed in config.throw_speed)
     return max(rising) + math.sqrt(3.0) * MAX_SPIN * config.ball_radius
 
 
 def waiting_places(place: Sequence[float], config: ThrowConfig) -> np.ndarray:
-    """Where balls wait: on the floor behind the avatar, side by side, shape ``(num_balls, 3)`` [m].
+    """Return the waiting places, on the floor behind the avatar, side by side, shape ``(num_balls, 3)`` [m].
 
     Args:
         place: of the avatar, x, y [m] and yaw [rad].
-        config: how many balls of which size, and where they are caught.
+        config: number, size and catching distance of the balls.
     """
     distance = catching_distance(config) + 0.1
     index = np.arange(config.num_balls) - 0.5 * (config.num_balls - 1)
@@ -101,7 +102,7 @@ def waiting_places(place: Sequence[float], config: ThrowConfig) -> np.ndarray:
 
 
 def throwing_domain(config: ThrowConfig, place: Sequence[float]) -> Domain:
-    """Room for balls to wait in, and to fly past the waiting ones before they are caught."""
+    """Return the box in which balls wait, and fly past the waiting ones before they are caught."""
     x, y, _ = place
     out = catching_distance(config) + config.ball_radius
     out += 0.1 + 1.5 * config.throw_speed[1] * config.physics.control_dt
@@ -112,37 +113,43 @@ def make_throws(
     config: ThrowConfig,
     place: Sequence[float],
     waiting: np.ndarray,
-    env: BatchEnv,
+    env: EpisodeArrays,
     aim: tuple[str, str] = ("spine3", "head"),
     log_mass: bool = False,
 ) -> Throws:
-    """Kernel argument; the balls are the first props of ``env``.
+    """Return the constants of the throws; the balls are the first props of ``env``.
 
     Args:
-        config: how many balls of which size and mass, from where and how fast.
+        config: number, size, mass, origins and speeds of the balls.
         place: of the avatar, x, y [m] and yaw [rad].
-        waiting: where balls wait [m], shape ``(num_balls, 3)``.
+        waiting: places of waiting balls [m], shape ``(num_balls, 3)``.
         env: the batch.
         aim: joints; balls are thrown at the line between them.
         log_mass: whether masses are drawn uniformly in their logarithm.
     """
-    throws = Throws()
-    throws.num_balls = config.num_balls
-    throws.interval = max(1, round(config.throw_interval / config.physics.control_dt))
-    throws.place = wp.vec3(*place)
-    throws.distance, throws.height = wp.vec2(*config.throw_distance), wp.vec2(*HEIGHT)
-    throws.angle, throws.spread = config.throw_angle, config.aim_spread
-    throws.speed, throws.gravity = wp.vec2(*config.throw_speed), config.physics.gravity
-    throws.aim, throws.log_mass = wp.vec2i(*map(joint_index, aim)), int(log_mass)
-    throws.mass, throws.volume = wp.vec2(*config.ball_mass), float(env.simulation.props.volume[0])
-    throws.reach = catching_distance(config)
-    throws.rest = wp.array(waiting.astype(np.float32), dtype=wp.vec3, device=env.device)
-    return throws
+    return fill(
+        Throws(),
+        num_balls=config.num_balls,
+        interval=max(1, round(config.throw_interval / config.physics.control_dt)),
+        place=wp.vec3(*place),
+        distance=wp.vec2(*config.throw_distance),
+        height=wp.vec2(*HEIGHT),
+        angle=config.throw_angle,
+        speed=wp.vec2(*config.throw_speed),
+        aim=wp.vec2i(*map(joint_index, aim)),
+        spread=config.aim_spread,
+        gravity=config.physics.gravity,
+        mass=wp.vec2(*config.ball_mass),
+        log_mass=int(log_mass),
+        volume=float(env.simulation.props.volume[0]),
+        reach=catching_distance(config),
+        rest=wp.array(waiting.astype(np.float32), dtype=wp.vec3, device=env.device),
+    )
 
 
 @wp.func
 def launch_velocity(start: wp.vec3, aim: wp.vec3, speed: float, gravity: float):
-    """Velocity [m/s] of a free body from ``start`` to ``aim`` in the time of a straight way at ``speed``."""
+    """Return the velocity [m/s] of a free body from ``start`` to ``aim`` in the time of a straight way at ``speed``."""
     way = aim - start
     time = wp.length(way) / speed
     return way / time + wp.vec3(0.0, 0.0, 0.5 * gravity * time)
@@ -150,7 +157,7 @@ def launch_velocity(start: wp.vec3, aim: wp.vec3, speed: float, gravity: float):
 
 @wp.func
 def out_of_the_body(joints: wp.array2d(dtype=wp.vec3), e: int, start: wp.vec3, outwards: wp.vec3):
-    """``start``, moved on along the unit vector ``outwards`` until no limb reaches so far."""
+    """Return ``start``, moved along the unit vector ``outwards`` beyond the reach of every limb."""
     further = float(0.0)
     for b in range(joints.shape[1]):
         way = joints[e, b] - start
@@ -163,7 +170,7 @@ def out_of_the_body(joints: wp.array2d(dtype=wp.vec3), e: int, start: wp.vec3, o
 
 @wp.func
 def draw_throw(throws: Throws, random: wp.uint32, e: int, joints: wp.array2d(dtype=wp.vec3)):
-    """Where a ball is thrown from [m], how fast [m/s], to meet the body where that is now, and its spin [rad/s]."""
+    """Draw a throw that meets the body at its present place: origin [m], velocity [m/s] and spin [rad/s]."""
     turn = quat_exp(wp.vec3(0.0, 0.0, throws.place[2] + wp.randf(random, -throws.angle, throws.angle)))
     away = wp.quat_rotate(turn, wp.vec3(0.0, -1.0, 0.0))
     start = wp.vec3(throws.place[0], throws.place[1], wp.randf(random, throws.height[0], throws.height[1]))
@@ -178,7 +185,7 @@ def draw_throw(throws: Throws, random: wp.uint32, e: int, joints: wp.array2d(dty
 
 @wp.func
 def flies_on(throws: Throws, position: wp.vec3, velocity: wp.vec3):
-    """Whether a ball moves outwards beyond the catching radius."""
+    """Return whether a ball moves outwards beyond the catching radius."""
     out = position - wp.vec3(throws.place[0], throws.place[1], 0.0)
     out[2] = 0.0
     distance = wp.length(out)
@@ -195,7 +202,7 @@ def rest_ball(
     velocity: wp.array2d(dtype=wp.vec3),
     spin: wp.array2d(dtype=wp.vec3),
 ):
-    """Let a ball lie where it waits."""
+    """Put a ball at its waiting place, at rest."""
     position[e, ball] = throws.rest[ball]
     velocity[e, ball] = wp.vec3(0.0)
     spin[e, ball] = wp.vec3(0.0)
@@ -216,7 +223,7 @@ def throw_or_catch(
     velocity: wp.array2d(dtype=wp.vec3),
     spin: wp.array2d(dtype=wp.vec3),
 ):
-    """Whether a ball is placed anew, and how: thrown if it is due, caught if it flies on."""
+    """Place a ball anew, thrown if it is due and caught if it flies on; return whether it is placed."""
     if due:
         at, way, turning = draw_throw(throws, random, e, joints)
         position[e, ball] = at
@@ -241,7 +248,7 @@ def draw_balls(
     spin: wp.array2d(dtype=wp.vec3),
     density: wp.array2d(dtype=float),
 ):
-    """At reset every ball is given its mass, and waits."""
+    """Draw the mass of every ball and put it at its waiting place."""
     e, ball = wp.tid()
     if not mask[e]:
         return
@@ -254,8 +261,8 @@ def draw_balls(
     rest_ball(throws, e, ball, position, velocity, spin)
 
 
-def record_balls(env: BatchEnv, graph: LaunchGraph, throws: Throws) -> None:
-    """Append, at reset: in the masked environments every ball is given its mass, and waits."""
+def record_balls(env: EpisodeArrays, graph: LaunchGraph, throws: Throws) -> None:
+    """Append, at a reset: draw the mass of every ball and put it at its waiting place."""
     props = env.simulation.props
     graph.launch(
         draw_balls,
