@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import ConfigError, load_config
-from piavatar_envs.tasks.push_box import LEASH, WALK, PushBoxConfig, PushBoxTask
+from piavatar_envs.tasks.push_box import ROOT_LEAD, WALK, PushBoxConfig, PushBoxTask
 
 PUSH = "PIAvatar/PushBox-v0"
 GRAVITY = 9.81
@@ -253,7 +253,7 @@ def test_what_blocks_the_body_holds_its_command_back(make_env):
         leads.append(env.observation_layout.split(observation)["command_lead"][1])
     assert env.batch.simulation.avatar.tracked.position.numpy()[0, 0, 1] < 0.4
     # taken back before the step of the action is added; and the wall throws the body back a little
-    assert 0.5 * LEASH < max(leads) <= LEASH + 2.0 * WALK * env.config.physics.control_dt
+    assert 0.5 * ROOT_LEAD < max(leads) <= ROOT_LEAD + 2.0 * WALK * env.config.physics.control_dt
 
 
 @pytest.mark.parametrize(
