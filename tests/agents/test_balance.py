@@ -126,30 +126,3 @@ def test_the_hip_strategy_turns_the_trunk_with_the_fall():
     # +x brings the head (+z) forward (-y), +y brings it to the left (+x)
     np.testing.assert_allclose(np.cross([1, 0, 0], [0, 0, 1]), [0, -1, 0])
     np.testing.assert_allclose(np.cross([0, 1, 0], [0, 0, 1]), [1, 0, 0])
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"gain": 0.0}, "gain=0.0 must be > 0"),
-        ({"goal": (0.2, 0.0)}, r"goal=\[0.2, 0.0\] must lie within the feet"),
-        ({"hip_limit": (-1.0, 0.0)}, "must be >= 0"),
-    ],
-)
-def test_what_cannot_balance_is_refused(settings, words):
-    with pytest.raises(ValueError, match=words):
-        Balance(STANCE, **settings)
-    with pytest.raises(ValueError, match=r"height=0\.0 must be > 0"):
-        Stance(70.0, 0.0, 0.1, 0.1, 0.1, 0.1)
-    with pytest.raises(ValueError, match=r"behind=-0\.1 must be > -ahead=-0\.1"):
-        Stance(70.0, 0.9, -0.1, 0.1, 0.1, 0.1)
-
-
-def test_feet_that_bear_only_ahead_of_the_ankles_do_not_hold_what_is_over_them():
-    """Where nothing behind 1 cm ahead of the ankles bears, a body at rest over them falls backward."""
-    balance = Balance(Stance(70.0, 0.9, behind=-0.01, ahead=0.11, beside=0.14, foot_width=0.08))
-    assert balance.goal[SAGITTAL] == pytest.approx(0.06)
-    for start, caught in ((0.0, False), (0.02, True)):
-        path = fall(balance, np.array([[start, 0.0]]), np.zeros((1, 2)), seconds=8.0)
-        assert (abs(path[-1, 0, SAGITTAL] - 0.06) < 1e-3) == caught
-        assert (path[-1, 0, SAGITTAL] < -1.0) == (not caught)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from agents.pid.bones import BEYOND, NUM_DOF, Bones, Posture, answered, force_moments, in_bones
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
+from agents.pid.bones import NUM_DOF, Bones, Posture, answered, force_moments, in_bones
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 
 GRAVITY = 9.81
 STEP = 1e-6
@@ -48,15 +48,6 @@ def rates(bones: Bones, local: np.ndarray, velocity: np.ndarray) -> tuple[np.nda
     return (after.centres - before.centres) / STEP, spin / STEP
 
 
-def test_what_hangs_on_a_joint_is_what_its_turn_moves():
-    for joint in range(NUM_JOINTS):
-        for bone in range(NUM_JOINTS):
-            above = bone
-            while above not in (joint, -1):
-                above = PARENTS[above]
-            assert BEYOND[joint, bone] == (above == joint)
-
-
 def test_the_mass_matrix_gives_the_kinetic_energy(bones, local):
     velocity = np.random.default_rng(2).normal(size=NUM_DOF)
     linear, spin = rates(bones, local, velocity)
@@ -86,28 +77,6 @@ def test_moments_of_weight_and_of_forces_do_the_work_that_they_do(bones, local):
     speed = linear[:, foot] + np.cross(spin[:, foot], place - now.centres[:, foot])
     moments = in_bones(now, force_moments(now, foot, place, force))[:, 1:]
     np.testing.assert_allclose(np.einsum("nbi,bi->n", moments, own), (force * speed).sum(1), rtol=1e-6)
-
-
-def test_joints_that_carry_the_weight_by_their_moments_stay_as_they_are(bones, local):
-    """Held at the pelvis, gravity and the moments against it leave no acceleration: no joint is forgotten."""
-    now = bones.posture(local)
-    matrix, moments = bones.mass_matrix(now), in_bones(now, bones.weight_moments(now, GRAVITY))
-    pull = np.einsum("nij,j->ni", matrix[:, :, :3], [0.0, 0.0, -GRAVITY])  # all bones fall alike
-    np.testing.assert_allclose(pull[:, 6:], moments[:, 1:].reshape(2, -1), atol=1e-9)
-
-
-def test_of_a_free_joint_that_answers_alone_the_known_share_is_left():
-    """M / (M + A), which is what Gains with an inertia leave, of a bone much lighter than all others."""
-    joints = np.zeros((NUM_JOINTS, 3))
-    mass, inertia = np.full(NUM_JOINTS, 1e6), np.tile(1e6 * np.eye(3), (NUM_JOINTS, 1, 1))
-    wrist = joint_index("left_wrist")
-    mass[wrist], inertia[wrist] = 1e-3, 0.2 * np.eye(3)
-    light = Bones(mass, joints, joints, inertia)
-    matrix = light.mass_matrix(light.posture(np.tile(np.eye(3), (1, NUM_JOINTS, 1, 1))))
-    torque, added = np.zeros((1, NUM_JOINTS - 1, 3)), np.zeros((1, NUM_JOINTS - 1, 3))
-    torque[0, wrist - 1], added[0, wrist - 1] = [1.0, 2.0, 3.0], [0.1, 0.2, 0.3]
-    left = answered(matrix, torque, added)[0, wrist - 1]
-    np.testing.assert_allclose(left, [1.0 * 0.2 / 0.3, 2.0 * 0.2 / 0.4, 3.0 * 0.2 / 0.5], rtol=1e-5)
 
 
 def energies(bones: Bones, local: np.ndarray, together: bool, steps: int = 60, dt: float = 1.0 / 30.0) -> np.ndarray:

@@ -60,20 +60,3 @@ def test_files_of_other_scripts_are_known_wherever_they_lie(path, tmp_path):
     for script in ("rsl_rl.train", "skrl.train", "sb3.train"):
         told = "" if script == owner else f" (this is a file for python -m agents.{owner})"
         assert meant_for(path, script) == meant_for(copy, script) == told
-
-
-@pytest.mark.parametrize("text", [None, "", "seed: 3", "[1, 2]", "a: [", "\xff"], ids=repr)
-def test_files_that_may_be_anybodys_are_nobodys(text, tmp_path):
-    if text is not None:
-        (tmp_path / "config.yaml").write_text(text, encoding="latin-1")
-    assert meant_for(tmp_path / "config.yaml", "sb3.train") == ""
-
-
-def test_a_file_of_another_script_is_refused_with_that_ones_name():
-    with pytest.raises(SystemExit, match=r"no setting of TrainingConfig.*\agents\.rsl_rl\.train\)$"):
-        train.main([str(CONFIGS / "rsl_rl" / "stand_rsl.yaml")])
-
-
-def test_what_is_no_setting_is_refused(tmp_path):
-    with pytest.raises(SystemExit, match=r"error: .*true.*KEY=VALUE"):
-        train.main(["configs/reach_ppo.yaml", "seed=1", "--resume", "true", "--out", str(tmp_path)])

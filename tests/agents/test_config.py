@@ -10,7 +10,6 @@ import yaml
 from agents.sb3.config import env_config, load_training
 from agents.sb3.workers import components, factory
 from piavatar_envs.config import ConfigError, dump_yaml
-from piavatar_envs.envs.observations import ObservationLayout, ObservationTerm
 
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.yaml"))
 
@@ -45,14 +44,6 @@ def test_errors_are_one_line_with_key_value_and_limit(settings, words):
     assert all(word in message for word in words), message
 
 
-@pytest.mark.parametrize(
-    ("spelling", "listed"), [("Reach-v0", "PIAvatar/Reach-v0"), ("piavatar_envs.multi.sumo_v0", "sumo_v0")]
-)
-def test_environments_are_known_without_what_they_stand_in(spelling, listed):
-    config = load_training({"env_id": spelling, "env": {"fidelity": "tiny"}})
-    assert config.env_id == listed and config.is_multi == (listed == "sumo_v0")
-
-
 def test_environment_settings_of_the_command_line_win_over_the_file():
     config = load_training({"env": {"fidelity": "tiny", "tone": 0.5}}, {"env.tone": 0.25, "seed": 3})
     assert env_config(config).drive.tone == 0.25
@@ -68,13 +59,3 @@ def test_a_resolved_configuration_is_whole_and_reads_back_equal(tiny, tmp_path):
     assert again == tiny
     # and a change of it is no setting given twice
     assert env_config(load_training(path, {"env.fidelity": "coarse"})).physics.fidelity == "coarse"
-
-
-def test_components_are_those_of_the_named_terms_in_order():
-    layout = ObservationLayout(
-        ObservationTerm(name, size, "m", "root", "") for name, size in (("a", 2), ("b", 1), ("c", 3))
-    )
-    assert components(layout, ("c", "a")) == [3, 4, 5, 0, 1]
-    assert components(layout, None) == [0, 1, 2, 3, 4, 5]
-    with pytest.raises(ConfigError, match=r"no term 'd'; use some of a, b, c"):
-        components(layout, ("a", "d"))

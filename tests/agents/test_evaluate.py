@@ -13,8 +13,6 @@ from agents.evaluate import (
     by_push,
     evaluate,
     over_seeds,
-    random_agent,
-    separated,
     zero_agent,
 )
 from agents.intervals import mean_and_interval, mean_over_seeds, share_interval, share_interval_over_seeds, wilson
@@ -99,14 +97,6 @@ def test_success_once_at_the_end_and_its_share(countdown):
     assert row["episodes"] == 4
 
 
-def test_the_interval_is_students_t():
-    values = [3.0, 5.0, 10.0, 2.0]
-    result = Evaluation("x", [Episode(i, total=v, steps=1) for i, v in enumerate(values)])
-    low, high = result.row()["return_interval"]
-    expected = stats.t.interval(0.95, 3, loc=np.mean(values), scale=stats.sem(values))
-    np.testing.assert_allclose((low, high), expected)
-
-
 def test_wilsons_interval_is_scipys_and_is_not_empty_at_the_ends():
     for successes, size in ((0, 12), (5, 12), (12, 12), (99, 100)):
         expected = stats.binomtest(successes, size).proportion_ci(0.95, method="wilson")
@@ -160,16 +150,6 @@ def coverage(intervals, truth) -> float:
     return float(np.mean([low <= truth <= high for low, high in intervals]))
 
 
-def test_the_interval_of_shares_covers_what_it_says_also_where_seeds_differ():
-    """95 of 100 times and more, with shares of seeds from a beta distribution; all episodes in one sample would not."""
-    rng = np.random.default_rng(0)
-    seeds, episodes, trials, a, b = 5, 40, 1500, 8.0, 2.0
-    shares = rng.binomial(episodes, rng.beta(a, b, (trials, seeds))) / episodes
-    truth = a / (a + b)
-    assert coverage([share_interval_over_seeds(row, episodes) for row in shares], truth) > 0.93
-    assert coverage([wilson(row.mean(), seeds * episodes, 1.96) for row in shares], truth) < 0.8
-
-
 @pytest.mark.parametrize("of_episodes", [0.0, 0.5, 1.0])
 def test_intervals_cover_what_they_say_where_all_seeds_play_the_same_episodes(of_episodes):
     """Of scatter that episodes, seeds, and both together bring; seeds alone would not cover it."""
@@ -188,25 +168,6 @@ def test_intervals_cover_what_they_say_where_all_seeds_play_the_same_episodes(of
     if of_episodes == 1.0:
         of_seeds_alone = [mean_and_interval(row) for row in means]
         assert coverage([(estimate.low, estimate.high) for estimate in of_seeds_alone], 3.0) < 0.7
-
-
-def test_separated_asks_for_whole_intervals():
-    def evaluation(values):
-        return Evaluation("x", [Episode(i, total=v, steps=1) for i, v in enumerate(values)])
-
-    low, wide, high = evaluation([1.0, 1.1, 0.9]), evaluation([-5.0, 5.0, 3.0]), evaluation([9.0, 9.1, 8.9])
-    assert separated(high, [low])
-    assert not separated(high, [low, wide])  # a better mean is not enough
-    assert not separated(low, [high])
-
-
-def test_random_actions_fill_the_action_space_and_repeat():
-    observation = np.zeros((5, 3))
-    first, again, other = (random_agent(40, seed)(observation) for seed in (1, 1, 2))
-    assert first.shape == (5, 40)
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
-    assert first.min() < -0.9 and first.max() > 0.9 and np.abs(first).max() <= 1.0
 
 
 def test_pushes_fall_into_classes_and_pool_over_seeds():

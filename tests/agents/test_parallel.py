@@ -13,14 +13,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.evaluate import evaluate, zero_agent
 from agents.sb3 import ppo
-from agents.sb3.config import load_training
 from agents.sb3.matches import seated
-from agents.sb3.parallel import WAITING, AgentVecEnv, World, WorldFactory
+from agents.sb3.parallel import WAITING, AgentVecEnv, WorldFactory
 from agents.sb3.ppo import MarkPlayed, PlayedBuffer, PPOSettings
-from agents.sb3.train import train
-from agents.sb3.workers import factory, prepare, start_workers
-from piavatar_envs.config import ConfigError
-from tests.agents.games.auction_v0 import Auction
+from agents.sb3.workers import start_workers
 from tests.agents.games.ledger_v0 import LEAVES, TERMINATED, Ledger
 
 LEDGER = WorldFactory("tests.agents.games.ledger_v0", {})
@@ -169,12 +165,6 @@ def test_where_all_play_the_minibatches_are_the_usual_ones(folded, batch_size):
         assert all(torch.equal(x, y) for x, y in zip(a[:6], b[:6], strict=True))
 
 
-def test_a_buffer_that_nobody_marks_says_so(folded):
-    model = ppo.build(PPOSettings(rollout_steps=8, batch_size=8, epochs=1, hidden=(8,)), folded, range(4), seed=0)
-    with pytest.raises(RuntimeError, match="8 of 8 steps, 0 of them marked as played"):
-        model.learn(48)
-
-
 def test_worlds_in_processes_play_as_those_in_this_one():
     traces = []
     for workers in (DummyVecEnv([LEDGER] * 2), start_workers(LEDGER, 2)):
@@ -232,22 +222,6 @@ def test_a_duel_ends_with_its_learner_and_seats_are_drawn():
     assert venv.opponents.draws == [0] * 31
 
 
-def test_duels_need_opponents_and_two_agents(folded):
-    venv = AgentVecEnv(DummyVecEnv([LEDGER]), num_duels=1)
-    with pytest.raises(RuntimeError, match="1 worlds wait for opponents"):
-        venv.reset()
-    with pytest.raises(ValueError, match="2 duels in 1 worlds of 3 agents"):
-        AgentVecEnv(DummyVecEnv([LEDGER]), num_duels=2)
-
-
-def test_agents_of_different_kinds_are_refused(monkeypatch):
-    spaces = {name: Auction.action_space(None, name) for name in Auction.names}
-    spaces["right"] = type(spaces["right"])(-2.0, 2.0, (1,))
-    monkeypatch.setattr(Auction, "action_space", lambda self, agent: spaces[agent])
-    with pytest.raises(ConfigError, match=r"right has Box\(-2.*left has Box\(-1.*must be alike"):
-        World(Auction())
-
-
 def test_an_evaluation_books_every_agent_until_it_leaves():
     worlds = DummyVecEnv([LEDGER] * 2)
     result = evaluate("zero", seated([zero_agent(1)] * 3), worlds, episodes=3, first_seed=9, progress=False)
@@ -260,40 +234,3 @@ def test_an_evaluation_books_every_agent_until_it_leaves():
         assert episode.total == pytest.approx(np.mean(totals))
         assert not episode.success_at_end  # not all had it
     np.testing.assert_allclose(result.row()["agent_return_mean"], totals)
-
-
-def test_a_failed_world_says_why(monkeypatch):
-    def play(self, actions):
-        over = dict.fromkeys(actions, True)
-        return (
-            dict.fromkeys(actions, 0.0),
-            over,
-            over,
-            {name: {"failure": "particles", "distance": float(i)} for i, name in enumerate(actions)},
-        )
-
-    monkeypatch.setattr(Ledger, "play", play)
-    world = World(Ledger())
-    world.reset(seed=0)
-    _, _, terminated, truncated, info = world.step(np.zeros((3, 1), np.float32))
-    assert (terminated, truncated, info["failure"], info["distance"]) == (True, False, "particles", 1.0)
-
-
-def test_the_curve_has_every_agents_episodes_and_no_others(games, tmp_path):
-    settings = {"rollout_steps": 2 * LAST, "batch_size": 10, "epochs": 1, "hidden": [8]}
-    config = load_training({"env_id": "ledger_v0", "total_steps": 2 * LAST * 3, "num_workers": 1, "ppo": settings})
-    make = factory(config)
-    _, curve = train(config, AgentVecEnv(DummyVecEnv([make])), prepare(make), tmp_path)
-    # b, c and a leave, in this order, and each has three slots' steps behind it
-    assert curve.steps == [3 * (episode * LAST + time) for episode in range(2) for time in sorted(LEAVES.values())]
-    for value, agent in zip(curve.returns, (1, 2, 0) * 2, strict=True):
-        times = np.arange(1, LEAVES[NAMES[agent]] + 1)
-        assert abs(value - (100.0 * agent + 10.0 * times).sum()) <= len(times)  # its actions
-
-
-def test_a_configured_world_is_made_with_its_settings(games):
-    config = load_training({"env_id": "auction_v0", "env": {"rounds": 2}})
-    facts = prepare(factory(config))
-    assert facts.agents == ("left", "right")
-    assert tuple(facts.layout) == ("played", "lead")
-    assert factory(config)().config.rounds == 2

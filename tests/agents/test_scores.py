@@ -84,23 +84,6 @@ def test_several_streams_of_random_actions_take_the_place_of_single_ones(runs):
     assert len(rows) == 9 and found["Stand-v0", "zero"] == (3.0, None, 10)
 
 
-def test_the_untrained_of_one_environment_stand_once_also_in_fewer_episodes(runs):
-    runs["stand_pid"]["results"][:2] = [row("zero", 3.4, episodes=4), row("random", 2.4, episodes=4)]
-    found = [(r["agent"], r["return_mean"]) for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
-    assert found == [("random", 2.0), ("zero", 3.0), ("PID", 40.0), ("rsl_ppo", 85.0)]
-    runs["stand_pid"]["config"]["env"]["physics"]["fidelity"] = "fine"
-    assert {r["agent"] for r in scores.scores(runs)} >= {"random, as PID", "zero, as PID"}
-
-
-@pytest.mark.parametrize("value, same", [(False, True), (True, False)])
-def test_what_is_null_is_the_same_as_what_follows(value, same, runs):
-    """``free_motion`` is off where nothing is said of it, and a wrench holds the root."""
-    runs["stand_pid"]["config"]["env"]["control"] = {"free_motion": value}
-    runs["stand_pid"]["results"][:2] = [row("zero", 3.4), row("random", 2.4)]
-    found = {r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"}
-    assert found == {"random", "zero", "PID", "rsl_ppo"} | (set() if same else {"random, as PID", "zero, as PID"})
-
-
 def test_a_table_an_environment_in_both_files(runs, tmp_path, capsys):
     """With what drives the avatar; what an environment does not say is as by default."""
     runs["push"]["config"]["env"]["control"] = {"mode": "pd", "firm_bones": False}
@@ -144,31 +127,6 @@ def test_a_later_evaluation_takes_the_place_of_the_trainings_own(runs, tmp_path,
     assert report["commits"] == ["abc", "def"] and report["devices"] == ["another GPU", "some GPU"]
 
 
-def test_a_setting_that_the_training_did_not_know_has_its_default_in_a_later_evaluation(runs, tmp_path, capsys):
-    env_id, folder = "PIAvatar/Stand-v0", tmp_path / "stand_0"
-    folder.mkdir()
-    older = runs["stand_0"]["config"] | {"env_id": env_id, "env": {"physics": {"fidelity": "coarse"}}}
-    (folder / "results.json").write_text(json.dumps(runs["stand_0"] | {"config": older}))
-    later(folder, env=older["env"] | {"control": {"firm_bones": True}})
-    scores.main([str(folder), "--out", str(tmp_path / "table.json")])
-    later(folder, env={})
-    with pytest.raises(SystemExit, match=r"has env\.\S+=None, of this run it would have"):
-        scores.main([str(folder)])
-    later(folder, env=older["env"] | {"control": {"bone_contact": False}})  # a policy may be scored on other bones
-    scores.main([str(folder), "--out", str(tmp_path / "table.json")])
-    found = {row["agent"]: row["bone_contact"] for row in json.loads((tmp_path / "table.json").read_text())["results"]}
-    assert found == {"rsl_ppo": False}, "the untrained were played on the bones of the training"
-    other = tmp_path / "stand_1"
-    other.mkdir()
-    again = runs["stand_1"]["config"] | {"env_id": env_id}
-    (other / "results.json").write_text(json.dumps(runs["stand_1"] | {"config": again}))
-    with pytest.raises(SystemExit, match=r"control\.bone_contact of what was scored differs"):
-        scores.main([str(folder), str(other)])
-    later(folder, env=older["env"] | {"control": {"firm_bones": False}})
-    with pytest.raises(SystemExit, match=r"env\.control\.firm_bones=False, of this run it would have True"):
-        scores.main([str(folder)])
-
-
 @pytest.mark.parametrize(
     ("run_name", "more", "words"),
     [
@@ -207,35 +165,6 @@ def test_other_environments_keep_their_rows(runs, tmp_path, capsys):
     assert after["commits"] == sorted(name[:12] for name in runs)
     with pytest.raises(SystemExit, match=r"results.json has no 'devices'"):
         scores.main([str(tmp_path / "stand_1"), "--keep", str(tmp_path / "push" / "results.json")])
-
-
-def test_runs_of_one_name_in_other_folders_all_count(runs, tmp_path, capsys):
-    folders = [tmp_path / f"seed{seed}" / "stand" for seed in range(2)]
-    for folder, name in zip(folders, ("stand_0", "stand_1"), strict=True):
-        folder.mkdir(parents=True)
-        (folder / "results.json").write_text(json.dumps(runs[name]))
-    scores.main([*map(str, folders), "--out", str(tmp_path / "table.json")])
-    trained = json.loads((tmp_path / "table.json").read_text())["results"][-1]
-    assert trained["seeds"] == 2 and trained["runs"] == [str(folder) for folder in folders]
-
-
-def test_other_files_are_refused(runs, tmp_path):
-    path = tmp_path / "results.json"
-    for broken, words in (
-        ({key: value for key, value in runs["push"].items() if key != "config"}, "has no 'config'"),
-        (runs["push"] | {"results": [{"case": "a against b", "win_rate": 0.5}]}, "holds matches of competing agents"),
-    ):
-        path.write_text(json.dumps(broken))
-        with pytest.raises(SystemExit, match=f"error: .*results.json {words}"):
-            scores.main([str(tmp_path)])
-
-
-def test_untrained_agents_stand_twice_where_actions_mean_something_else(runs):
-    runs["stand_pid"]["config"]["env"]["episode_seconds"] = 5.0
-    runs["stand_pid"]["results"][0]["return_mean"] = 3.0001  # rounding, on another device
-    runs["stand_pid"]["results"][1]["return_mean"] = 2.5
-    agents = [r["agent"] for r in scores.scores(runs) if r["env_id"] == "Stand-v0"]
-    assert agents == ["random", "random, as PID", "zero", "PID", "rsl_ppo"]
 
 
 def test_other_settings_are_refused(runs):

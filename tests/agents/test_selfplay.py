@@ -12,12 +12,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.checkpoint import Checkpoint
 from agents.config import first_training_seed
-from agents.evaluate import Episode, random_agent, zero_agent
+from agents.evaluate import Episode
 from agents.sb3 import matches, ppo, selfplay, train
 from agents.sb3.config import TrainingConfig, load_training
 from agents.sb3.learning import begin, learn
 from agents.sb3.parallel import AgentVecEnv, WorldFactory
-from agents.sb3.selfplay import Opponents, Pool, SelfPlaySettings
+from agents.sb3.selfplay import Opponents, Pool
 from agents.sb3.workers import factory, prepare
 from piavatar_envs.config import ConfigError, dump_yaml
 from tests.agents.killing import KillAt, Killed
@@ -152,32 +152,6 @@ def test_snapshots_join_the_pool_between_rollouts_and_play(auction, tmp_path):
     assert watch.seeds == {first_training_seed(3), first_training_seed(3) + 1}
 
 
-def test_snapshots_wait_for_the_first_rollout_after_their_time(auction, tmp_path):
-    rare = SelfPlaySettings(snapshot_every=300, evaluate_against=("random",))
-    config = auction.model_copy(update={"selfplay": rare})
-    model, pool, _ = play(config, tmp_path)
-    assert pool.steps == [0, 384]  # rollouts begin at 0, 192, 384 and 576
-    # and every match is played in all seats, each game with a seed of its own
-    worlds = DummyVecEnv([factory(config)] * 2)
-    for match in matches.play_matches(config, model, pool, worlds):
-        assert match.opponent == "random" and match.player in ("zero", "trained")
-        assert match.seats == (0,) * 10 + (1,) * 10
-        first = config.evaluation.first_seed
-        assert [game.seed for game in match.games] == list(range(first, first + 20))
-
-
-def test_a_run_repeats_and_depends_on_its_seed(auction, tmp_path):
-    runs = []
-    for seed in (3, 3, 4):
-        watch = Watch()
-        model, _, curve = play(auction.model_copy(update={"seed": seed}), tmp_path / "run", watcher=watch)
-        runs.append((weights(model), watch.drawn, curve.returns))
-    np.testing.assert_array_equal(runs[0][0], runs[1][0])
-    assert runs[0][1:] == runs[1][1:]
-    assert not np.allclose(runs[0][0], runs[2][0])
-    assert runs[0][1] != runs[2][1]
-
-
 def test_what_is_interrupted_goes_on_with_its_pool_as_if_it_had_not_been(auction, tmp_path):
     """Killed in the third rollout; the checkpoint is of its start, when a third snapshot had just joined the pool."""
     runs = {}
@@ -278,38 +252,3 @@ def test_a_match_counts_from_the_players_seat():
     np.testing.assert_allclose(
         row["win_interval"], [(p + z**2 / (2 * n) + s * half) / (1 + z**2 / n) for s in (-1, 1)], rtol=1e-5
     )
-
-
-def test_every_seat_is_acted_for_by_its_own_agent():
-    observation = np.arange(12.0).reshape(2, 3, 2)
-    agent = matches.seated([lambda seen: seen[:, :1], zero_agent(1), lambda seen: -seen[:, 1:]])
-    np.testing.assert_array_equal(agent(observation)[..., 0], [[0, 0, -5], [6, 0, -11]])
-    both = matches.seated([random_agent(1, 0)] * 2)(observation[:, :2])
-    assert both.shape == (2, 2, 1)
-
-
-@pytest.mark.parametrize(
-    ("share", "worlds", "duels"), [(0.5, 4, 2), (0.0, 4, 0), (1.0, 4, 4), (0.1, 2, 1), (0.5, 1, 1)]
-)
-def test_a_share_of_the_worlds_are_duels(share, worlds, duels):
-    assert SelfPlaySettings(duel_share=share).num_duels(worlds) == duels
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"env_id": "PIAvatar/Reach-v0", "selfplay": {}}, ["selfplay", "PIAvatar/Reach-v0", "one agent"]),
-        ({"env_id": "chess_v0"}, ["env_id", "chess_v0", "auction_v0, ledger_v0, rendezvous_v0"]),
-        ({"env_id": "os.path_v0"}, ["env_id", "os.path_v0"]),
-        ({"env_id": "auction_v0", "env": {"round": 3}}, ["env:", "round", "did you mean rounds"]),
-        ({"env_id": "auction_v0", "selfplay": {"duel_share": 1.5}}, ["selfplay.duel_share=1.5", "<= 1"]),
-        ({"env_id": "auction_v0", "selfplay.evaluate_against": ["best"]}, ["evaluate_against", "'best'", "'latest'"]),
-        ({"env_id": "auction_v0", "selfplay": {"dual_share": 0.5}}, ["selfplay.dual_share", "no setting"]),
-    ],
-)
-def test_wrong_settings_are_refused_in_one_line(games, settings, words):
-    with pytest.raises(ConfigError) as caught:
-        load_training(settings)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert all(word in message for word in words), message

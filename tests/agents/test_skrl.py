@@ -52,10 +52,6 @@ def env(config, device):
     made.close()
 
 
-def test_there_are_published_configurations():
-    assert CONFIGS
-
-
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_published_configurations_train_and_leave_their_results(path, device, tmp_path, capsys):
     skrl_mappo.main([str(path), *TINY, "--out", str(tmp_path), "--device", device])
@@ -69,13 +65,6 @@ def test_published_configurations_train_and_leave_their_results(path, device, tm
     # 20 steps of two worlds, whose episodes have 9
     curve = np.loadtxt(tmp_path / "curve.csv", delimiter=",", skiprows=1)
     assert curve[:, 0].tolist() == [18, 18, 36, 36] and np.isfinite(curve).all()
-
-
-def test_an_unknown_term_and_a_single_agents_id_are_refused(config, env, tmp_path):
-    with pytest.raises(ConfigError, match="there is no term 'hands'"):
-        skrl_mappo.build(config.model_copy(update={"observe": ("hands",)}), env, tmp_path)
-    with pytest.raises(ConfigError, match=r"unknown world 'PIAvatar/Reach-v0'; there are .*high_five_v0"):
-        load_batched(skrl_mappo.MAPPOTraining, skrl_mappo.find_world, {"env_id": "PIAvatar/Reach-v0"})
 
 
 def test_networks_see_the_chosen_terms_of_their_agents(config, env, tmp_path):
@@ -167,13 +156,6 @@ def test_only_an_agents_own_steps_are_learned_from(device):
     assert sorted(counted.tolist()) == pytest.approx(sorted(expected.tolist()), abs=1e-5)
     memory.acted[:] = False
     assert memory.sample(["observations"], batch_size=6, mini_batches=2) == []
-
-
-def test_who_is_out_is_marked(env, config, tmp_path):
-    mappo = skrl_mappo.build(config, env, tmp_path)
-    played(mappo, env, 4)
-    assert mappo.memories["agent_0"].acted.all()
-    assert mappo.memories["agent_1"].acted.tolist() == [[True, True], [True, True], [False, True], [False, True]]
 
 
 def test_training_repeats_and_depends_on_its_seed(config, env, device, tmp_path):

@@ -67,19 +67,6 @@ def test_scores_of_less_are_not_the_end_and_of_other_settings_refused(stem, tmp_
         job.is_over(())
 
 
-def test_one_that_fails_is_named_with_its_log(tmp_path, capsys):
-    assert train_all.main(("stand_sb3",), (*SMALL, "observe=[tail]"), seeds=1, runs=tmp_path) == 1
-    assert "stand_sb3_0: exit" in capsys.readouterr().err
-    assert "tail" in (tmp_path / "stand_sb3_0" / "log.txt").read_text()
-
-
-@pytest.mark.parametrize("setting", ["env.fidelity=huge", "seed=3", "total_steps"])
-def test_settings_that_are_none_are_refused_before_anything_begins(setting, tmp_path):
-    with pytest.raises(ValueError, match=setting.partition("=")[0].rpartition(".")[2]):
-        train_all.main(("stand_sb3",), (setting,), seeds=1, runs=tmp_path / "runs")
-    assert not (tmp_path / "runs").exists()
-
-
 def test_every_published_training_has_a_job_and_others_are_refused():
     files = {path for folder in train_all.SCRIPTS for path in (train_all.CONFIGS / folder).glob("*.yaml")}
     assert set(train_all.find(())) == files and len(files) > 10

@@ -9,15 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from agents import play, scores
-from agents.batch_training import load_batched
 from agents.checkpoint import UNREADABLE, Checkpoint, load_whole
 from agents.files import hold
-from agents.rsl_rl.policy import RslTraining
 from agents.sb3.config import load_training
 from piavatar_envs.config import ConfigError
-from piavatar_envs.tasks import load_task
-from scripts import train_all
 
 
 def test_no_other_process_trains_where_one_does(tmp_path):
@@ -59,25 +54,3 @@ def test_damage_anywhere_is_found(tmp_path):
             load_whole(damaged, "cpu")
     with pytest.raises(UNREADABLE):
         load_whole(tmp_path, "cpu")
-
-
-def test_more_minibatches_than_steps_are_refused():
-    few = {"env_id": "PIAvatar/Stand-v0", "num_envs": 2, "iterations": 1, "ppo": {"rollout_steps": 2, "minibatches": 5}}
-    with pytest.raises(ConfigError, match=r"ppo\.minibatches=5 must be <= 4"):
-        load_batched(RslTraining, load_task, few)
-    assert load_batched(RslTraining, load_task, few | {"num_envs": 3}).ppo.minibatches == 5
-
-
-@pytest.mark.parametrize("out", ["results.json", "config.yaml", "policy.pt"])
-def test_figures_have_a_file_of_their_own(out, tmp_path, capsys):
-    with pytest.raises(SystemExit, match=r"\.json file of its own"):
-        play.main([str(tmp_path), "--out", str(tmp_path / out)])
-    if not out.endswith(".json"):
-        with pytest.raises(SystemExit, match=r"must be a \.json file"):
-            scores.main([str(tmp_path), "--out", str(tmp_path / out)])
-
-
-@pytest.mark.parametrize("minutes", [float("nan"), -1.0])
-def test_no_time_is_refused(minutes):
-    with pytest.raises(ValueError, match=r"minutes=.* must be >= 0"):
-        train_all.main(("stand_sb3",), minutes=minutes)

@@ -29,10 +29,6 @@ TINY = (
 )  # fmt: skip
 
 
-def test_there_are_published_configurations():
-    assert CONFIGS
-
-
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_published_configurations_train_and_leave_their_results(path, device, tmp_path, capsys):
     if "deepmimic:" in path.read_text() and deepmimic.clip_folder() is None:
@@ -90,46 +86,6 @@ def test_updates_aim_at_smaller_and_smaller_divergences(tmp_path, monkeypatch, c
     assert aims == pytest.approx([0.02, 0.015, 0.01])
     with pytest.raises(SystemExit, match="falls to, and there is none; give both"):
         rsl_ppo.main([*run, "ppo.desired_kl=null", "--out", str(tmp_path / "none")])
-
-
-def test_what_does_not_fit_leaves_nothing_and_the_steps_are_told_without_an_episode(tmp_path, capsys):
-    long = [word for word in TINY if "seconds" not in word] + ["env.episode_seconds=9.0", "lessons={}", "help=null"]
-    path = next(path for path in CONFIGS if path.stem == "reach_rsl")
-    run = [str(path), *long, "--out", str(tmp_path / "run")]
-    for misfit in ("observe=[tail]", "ppo.final_kl=0.01"):
-        with pytest.raises(SystemExit, match=r"^error: "):
-            rsl_ppo.main([*run, misfit, "ppo.desired_kl=null"])
-        assert not (tmp_path / "run").exists()
-    rsl_ppo.main(run)
-    assert json.loads((tmp_path / "run" / "results.json").read_text())["train_steps"] == 48
-    before = (tmp_path / "run" / "config.yaml").read_bytes()
-    with pytest.raises(SystemExit, match="has had 3 iterations, iterations=2; ask for as many or more"):
-        rsl_ppo.main([*(word.replace("iterations=3", "iterations=2") for word in run), "--resume"])
-    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
-
-
-def test_networks_learn_from_noisy_observations_and_play_on_exact_ones(tmp_path, monkeypatch, capsys):
-    exact, seen = [], []
-    act, record = rsl_algorithm.PPO.act, rsl_algorithm.PPO.process_env_step
-    monkeypatch.setattr(
-        rsl_algorithm.PPO, "act", lambda self, obs: seen.append(obs["policy"].clone()) or act(self, obs)
-    )
-    monkeypatch.setattr(
-        rsl_algorithm.PPO,
-        "process_env_step",
-        lambda self, obs, *of_step: exact.append(obs["policy"].clone()) or record(self, obs, *of_step),
-    )
-
-    def noise(std: float) -> torch.Tensor:
-        exact.clear(), seen.clear()
-        out = tmp_path / str(std)
-        rsl_ppo.main([str(CONFIGS[0]), *TINY, "help=null", f"ppo.observation_noise={std}", "--out", str(out)])
-        return torch.stack(seen[1:]) - torch.stack(exact[:-1])  # 23 steps of two environments
-
-    assert (noise(0.0) == 0.0).all()
-    added = noise(0.25)
-    assert added.numel() > 5000 and abs(added.mean()) < 0.02
-    assert added.std().item() == pytest.approx(0.25, rel=0.05)
 
 
 def test_sigkill_at_a_step_and_in_the_middle_of_writing(device, tmp_path, capsys):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from agents.batch_training import BatchTraining, load_batched, run
+from agents.batch_training import BatchTraining
 from agents.evaluate import Episode, in_every_seat, play, zero_agent
 from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.config import ConfigError, load_config
+from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
 
 SETTINGS = {"fidelity": "tiny", "episode_seconds": 0.3}
@@ -56,42 +56,6 @@ def test_every_episode_is_the_one_a_single_env_would_play(make_env, device):
         assert episode.total == pytest.approx(expected.total, abs=1e-5)
         assert episode.distance == pytest.approx(expected.distance, abs=1e-6)
     batch.close()
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"iteration": 10}, ["iteration is no setting of Training", "did you mean iterations"]),
-        ({"num_envs": 0}, ["num_envs=0", ">= 1"]),
-        ({"env": {"tone": 7.0}}, ["env:", "control.tone=7.0", "<= 1"]),
-        ({"env_id": "PIAvatar/Fly-v0"}, ["env_id", "Fly-v0", "PIAvatar/Reach-v0"]),
-        ({"env": {"obs_mode": "dict"}}, ["obs_mode='dict'", "flat", "observe"]),
-    ],
-)
-def test_errors_are_one_line_with_key_value_and_limit(settings, words):
-    with pytest.raises(ConfigError) as caught:
-        load_batched(Training, load_task, settings)
-    assert "\n" not in str(caught.value) and all(word in str(caught.value) for word in words), caught.value
-
-
-def test_the_command_line_wins_over_the_file(tmp_path):
-    path = tmp_path / "run.yaml"
-    path.write_text("iterations: 7\nenv: {fidelity: tiny, tone: 0.5}\n")
-    config = load_batched(Training, load_task, path, {"env.tone": 0.25, "iterations": 3})
-    assert config.iterations == 3 and config.env["control"]["tone"] == 0.25
-    assert config.env["physics"]["density"] == 1000.0, "defaults are said, too"
-
-
-def test_a_device_that_is_not_there_is_refused_before_anything_is_written(tmp_path):
-    (tmp_path / "run.yaml").write_text("env_id: Reach-v0\n")
-    line = [str(tmp_path / "run.yaml"), "--device", "cuda:99", "--out", str(tmp_path / "run")]
-    with pytest.raises(SystemExit, match=r"^error: device='cuda:99' is not available .*; use one of cpu"):
-        run("rsl_rl.train", Training, load_task, pytest.fail, line)
-    assert not (tmp_path / "run").exists()
-
-
-def test_an_environment_is_known_without_its_namespace():
-    assert load_batched(Training, load_task, {"env_id": "Stand-v0"}).env_id == "PIAvatar/Stand-v0"
 
 
 def test_falls_and_pushes_are_told(device):

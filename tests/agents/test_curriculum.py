@@ -75,20 +75,6 @@ def test_a_resumed_training_has_the_help_that_it_would_have_had(device, tmp_path
     assert not all(torch.equal(whole[name], alone[name]) for name in whole)
 
 
-def test_what_cannot_be_helped_is_refused(device, tmp_path, capsys):
-    posed = ("env.control.mode=pose", "help={first: 0.5, rollouts: 3}", "iterations=1")
-    with pytest.raises(SystemExit, match=r"help is for bodies under torques"):
-        rsl_ppo.main([*FEW, *posed, "--device", device, "--out", str(tmp_path)])
-    both = ("env.control.root_assist=0.1", "help={first: 0.5, rollouts: 3}", "iterations=1")
-    with pytest.raises(SystemExit, match=r"root_assist=0.1 stays; give one of them"):
-        rsl_ppo.main([*FEW, *both, "--device", device, "--out", str(tmp_path)])
-    neither = ("help={first: 0.5}", "iterations=1")
-    with pytest.raises(SystemExit, match=r"rollouts=None and step=None: give one of them"):
-        rsl_ppo.main([*FEW, *neither, "--device", device, "--out", str(tmp_path)])
-    with pytest.raises(SystemExit, match=r"error: .*'tail' is not a joint"):
-        rsl_ppo.main([*FEW, "env.joints=[tail]", "--device", device, "--out", str(tmp_path)])
-
-
 def test_lessons_are_for_learning_only(device, tmp_path, capsys):
     lessons = "lessons={pose_noise: 0.3, control.root_assist: 0.1}"
     config = load_batched(RslTraining, load_task, FEW[0], parse_assignments([*FEW[1:], lessons]))

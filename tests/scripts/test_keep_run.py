@@ -6,7 +6,6 @@ import io
 import json
 import shutil
 import zipfile
-from pathlib import Path
 
 import pytest
 import torch
@@ -99,17 +98,3 @@ def test_nothing_is_written_where_something_is_wrong(run, tmp_path, change, mess
     with pytest.raises(ValueError, match=message):
         keep_run.main((run, spoilt(run, "walk_2", change)), tmp_path / "results")
     assert not (tmp_path / "results").exists()
-
-
-def test_names_are_taken_once(run, tmp_path, monkeypatch):
-    to = tmp_path / "results"
-    with pytest.raises(ValueError, match="no runs"):
-        keep_run.main((), to)
-    with pytest.raises(ValueError, match="exists"):
-        keep_run.main((run, run), to)
-    assert not to.exists()
-    monkeypatch.chdir(run)
-    keep_run.main((Path("."),), to)
-    assert (to / "walk_1" / "results.json").is_file()
-    with pytest.raises(ValueError, match="exists"):
-        keep_run.main((run,), to)

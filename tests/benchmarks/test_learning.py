@@ -1,4 +1,4 @@
-"""The benchmark of scores plays every environment, and trains where it is asked to."""
+"""Scores of every environment: zero, random and briefly trained agents."""
 
 from __future__ import annotations
 
