@@ -97,9 +97,12 @@ def memory_estimate() -> dict[str, Any]:
     from piavatar_envs.sim.world import Simulation
 
     model = Simulation(EnvConfig(), num_envs=1, device="cpu").model
-    nodes = int(BLOCK_NODES) * model.max_slots
+    nodes = int(BLOCK_NODES) * model.max_active_blocks
     size = {"particles": model.num_particles, "nodes": nodes, "substeps": model.num_substeps}
-    return {**size, "bytes": estimate_bytes(1, model.num_particles, model.max_slots, num_blocks=model.num_blocks)}
+    return {
+        **size,
+        "bytes": estimate_bytes(1, model.num_particles, model.max_active_blocks, num_blocks=model.num_blocks),
+    }
 
 
 def find_device(device: str) -> str:

@@ -14,7 +14,7 @@ from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
-from piavatar_envs.mpm.solver import record_begin, record_end, record_marks, record_substep
+from piavatar_envs.mpm.solver import record_begin, record_end, record_first_activation, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
 
 wp.set_module_options({"enable_backward": False})
@@ -81,11 +81,11 @@ class Matter:
         return self.model.particles.field.numpy() == field
 
     @property
-    def sums_are_clear(self) -> bool:
+    def accumulators_are_clear(self) -> bool:
         """Whether no node holds anything that a later substep would add to."""
-        sums = self.scratch.sums
-        arrays = [sums.fixed, sums.offset, sums.offset_fixed, sums.told]
-        if self.model.scatter != "shared":  # whose sums are written, not added up
+        sums = self.scratch.accumulators
+        arrays = [sums.fixed, sums.offset, sums.offset_fixed, sums.candidates]
+        if self.model.path != "block":  # whose sums are written, not added up
             arrays.append(sums.value)
         return not any(array.numpy().any() for array in arrays)
 
@@ -164,7 +164,7 @@ def build_matter(
     if "fields" in kwargs:
         record_begin(graph, model, state, scratch)
     else:  # sensors add up over control steps
-        record_marks(graph, model, state, scratch)
+        record_first_activation(graph, model, state, scratch)
     for index in range(model.num_substeps):
         record_substep(graph, model, state, scratch, index)
         if pushed:

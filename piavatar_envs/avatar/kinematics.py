@@ -9,7 +9,7 @@ import warp as wp
 
 from piavatar_envs.avatar.rotation import quat_exp, rigid_matrix
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.core.cuda_intrinsics import meet_threads, over_ancestors
+from piavatar_envs.core.cuda_intrinsics import over_ancestors, sync_threads
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -82,7 +82,7 @@ def pose_bones(
         if thread < bones:
             rotation[e, own] = wp.normalize(wp.transform_get_rotation(placed))
             position[e, own] = wp.transform_get_translation(placed)
-        meet_threads(threads)
+        sync_threads(threads)
 
 
 @wp.kernel

@@ -25,7 +25,7 @@ vec8 = wp.types.vector(length=8, dtype=wp.float32)
 vec4l = wp.types.vector(length=4, dtype=wp.int64)
 
 
-#: What eight bricks, blocks or nodes around a particle have.
+#: What eight subblocks, blocks or nodes around a particle have.
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
 
@@ -74,7 +74,7 @@ const char* const line = reinterpret_cast<const char*>(&rows.data[rows.shape[1] 
 if (128 * thread < (int)sizeof(*rows.data) * count) asm volatile("prefetch.global.L2 [%0];" :: "l"(line));
 #endif
 """)
-def ask_ahead(rows: wp.array2d(dtype=wp.vec3), e: int, p: int, count: int, thread: int):
+def prefetch_rows(rows: wp.array2d(dtype=wp.vec3), e: int, p: int, count: int, thread: int):
     """Let a GPU fetch ``rows[e, p : p + count]`` into its second-level cache: each thread a line of it."""
     ...
 
@@ -120,7 +120,7 @@ return wp::vec_t<4, wp::float32>(v.x, v.y, v.z, v.w);
 return wp::index(node, e, r);
 #endif
 """)
-def read_change(node: wp.array2d(dtype=wp.vec4), e: int, r: int) -> wp.vec4:
+def read_vec4(node: wp.array2d(dtype=wp.vec4), e: int, r: int) -> wp.vec4:
     """``node[e, r]``, of the sensors or of what faces what, on a GPU in one load of 16 bytes."""
     ...
 
@@ -132,7 +132,7 @@ def read_change(node: wp.array2d(dtype=wp.vec4), e: int, r: int) -> wp.vec4:
 wp::index(node, e, r) = value;
 #endif
 """)
-def write_change(node: wp.array2d(dtype=wp.vec4), e: int, r: int, value: wp.vec4):
+def write_vec4(node: wp.array2d(dtype=wp.vec4), e: int, r: int, value: wp.vec4):
     """``node[e, r] = value`` in one store."""
     ...
 
@@ -265,7 +265,7 @@ def components_of(matrices: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-2], 9), -1, -2))
 
 
-def group(struct: wp.Struct, **arrays: wp.array):
+def make_struct(struct: wp.Struct, **arrays: wp.array):
     """Arrays bundled as one kernel argument."""
     instance = struct()
     for name, array in arrays.items():

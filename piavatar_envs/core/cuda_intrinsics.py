@@ -34,7 +34,7 @@ def cuda_native(cuda: str, otherwise: str = "") -> str:
 
 
 @wp.func_native(cuda_native("__syncwarp();"))
-def meet_warp():
+def sync_warp():
     """Wait for the other threads of the warp; all that have not ended come here."""
     ...
 
@@ -58,7 +58,7 @@ def threads_of_block() -> int:
 
 
 @wp.func_native(cuda_native("__syncthreads();"))
-def meet():
+def sync_block():
     """Wait for the other threads of the CUDA block."""
     ...
 
@@ -301,7 +301,7 @@ for (int distance = threads >> 1; distance > 0; distance >>= 1) bits |= __shfl_x
 #endif
 return bits;
 """)
-def bits_of_threads(bits: int, threads: int) -> int:
+def or_of_threads(bits: int, threads: int) -> int:
     """All bits that any thread of a warp has set, told to all of them."""
     ...
 
@@ -316,7 +316,7 @@ for (int distance = threads >> 1; distance > 0; distance >>= 1) {
 #endif
 return wp::vec_t<2, wp::float32>(value, (float)which);
 """)
-def most_of_threads(value: float, which: int, threads: int) -> wp.vec2:
+def max_of_threads(value: float, which: int, threads: int) -> wp.vec2:
     """The largest value of the threads of a warp, and ``which`` of theirs it is, the lower of two; told to all."""
     ...
 
@@ -326,7 +326,7 @@ def most_of_threads(value: float, which: int, threads: int) -> wp.vec2:
 if (threads > 1) __syncwarp();
 #endif
 """)
-def meet_threads(threads: int):
+def sync_threads(threads: int):
     """What one thread of a warp has stored, the others see from here on."""
     ...
 

@@ -10,8 +10,8 @@ wp.set_module_options({"enable_backward": False})
 
 
 def native(cuda: str, otherwise: str = "") -> str:
-    """A snippet that finds the room as ``room``; on a CPU, where nobody launches it, ``otherwise``."""
-    start = "extern __shared__ int piavatar_room[];\nint* const room = piavatar_room;\n"
+    """A snippet that finds the room as ``arena``; on a CPU, where nobody launches it, ``otherwise``."""
+    start = "extern __shared__ int piavatar_arena[];\nint* const arena = piavatar_arena;\n"
     return cuda_native(start + cuda, otherwise)
 
 
@@ -25,81 +25,81 @@ auto append = [](int* count, unsigned all, int of) {
 """
 
 
-@wp.func_native(native("return room[at];", "return 0;"))
+@wp.func_native(native("return arena[at];", "return 0;"))
 def word(at: int) -> int:
     """Word ``at``."""
     ...
 
 
-@wp.func_native(native("room[at] = value;"))
+@wp.func_native(native("arena[at] = value;"))
 def set_word(at: int, value: int):
     """Write word ``at``."""
     ...
 
 
-@wp.func_native(native("atomicOr(room + at, bits);"))
+@wp.func_native(native("atomicOr(arena + at, bits);"))
 def or_word(at: int, bits: int):
     """Set bits of word ``at``."""
     ...
 
 
-@wp.func_native(native("atomicAdd(room + at, value);"))
+@wp.func_native(native("atomicAdd(arena + at, value);"))
 def add_word(at: int, value: int):
     """Add to word ``at``."""
     ...
 
 
-@wp.func_native(native("return (room[bits + (n >> 5)] >> (n & 31)) & 1;", "return false;"))
+@wp.func_native(native("return (arena[bits + (n >> 5)] >> (n & 31)) & 1;", "return false;"))
 def has_bit(bits: int, n: int) -> bool:
     """Bit ``n`` of those that begin at a word."""
     ...
 
 
-@wp.func_native(native("return reinterpret_cast<const unsigned short*>(room + at)[n];", "return 0;"))
+@wp.func_native(native("return reinterpret_cast<const unsigned short*>(arena + at)[n];", "return 0;"))
 def half_word(at: int, n: int) -> int:
     """Half word ``n`` after word ``at``."""
     ...
 
 
-@wp.func_native(native("reinterpret_cast<unsigned short*>(room + at)[n] = (unsigned short)value;"))
+@wp.func_native(native("reinterpret_cast<unsigned short*>(arena + at)[n] = (unsigned short)value;"))
 def set_half_word(at: int, n: int, value: int):
     """Write half word ``n`` after word ``at``."""
     ...
 
 
-@wp.func_native(native("return reinterpret_cast<const unsigned char*>(room + at)[n];", "return 0;"))
+@wp.func_native(native("return reinterpret_cast<const unsigned char*>(arena + at)[n];", "return 0;"))
 def byte(at: int, n: int) -> int:
     """Byte ``n`` after word ``at``."""
     ...
 
 
-@wp.func_native(native("reinterpret_cast<unsigned char*>(room + at)[n] = (unsigned char)value;"))
+@wp.func_native(native("reinterpret_cast<unsigned char*>(arena + at)[n] = (unsigned char)value;"))
 def set_byte(at: int, n: int, value: int):
     """Write byte ``n`` after word ``at``."""
     ...
 
 
-@wp.func_native(native("if (value > __int_as_float(room[at])) atomicMax(room + at, __float_as_int(value));"))
-def raise_to(at: int, value: float):
+@wp.func_native(native("if (value > __int_as_float(arena[at])) atomicMax(arena + at, __float_as_int(value));"))
+def max_float_word(at: int, value: float):
     """Make the number in word ``at`` at least ``value``, which is not negative."""
     ...
 
 
-@wp.func_native(native("return __int_as_float(room[at]);", "return 0.0f;"))
-def number(at: int) -> float:
+@wp.func_native(native("return __int_as_float(arena[at]);", "return 0.0f;"))
+def float_word(at: int) -> float:
     """The number in word ``at``."""
     ...
 
 
-@wp.func_native(native("room[at] = __float_as_int(value);"))
-def set_number(at: int, value: float):
+@wp.func_native(native("arena[at] = __float_as_int(value);"))
+def set_float_word(at: int, value: float):
     """Write a number to word ``at``."""
     ...
 
 
 @wp.func_native(
     native("""
-int4* const first = reinterpret_cast<int4*>(room + start);
+int4* const first = reinterpret_cast<int4*>(arena + start);
 const int4 four = make_int4(value, value, value, value);
 for (int n = threadIdx.x; n < words / 4; n += blockDim.x) first[n] = four;
 """)
@@ -119,11 +119,11 @@ def clear_words(start: int, words: int):
     native(
         APPEND
         + """
-unsigned short* const list = reinterpret_cast<unsigned short*>(room + at);
+unsigned short* const list = reinterpret_cast<unsigned short*>(arena + at);
 const int lane = threadIdx.x & 31, warps = blockDim.x >> 5;
 for (int n = threadIdx.x >> 5; n < words; n += warps) {
-    const unsigned some = (unsigned)room[bits + n];
-    const int place = append(room + count, some, lane);
+    const unsigned some = (unsigned)arena[bits + n];
+    const int place = append(arena + count, some, lane);
     if (some >> lane & 1u) list[place] = (unsigned short)(32 * n + lane);
 }
 """

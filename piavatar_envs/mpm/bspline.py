@@ -111,8 +111,8 @@ def blocks_touched(base: wp.vec3i):
 
 
 @wp.func
-def in_same_brick(a: wp.vec3i, b: wp.vec3i):
-    """Whether two nodes lie in the same brick of 2 x 2 x 2 nodes; then the stencils at them lie in the same blocks."""
+def in_same_subblock(a: wp.vec3i, b: wp.vec3i):
+    """Whether two nodes lie in the same subblock of 2 x 2 x 2 nodes; then the stencils at them lie in the same blocks."""
     return (((a[0] ^ b[0]) | (a[1] ^ b[1]) | (a[2] ^ b[2])) >> 1) == 0
 
 

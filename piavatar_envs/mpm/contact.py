@@ -28,12 +28,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.core.arrays import read_change, vec8, write_change
+from piavatar_envs.core.arrays import read_vec4, vec8, write_vec4
 from piavatar_envs.core.cuda_intrinsics import environment_of
 from piavatar_envs.mpm.bspline import BLOCK_NODES, block_corner, node_of_block
 from piavatar_envs.mpm.colliders import GATED_SLAB
 from piavatar_envs.mpm.contact_normals import (
-    GROWN_TOGETHER,
+    MERGED,
     normal_from,
     records_around,
     shared_normal,
@@ -42,22 +42,39 @@ from piavatar_envs.mpm.contact_normals import (
 )
 from piavatar_envs.mpm.contact_sensors import add_impulse, pair_entry
 from piavatar_envs.mpm.grid_arrays import MASS_MIN, clear_offset, offset_at, read_record, write_record
-from piavatar_envs.mpm.grid_update import meet_boundaries, physical_velocity, place_of, slab_is_near, total_velocity
+from piavatar_envs.mpm.grid_update import (
+    collide_with_boundaries,
+    node_position_in_block,
+    physical_velocity,
+    slab_is_near,
+    total_velocity,
+)
 from piavatar_envs.mpm.sparse_grid import (
     THREADS,
     Sweep,
+    contact_block_of,
     end_of_fields,
+    exceeds_active_blocks,
     first_record,
+    has_all_candidates,
     has_field,
-    has_told,
-    lacks_slots,
     lowest_field,
     lowest_other,
-    nodes_shared,
-    note_others,
-    shared_block,
+    num_contact_nodes,
+    store_contact_node,
 )
-from piavatar_envs.mpm.types import NO_STRESS, SPLIT, Blocks, Boundaries, Contact, Grid, Sensors, Step, Sums, row
+from piavatar_envs.mpm.types import (
+    NO_STRESS,
+    SPLIT,
+    Accumulators,
+    Blocks,
+    Boundaries,
+    Contact,
+    Grid,
+    Sensors,
+    Step,
+    row,
+)
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
@@ -78,17 +95,17 @@ def coulomb(m_a: float, m_b: float, approach: wp.vec3, n: wp.vec3, friction: flo
 
 
 @wp.func
-def book_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, mark: int, sensors: Sensors):
+def store_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, mark: int, sensors: Sensors):
     """Add a change of velocity [m/s] to a node's record, and keep the subject that has done most of it.
 
     What ``touched`` says of the slot then is ``mark``.
     """
     sensors.touched[e, r // BLOCK_NODES] = mark
-    before = read_change(sensors.node, e, r)
+    before = read_vec4(sensors.node, e, r)
     so_far = wp.vec3(before[0], before[1], before[2])
     subject = wp.where(wp.length_sq(change) >= wp.length_sq(so_far), float(contact.subject[other]), before[3])
     after = so_far + change
-    write_change(sensors.node, e, r, wp.vec4(after[0], after[1], after[2], subject))
+    write_vec4(sensors.node, e, r, wp.vec4(after[0], after[1], after[2], subject))
 
 
 @wp.func
@@ -117,7 +134,7 @@ def impulse_between(
 
 
 @wp.func
-def book_pair(contact: Contact, e: int, a: int, b: int, J: wp.vec3, sensors: Sensors):
+def store_pair_impulse(contact: Contact, e: int, a: int, b: int, J: wp.vec3, sensors: Sensors):
     """Add the impulse that field ``a`` gives ``b`` to what is known of their subjects, if they have two."""
     first = contact.subject[a]
     second = contact.subject[b]
@@ -126,17 +143,17 @@ def book_pair(contact: Contact, e: int, a: int, b: int, J: wp.vec3, sensors: Sen
 
 
 @wp.func
-def touch(
+def collide_pair(
     grid: Grid,
     contact: Contact,
     blocks: Blocks,
-    sums: Sums,
+    accumulators: Accumulators,
     e: int,
     block: int,
     local: int,
     a: int,
     b: int,
-    node_facing: wp.array2d(dtype=wp.vec4),
+    volume_gradient: wp.array2d(dtype=wp.vec4),
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
@@ -147,25 +164,25 @@ def touch(
     vb = read_record(node_velocity, e, rb)
     if va[0] <= MASS_MIN or vb[0] <= MASS_MIN:
         return
-    n_ab = shared_normal(grid, blocks, e, node_of_block(block_corner(grid, block), local), a, b, node_facing)
-    offset_a = offset_at(grid, sums, e, a, ra)
-    offset_b = offset_at(grid, sums, e, b, rb)
+    n_ab = shared_normal(grid, blocks, e, node_of_block(block_corner(grid, block), local), a, b, volume_gradient)
+    offset_a = offset_at(grid, accumulators, e, a, ra)
+    offset_b = offset_at(grid, accumulators, e, b, rb)
     J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
     if wp.length_sq(J) <= 0.0:
         return
     write_record(node_velocity, e, ra, va - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / va[0])
     write_record(node_velocity, e, rb, vb + vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / vb[0])
-    book_contact(contact, e, ra, b, -J / va[0], 1, sensors)
-    book_contact(contact, e, rb, a, J / vb[0], 1, sensors)
-    book_pair(contact, e, a, b, J, sensors)
+    store_contact(contact, e, ra, b, -J / va[0], 1, sensors)
+    store_contact(contact, e, rb, a, J / vb[0], 1, sensors)
+    store_pair_impulse(contact, e, a, b, J, sensors)
 
 
 @wp.func
-def project_alone(
+def project_own_normals(
     grid: Grid,
     contact: Contact,
     blocks: Blocks,
-    sums: Sums,
+    accumulators: Accumulators,
     mask: int,
     e: int,
     block: int,
@@ -195,50 +212,63 @@ def project_alone(
             r = first_record(grid, blocks, e, f, block) + local
             v = read_record(node_velocity, e, r)
             if v[0] > MASS_MIN:
-                offset = offset_at(grid, sums, e, f, r)
+                offset = offset_at(grid, accumulators, e, f, r)
                 out = wp.normalize(wp.vec3(offset[0], offset[1], offset[2]))
                 other = wp.where(f == heaviest, lowest_other(mask, f, contact.num_fields), heaviest)
                 mu = contact.friction[row(e, contact.friction.shape[0]), f * contact.num_fields + other]
                 # against a wall that moves with the common velocity
                 J = coulomb(1.0, 1.0, 2.0 * (wp.vec3(v[1], v[2], v[3]) - common), out, mu)
                 write_record(node_velocity, e, r, v - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0))
-                book_contact(contact, e, r, other, -J, 1, sensors)
+                store_contact(contact, e, r, other, -J, 1, sensors)
 
 
 @wp.func
-def touch_all(
+def collide_all(
     grid: Grid,
     contact: Contact,
     blocks: Blocks,
-    sums: Sums,
+    accumulators: Accumulators,
     mask: int,
     e: int,
     block: int,
     local: int,
-    node_facing: wp.array2d(dtype=wp.vec4),
+    volume_gradient: wp.array2d(dtype=wp.vec4),
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """Contact of the fields of a ``mask`` at a node, of those that have told it where they are."""
     if contact.own_normals != 0:
-        project_alone(grid, contact, blocks, sums, mask, e, block, local, node_velocity, sensors)
+        project_own_normals(grid, contact, blocks, accumulators, mask, e, block, local, node_velocity, sensors)
         return
     end = end_of_fields(mask)
     for a in range(lowest_field(mask, contact.num_fields), end - 1):
         if has_field(mask, a):
             for b in range(a + 1, end):
                 if has_field(mask, b):
-                    touch(grid, contact, blocks, sums, e, block, local, a, b, node_facing, node_velocity, sensors)
+                    collide_pair(
+                        grid,
+                        contact,
+                        blocks,
+                        accumulators,
+                        e,
+                        block,
+                        local,
+                        a,
+                        b,
+                        volume_gradient,
+                        node_velocity,
+                        sensors,
+                    )
 
 
 @wp.func
-def settle_node(
+def finish_node(
     grid: Grid,
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
-    sums: Sums,
+    accumulators: Accumulators,
     mask: int,
     near: bool,
     e: int,
@@ -253,21 +283,23 @@ def settle_node(
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
             total = read_record(node_velocity, e, r)
-            if total[0] == GROWN_TOGETHER:
+            if total[0] == MERGED:
                 # the trunk comes first: its velocity is final
                 t = first_record(grid, blocks, e, contact.trunk[f], block) + local
                 v = read_record(node_velocity, e, t)
                 write_record(node_velocity, e, r, vec8(0.0, v[1], v[2], v[3], v[4], v[5], v[6], 0.0))
-                change = read_change(sensors.node, e, t)
-                write_change(sensors.node, e, r, change)
+                change = read_vec4(sensors.node, e, t)
+                write_vec4(sensors.node, e, r, change)
                 if wp.length_sq(wp.vec3(change[0], change[1], change[2])) > 0.0:
                     sensors.touched[e, r // BLOCK_NODES] = 1
             else:
                 if near:
-                    at = place_of(grid, block_corner(grid, block), local)
-                    total = meet_boundaries(grid, boundaries, contact, sums, e, f, r, at, total, sensors)
+                    at = node_position_in_block(grid, block_corner(grid, block), local)
+                    total = collide_with_boundaries(
+                        grid, boundaries, contact, accumulators, e, f, r, at, total, sensors
+                    )
                 write_record(node_velocity, e, r, physical_velocity(split, total))
-            clear_offset(sums, e, r)
+            clear_offset(accumulators, e, r)
 
 
 @wp.func
@@ -277,8 +309,8 @@ def solve_node(
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
-    node_facing: wp.array2d(dtype=wp.vec4),
-    sums: Sums,
+    volume_gradient: wp.array2d(dtype=wp.vec4),
+    accumulators: Accumulators,
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
@@ -289,7 +321,7 @@ def solve_node(
     """A node with any number of fields, those of ``mask``."""
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     present = int(0)
-    told = int(0)
+    candidates = int(0)
     near = slab_is_near(grid, boundaries, e, block_corner(grid, block), local, GATED_SLAB)
     for f in range(contact.num_fields):
         if has_field(mask, f):
@@ -297,19 +329,21 @@ def solve_node(
             v = read_record(node_velocity, e, r)
             if v[0] != 0.0:
                 present = present | (1 << f)
-            if has_told(blocks, e, r):
-                told = told | (1 << f)
+            if has_all_candidates(blocks, e, r):
+                candidates = candidates | (1 << f)
             v = total_velocity(step, split, v)
             write_record(node_velocity, e, r, v)
-            write_change(sensors.node, e, r, wp.vec4(0.0))
-    touch_all(grid, contact, blocks, sums, told, e, block, local, node_facing, node_velocity, sensors)
-    settle_node(
-        grid, step, boundaries, contact, blocks, sums, mask, near, e, block, local, node_velocity, sensors
+            write_vec4(sensors.node, e, r, wp.vec4(0.0))
+    collide_all(
+        grid, contact, blocks, accumulators, candidates, e, block, local, volume_gradient, node_velocity, sensors
+    )
+    finish_node(
+        grid, step, boundaries, contact, blocks, accumulators, mask, near, e, block, local, node_velocity, sensors
     )  # fmt: skip
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
-            note_others(blocks, e, r, (present & ~(1 << f)) != 0)
+            store_contact_node(blocks, e, r, (present & ~(1 << f)) != 0)
 
 
 @wp.func
@@ -319,8 +353,8 @@ def solve_pair(
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
-    node_facing: wp.array2d(dtype=wp.vec4),
-    sums: Sums,
+    volume_gradient: wp.array2d(dtype=wp.vec4),
+    accumulators: Accumulators,
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
@@ -338,19 +372,19 @@ def solve_pair(
     around_a, around_b = records_around(grid, blocks, e, node, a, b)  # asked for before it is known who needs them
     va = read_record(node_velocity, e, ra)
     vb = read_record(node_velocity, e, rb)
-    offset_a = offset_at(grid, sums, e, a, ra)
-    offset_b = offset_at(grid, sums, e, b, rb)
+    offset_a = offset_at(grid, accumulators, e, a, ra)
+    offset_b = offset_at(grid, accumulators, e, b, rb)
     near = slab_is_near(grid, boundaries, e, corner, local, GATED_SLAB)
-    told = has_told(blocks, e, ra) and has_told(blocks, e, rb)
+    candidates = has_all_candidates(blocks, e, ra) and has_all_candidates(blocks, e, rb)
     here_a = va[0] != 0.0
     here_b = vb[0] != 0.0
-    grown = vb[0] == GROWN_TOGETHER  # only to a trunk, which comes first
+    merged = vb[0] == MERGED  # only to a trunk, which comes first
     va = total_velocity(step, split, va)
     vb = total_velocity(step, split, vb)
     change_a = wp.vec4()
     change_b = wp.vec4()
-    if told and va[0] > MASS_MIN and vb[0] > MASS_MIN:
-        n_ab = normal_from(grid, e, node, around_a, around_b, node_facing)
+    if candidates and va[0] > MASS_MIN and vb[0] > MASS_MIN:
+        n_ab = normal_from(grid, e, node, around_a, around_b, volume_gradient)
         J = impulse_between(grid, contact, e, a, b, va, vb, offset_a, offset_b, n_ab)
         if wp.length_sq(J) > 0.0:
             dv = J / va[0]
@@ -361,23 +395,23 @@ def solve_pair(
             vb = vb + vec8(0.0, dv[0], dv[1], dv[2], 0.0, 0.0, 0.0, 0.0)
             sensors.touched[e, ra // BLOCK_NODES] = 1
             sensors.touched[e, rb // BLOCK_NODES] = 1
-            book_pair(contact, e, a, b, J, sensors)
+            store_pair_impulse(contact, e, a, b, J, sensors)
     if near:
-        at = place_of(grid, corner, local)
-        va = meet_boundaries(grid, boundaries, contact, sums, e, a, ra, at, va, sensors)
-        vb = meet_boundaries(grid, boundaries, contact, sums, e, b, rb, at, vb, sensors)
+        at = node_position_in_block(grid, corner, local)
+        va = collide_with_boundaries(grid, boundaries, contact, accumulators, e, a, ra, at, va, sensors)
+        vb = collide_with_boundaries(grid, boundaries, contact, accumulators, e, b, rb, at, vb, sensors)
     va = physical_velocity(split, va)
     vb = physical_velocity(split, vb)
-    if grown:
+    if merged:
         vb = vec8(0.0, va[1], va[2], va[3], va[4], va[5], va[6], 0.0)
     write_record(node_velocity, e, ra, va)
     write_record(node_velocity, e, rb, vb)
-    write_change(sensors.node, e, ra, change_a)
-    write_change(sensors.node, e, rb, change_b)
-    clear_offset(sums, e, ra)
-    clear_offset(sums, e, rb)
-    note_others(blocks, e, ra, here_b)
-    note_others(blocks, e, rb, here_a)
+    write_vec4(sensors.node, e, ra, change_a)
+    write_vec4(sensors.node, e, rb, change_b)
+    clear_offset(accumulators, e, ra)
+    clear_offset(accumulators, e, rb)
+    store_contact_node(blocks, e, ra, here_b)
+    store_contact_node(blocks, e, rb, here_a)
 
 
 @wp.kernel(launch_bounds=(THREADS, 2))
@@ -389,9 +423,9 @@ def solve_contact(
     sweep: Sweep,
     blocks: Blocks,
     failure: wp.array(dtype=int),
-    node_facing: wp.array2d(dtype=wp.vec4),
+    volume_gradient: wp.array2d(dtype=wp.vec4),
     # in and out: offsets are read, then cleared; sums become velocities
-    sums: Sums,
+    accumulators: Accumulators,
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
@@ -402,24 +436,26 @@ def solve_contact(
     at = environment_of(wp.tid(), sweep.threads)
     e = at[0]
     thread = at[1]
-    end = wp.where(lacks_slots(failure, e), 0, nodes_shared(blocks, e))  # else nobody has added up all particles
-    for turn in range(sweep.turns):
-        first = thread * sweep.share + turn * sweep.stride
-        block = shared_block(blocks, e, first)
+    end = wp.where(
+        exceeds_active_blocks(failure, e), 0, num_contact_nodes(blocks, e)
+    )  # else nobody has added up all particles
+    for visit in range(sweep.visits):
+        first = thread * sweep.nodes + visit * sweep.stride
+        block = contact_block_of(blocks, e, first)
         if first >= end:
             break
         mask = blocks.fields[e, block]
         b = end_of_fields(mask) - 1
         last = 1 << wp.max(b, 0)
-        for n in range(first, first + sweep.share):
+        for n in range(first, first + sweep.nodes):
             local = n % BLOCK_NODES
             if (mask & (mask - 1)) == last and contact.own_normals == 0:
                 solve_pair(
-                    grid, step, boundaries, contact, blocks, node_facing, sums, node_velocity, sensors, e, block, local,
+                    grid, step, boundaries, contact, blocks, volume_gradient, accumulators, node_velocity, sensors, e, block, local,
                     lowest_field(mask, contact.num_fields), b,
                 )  # fmt: skip
             else:
                 solve_node(
-                    grid, step, boundaries, contact, blocks, node_facing, sums, node_velocity, sensors, e, block, local,
+                    grid, step, boundaries, contact, blocks, volume_gradient, accumulators, node_velocity, sensors, e, block, local,
                     mask,
                 )  # fmt: skip

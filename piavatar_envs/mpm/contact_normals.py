@@ -15,21 +15,29 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.core.arrays import read_change, vec8, vec8i, write_change
+from piavatar_envs.core.arrays import read_vec4, vec8, vec8i, write_vec4
 from piavatar_envs.core.cuda_intrinsics import environment_of
 from piavatar_envs.mpm.bspline import BLOCK_NODES, block_index, node_in_block
-from piavatar_envs.mpm.grid_arrays import MASS_MIN, mass_of, move_offset, offset_at, read_record, take_sum, write_record
+from piavatar_envs.mpm.grid_arrays import (
+    MASS_MIN,
+    mass_of,
+    move_offset,
+    offset_at,
+    read_record,
+    take_accumulator,
+    write_record,
+)
 from piavatar_envs.mpm.sparse_grid import (
     THREADS,
     Sweep,
+    contact_block_of,
+    exceeds_active_blocks,
     first_record,
+    has_all_candidates,
     has_field,
-    has_told,
-    lacks_slots,
-    nodes_shared,
-    shared_block,
+    num_contact_nodes,
 )
-from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sensors, Sums, row
+from piavatar_envs.mpm.types import Accumulators, Blocks, Contact, Grid, Sensors, row
 
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
@@ -37,7 +45,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 #: Volume of two fields [cells] at a node below which there is nothing: less than the least mass has.
 EMPTY = wp.constant(1.0e-30)
 #: Mass of a record whose field has grown together with its subject's trunk at a node.
-GROWN_TOGETHER = wp.constant(-1.0)
+MERGED = wp.constant(-1.0)
 
 #: Distance of the matter of two half-spaces that touch, as a node at any distance from their common surface sees it:
 #: ``TOUCHING - SLOPE (4 V_a V_b / (V_a + V_b)^2)^(1/4)`` grid spacings, to 0.011, from 0.81 at the surface to 1.5.
@@ -48,11 +56,11 @@ PER_GAP = wp.constant(0.65)
 
 
 @wp.func
-def take_sums(
+def merge_limbs(
     grid: Grid,
     contact: Contact,
     blocks: Blocks,
-    sums: Sums,
+    accumulators: Accumulators,
     mask: int,
     e: int,
     block: int,
@@ -69,16 +77,20 @@ def take_sums(
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
-            s = take_sum(sums, e, f, r)
+            s = take_accumulator(accumulators, e, f, r)
             write_record(node_velocity, e, r, s)
             t = contact.trunk[f]
             if t != f and has_field(mask, t):
                 into = first_record(grid, blocks, e, t, block) + local
-                told = has_told(blocks, e, r) and has_told(blocks, e, into)
-                if told and offset_at(grid, sums, e, f, r)[3] > 0.0 and offset_at(grid, sums, e, t, into)[3] > 0.0:
+                candidates = has_all_candidates(blocks, e, r) and has_all_candidates(blocks, e, into)
+                if (
+                    candidates
+                    and offset_at(grid, accumulators, e, f, r)[3] > 0.0
+                    and offset_at(grid, accumulators, e, t, into)[3] > 0.0
+                ):
                     write_record(node_velocity, e, into, read_record(node_velocity, e, into) + s)
-                    move_offset(sums, e, r, into)
-                    write_record(node_velocity, e, r, vec8(GROWN_TOGETHER, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+                    move_offset(accumulators, e, r, into)
+                    write_record(node_velocity, e, r, vec8(MERGED, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
 
 @wp.func
@@ -95,35 +107,35 @@ def weighted_gradient(grid: Grid, V: float, m: float, offset: wp.vec4):
 
 
 @wp.func
-def facing_from(grid: Grid, V: float, m: float, offset: wp.vec4):
+def volume_gradient_from(grid: Grid, V: float, m: float, offset: wp.vec4):
     """Weighted outward gradient and volume [cells] of a field of volume ``V`` and mass ``m`` with that ``offset``."""
     outward = weighted_gradient(grid, V, m, offset)
     return wp.vec4(outward[0], outward[1], outward[2], V)
 
 
 @wp.func
-def facing_of(grid: Grid, contact: Contact, sums: Sums, e: int, f: int, r: int, m: float):
-    """:func:`facing_from` of field ``f`` of mass ``m`` at the node of record ``r``; nothing if there is none of it."""
+def volume_gradient_of(grid: Grid, contact: Contact, accumulators: Accumulators, e: int, f: int, r: int, m: float):
+    """:func:`volume_gradient_from` of field ``f`` of mass ``m`` at the node of record ``r``; nothing if there is none of it."""
     V = volume_at(grid, contact, e, f, m)
     facing = wp.vec4()
     if V > 0.0:
-        facing = facing_from(grid, V, m, offset_at(grid, sums, e, f, r))
+        facing = volume_gradient_from(grid, V, m, offset_at(grid, accumulators, e, f, r))
     return facing
 
 
 @wp.func
-def face_node(
+def store_volume_gradients(
     grid: Grid,
     contact: Contact,
     blocks: Blocks,
-    sums: Sums,
+    accumulators: Accumulators,
     mask: int,
     e: int,
     block: int,
     local: int,
     node_velocity: wp.array2d(dtype=wp.vec4),
     # out
-    node_facing: wp.array2d(dtype=wp.vec4),
+    volume_gradient: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """What a node says of every field: its weighted outward gradient, and its volume [cells]; nothing has touched."""
@@ -132,25 +144,25 @@ def face_node(
             r = first_record(grid, blocks, e, f, block) + local
             m = mass_of(node_velocity, e, r)
             facing = wp.vec4()
-            if has_told(blocks, e, r):
-                facing = facing_of(grid, contact, sums, e, f, r, m)
-            write_change(node_facing, e, r, facing)
+            if has_all_candidates(blocks, e, r):
+                facing = volume_gradient_of(grid, contact, accumulators, e, f, r, m)
+            write_vec4(volume_gradient, e, r, facing)
             if local == 0:
                 sensors.touched[e, r // BLOCK_NODES] = 0
 
 
 @wp.kernel(launch_bounds=(THREADS, 6))
-def find_facing(
+def find_volume_gradients(
     grid: Grid,
     contact: Contact,
     sweep: Sweep,
     blocks: Blocks,
     failure: wp.array(dtype=int),
     # in and out: taken where several fields are
-    sums: Sums,
+    accumulators: Accumulators,
     # out
     node_velocity: wp.array2d(dtype=wp.vec4),
-    node_facing: wp.array2d(dtype=wp.vec4),
+    volume_gradient: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
     """What every node of a block with several fields says about the normals around it.
@@ -160,16 +172,30 @@ def find_facing(
     """
     at = environment_of(wp.tid(), sweep.threads)
     e = at[0]
-    end = wp.where(lacks_slots(failure, e), 0, nodes_shared(blocks, e))  # else nobody has added up all particles
-    for turn in range(sweep.turns):
-        first = at[1] * sweep.share + turn * sweep.stride
-        block = shared_block(blocks, e, first)
+    end = wp.where(
+        exceeds_active_blocks(failure, e), 0, num_contact_nodes(blocks, e)
+    )  # else nobody has added up all particles
+    for visit in range(sweep.visits):
+        first = at[1] * sweep.nodes + visit * sweep.stride
+        block = contact_block_of(blocks, e, first)
         if first >= end:
             break
         mask = blocks.fields[e, block]
-        for n in range(first, first + sweep.share):
-            take_sums(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity)
-            face_node(grid, contact, blocks, sums, mask, e, block, n % BLOCK_NODES, node_velocity, node_facing, sensors)
+        for n in range(first, first + sweep.nodes):
+            merge_limbs(grid, contact, blocks, accumulators, mask, e, block, n % BLOCK_NODES, node_velocity)
+            store_volume_gradients(
+                grid,
+                contact,
+                blocks,
+                accumulators,
+                mask,
+                e,
+                block,
+                n % BLOCK_NODES,
+                node_velocity,
+                volume_gradient,
+                sensors,
+            )
 
 
 @wp.func
@@ -209,7 +235,7 @@ def in_grid(grid: Grid, node: wp.vec3i):
 
 
 @wp.func
-def share_of_normal(c: float, of_a: wp.vec4, of_b: wp.vec4):
+def normal_term(c: float, of_a: wp.vec4, of_b: wp.vec4):
     """What a node adds to a normal, times ``c`` for its distance, from what both its fields say."""
     reduced = of_a[3] * of_b[3] / wp.max(of_a[3] + of_b[3], EMPTY)
     return (c * reduced * reduced) * (of_a - of_b)
@@ -217,7 +243,7 @@ def share_of_normal(c: float, of_a: wp.vec4, of_b: wp.vec4):
 
 @wp.func
 def normal_along(facing: wp.vec4):
-    """Unit vector along a sum of :func:`share_of_normal`; zero if there is no telling.
+    """Unit vector along a sum of :func:`normal_term`; zero if there is no telling.
 
     Summands of nearly empty nodes are so small that their squares are not.
     """
@@ -229,14 +255,14 @@ def normal_along(facing: wp.vec4):
 
 
 @wp.func
-def say_of(distance_sq: float):
+def neighbour_weight(distance_sq: float):
     """How much a node around another says of its normal, by the square of their distance [grid spacings squared]."""
     return 1.0 / (1.0 + distance_sq)
 
 
 @wp.func
 def normal_from(
-    grid: Grid, e: int, node: wp.vec3i, first_a: vec8i, first_b: vec8i, node_facing: wp.array2d(dtype=wp.vec4)
+    grid: Grid, e: int, node: wp.vec3i, first_a: vec8i, first_b: vec8i, volume_gradient: wp.array2d(dtype=wp.vec4)
 ):
     """:func:`shared_normal`, from the :func:`records_around` a node."""
     # along an axis, the node's own block is the lower of the two unless the node is the first of it
@@ -260,21 +286,21 @@ def normal_from(
                 to_b = component(first_b, bx, by, bz)
                 counts = to_a >= 0 and in_grid(grid, at)
                 across = float((j - 1) * (j - 1) + (k - 1) * (k - 1))
-                c = wp.where(i == 1, say_of(across), say_of(1.0 + across))
+                c = wp.where(i == 1, neighbour_weight(across), neighbour_weight(1.0 + across))
                 # what does not count is the node itself, times 0: all are read before the first has come
-                of_a = read_change(node_facing, e, wp.where(counts, to_a + n, ra))
-                of_b = read_change(node_facing, e, wp.where(counts, to_b + n, rb))
-                facing += share_of_normal(wp.where(counts, c, 0.0), of_a, of_b)
+                of_a = read_vec4(volume_gradient, e, wp.where(counts, to_a + n, ra))
+                of_b = read_vec4(volume_gradient, e, wp.where(counts, to_b + n, rb))
+                facing += normal_term(wp.where(counts, c, 0.0), of_a, of_b)
     return normal_along(facing)
 
 
 @wp.func
 def shared_normal(
-    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, node_facing: wp.array2d(dtype=wp.vec4)
+    grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, volume_gradient: wp.array2d(dtype=wp.vec4)
 ):
     """Unit normal from field ``a`` to field ``b`` at a node; zero if there is no telling."""
     first_a, first_b = records_around(grid, blocks, e, node, a, b)
-    return normal_from(grid, e, node, first_a, first_b, node_facing)
+    return normal_from(grid, e, node, first_a, first_b, volume_gradient)
 
 
 @wp.func

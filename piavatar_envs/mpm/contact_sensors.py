@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.core.arrays import read_change
+from piavatar_envs.core.arrays import read_vec4
 from piavatar_envs.mpm.bspline import (
     BLOCK_NODES,
     base_node,
@@ -23,22 +23,22 @@ from piavatar_envs.mpm.grid_arrays import mass_of
 from piavatar_envs.mpm.sparse_grid import (
     THREADS,
     VECTORS,
+    candidate_bits,
     fields_around,
     first_record,
     has_field,
     line_of_records,
-    noted_around,
     record_of,
     slab_records,
 )
-from piavatar_envs.mpm.types import BESIDE, Blocks, Contact, Grid, Model, Particles, Sensors, row
+from piavatar_envs.mpm.types import NEAR_FIELD, Blocks, Contact, Grid, Model, Particles, Sensors, row
 
 # unrolled, the stencil takes so many registers that a GPU has few threads at once
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 
 #: Units in a newton second: sums are right to 1e-12 N s, and end at 8e6 N s.
-UNITS = wp.constant(float(2**40))
+QUANTA_PER_NEWTON_SECOND = wp.constant(float(2**40))
 
 
 @wp.func
@@ -70,23 +70,23 @@ def moment_entry(sensors: Sensors, subject: int):
 def add_impulse(sensors: Sensors, e: int, entry: int, J: wp.vec3):
     """Add an impulse [N s] to an entry."""
     for axis in range(3):
-        wp.atomic_add(sensors.sums, e, 3 * entry + axis, wp.int64(wp.rint(UNITS * J[axis])))
+        wp.atomic_add(sensors.accumulators, e, 3 * entry + axis, wp.int64(wp.rint(QUANTA_PER_NEWTON_SECOND * J[axis])))
 
 
 @wp.func
 def impulse_at(sensors: Sensors, e: int, entry: int):
     """Sum of an entry [N s]."""
-    x = float(sensors.sums[e, 3 * entry])
-    y = float(sensors.sums[e, 3 * entry + 1])
-    z = float(sensors.sums[e, 3 * entry + 2])
-    return wp.vec3(x, y, z) / UNITS
+    x = float(sensors.accumulators[e, 3 * entry])
+    y = float(sensors.accumulators[e, 3 * entry + 1])
+    z = float(sensors.accumulators[e, 3 * entry + 2])
+    return wp.vec3(x, y, z) / QUANTA_PER_NEWTON_SECOND
 
 
 @wp.func
-def forget(e: int, sensors: Sensors):
+def clear_environment(e: int, sensors: Sensors):
     """Zero the sensors of an environment."""
-    for n in range(sensors.sums.shape[1]):
-        sensors.sums[e, n] = wp.int64(0)
+    for n in range(sensors.accumulators.shape[1]):
+        sensors.accumulators[e, n] = wp.int64(0)
     for s in range(sensors.boundary_impulse.shape[1]):
         sensors.boundary_impulse[e, s] = wp.vec3(0.0)
         sensors.boundary_moment[e, s] = wp.vec3(0.0)
@@ -101,7 +101,7 @@ def forget(e: int, sensors: Sensors):
 @wp.kernel
 def clear_sensors(sensors: Sensors):
     """Forget the contacts of the last control step."""
-    forget(wp.tid(), sensors)
+    clear_environment(wp.tid(), sensors)
 
 
 @wp.kernel
@@ -109,7 +109,7 @@ def clear_masked_sensors(mask: wp.array(dtype=wp.bool), sensors: Sensors):
     """Forget the contacts of the masked environments."""
     e = wp.tid()
     if mask[e]:
-        forget(e, sensors)
+        clear_environment(e, sensors)
 
 
 @wp.kernel
@@ -157,13 +157,13 @@ def touched_around(grid: Grid, blocks: Blocks, sensors: Sensors, e: int, f: int,
 @wp.func
 def change_at(sensors: Sensors, e: int, r: int):
     """What contact has done to a record: change of velocity, and the subject that did most of it."""
-    change = read_change(sensors.node, e, r)
+    change = read_vec4(sensors.node, e, r)
     # else it is of the past
     return wp.where(sensors.touched[e, r // BLOCK_NODES] != 0, change, wp.vec4())
 
 
 @wp.func
-def give(sensors: Sensors, e: int, sensor: int, taken: wp.vec4):
+def add_sensor_impulse(sensors: Sensors, e: int, sensor: int, taken: wp.vec4):
     """Add an impulse to a sensor, by the subject in its last component."""
     impulse = wp.vec3(taken[0], taken[1], taken[2])
     if wp.length_sq(impulse) > 0.0:
@@ -171,7 +171,7 @@ def give(sensors: Sensors, e: int, sensor: int, taken: wp.vec4):
 
 
 @wp.func
-def take_share(sensors: Sensors, e: int, sensor: int, taken: wp.vec4, change: wp.vec4, share: float):
+def accumulate_share(sensors: Sensors, e: int, sensor: int, taken: wp.vec4, change: wp.vec4, share: float):
     """Impulse that a particle has taken so far, and from whom, with its ``share`` [kg] of a node's change.
 
     As long as it comes from one subject it is added up before it is rounded.
@@ -179,7 +179,7 @@ def take_share(sensors: Sensors, e: int, sensor: int, taken: wp.vec4, change: wp
     if wp.length_sq(wp.vec3(change[0], change[1], change[2])) == 0.0:
         return taken
     if change[3] != taken[3]:
-        give(sensors, e, sensor, taken)
+        add_sensor_impulse(sensors, e, sensor, taken)
         taken = wp.vec4(0.0, 0.0, 0.0, change[3])
     return taken + share * wp.vec4(change[0], change[1], change[2], 0.0)
 
@@ -210,39 +210,39 @@ def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Se
             first = change_at(sensors, e, at[0])
             second = change_at(sensors, e, at[1])
             third = change_at(sensors, e, at[2])
-            taken = take_share(sensors, e, sensor, taken, first, w * stencil.wz[0])
-            taken = take_share(sensors, e, sensor, taken, second, w * stencil.wz[1])
-            taken = take_share(sensors, e, sensor, taken, third, w * stencil.wz[2])
-    give(sensors, e, sensor, taken)
+            taken = accumulate_share(sensors, e, sensor, taken, first, w * stencil.wz[0])
+            taken = accumulate_share(sensors, e, sensor, taken, second, w * stencil.wz[1])
+            taken = accumulate_share(sensors, e, sensor, taken, third, w * stencil.wz[2])
+    add_sensor_impulse(sensors, e, sensor, taken)
 
 
 @wp.func
-def sense_gathered(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
+def sense_near_field(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
     """:func:`sense_particle` of one near which the grid pass has seen another field; nearly all leave here."""
     base = base_node(xg)
     r = first_record(grid, blocks, e, particles.field[p], block_index(grid, base[0], base[1], base[2]))
-    if blocks.beside[e, r // BLOCK_NODES] != 0:
+    if blocks.near_field[e, r // BLOCK_NODES] != 0:
         sense_particle(grid, particles, blocks, sensors, e, p, xg)
 
 
 @wp.func
-def is_alone(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i):
+def is_single_field(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i):
     """Whether the grid pass has noted that a stencil of field ``f`` lies in no block of another one.
 
     It has noted nothing of blocks that have been marked since, nor where a gather does not ask for it.
     """
-    if blocks.beside.shape[1] == 1:
+    if blocks.near_field.shape[1] == 1:
         return False
     r = first_record(grid, blocks, e, f, block_index(grid, base[0], base[1], base[2]))
-    if r >= BLOCK_NODES * blocks.swept[e]:
+    if r >= BLOCK_NODES * blocks.num_updated[e]:
         return False
-    return blocks.beside[e, r // BLOCK_NODES] == 0
+    return blocks.near_field[e, r // BLOCK_NODES] == 0
 
 
-def senses_in_gather(model: Model) -> bool:
+def senses_in_g2p(model: Model) -> bool:
     """Whether particles sense contact in the gather, that of large bodies on a GPU, and not in a launch of its own."""
     senses = model.contact.num_fields > 1 and model.num_sensors > 0
-    return senses and model.scatter not in ("plain", "shared")
+    return senses and model.path not in ("plain", "block")
 
 
 @wp.kernel(launch_bounds=(THREADS, 7))
@@ -262,7 +262,7 @@ def sense_contact(
     """
     e, p = wp.tid()
     xg = grid_position(grid, x[e, p])
-    if failure[e] == 0 and (noted_around(blocks, e, p) & BESIDE) != 0:
+    if failure[e] == 0 and (candidate_bits(blocks, e, p) & NEAR_FIELD) != 0:
         sense_particle(grid, particles, blocks, sensors, e, p, xg)
 
 
@@ -291,7 +291,7 @@ def sense_penetration(
     base = stencil.base
     if not stencil_inside(grid, base):
         return
-    if is_alone(grid, blocks, e, particles.field[p], base):
+    if is_single_field(grid, blocks, e, particles.field[p], base):
         return
     own = contact.subject[particles.field[p]]
     around = fields_around(grid, blocks, base, e)
@@ -305,7 +305,7 @@ def sense_penetration(
                         if has_field(blocks.fields[e, block_index(grid, base[0] + i, base[1] + j, base[2] + k)], g):
                             r = record_of(grid, blocks, e, g, base[0] + i, base[1] + j, base[2] + k)
                             # a block that the last gather has marked knows nothing yet
-                            if r < BLOCK_NODES * blocks.swept[e]:
+                            if r < BLOCK_NODES * blocks.num_updated[e]:
                                 w = pick(stencil.wx, i) * pick(stencil.wy, j) * pick(stencil.wz, k)
                                 m += w * mass_of(node_velocity, e, r)
             density = contact.density[row(e, contact.density.shape[0]), g]

@@ -21,19 +21,26 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.core.arrays import matrix_at, store_matrix, store_pair
-from piavatar_envs.mpm.bspline import Stencil, base_node, grid_position, in_same_brick, stencil_at, stencil_inside
+from piavatar_envs.mpm.bspline import Stencil, base_node, grid_position, in_same_subblock, stencil_at, stencil_inside
 from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.grid_arrays import TO_KINEMATIC, first_of_halves, read_half_from
 from piavatar_envs.mpm.p2g import _LINES, Lines, lines_of
-from piavatar_envs.mpm.sparse_grid import HALVES, ends_of_line, line_of_records, mark_blocks, noted_around, slab_records
+from piavatar_envs.mpm.sparse_grid import (
+    HALVES,
+    activate_stencil,
+    candidate_bits,
+    ends_of_line,
+    line_of_records,
+    slab_records,
+)
 from piavatar_envs.mpm.types import (
+    CANDIDATE,
     FAILURE_CFL,
     FAILURE_NONFINITE,
     FAILURE_OUT_OF_GRID,
     NO_STRESS,
     PAPER,
     SPLIT,
-    TELLS,
     Blocks,
     Boundaries,
     Grid,
@@ -109,7 +116,7 @@ def fault_of(grid: Grid, step: Step, F: wp.mat33, advection: wp.vec3, at: wp.vec
 
 
 @wp.struct
-class Gathered:
+class Advanced:
     """A particle at the end of a substep; see :class:`piavatar_envs.mpm.types.State`."""
 
     fault: int  # why it cannot go on: bits FAILURE_*; then it stays as it is
@@ -143,7 +150,7 @@ def gradient_of(grid: Grid, g: Gradients, f: wp.vec3):
 
 
 @wp.func
-def asks_kinematic(grid: Grid, step: Step, distance: float):
+def needs_kinematic(grid: Grid, step: Step, distance: float):
     """Whether a particle must know the grid's kinematic velocity: the variant wants it, or a boundary is at hand.
 
     ``distance`` is how far the particle is from any [m].
@@ -155,33 +162,33 @@ def asks_kinematic(grid: Grid, step: Step, distance: float):
 
 
 @wp.func
-def begun(grid: Grid, physical: Gradients, f: wp.vec3):
+def velocity_of(grid: Grid, physical: Gradients, f: wp.vec3):
     """Physical velocity and its gradient of a particle that is ``f`` from the lowest node."""
-    s = Gathered()
+    s = Advanced()
     s.u = wp.vec3(physical.mean[1], physical.mean[2], physical.mean[3])
     s.C = gradient_of(grid, physical, f)
     return s
 
 
 @wp.func
-def own_velocity(
-    grid: Grid, boundaries: Boundaries, e: int, x: wp.vec3, vk: wp.vec3, kinematic: Gradients, asked: bool
+def carried_velocity(
+    grid: Grid, boundaries: Boundaries, e: int, x: wp.vec3, vk: wp.vec3, kinematic: Gradients, needed: bool
 ):
     """Kinematic velocity that carries a particle at ``x``: what the grid did not see of it enters no boundary.
 
-    ``kinematic`` has nothing where it was not ``asked`` for, see :func:`asks_kinematic`.
+    ``kinematic`` has nothing where it was not ``needed`` for, see :func:`needs_kinematic`.
     """
-    if not asked:
+    if not needed:
         return vk
     seen = wp.vec3(kinematic.mean[1], kinematic.mean[2], kinematic.mean[3])
     return seen + remove_approach(boundaries, e, x, vk - seen, CONTACT_GATE * grid.dx)
 
 
 @wp.func
-def settled(
+def complete_advance(
     grid: Grid,
     step: Step,
-    s: Gathered,
+    s: Advanced,
     x: wp.vec3,
     advection: wp.vec3,
     F: wp.mat33,
@@ -197,7 +204,7 @@ def settled(
 
 
 @wp.func
-def finish_gather(
+def advance_particle(
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -209,7 +216,7 @@ def finish_gather(
     p: int,
     physical: Gradients,
     kinematic: Gradients,
-    asked: bool,
+    needed: bool,
     stencil: Stencil,
 ):
     """Particle ``p`` a substep later; the blocks that it comes to are marked.
@@ -218,25 +225,25 @@ def finish_gather(
     (1e-5 m against 1e-2 m).
     """
     x = moved.x[e, p]
-    s = begun(grid, physical, stencil.f)
+    s = velocity_of(grid, physical, stencil.f)
     advection = s.u
     grad_vk = wp.mat33()
     if step.decoupling == PAPER:
         grad_vk = gradient_of(grid, kinematic, stencil.f)
     elif step.decoupling == SPLIT or step.decoupling == NO_STRESS:
-        advection += own_velocity(grid, boundaries, e, x, moved.vk[e, p], kinematic, asked)
-    s = settled(grid, step, s, x, advection, matrix_at(moved.F, e, p), grad_vk, moved.spin[e, p])
+        advection += carried_velocity(grid, boundaries, e, x, moved.vk[e, p], kinematic, needed)
+    s = complete_advance(grid, step, s, x, advection, matrix_at(moved.F, e, p), grad_vk, moved.spin[e, p])
     if s.fault != 0:
         wp.atomic_or(failure, e, s.fault)
     else:
         to = base_node(grid_position(grid, s.x))
-        if not in_same_brick(to, stencil.base):
-            mark_blocks(grid, blocks, to, particles.field[p], e, failure)
+        if not in_same_subblock(to, stencil.base):
+            activate_stencil(grid, blocks, to, particles.field[p], e, failure)
     return s
 
 
 @wp.func
-def gather_physical(
+def sum_physical(
     grid: Grid,
     blocks: Blocks,
     nodes: wp.uint64,
@@ -244,7 +251,7 @@ def gather_physical(
     field: int,
     stencil: Stencil,
 ):
-    """Sums over a stencil of the nodes' physical velocity, on a GPU; on a CPU they are :func:`gather_lines`."""
+    """Sums over a stencil of the nodes' physical velocity, on a GPU; on a CPU they are :func:`sum_lines`."""
     base = stencil.base
     wx = stencil.wx
     wy = stencil.wy
@@ -273,7 +280,7 @@ def gather_physical(
 
 
 @wp.func
-def gather_kinematic(
+def sum_kinematic(
     grid: Grid,
     blocks: Blocks,
     nodes: wp.uint64,
@@ -302,7 +309,7 @@ def gather_kinematic(
 
 
 @wp.func
-def gather(
+def g2p_particle(
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -316,26 +323,26 @@ def gather(
 ):
     """Particle ``p`` from the nodes: velocities and gradients, and with them position and deformation.
 
-    Also, how far it was from any boundary [m]. Blocks that it comes to are marked. See also :func:`gather_by_lines`.
+    Also, how far it was from any boundary [m]. Blocks that it comes to are marked. See also :func:`g2p_particle_by_lines`.
     """
     x = moved.x[e, p]
     stencil = stencil_at(grid_position(grid, x))
     field = particles.field[p]
     nodes = first_of_halves(node_velocity, e)
-    physical = gather_physical(grid, blocks, nodes, e, field, stencil)
+    physical = sum_physical(grid, blocks, nodes, e, field, stencil)
     kinematic = Gradients()
     distance = nearest_boundary(boundaries, e, x)
-    asked = asks_kinematic(grid, step, distance)
-    if asked:
-        kinematic = gather_kinematic(grid, blocks, nodes, e, field, stencil)
-    s = finish_gather(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, stencil
+    needed = needs_kinematic(grid, step, distance)
+    if needed:
+        kinematic = sum_kinematic(grid, blocks, nodes, e, field, stencil)
+    s = advance_particle(
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, needed, stencil
     )  # fmt: skip
     return s, distance
 
 
 @wp.func
-def gather_by_lines(
+def g2p_particle_by_lines(
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -347,27 +354,27 @@ def gather_by_lines(
     e: int,
     p: int,
 ):
-    """:func:`gather` for a CPU, whose scatter has noted what is around a particle."""
+    """:func:`g2p_particle` for a CPU, whose scatter has noted what is around a particle."""
     x = moved.x[e, p]
     stencil = stencil_at(grid_position(grid, x))
     field = particles.field[p]
     nodes = first_of_halves(node_velocity, e)
     lines = lines_of(grid, blocks, e, field, stencil, HALVES)
-    sums = gather_lines(nodes, lines)
-    physical = Gradients(sums[0], sums[1], sums[2], sums[3])
+    accumulators = sum_lines(nodes, lines)
+    physical = Gradients(accumulators[0], accumulators[1], accumulators[2], accumulators[3])
     kinematic = Gradients()
-    asked = bool(False)
-    if step.decoupling == PAPER or (noted_around(blocks, e, p) & TELLS) != 0:
-        asked = asks_kinematic(grid, step, nearest_boundary(boundaries, e, x))
-    if asked:
-        kinematic = gather_kinematic(grid, blocks, nodes, e, field, stencil)
-    return finish_gather(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, stencil
+    needed = bool(False)
+    if step.decoupling == PAPER or (candidate_bits(blocks, e, p) & CANDIDATE) != 0:
+        needed = needs_kinematic(grid, step, nearest_boundary(boundaries, e, x))
+    if needed:
+        kinematic = sum_kinematic(grid, blocks, nodes, e, field, stencil)
+    return advance_particle(
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, needed, stencil
     )  # fmt: skip
 
 
 @wp.kernel
-def grid_to_particles(
+def g2p(
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -378,11 +385,11 @@ def grid_to_particles(
     moved: Moving,
     failure: wp.array(dtype=int),
 ):
-    """Move every particle with the grid, see :func:`gather_by_lines`."""
+    """Move every particle with the grid, see :func:`g2p_particle_by_lines`."""
     e, p = wp.tid()
     if blocks.frozen[e] != 0:
         return
-    s = gather_by_lines(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+    s = g2p_particle_by_lines(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
     if s.fault == 0:
         moved.x[e, p] = s.x
         moved.u[e, p] = s.u
@@ -391,7 +398,7 @@ def grid_to_particles(
 
 
 @wp.func
-def store_particle(moved: Moving, e: int, p: int, s: Gathered, store: bool):
+def store_particle(moved: Moving, e: int, p: int, s: Advanced, store: bool):
     """All that a particle ``p`` has become, if ``store``; at best all threads of a warp come here."""
     store_pair(moved.x, moved.u, e, p, s.x, s.u, True, store)
     if store:
@@ -421,13 +428,13 @@ for (int i = 0; i < 3; ++i) {
     along_y = along_y + plane_y * wx[i];
     along_z = along_z + plane_z * wx[i];
 }
-wp::mat_t<4, 4, wp::float32> sums;
+wp::mat_t<4, 4, wp::float32> accumulators;
 for (int c = 0; c < 4; ++c)
-    sums.data[0][c] = mean[c], sums.data[1][c] = along_x[c], sums.data[2][c] = along_y[c], sums.data[3][c] = along_z[c];
-return sums;
+    accumulators.data[0][c] = mean[c], accumulators.data[1][c] = along_x[c], accumulators.data[2][c] = along_y[c], accumulators.data[3][c] = along_z[c];
+return accumulators;
 """
 )
-def gather_lines(
+def sum_lines(
     nodes: wp.uint64,
     lines: Lines,
 ) -> wp.mat44:

@@ -25,7 +25,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.core.arrays import vec4l, vec8
-from piavatar_envs.mpm.types import Grid, Step, Sums, row
+from piavatar_envs.mpm.types import Accumulators, Grid, Step, row
 
 wp.set_module_options({"enable_backward": False})
 
@@ -121,16 +121,16 @@ def write_record(halves: wp.array2d(dtype=wp.vec4), e: int, r: int, value: vec8)
 
 
 #: Units in a full cell.
-UNITS = 2.0**36
+QUANTA_PER_CELL = 2.0**36
 
 
-def units(density: np.ndarray, grid: Grid, step: Step) -> tuple[np.ndarray, np.ndarray]:
+def choose_quanta(density: np.ndarray, grid: Grid, step: Step) -> tuple[np.ndarray, np.ndarray]:
     """Units of mass [kg] and of momentum [kg m/s] of fields with reference ``density`` [kg/m^3], in its shape.
 
     They are powers of two, into and out of which numbers go without rounding: a factor that is off by 3e-8 each time
     has taken 1e-5 of a body's momentum after twenty steps.
     """
-    mass = np.asarray(density, float) * grid.dx**3 / UNITS
+    mass = np.asarray(density, float) * grid.dx**3 / QUANTA_PER_CELL
     return np.exp2(np.round(np.log2(mass))), np.exp2(np.round(np.log2(mass * grid.dx / step.dt)))
 
 
@@ -143,7 +143,7 @@ return wp::vec_t<4, wp::int64>(a.x, a.y, b.x, b.y);
 return wp::vec_t<4, wp::int64>(own[0], own[1], own[2], own[3]);
 #endif
 """)
-def numbers_at(numbers: wp.array2d(dtype=vec4l), e: int, at: int) -> vec4l:
+def quanta_at(numbers: wp.array2d(dtype=vec4l), e: int, at: int) -> vec4l:
     """``numbers[e, at]``, on a GPU in two loads."""
     ...
 
@@ -171,110 +171,113 @@ if (clears) mine[0] = zero, mine[1] = zero;
 if (clears) wp::index(numbers, e, at) = wp::vec_t<4, wp::int64>(0, 0, 0, 0);
 #endif
 """)
-def clear_numbers(numbers: wp.array2d(dtype=vec4l), e: int, at: int, clears: bool):
+def clear_quanta(numbers: wp.array2d(dtype=vec4l), e: int, at: int, clears: bool):
     """Zero ``numbers[e, at]`` if ``clears``; at best all threads of a warp come here."""
     ...
 
 
 @wp.func
-def counted(n: vec4l):
+def quanta_to_float(n: vec4l):
     """How many units there are, in floating point."""
     return wp.vec4(float(n[0]), float(n[1]), float(n[2]), float(n[3]))
 
 
 @wp.func
-def physical_sum(units: wp.vec2, a: wp.vec4):
+def decode_physical(quanta: wp.vec2, a: wp.vec4):
     """Mass and physical momentum that ``a`` counts."""
-    p = units[1]
-    return vec8(units[0] * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
+    p = quanta[1]
+    return vec8(quanta[0] * a[0], p * a[1], p * a[2], p * a[3], 0.0, 0.0, 0.0, 0.0)
 
 
 @wp.func
-def units_of(sums: Sums, e: int, f: int):
+def quanta_of(accumulators: Accumulators, e: int, f: int):
     """Units of mass [kg] and of momentum [kg m/s] of field ``f``."""
     return wp.vec2(
-        sums.mass_unit[row(e, sums.mass_unit.shape[0]), f], sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), f]
+        accumulators.mass_quantum[row(e, accumulators.mass_quantum.shape[0]), f],
+        accumulators.momentum_quantum[row(e, accumulators.momentum_quantum.shape[0]), f],
     )
 
 
 @wp.func
-def begin_sum(sums: Sums, e: int, r: int):
-    """What :func:`end_sum` begins with, mass and physical momentum in fixed point, to be asked for early.
+def load_accumulator(accumulators: Accumulators, e: int, r: int):
+    """What :func:`finish_take` begins with, mass and physical momentum in fixed point, to be asked for early.
 
     Nothing where sums are in floating point.
     """
     s = vec4l()
-    if sums.is_fixed != 0:
-        s = numbers_at(sums.fixed, e, half_of(r, 0))
+    if accumulators.is_fixed != 0:
+        s = quanta_at(accumulators.fixed, e, half_of(r, 0))
     return s
 
 
 @wp.func
-def take_sum(sums: Sums, e: int, f: int, r: int):
+def take_accumulator(accumulators: Accumulators, e: int, f: int, r: int):
     """Mass, physical and kinematic momentum of record ``r`` of field ``f``, which is cleared."""
-    return end_sum(sums, e, units_of(sums, e, f), r, begin_sum(sums, e, r), True)
+    return finish_take(accumulators, e, quanta_of(accumulators, e, f), r, load_accumulator(accumulators, e, r), True)
 
 
 @wp.func
-def sum_of(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l):
-    """Mass, physical and kinematic momentum in fixed point, of what has ``begun``; nothing is cleared."""
-    b = counted(numbers_at(sums.fixed, e, half_of(r, 1)))
-    p = units[1]
-    return physical_sum(units, counted(begun)) + vec8(0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0)
+def decode_record(accumulators: Accumulators, e: int, quanta: wp.vec2, r: int, loaded: vec4l):
+    """Mass, physical and kinematic momentum in fixed point, of what has ``loaded``; nothing is cleared."""
+    b = quanta_to_float(quanta_at(accumulators.fixed, e, half_of(r, 1)))
+    p = quanta[1]
+    return decode_physical(quanta, quanta_to_float(loaded)) + vec8(
+        0.0, 0.0, 0.0, 0.0, p * b[0], p * b[1], p * b[2], 0.0
+    )
 
 
 @wp.func
-def end_sum(sums: Sums, e: int, units: wp.vec2, r: int, begun: vec4l, driven: bool):
-    """:func:`take_sum` of what has ``begun``, of a field with these ``units``.
+def finish_take(accumulators: Accumulators, e: int, quanta: wp.vec2, r: int, loaded: vec4l, driven: bool):
+    """:func:`take_accumulator` of what has ``loaded``, of a field with these ``quanta``.
 
     Where it is known that nobody has added kinematic momentum, the record is not ``driven``: that is not read in fixed
     point, nor cleared. (A CPU would lose more by the question than by the answer.)
     """
     s = vec8()
-    if sums.is_fixed == 0:
-        s = read_record(sums.value, e, r)
-        write_record(sums.value, e, r, vec8())
+    if accumulators.is_fixed == 0:
+        s = read_record(accumulators.value, e, r)
+        write_record(accumulators.value, e, r, vec8())
     else:
-        a = counted(begun)
+        a = quanta_to_float(loaded)
         if a[0] > 0.0:  # who adds no mass adds nothing
             if driven:
-                s = sum_of(sums, e, units, r, begun)
+                s = decode_record(accumulators, e, quanta, r, loaded)
             else:
-                s = physical_sum(units, a)
-        clear_numbers(sums.fixed, e, half_of(r, 0), a[0] > 0.0)
+                s = decode_physical(quanta, a)
+        clear_quanta(accumulators.fixed, e, half_of(r, 0), a[0] > 0.0)
         if driven:
-            clear_numbers(sums.fixed, e, half_of(r, 1), a[0] > 0.0)
+            clear_quanta(accumulators.fixed, e, half_of(r, 1), a[0] > 0.0)
     return s
 
 
 @wp.func
-def offset_unit(grid: Grid, sums: Sums, e: int, f: int):
+def offset_quantum(grid: Grid, accumulators: Accumulators, e: int, f: int):
     """Unit of a sum of offsets [kg m]; only their quotients with masses matter."""
-    return grid.dx * sums.mass_unit[row(e, sums.mass_unit.shape[0]), f]
+    return grid.dx * accumulators.mass_quantum[row(e, accumulators.mass_quantum.shape[0]), f]
 
 
 @wp.func
-def offset_at(grid: Grid, sums: Sums, e: int, f: int, r: int):
+def offset_at(grid: Grid, accumulators: Accumulators, e: int, f: int, r: int):
     """Sum of ``w m (x_i - x_p)`` [kg m] and of the mass of seam particles [kg] at record ``r`` of field ``f``."""
-    if sums.is_fixed == 0:
-        return sums.offset[e, r]
-    s = offset_unit(grid, sums, e, f) * counted(numbers_at(sums.offset_fixed, e, r))
+    if accumulators.is_fixed == 0:
+        return accumulators.offset[e, r]
+    s = offset_quantum(grid, accumulators, e, f) * quanta_to_float(quanta_at(accumulators.offset_fixed, e, r))
     return wp.vec4(s[0], s[1], s[2], s[3] / grid.dx)
 
 
 @wp.func
-def move_offset(sums: Sums, e: int, r: int, into: int):
+def move_offset(accumulators: Accumulators, e: int, r: int, into: int):
     """Add the offsets of record ``r`` to those of ``into``, of a field of the same units."""
-    if sums.is_fixed == 0:
-        sums.offset[e, into] = sums.offset[e, into] + sums.offset[e, r]
+    if accumulators.is_fixed == 0:
+        accumulators.offset[e, into] = accumulators.offset[e, into] + accumulators.offset[e, r]
     else:
-        sums.offset_fixed[e, into] = sums.offset_fixed[e, into] + sums.offset_fixed[e, r]
+        accumulators.offset_fixed[e, into] = accumulators.offset_fixed[e, into] + accumulators.offset_fixed[e, r]
 
 
 @wp.func
-def clear_offset(sums: Sums, e: int, r: int):
+def clear_offset(accumulators: Accumulators, e: int, r: int):
     """Forget the offsets of a record."""
-    if sums.is_fixed == 0:
-        sums.offset[e, r] = wp.vec4(0.0)
+    if accumulators.is_fixed == 0:
+        accumulators.offset[e, r] = wp.vec4(0.0)
     else:
-        clear_numbers(sums.offset_fixed, e, r, True)
+        clear_quanta(accumulators.offset_fixed, e, r, True)

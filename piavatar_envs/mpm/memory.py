@@ -7,30 +7,30 @@ import math
 import numpy as np
 import warp as wp
 
-from piavatar_envs.core.arrays import allocate_matrices, components_of, group, vec4l, whole_lines
+from piavatar_envs.core.arrays import allocate_matrices, components_of, make_struct, vec4l, whole_lines
 from piavatar_envs.mpm.bspline import BLOCK, BLOCK_NODES
-from piavatar_envs.mpm.contact_sensors import senses_in_gather
-from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, plan_room
-from piavatar_envs.mpm.grid_arrays import units
-from piavatar_envs.mpm.sparse_grid import NOBODY, most_shared, notes_others
-from piavatar_envs.mpm.types import Blocks, Grid, Model, Scratch, Sensors, State, Sums
+from piavatar_envs.mpm.contact_sensors import senses_in_g2p
+from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, plan_arena
+from piavatar_envs.mpm.grid_arrays import choose_quanta
+from piavatar_envs.mpm.sparse_grid import UNASSIGNED, max_contact_blocks, tracks_contact_nodes
+from piavatar_envs.mpm.types import Accumulators, Blocks, Grid, Model, Scratch, Sensors, State
 
 #: Blocks with matter that a body may come to need, over those that it needs at rest. Random full-scale actions, also of
 #: random shapes, made it 1.2 times as many at most.
-SLOT_MARGIN = 1.7
+ACTIVE_MARGIN = 1.7
 #: The same of a body with more particles than fit into shared memory.
 LARGE_MARGIN = 2.2
 #: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In eight
 #: substeps nothing moves further than two blocks.
-MARKS_EVERY = 8
+ACTIVATION_INTERVAL = 8
 #: The same where groups scatter, whose marks take longer; and where one of their bodies is large. One of 2,300 blocks
 #: that goes a grid spacing a substep leaves some 1,600 behind in 16 of them, 2,500 in 25: there is room for that.
-MARKS_OF_GROUPS, MARKS_OF_LARGE = 16, 25
+TILED_INTERVAL, LARGE_INTERVAL = 16, 25
 #: Warp's strides are 32-bit: the records of an environment, of 64 bytes at most, take less than 2^31.
-MOST_SLOTS = 2**31 // (64 * BLOCK**3)
+MAX_ACTIVE_BLOCKS = 2**31 // (64 * BLOCK**3)
 
 
-def bound_slots(max_slots: int | None, field: np.ndarray, grid: Grid, num_fields: int) -> int:
+def bound_active_blocks(max_active_blocks: int | None, field: np.ndarray, grid: Grid, num_fields: int) -> int:
     """Slots of an environment: as asked for, at most what its particles, of velocity fields ``field``, touch at once.
 
     Raises:
@@ -38,16 +38,16 @@ def bound_slots(max_slots: int | None, field: np.ndarray, grid: Grid, num_fields
     """
     count = np.bincount(field, minlength=num_fields)
     most = int(np.minimum(8 * count, grid.num_blocks).sum())
-    slots = most if max_slots is None else min(max_slots, most)
-    if not 1 <= slots < MOST_SLOTS:
+    active_blocks = most if max_active_blocks is None else min(max_active_blocks, most)
+    if not 1 <= active_blocks < MAX_ACTIVE_BLOCKS:
         raise ValueError(
-            f"{slots} blocks of nodes an environment: use at least 1 and less than {MOST_SLOTS} (a coarser dx, or "
-            f"max_slots)"
+            f"{active_blocks} blocks of nodes an environment: use at least 1 and less than {MAX_ACTIVE_BLOCKS} (a coarser dx, or "
+            f"max_active_blocks)"
         )
-    return slots
+    return active_blocks
 
 
-def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin: float | None = None) -> int:
+def estimate_active_blocks(rest: np.ndarray, field: np.ndarray | None, dx: float, margin: float | None = None) -> int:
     """Slots that bodies will need, from how many they take where they are at rest.
 
     Args:
@@ -55,7 +55,7 @@ def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin
         field: their velocity fields, shape ``(num_particles,)``; the first for all if not given.
         dx: grid spacing [m].
         margin: how many times as many slots a body may come to need, in another pose or shape, and while it goes on;
-            ``SLOT_MARGIN`` if not given, or ``LARGE_MARGIN``.
+            ``ACTIVE_MARGIN`` if not given, or ``LARGE_MARGIN``.
     """
     field = np.zeros(len(rest), int) if field is None else field
     corners = np.array(np.meshgrid([0, 2], [0, 2], [0, 2])).reshape(3, -1).T
@@ -64,7 +64,7 @@ def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin
         own = rest[field == index]
         times = margin
         if times is None:
-            times = LARGE_MARGIN if len(own) > MOST_PARTICLES else SLOT_MARGIN
+            times = LARGE_MARGIN if len(own) > MOST_PARTICLES else ACTIVE_MARGIN
         base = np.floor(own / dx - 0.5).astype(int)
         counts = []
         for shift in np.ndindex(2, 2, 2):  # the grid may lie to the body as it likes
@@ -74,36 +74,43 @@ def estimate_slots(rest: np.ndarray, field: np.ndarray | None, dx: float, margin
     return needed
 
 
-def choose_marks(scatter: str, field: np.ndarray) -> int:
+def choose_activation_interval(path: str, field: np.ndarray) -> int:
     """Substeps after which the blocks of particles of velocity fields ``field`` are marked anew."""
-    if scatter != "runs":
-        return MARKS_EVERY
-    return MARKS_OF_LARGE if np.bincount(field).max() > MOST_PARTICLES else MARKS_OF_GROUPS
+    if path != "tiled":
+        return ACTIVATION_INTERVAL
+    return LARGE_INTERVAL if np.bincount(field).max() > MOST_PARTICLES else TILED_INTERVAL
 
 
 def estimate_bytes(
-    num_envs: int, num_particles: int, max_slots: int, num_fields: int = 1, num_blocks: int = 0, scatter: str = "plain"
+    num_envs: int,
+    num_particles: int,
+    max_active_blocks: int,
+    num_fields: int = 1,
+    num_blocks: int = 0,
+    path: str = "plain",
 ) -> int:
     """Device memory of state and scratch [bytes].
 
     120 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 32 more
     where there are several fields; the map of blocks.
     """
-    sums = 16 if scatter == "shared" else (32 + 16) * (2 if scatter == "runs" else 1)
-    node = sums + 32 + (16 + 16 if num_fields > 1 else 0)
-    slots = max_slots * (BLOCK**3 * node + (10 if num_fields > 1 else 4) + (0 if scatter == "shared" else 4))
+    accumulators = 16 if path == "block" else (32 + 16) * (2 if path == "tiled" else 1)
+    node = accumulators + 32 + (16 + 16 if num_fields > 1 else 0)
+    active_blocks = max_active_blocks * (
+        BLOCK**3 * node + (10 if num_fields > 1 else 4) + (0 if path == "block" else 4)
+    )
     particles = 48 * num_particles + 72 * whole_lines(num_particles)  # four vectors and two matrices
-    return num_envs * (particles + slots + 4 * num_blocks * (1 + num_fields)) + 2**10
+    return num_envs * (particles + active_blocks + 4 * num_blocks * (1 + num_fields)) + 2**10
 
 
 def check_memory(
     num_envs: int,
     num_particles: int,
-    max_slots: int,
+    max_active_blocks: int,
     device: str,
     num_fields: int = 1,
     num_blocks: int = 0,
-    scatter: str = "plain",
+    path: str = "plain",
 ) -> None:
     """Refuse a batch that does not fit.
 
@@ -113,7 +120,7 @@ def check_memory(
     target = wp.get_device(device)
     if not target.is_cuda:
         return
-    need = estimate_bytes(num_envs, num_particles, max_slots, num_fields, num_blocks, scatter)
+    need = estimate_bytes(num_envs, num_particles, max_active_blocks, num_fields, num_blocks, path)
     if need > target.free_memory:
         fits = int(num_envs * target.free_memory / need)
         raise ValueError(
@@ -136,18 +143,18 @@ def allocate(model: Model) -> tuple[State, Scratch]:
         spin=_zeros(model, particles, wp.vec3),
         failure=_zeros(model, model.num_envs, int),
     )
-    records = (model.num_envs, int(BLOCK_NODES) * model.max_slots)
+    records = (model.num_envs, int(BLOCK_NODES) * model.max_active_blocks)
     shared = records if model.contact.num_fields > 1 else (1, 1)
     velocity = _zeros(model, (records[0], 2 * records[1]), wp.vec4)
-    room, large_room = plan_room(model)
+    arena, large_arena = plan_arena(model)
     scratch = Scratch(
         blocks=allocate_blocks(model),
-        sums=allocate_sums(model, velocity),
+        accumulators=allocate_accumulators(model, velocity),
         velocity=velocity,
-        facing=_zeros(model, shared, wp.vec4),
+        volume_gradient=_zeros(model, shared, wp.vec4),
         sensors=allocate_sensors(model, shared),
-        room=room,
-        large_room=large_room,
+        arena=arena,
+        large_arena=large_arena,
     )
     return state, scratch
 
@@ -159,37 +166,37 @@ def _zeros(model: Model, shape: int | tuple[int, ...], dtype: type) -> wp.array:
 def allocate_blocks(model: Model) -> Blocks:
     """No block holds matter yet."""
     n, count = model.num_envs, model.num_blocks
-    return group(
+    return make_struct(
         Blocks,
         fields=_zeros(model, (n, count), int),
-        slot=_zeros(model, (n, model.contact.num_fields * count), int),
-        held=wp.full((n, model.max_slots), int(NOBODY), dtype=int, device=model.device),
-        count=_zeros(model, n, int),
-        shared=_zeros(model, (n, most_shared(model)), int),
-        num_shared=_zeros(model, n, int),
-        swept=_zeros(model, n, int),
+        active=_zeros(model, (n, model.contact.num_fields * count), int),
+        owner=wp.full((n, model.max_active_blocks), int(UNASSIGNED), dtype=int, device=model.device),
+        num_active=_zeros(model, n, int),
+        contact_blocks=_zeros(model, (n, max_contact_blocks(model)), int),
+        num_contact_blocks=_zeros(model, n, int),
+        num_updated=_zeros(model, n, int),
         frozen=_zeros(model, n, int),
-        beside=_zeros(model, (n, model.max_slots) if senses_in_gather(model) else (1, 1), int),
-        others=_zeros(model, (n, 2 * model.max_slots) if notes_others(model) else (1, 1), int),
-        around=_zeros(model, (n, model.num_particles) if wp.get_device(model.device).is_cpu else (1, 1), wp.uint8),
+        near_field=_zeros(model, (n, model.max_active_blocks) if senses_in_g2p(model) else (1, 1), int),
+        contact_nodes=_zeros(model, (n, 2 * model.max_active_blocks) if tracks_contact_nodes(model) else (1, 1), int),
+        candidate=_zeros(model, (n, model.num_particles) if wp.get_device(model.device).is_cpu else (1, 1), wp.uint8),
     )
 
 
-def allocate_sums(model: Model, velocity: wp.array) -> Sums:
+def allocate_accumulators(model: Model, velocity: wp.array) -> Accumulators:
     """Zeroed sums of the nodes, and their units. Sums from shared memory come to the records of the ``velocity``."""
-    fixed, records = model.scatter == "runs", (model.num_envs, int(BLOCK_NODES) * model.max_slots)
-    mass, momentum = units(model.contact.density.numpy(), model.grid, model.step)
+    fixed, records = model.path == "tiled", (model.num_envs, int(BLOCK_NODES) * model.max_active_blocks)
+    mass, momentum = choose_quanta(model.contact.density.numpy(), model.grid, model.step)
     floats, integers = ((1, 1), records) if fixed else (records, (1, 1))
-    return group(
-        Sums,
+    return make_struct(
+        Accumulators,
         is_fixed=int(fixed),
-        value=velocity if model.scatter == "shared" else _zeros(model, (1, 1) if fixed else velocity.shape, wp.vec4),
+        value=velocity if model.path == "block" else _zeros(model, (1, 1) if fixed else velocity.shape, wp.vec4),
         fixed=_zeros(model, (records[0], 2 * records[1]) if fixed else (1, 1), vec4l),
         offset=_zeros(model, floats, wp.vec4),
         offset_fixed=_zeros(model, integers, vec4l),
-        mass_unit=wp.array(mass.astype(np.float32), dtype=float, device=model.device),
-        momentum_unit=wp.array(momentum.astype(np.float32), dtype=float, device=model.device),
-        told=_zeros(model, (1, 1) if model.scatter == "shared" else (model.num_envs, model.max_slots), int),
+        mass_quantum=wp.array(mass.astype(np.float32), dtype=float, device=model.device),
+        momentum_quantum=wp.array(momentum.astype(np.float32), dtype=float, device=model.device),
+        candidates=_zeros(model, (1, 1) if model.path == "block" else (model.num_envs, model.max_active_blocks), int),
     )
 
 
@@ -198,9 +205,9 @@ def allocate_sensors(model: Model, records: tuple[int, int]) -> Sensors:
     n, subjects = model.num_envs, model.contact.num_subjects
     rows = max(1, model.num_sensors)
     entries = subjects * (2 + subjects + rows)
-    return group(
+    return make_struct(
         Sensors,
-        sums=_zeros(model, (n, 3 * entries), wp.int64),
+        accumulators=_zeros(model, (n, 3 * entries), wp.int64),
         boundary_impulse=_zeros(model, (n, subjects), wp.vec3),
         boundary_moment=_zeros(model, (n, subjects), wp.vec3),
         pair_impulse=_zeros(model, (n, subjects * subjects), wp.vec3),

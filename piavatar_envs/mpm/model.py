@@ -18,13 +18,13 @@ import warp as wp
 
 from piavatar_envs.mpm.bspline import BLOCK
 from piavatar_envs.mpm.colliders import Collider, make_boundaries
-from piavatar_envs.mpm.cuda.block_grid import MOST_LISTED, MOST_PARTICLES, most_particles, suits_shared
-from piavatar_envs.mpm.cuda.tiled_p2g import begin_groups
+from piavatar_envs.mpm.cuda.block_grid import MOST_LISTED, MOST_PARTICLES, largest_partition, suits_block_path
+from piavatar_envs.mpm.cuda.tiled_p2g import plan_tiles
 from piavatar_envs.mpm.materials import lame_parameters, material_index
-from piavatar_envs.mpm.memory import bound_slots, check_memory, choose_marks
+from piavatar_envs.mpm.memory import bound_active_blocks, check_memory, choose_activation_interval
 from piavatar_envs.mpm.types import (
     DECOUPLING,
-    SCATTERS,
+    PATHS,
     Contact,
     Grid,
     Model,
@@ -257,18 +257,18 @@ def build_model(
     colliders: Sequence[Collider] = (),
     fields: Fields | None = None,
     sound_speed: float | None = None,
-    max_slots: int | None = None,
+    max_active_blocks: int | None = None,
     rest: np.ndarray | None = None,
-    scatter: str | None = None,
+    path: str | None = None,
 ) -> Model:
     """Constants of a simulation on ``device``.
 
     ``num_substeps`` is chosen from the CFL limit unless given; the limit comes from the points, or from
-    ``sound_speed`` [m/s] where parameters will be randomised. ``max_slots`` bounds the blocks with matter of an
+    ``sound_speed`` [m/s] where parameters will be randomised. ``max_active_blocks`` bounds the blocks with matter of an
     environment, each field's counted; if not given, no state can exceed it. ``rest``, shape ``(P, 3)``, is where
     particles are when their body is at rest [m]; on a GPU, those of large bodies are added up by compact groups then.
-    ``scatter`` is a key of ``SCATTERS``; if not given, ``"shared"`` on a GPU whose shared memory holds an environment's
-    grid; ``"runs"`` on another one that can match within a warp; else ``"plain"``.
+    ``scatter`` is a key of ``PATHS``; if not given, ``"shared"`` on a GPU whose shared memory holds an environment's
+    grid; ``"tiled"`` on another one that can match within a warp; else ``"plain"``.
 
     Raises:
         ValueError: bad material, unstable time step, a scatter that the device does not know, or more memory than it
@@ -283,9 +283,9 @@ def build_model(
         num_substeps = choose_num_substeps(control_dt, grid.dx, sound_speed, cfl)
     check_num_substeps(num_substeps, control_dt, grid.dx, sound_speed)
     mu, lam = lame_parameters(points.young_modulus, points.poisson_ratio)
-    max_slots = bound_slots(max_slots, points.fields, grid, fields.num_fields)
-    scatter = choose_scatter(scatter, device, points.fields, max_slots, decoupling)
-    check_memory(num_envs, points.num_particles, max_slots, device, fields.num_fields, grid.num_blocks, scatter)
+    max_active_blocks = bound_active_blocks(max_active_blocks, points.fields, grid, fields.num_fields)
+    path = choose_path(path, device, points.fields, max_active_blocks, decoupling)
+    check_memory(num_envs, points.num_particles, max_active_blocks, device, fields.num_fields, grid.num_blocks, path)
     step = Step()
     step.dt = control_dt / num_substeps
     step.gravity = wp.vec3(*gravity)
@@ -304,13 +304,13 @@ def build_model(
         sound_speed=sound_speed,
         moving_boundaries=any(collider.moves or collider.kinematic for collider in colliders),
         num_sensors=fields.num_sensors,
-        max_slots=max_slots,
-        marks_every=choose_marks(scatter, points.fields),
-        scatter=scatter,
+        max_active_blocks=max_active_blocks,
+        activation_interval=choose_activation_interval(path, points.fields),
+        path=path,
     )
 
 
-def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slots: int, decoupling: str) -> str:
+def choose_path(path: str | None, device: str, field: np.ndarray, max_active_blocks: int, decoupling: str) -> str:
     """How particles of velocity fields ``field`` reach the nodes, on a device.
 
     Raises:
@@ -319,27 +319,27 @@ def choose_scatter(scatter: str | None, device: str, field: np.ndarray, max_slot
     target = wp.get_device(device)
     matches = target.is_cuda and target.arch >= 70
     # in shared memory nobody asks for the gradient of the kinematic velocity
-    shared = decoupling != "paper" and suits_shared(device, field, max_slots)
-    if scatter is None:
-        return "shared" if shared else "runs" if matches else "plain"
-    if scatter not in SCATTERS:
-        raise ValueError(f"unknown scatter {scatter!r}; use one of {', '.join(SCATTERS)}")
-    if scatter != "plain" and not matches:
-        raise ValueError(f"scatter={scatter!r} needs a GPU of compute capability 7.0 or more; {target} takes 'plain'")
-    if scatter == "shared" and not shared:
+    fits = decoupling != "paper" and suits_block_path(device, field, max_active_blocks)
+    if path is None:
+        return "block" if fits else "tiled" if matches else "plain"
+    if path not in PATHS:
+        raise ValueError(f"unknown path {path!r}; use one of {', '.join(PATHS)}")
+    if path != "plain" and not matches:
+        raise ValueError(f"path={path!r} needs a GPU of compute capability 7.0 or more; {target} takes 'plain'")
+    if path == "block" and not fits:
         raise ValueError(
-            f"scatter='shared' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
-            f"particles a body (here {most_particles(field)}), {MOST_LISTED} in all ({len(field)}), few slots "
-            f"({max_slots}) and another decoupling than 'paper' ({decoupling!r}); {target} takes "
-            f"{('runs' if matches else 'plain')!r}"
+            f"path='shared' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
+            f"particles a body (here {largest_partition(field)}), {MOST_LISTED} in all ({len(field)}), few active_blocks "
+            f"({max_active_blocks}) and another decoupling than 'paper' ({decoupling!r}); {target} takes "
+            f"{('tiled' if matches else 'plain')!r}"
         )
-    return scatter
+    return path
 
 
 def upload_points(
     points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, rest: np.ndarray | None, dx: float, device: str
 ) -> Particles:
-    """Per-particle constants on the device; ``rest`` and ``dx`` as for :func:`begin_groups`."""
+    """Per-particle constants on the device; ``rest`` and ``dx`` as for :func:`plan_tiles`."""
     particles, count = Particles(), points.num_particles
 
     def upload(value, dtype):
@@ -350,7 +350,7 @@ def upload_points(
     particles.volume, particles.mu, particles.lam = upload(points.volume, float), upload(mu, float), upload(lam, float)
     particles.material = upload(points.material, int)
     particles.field = upload(points.fields, int)
-    particles.groups = wp.array(begin_groups(points.fields, rest, dx), dtype=wp.vec2i, device=device)
+    particles.tiles = wp.array(plan_tiles(points.fields, rest, dx), dtype=wp.vec2i, device=device)
     particles.seam = upload(np.zeros(count) if points.seam is None else points.seam, float)
     particles.sensor = upload(np.full(count, -1) if points.sensor is None else points.sensor, int)
     return particles

@@ -18,13 +18,14 @@ from piavatar_envs.mpm.bspline import BLOCK_NODES, Stencil, grid_position, stenc
 from piavatar_envs.mpm.colliders import NEAR_PARTICLE, nearest_boundary
 from piavatar_envs.mpm.grid_arrays import TO_KINEMATIC
 from piavatar_envs.mpm.materials import kirchhoff_stress
-from piavatar_envs.mpm.sparse_grid import HALVES, VECTORS, fields_around, note_around, slab_records
+from piavatar_envs.mpm.sparse_grid import HALVES, VECTORS, fields_around, slab_records, store_candidate
 from piavatar_envs.mpm.types import (
     FAILURE_BLOCKS,
     FAILURE_CFL,
     FAILURE_NONFINITE,
     NO_STRESS,
     PAPER,
+    Accumulators,
     Blocks,
     Boundaries,
     Contact,
@@ -32,7 +33,6 @@ from piavatar_envs.mpm.types import (
     Moving,
     Particles,
     Step,
-    Sums,
     row,
 )
 
@@ -40,7 +40,7 @@ from piavatar_envs.mpm.types import (
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
 #: Units of momentum that a particle may have: those of 4,000 full cells that move a grid spacing in a time step.
-MOST_COUNTED = wp.constant(float(2**48))
+MAX_QUANTA = wp.constant(float(2**48))
 
 
 # Places of a line's nodes as piavatar_envs.mpm.sparse_grid has them, of all nine lines, one after the other.
@@ -113,7 +113,7 @@ auto adding_to = [](auto& vectors, int e) {
     + _ADDING
     + f"""
 constexpr int TO_KINEMATIC = {int(TO_KINEMATIC)};
-const auto add = adding_to(sums.value, e);
+const auto add = adding_to(accumulators.value, e);
 auto along = [&](int axis) {{ return vector(0.0f, A.data[0][axis], A.data[1][axis], A.data[2][axis]); }};
 const four along_x = along(0), along_y = along(1), along_z = along(2);
 const four kinematic = vector(at_base[4], at_base[5], at_base[6], 0.0f);
@@ -140,8 +140,8 @@ for (int i = 0; i < 3; ++i) {{
 }}
 """
 )
-def scatter_lines(
-    sums: Sums,
+def add_lines(
+    accumulators: Accumulators,
     e: int,
     lines: Lines,
     at_base: vec8,
@@ -156,7 +156,7 @@ def scatter_lines(
     _LINES
     + _ADDING
     + """
-const auto add = adding_to(sums.offset, e);
+const auto add = adding_to(accumulators.offset, e);
 const wp::vec3 f = lines.of.f;
 #pragma unroll
 for (int i = 0; i < 3; ++i)
@@ -172,8 +172,8 @@ for (int i = 0; i < 3; ++i)
         });
 """
 )
-def scatter_places(
-    sums: Sums,
+def add_offset_lines(
+    accumulators: Accumulators,
     e: int,
     lines: Lines,
     mass: float,
@@ -185,11 +185,11 @@ def scatter_places(
 
 
 @wp.func
-def note_told(sums: Sums, e: int, lines: Lines):
+def flag_candidate_blocks(accumulators: Accumulators, e: int, lines: Lines):
     """Note that nodes in the blocks of a stencil have been told something; ``lines`` are of ``VECTORS``."""
     for n in range(4):  # what is less by 4 is the last of two along z, see slab_records
-        sums.told[e, (lines.slab0[n] + 4) // BLOCK_NODES] = 1
-        sums.told[e, (lines.slab2[n] + 4) // BLOCK_NODES] = 1
+        accumulators.candidates[e, (lines.slab0[n] + 4) // BLOCK_NODES] = 1
+        accumulators.candidates[e, (lines.slab2[n] + 4) // BLOCK_NODES] = 1
 
 
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
@@ -198,7 +198,7 @@ _CFL = wp.constant(FAILURE_CFL)
 
 
 @wp.struct
-class Scattered:
+class Deposit:
     """What a particle adds to the nodes around it; momentum ``m u + affine (x_i - x_p)`` is linear over the stencil."""
 
     base: wp.vec3i  # lowest node of the stencil
@@ -208,9 +208,9 @@ class Scattered:
 
 
 @wp.func
-def placed(grid: Grid, x: wp.vec3):
+def empty_deposit(grid: Grid, x: wp.vec3):
     """A particle at ``x`` that scatters nothing."""
-    s = Scattered()
+    s = Deposit()
     stencil = stencil_at(grid_position(grid, x))
     s.base = stencil.base
     s.f = stencil.f
@@ -230,7 +230,7 @@ def affine_momentum(grid: Grid, m: float, C: wp.mat33, stress: wp.mat33):
 
 
 @wp.func
-def with_momentum(s: Scattered, m: float, u: wp.vec3, k: wp.vec3, A: wp.mat33):
+def with_momentum(s: Deposit, m: float, u: wp.vec3, k: wp.vec3, A: wp.mat33):
     """``s`` with mass, physical momentum, which changes by ``A`` from node to node, and kinematic momentum."""
     s.A = A
     q = m * u - A * s.f
@@ -239,7 +239,7 @@ def with_momentum(s: Scattered, m: float, u: wp.vec3, k: wp.vec3, A: wp.mat33):
 
 
 @wp.func
-def stressed(grid: Grid, step: Step, particles: Particles, e: int, p: int, F: wp.mat33):
+def stress_impulse(grid: Grid, step: Step, particles: Particles, e: int, p: int, F: wp.mat33):
     """:func:`impulse_of_stress` of particle ``p`` with deformation ``F``."""
     tau = kirchhoff_stress(
         particles.material[row(e, particles.material.shape[0]), p],
@@ -251,27 +251,27 @@ def stressed(grid: Grid, step: Step, particles: Particles, e: int, p: int, F: wp
 
 
 @wp.func
-def prepare(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, tells: bool):
+def deposit_of(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, candidate: bool):
     """What particle ``p`` of environment ``e`` scatters.
 
     Kinematic momentum is for contact, which acts on the total velocity; elsewhere it would be added and taken off
     again. So only particles add it that ``tell`` the nodes how they are driven. (The paper's variant needs its gradient
     everywhere.)
     """
-    s = placed(grid, moving.x[e, p])
+    s = empty_deposit(grid, moving.x[e, p])
     m = particles.mass[row(e, particles.mass.shape[0]), p]
     C = matrix_at(moving.C, e, p)  # first used after the stress: its parameters are asked for before this has come
     stress = wp.mat33()
     if step.decoupling != NO_STRESS:
-        stress = stressed(grid, step, particles, e, p, matrix_at(moving.F, e, p))
+        stress = stress_impulse(grid, step, particles, e, p, matrix_at(moving.F, e, p))
     k = wp.vec3()
-    if tells or step.decoupling == PAPER:
+    if candidate or step.decoupling == PAPER:
         k = m * moving.vk[e, p]
     return with_momentum(s, m, moving.u[e, p], k, affine_momentum(grid, m, C, stress))
 
 
 @wp.func
-def momentum_bounds(s: Scattered):
+def momentum_bounds(s: Deposit):
     """Bounds of the components of physical momentum that a particle has anywhere in its stencil [kg m/s]."""
     bounds = wp.vec3()
     for c in range(3):
@@ -292,7 +292,7 @@ def takes_part(blocks: Blocks, e: int, failure: wp.array(dtype=int)):
 
 
 @wp.func
-def moves_finitely(moving: Moving, e: int, p: int):
+def has_finite_velocity(moving: Moving, e: int, p: int):
     """Whether a particle's velocities are finite."""
     return wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p]))
 
@@ -306,9 +306,9 @@ def admitted(takes: bool, moves: bool, e: int, failure: wp.array(dtype=int)):
 
 
 @wp.func
-def scatters(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
+def deposits(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
     """Whether a particle takes part; one that is not finite flags its environment and does not."""
-    moves = moves_finitely(moving, e, p)  # asked for before it is known who takes part
+    moves = has_finite_velocity(moving, e, p)  # asked for before it is known who takes part
     return admitted(takes_part(blocks, e, failure), moves, e, failure)
 
 
@@ -319,13 +319,13 @@ def near_boundary(grid: Grid, boundaries: Boundaries, e: int, x: wp.vec3):
 
 
 @wp.func
-def is_beside(grid: Grid, particles: Particles, contact: Contact, blocks: Blocks, e: int, p: int, base: wp.vec3i):
+def is_near_field(grid: Grid, particles: Particles, contact: Contact, blocks: Blocks, e: int, p: int, base: wp.vec3i):
     """Whether another field is in a block of a particle's stencil."""
     return contact.num_fields > 1 and fields_around(grid, blocks, base, e) != (1 << particles.field[p])
 
 
 @wp.func
-def tells_place(
+def is_contact_candidate(
     grid: Grid,
     particles: Particles,
     boundaries: Boundaries,
@@ -337,13 +337,13 @@ def tells_place(
     base: wp.vec3i,
 ):
     """Whether nodes must know where this particle is and how it is driven: another field or a boundary is near."""
-    if is_beside(grid, particles, contact, blocks, e, p, base):
+    if is_near_field(grid, particles, contact, blocks, e, p, base):
         return True
     return near_boundary(grid, boundaries, e, x)
 
 
 @wp.kernel
-def particles_to_grid(
+def p2g(
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -353,32 +353,32 @@ def particles_to_grid(
     blocks: Blocks,
     # in and out
     failure: wp.array(dtype=int),
-    sums: Sums,
+    accumulators: Accumulators,
 ):
     """Sum mass, physical momentum with the stress impulse, and kinematic momentum on the nodes of a field.
 
     The plain scatter: a thread a particle, which adds to one node after the other.
     """
     e, p = wp.tid()
-    if not scatters(blocks, moving, e, p, failure):
+    if not deposits(blocks, moving, e, p, failure):
         return
     x = moving.x[e, p]
     stencil = stencil_at(grid_position(grid, x))
-    beside = is_beside(grid, particles, contact, blocks, e, p, stencil.base)
-    tells = beside or near_boundary(grid, boundaries, e, x)
-    note_around(blocks, e, p, tells, beside)
-    s = prepare(grid, step, particles, moving, e, p, tells)
+    near_field = is_near_field(grid, particles, contact, blocks, e, p, stencil.base)
+    candidate = near_field or near_boundary(grid, boundaries, e, x)
+    store_candidate(blocks, e, p, candidate, near_field)
+    s = deposit_of(grid, step, particles, moving, e, p, candidate)
     field = particles.field[p]
-    driven = tells or step.decoupling == PAPER
-    scatter_lines(sums, e, lines_of(grid, blocks, e, field, stencil, HALVES), s.at_base, s.A, driven)
-    if tells:
+    driven = candidate or step.decoupling == PAPER
+    add_lines(accumulators, e, lines_of(grid, blocks, e, field, stencil, HALVES), s.at_base, s.A, driven)
+    if candidate:
         lines = lines_of(grid, blocks, e, field, stencil, VECTORS)
-        scatter_places(sums, e, lines, s.at_base[0], particles.seam[p], grid.dx)
-        note_told(sums, e, lines)
+        add_offset_lines(accumulators, e, lines, s.at_base[0], particles.seam[p], grid.dx)
+        flag_candidate_blocks(accumulators, e, lines)
 
 
 @wp.func
-def fault_of_sums(s: Scattered, unit: float):
+def fault_of_sums(s: Deposit, quantum: float):
     """Why a particle must not be added up, bits ``FAILURE_*``: an integer would hide what is no number or too large."""
     columns = s.A * wp.vec3(1.0, 1.0, 1.0)
     momentum = wp.vec3(s.at_base[1], s.at_base[2], s.at_base[3])
@@ -389,13 +389,13 @@ def fault_of_sums(s: Scattered, unit: float):
     for i in range(3):
         for j in range(3):
             most = wp.max(most, wp.abs(s.A[i, j]))
-    return wp.where(most > MOST_COUNTED * unit, _CFL, 0)
+    return wp.where(most > MAX_QUANTA * quantum, _CFL, 0)
 
 
 @wp.func
-def fault_within(s: Scattered, bounds: wp.vec3, unit: float):
+def fault_within(s: Deposit, bounds: wp.vec3, quantum: float):
     """:func:`fault_of_sums`, asked for only where the ``bounds`` of what a particle has leave that open."""
     fault = int(0)
-    if not bounds[0] + bounds[1] + bounds[2] < MOST_COUNTED * unit:  # of what is no number, either
-        fault = fault_of_sums(s, unit)
+    if not bounds[0] + bounds[1] + bounds[2] < MAX_QUANTA * quantum:  # of what is no number, either
+        fault = fault_of_sums(s, quantum)
     return fault

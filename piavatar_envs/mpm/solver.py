@@ -4,8 +4,8 @@ The split-velocity scheme of PIAvatar (Han et al., arXiv 2606.21162) with APIC t
 quadratic B-splines: particles carry a physical velocity ``u`` and a kinematic velocity ``vk``; contact acts on the
 nodes' total velocity.
 
-``model.scatter`` names the path of P2G and G2P. ``"plain"`` runs on any device. ``"runs"`` sums tiles of particles of
-large bodies in shared memory before they reach the grid. ``"shared"`` keeps the grid of an environment in the shared
+``model.path`` names the path of P2G and G2P. ``"plain"`` runs on any device. ``"tiled"`` sums tiles of particles of
+large bodies in shared memory before they reach the grid. ``"block"`` keeps the grid of an environment in the shared
 memory of CUDA blocks, so that P2G, the grid update and, for a single velocity field, G2P are one launch.
 """
 
@@ -13,33 +13,34 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from piavatar_envs.core.arrays import group
+from piavatar_envs.core.arrays import make_struct
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.contact import solve_contact
-from piavatar_envs.mpm.contact_normals import find_facing
+from piavatar_envs.mpm.contact_normals import find_volume_gradients
 from piavatar_envs.mpm.contact_sensors import (
     clear_sensors,
     read_impulses,
     sense_contact,
     sense_penetration,
-    senses_in_gather,
+    senses_in_g2p,
 )
-from piavatar_envs.mpm.cuda import tiled_g2p as runs
-from piavatar_envs.mpm.cuda.block_substep import forget_speeds, record_in_block
-from piavatar_envs.mpm.cuda.tiled_p2g import record_groups
-from piavatar_envs.mpm.g2p import grid_to_particles
-from piavatar_envs.mpm.grid_update import slot_threads, slots_at_once, update_grid
-from piavatar_envs.mpm.p2g import particles_to_grid
+from piavatar_envs.mpm.cuda.block_substep import record_in_block, reset_speeds
+from piavatar_envs.mpm.cuda.tiled_g2p import THREADS as G2P_THREADS
+from piavatar_envs.mpm.cuda.tiled_g2p import tiled_g2p
+from piavatar_envs.mpm.cuda.tiled_p2g import record_tiled_p2g
+from piavatar_envs.mpm.g2p import g2p
+from piavatar_envs.mpm.grid_update import blocks_at_once, threads_per_active_block, update_grid
+from piavatar_envs.mpm.p2g import p2g
 from piavatar_envs.mpm.sparse_grid import (
     THREADS,
-    begin_others,
-    forget_blocks,
-    free_slots,
+    activate_particle_blocks,
+    deactivate_blocks,
     freeze,
-    mark_particles,
-    notes_others,
     plan_sweep,
+    reset_active_blocks,
+    reset_contact_nodes,
+    tracks_contact_nodes,
 )
 from piavatar_envs.mpm.types import Model, Moving, Scratch, State
 
@@ -51,10 +52,10 @@ def record_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scra
     velocity ``state.vk``; contact is added to the sensors.
     """
     world = (model, state, scratch)
-    if index == 0 and model.scatter == "shared":
-        graph.launch(forget_speeds, scratch.room.speed.shape, [scratch.room])
-    if index > 0 and index % model.marks_every == 0:
-        activate_blocks(graph, *world)
+    if index == 0 and model.path == "block":
+        graph.launch(reset_speeds, scratch.arena.speed.shape, [scratch.arena])
+    if index > 0 and index % model.activation_interval == 0:
+        record_activation(graph, *world)
     record_p2g(graph, *world)
     record_grid_update(graph, *world)
     record_g2p(graph, *world)
@@ -62,31 +63,33 @@ def record_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scra
         graph.launch(move_colliders, model.boundaries.position.shape, [model.step.dt], [model.boundaries])
 
 
-def activate_blocks(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
+def record_activation(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append: release all blocks, and activate those that particles touch.
 
     Between activations G2P adds the blocks that particles reach. A block that stays active without need costs time.
     """
     blocks = scratch.blocks
-    graph.launch(forget_blocks, (model.num_envs, model.max_slots), [model.grid], [blocks])
-    graph.launch(free_slots, model.num_envs, [state.failure], [blocks])
-    graph.launch(mark_particles, state.x.shape, [model.grid, model.particles, state.x], [blocks, state.failure])
-    if notes_others(model):
-        graph.launch(begin_others, (model.num_envs, model.max_slots), [], [blocks])
+    graph.launch(deactivate_blocks, (model.num_envs, model.max_active_blocks), [model.grid], [blocks])
+    graph.launch(reset_active_blocks, model.num_envs, [state.failure], [blocks])
+    graph.launch(
+        activate_particle_blocks, state.x.shape, [model.grid, model.particles, state.x], [blocks, state.failure]
+    )
+    if tracks_contact_nodes(model):
+        graph.launch(reset_contact_nodes, (model.num_envs, model.max_active_blocks), [], [blocks])
 
 
 def record_p2g(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append P2G: particles add mass, physical and kinematic momentum to the nodes around them."""
     m, moving = model, _moving(state)
-    if m.scatter == "shared":  # with the grid update, and G2P where there is one field
+    if m.path == "block":  # with the grid update, and G2P where there is one field
         record_in_block(graph, model, state, scratch, moving)
         return
     inputs = [m.grid, m.step, m.particles, m.boundaries, m.contact, moving, scratch.blocks]
-    outputs = [state.failure, scratch.sums]
-    if m.scatter == "plain":
-        graph.launch(particles_to_grid, state.x.shape, inputs, outputs)
+    outputs = [state.failure, scratch.accumulators]
+    if m.path == "plain":
+        graph.launch(p2g, state.x.shape, inputs, outputs)
     else:
-        record_groups(graph, m, inputs, outputs)
+        record_tiled_p2g(graph, m, inputs, outputs)
 
 
 def record_grid_update(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
@@ -99,17 +102,17 @@ def record_grid_update(graph: LaunchGraph, model: Model, state: State, scratch: 
     contact, update = LaunchGraph(graph.device), LaunchGraph(graph.device)
     if m.contact.num_fields > 1:
         _record_contact(contact, model, state, scratch)
-    if m.scatter != "shared":  # else done in shared memory, with P2G
-        slots = slots_at_once(m)
+    if m.path != "block":  # else done in shared memory, with P2G
+        active_blocks = blocks_at_once(m)
         update.launch(
             update_grid,
-            m.num_envs * slots * slot_threads(m),
-            [m.grid, m.step, m.boundaries, m.contact, slots, state.failure],
-            [scratch.blocks, scratch.sums, scratch.velocity, scratch.sensors],
+            m.num_envs * active_blocks * threads_per_active_block(m),
+            [m.grid, m.step, m.boundaries, m.contact, active_blocks, state.failure],
+            [scratch.blocks, scratch.accumulators, scratch.velocity, scratch.sensors],
             block_dim=THREADS,
         )
     graph.parallel(contact, update)
-    if m.contact.num_fields > 1 and m.num_sensors > 0 and not senses_in_gather(m):
+    if m.contact.num_fields > 1 and m.num_sensors > 0 and not senses_in_g2p(m):
         graph.launch(
             sense_contact,
             state.x.shape,
@@ -121,20 +124,20 @@ def record_grid_update(graph: LaunchGraph, model: Model, state: State, scratch: 
 
 def _record_contact(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append contact in the blocks with several fields: first the normals, then the impulses."""
-    m, blocks, sums = model, scratch.blocks, scratch.sums
+    m, blocks, accumulators = model, scratch.blocks, scratch.accumulators
     sweep = plan_sweep(m)
     graph.launch(
-        find_facing,
+        find_volume_gradients,
         m.num_envs * sweep.threads,
         [m.grid, m.contact, sweep, blocks, state.failure],
-        [sums, scratch.velocity, scratch.facing, scratch.sensors],
+        [accumulators, scratch.velocity, scratch.volume_gradient, scratch.sensors],
         block_dim=THREADS,
     )
     graph.launch(
         solve_contact,
         m.num_envs * sweep.threads,
-        [m.grid, m.step, m.boundaries, m.contact, sweep, blocks, state.failure, scratch.facing],
-        [sums, scratch.velocity, scratch.sensors],
+        [m.grid, m.step, m.boundaries, m.contact, sweep, blocks, state.failure, scratch.volume_gradient],
+        [accumulators, scratch.velocity, scratch.sensors],
         block_dim=THREADS,
     )
 
@@ -142,29 +145,29 @@ def _record_contact(graph: LaunchGraph, model: Model, state: State, scratch: Scr
 def record_g2p(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append G2P: particles take velocity and its gradient from the nodes, move, and update ``F``."""
     m = model
-    if m.scatter == "shared" and m.contact.num_fields == 1:
+    if m.path == "block" and m.contact.num_fields == 1:
         return  # done in shared memory, with P2G
     inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
     outputs = [scratch.blocks, _moving(state), state.failure]
-    if m.scatter == "plain":
-        graph.launch(grid_to_particles, state.x.shape, inputs, outputs, block_dim=runs.THREADS)
+    if m.path == "plain":
+        graph.launch(g2p, state.x.shape, inputs, outputs, block_dim=G2P_THREADS)
     else:
         graph.launch(
-            runs.grid_to_particles,
+            tiled_g2p,
             m.num_envs * m.num_particles,
-            [*inputs, int(senses_in_gather(m))],
+            [*inputs, int(senses_in_g2p(m))],
             [*outputs, scratch.sensors],
-            block_dim=runs.THREADS,
+            block_dim=G2P_THREADS,
         )
 
 
 def _moving(state: State) -> Moving:
     s = state
-    return group(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk, spin=s.spin)
+    return make_struct(Moving, x=s.x, u=s.u, C=s.C, F=s.F, vk=s.vk, spin=s.spin)
 
 
 def record_begin(
-    graph: LaunchGraph, model: Model, state: State, scratch: Scratch, beside: Sequence[LaunchGraph] = ()
+    graph: LaunchGraph, model: Model, state: State, scratch: Scratch, branches: Sequence[LaunchGraph] = ()
 ) -> None:
     """Append what precedes the first substep of a control step: clear the sensors, activate blocks.
 
@@ -173,26 +176,26 @@ def record_begin(
         model: the constants.
         state: the particles.
         scratch: the grid.
-        beside: branches that may run in parallel: they use neither sensors nor blocks, move no particles, and do not
+        branches: launches that may run in parallel: they use neither sensors nor blocks, move no particles, and do not
             read which environments have failed, because activation sets that.
     """
     sensors, marks = LaunchGraph(graph.device), LaunchGraph(graph.device)
     sensors.launch(clear_sensors, model.num_envs, [], [scratch.sensors])
-    record_marks(marks, model, state, scratch)
-    graph.parallel(sensors, marks, *beside)
+    record_first_activation(marks, model, state, scratch)
+    graph.parallel(sensors, marks, *branches)
 
 
-def record_marks(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
+def record_first_activation(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append: activate the blocks of all particles, and freeze the environments that have failed.
 
     Required at the start of a control step, because a reset may have moved the particles.
     """
-    activate_blocks(graph, model, state, scratch)
+    record_activation(graph, model, state, scratch)
     graph.launch(freeze, model.num_envs, [state.failure], [scratch.blocks])
 
 
 def record_end(
-    graph: LaunchGraph, model: Model, state: State, scratch: Scratch, beside: Sequence[LaunchGraph] = ()
+    graph: LaunchGraph, model: Model, state: State, scratch: Scratch, branches: Sequence[LaunchGraph] = ()
 ) -> None:
     """Append what follows the last substep of a control step: sensors that are read once a control step.
 
@@ -201,10 +204,10 @@ def record_end(
         model: the constants.
         state: the particles.
         scratch: the grid.
-        beside: branches that may run in parallel: they use no sensors, move no particles, and set no failure.
+        branches: launches that may run in parallel: they use no sensors, move no particles, and set no failure.
     """
     m, impulses, depths = model, LaunchGraph(graph.device), LaunchGraph(graph.device)
-    entries = scratch.sensors.sums.shape[1] // 3
+    entries = scratch.sensors.accumulators.shape[1] // 3
     impulses.launch(read_impulses, (m.num_envs, entries), [], [scratch.sensors])
     if m.contact.num_subjects > 1:
         depths.launch(
@@ -213,4 +216,4 @@ def record_end(
             [m.grid, m.particles, m.contact, state.x, scratch.blocks, scratch.velocity, state.failure],
             [scratch.sensors.penetration],
         )
-    graph.parallel(impulses, depths, *beside)
+    graph.parallel(impulses, depths, *branches)

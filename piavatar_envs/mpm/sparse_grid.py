@@ -35,11 +35,11 @@ from piavatar_envs.mpm.bspline import (
     stencil_inside,
 )
 from piavatar_envs.mpm.types import (
-    BESIDE,
+    CANDIDATE,
     FAILURE_BLOCKS,
     FAILURE_NONFINITE,
     FAILURE_OUT_OF_GRID,
-    TELLS,
+    NEAR_FIELD,
     Blocks,
     Grid,
     Model,
@@ -52,9 +52,9 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 THREADS = 128
 
 #: The same for blocks that have several fields.
-SHARED_AT_ONCE = 132 * 6
+CONTACT_BLOCKS_AT_ONCE = 132 * 6
 
-FEWEST_SHARED = 2
+MIN_CONTACT_BLOCKS = 2
 
 
 @wp.func_native("""
@@ -110,8 +110,8 @@ _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
 
 
-#: What ``held`` says of a slot that nobody has got yet.
-NOBODY = wp.constant(-1)
+#: What ``owner`` says of a slot that nobody has got yet.
+UNASSIGNED = wp.constant(-1)
 
 
 @wp.func
@@ -169,23 +169,23 @@ def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
 # A GPU finds out anew: to write it down and read it takes as long
 @wp.func_native(f"""
 #if !defined(__CUDA_ARCH__)
-wp::index(blocks.around, e, p) = tells ? {int(TELLS)} | (beside ? {int(BESIDE)} : 0) : 0;
+wp::index(blocks.candidate, e, p) = candidate ? {int(CANDIDATE)} | (near_field ? {int(NEAR_FIELD)} : 0) : 0;
 #endif
 """)
-def note_around(blocks: Blocks, e: int, p: int, tells: bool, beside: bool):
+def store_candidate(blocks: Blocks, e: int, p: int, candidate: bool, near_field: bool):
     """Note whether particle ``p`` tells its nodes where it is, and whether that is because another field is beside."""
     ...
 
 
 @wp.func_native(f"""
 #if !defined(__CUDA_ARCH__)
-return wp::index(blocks.around, e, p);
+return wp::index(blocks.candidate, e, p);
 #else
-return {int(TELLS) | int(BESIDE)};
+return {int(CANDIDATE) | int(NEAR_FIELD)};
 #endif
 """)
-def noted_around(blocks: Blocks, e: int, p: int) -> int:
-    """Bits ``TELLS`` and ``BESIDE`` of particle ``p``; what may be, where nobody notes what is."""
+def candidate_bits(blocks: Blocks, e: int, p: int) -> int:
+    """Bits ``CANDIDATE`` and ``NEAR_FIELD`` of particle ``p``; what may be, where nobody notes what is."""
     ...
 
 
@@ -215,7 +215,7 @@ def fields_next(grid: Grid, blocks: Blocks, block: int, e: int, n: int):
 @wp.func
 def first_record(grid: Grid, blocks: Blocks, e: int, f: int, block: int):
     """Record of the first node of a block that holds matter of field ``f``."""
-    return BLOCK_NODES * blocks.slot[e, f * grid.num_blocks + block]
+    return BLOCK_NODES * blocks.active[e, f * grid.num_blocks + block]
 
 
 @wp.func
@@ -225,46 +225,46 @@ def record_of(grid: Grid, blocks: Blocks, e: int, f: int, i: int, j: int, k: int
 
 
 @wp.func
-def slots_used(blocks: Blocks, e: int):
+def num_active(blocks: Blocks, e: int):
     """Slots of environment ``e`` that mean something, though more may have been asked for."""
-    return wp.min(blocks.count[e], blocks.held.shape[1])
+    return wp.min(blocks.num_active[e], blocks.owner.shape[1])
 
 
 @wp.func
-def held_by(grid: Grid, held: int):
-    """Field and block that a slot belongs to, from what ``held`` says of it."""
-    return wp.vec2i(held // grid.num_blocks, held % grid.num_blocks)
+def field_and_block(grid: Grid, owner: int):
+    """Field and block that a slot belongs to, from what ``owner`` says of it."""
+    return wp.vec2i(owner // grid.num_blocks, owner % grid.num_blocks)
 
 
 @wp.func
-def list_shared(blocks: Blocks, e: int, block: int, before: int):
+def list_contact_block(blocks: Blocks, e: int, block: int, before: int):
     """Note that a block which had the fields ``before`` gets another one, if that is its second."""
     if before != 0 and (before & (before - 1)) == 0:
-        n = wp.atomic_add(blocks.num_shared, e, 1)
-        if n < blocks.shared.shape[1]:
-            blocks.shared[e, n] = block
+        n = wp.atomic_add(blocks.num_contact_blocks, e, 1)
+        if n < blocks.contact_blocks.shape[1]:
+            blocks.contact_blocks[e, n] = block
 
 
 @wp.func
-def nodes_shared(blocks: Blocks, e: int):
+def num_contact_nodes(blocks: Blocks, e: int):
     """Nodes of the blocks of environment ``e`` that have several fields."""
-    return BLOCK_NODES * wp.min(blocks.num_shared[e], blocks.shared.shape[1])
+    return BLOCK_NODES * wp.min(blocks.num_contact_blocks[e], blocks.contact_blocks.shape[1])
 
 
 @wp.func
-def lacks_slots(failure: wp.array(dtype=int), e: int):
+def exceeds_active_blocks(failure: wp.array(dtype=int), e: int):
     """Whether slots have run out: some particles have none. No scatter and no grid pass sets that flag."""
     return (failure[e] & _BLOCKS) != 0
 
 
 @wp.func
-def shared_block(blocks: Blocks, e: int, n: int):
-    """Block with the ``n``-th of :func:`nodes_shared`, nonsense beyond: who asks need not know their number yet."""
-    return blocks.shared[e, wp.min(n // BLOCK_NODES, blocks.shared.shape[1] - 1)]
+def contact_block_of(blocks: Blocks, e: int, n: int):
+    """Block with the ``n``-th of :func:`num_contact_nodes`, nonsense beyond: who asks need not know their number yet."""
+    return blocks.contact_blocks[e, wp.min(n // BLOCK_NODES, blocks.contact_blocks.shape[1] - 1)]
 
 
 @wp.func
-def mark_block(grid: Grid, blocks: Blocks, block: int, field: int, e: int, failure: wp.array(dtype=int)):
+def activate_block(grid: Grid, blocks: Blocks, block: int, field: int, e: int, failure: wp.array(dtype=int)):
     """See that a field has a slot in a block; too few slots flag the environment."""
     bit = 1 << field
     if (blocks.fields[e, block] & bit) != 0:
@@ -272,42 +272,42 @@ def mark_block(grid: Grid, blocks: Blocks, block: int, field: int, e: int, failu
     before = wp.atomic_or(blocks.fields, e, block, bit)
     if (before & bit) != 0:
         return
-    list_shared(blocks, e, block, before)
-    slot = wp.atomic_add(blocks.count, e, 1)
-    if slot < blocks.held.shape[1]:
-        blocks.held[e, slot] = field * grid.num_blocks + block
-        blocks.slot[e, field * grid.num_blocks + block] = slot
+    list_contact_block(blocks, e, block, before)
+    active = wp.atomic_add(blocks.num_active, e, 1)
+    if active < blocks.owner.shape[1]:
+        blocks.owner[e, active] = field * grid.num_blocks + block
+        blocks.active[e, field * grid.num_blocks + block] = active
     else:
         wp.atomic_and(blocks.fields, e, block, ~bit)
         wp.atomic_or(failure, e, _BLOCKS)
 
 
 @wp.func
-def mark_blocks(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: int, failure: wp.array(dtype=int)):
-    """:func:`mark_block` of all blocks that a stencil touches."""
+def activate_stencil(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: int, failure: wp.array(dtype=int)):
+    """:func:`activate_block` of all blocks that a stencil touches."""
     touched = blocks_touched(base)
     for i in range(touched[0]):
         for j in range(touched[1]):
             for k in range(touched[2]):
                 block = block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)
-                mark_block(grid, blocks, block, field, e, failure)
+                activate_block(grid, blocks, block, field, e, failure)
 
 
 @wp.kernel
-def forget_blocks(grid: Grid, blocks: Blocks):
-    """No block holds matter; the slots are taken back by :func:`free_slots`."""
-    e, slot = wp.tid()
-    if slot < slots_used(blocks, e):
-        blocks.fields[e, blocks.held[e, slot] % grid.num_blocks] = 0
-        blocks.held[e, slot] = NOBODY
+def deactivate_blocks(grid: Grid, blocks: Blocks):
+    """No block holds matter; the slots are taken back by :func:`reset_active_blocks`."""
+    e, active = wp.tid()
+    if active < num_active(blocks, e):
+        blocks.fields[e, blocks.owner[e, active] % grid.num_blocks] = 0
+        blocks.owner[e, active] = UNASSIGNED
 
 
 @wp.kernel
-def free_slots(failure: wp.array(dtype=int), blocks: Blocks):
+def reset_active_blocks(failure: wp.array(dtype=int), blocks: Blocks):
     """No slot is in use."""
     e = wp.tid()
-    blocks.count[e] = 0
-    blocks.num_shared[e] = 0
+    blocks.num_active[e] = 0
+    blocks.num_contact_blocks[e] = 0
     blocks.frozen[e] = failure[e]
 
 
@@ -323,7 +323,7 @@ def freeze(failure: wp.array(dtype=int), blocks: Blocks):
 
 
 @wp.kernel
-def mark_particles(
+def activate_particle_blocks(
     grid: Grid,
     particles: Particles,
     x: wp.array2d(dtype=wp.vec3),
@@ -350,25 +350,25 @@ def mark_particles(
     mine = share_of_blocks(grid, e, field, base, takes)
     if mine[0] == -2:
         if takes:
-            mark_blocks(grid, blocks, base, field, e, failure)
+            activate_stencil(grid, blocks, base, field, e, failure)
         return
     for n in range(2):
         if mine[n] >= 0:
-            mark_block(grid, blocks, mine[n], field, e, failure)
+            activate_block(grid, blocks, mine[n], field, e, failure)
 
 
 #: What a block has in an array of a vector a node, and in one of halves of records.
 VECTORS, HALVES = wp.constant(int(BLOCK_NODES)), wp.constant(2 * int(BLOCK_NODES))
 
 
-@wp.func_native("return (wp::uint64)&wp::index(blocks.slot, e, n);")
-def address_of_slot(blocks: Blocks, e: int, n: int) -> wp.uint64:
-    """Address of ``blocks.slot[e, n]``, for :func:`slot_from`."""
+@wp.func_native("return (wp::uint64)&wp::index(blocks.active, e, n);")
+def active_address(blocks: Blocks, e: int, n: int) -> wp.uint64:
+    """Address of ``blocks.active[e, n]``, for :func:`active_from`."""
     ...
 
 
 @wp.func_native("return reinterpret_cast<const int*>(address)[n];")
-def slot_from(address: wp.uint64, n: int) -> int:
+def active_from(address: wp.uint64, n: int) -> int:
     """The ``n``-th slot from an address: neighbours are found without looking for the row again."""
     ...
 
@@ -381,19 +381,19 @@ def slab_records(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i, i: 
     holds for all slabs of a stencil in the same blocks. A block has ``of_block`` entries, ``VECTORS`` or ``HALVES``.
     """
     block = block_index(grid, base[0] + i, base[1], base[2])
-    slots = address_of_slot(blocks, e, f * grid.num_blocks + block)
-    lower = of_block * slot_from(slots, 0)
+    active_blocks = active_address(blocks, e, f * grid.num_blocks + block)
+    lower = of_block * active_from(active_blocks, 0)
     lower_last = lower
     upper = lower
     upper_last = lower
     if (base[2] & 3) > 1:
-        lower_last = of_block * slot_from(slots, 1) - 4
+        lower_last = of_block * active_from(active_blocks, 1) - 4
         upper_last = lower_last
     if (base[1] & 3) > 1:
-        upper = of_block * slot_from(slots, grid.blocks[2])
+        upper = of_block * active_from(active_blocks, grid.blocks[2])
         upper_last = upper
         if (base[2] & 3) > 1:
-            upper_last = of_block * slot_from(slots, grid.blocks[2] + 1) - 4
+            upper_last = of_block * active_from(active_blocks, grid.blocks[2] + 1) - 4
     return wp.vec4i(lower, lower_last, upper, upper_last)
 
 
@@ -412,39 +412,39 @@ def line_of_records(slab: wp.vec4i, base: wp.vec3i, i: int, j: int):
     return wp.vec3i(ends[0], wp.where((base[2] & 3) == 3, ends[1], ends[0]) + 1, ends[1] + 2)
 
 
-def notes_others(model: Model) -> bool:
+def tracks_contact_nodes(model: Model) -> bool:
     """Whether that is noted, and not told everywhere."""
-    return model.scatter == "runs" and model.contact.num_fields > 1
+    return model.path == "tiled" and model.contact.num_fields > 1
 
 
 @wp.func
-def told_at_first(blocks: Blocks, e: int, slot: int):
+def initial_contact_nodes(blocks: Blocks, e: int, active: int):
     """Bits of a slot's nodes that are told where particles are when blocks have just been marked: all or none."""
-    told = int(0)
-    if slot < slots_used(blocks, e):
-        mask = blocks.fields[e, blocks.held[e, slot] % blocks.fields.shape[1]]
+    candidates = int(0)
+    if active < num_active(blocks, e):
+        mask = blocks.fields[e, blocks.owner[e, active] % blocks.fields.shape[1]]
         if (mask & (mask - 1)) != 0:
-            told = -1
-    return told
+            candidates = -1
+    return candidates
 
 
 @wp.kernel
-def begin_others(blocks: Blocks):
+def reset_contact_nodes(blocks: Blocks):
     """Blocks have been marked."""
-    e, slot = wp.tid()
-    told = told_at_first(blocks, e, slot)
-    blocks.others[e, 2 * slot] = told
-    blocks.others[e, 2 * slot + 1] = told
+    e, active = wp.tid()
+    candidates = initial_contact_nodes(blocks, e, active)
+    blocks.contact_nodes[e, 2 * active] = candidates
+    blocks.contact_nodes[e, 2 * active + 1] = candidates
 
 
 @wp.func
-def has_bit(words: wp.array2d(dtype=int), e: int, first: int, local: int):
+def has_node_bit(words: wp.array2d(dtype=int), e: int, first: int, local: int):
     """Whether a node of a block has its bit, of the two words from ``first`` on."""
     return ((words[e, first + local // 32] >> (local & 31)) & 1) != 0
 
 
 @wp.func
-def note_bits(words: wp.array2d(dtype=int), e: int, first: int, local: int, here: bool):
+def store_node_bits(words: wp.array2d(dtype=int), e: int, first: int, local: int, here: bool):
     """Give a node of a block its bit, or take it away; all threads of a warp, with half a block, come here."""
     bits = lanes_with(here)
     if lane_of_thread() == 0:
@@ -452,31 +452,31 @@ def note_bits(words: wp.array2d(dtype=int), e: int, first: int, local: int, here
 
 
 @wp.func
-def had_others(others: wp.array2d(dtype=int), e: int, r: int):
+def had_contact(contact_nodes: wp.array2d(dtype=int), e: int, r: int):
     """Whether the node of a field's record ``r`` had another field in the substep whose bits these are.
 
     In the next, all particles of its own field have told it where they are.
     """
-    return has_bit(others, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES)
+    return has_node_bit(contact_nodes, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES)
 
 
 @wp.func
-def has_told(blocks: Blocks, e: int, r: int):
+def has_all_candidates(blocks: Blocks, e: int, r: int):
     """Whether all particles have told the node of a field's record ``r``, in a block that has several, where they are.
 
     They have where nobody notes who is where.
     """
-    if blocks.others.shape[1] == 1:
+    if blocks.contact_nodes.shape[1] == 1:
         return True
-    return had_others(blocks.others, e, r)
+    return had_contact(blocks.contact_nodes, e, r)
 
 
 @wp.func
-def note_others(blocks: Blocks, e: int, r: int, here: bool):
+def store_contact_node(blocks: Blocks, e: int, r: int, here: bool):
     """Note whether others are ``here``, at the node of record ``r``; all threads of a warp, with half a block, do."""
-    if blocks.others.shape[1] == 1:
+    if blocks.contact_nodes.shape[1] == 1:
         return
-    note_bits(blocks.others, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES, here)
+    store_node_bits(blocks.contact_nodes, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES, here)
 
 
 @wp.struct
@@ -489,9 +489,9 @@ class Sweep:
     stride: int  # nodes from one turn to the next
 
 
-def most_shared(model: Model) -> int:
+def max_contact_blocks(model: Model) -> int:
     """Most blocks of an environment that can have several fields, and so several slots; 1 where there is but one."""
-    return max(1, model.max_slots // 2) if model.contact.num_fields > 1 else 1
+    return max(1, model.max_active_blocks // 2) if model.contact.num_fields > 1 else 1
 
 
 def plan_sweep(model: Model) -> Sweep:
@@ -500,10 +500,10 @@ def plan_sweep(model: Model) -> Sweep:
     sweep = Sweep()
     if model.contact.num_fields == 1:
         return sweep
-    sweep.share = nodes
+    sweep.nodes = nodes
     if wp.get_device(model.device).is_cuda:
-        blocks = min(most_shared(model), max(FEWEST_SHARED, -(-SHARED_AT_ONCE // model.num_envs)))
-        sweep.share = 1
-    sweep.turns, sweep.stride = -(-most_shared(model) // blocks), nodes * blocks
-    sweep.threads = sweep.stride // sweep.share
+        blocks = min(max_contact_blocks(model), max(MIN_CONTACT_BLOCKS, -(-CONTACT_BLOCKS_AT_ONCE // model.num_envs)))
+        sweep.nodes = 1
+    sweep.visits, sweep.stride = -(-max_contact_blocks(model) // blocks), nodes * blocks
+    sweep.threads = sweep.stride // sweep.nodes
     return sweep

@@ -22,7 +22,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import warp as wp
 
-from piavatar_envs.core.arrays import group, matrices_of, vec4l
+from piavatar_envs.core.arrays import make_struct, matrices_of, vec4l
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,10 +43,10 @@ FAILURE_NAMES: dict[int, str] = {
 
 #: How the prescribed motion and the deformation gradient are kept apart (docs of :mod:`piavatar_envs.mpm.g2p`).
 DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
-#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.p2g`, ``groups`` and ``shared_substep``).
-SCATTERS = ("plain", "runs", "shared")
+#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.p2g`, ``tiles`` and ``shared_substep``).
+PATHS = ("plain", "tiled", "block")
 #: What is around a particle: perhaps a boundary or another field, so that it tells its nodes where it is; the latter.
-TELLS, BESIDE = wp.constant(1), wp.constant(2)
+CANDIDATE, NEAR_FIELD = wp.constant(1), wp.constant(2)
 SPLIT = wp.constant(0)
 PAPER = wp.constant(1)
 NO_STRESS = wp.constant(3)
@@ -91,7 +91,7 @@ class Particles:
     field: wp.array(dtype=int)  # (num_particles,) velocity field
     seam: wp.array(dtype=float)  # (num_particles,) 1 where two fields of a subject grow together, else 0
     sensor: wp.array(dtype=int)  # (num_particles,) row of the contact sensor, -1 for none
-    groups: wp.array(dtype=wp.vec2i)  # (G + 1,) :func:`piavatar_envs.mpm.cuda.tiled_p2g.begin_groups`
+    tiles: wp.array(dtype=wp.vec2i)  # (G + 1,) :func:`piavatar_envs.mpm.cuda.tiled_p2g.plan_tiles`
 
 
 @wp.struct
@@ -112,7 +112,7 @@ class Contact:
 class Sensors:
     """What contact did in this control step, and at the nodes in this substep."""
 
-    sums: wp.array2d(dtype=wp.int64)  # (num_envs, 3 * entries) see :mod:`piavatar_envs.mpm.contact_sensors`
+    accumulators: wp.array2d(dtype=wp.int64)  # (num_envs, 3 * entries) see :mod:`piavatar_envs.mpm.contact_sensors`
     boundary_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S) impulse of the colliders on a subject [N s]
     boundary_moment: wp.array2d(dtype=wp.vec3)  # (num_envs, S) moment of that about the world's origin [N m s]
     pair_impulse: wp.array2d(dtype=wp.vec3)  # (num_envs, S * S) on a by b, only a < b [N s]
@@ -149,24 +149,24 @@ class Blocks:
     """
 
     fields: wp.array2d(dtype=int)  # (num_envs, B) bit f for matter of field f
-    slot: wp.array2d(dtype=int)  # (num_envs, F * B) slot of a field's block; means something where its bit is set
-    held: wp.array2d(dtype=int)  # (num_envs, S) field * B + block of a slot
-    count: wp.array(dtype=int)  # (num_envs,) slots in use
-    shared: wp.array2d(dtype=int)  # (num_envs, S // 2) blocks that have got a second field, as they got it
-    num_shared: wp.array(dtype=int)  # (num_envs,) how many, also such as found no slot for it
-    swept: wp.array(dtype=int)  # (num_envs,) slots whose records the last grid pass has written
+    active: wp.array2d(dtype=int)  # (num_envs, F * B) slot of a field's block; means something where its bit is set
+    owner: wp.array2d(dtype=int)  # (num_envs, S) field * B + block of a slot
+    num_active: wp.array(dtype=int)  # (num_envs,) slots in use
+    contact_blocks: wp.array2d(dtype=int)  # (num_envs, S // 2) blocks that have got a second field, as they got it
+    num_contact_blocks: wp.array(dtype=int)  # (num_envs,) how many, also such as found no slot for it
+    num_updated: wp.array(dtype=int)  # (num_envs,) slots whose records the last grid pass has written
     frozen: wp.array(dtype=int)  # (num_envs,) not 0: had failed when this was last looked at, see :func:`freeze`
     # (num_envs, S) not 0: a stencil that begins in this slot's block may lie in one of another field; of large bodies
-    beside: wp.array2d(dtype=int)
-    others: wp.array2d(
+    near_field: wp.array2d(dtype=int)
+    contact_nodes: wp.array2d(
         dtype=int
     )  # (num_envs, 2 S) bits of nodes, see :mod:`piavatar_envs.mpm.sparse_grid`; of those, too
     # (num_envs, num_particles) TELLS and BESIDE, as the scatter has found them in this substep; of a CPU
-    around: wp.array2d(dtype=wp.uint8)
+    candidate: wp.array2d(dtype=wp.uint8)
 
 
 @wp.struct
-class Sums:
+class Accumulators:
     """What particles add up on nodes, zero between substeps; see :mod:`piavatar_envs.mpm.grid_arrays`.
 
     ``(num_envs, 64 S)``; ``value`` and ``fixed``, of halves of records, ``(num_envs, 128 S)``.
@@ -179,23 +179,25 @@ class Sums:
     fixed: wp.array2d(dtype=vec4l)  # the same in units
     offset: wp.array2d(dtype=wp.vec4)  # sum of w m (x_i - x_p), of w m of seam particles; near others and boundaries
     offset_fixed: wp.array2d(dtype=vec4l)
-    mass_unit: wp.array2d(dtype=float)  # [kg]
-    momentum_unit: wp.array2d(dtype=float)  # [kg m/s]
-    told: wp.array2d(dtype=int)  # (num_envs, S) not 0: nodes of this slot were told where particles are and go
+    mass_quantum: wp.array2d(dtype=float)  # [kg]
+    momentum_quantum: wp.array2d(dtype=float)  # [kg m/s]
+    candidates: wp.array2d(dtype=int)  # (num_envs, S) not 0: nodes of this slot were told where particles are and go
 
 
 @wp.struct
-class Room:
+class Arena:
     """What lies where in the shared memory of a CUDA block, in words; see :mod:`piavatar_envs.mpm.cuda.block_grid`."""
 
-    numbers: int  # of the bricks, two a word
-    told: int  # bits of particles that tell their place
+    numbers: int  # of the subblocks, two a word
+    candidates: int  # bits of particles that tell their place
     near: int  # bytes of slots: what is near, see :mod:`piavatar_envs.mpm.cuda.block_grid`
-    places: int  # of the bricks: 8 slot + brick in block, and bits of planes near boundaries, two a word
-    bricks: int
+    places: int  # of the subblocks: 8 slot + subblock in block, and bits of planes near boundaries, two a word
+    subblocks: int
     kinematic: int  # of kinematic momenta, three a node
-    capacity: int  # bricks that the room has; one more takes what is not of this round
-    part: wp.array(dtype=wp.vec3i)  # (parts,) first particle, one after the last, bits of the fields that are theirs
+    capacity: int  # subblocks that the room has; one more takes what is not of this round
+    partition: wp.array(
+        dtype=wp.vec3i
+    )  # (parts,) first particle, one after the last, bits of the fields that are theirs
     speed: wp.array2d(dtype=float)  # (num_envs, fields) at which momenta are counted [m/s], 0 for not known
 
 
@@ -230,8 +232,8 @@ class Model:
     """Everything that does not change: grid, step, particle constants and boundaries.
 
     ``sound_speed`` is the fastest elastic wave of any particle [m/s]; ``moving_boundaries`` says whether any boundary
-    may have a velocity; ``num_sensors`` counts the rows of the contact sensor; ``max_slots`` the blocks with matter an
-    environment can hold, by fields, marked anew after ``marks_every`` substeps; ``scatter`` is one of :data:`SCATTERS`.
+    may have a velocity; ``num_sensors`` counts the rows of the contact sensor; ``max_active_blocks`` the blocks with matter an
+    environment can hold, by fields, marked anew after ``activation_interval`` substeps; ``scatter`` is one of :data:`PATHS`.
     """
 
     num_envs: int
@@ -247,9 +249,9 @@ class Model:
     sound_speed: float
     moving_boundaries: bool
     num_sensors: int
-    max_slots: int
-    marks_every: int
-    scatter: str
+    max_active_blocks: int
+    activation_interval: int
+    path: str
 
     @property
     def num_blocks(self) -> int:
@@ -275,7 +277,7 @@ class State:
     @property
     def kinematic(self) -> Kinematic:
         """The prescribed motion."""
-        return group(Kinematic, vk=self.vk, spin=self.spin)
+        return make_struct(Kinematic, vk=self.vk, spin=self.spin)
 
     def numpy(self) -> dict[str, np.ndarray]:
         """A copy of every array on the host, matrices as such: ``(num_envs, num_particles, 3, 3)``."""
@@ -303,9 +305,9 @@ class Scratch:
     """
 
     blocks: Blocks
-    sums: Sums
+    accumulators: Accumulators
     velocity: wp.array
-    facing: wp.array
+    volume_gradient: wp.array
     sensors: Sensors
-    room: Room
-    large_room: bool
+    arena: Arena
+    large_arena: bool

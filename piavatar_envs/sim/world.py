@@ -21,7 +21,7 @@ from piavatar_envs.config.schema import MOST_SUBSTEPS, select_joints
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider, make_boundaries, place_colliders
 from piavatar_envs.mpm.contact_sensors import clear_masked_sensors
-from piavatar_envs.mpm.memory import allocate, estimate_slots
+from piavatar_envs.mpm.memory import allocate, estimate_active_blocks
 from piavatar_envs.mpm.model import build_model, choose_num_substeps, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
@@ -115,7 +115,7 @@ class Simulation:
             decoupling=physics.decoupling,
             colliders=self.subjects.colliders,
             fields=self.subjects.fields,
-            max_slots=estimate_slots(rest, self.subjects.matter.field, self.dx),
+            max_active_blocks=estimate_active_blocks(rest, self.subjects.matter.field, self.dx),
             rest=rest,
             sound_speed=wave,
         )

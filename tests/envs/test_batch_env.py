@@ -168,6 +168,6 @@ def test_what_goes_beside_marks_and_sensors(make_env, task, moves):
     launches = make_env(task).unwrapped.batch.step_graph._launches
     forks = {launch.kernel.key: launch.fork for launch in reversed(launches)}  # of the first launch of each
     begins = "set_springs" if moves else "begin_control"
-    assert forks[begins] == forks["mark_particles"] == forks["clear_sensors"] > 0
+    assert forks[begins] == forks["activate_particle_blocks"] == forks["clear_sensors"] > 0
     assert (forks["track_bones"] == forks["read_impulses"] > 0) != moves
     assert ("put_in_place" in forks) == moves and forks.get("put_in_place", 0) in (0, forks["track_bones"])

@@ -31,7 +31,7 @@ _INCLUDES = '#include "deterministic.h"\n'
 _BEGIN = "    const size_t task_index = payload->block_first + (size_t)lane;\n"
 _RUN = r"(    \w+_cpu_kernel_(?:for|back)ward<false>\(\*dim, task_index, payload->args(?:, payload->adj_args)?\);\n)"
 #: What a snippet has as its shared memory, and how many words a kernel reserves.
-_ROOM = "extern __shared__ int piavatar_room[];"
+_ROOM = "extern __shared__ int piavatar_arena[];"
 _RESERVED = r"tile_alloc_empty<wp::int32,wp::tile_shape_t<(\d+)>"
 #: Instructions in PTX, and what they do.
 _PTX = (
@@ -70,7 +70,7 @@ def on_cpu(source: str) -> str:
     """
     words = max((int(words) for words in re.findall(_RESERVED, source)), default=0)
     source = source.replace(_INCLUDES, f'{_INCLUDES}#define GPU_ROOM_WORDS {words}\n#include "{_HEADER}"\n', 1)
-    source = source.replace("__CUDA_ARCH__", "GPU_ARCH").replace(_ROOM, "int* const piavatar_room = gpu::room;")
+    source = source.replace("__CUDA_ARCH__", "GPU_ARCH").replace(_ROOM, "int* const piavatar_arena = gpu::room;")
     for pattern, replacement in _PTX:
         source = re.sub(pattern, replacement, source)
     begin = """\

@@ -106,15 +106,19 @@ def test_substeps_equal_control_steps(simulate):
 def test_timed_reports_every_kernel(simulate):
     sim = simulate(**SCENE)
     seconds = sim.graph.timed(1)
-    once = {"forget_blocks", "free_slots", "mark_particles", "freeze", "read_impulses"}
-    scatters = {"plain": "particles_to_grid", "runs": "runs_to_grid"}
-    each = {scatters.get(sim.model.scatter), "update_grid", "grid_to_particles"}
-    if sim.model.scatter == "shared":
-        once |= {"forget_speeds"}
+    once = {"deactivate_blocks", "reset_active_blocks", "activate_particle_blocks", "freeze", "read_impulses"}
+    deposits = {"plain": "p2g", "tiled": "tiled_p2g"}
+    each = {deposits.get(sim.model.path), "update_grid", "g2p"}
+    if sim.model.path == "block":
+        once |= {"reset_speeds"}
         each = {"substep_in_large_room"}
     assert set(seconds) == once | each
     assert all(value > 0.0 for value in seconds.values())
-    marks = {"forget_blocks", "free_slots", "mark_particles"}  # at the start, and after 8, 16 and 24 substeps
+    marks = {
+        "deactivate_blocks",
+        "reset_active_blocks",
+        "activate_particle_blocks",
+    }  # at the start, and after 8, 16 and 24 substeps
     assert len(sim.graph) == len(once - marks) + 4 * len(marks) + len(each) * 25
 
 

@@ -76,7 +76,7 @@ def test_ground_presses_below_the_middle(simulate):
     at = np.array([0.13, -0.08])
     block = {**BLOCK, "lower": (*(at - 0.1), 0.0), "upper": (*(at + 0.1), 0.1)}
     sim = simulate(**block, gravity=(0.0, 0.0, -9.81), planes=[(GROUND, 0.0, 0.5)]).run(30)
-    sim.scratch.sensors.sums.zero_()
+    sim.scratch.sensors.accumulators.zero_()
     sensors = sim.run(30).scratch.sensors
     impulse, moment = sensors.boundary_impulse.numpy()[0, 0], sensors.boundary_moment.numpy()[0, 0]
     middle = sim.get("x").mean(0)[:2]
@@ -86,7 +86,7 @@ def test_ground_presses_below_the_middle(simulate):
 
 def test_ground_bears_the_weight(simulate):
     sim = simulate(**BLOCK, gravity=(0.0, 0.0, -9.81), planes=[(GROUND, 0.0, 0.5)]).run(30)
-    sim.scratch.sensors.sums.zero_()
+    sim.scratch.sensors.accumulators.zero_()
     steps = 30
     impulse = sim.run(steps).scratch.sensors.boundary_impulse.numpy()[0, 0]
     weight = sim.totals().mass * 9.81
@@ -111,16 +111,16 @@ def test_nothing_passes_a_plane(simulate, how, speed):
 def test_what_tells_the_nodes_how_it_is_driven_goes_no_other_way(simulate):
     """Kinematic momentum is for contact: a body just above the ground does what it does where there is none."""
     spin = np.array([0.5, -1.0, 2.0])
-    free, told = (simulate(**BLOCK, planes=planes, num_substeps=15) for planes in ([], [(GROUND, -0.02, 0.5)]))
+    free, candidates = (simulate(**BLOCK, planes=planes, num_substeps=15) for planes in ([], [(GROUND, -0.02, 0.5)]))
     vk = np.cross(spin, free.rest) + [0.3, 0.0, 2.0]
     stretch = np.diag([1.02, 0.99, 1.0])
-    for sim in (free, told):
+    for sim in (free, candidates):
         sim.set(vk=vk, spin=spin, u=[0.0, 0.1, 0.5], F=stretch).run()
         assert sim.failures == [0]
-    assert told.get("x")[:, 2].min() > 0.05  # it is on its way
+    assert candidates.get("x")[:, 2].min() > 0.05  # it is on its way
     for name, atol in (("x", 1e-6), ("u", 2e-5), ("F", 1e-5)):
-        np.testing.assert_allclose(told.get(name), free.get(name), atol=atol, err_msg=name)
-    assert told.scratch.sensors.boundary_impulse.numpy()[0, 0].tolist() == [0.0, 0.0, 0.0]
+        np.testing.assert_allclose(candidates.get(name), free.get(name), atol=atol, err_msg=name)
+    assert candidates.scratch.sensors.boundary_impulse.numpy()[0, 0].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_own_prescribed_motion_meets_the_ground_too(simulate):
@@ -158,7 +158,7 @@ def test_corner_of_two_planes(simulate):
     """Pulled into a corner, a block rests on both planes."""
     gravity = (-5.0, 0.0, -9.81)
     sim = simulate(**BLOCK, gravity=gravity, planes=[(GROUND, 0.0, 0.0), ((1.0, 0.0, 0.0), -0.1, 0.0)]).run(30)
-    sim.scratch.sensors.sums.zero_()
+    sim.scratch.sensors.accumulators.zero_()
     impulse = sim.run(15).scratch.sensors.boundary_impulse.numpy()[0, 0]
     expected = -np.array(gravity) * sim.totals().mass * 15 * sim.model.control_dt
     assert impulse == pytest.approx(expected, abs=0.02 * expected[2])
@@ -181,4 +181,4 @@ def test_scratch_is_clear_between_steps(simulate, planes, num_substeps):
     for _ in range(4):
         sim.run()
         assert sim.failures == [0]
-        assert sim.sums_are_clear
+        assert sim.accumulators_are_clear

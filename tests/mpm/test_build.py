@@ -94,7 +94,7 @@ def test_model_is_what_was_asked_for(model_of):
     assert list(model.step.gravity) == [0.0, 1.0, -2.0]
     assert model.particles.mass.numpy() == pytest.approx(np.ones((1, 8)))
     state, scratch = allocate(model)
-    assert state.x.shape == (2, 8) and scratch.velocity.shape == (2, 2 * 64 * model.max_slots)
+    assert state.x.shape == (2, 8) and scratch.velocity.shape == (2, 2 * 64 * model.max_active_blocks)
     assert np.array_equal(state.numpy()["F"], np.broadcast_to(np.eye(3), (2, 8, 3, 3)))
 
 
@@ -153,23 +153,23 @@ def test_too_fine_grid():
 def test_slots(model_of):
     """As many as all particles can touch at once, fewer if asked for; a record's stride is 32-bit."""
     blocks = model_of().num_blocks
-    assert model_of().max_slots == min(8 * 8, blocks) and model_of(max_slots=5).max_slots == 5
-    for slots in (0, -1):
-        with pytest.raises(ValueError, match=rf"{slots} blocks of nodes.*at least 1"):
-            model_of(max_slots=slots)
+    assert model_of().max_active_blocks == min(8 * 8, blocks) and model_of(max_active_blocks=5).max_active_blocks == 5
+    for active_blocks in (0, -1):
+        with pytest.raises(ValueError, match=rf"{active_blocks} blocks of nodes.*at least 1"):
+            model_of(max_active_blocks=active_blocks)
     fine = make_grid((0, 0, 0), (4, 4, 4), 0.005)
     field = np.zeros(10**6, int)
-    assert memory.bound_slots(memory.MOST_SLOTS - 1, field, fine, 1) * 64 * 64 < 2**31
-    with pytest.raises(ValueError, match=rf"{memory.MOST_SLOTS} blocks.*less than {memory.MOST_SLOTS}"):
-        memory.bound_slots(memory.MOST_SLOTS, field, fine, 1)
+    assert memory.bound_active_blocks(memory.MAX_ACTIVE_BLOCKS - 1, field, fine, 1) * 64 * 64 < 2**31
+    with pytest.raises(ValueError, match=rf"{memory.MAX_ACTIVE_BLOCKS} blocks.*less than {memory.MAX_ACTIVE_BLOCKS}"):
+        memory.bound_active_blocks(memory.MAX_ACTIVE_BLOCKS, field, fine, 1)
 
 
 def test_unknown_scatter_is_refused(model_of, device):
     with pytest.raises(ValueError, match=r"unknown scatter 'heap'.*plain, runs"):
-        model_of(scatter="heap")
+        model_of(path="heap")
     if device == "cpu":
-        with pytest.raises(ValueError, match=r"scatter='runs' needs a GPU.*cpu takes 'plain'"):
-            model_of(scatter="runs")
+        with pytest.raises(ValueError, match=r"path='tiled' needs a GPU.*cpu takes 'plain'"):
+            model_of(path="tiled")
 
 
 def test_domain_lies_inside_its_grid():
@@ -191,21 +191,21 @@ def test_memory_estimate(model_of, fields):
     """Close to what the arrays take."""
     model = model_of(num_envs=3, fields=Fields(tuple(range(fields))))
     state, scratch = allocate(model)
-    sums, blocks = scratch.sums, scratch.blocks
+    sums, blocks = scratch.accumulators, scratch.blocks
     grid = [
         sums.value,
         sums.offset,
         sums.fixed,
         sums.offset_fixed,
         scratch.velocity,
-        scratch.facing,
+        scratch.volume_gradient,
         scratch.sensors.node,
         scratch.sensors.touched,
     ]
-    grid += [blocks.fields, blocks.slot, blocks.held, blocks.shared]
+    grid += [blocks.fields, blocks.active, blocks.owner, blocks.contact_blocks]
     arrays = {array.ptr: array.capacity for array in [*vars(state).values(), *grid]}  # two may be one
     taken = sum(arrays.values())
-    layout = model.max_slots, fields, model.num_blocks, model.scatter
+    layout = model.max_active_blocks, fields, model.num_blocks, model.path
     estimate = estimate_bytes(3, model.num_particles, *layout)
     assert taken <= estimate <= 1.25 * taken
 

@@ -51,7 +51,7 @@ def query(
 
 
 @wp.kernel
-def touch(
+def collide_pair(
     boundaries: Boundaries,
     env: wp.array(dtype=int),
     field: wp.array(dtype=int),
@@ -100,13 +100,13 @@ class Solids:
         distance, velocity, nearest = (array.numpy().astype(float) for array in out)
         return distance[:, :3], distance[:, 3], velocity, nearest
 
-    def touch(self, x, v, gate=np.inf, field=0, env=0):
+    def collide_pair(self, x, v, gate=np.inf, field=0, env=0):
         """Velocity after contact and velocity without approach, both ``(N, 3)``."""
         n = len(x)
         out = [wp.full(n, wp.vec3(np.nan), dtype=wp.vec3, device=self.device) for _ in range(2)]
         moving = [self.upload(value, wp.vec3, (n, 3)) for value in (x, v)]
         inputs = [self.boundaries, self.indices(env, n), self.indices(field, n), *moving, float(gate)]
-        wp.launch(touch, n, inputs, out, device=self.device)
+        wp.launch(collide_pair, n, inputs, out, device=self.device)
         return tuple(array.numpy().astype(float) for array in out)
 
     def move(self, dt, steps=1):
@@ -242,7 +242,7 @@ def test_without_colliders_nothing_is_near_and_nothing_happens(device):
     solids.boundaries.count = 0  # arrays of one entry stand for none
     x, v = random_points(50), random_points(50, seed=4)
     assert solids.query(x)[3].min() > 1e5
-    for after in solids.touch(x, v):
+    for after in solids.collide_pair(x, v):
         assert np.array_equal(after, v.astype(np.float32).astype(float))
 
 
@@ -252,7 +252,7 @@ def test_environments_have_colliders_and_friction_of_their_own(device):
     x, env = np.array([[3.0, 0, 0]] * 3), np.arange(3)
     assert own.query(x, env=env)[1] == pytest.approx([2.7, 1.7, np.sqrt(13.0) - 0.3], abs=1e-6)
     floor = Solids(device, ["plane"], (0, 0, 0), Rotation.identity(), friction=[[0.0], [0.5], [2.0]])
-    after, _ = floor.touch(x, np.array([[1.0, 0, -1.0]] * 3), env=env)
+    after, _ = floor.collide_pair(x, np.array([[1.0, 0, -1.0]] * 3), env=env)
     assert after[:, 0] == pytest.approx([1.0, 0.5, 0.0], abs=1e-6)
     shared = Solids(device, ["sphere"], (0, 0, 0), Rotation.identity())
     assert shared.query(x, env=env)[1] == pytest.approx([2.7] * 3, abs=1e-6)
@@ -280,7 +280,7 @@ def test_contact_with_a_moving_surface_follows_coulomb(device, kind):
     field = rng.integers(0, 4, 3000)
     normal, _, surface, _ = solid.query(x)
     assert np.abs(surface - (velocity + np.cross(spin, x - POSITION))).max() < 1e-5
-    after, _ = solid.touch(x, v, field=field)
+    after, _ = solid.collide_pair(x, v, field=field)
     assert np.abs(after - coulomb(normal, surface, coefficients[field], v)).max() < 2e-5
 
     # what the law means, apart from its formula
@@ -303,14 +303,14 @@ def test_contact_with_a_moving_surface_follows_coulomb(device, kind):
 def test_a_belt_drags_until_it_need_not(device):
     """A floor that moves at 1 m/s under matter pressed on at 0.5 m/s: faster by friction times that, at most along."""
     belt = Solids(device, ["plane"], (0, 0, 0), Rotation.identity(), velocity=(1.0, 0, 0), friction=[0.4, 1.0, 3.0])
-    after, _ = belt.touch(np.zeros((3, 3)), np.array([[0.0, 0, -0.5]] * 3), field=np.arange(3))
+    after, _ = belt.collide_pair(np.zeros((3, 3)), np.array([[0.0, 0, -0.5]] * 3), field=np.arange(3))
     assert after == pytest.approx(np.array([[0.2, 0, 0], [0.5, 0, 0], [1.0, 0, 0]]), abs=1e-6)
 
 
 def test_a_ram_pushes_what_rests_and_what_is_too_slow(device):
     ram = Solids(device, ["box"], (0, 0, 0), Rotation.identity(), velocity=(2.0, 0, 0))
     x, v = np.array([[0.21, 0, 0]] * 3), np.array([[0.0, 1.0, 0], [1.0, 0, 0], [3.0, 0, 0]])
-    after, _ = ram.touch(x, v, gate=0.02)
+    after, _ = ram.collide_pair(x, v, gate=0.02)
     assert after == pytest.approx(np.array([[2.0, 1.0, 0], [2.0, 0, 0], [3.0, 0, 0]]), abs=1e-6)
 
 
@@ -319,7 +319,7 @@ def test_fields_and_colliders_have_friction_of_their_own(device):
     table = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])  # three fields, two colliders
     for b, heights in enumerate([((0, 0, 0), (0, 0, -5.0)), ((0, 0, -5.0), (0, 0, 0))]):
         floors = Solids(device, ["plane", "plane"], [heights], Rotation.identity(2), friction=table)
-        after, _ = floors.touch(np.zeros((3, 3)), np.array([[1.0, 0, -1.0]] * 3), gate=0.1, field=np.arange(3))
+        after, _ = floors.collide_pair(np.zeros((3, 3)), np.array([[1.0, 0, -1.0]] * 3), gate=0.1, field=np.arange(3))
         assert after[:, 0] == pytest.approx(1.0 - table.reshape(3, 2)[:, b], abs=1e-6)
 
 
@@ -327,7 +327,7 @@ def test_the_gate_is_a_distance(device):
     floor = Solids(device, ["plane"], (0, 0, 0.1), Rotation.identity(), friction=0.2)
     x = np.array([[0, 0, 0.1 + d] for d in (-5.0, 0.0, 0.029, 0.031, 1.0)])
     v = np.array([[0.3, 0, -1.0]] * 5)
-    for after, slid in zip(floor.touch(x, v, gate=0.03), (0.1, 0.3), strict=True):
+    for after, slid in zip(floor.collide_pair(x, v, gate=0.03), (0.1, 0.3), strict=True):
         assert after == pytest.approx(np.array([[slid, 0, 0]] * 3 + [[0.3, 0, -1.0]] * 2), abs=1e-6)
 
 
@@ -335,7 +335,7 @@ def test_in_a_corner_of_two_walls_nothing_approaches_either(device):
     turns = Rotation.from_rotvec([[0, 0, 0], [0, 0.5 * np.pi, 0]])  # normals +z and +x
     corner = Solids(device, ["plane", "plane"], (0, 0, 0), turns)
     v = np.random.default_rng(7).normal(size=(500, 3))
-    for after in corner.touch(np.zeros((500, 3)), v):
+    for after in corner.collide_pair(np.zeros((500, 3)), v):
         assert after == pytest.approx(np.maximum(v, [0.0, -np.inf, 0.0]), abs=1e-6)
 
 
@@ -345,7 +345,7 @@ def test_what_the_grid_did_not_see_only_stops_approaching(device, kind):
     solid = Solids(device, [kind], velocity=(5.0, 4.0, -3.0), spin=(1.0, 2.0, 3.0), friction=10.0)
     x, v = world(random_points(seed=8)), np.random.default_rng(9).normal(size=(3000, 3))
     normal = solid.query(x)[0]
-    _, unseen = solid.touch(x, v)
+    _, unseen = solid.collide_pair(x, v)
     vn = np.einsum("ni,ni->n", v, normal)
     assert unseen == pytest.approx(v - np.minimum(vn, 0.0)[:, None] * normal, abs=1e-5)
 

@@ -88,7 +88,7 @@ def test_blocks_with_several_fields_are_listed_once(meet):
         fields = blocks.fields.numpy()[0]
         several = np.flatnonzero(fields & (fields - 1))
         assert len(several) > 3 and (np.bitwise_count(fields) == 3).any()
-        assert sorted(blocks.shared.numpy()[0, : blocks.num_shared.numpy()[0]]) == several.tolist()
+        assert sorted(blocks.contact_blocks.numpy()[0, : blocks.num_contact_blocks.numpy()[0]]) == several.tolist()
 
 
 def test_three_bodies_at_a_node(meet):
@@ -131,11 +131,11 @@ def test_bodies_that_separate_are_not_held(meet, equal, speed, device):
 
     In the same kernels and groups of particles: a GPU has others for a world of one body.
     """
-    scatter = "plain" if device == "cpu" else "runs"
+    path = "plain" if device == "cpu" else "tiled"
     bodies = [LEFT | {"velocity": (-speed, 0.3, 0.0)}, RIGHT | {"velocity": (speed, 0.3, 0.0)}]
-    both = meet(bodies, friction=1.0, scatter=scatter)
-    alone = [meet([bodies[0], moved(bodies[1], 0.4)], scatter=scatter)]
-    alone.append(meet([moved(bodies[0], -0.4), bodies[1]], scatter=scatter))
+    both = meet(bodies, friction=1.0, path=path)
+    alone = [meet([bodies[0], moved(bodies[1], 0.4)], path=path)]
+    alone.append(meet([moved(bodies[0], -0.4), bodies[1]], path=path))
     for _ in range(3):
         both.run()
         for field, single in enumerate(alone):
@@ -161,7 +161,7 @@ def test_far_bodies_do_not_know_each_other(meet, device):
     plane = [((0.0, 0.0, 1.0), -0.11, 0.5)]
     near = BLOCK | {"velocity": (-0.5, 0.0, -2.0)}
     gravity = {"gravity": (0.0, 0.0, -9.81), "planes": plane, "num_substeps": 15}
-    gravity["scatter"] = "plain" if device == "cpu" else "runs"
+    gravity["path"] = "plain" if device == "cpu" else "tiled"
     both = meet([near, far], friction=0.5, **gravity).run(3)
     assert (both.scratch.blocks.fields.numpy() == 3).any()
     for field, bodies in enumerate(([near, moved(far, 0.4)], [moved(near, -0.4), far])):

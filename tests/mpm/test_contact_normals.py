@@ -10,15 +10,15 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.bspline import block_corner, node_of_block, node_position
 from piavatar_envs.mpm.contact_normals import (
-    find_facing,
+    find_volume_gradients,
     shared_normal,
     surface_gap,
     volume_at,
 )
 from piavatar_envs.mpm.grid_arrays import mass_of, offset_at
-from piavatar_envs.mpm.solver import record_marks, record_p2g
-from piavatar_envs.mpm.sparse_grid import THREADS, held_by, plan_sweep, record_of
-from piavatar_envs.mpm.types import Blocks, Contact, Grid, Sums
+from piavatar_envs.mpm.solver import record_first_activation, record_p2g
+from piavatar_envs.mpm.sparse_grid import THREADS, field_and_block, plan_sweep, record_of
+from piavatar_envs.mpm.types import Accumulators, Blocks, Contact, Grid
 
 DX = 0.05
 #: Two bodies that touch in the plane z = 0: first halves of a cube, then a block on a table.
@@ -31,9 +31,9 @@ def look_at_nodes(
     grid: Grid,
     contact: Contact,
     blocks: Blocks,
-    sums: Sums,
+    sums: Accumulators,
     node_velocity: wp.array2d(dtype=wp.vec4),
-    node_facing: wp.array2d(dtype=wp.vec4),
+    volume_gradient: wp.array2d(dtype=wp.vec4),
     # out
     volume: wp.array2d(dtype=float),
     normal: wp.array(dtype=wp.vec3),
@@ -42,22 +42,22 @@ def look_at_nodes(
     position: wp.array(dtype=wp.vec3),
 ):
     """The nodes of the blocks that both fields share, where the first of them has its slot."""
-    slot, local = wp.tid()
-    if slot >= blocks.count[0]:
+    active, local = wp.tid()
+    if active >= blocks.num_active[0]:
         return
-    held = held_by(grid, blocks.held[0, slot])
-    if held[0] != 0 or (blocks.fields[0, held[1]] & 3) != 3:
+    owner = field_and_block(grid, blocks.owner[0, active])
+    if owner[0] != 0 or (blocks.fields[0, owner[1]] & 3) != 3:
         return
-    node = node_of_block(block_corner(grid, held[1]), local)
+    node = node_of_block(block_corner(grid, owner[1]), local)
     a = record_of(grid, blocks, 0, 0, node[0], node[1], node[2])
     b = record_of(grid, blocks, 0, 1, node[0], node[1], node[2])
     m_a = mass_of(node_velocity, 0, a)  # not yet velocities
     m_b = mass_of(node_velocity, 0, b)
     if m_a > 0.0 and m_b > 0.0:
-        n = 64 * slot + local
+        n = 64 * active + local
         volume[0, n] = volume_at(grid, contact, 0, 0, m_a)
         volume[1, n] = volume_at(grid, contact, 0, 1, m_b)
-        n_ab = shared_normal(grid, blocks, 0, node, 0, 1, node_facing)
+        n_ab = shared_normal(grid, blocks, 0, node, 0, 1, volume_gradient)
         of_a = offset_at(grid, sums, 0, 0, a)
         of_b = offset_at(grid, sums, 0, 1, b)
         apart = of_a / m_a - of_b / m_b
@@ -74,26 +74,33 @@ class Look:
     def __init__(self, sim) -> None:
         model, state, scratch = sim.model, sim.state, sim.scratch
         graph = LaunchGraph(model.device)
-        record_marks(graph, model, state, scratch)
+        record_first_activation(graph, model, state, scratch)
         record_p2g(graph, model, state, scratch)
         sweep = plan_sweep(model)
-        found = [scratch.sums, scratch.velocity, scratch.facing, scratch.sensors]
+        found = [scratch.accumulators, scratch.velocity, scratch.volume_gradient, scratch.sensors]
         graph.launch(
-            find_facing,
+            find_volume_gradients,
             sweep.threads,
             [model.grid, model.contact, sweep, scratch.blocks, state.failure],
             found,
             block_dim=THREADS,
         )
-        count = 64 * model.max_slots
+        count = 64 * model.max_active_blocks
 
         def zeros(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=model.device)
 
         volume, gap = zeros((2, count), float), zeros(count, float)
         normal, alone, position = (zeros(count, wp.vec3) for _ in range(3))
-        inputs = [model.grid, model.contact, scratch.blocks, scratch.sums, scratch.velocity, scratch.facing]
-        graph.launch(look_at_nodes, (model.max_slots, 64), inputs, [volume, normal, alone, gap, position])
+        inputs = [
+            model.grid,
+            model.contact,
+            scratch.blocks,
+            scratch.accumulators,
+            scratch.velocity,
+            scratch.volume_gradient,
+        ]
+        graph.launch(look_at_nodes, (model.max_active_blocks, 64), inputs, [volume, normal, alone, gap, position])
         graph.run()
         a, b = volume.numpy()
         shared = self.shared = (a > 1e-4) & (b > 1e-4)
@@ -107,7 +114,7 @@ class Look:
         return float((self.weight * angle).sum() / self.weight.sum())
 
 
-def placed(meet, boxes, gap=0.0, turn=None, **kwargs):
+def empty_deposit(meet, boxes, gap=0.0, turn=None, **kwargs):
     """Two boxes, the upper lifted by ``gap`` [grid spacings], turned against the grid and off its nodes."""
     upper = tuple(tuple(np.add(corner, (0.0, 0.0, gap * DX))) for corner in boxes[0])
     sim = meet([{"box": upper}, {"box": boxes[1]}], spacing=0.5 * DX, dx=DX, **kwargs)
@@ -120,7 +127,7 @@ def test_a_third_body_turns_no_normal(meet, apart):
     """One beside the other two, on both, ``apart`` [grid spacings]; it shares blocks and nodes with either."""
     side = {"box": ((0.2 + apart * DX, -0.1, -0.1), (0.3 + apart * DX, 0.1, 0.1))}
     pair = [{"box": box} for box in HALVES]
-    two, three = Look(meet(pair)), Look(meet([*pair, side], max_slots=400))
+    two, three = Look(meet(pair)), Look(meet([*pair, side], max_active_blocks=400))
     assert len(two.position) == len(three.position) > 100
     first, second = (np.lexsort(np.round(look.position / DX).T) for look in (two, three))
     np.testing.assert_allclose(three.position[second], two.position[first], atol=1e-6)
@@ -148,7 +155,7 @@ def test_gap_of_flat_faces(meet, gap, density):
 def test_normals_tilt_little_at_edges(meet, angles):
     """Less than two thirds of what the gradients of single nodes give."""
     turn = Rotation.from_euler("xyz", angles)
-    look = Look(placed(meet, (BLOCK, TABLE), turn=turn))
+    look = Look(empty_deposit(meet, (BLOCK, TABLE), turn=turn))
     true = turn.apply([0.0, 0.0, -1.0])
     alone = look.tilt(look.alone, true)
     assert 12.0 < alone < 25.0
@@ -158,7 +165,7 @@ def test_normals_tilt_little_at_edges(meet, angles):
 
 def test_normals_are_antisymmetric(meet):
     """The order of the bodies does not matter."""
-    one, other = Look(placed(meet, (BLOCK, TABLE))), Look(placed(meet, (TABLE, BLOCK)))
+    one, other = Look(empty_deposit(meet, (BLOCK, TABLE))), Look(empty_deposit(meet, (TABLE, BLOCK)))
     key = [np.lexsort(look.position.T) for look in (one, other)]
     np.testing.assert_allclose(one.normal[key[0]], -other.normal[key[1]], atol=1e-4)
 

@@ -31,15 +31,15 @@ FAULTS = {
 }
 
 
-@pytest.fixture(scope="module", params=[None, "runs"])
+@pytest.fixture(scope="module", params=[None, "tiled"])
 def three(simulate, device, request):
     """Three environments in free fall onto the ground, each with another velocity; a fresh start each call.
 
     On a GPU also with the scatters of large bodies.
     """
     if request.param is not None and device == "cpu":
-        pytest.skip("only the plain scatter is for a CPU")
-    falling = {"num_envs": 3, "gravity": (0.0, 0.0, -9.81), "pushed": True, "scatter": request.param}
+        pytest.skip("only the plain path is for a CPU")
+    falling = {"num_envs": 3, "gravity": (0.0, 0.0, -9.81), "pushed": True, "path": request.param}
     sim = simulate(**falling, planes=[((0.0, 0.0, 1.0), -0.11, 0.5)])
 
     def start():
@@ -91,7 +91,7 @@ def test_nothing_of_a_fault_stays_on_the_grid(three, fault):
     sim = three()
     break_particle(sim, name, value)
     sim.run()
-    assert sim.sums_are_clear
+    assert sim.accumulators_are_clear
 
 
 def test_environment_runs_again_after_a_reset(three):

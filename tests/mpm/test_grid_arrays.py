@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.core.arrays import group, vec4l, vec8
+from piavatar_envs.core.arrays import make_struct, vec4l, vec8
 from piavatar_envs.mpm.grid_arrays import (
-    begin_sum,
     clear_offset,
-    end_sum,
+    finish_take,
+    load_accumulator,
     mass_of,
     offset_at,
+    quanta_of,
     read_record,
-    units_of,
     write_physical,
     write_record,
 )
-from piavatar_envs.mpm.types import Grid, Sums
+from piavatar_envs.mpm.types import Accumulators, Grid
 
 RECORDS = 64
 SLOTS = 3
@@ -27,14 +27,14 @@ SLOTS = 3
 @wp.kernel
 def take_all(
     grid: Grid,
-    sums: Sums,
+    sums: Accumulators,
     driven: wp.array(dtype=bool),
     taken: wp.array(dtype=vec8),
     offset: wp.array(dtype=wp.vec4),
 ):
     """Records of field 1 in environment 1."""
     r = wp.tid()
-    taken[r] = end_sum(sums, 1, units_of(sums, 1, 1), r, begin_sum(sums, 1, r), driven[r])
+    taken[r] = finish_take(sums, 1, quanta_of(sums, 1, 1), r, load_accumulator(sums, 1, r), driven[r])
     offset[r] = offset_at(grid, sums, 1, 1, r)
     if r % 2 == 0:
         clear_offset(sums, 1, r)
@@ -55,15 +55,15 @@ def test_fixed_sums(device, driven):
     asks = {"all": records >= 0, "none": records < 0, "slabs": records // 16 % 2 == 0, "some": records % 5 == 0}[driven]
     offsets = rng.integers(-(2**50), 2**50, (2, 64 * SLOTS, 4))
     unit = np.array([[1.0, 2.0**-30]], np.float32), np.array([[1.0, 2.0**-28]], np.float32)
-    sums = group(
-        Sums,
+    sums = make_struct(
+        Accumulators,
         is_fixed=1,
         value=wp.zeros((1, 1), dtype=wp.vec4, device=device),
         fixed=wp.array(numbers.reshape(2, -1, 4), dtype=vec4l, device=device),
         offset=wp.zeros((1, 1), dtype=wp.vec4, device=device),
         offset_fixed=wp.array(offsets, dtype=vec4l, device=device),
-        mass_unit=wp.array(unit[0], dtype=float, device=device),
-        momentum_unit=wp.array(unit[1], dtype=float, device=device),
+        mass_quantum=wp.array(unit[0], dtype=float, device=device),
+        momentum_quantum=wp.array(unit[1], dtype=float, device=device),
     )
     grid = Grid()
     grid.dx = 0.25
@@ -72,12 +72,12 @@ def test_fixed_sums(device, driven):
     inputs = [grid, sums, wp.array(asks, dtype=bool, device=device)]
     wp.launch(take_all, 64 * SLOTS, inputs=inputs, outputs=[taken, found], device=device)
     expected, left = numbers[1].astype(float), sums.fixed.numpy().reshape(shape)
-    asked, massive = asks.reshape(SLOTS, 64), numbers[1, :, 0, :, 0] > 0
+    needed, massive = asks.reshape(SLOTS, 64), numbers[1, :, 0, :, 0] > 0
     expected[:, 0][~massive] = 0.0
-    expected[:, 1][~(massive & asked)] = 0.0
+    expected[:, 1][~(massive & needed)] = 0.0
     kept = numbers.copy()
     kept[1, :, 0][massive] = 0
-    kept[1, :, 1][massive & asked] = 0
+    kept[1, :, 1][massive & needed] = 0
     np.testing.assert_array_equal(left, kept)
     scale = np.array([2.0**-30] + 7 * [2.0**-28])
     halves = np.concatenate([expected[:, 0], expected[:, 1]], axis=2).reshape(-1, 8)
@@ -109,9 +109,9 @@ def test_records_have_two_halves(device, stride):
     wp.launch(count_up, RECORDS, inputs=[stride], outputs=[records, mass], device=device)
     at = stride * np.arange(RECORDS)
     expected = start.copy()
-    slot, node = at // 64, at % 64
-    np.testing.assert_array_equal(mass.numpy(), start[slot, 0, node, 0])
-    expected[slot, 0, node] += np.arange(1, 5)
-    slot, node, last = slot[::2], node[::2], at[::2, None]
-    expected[slot, 1, node] += np.hstack([np.tile(np.arange(5, 8), (len(last), 1)), last])
+    active, node = at // 64, at % 64
+    np.testing.assert_array_equal(mass.numpy(), start[active, 0, node, 0])
+    expected[active, 0, node] += np.arange(1, 5)
+    active, node, last = active[::2], node[::2], at[::2, None]
+    expected[active, 1, node] += np.hstack([np.tile(np.arange(5, 8), (len(last), 1)), last])
     np.testing.assert_array_equal(records.numpy().reshape(start.shape), expected)

@@ -111,7 +111,7 @@ def test_forks_are_refused(device):
     [
         "from piavatar_envs.doctor import compile_kernels; compile_kernels(DEVICE)",
         "from piavatar_envs.mpm import graph, blocks; p = graph.LaunchGraph(DEVICE); "
-        "p.launch(blocks.free_slots, 1, [None], []); p.compile()",
+        "p.launch(blocks.reset_active_blocks, 1, [None], []); p.compile()",
     ],
 )
 def test_a_device_is_acquired_before_threads_compile_for_it(device, compiles):

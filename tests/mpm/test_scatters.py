@@ -9,15 +9,15 @@ import pytest
 import warp as wp
 
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.mpm.cuda import tiled_p2g as group_plan
-from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, parts_of, suits_shared
+from piavatar_envs.mpm.cuda import tiled_p2g as tiled_p2g
+from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, partitions_of, suits_block_path
 from piavatar_envs.mpm.cuda.tile_grid import CAPACITY
-from piavatar_envs.mpm.grid_arrays import units
-from piavatar_envs.mpm.memory import LARGE_MARGIN, SLOT_MARGIN, choose_marks, estimate_slots
-from piavatar_envs.mpm.model import MaterialPoints, choose_scatter
-from piavatar_envs.mpm.p2g import MOST_COUNTED
-from piavatar_envs.mpm.solver import record_marks, record_p2g
-from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, SCATTERS
+from piavatar_envs.mpm.grid_arrays import choose_quanta
+from piavatar_envs.mpm.memory import ACTIVE_MARGIN, LARGE_MARGIN, choose_activation_interval, estimate_active_blocks
+from piavatar_envs.mpm.model import MaterialPoints, choose_path
+from piavatar_envs.mpm.p2g import MAX_QUANTA
+from piavatar_envs.mpm.solver import record_first_activation, record_p2g
+from piavatar_envs.mpm.types import FAILURE_BLOCKS, FAILURE_CFL, PATHS
 
 ARRAYS = ("x", "u", "C", "F")
 CUBES = [
@@ -33,14 +33,14 @@ PLANE = [((0.0, 0.0, 1.0), -0.11, 0.5)]
 def scatter(request, device):
     """A way to scatter; those of a GPU only there."""
     if request.param != "plain" and device == "cpu":
-        pytest.skip("only the plain scatter is for a CPU")
+        pytest.skip("only the plain path is for a CPU")
     return request.param
 
 
-def heights(sim, held):
+def heights(sim, owner):
     """Of the nodes of a block [m]."""
     grid = sim.model.grid
-    return float(grid.origin[2]) + float(grid.dx) * (4 * (held % int(grid.blocks[2])) + np.arange(64) % 4)
+    return float(grid.origin[2]) + float(grid.dx) * (4 * (owner % int(grid.blocks[2])) + np.arange(64) % 4)
 
 
 @pytest.fixture
@@ -64,21 +64,21 @@ def records_of(sums):
 def node_sums(sim):
     """Mass, momenta and offsets of every node that has a slot, by field and block: ``{(env, of both): (64, 10)}``."""
     model, scratch, graph = sim.model, sim.scratch, LaunchGraph(sim.model.device)
-    record_marks(graph, model, sim.state, scratch)
+    record_first_activation(graph, model, sim.state, scratch)
     record_p2g(graph, model, sim.state, scratch)
     graph.run()
-    count, held = scratch.blocks.count.numpy(), scratch.blocks.held.numpy()
-    own, places = records_of(scratch.sums)
+    count, owner = scratch.blocks.num_active.numpy(), scratch.blocks.owner.numpy()
+    own, places = records_of(scratch.accumulators)
     halves = own.numpy().astype(float).reshape(model.num_envs, -1, 2, 64, 4)
     offsets = places.numpy().astype(float).reshape(model.num_envs, -1, 64, 4)
     sums = np.concatenate([halves[:, :, 0], halves[:, :, 1, :, :3], offsets[..., :3]], axis=-1)
-    if scratch.sums.is_fixed:
-        mass = scratch.sums.mass_unit.numpy()[0, 0]
+    if scratch.accumulators.is_fixed:
+        mass = scratch.accumulators.mass_quantum.numpy()[0, 0]
         sums[..., 0] *= mass
-        sums[..., 1:7] *= scratch.sums.momentum_unit.numpy()[0, 0]
+        sums[..., 1:7] *= scratch.accumulators.momentum_quantum.numpy()[0, 0]
         sums[..., 7:] *= mass * float(model.grid.dx)
-    records = sums.reshape(model.num_envs, model.max_slots, 64, 10)
-    return {(e, held[e, s]): records[e, s] for e in range(model.num_envs) for s in range(count[e])}
+    records = sums.reshape(model.num_envs, model.max_active_blocks, 64, 10)
+    return {(e, owner[e, s]): records[e, s] for e in range(model.num_envs) for s in range(count[e])}
 
 
 def nodes_by_hand(sim):
@@ -106,14 +106,14 @@ def nodes_by_hand(sim):
     return found
 
 
-@pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "shared"], indirect=True)
-def test_sums_are_those_of_the_equations(collide, scatter):
+@pytest.mark.parametrize("path", [name for name in PATHS if name != "block"], indirect=True)
+def test_sums_are_those_of_the_equations(collide, path):
     """Of unstrained bodies; what stress adds is held by the momentum and energy tests.
 
     Kinematic momentum and offsets are for contact: nodes have them whole that two bodies are at, or matter that is at
     the plane.
     """
-    sim = collide(scatter=scatter)
+    sim = collide(path=path)
     rng = np.random.default_rng(5)
     sim.set(vk=rng.normal(0.0, 0.3, sim.state.vk.numpy().shape))
     found, expected = node_sums(sim), nodes_by_hand(sim)
@@ -129,39 +129,39 @@ def test_sums_are_those_of_the_equations(collide, scatter):
     assert compared > 1000
 
 
-@pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "shared"], indirect=True)
-def test_slots_whose_nodes_are_told_something_are_noted(meet, scatter):
+@pytest.mark.parametrize("path", [name for name in PATHS if name != "block"], indirect=True)
+def test_slots_whose_nodes_are_told_something_are_noted(meet, path):
     """The grid pass asks no others for offsets and kinematic momentum; it leaves nothing of what it has read."""
     bar = {"box": ((-0.8, -0.1, -0.1), (0.0, 0.1, 0.1)), "velocity": (0.2, 0.1, 0.0)}  # from a wall to a cube
     wall = [((1.0, 0.0, 0.0), -0.81, 0.5)]
-    sim = meet([bar, CUBES[1]], friction=0.3, planes=wall, num_envs=2, scatter=scatter)
+    sim = meet([bar, CUBES[1]], friction=0.3, planes=wall, num_envs=2, path=path)
     sim.set(vk=np.random.default_rng(5).normal(0.0, 0.3, sim.state.vk.numpy().shape))
     node_sums(sim)
-    model, sums = sim.model, sim.scratch.sums
-    shape = (model.num_envs, model.max_slots, -1)
+    model, sums = sim.model, sim.scratch.accumulators
+    shape = (model.num_envs, model.max_active_blocks, -1)
     own, places = records_of(sums)
     driven = own.numpy().reshape(model.num_envs, -1, 2, 64, 4)[:, :, 1].reshape(shape).any(2)
-    told = sums.told.numpy() != 0
-    assert told[places.numpy().reshape(shape).any(2) | driven].all()
-    used = sim.scratch.blocks.count.numpy().sum()
-    assert 0 < np.count_nonzero(told) < 0.9 * used
+    candidates = sums.candidates.numpy() != 0
+    assert candidates[places.numpy().reshape(shape).any(2) | driven].all()
+    used = sim.scratch.blocks.num_active.numpy().sum()
+    assert 0 < np.count_nonzero(candidates) < 0.9 * used
     sim.run(3)
-    assert sim.sums_are_clear
+    assert sim.accumulators_are_clear
 
 
-@pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "shared"], indirect=True)
+@pytest.mark.parametrize("path", [name for name in PATHS if name != "block"], indirect=True)
 @pytest.mark.parametrize("edges", [(4.0, 4.0, 2.4), (7.0, 5.0, 2.4)])
-def test_what_particles_tell_in_boxes_of_any_size(simulate, scatter, edges):
-    """How they are driven and where they are is added up by groups at once, or, where bricks are many, in turns."""
+def test_what_particles_tell_in_boxes_of_any_size(simulate, path, edges):
+    """How they are driven and where they are is added up by groups at once, or, where subblocks are many, in turns."""
     rng = np.random.default_rng(7)
-    sim = simulate(rest=rng.uniform(0.3, 1.0, (30, 3)), planes=[((0.0, 0.0, 1.0), 0.0, 0.5)], scatter=scatter)
+    sim = simulate(rest=rng.uniform(0.3, 1.0, (30, 3)), planes=[((0.0, 0.0, 1.0), 0.0, 0.5)], path=path)
     dx = float(sim.model.grid.dx)
     x = dx * rng.uniform(0.0, edges, (30, 3))
     x[:2] = [[0.0, 0.0, 0.0], dx * np.array(edges)]
     sim.set(x=x + [0.0, 0.0, 0.3 * dx], vk=rng.normal(0.0, 0.3, (30, 3)))
     base = np.floor((sim.get("x") - np.array(sim.model.grid.origin)) / dx - 0.5).astype(int)
-    bricks = np.prod((base.max(0) + 2) // 2 - base.min(0) // 2 + 1)  # of 2 x 2 x 2 nodes, around all particles
-    assert (bricks > CAPACITY // 2) == (edges[0] > 4.0) and bricks <= CAPACITY
+    subblocks = np.prod((base.max(0) + 2) // 2 - base.min(0) // 2 + 1)  # of 2 x 2 x 2 nodes, around all particles
+    assert (subblocks > CAPACITY // 2) == (edges[0] > 4.0) and subblocks <= CAPACITY
     found, expected = node_sums(sim), nodes_by_hand(sim)
     assert set(found) >= set(expected)
     for key, sums in found.items():
@@ -169,11 +169,11 @@ def test_what_particles_tell_in_boxes_of_any_size(simulate, scatter, edges):
         np.testing.assert_allclose(sums, by_hand, atol=2e-7, err_msg=str(key))
 
 
-@pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "shared"], indirect=True)
-def test_particles_far_apart(simulate, scatter):
-    """They touch more bricks of nodes than a group has room for, and go in turns."""
+@pytest.mark.parametrize("path", [name for name in PATHS if name != "block"], indirect=True)
+def test_particles_far_apart(simulate, path):
+    """They touch more subblocks of nodes than a group has room for, and go in turns."""
     rng = np.random.default_rng(6)
-    sim = simulate(rest=rng.uniform(-0.5, 0.5, (300, 3)), scatter=scatter)
+    sim = simulate(rest=rng.uniform(-0.5, 0.5, (300, 3)), path=path)
     sim.set(u=rng.normal(0.0, 1.0, (300, 3)))
     found, expected = node_sums(sim), nodes_by_hand(sim)
     assert set(found) >= set(expected)
@@ -182,8 +182,8 @@ def test_particles_far_apart(simulate, scatter):
         np.testing.assert_allclose(sums[:, :4], by_hand[:, :4], atol=2e-7, err_msg=str(key))  # of 0.016 kg
 
 
-@pytest.mark.parametrize("scatter", ["runs"], indirect=True)
-def test_who_adds_no_mass_adds_nothing(simulate, scatter):
+@pytest.mark.parametrize("path", ["tiled"], indirect=True)
+def test_who_adds_no_mass_adds_nothing(simulate, path):
     """Light particles are fast: their momentum counts, their mass is less than a unit.
 
     A node with momentum and no mass would be skipped, and keep it for who comes there later.
@@ -192,8 +192,8 @@ def test_who_adds_no_mass_adds_nothing(simulate, scatter):
     light = np.arange(8) > 3
     rest = rng.uniform(-0.02, 0.02, (8, 3)) + np.where(light, 0.15, -0.15)[:, None] * [1.0, 0.0, 0.0]
     points = MaterialPoints.uniform(np.where(light, 1e-10, 1.0) * 0.025**3)
-    sim = simulate(rest=rest, points=points, scatter=scatter).set(u=np.where(light, 1e4, 0.0)[:, None])
-    assert len(sim.model.particles.groups) == 2  # of all, and where it ends
+    sim = simulate(rest=rest, points=points, path=path).set(u=np.where(light, 1e4, 0.0)[:, None])
+    assert len(sim.model.particles.tiles) == 2  # of all, and where it ends
     sums = np.concatenate(list(node_sums(sim).values()))
     assert sim.failures == [0] and 27 <= np.count_nonzero(sums[:, 0]) <= 64
     assert not sums[:, 1:].any()
@@ -204,17 +204,17 @@ def test_sums_too_large_for_their_words_fail(simulate, device, share, failure):
     """Particles that may be added up, but are too much together: a node has those of eight."""
     if device == "cpu":
         pytest.skip("a CPU adds floating-point numbers")
-    sim = simulate(scatter="runs")
-    unit, mass = sim.scratch.sums.momentum_unit.numpy()[0, 0], sim.model.particles.mass.numpy()[0, 0]
-    sim.set(u=(share * float(MOST_COUNTED) * float(unit) / float(mass), 0.0, 0.0))
+    sim = simulate(path="tiled")
+    unit, mass = sim.scratch.accumulators.momentum_quantum.numpy()[0, 0], sim.model.particles.mass.numpy()[0, 0]
+    sim.set(u=(share * float(MAX_QUANTA) * float(unit) / float(mass), 0.0, 0.0))
     node_sums(sim)
     assert sim.failures == [failure]
 
 
-@pytest.mark.parametrize("scatter", [name for name in SCATTERS if name != "plain"], indirect=True)
-def test_scatters_agree(collide, scatter):
+@pytest.mark.parametrize("path", [name for name in PATHS if name != "plain"], indirect=True)
+def test_scatters_agree(collide, path):
     """With the plain one, to what round-off makes of a collision."""
-    other, plain = collide(scatter=scatter, max_slots=SLOTS).run(2), collide(scatter="plain").run(2)
+    other, plain = collide(path=path, max_active_blocks=SLOTS).run(2), collide(path="plain").run(2)
     for e in range(3):
         for array, atol in zip(ARRAYS, (1e-5, 2e-3, 2e-1, 1e-3), strict=True):
             np.testing.assert_allclose(other.get(array, e), plain.get(array, e), atol=atol, err_msg=array)
@@ -224,21 +224,21 @@ def test_scatters_agree(collide, scatter):
 def test_groups_of_any_size_agree(collide, device, monkeypatch, share):
     """Their units are their own, and some groups go in turns."""
     if device == "cpu":
-        pytest.skip("groups are a GPU's")
-    monkeypatch.setattr(group_plan, "SHARES", ((2**31, share),))
-    grouped, plain = collide(scatter="runs", max_slots=SLOTS).run(2), collide(scatter="plain").run(2)
+        pytest.skip("tiles are a GPU's")
+    monkeypatch.setattr(tiled_p2g, "TILE_SIZES", ((2**31, share),))
+    grouped, plain = collide(path="tiled", max_active_blocks=SLOTS).run(2), collide(path="plain").run(2)
     for e in range(3):
         for array, atol in zip(ARRAYS, (1e-5, 2e-3, 2e-1, 1e-3), strict=True):
             np.testing.assert_allclose(grouped.get(array, e), plain.get(array, e), atol=atol, err_msg=array)
 
 
-def test_bricks_that_do_not_fit_go_in_rounds(collide, device):
-    """Integers are added up: how many bricks shared memory holds at once changes no bit of the sums."""
+def test_subblocks_that_do_not_fit_go_in_rounds(collide, device):
+    """Integers are added up: how many subblocks shared memory holds at once changes no bit of the sums."""
     if device == "cpu":
         pytest.skip("shared memory is a GPU's")
-    once, often = (collide(scatter="shared", max_slots=SLOTS) for _ in range(2))
-    assert once.scratch.room.capacity > 150
-    often.scratch.room.capacity = 40
+    once, often = (collide(path="block", max_active_blocks=SLOTS) for _ in range(2))
+    assert once.scratch.arena.capacity > 150
+    often.scratch.arena.capacity = 40
     once.run(2), often.run(2)
     for array in ARRAYS:
         np.testing.assert_array_equal(
@@ -251,17 +251,17 @@ def test_a_large_room_gives_the_same(simulate, equal, device, monkeypatch):
     if device == "cpu":
         pytest.skip("shared memory is a GPU's")
     start = {"u": (0.3, -0.2, 0.1), "C": np.diag([1.0, -2.0, 0.5])}
-    large = simulate(scatter="shared", max_slots=SLOTS // 2).set(**start)
-    assert large.scratch.large_room
-    monkeypatch.setattr("piavatar_envs.mpm.cuda.block_grid.has_large_room", lambda model, parts: False)
-    small = simulate(scatter="shared", max_slots=SLOTS // 2, control_dt=large.model.control_dt).set(**start)
-    assert not small.scratch.large_room
+    large = simulate(path="block", max_active_blocks=SLOTS // 2).set(**start)
+    assert large.scratch.large_arena
+    monkeypatch.setattr("piavatar_envs.mpm.cuda.block_grid.needs_large_arena", lambda model, partitions: False)
+    small = simulate(path="block", max_active_blocks=SLOTS // 2, control_dt=large.model.control_dt).set(**start)
+    assert not small.scratch.large_arena
     for array in ARRAYS:
         assert equal(large.run(2).get(array), small.run(2).get(array)), array
 
 
 @pytest.mark.parametrize(
-    ("field", "parts"),
+    ("field", "partitions"),
     [
         ([0, 0, 0], [(0, 3, 0b1)]),
         ([0, 0, 1, 0, 2, 2, 3, 3], [(0, 4, 0b11), (4, 6, 0b100), (6, 8, 0b1000)]),
@@ -269,12 +269,12 @@ def test_a_large_room_gives_the_same(simulate, equal, device, monkeypatch):
         ([2, 1, 0, 2], [(0, 4, 0b111)]),
     ],
 )
-def test_parts_share_no_field(field, parts):
-    assert parts_of(np.array(field)) == parts
+def test_parts_share_no_field(field, partitions):
+    assert partitions_of(np.array(field)) == partitions
 
 
 @pytest.mark.parametrize(
-    ("bodies", "particles", "slots", "suits"),
+    ("bodies", "particles", "active_blocks", "suits"),
     [
         (1, 8192, 300, True),
         (1, 8193, 300, False),
@@ -283,33 +283,33 @@ def test_parts_share_no_field(field, parts):
         (1, 2000, 3000, False),
     ],
 )
-def test_what_shared_memory_holds(monkeypatch, bodies, particles, slots, suits):
+def test_what_shared_memory_holds(monkeypatch, bodies, particles, active_blocks, suits):
     """Bodies that a CUDA block has time for, particles that half words count, slots that there is room for."""
     h200 = SimpleNamespace(is_cuda=True, arch=90, max_shared_memory_per_block=227 * 1024)
     monkeypatch.setattr(wp, "get_device", lambda name: h200)
-    assert suits_shared("cuda:0", np.repeat(np.arange(bodies), particles), slots) is suits
+    assert suits_block_path("cuda:0", np.repeat(np.arange(bodies), particles), active_blocks) is suits
 
 
 @pytest.mark.parametrize(
-    ("particles", "slots", "arch", "chosen"),
+    ("particles", "active_blocks", "arch", "chosen"),
     [
-        (2_900, 200, 90, "shared"),
-        (19_757, 680, 90, "runs"),
-        (300_000, 5_000, 90, "runs"),
+        (2_900, 200, 90, "block"),
+        (19_757, 680, 90, "tiled"),
+        (300_000, 5_000, 90, "tiled"),
         (10_475, 3_600, 60, "plain"),
     ],
 )
-def test_device_and_size_choose_the_path(monkeypatch, particles, slots, arch, chosen):
+def test_device_and_size_choose_the_path(monkeypatch, particles, active_blocks, arch, chosen):
     gpu = SimpleNamespace(is_cuda=True, arch=arch, max_shared_memory_per_block=227 * 1024)
     monkeypatch.setattr(wp, "get_device", lambda name: gpu)
-    assert choose_scatter(None, "cuda:0", np.zeros(particles, int), slots, "split") == chosen
+    assert choose_path(None, "cuda:0", np.zeros(particles, int), active_blocks, "split") == chosen
 
 
 @pytest.mark.parametrize("copies", [60, 80, 100, 140, 300])
 def test_a_crowd_is_counted_in_larger_units(simulate, device, copies):
     """Where a node holds more than sixteen particles of one field, words would run over; so often that nobody sees it.
 
-    A corner of the box is crowded; the sums of the others must not depend on the rounds that bricks go in.
+    A corner of the box is crowded; the sums of the others must not depend on the rounds that subblocks go in.
     """
     if device == "cpu":
         pytest.skip("a CPU adds floating-point numbers")
@@ -317,8 +317,8 @@ def test_a_crowd_is_counted_in_larger_units(simulate, device, copies):
     rest = np.concatenate([np.repeat(box[:1], copies, axis=0), box[1:]])
     moved = []
     for capacity in (None, 12, 7):
-        sim = simulate(rest=rest, scatter="shared", max_slots=SLOTS).set(u=(0.3, -0.2, 0.1))
-        sim.scratch.room.capacity = capacity or sim.scratch.room.capacity
+        sim = simulate(rest=rest, path="block", max_active_blocks=SLOTS).set(u=(0.3, -0.2, 0.1))
+        sim.scratch.arena.capacity = capacity or sim.scratch.arena.capacity
         sim.run(3)
         assert sim.failures == [0]
         np.testing.assert_allclose(sim.get("u"), np.tile([0.3, -0.2, 0.1], (len(rest), 1)), atol=1e-5)
@@ -326,10 +326,10 @@ def test_a_crowd_is_counted_in_larger_units(simulate, device, copies):
     np.testing.assert_array_equal(*moved[1:])  # one round's gather is another kernel
 
 
-@pytest.mark.parametrize("scatter", ["shared", "runs"], indirect=True)
-def test_runs_repeat_bit_for_bit(collide, scatter):
+@pytest.mark.parametrize("path", ["block", "tiled"], indirect=True)
+def test_runs_repeat_bit_for_bit(collide, path):
     """With contact, sensors and all; a CPU adds in one order only."""
-    first, second = (collide(scatter=scatter, max_slots=SLOTS).run(3) for _ in range(2))
+    first, second = (collide(path=path, max_active_blocks=SLOTS).run(3) for _ in range(2))
     for array in ARRAYS:
         np.testing.assert_array_equal(getattr(first.state, array).numpy(), getattr(second.state, array).numpy())
     for name in ("boundary_impulse", "pair_impulse", "part_impulse"):
@@ -341,43 +341,47 @@ def test_runs_repeat_bit_for_bit(collide, scatter):
 def test_units_are_powers_of_two(collide):
     """So that numbers go in and out of fixed point without a factor that would drain momentum."""
     sim = collide()
-    for unit in units(np.array([[900.0, 1000.0, 7800.0]]), sim.model.grid, sim.model.step):
+    for unit in choose_quanta(np.array([[900.0, 1000.0, 7800.0]]), sim.model.grid, sim.model.step):
         mantissa, _ = np.frexp(unit)
         assert (mantissa == 0.5).all()
     cell = 1000.0 * float(sim.model.grid.dx) ** 3
-    mass = sim.scratch.sums.mass_unit.numpy()
+    mass = sim.scratch.accumulators.mass_quantum.numpy()
     assert (mass > 0.7 * cell / 2**36).all() and (mass < 1.5 * cell / 2**36).all()
 
 
 def test_too_few_slots_fail_one_environment(simulate):
     """A body that flies apart needs more blocks than there are: that environment fails, says so, and can be reset."""
-    sim = simulate(num_envs=2, num_substeps=10, max_slots=40, margin=1.0)
+    sim = simulate(num_envs=2, num_substeps=10, max_active_blocks=40, margin=1.0)
     together = sim.state.x.numpy().copy()
     apart = together.copy()
     apart[1] *= 6.0
     sim.set(x=apart).run()
     assert sim.failures == [0, 16] and np.array_equal(sim.state.x.numpy()[1], apart[1].astype(np.float32))
     sim.state.failure.zero_()
-    fresh = simulate(num_envs=2, num_substeps=10, max_slots=40, margin=1.0).set(x=together).run()
+    fresh = simulate(num_envs=2, num_substeps=10, max_active_blocks=40, margin=1.0).set(x=together).run()
     zero = np.zeros(3)
     sim.set(x=together, u=zero, C=np.zeros((3, 3)), F=np.eye(3)).run()
-    assert sim.failures == [0, 0] and sim.sums_are_clear
+    assert sim.failures == [0, 0] and sim.accumulators_are_clear
     np.testing.assert_array_equal(sim.state.x.numpy(), fresh.state.x.numpy())
 
 
 def test_slots_that_run_out_in_flight(simulate):
     """A body that leaves its blocks within a control step, with no slot to spare."""
     still = simulate(num_substeps=10).run()
-    used = int(still.scratch.blocks.count.numpy()[0])
-    assert simulate(num_substeps=10, max_slots=used).run().failures == [0]
-    moving = simulate(num_substeps=10, max_slots=used).set(u=(6.0, 0.0, 0.0))
-    assert moving.run().failures == [16] and moving.sums_are_clear
+    used = int(still.scratch.blocks.num_active.numpy()[0])
+    assert simulate(num_substeps=10, max_active_blocks=used).run().failures == [0]
+    moving = simulate(num_substeps=10, max_active_blocks=used).set(u=(6.0, 0.0, 0.0))
+    assert moving.run().failures == [16] and moving.accumulators_are_clear
 
 
 def test_fast_bodies_leave_their_slots_behind(simulate):
     """20 m/s: in a control step the body sweeps many times the blocks that it ever needs at once."""
-    slots = estimate_slots(simulate().rest, None, 0.05)
-    sim = simulate(num_substeps=80, control_dt=0.1, margin=2.5, max_slots=slots).set(u=(20.0, 0.0, 0.0)).run()
+    active_blocks = estimate_active_blocks(simulate().rest, None, 0.05)
+    sim = (
+        simulate(num_substeps=80, control_dt=0.1, margin=2.5, max_active_blocks=active_blocks)
+        .set(u=(20.0, 0.0, 0.0))
+        .run()
+    )
     assert sim.failures == [0]
     np.testing.assert_allclose(sim.get("x") - sim.rest, np.tile([2.0, 0.0, 0.0], (len(sim.rest), 1)), atol=1e-3)
 
@@ -387,33 +391,33 @@ def test_large_bodies_have_more_slots_to_leave_behind(simulate, device):
     box = {"lower": (-0.3, -0.675, -0.675), "upper": (0.3, 0.675, 0.675), "spacing": 0.05}
     rest = simulate(**box).rest
     assert len(rest) > MOST_PARTICLES
-    few, enough = (estimate_slots(rest, None, 0.05, margin) for margin in (SLOT_MARGIN, LARGE_MARGIN))
-    assert estimate_slots(rest, None, 0.05) == enough
-    assert estimate_slots(rest[:MOST_PARTICLES], None, 0.05) <= few
+    few, enough = (estimate_active_blocks(rest, None, 0.05, margin) for margin in (ACTIVE_MARGIN, LARGE_MARGIN))
+    assert estimate_active_blocks(rest, None, 0.05) == enough
+    assert estimate_active_blocks(rest[:MOST_PARTICLES], None, 0.05) <= few
     if device == "cpu":
-        pytest.skip("groups are a GPU's")
-    world = {"num_substeps": 26, "control_dt": 26 * 1.75e-3, "margin": 1.2, "scatter": "runs"} | box
-    for slots, failures in ((few, [FAILURE_BLOCKS]), (enough, [0])):
-        sim = simulate(**world, max_slots=slots).set(u=(15.0, 0.0, 0.0))
-        assert sim.model.marks_every == 25 and sim.run().failures == failures
+        pytest.skip("tiles are a GPU's")
+    world = {"num_substeps": 26, "control_dt": 26 * 1.75e-3, "margin": 1.2, "path": "tiled"} | box
+    for active_blocks, failures in ((few, [FAILURE_BLOCKS]), (enough, [0])):
+        sim = simulate(**world, max_active_blocks=active_blocks).set(u=(15.0, 0.0, 0.0))
+        assert sim.model.activation_interval == 25 and sim.run().failures == failures
 
 
 @pytest.mark.parametrize(
-    ("scatter", "counts", "marks"),
+    ("path", "counts", "marks"),
     [
         ("plain", [9_000], 8),
-        ("runs", [8_192, 8_192], 16),
-        ("runs", [100, 8_193], 25),
+        ("tiled", [8_192, 8_192], 16),
+        ("tiled", [100, 8_193], 25),
     ],
 )
-def test_marks_are_as_rare_as_there_is_room_for(scatter, counts, marks):
-    assert choose_marks(scatter, np.repeat(np.arange(len(counts)), counts)) == marks
+def test_marks_are_as_rare_as_there_is_room_for(path, counts, marks):
+    assert choose_activation_interval(path, np.repeat(np.arange(len(counts)), counts)) == marks
 
 
 def test_slots_do_not_grow_with_the_grid(simulate):
     """Slots are as many as the body touches, whatever the size of the grid."""
     near, far = simulate(margin=0.3).run(), simulate(margin=3.0).run()
-    assert near.scratch.blocks.count.numpy()[0] <= 27 and far.scratch.blocks.count.numpy()[0] <= 27
+    assert near.scratch.blocks.num_active.numpy()[0] <= 27 and far.scratch.blocks.num_active.numpy()[0] <= 27
     assert far.model.num_blocks > 20 * near.model.num_blocks
 
 
@@ -422,11 +426,11 @@ def test_groups_are_compact_and_of_one_field():
     rng = np.random.default_rng(7)
     near, far = rng.uniform(0.0, 0.05, (200, 3)), rng.uniform(0.0, 0.05, (56, 3)) + [0.0, 2.0, 0.0]
     rest, field = np.concatenate([near, far, near[:30]]), np.repeat([3, 1], [256, 30])
-    groups = group_plan.begin_groups(field, rest, 0.01)
-    begins, ends = groups[:-1, 0], groups[1:, 0]
+    tiles = tiled_p2g.plan_tiles(field, rest, 0.01)
+    begins, ends = tiles[:-1, 0], tiles[1:, 0]
     assert begins[0] == 0 and ends[-1] == len(rest)
-    assert (np.diff(groups[:, 0]) > 0).all() and (ends - begins <= 32).all()
-    for begin, end, own in zip(begins, ends, groups[:-1, 1], strict=True):
+    assert (np.diff(tiles[:, 0]) > 0).all() and (ends - begins <= 32).all()
+    for begin, end, own in zip(begins, ends, tiles[:-1, 1], strict=True):
         assert (field[begin:end] == own).all()
         assert np.ptp(rest[begin:end], axis=0).max() < 0.06
-    assert len(group_plan.begin_groups(field, None, 0.01)) - 1 == 8 + 1
+    assert len(tiled_p2g.plan_tiles(field, None, 0.01)) - 1 == 8 + 1

@@ -36,12 +36,12 @@ def load(sim, how):
 
 
 @pytest.mark.parametrize("how", ["tension", "bending", "torsion"])
-@pytest.mark.parametrize(("cut", "scatter"), [(0.0, None), (0.025, None), (0.025, "runs")])
-def test_halves_with_a_seam_are_one_bar(simulate, device, how, cut, scatter):
+@pytest.mark.parametrize(("cut", "path"), [(0.0, None), (0.025, None), (0.025, "tiled")])
+def test_halves_with_a_seam_are_one_bar(simulate, device, how, cut, path):
     """Wherever the cut lies on the grid, to round-off; the seam needs no more particles than those next to it."""
-    if scatter is not None and device == "cpu":
-        pytest.skip("groups are a GPU's")
-    way = {} if scatter is None else {"scatter": scatter}
+    if path is not None and device == "cpu":
+        pytest.skip("tiles are a GPU's")
+    way = {} if path is None else {"path": path}
     one, two = bar(simulate, **way), bar(simulate, cut, **way)
     for sim in (one, two):
         sim.push(damping=5.0, acceleration=load(sim, how)).run(5)

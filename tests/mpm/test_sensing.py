@@ -30,7 +30,7 @@ def test_impulses_are_the_changes_of_momentum(meet, normals):
         assert np.abs(parts[0, 1] - change[0]).max() < 1e-5 * scale
         assert np.abs(parts[1, 0] - change[1]).max() < 1e-5 * scale
         assert not parts[0, 0].any() and not parts[1, 1].any()
-        if normals == "shared":
+        if normals == "block":
             pairs = sensors.pair_impulse.numpy()[0].reshape(2, 2, 3)
             assert np.abs(pairs[0, 1] - change[0]).max() < 1e-5 * scale
             assert not pairs[1, 0].any()  # only a < b is kept
@@ -40,13 +40,13 @@ def test_impulses_are_the_changes_of_momentum(meet, normals):
 
 @pytest.mark.parametrize("overlap", [-0.5, 0.1, 0.4, 0.8])
 @pytest.mark.parametrize("density", [500.0, 2000.0])
-@pytest.mark.parametrize("scatter", [None, "runs"])
-def test_penetration_of_a_known_overlap(meet, device, overlap, density, scatter):
+@pytest.mark.parametrize("path", [None, "tiled"])
+def test_penetration_of_a_known_overlap(meet, device, overlap, density, path):
     """The centre of the deepest particle, a quarter of a spacing inside its body; the bodies are at rest."""
-    if device == "cpu" and scatter:
+    if device == "cpu" and path:
         pytest.skip("a CPU has but one way to scatter")
     into = {"box": ((-overlap * DX, -0.1, -0.1), (0.2 - overlap * DX, 0.1, 0.1)), "density": density}
-    sim = meet([CUBE, into], num_substeps=1, control_dt=1e-4, scatter=scatter).run()
+    sim = meet([CUBE, into], num_substeps=1, control_dt=1e-4, path=path).run()
     expected = max(0.0, overlap - 0.25) * DX
     found = sim.scratch.sensors.penetration.numpy()[0]
     np.testing.assert_allclose(found, expected, atol=0.15 * DX)
@@ -54,14 +54,14 @@ def test_penetration_of_a_known_overlap(meet, device, overlap, density, scatter)
     assert overlap < 0.2 or found.all()
 
 
-@pytest.mark.parametrize("scatter", ["runs"])
-def test_penetration_of_bodies_that_go_on(meet, device, scatter):
+@pytest.mark.parametrize("path", ["tiled"])
+def test_penetration_of_bodies_that_go_on(meet, device, path):
     """Into blocks that the last gather has marked, of which a grid pass knows nothing yet."""
     if device == "cpu":
         pytest.skip("a CPU has but one way to scatter")
     for substeps in (1, 2, 5, 9):
         settings = {"num_substeps": substeps, "control_dt": 1e-3 * substeps}
-        sims = [meet([BLOCK, BALL], scatter=way, **settings) for way in ("plain", scatter)]
+        sims = [meet([BLOCK, BALL], path=way, **settings) for way in ("plain", path)]
         for _ in range(36 // substeps):
             plain, found = (sim.run().scratch.sensors.penetration.numpy() for sim in sims)
             np.testing.assert_allclose(found, plain, atol=1e-4)
@@ -117,7 +117,7 @@ def test_a_failure_in_contact_leaves_the_grid_clear(meet):
     sim.state.u.assign(u)
     sim.run(2)
     assert sim.failures[0] != 0 and sim.failures[1] == 0
-    assert sim.sums_are_clear
+    assert sim.accumulators_are_clear
 
 
 @pytest.mark.parametrize("normals", ["shared", "own"])
@@ -128,7 +128,7 @@ def test_scratch_is_clear_between_steps(meet, normals, num_substeps):
     for _ in range(3):
         sim.run()
         assert sim.failures == [0]
-        assert sim.sums_are_clear
+        assert sim.accumulators_are_clear
 
 
 def test_contacts_leave_nothing_behind(meet, equal):

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.core.arrays import group, matrices_of
+from piavatar_envs.core.arrays import make_struct, matrices_of
 from piavatar_envs.mpm.types import Kinematic, Particles
 from piavatar_envs.sim import prop_geometry as geometry
 from piavatar_envs.sim.props import Prop, PropMatter, PropState, place_prop, scale_density, track_prop
@@ -36,7 +36,7 @@ class Scene:
         if uneven:
             mass = np.repeat(mass, NUM_ENVS, axis=0)
         self.mass = mass
-        self.particles = group(Particles, mass=wp.array(mass, dtype=float, device=device))
+        self.particles = make_struct(Particles, mass=wp.array(mass, dtype=float, device=device))
         shape = (NUM_ENVS, self.total)
         self.x, self.u, self.vk, self.turning = (self.poisoned(shape, wp.vec3) for _ in range(4))
         self.C, self.F = (self.poisoned((NUM_ENVS, 9, self.total), float) for _ in range(2))
@@ -70,7 +70,7 @@ class Scene:
             place_prop,
             (NUM_ENVS, self.count),
             [self.array(mask, wp.bool), self.prop, INDEX, spawn.position, spawn.rotation, spawn.velocity, spawn.spin],
-            [self.x, self.u, self.C, self.F, group(Kinematic, vk=self.vk, spin=self.turning)],
+            [self.x, self.u, self.C, self.F, make_struct(Kinematic, vk=self.vk, spin=self.turning)],
             device=self.device,
         )
         turns = rotation.as_matrix().reshape(NUM_ENVS, NUM_PROPS, 3, 3)

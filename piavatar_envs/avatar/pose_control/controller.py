@@ -26,7 +26,7 @@ from piavatar_envs.avatar.pose_control.kernels import (
 )
 from piavatar_envs.avatar.segment_sums import GROUPS, sum_corrections, sum_moments, sum_motion, warps_of
 from piavatar_envs.avatar.types import Command, DriveSettings, PoseWorkspace, RootState, allocate
-from piavatar_envs.core.arrays import group
+from piavatar_envs.core.arrays import make_struct
 from piavatar_envs.core.cuda_intrinsics import BLOCK, chunk_threads, particle_rounds, particle_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.types import DECOUPLING, Scratch, State
@@ -56,10 +56,10 @@ class PoseController:
             self._start = state.command_rotation, state.command_root
         else:
             self._start = tracked.local, tracked.position[:, 0]
-        self._root = group(
+        self._root = make_struct(
             RootState, let_go=state.let_go, wrench_force=state.wrench_force, wrench_torque=state.wrench_torque
         )
-        command = group(
+        command = make_struct(
             Command,
             rotation=state.command_rotation,
             increment=wp.zeros((n, NUM_JOINTS), dtype=wp.vec3, device=model.device),
@@ -82,7 +82,7 @@ class PoseController:
         )
         w = self.workspace
         swapped = {name: getattr(w, name) for name in PoseWorkspace.vars} | {"now": w.after, "after": w.now}
-        self._workspaces = w, group(PoseWorkspace, **swapped)
+        self._workspaces = w, make_struct(PoseWorkspace, **swapped)
         # only injection blends whole matrices
         matrices = (n, NUM_JOINTS if self._injects else 0)
         self._bone_from, self._bone_step = (wp.zeros(matrices, dtype=wp.mat44, device=model.device) for _ in range(2))

@@ -53,8 +53,8 @@ from piavatar_envs.core.arrays import number_at, store_pair, store_vector, vec8,
 from piavatar_envs.core.cuda_intrinsics import (
     BLOCK,
     first_particle,
-    meet,
-    meet_threads,
+    sync_block,
+    sync_threads,
     place_in_block,
     sum_threads12,
     threads_of_environment,
@@ -173,9 +173,9 @@ def fit_motion(
     if chunk_threads > 0:
         for b in range(thread // chunk_threads, body.parent.shape[0], threads // chunk_threads):
             fit_bone(body, w.tracked, w.moments, e, b, thread % chunk_threads, chunk_threads, w.bones)
-        meet_threads(threads)
+        sync_threads(threads)
     fit_whole(body, w.bones, e, thread, threads, w.whole)
-    meet_threads(threads)
+    sync_threads(threads)
     if step > 0:
         for b in range(thread, body.parent.shape[0], threads):
             carry_bone(control.dt, w.bones, w.removed, e, b, w.carry)
@@ -193,7 +193,7 @@ def write_records(body: Body, control: PoseControl, step: int, w: PoseWorkspace,
         lay_command(body, w.command_pose, w.now, e, thread, threads, w.anchor)
         for b in range(thread, body.parent.shape[0], threads):
             w.gap[e, b] = w.tracked[e, b] - w.now.position[e, b]
-    meet_threads(threads)
+    sync_threads(threads)
     for b in range(thread, body.parent.shape[0], threads):
         write_record(body, control, w.now, w.after, w.carry, w.bones, w.command_pose, w.anchor, w.gap, e, b, w.record)
 
@@ -238,7 +238,7 @@ def prepare_body(
         pose_end(body, control, step, w, e, thread, threads)
     if warp == 2 % warps:
         pose_command(body, control, step, w, e, thread, threads)
-    meet()
+    sync_block()
     if warp == 0:
         write_records(body, control, step, w, e, thread, threads)
     if warp == 1 % warps and thread == 0:
@@ -434,7 +434,7 @@ def correct_bones(
     if chunk_threads > 0:
         for b in range(thread // chunk_threads, body.parent.shape[0], threads // chunk_threads):
             add_chunks(body, w.corrections, e, b, thread % chunk_threads, chunk_threads, w.bone_corrections)
-        meet_threads(threads)
+        sync_threads(threads)
     blend_corrections(body, control, w.bone_corrections, w.bones, w.whole, w.wrench, e, thread, threads, w.change)
 
 

@@ -32,7 +32,7 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import begin_solution, en
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, place_of_part, row_in_room, see_columns
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import vec8, vector_at
-from piavatar_envs.core.cuda_intrinsics import bits_of_threads, meet_threads, most_of_threads, sum_threads6
+from piavatar_envs.core.cuda_intrinsics import max_of_threads, or_of_threads, sum_threads6, sync_threads
 from piavatar_envs.mpm.colliders import PLANE, signed_distance, surface_velocity
 from piavatar_envs.mpm.contact_sensors import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.types import Boundaries, Sensors, row
@@ -156,7 +156,7 @@ def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: T
         for k in range(ground.boundaries.count):
             if may_lack(ground.boundaries, dt, w, e, b, k):
                 near = near | (1 << b)
-    return bits_of_threads(near, threads)
+    return or_of_threads(near, threads)
 
 
 @wp.func
@@ -185,7 +185,7 @@ def find_fastest(
                         which = (n * BONES + b) * count + k
         near = near >> 1
         b += 1
-    return most_of_threads(most, which, threads)
+    return max_of_threads(most, which, threads)
 
 
 #: The pelvis' place, then all joints.
@@ -217,7 +217,7 @@ def answer_at(
     n = w.velocity.shape[0]
     wanted = w.pattern.reach[1 + b]
     columns = see_columns(w.touch, room)
-    meet_threads(threads)
+    sync_threads(threads)
     for k in range(thread, PARTS, threads):
         arm = wp.vec3()
         if k > 0:
@@ -229,7 +229,7 @@ def answer_at(
                 along = wp.cross(arm, along)
             set_part(columns, row_in_room(axis * n + e, axis), place_of_part(k), along)
     begin_solution(w.pattern, w.factors, factor, wanted, e, n, threads, room, w.touch)
-    meet_threads(threads)
+    sync_threads(threads)
     s = vec8()
     for k in range(thread, PARTS, threads):
         if (wanted >> k) & 1 == 1:
@@ -259,7 +259,7 @@ def push(
                 y += p[axis] * part_of(columns, row_in_room(axis * n + e, axis), place_of_part(k))
         set_part(columns, row_in_room(e, 0), place_of_part(k), y)
     end_solution(w.pattern, w.factors, factor, e, threads, room, w.touch)
-    meet_threads(threads)
+    sync_threads(threads)
     for k in range(thread, PARTS, threads):
         change = part_of(columns, row_in_room(e, 0), place_of_part(k))
         set_part(w.whole, e, 3 * k, part_of(w.whole, e, 3 * k) + change)
@@ -344,13 +344,13 @@ def stop_bones(
     stops = int(0)
     while stops < _MOST_STOPS:
         spread_motion(body, w.pose.position, w.whole, e, e, thread, threads, w.moving)
-        meet_threads(threads)
+        sync_threads(threads)
         fastest = find_fastest(body, ground, dt, e, thread, threads, w)
         if fastest[0] <= TOLERANCE:
             break
         given += stop_point(body, ground, dt, int(fastest[1]), own, factor, e, thread, threads, room, w)
         stops += 1
-    meet_threads(threads)
+    sync_threads(threads)
     return given
 
 

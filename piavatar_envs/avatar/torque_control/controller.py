@@ -94,7 +94,7 @@ from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, JointMass, 
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
 from piavatar_envs.avatar.types import ROOT_RATE, Body, JointState, Pose, allocate
-from piavatar_envs.core.arrays import group
+from piavatar_envs.core.arrays import make_struct
 from piavatar_envs.core.cuda_intrinsics import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.types import Model, Scratch, State, row
@@ -161,14 +161,14 @@ class ArticulatedBody:
         self.body, self._parts = divide(points, body, device)
         self.model, self.threads = model, warp_threads(device)
         self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))
-        self.springs = group(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
+        self.springs = make_struct(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
         self.attachment = self._upload(rates)
         chosen = np.flatnonzero(np.zeros(points.num_points) if firm is None else firm)
         self.firm = wp.array(chosen.astype(np.int32), dtype=int, device=device)
 
         slip = 1 + int(chosen.max(initial=0))
         self.state: JointState = allocate(JointState, n, device, velocity=NUM_DOF, outside=NUM_DOF, slip=slip)
-        self.pose = group(Pose, rotation=self.state.rotation, position=self.state.position)
+        self.pose = make_struct(Pose, rotation=self.state.rotation, position=self.state.position)
         given = {"torque": self.state.torque, "factor": self._upload(np.ones(1))}
         self.target = allocate(Target, n, device, **given)
         self.target.rotation.fill_(wp.quat_identity())
@@ -287,7 +287,7 @@ class ArticulatedBody:
     def _ground(self, scratch: Scratch) -> Ground:
         """What bones meet."""
         model = self.model
-        return group(
+        return make_struct(
             Ground,
             solid=int(self.solid),
             boundaries=model.boundaries,
@@ -477,8 +477,8 @@ class TorqueController:
         locked = [joint_index(name) for name in LOCKED_JOINTS]
         self.joints.set_tissue(muscles.tissue_damping, muscles.stop, *ranges, locked)
         state = avatar.state
-        self.joints.support = group(Support, force=state.wrench_force, torque=state.wrench_torque)
-        self.joints.target = group(
+        self.joints.support = make_struct(Support, force=state.wrench_force, torque=state.wrench_torque)
+        self.joints.target = make_struct(
             Target,
             rotation=state.goal_rotation,
             root=state.goal_root,
@@ -487,7 +487,7 @@ class TorqueController:
         )
         gains = [spring_rows(values).astype(np.float32) for values in (muscles.stiffness, muscles.damping)]
         stiffness, damping = (wp.array(values, dtype=float, device=model.device) for values in gains)
-        self.gains = group(Springs, stiffness=stiffness, damping=damping)
+        self.gains = make_struct(Springs, stiffness=stiffness, damping=damping)
         self.assist = wp.full(n, settings.assist, dtype=float, device=model.device)
         # the height that goes with the joints' span in the first body
         joints, rest = points.joints[0], points.rest[0]

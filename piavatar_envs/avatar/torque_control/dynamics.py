@@ -36,13 +36,13 @@ from piavatar_envs.avatar.skinning import blend_steps, motion_at
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, I3, NUM_DOF
 from piavatar_envs.avatar.tracking import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body, Pose
-from piavatar_envs.core.arrays import group, store_triple, vec8, vec12, vec16, vector_at, vector_from
+from piavatar_envs.core.arrays import make_struct, store_triple, vec8, vec12, vec16, vector_at, vector_from
 from piavatar_envs.core.cuda_intrinsics import (
     BLOCK,
     first_particle,
-    meet_threads,
     over_ancestors,
     sum_threads16,
+    sync_threads,
     threads_of_environment,
 )
 from piavatar_envs.mpm.types import Kinematic, row
@@ -106,7 +106,7 @@ def spread_motion(
 
     A thread that is alone goes through the bones in their order, parents first. Each lane of a warp has a bone.
     """
-    meet_threads(threads)
+    sync_threads(threads)
     if threads == 1:
         for b in range(BONES):
             motion = joint_alone(position, q, row, e, b)
@@ -118,7 +118,7 @@ def spread_motion(
         whole = add_ancestors6(joint_alone(position, q, row, e, own), body.parent[own], body.levels)
         if thread < BONES:
             field[e, own] = whole
-    meet_threads(threads)
+    sync_threads(threads)
 
 
 @wp.func
@@ -227,12 +227,12 @@ def move_joints(
     position: wp.array2d(dtype=wp.vec3),
 ):
     """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together. Threads as above."""
-    meet_threads(threads)
+    sync_threads(threads)
     r = row(e, body.rest_joint.shape[0])
     for b in range(thread, BONES, threads):
         s = field[e, b]
         rotation[e, b] = wp.normalize(quat_exp(dt * wp.vec3(s[3], s[4], s[5])) * rotation[e, b])
-    meet_threads(threads)
+    sync_threads(threads)
     if threads == 1:
         for b in range(BONES):
             position[e, b] = next_position(body, dt, field, rotation, position, r, e, b)
@@ -244,7 +244,7 @@ def move_joints(
         place = add_ancestors3(step, body.parent[own], body.levels)
         if thread < BONES:
             position[e, own] = place
-    meet_threads(threads)
+    sync_threads(threads)
 
 
 @wp.func
@@ -259,7 +259,7 @@ def add_change(
     outside: wp.array2d(dtype=float),
 ):
     """What the particles did to the joints: it was not the joints' own doing."""
-    meet_threads(threads)
+    sync_threads(threads)
     for i in range(thread, NUM_DOF, threads):
         q[e, i] = q[e, i] + change[row, i]
         outside[e, i] = outside[e, i] + change[row, i]
@@ -283,7 +283,7 @@ def go_on(
     The joints' own ``change`` is in row ``own``; what was ``taken`` of the particles before is in ``row``, where what
     they lack of their whole velocity comes.
     """
-    meet_threads(threads)
+    sync_threads(threads)
     for i in range(thread, NUM_DOF, threads):
         after = q[e, i] + change[own, i] + outside[e, i]
         q[e, i] = after
@@ -460,7 +460,7 @@ def pass_down(
 
     Of so many velocities, a warp of three, the first in row ``own``, others ``step`` rows apart.
     """
-    meet_threads(threads)
+    sync_threads(threads)
     if threads > 1:
         pass_down_together(
             body.parent, body.depth, body.children, body.levels, position, e, own, step, linear, angular, momentum
@@ -591,7 +591,7 @@ class Tissue:
 
 def make_strength(lower: np.ndarray, upper: np.ndarray, rows: int, device: str) -> Strength:
     """Limits of the torques, each ``(22, 3)`` [N m], and a factor of 1 on them in ``rows`` rows."""
-    return group(
+    return make_struct(
         Strength,
         lower=wp.array(lower.astype(np.float32), dtype=wp.vec3, device=device),
         upper=wp.array(upper.astype(np.float32), dtype=wp.vec3, device=device),
@@ -618,7 +618,7 @@ def make_tissue(
     arrays = {name: wp.array(v.astype(np.float32), dtype=float, device=device) for name, v in numbers.items()}
     for name, bound in (("lower", lower), ("upper", upper)):
         arrays[name] = wp.array(bound.astype(np.float32), dtype=wp.vec3, device=device)
-    return group(Tissue, **arrays)
+    return make_struct(Tissue, **arrays)
 
 
 @wp.func

@@ -19,8 +19,8 @@ from piavatar_envs.avatar.skinning import blend_back, blend_images, skinned_plac
 from piavatar_envs.avatar.torque_control.dynamics import blended_motion, motion_apart
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.core.arrays import ask_ahead, int_at, matrix_at, number_at, set_vector, store_matrix, vector_at
-from piavatar_envs.core.cuda_intrinsics import environment_of, lane_of_warp, meet, threads_of_block, warp_of_block
+from piavatar_envs.core.arrays import int_at, matrix_at, number_at, prefetch_rows, set_vector, store_matrix, vector_at
+from piavatar_envs.core.cuda_intrinsics import environment_of, lane_of_warp, sync_block, threads_of_block, warp_of_block
 from piavatar_envs.mpm.colliders import signed_distance
 from piavatar_envs.mpm.types import Boundaries, Grid, row
 
@@ -89,9 +89,9 @@ def attach_flesh(
     r = row(e, mass.shape[0])
     p = first + thread
     pelvis = vector_at(w.pose.position, e, 0)
-    ask_ahead(x, e, body.first + first, last - first, thread)
-    ask_ahead(u, e, body.first + first, last - first, thread)
-    ask_ahead(vk, e, body.first + first, last - first, thread)
+    prefetch_rows(x, e, body.first + first, last - first, thread)
+    prefetch_rows(u, e, body.first + first, last - first, thread)
+    prefetch_rows(vk, e, body.first + first, last - first, thread)
     while p < last:
         n = body.first + p
         arm = vector_at(x, e, n) - pelvis
@@ -108,7 +108,7 @@ def attach_flesh(
         after = implicit_velocity(own_rate, dt, way, before)
         bring_particle(room, parts.size, p - first, m, arm, before - after, after, way)
         p += threads
-    meet()
+    sync_block()
     store_second(room, last - first, thread, threads, e, body.first + first, u)
     sum_part(parts, room, pelvis, e, at[1], w)
 

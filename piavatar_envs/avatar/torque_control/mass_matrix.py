@@ -48,7 +48,7 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import (
 from piavatar_envs.avatar.tracking import symmetric
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import add_rows12, add_rows16, float_at, int_at, number_at, vec12, vec16, vector_at
-from piavatar_envs.core.cuda_intrinsics import BLOCK, highest_bit, meet, sum_threads16, warp_threads
+from piavatar_envs.core.cuda_intrinsics import BLOCK, highest_bit, sum_threads16, sync_block, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.types import Model, Particles, State, row
 
@@ -387,7 +387,7 @@ def compose_together(
                     else:
                         own += take_column(position, records, e, a, b, other)
                 write_pair(records, c, d, own)
-        meet()
+        sync_block()
 
 
 @wp.func_native("return (int)((sqrtf(8.0f * (float)n + 1.0f) - 1.0f) * 0.5f);")
@@ -423,11 +423,11 @@ def fill_mass(pattern: Pattern, records: wp.uint64, thread: int, threads: int, a
         far_d = n - far_c * (far_c + 1) // 2
         s = read_pair(records, c, d)
         far = read_pair(records, far_c, far_d)
-        meet()
+        sync_block()
         fill_blocks(s, pattern, c, d, at)
         if thread + threads < LOWER:
             fill_blocks(far, pattern, far_c, far_d, at)
-    meet()
+    sync_block()
 
 
 @wp.func
@@ -451,14 +451,14 @@ def compose_mass(
     """
     for n in range(thread, BONES * BONES, threads):
         write_pair(records, n // BONES, n % BONES, vec16())
-    meet()
+    sync_block()
     for pair in range(thread, pairs.first.shape[0], threads):
         place_pair(pairs, sums, position, e, pair, records)
-    meet()
+    sync_block()
     lanes = wp.min(threads, LANES)
     for n in range(thread, lanes * BONES, threads):
         place_bone(body, pairs, moments, position, e, n // lanes, n % lanes, lanes, records)
-    meet()
+    sync_block()
     if threads == 1:
         compose_alone(body, position, records, e)
     else:

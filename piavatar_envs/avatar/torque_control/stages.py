@@ -56,7 +56,7 @@ from piavatar_envs.avatar.torque_control.workspace import (
 )
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import vec8
-from piavatar_envs.core.cuda_intrinsics import meet, meet_threads, place_in_block, sum_threads
+from piavatar_envs.core.cuda_intrinsics import place_in_block, sum_threads, sync_block, sync_threads
 from piavatar_envs.mpm.types import row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -159,7 +159,7 @@ def limit_joints(
         limited += limit_torque(
             body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, again, e, k, w.impulse, w.left
         )  # fmt: skip
-    meet_threads(threads)
+    sync_threads(threads)
     return sum_threads(limited, threads)
 
 
@@ -184,7 +184,7 @@ def turn_joints(
 
     ``driven`` is the factor of the mass matrix with all that is implicit.
     """
-    meet_threads(threads)
+    sync_threads(threads)
     for k in range(thread, PARTS, threads):
         joint_impulse(
             body, dt, w.pose, target, springs, tissue, w.stop, w.velocity, w.outside, e, k, w.muscle, w.impulse
@@ -243,7 +243,7 @@ def build_mass(
     mass = place_of_factor(w.matrix, e, records)
     compose_mass(body, pairs, w.pair_sums, w.moments, position, w.pattern, records, e, thread, threads, mass)
     store_room(mass, e, thread, threads, w.matrix)
-    meet()
+    sync_block()
     lanes = wp.min(threads, WARP)
     warp = thread // lanes
     for which in range(warp, 2, threads // lanes):

@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from piavatar_envs.core.cuda_intrinsics import lane_of_warp, meet_threads
+from piavatar_envs.core.cuda_intrinsics import lane_of_warp, sync_threads
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
@@ -493,7 +493,7 @@ def keep_factor(room: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
     """Write factor ``f``, which :func:`factorize` has just found, where it has not done so itself."""
     lane = lane_of_warp()
     store_room(room, f, lane[0], lane[1], factor)
-    meet_threads(lane[1])  # the room is free
+    sync_threads(lane[1])  # the room is free
 
 
 @wp.func
@@ -517,10 +517,10 @@ def solve(
     x: wp.array2d(dtype=float),
 ):
     """``x[row]`` with ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its room."""
-    meet_threads(threads)
+    sync_threads(threads)
     for i in range(thread, x.shape[1], threads):
         x[row, i] = right[e, i]
-    meet_threads(threads)
+    sync_threads(threads)
     solve_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), row, 0, x)
 
 
@@ -537,7 +537,7 @@ def solve_three_in_place(
     x: wp.array2d(dtype=float),
 ):
     """:func:`solve` of three right-hand sides in ``x``, the ``first`` and others ``step`` rows apart."""
-    meet_threads(threads)
+    sync_threads(threads)
     solve_three(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), first, step, x)
 
 
@@ -560,7 +560,7 @@ def begin_solution(
     nothing is read or written. A warp has them in its room, see
     :func:`piavatar_envs.avatar.torque_control.workspace.see_columns`.
     """
-    meet_threads(threads)
+    sync_threads(threads)
     at = place_of_factor(factor, f, room)
     descend_three(pattern.head, pattern.word, pattern.turn, at, first, step, wanted, x)
 
@@ -577,5 +577,5 @@ def end_solution(
     x: wp.array2d(dtype=float),
 ):
     """``L^-1`` times the first of the columns of :func:`begin_solution`."""
-    meet_threads(threads)
+    sync_threads(threads)
     ascend_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), first, x)

@@ -8,48 +8,53 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.core.arrays import vec8, vec8i
-from piavatar_envs.core.cuda_intrinsics import meet_warp, thread_of_block, threads_of_block
-from piavatar_envs.core.shared_memory import half_word, has_bit, number, word
+from piavatar_envs.core.cuda_intrinsics import sync_warp, thread_of_block, threads_of_block
+from piavatar_envs.core.shared_memory import float_word, half_word, has_bit, word
 from piavatar_envs.mpm.bspline import BLOCK_NODES, Stencil, block_corner, grid_position, stencil_at
 from piavatar_envs.mpm.colliders import nearest_boundary
 from piavatar_envs.mpm.cuda.block_grid import (
-    BLOCK_BRICKS,
-    NO_BRICK,
+    BLOCK_SUBBLOCKS,
+    NO_SUBBLOCK,
     PLACES,
     SPEED,
     block_of,
-    bricks_around,
-    bricks_of_round,
-    in_marked_plane,
+    in_flagged_plane,
     kinematic_at,
     kinematic_of,
     kinematic_word,
-    line_in_bricks,
+    line_in_subblocks,
+    mass_quantum_of,
     node_word,
     physical_at,
     place_of_record,
     record_of_place,
     set_velocities,
+    subblocks_around,
+    subblocks_of_round,
     sums_at,
-    unit_of_mass,
 )
-from piavatar_envs.mpm.g2p import Gathered, Gradients, asks_kinematic, finish_gather, gather, store_particle
+from piavatar_envs.mpm.g2p import Advanced, Gradients, advance_particle, g2p_particle, needs_kinematic, store_particle
 from piavatar_envs.mpm.grid_arrays import write_record
-from piavatar_envs.mpm.grid_update import meet_boundaries, physical_velocity, place_of, total_velocity
-from piavatar_envs.mpm.sparse_grid import has_field, slots_used
+from piavatar_envs.mpm.grid_update import (
+    collide_with_boundaries,
+    node_position_in_block,
+    physical_velocity,
+    total_velocity,
+)
+from piavatar_envs.mpm.sparse_grid import has_field, num_active
 from piavatar_envs.mpm.types import (
     NO_STRESS,
     SPLIT,
+    Accumulators,
+    Arena,
     Blocks,
     Boundaries,
     Contact,
     Grid,
     Moving,
     Particles,
-    Room,
     Sensors,
     Step,
-    Sums,
 )
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -62,13 +67,13 @@ def updated_node(
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
-    room: Room,
-    sums: Sums,
+    arena: Arena,
+    accumulators: Accumulators,
     sensors: Sensors,
     e: int,
     n: int,
-    marked: int,
-    unit: float,
+    flagged: int,
+    quantum: float,
     speed: float,
 ):
     """Velocity of node ``n`` of a round, from its sums; the units are those of one field, if it is the only.
@@ -77,22 +82,22 @@ def updated_node(
     """
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     several = contact.num_fields > 1
-    near = in_marked_plane(marked, n)
-    place = marked % PLACES
+    near = in_flagged_plane(flagged, n)
+    place = flagged % PLACES
     r = record_of_place(place, n % 8)
     block = int(0)
     f = int(0)
-    m = float(unit)
-    q = unit * speed
+    m = float(quantum)
+    q = quantum * speed
     if near or several:  # others need not wait to know
-        held = blocks.held[e, place // BLOCK_BRICKS]
-        block = block_of(grid, contact, held)
+        owner = blocks.owner[e, place // BLOCK_SUBBLOCKS]
+        block = block_of(grid, contact, owner)
         if several:
-            f = held // grid.num_blocks
-            m = unit_of_mass(f)
-            q = m * number(SPEED + f)
-    physical = sums_at(node_word(room, n))
-    at = kinematic_word(room, n)
+            f = owner // grid.num_blocks
+            m = mass_quantum_of(f)
+            q = m * float_word(SPEED + f)
+    physical = sums_at(node_word(arena, n))
+    at = kinematic_word(arena, n)
     s = vec8(
         m * float(physical[0]), q * float(physical[1]), q * float(physical[2]), q * float(physical[3]),
         q * float(word(at)), q * float(word(at + 1)), q * float(word(at + 2)), 0.0,
@@ -100,23 +105,23 @@ def updated_node(
     if not several or blocks.fields[e, block] == (1 << f):
         s = total_velocity(step, split, s)
         if near:
-            x = place_of(grid, block_corner(grid, block), r % BLOCK_NODES)
-            s = meet_boundaries(grid, boundaries, contact, sums, e, f, r, x, s, sensors)
+            x = node_position_in_block(grid, block_corner(grid, block), r % BLOCK_NODES)
+            s = collide_with_boundaries(grid, boundaries, contact, accumulators, e, f, r, x, s, sensors)
         s = physical_velocity(split, s)
         if near or several:
-            sums.offset[e, r] = wp.vec4()
+            accumulators.offset[e, r] = wp.vec4()
     return s
 
 
 @wp.func
-def update_bricks(
+def update_subblocks(
     grid: Grid,
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
-    room: Room,
-    sums: Sums,
+    arena: Arena,
+    accumulators: Accumulators,
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
@@ -124,59 +129,59 @@ def update_bricks(
     writes: bool,
 ):
     """Sums of a round's nodes to velocities; where it ``writes``, outside. All threads come here."""
-    unit = unit_of_mass(0)
-    speed = number(SPEED)
-    count = 8 * bricks_of_round(room, first)
+    quantum = mass_quantum_of(0)
+    speed = float_word(SPEED)
+    count = 8 * subblocks_of_round(arena, first)
     for n in range(thread_of_block(), count, threads_of_block()):
-        marked = half_word(room.places, first + n // 8)
+        flagged = half_word(arena.places, first + n // 8)
         s = updated_node(
-            grid, step, boundaries, contact, blocks, room, sums, sensors, e, n, marked, unit, speed
+            grid, step, boundaries, contact, blocks, arena, accumulators, sensors, e, n, flagged, quantum, speed
         )  # fmt: skip
         if writes:
-            write_record(node_velocity, e, record_of_place(marked % PLACES, n % 8), s)
+            write_record(node_velocity, e, record_of_place(flagged % PLACES, n % 8), s)
         else:
-            set_velocities(node_word(room, n), kinematic_word(room, n), s)
+            set_velocities(node_word(arena, n), kinematic_word(arena, n), s)
 
 
 @wp.func
 def clear_untouched(
     grid: Grid,
     blocks: Blocks,
-    room: Room,
+    arena: Arena,
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
-    part: wp.vec3i,
+    partition: wp.vec3i,
 ):
     """Records of nodes that no particle touches, in slots that the fields use; nothing has touched anything yet."""
-    for r in range(thread_of_block(), BLOCK_NODES * slots_used(blocks, e), threads_of_block()):
-        slot = r // BLOCK_NODES
-        if has_field(part[2], blocks.held[e, slot] // grid.num_blocks):
-            if half_word(room.numbers, place_of_record(r)) == NO_BRICK:
+    for r in range(thread_of_block(), BLOCK_NODES * num_active(blocks, e), threads_of_block()):
+        active = r // BLOCK_NODES
+        if has_field(partition[2], blocks.owner[e, active] // grid.num_blocks):
+            if half_word(arena.numbers, place_of_record(r)) == NO_SUBBLOCK:
                 write_record(node_velocity, e, r, vec8())
             if r % BLOCK_NODES == 0:
-                sensors.touched[e, slot] = 0
+                sensors.touched[e, active] = 0
 
 
 @wp.func
-def kinematic_from_bricks(room: Room, bricks: vec8i, stencil: Stencil):
+def kinematic_from_subblocks(arena: Arena, subblocks: vec8i, stencil: Stencil):
     """Kinematic velocity of a stencil's nodes, in components 1 to 3; few particles ask for it."""
     base = stencil.base
     wz = stencil.wz
     mean = wp.vec4()
     lines = int(9)  # not a constant: it is as short as can be
     for n in range(lines):
-        at = line_in_bricks(bricks, base, n // 3, n % 3)
+        at = line_in_subblocks(subblocks, base, n // 3, n % 3)
         w = stencil.wx[n // 3] * stencil.wy[n % 3]
-        first = wz[0] * kinematic_at(kinematic_of(room, at[0]))
-        second = wz[1] * kinematic_at(kinematic_of(room, at[1]))
-        mean += w * (first + second + wz[2] * kinematic_at(kinematic_of(room, at[2])))
+        first = wz[0] * kinematic_at(kinematic_of(arena, at[0]))
+        second = wz[1] * kinematic_at(kinematic_of(arena, at[1]))
+        mean += w * (first + second + wz[2] * kinematic_at(kinematic_of(arena, at[2])))
     return mean
 
 
 @wp.func
-def physical_from_bricks(bricks: vec8i, stencil: Stencil):
-    """Sums over a stencil, see :func:`piavatar_envs.mpm.g2p.gather_physical`."""
+def physical_from_subblocks(subblocks: vec8i, stencil: Stencil):
+    """Sums over a stencil, see :func:`piavatar_envs.mpm.g2p.sum_physical`."""
     base = stencil.base
     wx = stencil.wx
     wy = stencil.wy
@@ -189,7 +194,7 @@ def physical_from_bricks(bricks: vec8i, stencil: Stencil):
         along_y = wp.vec4()
         along_z = wp.vec4()
         for j in range(3):
-            at = line_in_bricks(bricks, base, i, j)
+            at = line_in_subblocks(subblocks, base, i, j)
             second = physical_at(at[1])
             third = physical_at(at[2])
             line = wz[0] * physical_at(at[0]) + wz[1] * second + wz[2] * third
@@ -204,43 +209,43 @@ def physical_from_bricks(bricks: vec8i, stencil: Stencil):
 
 
 @wp.func
-def gather_from_bricks(
+def g2p_from_subblocks(
     grid: Grid,
     step: Step,
     particles: Particles,
     boundaries: Boundaries,
     blocks: Blocks,
-    room: Room,
+    arena: Arena,
     moved: Moving,
     failure: wp.array(dtype=int),
     e: int,
     p: int,
 ):
-    """Particle ``p`` from the nodes, see :func:`piavatar_envs.mpm.g2p.gather`."""
+    """Particle ``p`` from the nodes, see :func:`piavatar_envs.mpm.g2p.g2p_particle`."""
     x = moved.x[e, p]
     stencil = stencil_at(grid_position(grid, x))
-    bricks = bricks_around(grid, blocks, room, e, particles.field[p], stencil.base, 0)
+    subblocks = subblocks_around(grid, blocks, arena, e, particles.field[p], stencil.base, 0)
     kinematic = Gradients()
-    asked = bool(False)
-    if has_bit(room.told, p):  # who is that near a boundary tells its place
-        asked = asks_kinematic(grid, step, nearest_boundary(boundaries, e, x))
-    if asked:
-        kinematic.mean = kinematic_from_bricks(room, bricks, stencil)
-    physical = physical_from_bricks(bricks, stencil)
-    return finish_gather(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, asked, stencil
+    needed = bool(False)
+    if has_bit(arena.candidates, p):  # who is that near a boundary tells its place
+        needed = needs_kinematic(grid, step, nearest_boundary(boundaries, e, x))
+    if needed:
+        kinematic.mean = kinematic_from_subblocks(arena, subblocks, stencil)
+    physical = physical_from_subblocks(subblocks, stencil)
+    return advance_particle(
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, needed, stencil
     )  # fmt: skip
 
 
 @wp.func
-def gather_all(
+def g2p_all(
     grid: Grid,
     step: Step,
     particles: Particles,
     boundaries: Boundaries,
     node_velocity: wp.array2d(dtype=wp.vec4),
     blocks: Blocks,
-    room: Room,
+    arena: Arena,
     moved: Moving,
     failure: wp.array(dtype=int),
     e: int,
@@ -253,18 +258,18 @@ def gather_all(
     if outside:
         for start in range(0, count, threads_of_block()):
             p = wp.min(start + t, count - 1)
-            s = Gathered()
+            s = Advanced()
             stays = fails or p < start + t
             if not stays:
-                s, _ = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
-            meet_warp()
+                s, _ = g2p_particle(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+            sync_warp()
             store_particle(moved, e, p, s, not stays and s.fault == 0)
     else:
         for start in range(0, count, threads_of_block()):
             p = wp.min(start + t, count - 1)
-            s = Gathered()
+            s = Advanced()
             stays = fails or p < start + t
             if not stays:
-                s = gather_from_bricks(grid, step, particles, boundaries, blocks, room, moved, failure, e, p)
-            meet_warp()
+                s = g2p_from_subblocks(grid, step, particles, boundaries, blocks, arena, moved, failure, e, p)
+            sync_warp()
             store_particle(moved, e, p, s, not stays and s.fault == 0)

@@ -6,7 +6,7 @@ nothing to do with each other.
 The grid of a small body in the shared memory of one CUDA block: where its nodes lie there, and how to get at them.
 
 A small body touches two thousand nodes. They fit into the memory that a multiprocessor shares among the threads of a
-CUDA block, where an integer is added a hundred times as fast as in the GPU's own. There they lie in bricks of 2 x 2 x 2
+CUDA block, where an integer is added a hundred times as fast as in the GPU's own. There they lie in subblocks of 2 x 2 x 2
 nodes, numbered anew in every substep as the particles touch them; what touches more than fit goes in several rounds.
 
 An integer has 32 bits. Of mass they count units of 2^-27 of a field's heaviest particle, so a node may hold 16 of them;
@@ -14,12 +14,12 @@ where one gets more, the environment counts anew, eight units as one. Of momentu
 none of the field's particles exceeds, a power of two, in every substep another: so the integers are used to the full,
 and what a particle adds is rounded as a floating-point number would be.
 
-Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; for every brick of every slot a half word, its
-number; a bit for every particle; a byte for every slot; the bricks' own places; bricks of four words a node; three more
-of every node, in the same order. A brick has a word in each of the 32 banks, and its place in the brick says in which:
+Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; for every subblock of every slot a half word, its
+number; a bit for every particle; a byte for every slot; the subblocks' own places; subblocks of four words a node; three more
+of every node, in the same order. A subblock has a word in each of the 32 banks, and its place in the subblock says in which:
 threads that add to different nodes of the eight, or to different words of the four, do not wait for each other.
 
-Which bricks of nodes a body touches, and which of its particles tell their places.
+Which subblocks of nodes a body touches, and which of its particles tell their places.
 
 What the words of nodes in shared memory count: units of mass, and speeds that momenta are counted at.
 """
@@ -30,45 +30,45 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.core.arrays import vec8, vec8i
-from piavatar_envs.core.cuda_intrinsics import meet, thread_of_block, threads_of_block
+from piavatar_envs.core.cuda_intrinsics import sync_block, thread_of_block, threads_of_block
 from piavatar_envs.core.shared_memory import (
     APPEND,
     add_word,
     byte,
     clear_words,
     fill_words,
+    float_word,
+    max_float_word,
     native,
-    number,
     or_word,
-    raise_to,
     set_byte,
+    set_float_word,
     set_half_word,
-    set_number,
     word,
 )
 from piavatar_envs.mpm.bspline import BLOCK_NODES, base_node, block_corner, grid_position
 from piavatar_envs.mpm.colliders import GATED_SLAB
 from piavatar_envs.mpm.grid_update import SLAB_NODES, block_is_near, slab_is_near
-from piavatar_envs.mpm.p2g import Scattered, takes_part, tells_place
-from piavatar_envs.mpm.sparse_grid import fields_beyond, has_field, slots_used
-from piavatar_envs.mpm.types import Blocks, Boundaries, Contact, Grid, Model, Particles, Room, row
+from piavatar_envs.mpm.p2g import Deposit, is_contact_candidate, takes_part
+from piavatar_envs.mpm.sparse_grid import fields_beyond, has_field, num_active
+from piavatar_envs.mpm.types import Arena, Blocks, Boundaries, Contact, Grid, Model, Particles, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 #: Words of a room of which two fit into a multiprocessor, and of one that takes it all; with what stores take of it.
-SMALL_ROOM, LARGE_ROOM = 27_008, 54_272
+SMALL_ARENA, LARGE_ARENA = 27_008, 54_272
 #: Threads of their CUDA blocks.
 SMALL_THREADS, LARGE_THREADS = 320, 640
 #: Slots of a part up to which the small one does: they are more than will be used, and half of their nodes.
-MOST_SLOTS_SMALL = 210
+SMALL_ACTIVE_BLOCKS = 210
 #: Particles of a part up to which its CUDA block has no more to do than others have time for.
 MOST_PARTICLES = 8192
 #: Particles of an environment, which are listed in half words.
 MOST_LISTED = 2**16
 
 
-def parts_of(field: np.ndarray) -> list[tuple[int, int, int]]:
+def partitions_of(field: np.ndarray) -> list[tuple[int, int, int]]:
     """The shortest runs of particles that share no velocity field, each for a CUDA block of its own.
 
     Args:
@@ -78,60 +78,60 @@ def parts_of(field: np.ndarray) -> list[tuple[int, int, int]]:
         First particle, one after the last, and bits of the fields, of every part.
     """
     last = {int(f): int(np.flatnonzero(field == f)[-1]) for f in np.unique(field)}
-    parts, first, end = [], 0, 0
+    partitions, first, end = [], 0, 0
     for p, f in enumerate(field.tolist()):
         end = max(end, last[f])
         if p == end:
-            parts.append((first, p + 1, int(np.bitwise_or.reduce(1 << np.unique(field[first : p + 1])))))
+            partitions.append((first, p + 1, int(np.bitwise_or.reduce(1 << np.unique(field[first : p + 1])))))
             first = p + 1
-    return parts
+    return partitions
 
 
-def most_particles(field: np.ndarray) -> int:
+def largest_partition(field: np.ndarray) -> int:
     """Particles of the largest part."""
-    return max(end - first for first, end, _ in parts_of(field))
+    return max(end - first for first, end, _ in partitions_of(field))
 
 
-def suits_shared(device: str, field: np.ndarray, max_slots: int) -> bool:
+def suits_block_path(device: str, field: np.ndarray, max_active_blocks: int) -> bool:
     """Whether environments with such particles may have CUDA blocks of their own, and enough shared memory."""
     target = wp.get_device(device)
-    few = most_particles(field) <= MOST_PARTICLES and len(field) <= MOST_LISTED
+    few = largest_partition(field) <= MOST_PARTICLES and len(field) <= MOST_LISTED
     if not (target.is_cuda and target.arch >= 80 and few):
         return False
-    tables = int(BLOCK_BRICKS) * max_slots + len(field) // 32 + max_slots // 4
-    fits = 4 * tables < LARGE_ROOM and int(BLOCK_BRICKS) * max_slots < int(PLACES)
+    tables = int(BLOCK_SUBBLOCKS) * max_active_blocks + len(field) // 32 + max_active_blocks // 4
+    fits = 4 * tables < LARGE_ARENA and int(BLOCK_SUBBLOCKS) * max_active_blocks < int(PLACES)
     return target.max_shared_memory_per_block >= 227 * 1024 and fits
 
 
-def has_large_room(model: Model, parts: list[tuple[int, int, int]]) -> bool:
-    """Whether rooms of these ``parts`` take a multiprocessor each: nodes need it, or there are enough of them.
+def needs_large_arena(model: Model, partitions: list[tuple[int, int, int]]) -> bool:
+    """Whether rooms of these ``partitions`` take a multiprocessor each: nodes need it, or there are enough of them.
 
     A large room has more threads, and what they add up are integers: the result is the same.
     """
-    share = max(end - first for first, end, _ in parts) / model.num_particles
-    if share * model.max_slots > MOST_SLOTS_SMALL:
+    share = max(end - first for first, end, _ in partitions) / model.num_particles
+    if share * model.max_active_blocks > SMALL_ACTIVE_BLOCKS:
         return True
-    return model.num_envs * len(parts) <= wp.get_device(model.device).sm_count
+    return model.num_envs * len(partitions) <= wp.get_device(model.device).sm_count
 
 
-def plan_room(model: Model) -> tuple[Room, bool]:
+def plan_arena(model: Model) -> tuple[Arena, bool]:
     """Where things lie in a room, and whether it is a large one."""
-    room = Room()
-    if model.scatter != "shared":
-        return room, False
-    parts = parts_of(model.particles.field.numpy())
-    large = has_large_room(model, parts)
-    room.numbers = int(HEADER)
-    room.told = room.numbers + int(BLOCK_BRICKS) * model.max_slots // 2
-    room.near = room.told + -(-model.num_particles // 32)
-    room.places = _multiple_of_4(room.near + -(-model.max_slots // 4))
-    room.bricks = _multiple_of_4(room.places + int(BLOCK_BRICKS) * model.max_slots // 2)
-    words = int(BRICK_WORDS) + int(KINEMATIC_BRICK_WORDS)
-    room.capacity = ((LARGE_ROOM if large else SMALL_ROOM) - room.bricks) // words - 1
-    room.kinematic = room.bricks + int(BRICK_WORDS) * (room.capacity + 1)
-    room.part = wp.array(np.array(parts, np.int32), dtype=wp.vec3i, device=model.device)
-    room.speed = wp.zeros((model.num_envs, model.contact.num_fields), dtype=float, device=model.device)
-    return room, large
+    arena = Arena()
+    if model.path != "block":
+        return arena, False
+    partitions = partitions_of(model.particles.field.numpy())
+    large = needs_large_arena(model, partitions)
+    arena.numbers = int(HEADER)
+    arena.candidates = arena.numbers + int(BLOCK_SUBBLOCKS) * model.max_active_blocks // 2
+    arena.near = arena.candidates + -(-model.num_particles // 32)
+    arena.places = _multiple_of_4(arena.near + -(-model.max_active_blocks // 4))
+    arena.subblocks = _multiple_of_4(arena.places + int(BLOCK_SUBBLOCKS) * model.max_active_blocks // 2)
+    words = int(SUBBLOCK_WORDS) + int(KINEMATIC_SUBBLOCK_WORDS)
+    arena.capacity = ((LARGE_ARENA if large else SMALL_ARENA) - arena.subblocks) // words - 1
+    arena.kinematic = arena.subblocks + int(SUBBLOCK_WORDS) * (arena.capacity + 1)
+    arena.partition = wp.array(np.array(partitions, np.int32), dtype=wp.vec3i, device=model.device)
+    arena.speed = wp.zeros((model.num_envs, model.contact.num_fields), dtype=float, device=model.device)
+    return arena, large
 
 
 def _multiple_of_4(words: int) -> int:
@@ -142,152 +142,154 @@ def _multiple_of_4(words: int) -> int:
 NODE_WORDS = wp.constant(4)
 #: Words that it has elsewhere: kinematic momentum, later kinematic velocity.
 KINEMATIC_WORDS = wp.constant(3)
-#: Words of a brick of 2 x 2 x 2 nodes, as many as there are banks, and those that it has elsewhere.
-BRICK_WORDS, KINEMATIC_BRICK_WORDS = wp.constant(8 * NODE_WORDS), wp.constant(8 * KINEMATIC_WORDS)
-#: Bricks of a block of 4 x 4 x 4 nodes.
-BLOCK_BRICKS = wp.constant(8)
-#: Words of the header: bricks in use; bits FAILURE_*; particles that tell their places; mass that has been lost
+#: Words of a subblock of 2 x 2 x 2 nodes, as many as there are banks, and those that it has elsewhere.
+SUBBLOCK_WORDS, KINEMATIC_SUBBLOCK_WORDS = wp.constant(8 * NODE_WORDS), wp.constant(8 * KINEMATIC_WORDS)
+#: Subblocks of a block of 4 x 4 x 4 nodes.
+BLOCK_SUBBLOCKS = wp.constant(8)
+#: Words of the header: subblocks in use; bits FAILURE_*; particles that tell their places; mass that has been lost
 #: [LOST_UNITS]; units in a field's heaviest particle; how many particles are listed; and of every field, of which there
 #: are 32 at most, for they are bits of a block's mask: the mass of its heaviest particle [kg], the speed of its
 #: fastest, and the speed that its momenta are counted at [m/s].
 HEADER = wp.constant(104)
-COUNT, FAULTS, TOLD, LOST, UNITS, LISTED = (wp.constant(n) for n in range(6))
+COUNT, FAULTS, NUM_CANDIDATES, LOST, QUANTA, LISTED = (wp.constant(n) for n in range(6))
 HEAVIEST, FASTEST, SPEED = (wp.constant(n) for n in (8, 40, 72))
 #: Units of mass in a field's heaviest particle, if no node holds too much.
-MOST_UNITS = wp.constant(float(2**27))
-#: No brick has this number; nor this one, which those have that are to be numbered.
-NO_BRICK, TOUCHED = wp.constant(0xFFFF), wp.constant(0xFFFE)
-#: What a brick's place has besides its slot and its number there: a bit for each of its planes of nodes across x.
+MAX_MASS_QUANTA = wp.constant(float(2**27))
+#: No subblock has this number; nor this one, which those have that are to be numbered.
+NO_SUBBLOCK, TOUCHED = wp.constant(0xFFFF), wp.constant(0xFFFE)
+#: What a subblock's place has besides its slot and its number there: a bit for each of its planes of nodes across x.
 PLACES = wp.constant(0x4000)
 
 
-def brick_native(cuda: str, otherwise: str = "") -> str:
-    """A snippet that knows the header's words, the strides of the nodes of a brick, and :func:`kinematic_of`."""
+def subblock_native(cuda: str, otherwise: str = "") -> str:
+    """A snippet that knows the header's words, the strides of the nodes of a subblock, and :func:`kinematic_of`."""
     z, rest = int(NODE_WORDS), int(KINEMATIC_WORDS)
-    strides = f"constexpr int ALONG_Z = {z}, ALONG_Y = {2 * z}, ALONG_X = {4 * z}, BRICK = {8 * z};\n"
+    strides = f"constexpr int ALONG_Z = {z}, ALONG_Y = {2 * z}, ALONG_X = {4 * z}, SUBBLOCK = {8 * z};\n"
     words = f"COUNT = {int(COUNT)}, TOUCHED = {int(TOUCHED)}, PLACES = {int(PLACES)}"
-    of = f"[](const auto& in, int at) {{ return in.kinematic + (at - in.bricks) / {z} * {rest}; }}"
+    of = f"[](const auto& in, int at) {{ return in.kinematic + (at - in.subblocks) / {z} * {rest}; }}"
     return native(f"constexpr int {words};\n{strides}auto kinematic_of = {of};\n{cuda}", otherwise)
 
 
 @wp.func_native(
-    brick_native(
+    subblock_native(
         APPEND
         + """
-unsigned short* const number = reinterpret_cast<unsigned short*>(room + numbers);
-unsigned short* const place = reinterpret_cast<unsigned short*>(room + places);
-const unsigned char* const slabs = reinterpret_cast<const unsigned char*>(room + near);
+unsigned short* const number = reinterpret_cast<unsigned short*>(arena + numbers);
+unsigned short* const place = reinterpret_cast<unsigned short*>(arena + places);
+const unsigned char* const slabs = reinterpret_cast<const unsigned char*>(arena + near);
 const int lane = threadIdx.x & 31;
 for (int n = threadIdx.x; n - lane < most; n += blockDim.x) {
     const bool touched = n < most && number[n] == TOUCHED;
-    // of the four slabs of a block a brick has the first or the last two
+    // of the four slabs of a block a subblock has the first or the last two
     const int planes = touched ? slabs[n >> 3] >> ((n & 4) >> 1) & 3 : 0;
     const bool own = touched && (planes != 0) == by_boundaries;
-    const int next = append(room + COUNT, __ballot_sync(0xffffffffu, own), lane);
+    const int next = append(arena + COUNT, __ballot_sync(0xffffffffu, own), lane);
     if (own) number[n] = next, place[next] = n + planes * PLACES;
 }
 """
     )
 )
-def number_bricks(numbers: int, places: int, near: int, most: int, by_boundaries: bool):
-    """Number the touched bricks of ``most`` that boundaries are near, or those that none is, and note their places.
+def number_subblocks(numbers: int, places: int, near: int, most: int, by_boundaries: bool):
+    """Number the touched subblocks of ``most`` that boundaries are near, or those that none is, and note their places.
 
-    All threads come here; which number a brick gets depends on who comes first, and nothing depends on that.
+    All threads come here; which number a subblock gets depends on who comes first, and nothing depends on that.
     """
     ...
 
 
 @wp.func
-def bricks_of_round(room: Room, first: int):
-    """How many bricks there are in a round of those from the ``first`` on."""
-    return wp.min(word(COUNT) - first, room.capacity)
+def subblocks_of_round(arena: Arena, first: int):
+    """How many subblocks there are in a round of those from the ``first`` on."""
+    return wp.min(word(COUNT) - first, arena.capacity)
 
 
 @wp.func
-def node_word(room: Room, n: int):
-    """Word at which node ``n`` of a round begins, eight a brick."""
-    return room.bricks + NODE_WORDS * n
+def node_word(arena: Arena, n: int):
+    """Word at which node ``n`` of a round begins, eight a subblock."""
+    return arena.subblocks + NODE_WORDS * n
 
 
 @wp.func
-def kinematic_word(room: Room, n: int):
+def kinematic_word(arena: Arena, n: int):
     """Word at which the kinematic momentum of node ``n`` of a round begins."""
-    return room.kinematic + KINEMATIC_WORDS * n
+    return arena.kinematic + KINEMATIC_WORDS * n
 
 
 @wp.func
-def kinematic_of(room: Room, at: int):
+def kinematic_of(arena: Arena, at: int):
     """The same of the node that begins at word ``at``."""
-    return kinematic_word(room, (at - room.bricks) >> 2)
+    return kinematic_word(arena, (at - arena.subblocks) >> 2)
 
 
 @wp.func
-def clear_bricks(room: Room, first: int):
+def clear_subblocks(arena: Arena, first: int):
     """Zero the nodes of a round."""
-    clear_words(room.bricks, BRICK_WORDS * bricks_of_round(room, first))
-    clear_words(room.kinematic, KINEMATIC_BRICK_WORDS * bricks_of_round(room, first))
+    clear_words(arena.subblocks, SUBBLOCK_WORDS * subblocks_of_round(arena, first))
+    clear_words(arena.kinematic, KINEMATIC_SUBBLOCK_WORDS * subblocks_of_round(arena, first))
 
 
 @wp.func
-def in_marked_plane(marked: int, n: int):
-    """Whether the plane of node ``n`` of a round has its bit in the ``marked`` place of the brick."""
-    return (marked & (PLACES << ((n >> 2) & 1))) != 0
+def in_flagged_plane(flagged: int, n: int):
+    """Whether the plane of node ``n`` of a round has its bit in the ``flagged`` place of the subblock."""
+    return (flagged & (PLACES << ((n >> 2) & 1))) != 0
 
 
-# of two bricks along an axis the upper one lies in the next block if the lower one is a block's second; a thread asks
+# of two subblocks along an axis the upper one lies in the next block if the lower one is a block's second; a thread asks
 # for no slot twice: reads of a warp in many places are what keeps a multiprocessor busy
 _AROUND = """
 const int ny = grid.blocks[1], nz = grid.blocks[2];
-const int* const slots =
-    &wp::index(blocks.slot, e, field * grid.num_blocks + ((base[0] >> 2) * ny + (base[1] >> 2)) * nz + (base[2] >> 2));
+const int* const active_blocks =
+    &wp::index(blocks.active, e, field * grid.num_blocks + ((base[0] >> 2) * ny + (base[1] >> 2)) * nz + (base[2] >> 2));
 const bool next_x = base[0] & 2, next_y = base[1] & 2, next_z = base[2] & 2;
-int asked[8] = {};
+int needed[8] = {};
 #pragma unroll
 for (int b = 0; b < 8; ++b)
     if ((!(b & 4) || next_x) && (!(b & 2) || next_y) && (!(b & 1) || next_z))
-        asked[b] = slots[(b & 4 ? ny * nz : 0) + (b & 2 ? nz : 0) + (b & 1)];
+        needed[b] = active_blocks[(b & 4 ? ny * nz : 0) + (b & 2 ? nz : 0) + (b & 1)];
 const int in_x = (base[0] & 2) << 1, in_y = base[1] & 2, in_z = (base[2] & 2) >> 1;
 wp::vec_t<8, wp::int32> n;
 #pragma unroll
 for (int b = 0; b < 8; ++b) {
-    if ((b & 4) && !next_x) asked[b] = asked[b ^ 4];
-    else if ((b & 2) && !next_y) asked[b] = asked[b ^ 2];
-    else if ((b & 1) && !next_z) asked[b] = asked[b ^ 1];
-    n[b] = 8 * asked[b] + (b & 4 ? 4 - in_x : in_x) + (b & 2 ? 2 - in_y : in_y) + (b & 1 ? 1 - in_z : in_z);
+    if ((b & 4) && !next_x) needed[b] = needed[b ^ 4];
+    else if ((b & 2) && !next_y) needed[b] = needed[b ^ 2];
+    else if ((b & 1) && !next_z) needed[b] = needed[b ^ 1];
+    n[b] = 8 * needed[b] + (b & 4 ? 4 - in_x : in_x) + (b & 2 ? 2 - in_y : in_y) + (b & 1 ? 1 - in_z : in_z);
 }
 """
 
 
-@wp.func_native(brick_native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
+@wp.func_native(subblock_native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
 def places_around(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i) -> vec8i:
-    """Where the bricks of a stencil have their half words: 8 slot + brick in block, for x, y and z lower and upper."""
+    """Where the subblocks of a stencil have their half words: 8 slot + subblock in block, for x, y and z lower and upper."""
     ...
 
 
 @wp.func_native(
-    brick_native(
+    subblock_native(
         _AROUND
         + """
-const unsigned short* const number = reinterpret_cast<const unsigned short*>(room + layout.numbers);
-for (int b = 0; b < 8; ++b)  // the last brick takes what is not of this round
-    n[b] = layout.bricks + BRICK * (int)min((unsigned)(number[n[b]] - first), (unsigned)layout.capacity);
+const unsigned short* const number = reinterpret_cast<const unsigned short*>(arena + layout.numbers);
+for (int b = 0; b < 8; ++b)  // the last subblock takes what is not of this round
+    n[b] = layout.subblocks + SUBBLOCK * (int)min((unsigned)(number[n[b]] - first), (unsigned)layout.capacity);
 return n;
 """,
         "return wp::vec_t<8, wp::int32>();",
     )
 )
-def bricks_around(grid: Grid, blocks: Blocks, layout: Room, e: int, field: int, base: wp.vec3i, first: int) -> vec8i:
-    """Words at which the bricks of a stencil begin, in a round of bricks from the ``first`` on."""
+def subblocks_around(
+    grid: Grid, blocks: Blocks, layout: Arena, e: int, field: int, base: wp.vec3i, first: int
+) -> vec8i:
+    """Words at which the subblocks of a stencil begin, in a round of subblocks from the ``first`` on."""
     ...
 
 
 @wp.func_native(
-    brick_native(
+    subblock_native(
         """
 const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
 const bool far = px + i > 1, upper = py + j > 1;
-const int lower_z = far ? (upper ? bricks[6] : bricks[4]) : (upper ? bricks[2] : bricks[0]);
-const int upper_z = far ? (upper ? bricks[7] : bricks[5]) : (upper ? bricks[3] : bricks[1]);
+const int lower_z = far ? (upper ? subblocks[6] : subblocks[4]) : (upper ? subblocks[2] : subblocks[0]);
+const int upper_z = far ? (upper ? subblocks[7] : subblocks[5]) : (upper ? subblocks[3] : subblocks[1]);
 const int line = ((px + i) & 1) * ALONG_X + ((py + j) & 1) * ALONG_Y;
 const int second = pz ? upper_z : lower_z + ALONG_Z;
 return wp::vec3i(line + lower_z + pz * ALONG_Z, line + second, line + upper_z + pz * ALONG_Z);
@@ -295,15 +297,15 @@ return wp::vec3i(line + lower_z + pz * ALONG_Z, line + second, line + upper_z + 
         "return wp::vec3i();",
     )
 )
-def line_in_bricks(bricks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
+def line_in_subblocks(subblocks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
     """Words at which the nodes ``base + (i, j, 0..2)`` begin."""
     ...
 
 
 @wp.func_native(
-    brick_native(
+    subblock_native(
         """
-const float4 v = *reinterpret_cast<const float4*>(room + at);
+const float4 v = *reinterpret_cast<const float4*>(arena + at);
 return wp::vec_t<4, wp::float32>(0.0f, v.x, v.y, v.z);
 """,
         "return wp::vec_t<4, wp::float32>();",
@@ -315,9 +317,9 @@ def physical_at(at: int) -> wp.vec4:
 
 
 @wp.func_native(
-    brick_native(
+    subblock_native(
         """
-const float* const v = reinterpret_cast<const float*>(room + at);
+const float* const v = reinterpret_cast<const float*>(arena + at);
 return wp::vec_t<4, wp::float32>(0.0f, v[0], v[1], v[2]);
 """,
         "return wp::vec_t<4, wp::float32>();",
@@ -329,9 +331,9 @@ def kinematic_at(at: int) -> wp.vec4:
 
 
 @wp.func_native(
-    brick_native(
+    subblock_native(
         """
-const int4 v = *reinterpret_cast<const int4*>(room + at);
+const int4 v = *reinterpret_cast<const int4*>(arena + at);
 return wp::vec_t<4, wp::int32>(v.x, v.y, v.z, v.w);
 """,
         "return wp::vec_t<4, wp::int32>();",
@@ -343,9 +345,9 @@ def sums_at(at: int) -> wp.vec4i:
 
 
 @wp.func_native(
-    brick_native("""
-*reinterpret_cast<float4*>(room + at) = make_float4(value[1], value[2], value[3], 0.0f);
-float* const k = reinterpret_cast<float*>(room + kinematic);
+    subblock_native("""
+*reinterpret_cast<float4*>(arena + at) = make_float4(value[1], value[2], value[3], 0.0f);
+float* const k = reinterpret_cast<float*>(arena + kinematic);
 for (int c = 0; c < 3; ++c) k[c] = value[4 + c];
 """)
 )
@@ -355,67 +357,67 @@ def set_velocities(at: int, kinematic: int, value: vec8):
 
 
 #: Bit of a slot whose particles may tell their places; the bits of its four slabs come before.
-MAY_TELL = wp.constant(16)
+MAY_CONTACT = wp.constant(16)
 
 
 @wp.func
-def block_of(grid: Grid, contact: Contact, held: int):
+def block_of(grid: Grid, contact: Contact, owner: int):
     """The block that a slot holds, of whatever field; a division, where there are several."""
-    block = held
+    block = owner
     if contact.num_fields > 1:
-        block = held % grid.num_blocks
+        block = owner % grid.num_blocks
     return block
 
 
 @wp.func
 def record_of_place(place: int, node: int):
-    """Record of node ``node`` of 2 x 2 x 2 of a brick."""
-    brick = place % BLOCK_BRICKS
-    i = ((brick >> 2) << 1) + (node >> 2)
-    j = (((brick >> 1) & 1) << 1) + ((node >> 1) & 1)
-    k = ((brick & 1) << 1) + (node & 1)
-    return BLOCK_NODES * (place // BLOCK_BRICKS) + 16 * i + 4 * j + k
+    """Record of node ``node`` of 2 x 2 x 2 of a subblock."""
+    subblock = place % BLOCK_SUBBLOCKS
+    i = ((subblock >> 2) << 1) + (node >> 2)
+    j = (((subblock >> 1) & 1) << 1) + ((node >> 1) & 1)
+    k = ((subblock & 1) << 1) + (node & 1)
+    return BLOCK_NODES * (place // BLOCK_SUBBLOCKS) + 16 * i + 4 * j + k
 
 
 @wp.func
 def place_of_record(r: int):
-    """Place of the brick that a record's node is in, see :func:`record_of_place`."""
-    return BLOCK_BRICKS * (r // BLOCK_NODES) + ((r >> 5) & 1) * 4 + ((r >> 3) & 1) * 2 + ((r >> 1) & 1)
+    """Place of the subblock that a record's node is in, see :func:`record_of_place`."""
+    return BLOCK_SUBBLOCKS * (r // BLOCK_NODES) + ((r >> 5) & 1) * 4 + ((r >> 3) & 1) * 2 + ((r >> 1) & 1)
 
 
 @wp.func
-def end_of_part(blocks: Blocks, failure: wp.array(dtype=int), e: int, part: wp.vec3i):
+def end_of_partition(blocks: Blocks, failure: wp.array(dtype=int), e: int, partition: wp.vec3i):
     """One after the last particle of a part that takes part: where the environment does not, they may be anywhere."""
-    end = part[1]
+    end = partition[1]
     if not takes_part(blocks, e, failure):
-        end = part[0]
+        end = partition[0]
     return end
 
 
 @wp.func
-def note_boundaries(grid: Grid, boundaries: Boundaries, contact: Contact, blocks: Blocks, room: Room, e: int):
+def note_boundaries(grid: Grid, boundaries: Boundaries, contact: Contact, blocks: Blocks, arena: Arena, e: int):
     """Find the slabs of every slot that a boundary is near, and whether its particles may tell their places."""
-    for slot in range(thread_of_block(), slots_used(blocks, e), threads_of_block()):
-        held = blocks.held[e, slot]
-        corner = block_corner(grid, block_of(grid, contact, held))
+    for active in range(thread_of_block(), num_active(blocks, e), threads_of_block()):
+        owner = blocks.owner[e, active]
+        corner = block_corner(grid, block_of(grid, contact, owner))
         bits = int(0)
         for slab in range(4):
             if slab_is_near(grid, boundaries, e, corner, SLAB_NODES * slab, GATED_SLAB):
                 bits = bits | (1 << slab)
         near = block_is_near(grid, boundaries, e, corner)
         if contact.num_fields > 1:
-            near = near or fields_beyond(grid, blocks, corner, e) != (1 << (held // grid.num_blocks))
-        set_byte(room.near, slot, wp.where(near, bits | MAY_TELL, bits))
+            near = near or fields_beyond(grid, blocks, corner, e) != (1 << (owner // grid.num_blocks))
+        set_byte(arena.near, active, wp.where(near, bits | MAY_CONTACT, bits))
 
 
 @wp.func
-def touch_bricks(
+def touch_subblocks(
     grid: Grid,
     particles: Particles,
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
-    room: Room,
+    arena: Arena,
     e: int,
     p: int,
     at: wp.vec3,
@@ -423,14 +425,16 @@ def touch_bricks(
     field: int,
     places: vec8i,
 ):
-    """Mark the bricks of a particle's stencil, which are at ``places``, and note whether it tells its place."""
-    raise_to(HEAVIEST + field, mass)
+    """Mark the subblocks of a particle's stencil, which are at ``places``, and note whether it tells its place."""
+    max_float_word(HEAVIEST + field, mass)
     for b in range(8):
-        set_half_word(room.numbers, places[b], TOUCHED)
-    if (byte(room.near, places[0] // BLOCK_BRICKS) & MAY_TELL) != 0:  # noqa: SIM102 - `and` would ask in any case
-        if tells_place(grid, particles, boundaries, contact, blocks, e, p, at, base_node(grid_position(grid, at))):
-            or_word(room.told + p // 32, 1 << (p % 32))
-            add_word(TOLD, 1)
+        set_half_word(arena.numbers, places[b], TOUCHED)
+    if (byte(arena.near, places[0] // BLOCK_SUBBLOCKS) & MAY_CONTACT) != 0:  # noqa: SIM102 - `and` would ask in any case
+        if is_contact_candidate(
+            grid, particles, boundaries, contact, blocks, e, p, at, base_node(grid_position(grid, at))
+        ):
+            or_word(arena.candidates + p // 32, 1 << (p % 32))
+            add_word(NUM_CANDIDATES, 1)
 
 
 @wp.func
@@ -440,13 +444,13 @@ def touch_with_all(
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
-    room: Room,
+    arena: Arena,
     e: int,
     begin: int,
     end: int,
     x: wp.array2d(dtype=wp.vec3),
 ):
-    """:func:`touch_bricks` with the particles from ``begin`` to ``end``, three of a thread at a time."""
+    """:func:`touch_subblocks` with the particles from ``begin`` to ``end``, three of a thread at a time."""
     r = row(e, particles.mass.shape[0])
     step = threads_of_block()
     for p in range(begin + thread_of_block(), end, 3 * step):
@@ -460,69 +464,73 @@ def touch_with_all(
         n = places_around(grid, blocks, e, f[0], base_node(grid_position(grid, at)))
         n_second = places_around(grid, blocks, e, f[1], base_node(grid_position(grid, at_second)))
         n_third = places_around(grid, blocks, e, f[2], base_node(grid_position(grid, at_third)))
-        touch_bricks(grid, particles, boundaries, contact, blocks, room, e, p, at, m[0], f[0], n)
+        touch_subblocks(grid, particles, boundaries, contact, blocks, arena, e, p, at, m[0], f[0], n)
         if p + step < end:
-            touch_bricks(grid, particles, boundaries, contact, blocks, room, e, second, at_second, m[1], f[1], n_second)
+            touch_subblocks(
+                grid, particles, boundaries, contact, blocks, arena, e, second, at_second, m[1], f[1], n_second
+            )
         if p + 2 * step < end:
-            touch_bricks(grid, particles, boundaries, contact, blocks, room, e, third, at_third, m[2], f[2], n_third)
+            touch_subblocks(
+                grid, particles, boundaries, contact, blocks, arena, e, third, at_third, m[2], f[2], n_third
+            )
 
 
 @wp.func
-def lay_out(
+def lay_out_arena(
     grid: Grid,
     particles: Particles,
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
-    room: Room,
+    arena: Arena,
     failure: wp.array(dtype=int),
     e: int,
-    part: wp.vec3i,
+    partition: wp.vec3i,
     x: wp.array2d(dtype=wp.vec3),
 ):
-    """Number the bricks that particles touch, and find the particles that tell their places.
+    """Number the subblocks that particles touch, and find the particles that tell their places.
 
-    Bricks that no boundary is near come first, so that few warps have to do with boundaries at their nodes.
+    Subblocks that no boundary is near come first, so that few warps have to do with boundaries at their nodes.
     """
-    clear_words(0, room.numbers)
-    fill_words(room.numbers, room.told - room.numbers, -1)  # NO_BRICK twice
-    clear_words(room.told, room.places - room.told)
-    meet()
-    note_boundaries(grid, boundaries, contact, blocks, room, e)
-    meet()
-    end = end_of_part(blocks, failure, e, part)
-    touch_with_all(grid, particles, boundaries, contact, blocks, room, e, part[0], end, x)
-    meet()
-    most = BLOCK_BRICKS * slots_used(blocks, e)
-    number_bricks(room.numbers, room.places, room.near, most, False)
-    meet()
-    number_bricks(room.numbers, room.places, room.near, most, True)
-    meet()
+    clear_words(0, arena.numbers)
+    fill_words(arena.numbers, arena.candidates - arena.numbers, -1)  # NO_SUBBLOCK twice
+    clear_words(arena.candidates, arena.places - arena.candidates)
+    sync_block()
+    note_boundaries(grid, boundaries, contact, blocks, arena, e)
+    sync_block()
+    end = end_of_partition(blocks, failure, e, partition)
+    touch_with_all(grid, particles, boundaries, contact, blocks, arena, e, partition[0], end, x)
+    sync_block()
+    most = BLOCK_SUBBLOCKS * num_active(blocks, e)
+    number_subblocks(arena.numbers, arena.places, arena.near, most, False)
+    sync_block()
+    number_subblocks(arena.numbers, arena.places, arena.near, most, True)
+    sync_block()
 
 
 #: Slowest speed that momenta are counted at [m/s].
 SLOWEST = wp.constant(2.0**-20)
 #: Units of mass in a field's heaviest particle where places are told.
-PLACE_UNITS = wp.constant(2.0**20)
+OFFSET_QUANTA = wp.constant(2.0**20)
 #: Units of mass in which is counted what particles have given and nodes have not got. Where a word has run over, 2^20
 #: are missing at least; what is rounded is far less than half of that.
-LOST_UNITS, MOST_LOST = wp.constant(2**12), wp.constant(2**19)
+LOST_QUANTA, MAX_LOST = wp.constant(2**12), wp.constant(2**19)
 
 
 @wp.func
-def unit_of_mass(field: int):
+def mass_quantum_of(field: int):
     """Mass that a word counts [kg], a power of two."""
-    return power_of_two(number(HEAVIEST + field)) / number(UNITS)
+    return power_of_two(float_word(HEAVIEST + field)) / float_word(QUANTA)
 
 
 @wp.func
-def unit_of_place(field: int):
+def offset_quantum_of(field: int):
     """Mass that a word of places counts [kg]: more than it does of masses, for they are seen to after these."""
-    return power_of_two(number(HEAVIEST + field)) / PLACE_UNITS
+    return power_of_two(float_word(HEAVIEST + field)) / OFFSET_QUANTA
 
 
 @wp.func
-def speed_of(s: Scattered, physical: float):
+def speed_of(s: Deposit, physical: float):
     """A bound of the momenta that a particle adds, by its mass [m/s]; of the ``physical`` ones it is known [kg m/s]."""
     most = physical
     for c in range(3):
@@ -537,48 +545,48 @@ def speed_for(fastest: float):
 
 
 @wp.func
-def speeds_known(room: Room, part: wp.vec3i):
+def speeds_known(arena: Arena, partition: wp.vec3i):
     """Whether there is a speed at which to count the momenta of every field."""
     known = bool(True)
-    for f in range(room.speed.shape[1]):
-        known = known and (number(SPEED + f) > 0.0 or not has_field(part[2], f))
+    for f in range(arena.speed.shape[1]):
+        known = known and (float_word(SPEED + f) > 0.0 or not has_field(partition[2], f))
     return known
 
 
 @wp.func
-def sums_hold(room: Room, part: wp.vec3i, first: int, given: int):
+def quanta_suffice(arena: Arena, partition: wp.vec3i, first: int, given: int):
     """Whether momenta have been counted at speeds that no particle exceeds, and no word counts more than it can.
 
     All threads come here; their particles have ``given`` so much mass [LOST_UNITS].
     """
-    known = speeds_known(room, part)
+    known = speeds_known(arena, partition)
     if known:
         lost = int(given)
-        for n in range(thread_of_block(), 8 * bricks_of_round(room, first), threads_of_block()):
-            lost -= word(node_word(room, n)) // LOST_UNITS
+        for n in range(thread_of_block(), 8 * subblocks_of_round(arena, first), threads_of_block()):
+            lost -= word(node_word(arena, n)) // LOST_QUANTA
         add_word(LOST, lost)
-    meet()
-    hold = known and word(LOST) < MOST_LOST
-    for f in range(room.speed.shape[1]):
-        hold = hold and (number(FASTEST + f) <= number(SPEED + f) or not has_field(part[2], f))
+    sync_block()
+    hold = known and word(LOST) < MAX_LOST
+    for f in range(arena.speed.shape[1]):
+        hold = hold and (float_word(FASTEST + f) <= float_word(SPEED + f) or not has_field(partition[2], f))
     return hold
 
 
 @wp.func
-def correct_units(room: Room, part: wp.vec3i):
+def rescale_quanta(arena: Arena, partition: wp.vec3i):
     """Count the momenta of fields that were too fast at higher speeds, and in larger units if words were too small.
 
     All threads come here.
     """
     f = thread_of_block()
-    meet()
-    if f == 0 and word(LOST) >= MOST_LOST:
-        set_number(UNITS, number(UNITS) / 8.0)
-    if f < room.speed.shape[1]:
-        slow = number(SPEED + f) == 0.0 or number(FASTEST + f) > number(SPEED + f)
-        if slow and has_field(part[2], f):
-            set_number(SPEED + f, speed_for(number(FASTEST + f)))
-    meet()
+    sync_block()
+    if f == 0 and word(LOST) >= MAX_LOST:
+        set_float_word(QUANTA, float_word(QUANTA) / 8.0)
+    if f < arena.speed.shape[1]:
+        slow = float_word(SPEED + f) == 0.0 or float_word(FASTEST + f) > float_word(SPEED + f)
+        if slow and has_field(partition[2], f):
+            set_float_word(SPEED + f, speed_for(float_word(FASTEST + f)))
+    sync_block()
 
 
 @wp.func_native(native("return __uint_as_float((__float_as_uint(x) + 0x7fffffu) & 0xff800000u);", "return x;"))

@@ -13,28 +13,30 @@ from functools import cache
 
 import warp as wp
 
-from piavatar_envs.core.cuda_intrinsics import meet, thread_of_block
+from piavatar_envs.core.cuda_intrinsics import sync_block, thread_of_block
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.core.shared_memory import number, or_word, set_number, word
-from piavatar_envs.mpm.cuda.block_g2p import clear_untouched, gather_all, update_bricks
+from piavatar_envs.core.shared_memory import float_word, or_word, set_float_word, word
+from piavatar_envs.mpm.cuda.block_g2p import clear_untouched, g2p_all, update_subblocks
 from piavatar_envs.mpm.cuda.block_grid import (
     COUNT,
     FASTEST,
     FAULTS,
-    LARGE_ROOM,
+    LARGE_ARENA,
     LARGE_THREADS,
-    MOST_UNITS,
-    SMALL_ROOM,
+    MAX_MASS_QUANTA,
+    NUM_CANDIDATES,
+    QUANTA,
+    SMALL_ARENA,
     SMALL_THREADS,
     SPEED,
-    TOLD,
-    UNITS,
-    lay_out,
+    lay_out_arena,
     speed_for,
 )
-from piavatar_envs.mpm.cuda.block_p2g import scatter_places, scatter_round
-from piavatar_envs.mpm.sparse_grid import freeze, has_field, slots_used
+from piavatar_envs.mpm.cuda.block_p2g import add_offsets, p2g_round
+from piavatar_envs.mpm.sparse_grid import freeze, has_field, num_active
 from piavatar_envs.mpm.types import (
+    Accumulators,
+    Arena,
     Blocks,
     Boundaries,
     Contact,
@@ -42,12 +44,10 @@ from piavatar_envs.mpm.types import (
     Model,
     Moving,
     Particles,
-    Room,
     Scratch,
     Sensors,
     State,
     Step,
-    Sums,
 )
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -60,66 +60,68 @@ def run_substep(
     particles: Particles,
     boundaries: Boundaries,
     contact: Contact,
-    room: Room,
+    arena: Arena,
     # in and out; vk is read
     blocks: Blocks,
     moved: Moving,
     failure: wp.array(dtype=int),
-    sums: Sums,
+    accumulators: Accumulators,
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
     e: int,
-    part: wp.vec3i,
-    gathers: bool,
+    partition: wp.vec3i,
+    with_g2p: bool,
 ):
-    """Scatter and grid pass of a part of an environment; it ``gathers``, too, if there is one velocity field."""
+    """Scatter and grid pass of a part of an environment; it ``with_g2p``, too, if there is one velocity field."""
     t = thread_of_block()
-    lay_out(grid, particles, boundaries, contact, blocks, room, failure, e, part, moved.x)
+    lay_out_arena(grid, particles, boundaries, contact, blocks, arena, failure, e, partition, moved.x)
     count = word(COUNT)
-    writes = not gathers or count > room.capacity
+    writes = not with_g2p or count > arena.capacity
     if t == 0:
-        blocks.swept[e] = slots_used(blocks, e)
-        set_number(UNITS, MOST_UNITS)
-        if gathers:  # else the bits of other parts come and go
+        blocks.num_updated[e] = num_active(blocks, e)
+        set_float_word(QUANTA, MAX_MASS_QUANTA)
+        if with_g2p:  # else the bits of other parts come and go
             or_word(FAULTS, failure[e])
-    if t < contact.num_fields and has_field(part[2], t):
-        set_number(SPEED + t, room.speed[e, t])
-    if not gathers:
-        clear_untouched(grid, blocks, room, node_velocity, sensors, e, part)
-    meet()
-    rounds = (count + room.capacity - 1) // room.capacity
+    if t < contact.num_fields and has_field(partition[2], t):
+        set_float_word(SPEED + t, arena.speed[e, t])
+    if not with_g2p:
+        clear_untouched(grid, blocks, arena, node_velocity, sensors, e, partition)
+    sync_block()
+    rounds = (count + arena.capacity - 1) // arena.capacity
     passes = wp.where(rounds > 1, 2 * rounds, rounds)  # the first ones to find units that hold in all
     for n in range(passes):
-        first = (n % rounds) * room.capacity
+        first = (n % rounds) * arena.capacity
         settles = n >= passes - rounds
-        tells = settles and word(TOLD) != 0
-        if tells:
-            scatter_places(grid, particles, blocks, room, e, part, first, moved.x, sums)
-        scatter_round(grid, step, particles, moved, blocks, room, sums, failure, e, part, first, tells)
+        candidate = settles and word(NUM_CANDIDATES) != 0
+        if candidate:
+            add_offsets(grid, particles, blocks, arena, e, partition, first, moved.x, accumulators)
+        p2g_round(grid, step, particles, moved, blocks, arena, accumulators, failure, e, partition, first, candidate)
         if settles:
-            update_bricks(grid, step, boundaries, contact, blocks, room, sums, node_velocity, sensors, e, first, writes)
-        meet()
+            update_subblocks(
+                grid, step, boundaries, contact, blocks, arena, accumulators, node_velocity, sensors, e, first, writes
+            )
+        sync_block()
     fails = word(FAULTS) != 0
-    if t == 0 and gathers:
+    if t == 0 and with_g2p:
         blocks.frozen[e] = word(FAULTS)
-    if t < contact.num_fields and has_field(part[2], t):
-        room.speed[e, t] = speed_for(number(FASTEST + t))
-    if gathers:
-        gather_all(
-            grid, step, particles, boundaries, node_velocity, blocks, room, moved, failure, e, fails, writes
+    if t < contact.num_fields and has_field(partition[2], t):
+        arena.speed[e, t] = speed_for(float_word(FASTEST + t))
+    if with_g2p:
+        g2p_all(
+            grid, step, particles, boundaries, node_velocity, blocks, arena, moved, failure, e, fails, writes
         )  # fmt: skip
 
 
 @cache
-def substep_kernel(large: bool, gathers: bool) -> wp.Kernel:
-    """:func:`run_substep` in a room, over ``(num_envs, parts threads)``; made when asked for, for compiling takes time.
+def substep_kernel(large: bool, with_g2p: bool) -> wp.Kernel:
+    """:func:`run_substep` in a room, over ``(num_envs, partitions threads)``; made when asked for, for compiling takes time.
 
     Args:
         large: the room takes a multiprocessor; else there are two in one.
-        gathers: the launch is the whole substep.
+        with_g2p: the launch is the whole substep.
     """
-    words, threads, at_once = (LARGE_ROOM, LARGE_THREADS, 1) if large else (SMALL_ROOM, SMALL_THREADS, 2)
-    name = f"{'substep' if gathers else 'nodes'}_in_{'large' if large else 'small'}_room"
+    words, threads, at_once = (LARGE_ARENA, LARGE_THREADS, 1) if large else (SMALL_ARENA, SMALL_THREADS, 2)
+    name = f"{'substep' if with_g2p else 'nodes'}_in_{'large' if large else 'small'}_room"
 
     @wp.kernel(
         name=name,
@@ -135,44 +137,44 @@ def substep_kernel(large: bool, gathers: bool) -> wp.Kernel:
         particles: Particles,
         boundaries: Boundaries,
         contact: Contact,
-        room: Room,
+        arena: Arena,
         # in and out; vk is read
         blocks: Blocks,
         moved: Moving,
         failure: wp.array(dtype=int),
-        sums: Sums,
+        accumulators: Accumulators,
         # out
         node_velocity: wp.array2d(dtype=wp.vec4),
         sensors: Sensors,
     ):
         e, t = wp.tid()
-        part = room.part[t // threads]
+        partition = arena.partition[t // threads]
         reserved = wp.tile_empty(shape=(words,), dtype=int, storage="shared")  # noqa: F841
         run_substep(
-            grid, step, particles, boundaries, contact, room, blocks, moved, failure, sums, node_velocity, sensors,
-            e, part, gathers,
+            grid, step, particles, boundaries, contact, arena, blocks, moved, failure, accumulators, node_velocity, sensors,
+            e, partition, with_g2p,
         )  # fmt: skip
 
     return substep_in_room
 
 
 @wp.kernel
-def forget_speeds(room: Room):
+def reset_speeds(arena: Arena):
     """The speeds at which momenta are counted are found anew: what comes then depends on the state alone."""
     e, f = wp.tid()
-    room.speed[e, f] = 0.0
+    arena.speed[e, f] = 0.0
 
 
 def record_in_block(graph: LaunchGraph, model: Model, state: State, scratch: Scratch, moving: Moving) -> None:
     """Append the substep: all of it where there is one field, else up to contact."""
-    threads = LARGE_THREADS if scratch.large_room else SMALL_THREADS
-    gathers = model.contact.num_fields == 1
+    threads = LARGE_THREADS if scratch.large_arena else SMALL_THREADS
+    with_g2p = model.contact.num_fields == 1
     graph.launch(
-        substep_kernel(scratch.large_room, gathers),
-        (model.num_envs, scratch.room.part.shape[0] * threads),
-        [model.grid, model.step, model.particles, model.boundaries, model.contact, scratch.room],
-        [scratch.blocks, moving, state.failure, scratch.sums, scratch.velocity, scratch.sensors],
+        substep_kernel(scratch.large_arena, with_g2p),
+        (model.num_envs, scratch.arena.partition.shape[0] * threads),
+        [model.grid, model.step, model.particles, model.boundaries, model.contact, scratch.arena],
+        [scratch.blocks, moving, state.failure, scratch.accumulators, scratch.velocity, scratch.sensors],
         block_dim=threads,
     )
-    if not gathers:
+    if not with_g2p:
         graph.launch(freeze, model.num_envs, [state.failure], [scratch.blocks])

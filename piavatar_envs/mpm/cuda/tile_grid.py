@@ -1,12 +1,12 @@
 """The nodes of a group of particles in the shared memory of its CUDA block, in CUDA: where they lie.
 
-They are those of a box around the particles' stencils, in bricks of 2 x 2 x 2 nodes, so where a node is follows from
-where it is on the grid. A group whose box has too many bricks goes in turns: each takes the particles that are near the
+They are those of a box around the particles' stencils, in subblocks of 2 x 2 x 2 nodes, so where a node is follows from
+where it is on the grid. A group whose box has too many subblocks goes in turns: each takes the particles that are near the
 first of those that are left, and a box around that one. Whose turn comes when depends on the particles' places only.
 
-Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; of every brick its record, which nodes have got
+Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; of every subblock its record, which nodes have got
 mass, and where it is in its block; whose particles tell their nodes more than momentum; four sums of every node, one
-brick after the other. A brick has a word in each of the 32 banks, as in :mod:`piavatar_envs.mpm.cuda.block_grid`.
+subblock after the other. A subblock has a word in each of the 32 banks, as in :mod:`piavatar_envs.mpm.cuda.block_grid`.
 
 The sums of a group of particles in shared memory, put down on the nodes.
 
@@ -21,10 +21,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.core.shared_memory import native, number
-from piavatar_envs.mpm.cuda.block_grid import BRICK_WORDS
-from piavatar_envs.mpm.p2g import Scattered, fault_within, momentum_bounds
-from piavatar_envs.mpm.types import FAILURE_CFL, Blocks, Grid, Sums
+from piavatar_envs.core.shared_memory import float_word, native
+from piavatar_envs.mpm.cuda.block_grid import SUBBLOCK_WORDS
+from piavatar_envs.mpm.p2g import Deposit, fault_within, momentum_bounds
+from piavatar_envs.mpm.types import FAILURE_CFL, Accumulators, Blocks, Grid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,58 +34,58 @@ MOMENTUM, KINEMATIC, PLACE = (wp.constant(n) for n in range(3))
 
 #: Particles of a group, at most, a thread each.
 THREADS = 128
-#: Bricks that there is room for, enough for a box of ``REACH`` grid spacings to each side of a particle.
+#: Subblocks that there is room for, enough for a box of ``REACH`` grid spacings to each side of a particle.
 CAPACITY = wp.constant(128)
 REACH = wp.constant(3)
 #: Words of the header: how many tell their nodes more than momentum; whether some are left for another turn; the first
 #: of these; the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units;
 #: the least and the greatest lowest node of a stencil, along three axes, and whether any of the nodes has others.
-MORE, LEFT, FIRST = (wp.constant(n) for n in range(3))
-HEAVIEST, FASTEST, DRIVEN = (wp.constant(n) for n in range(3, 6))
-MASS_UNIT, MOMENTUM_UNIT = (wp.constant(n) for n in (6, 7))
-LOWEST, BESIDE, HIGHEST = (wp.constant(n) for n in (8, 11, 12))
+NUM_CANDIDATES, REMAINING, FIRST = (wp.constant(n) for n in range(3))
+HEAVIEST, FASTEST, FASTEST_KINEMATIC = (wp.constant(n) for n in range(3, 6))
+MASS_QUANTUM, MOMENTUM_QUANTUM = (wp.constant(n) for n in (6, 7))
+LOWEST, HAS_CONTACT_NODES, HIGHEST = (wp.constant(n) for n in (8, 11, 12))
 RECORDS = wp.constant(16)
 MASSIVE = wp.constant(int(RECORDS) + int(CAPACITY))
 WITHIN = wp.constant(int(MASSIVE) + int(CAPACITY))
-TELLERS = wp.constant(int(WITHIN) + int(CAPACITY))
-NODES = wp.constant(-(-(int(TELLERS) + THREADS) // 32) * 32)
+CANDIDATES = wp.constant(int(WITHIN) + int(CAPACITY))
+NODES = wp.constant(-(-(int(CANDIDATES) + THREADS) // 32) * 32)
 #: Words of a room.
-WORDS = wp.constant(int(NODES) + int(BRICK_WORDS) * int(CAPACITY))
+WORDS = wp.constant(int(NODES) + int(SUBBLOCK_WORDS) * int(CAPACITY))
 #: Units of the most that a particle has.
-UNITS = wp.constant(float(2**25))
-#: What a brick has besides its place in its block: whether there is matter of another field there; then bits of its
+MAX_PARTICLE_QUANTA = wp.constant(float(2**25))
+#: What a subblock has besides its place in its block: whether there is matter of another field there; then bits of its
 #: nodes, those that had another field.
-SHARED, OTHERS = wp.constant(1 << 30), wp.constant(256)
+SEVERAL_FIELDS, CONTACT_NODES = wp.constant(1 << 30), wp.constant(256)
 
 #: The least power of two that is not below the positive number in a word.
 POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fffff) & 0x7f800000); };"
-#: How many bricks a box has along each axis, none if nobody is in it.
+#: How many subblocks a box has along each axis, none if nobody is in it.
 SIZE = """
 int lowest[3], size[3];
 for (int c = 0; c < 3; ++c) {
-    lowest[c] = room[LOWEST + c] >> 1;
-    size[c] = max((room[HIGHEST + c] + 2 >> 1) - lowest[c] + 1, 0);
+    lowest[c] = arena[LOWEST + c] >> 1;
+    size[c] = max((arena[HIGHEST + c] + 2 >> 1) - lowest[c] + 1, 0);
 }
 """
 
 
-def in_group(cuda: str, otherwise: str = "") -> str:
+def tile_native(cuda: str, otherwise: str = "") -> str:
     """A snippet that knows what lies where."""
-    names = "CAPACITY REACH MORE LEFT FIRST HEAVIEST FASTEST DRIVEN MASS_UNIT MOMENTUM_UNIT LOWEST HIGHEST RECORDS"
-    names += " BESIDE MASSIVE WITHIN TELLERS NODES BRICK_WORDS SHARED OTHERS"
+    names = "CAPACITY REACH NUM_CANDIDATES REMAINING FIRST HEAVIEST FASTEST FASTEST_KINEMATIC MASS_QUANTUM MOMENTUM_QUANTUM LOWEST HIGHEST RECORDS"
+    names += " HAS_CONTACT_NODES MASSIVE WITHIN CANDIDATES NODES SUBBLOCK_WORDS SEVERAL_FIELDS CONTACT_NODES"
     values = {name: globals()[name] for name in names.split()} | {"KINEMATIC": KINEMATIC, "PLACE": PLACE}
     known = ", ".join(f"{name} = {int(value)}" for name, value in values.items())
     return native(f"constexpr int {known};\nconstexpr unsigned ALL = 0xffffffffu;\n{cuda}", otherwise)
 
 
 @wp.func_native(
-    in_group("""
-int4* const nodes = reinterpret_cast<int4*>(room + NODES);
+    tile_native("""
+int4* const nodes = reinterpret_cast<int4*>(arena + NODES);
 if (blockDim.x == 128) {  // the usual case without a loop
 #pragma unroll
-    for (int n = 0; n < BRICK_WORDS * CAPACITY / 512; ++n) nodes[threadIdx.x + 128 * n] = make_int4(0, 0, 0, 0);
+    for (int n = 0; n < SUBBLOCK_WORDS * CAPACITY / 512; ++n) nodes[threadIdx.x + 128 * n] = make_int4(0, 0, 0, 0);
 } else
-    for (int n = threadIdx.x; n < BRICK_WORDS * CAPACITY / 4; n += blockDim.x) nodes[n] = make_int4(0, 0, 0, 0);
+    for (int n = threadIdx.x; n < SUBBLOCK_WORDS * CAPACITY / 4; n += blockDim.x) nodes[n] = make_int4(0, 0, 0, 0);
 """)
 )
 def clear_nodes():
@@ -94,36 +94,36 @@ def clear_nodes():
 
 
 @wp.func_native(
-    in_group("""
+    tile_native("""
 if (threadIdx.x != 0) return;
-room[MORE] = 0, room[LEFT] = 0, room[BESIDE] = 0, room[FIRST] = 0x7fffffff;
-for (int c = 0; c < 3; ++c) room[LOWEST + c] = 0x7fffffff, room[HIGHEST + c] = -1;
+arena[NUM_CANDIDATES] = 0, arena[REMAINING] = 0, arena[HAS_CONTACT_NODES] = 0, arena[FIRST] = 0x7fffffff;
+for (int c = 0; c < 3; ++c) arena[LOWEST + c] = 0x7fffffff, arena[HIGHEST + c] = -1;
 """)
 )
-def begin_turn():
+def begin_pass():
     """Nobody is in the box, and nobody tells anything."""
     ...
 
 
 @wp.func_native(
-    in_group("""
+    tile_native("""
 int mass = takes ? __float_as_int(scalar) : 0, most = takes ? __float_as_int(momentum) : 0;
 #if __CUDA_ARCH__ >= 800
 mass = __reduce_max_sync(ALL, mass), most = __reduce_max_sync(ALL, most);
 takes = (threadIdx.x & 31) == 0;
 #endif
-int* const of_vector = room + (kind == 0 ? FASTEST : DRIVEN);
-if (takes && mass > room[HEAVIEST]) atomicMax(room + HEAVIEST, mass);  // it is 0 where it is not asked for
+int* const of_vector = arena + (kind == 0 ? FASTEST : FASTEST_KINEMATIC);
+if (takes && mass > arena[HEAVIEST]) atomicMax(arena + HEAVIEST, mass);  // it is 0 where it is not needed for
 if (takes && most > *of_vector) atomicMax(of_vector, most);
 """)
 )
-def raise_most(takes: bool, kind: int, scalar: float, momentum: float):
+def raise_maxima(takes: bool, kind: int, scalar: float, momentum: float):
     """See that the group's units are large enough for a particle's momenta; all threads of a warp come here."""
     ...
 
 
 @wp.func_native(
-    in_group("""
+    tile_native("""
 int low[3], high[3];
 for (int c = 0; c < 3; ++c) {
     low[c] = takes ? base[c] : 0x7fffffff, high[c] = takes ? base[c] : -1;
@@ -135,7 +135,7 @@ for (int c = 0; c < 3; ++c) {
 takes = (threadIdx.x & 31) == 0;
 #endif
 if (!takes) return;
-for (int c = 0; c < 3; ++c) atomicMin(room + LOWEST + c, low[c]), atomicMax(room + HIGHEST + c, high[c]);
+for (int c = 0; c < 3; ++c) atomicMin(arena + LOWEST + c, low[c]), atomicMax(arena + HIGHEST + c, high[c]);
 """)
 )
 def widen_box(takes: bool, base: wp.vec3i):
@@ -144,106 +144,106 @@ def widen_box(takes: bool, base: wp.vec3i):
 
 
 @wp.func_native(
-    in_group(
+    tile_native(
         SIZE
         + """
 const bool fits = (float)size[0] * (float)size[1] * (float)size[2] <= (float)CAPACITY;
-if (threadIdx.x == 0) room[LEFT] = !fits;
+if (threadIdx.x == 0) arena[REMAINING] = !fits;
 if (fits) return takes;
 __syncthreads();  // all have seen it
-if (takes) atomicMin(room + FIRST, (int)threadIdx.x);
+if (takes) atomicMin(arena + FIRST, (int)threadIdx.x);
 __syncthreads();
-if (threadIdx.x == room[FIRST])
+if (threadIdx.x == arena[FIRST])
     for (int c = 0; c < 3; ++c) {
-        room[LOWEST + c] = max(base[c] - REACH, 0);
-        room[HIGHEST + c] = min(base[c] + REACH, grid.nodes[c] - 3);
+        arena[LOWEST + c] = max(base[c] - REACH, 0);
+        arena[HIGHEST + c] = min(base[c] + REACH, grid.nodes[c] - 3);
     }
 __syncthreads();
-for (int c = 0; c < 3; ++c) takes = takes && base[c] >= room[LOWEST + c] && base[c] <= room[HIGHEST + c];
+for (int c = 0; c < 3; ++c) takes = takes && base[c] >= arena[LOWEST + c] && base[c] <= arena[HIGHEST + c];
 return takes;
 """,
         "return takes;",
     )
 )
-def has_turn(grid: Grid, takes: bool, base: wp.vec3i) -> bool:
+def in_pass(grid: Grid, takes: bool, base: wp.vec3i) -> bool:
     """Whether it is a particle's turn: that of all who take part, or of some, for whom the box is made smaller.
 
-    All threads come here, and have met since the box was widened. Whether some are left is in word ``LEFT``.
+    All threads come here, and have met since the box was widened. Whether some are left is in word ``REMAINING``.
     """
     ...
 
 
 @wp.func_native(
-    in_group(
+    tile_native(
         SIZE
         + """
-const int along_y = BRICK_WORDS * size[2], along_x = along_y * size[1];
+const int along_y = SUBBLOCK_WORDS * size[2], along_x = along_y * size[1];
 const int first = NODES + ((base[0] >> 1) - lowest[0]) * along_x + ((base[1] >> 1) - lowest[1]) * along_y
-    + ((base[2] >> 1) - lowest[2]) * BRICK_WORDS;
+    + ((base[2] >> 1) - lowest[2]) * SUBBLOCK_WORDS;
 return wp::vec_t<3, wp::int32>(first, along_x, along_y);
 """,
         "return wp::vec_t<3, wp::int32>();",
     )
 )
-def bricks_around(base: wp.vec3i) -> wp.vec3i:
-    """Word at which the brick of a stencil's lowest node begins, and how far on its neighbors along x and y do."""
+def subblocks_around(base: wp.vec3i) -> wp.vec3i:
+    """Word at which the subblock of a stencil's lowest node begins, and how far on its neighbors along x and y do."""
     ...
 
 
 @wp.func_native(
-    in_group(
+    tile_native(
         SIZE
         + """
-const int bricks = size[0] * size[1] * size[2];
-for (int n = threadIdx.x; n < bricks; n += blockDim.x) {
+const int subblocks = size[0] * size[1] * size[2];
+for (int n = threadIdx.x; n < subblocks; n += blockDim.x) {
     // halves are so far from any border that a quotient need not be exact, and a whole number's takes longer
     const int line = (int)(((float)n + 0.5f) / (float)size[2]), plane = (int)(((float)line + 0.5f) / (float)size[1]);
     const int i = lowest[0] + plane, j = lowest[1] + line - plane * size[1], l = lowest[2] + n - line * size[2];
     const int block = ((i >> 1) * grid.blocks[1] + (j >> 1)) * grid.blocks[2] + (l >> 1);
     int within = ((i & 1) << 5) + ((j & 1) << 3) + ((l & 1) << 1);
-    const int* const slot = &wp::index(blocks.slot, e, field * grid.num_blocks + block);
+    const int* const active = &wp::index(blocks.active, e, field * grid.num_blocks + block);
 #if __CUDA_ARCH__ >= 800
-    const unsigned to = (unsigned)__cvta_generic_to_shared(room + RECORDS + n);
-    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" :: "r"(to), "l"(slot) : "memory");
+    const unsigned to = (unsigned)__cvta_generic_to_shared(arena + RECORDS + n);
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" :: "r"(to), "l"(active) : "memory");
 #else
-    room[RECORDS + n] = *slot;
+    arena[RECORDS + n] = *active;
 #endif
-    if (num_fields > 1 && wp::index(blocks.fields, e, block) != 1 << field) within |= SHARED;
-    room[WITHIN + n] = within;
+    if (num_fields > 1 && wp::index(blocks.fields, e, block) != 1 << field) within |= SEVERAL_FIELDS;
+    arena[WITHIN + n] = within;
 }
 """
     )
 )
-def fetch_slots(grid: Grid, blocks: Blocks, num_fields: int, e: int, field: int):
-    """Ask for the slots of the bricks' blocks, which nobody waits for before :func:`note_records`."""
+def fetch_active(grid: Grid, blocks: Blocks, num_fields: int, e: int, field: int):
+    """Ask for the slots of the subblocks' blocks, which nobody waits for before :func:`store_records`."""
     ...
 
 
 @wp.func_native(
-    in_group(
+    tile_native(
         SIZE
         + """
 #if __CUDA_ARCH__ >= 800
 asm volatile("cp.async.wait_all;" ::: "memory");
 #endif
-const int bricks = size[0] * size[1] * size[2];
-for (int n = threadIdx.x; n < bricks; n += blockDim.x) {
-    const int slot = room[RECORDS + n], within = room[WITHIN + n];
-    room[RECORDS + n] = 128 * slot + (within & ~SHARED);
-    if (within & SHARED) {
-        // of half a block, two planes of 16 nodes, those of a brick: two nodes along each axis
-        const unsigned half = wp::index(blocks.others, e, 2 * slot + (within >> 5 & 1));
+const int subblocks = size[0] * size[1] * size[2];
+for (int n = threadIdx.x; n < subblocks; n += blockDim.x) {
+    const int active = arena[RECORDS + n], within = arena[WITHIN + n];
+    arena[RECORDS + n] = 128 * active + (within & ~SEVERAL_FIELDS);
+    if (within & SEVERAL_FIELDS) {
+        // of half a block, two planes of 16 nodes, those of a subblock: two nodes along each axis
+        const unsigned half = wp::index(blocks.contact_nodes, e, 2 * active + (within >> 5 & 1));
         const unsigned two = half >> (within & 10) & 0x330033u, four = (two | two >> 2) & 0xf000fu;
-        const int others = (four | four >> 12) & 0xff;
-        room[WITHIN + n] = OTHERS * others;
-        if (others != 0) room[BESIDE] = 1;
+        const int contact_nodes = (four | four >> 12) & 0xff;
+        arena[WITHIN + n] = CONTACT_NODES * contact_nodes;
+        if (contact_nodes != 0) arena[HAS_CONTACT_NODES] = 1;
     }
 }
 """
     )
 )
-def note_records(blocks: Blocks, e: int):
-    """Find the record of every brick's first node, of its momentum, and which of its nodes had another field.
+def store_records(blocks: Blocks, e: int):
+    """Find the record of every subblock's first node, of its momentum, and which of its nodes had another field.
 
     The slots are those that the same threads have fetched.
     """
@@ -251,83 +251,83 @@ def note_records(blocks: Blocks, e: int):
 
 
 @wp.func_native(
-    in_group(
+    tile_native(
         """
-if (room[BESIDE] == 0) return false;
-// of a brick's two nodes along an axis, those that are in the stencil: of the lower brick, and of the upper one
+if (arena[HAS_CONTACT_NODES] == 0) return false;
+// of a subblock's two nodes along an axis, those that are in the stencil: of the lower subblock, and of the upper one
 int lower[3], upper[3];
 for (int c = 0; c < 3; ++c) lower[c] = base[c] & 1 ? 2 : 3, upper[c] = base[c] & 1 ? 3 : 1;
 int all = 0;
 #pragma unroll 1
 for (int n = 0; n < 8; ++n) {
-    const int at = box[0] + (n & 4 ? box[1] : 0) + (n & 2 ? box[2] : 0) + (n & 1 ? BRICK_WORDS : 0);
+    const int at = box[0] + (n & 4 ? box[1] : 0) + (n & 2 ? box[2] : 0) + (n & 1 ? SUBBLOCK_WORDS : 0);
     const int x = n & 4 ? upper[0] : lower[0], y = n & 2 ? upper[1] : lower[1], z = n & 1 ? upper[2] : lower[2];
     const int plane = z * ((y & 1) + 2 * (y & 2));
-    all |= room[WITHIN + (at - NODES) / BRICK_WORDS] & OTHERS * plane * ((x & 1) + 8 * (x & 2));
+    all |= arena[WITHIN + (at - NODES) / SUBBLOCK_WORDS] & CONTACT_NODES * plane * ((x & 1) + 8 * (x & 2));
 }
 return all != 0;
 """,
         "return false;",
     )
 )
-def has_others(box: wp.vec3i, base: wp.vec3i) -> bool:
-    """Whether any node of the stencil at ``base`` had another field, its bricks :func:`bricks_around` it."""
+def has_contact_nodes(box: wp.vec3i, base: wp.vec3i) -> bool:
+    """Whether any node of the stencil at ``base`` had another field, its subblocks :func:`subblocks_around` it."""
     ...
 
 
 @wp.func_native(
-    in_group(
-        POWER + "return __int_as_float(0x7f000000 - __float_as_int(power_of_two(room[at]))) * 0x1p25f;",
+    tile_native(
+        POWER + "return __int_as_float(0x7f000000 - __float_as_int(power_of_two(arena[at]))) * 0x1p25f;",
         "return 0.0f;",
     )
 )
-def per_unit_of(at: int) -> float:
+def inverse_quantum(at: int) -> float:
     """One over the unit for what has the most in word ``at``; exact, however the module divides."""
     ...
 
 
 @wp.func
-def raised(s: Scattered, takes: bool, kind: int, failure: wp.array(dtype=int), e: int):
+def raise_quanta(s: Deposit, takes: bool, kind: int, failure: wp.array(dtype=int), e: int):
     """Whether a particle can be added up; if so, the group's units are raised to its momenta. All threads come here."""
     momentum = float(0.0)
     if takes:
-        momentum = bounded(s, number(MOMENTUM_UNIT), failure, e)
+        momentum = bounded(s, float_word(MOMENTUM_QUANTUM), failure, e)
         takes = momentum >= 0.0
-    raise_most(takes, kind, s.at_base[0], momentum)
+    raise_maxima(takes, kind, s.at_base[0], momentum)
     return takes
 
 
 @wp.func_native(
-    in_group(f"""
+    tile_native(f"""
 {POWER}{SIZE}
-const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, c = lane & 3;  // of four sums
+const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, c = lane & 3;  // of four accumulators
 int warps = blockDim.x >> 5;
-asm volatile("" : "+r"(warps));  // or a compiler finds it anew for each brick
-const int bricks = size[0] * size[1] * size[2];
+asm volatile("" : "+r"(warps));  // or a compiler finds it anew for each subblock
+const int subblocks = size[0] * size[1] * size[2];
 const bool is_place = kind == PLACE, of_mass = c == 0 || is_place;
 const int word = kind == 0 ? c : c + 3 & 3;  // a vector begins where the mass was, if there is none
 const int within = (lane & 16) + (lane >> 1 & 4) + (lane >> 2 & 1) + (kind == KINEMATIC ? 64 : 0);
 const unsigned mass_of_node = 1u << (lane & 28);
-// the group's units are not smaller than those of the sums: shifted, they are exact
-float unit = power_of_two(room[of_mass ? HEAVIEST : kind == KINEMATIC ? DRIVEN : FASTEST]);
-unit *= is_place && c > 0 ? 0x1p-24f : 0x1p-25f;
-const int shift = __float_as_int(unit) - room[of_mass ? MASS_UNIT : MOMENTUM_UNIT] >> 23;
+// the tile's units are not smaller than those of the accumulators: shifted, they are exact
+float quantum = power_of_two(arena[of_mass ? HEAVIEST : kind == KINEMATIC ? FASTEST_KINEMATIC : FASTEST]);
+quantum *= is_place && c > 0 ? 0x1p-24f : 0x1p-25f;
+const int shift = __float_as_int(quantum) - arena[of_mass ? MASS_QUANTUM : MOMENTUM_QUANTUM] >> 23;
 // a loop for what comes first and one for the rest: threads that branch in it would wait for each other
 struct First {{ enum {{ IS = 1 }}; }};
 struct Later {{ enum {{ IS = 0 }}; }};
-auto put_bricks = [&](auto which, auto add) {{
-    int* from = room + NODES + start + BRICK_WORDS * warp + lane;
+auto put_subblocks = [&](auto which, auto add) {{
+    int* from = arena + NODES + start + SUBBLOCK_WORDS * warp + lane;
 #pragma unroll 1
-    for (int n = RECORDS + warp; n < RECORDS + bricks; n += warps, from += BRICK_WORDS * warps) {{
-        const int sum = *from, record = room[n] + within;
-        int& massive = room[n - RECORDS + MASSIVE];
+    for (int n = RECORDS + warp; n < RECORDS + subblocks; n += warps, from += SUBBLOCK_WORDS * warps) {{
+        const int sum = *from, record = arena[n] + within;
+        int& massive = arena[n - RECORDS + MASSIVE];
         if (decltype(which)::IS) massive = __ballot_sync(ALL, sum != 0);  // written by all threads, the same
         if (sum != 0 && (massive & mass_of_node)) add(record, sum);  // who adds no mass adds nothing
     }}
 }};
 auto put = [&](auto add) {{
-    if (kind == 0) put_bricks(First(), add);
-    else put_bricks(Later(), add);
+    if (kind == 0) put_subblocks(First(), add);
+    else put_subblocks(Later(), add);
 }};
 // memory takes the four numbers of a node at a time
 auto red = [](size_t to, int record, long long added) {{
@@ -338,12 +338,12 @@ auto red = [](size_t to, int record, long long added) {{
 // what places have of records has no halves
 auto own = [&](int record) {{ return is_place ? (record >> 1 & ~63) + (record & 63) : record; }};
 if (is_place)
-    for (int n = threadIdx.x; n < bricks; n += blockDim.x)
-        if (room[MASSIVE + n]) wp::index(sums.told, e, room[RECORDS + n] >> 7) = 1;
+    for (int n = threadIdx.x; n < subblocks; n += blockDim.x)
+        if (arena[MASSIVE + n]) wp::index(accumulators.candidates, e, arena[RECORDS + n] >> 7) = 1;
 bool too_much = false;
-// sums have 31 bits, so most of them cannot be too large
+// accumulators have 31 bits, so most of them cannot be too large
 if (!is_place && __all_sync(ALL, shift < 18)) {{
-    const size_t to = __cvta_generic_to_global(&wp::index(sums.fixed, e, 0)) + 8 * word;
+    const size_t to = __cvta_generic_to_global(&wp::index(accumulators.fixed, e, 0)) + 8 * word;
     const int factor = 1 << shift;
     put([&](int record, int sum) {{
         long long added;
@@ -351,7 +351,7 @@ if (!is_place && __all_sync(ALL, shift < 18)) {{
         red(to, record, added);
     }});
 }} else {{
-    void* const records = is_place ? (void*)&wp::index(sums.offset_fixed, e, 0) : &wp::index(sums.fixed, e, 0);
+    void* const records = is_place ? (void*)&wp::index(accumulators.offset_fixed, e, 0) : &wp::index(accumulators.fixed, e, 0);
     const size_t to = __cvta_generic_to_global(records) + 8 * word;
     const int most_counted = shift > 48 ? 0 : shift < 18 ? 0x7fffffff : 1 << (48 - shift);
     put([&](int record, int sum) {{
@@ -362,7 +362,7 @@ if (!is_place && __all_sync(ALL, shift < 18)) {{
 if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 """)
 )
-def put_down(grid: Grid, sums: Sums, failure: wp.array(dtype=int), e: int, kind: int, start: int):
+def flush_nodes(grid: Grid, accumulators: Accumulators, failure: wp.array(dtype=int), e: int, kind: int, start: int):
     """Add what the nodes have got of a ``kind`` to the sums outside; sums that are too large are not.
 
     It begins ``start`` words after the nodes' first. Four threads a node. Masses come first; slots whose nodes are told
@@ -372,10 +372,10 @@ def put_down(grid: Grid, sums: Sums, failure: wp.array(dtype=int), e: int, kind:
 
 
 @wp.func
-def bounded(s: Scattered, unit: float, failure: wp.array(dtype=int), e: int):
+def bounded(s: Deposit, quantum: float, failure: wp.array(dtype=int), e: int):
     """The most momentum that a particle has anywhere in its stencil [kg m/s]; -1 if it must not be added up."""
     bounds = momentum_bounds(s)
-    fault = fault_within(s, bounds, unit)
+    fault = fault_within(s, bounds, quantum)
     if fault != 0:
         wp.atomic_or(failure, e, fault)
         return -1.0

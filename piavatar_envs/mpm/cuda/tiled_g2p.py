@@ -6,8 +6,8 @@ import warp as wp
 
 from piavatar_envs.core.cuda_intrinsics import environment_of
 from piavatar_envs.mpm.bspline import grid_position
-from piavatar_envs.mpm.contact_sensors import sense_gathered
-from piavatar_envs.mpm.g2p import Gathered, gather, store_particle
+from piavatar_envs.mpm.contact_sensors import sense_near_field
+from piavatar_envs.mpm.g2p import Advanced, g2p_particle, store_particle
 from piavatar_envs.mpm.types import (
     FAILURE_CFL,
     FAILURE_NONFINITE,
@@ -31,7 +31,7 @@ THREADS = 128
 
 
 @wp.kernel(launch_bounds=(THREADS, 6))
-def grid_to_particles(
+def tiled_g2p(
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -44,7 +44,7 @@ def grid_to_particles(
     failure: wp.array(dtype=int),
     sensors: Sensors,
 ):
-    """Move every particle with the grid, see :func:`piavatar_envs.mpm.g2p.gather`.
+    """Move every particle with the grid, see :func:`piavatar_envs.mpm.g2p.g2p_particle`.
 
     Unlike the gather of a CPU it has its loops unrolled, and its threads store together. If it ``senses``, it does the
     work of :func:`piavatar_envs.mpm.contact_sensors.sense_contact` first.
@@ -53,10 +53,10 @@ def grid_to_particles(
     e = at[0]
     p = at[1]
     stays = blocks.frozen[e] != 0
-    s = Gathered()
+    s = Advanced()
     if not stays:
         if senses != 0:
-            sense_gathered(grid, particles, blocks, sensors, e, p, grid_position(grid, moved.x[e, p]))
-        s, _ = gather(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+            sense_near_field(grid, particles, blocks, sensors, e, p, grid_position(grid, moved.x[e, p]))
+        s, _ = g2p_particle(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
         stays = s.fault != 0
     store_particle(moved, e, p, s, not stays)

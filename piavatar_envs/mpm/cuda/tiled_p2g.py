@@ -2,13 +2,13 @@
 
 What few particles of a group tell their nodes besides momentum: how they are driven, and where they are.
 
-Contact asks for that, see :func:`piavatar_envs.mpm.p2g.tells_place`. These particles are listed, so that the first
+Contact asks for that, see :func:`piavatar_envs.mpm.p2g.is_contact_candidate`. These particles are listed, so that the first
 threads of the group's CUDA block have them, and what they tell is added up and put down as momenta are, see
 :mod:`piavatar_envs.mpm.cuda.tiled_p2g`.
 
 The scatter of a GPU for large, dense bodies: particles are added up by the group before the nodes are touched.
 
-A group is of neighbours in memory, which should be neighbours in the body: the fewer bricks of nodes there are in the
+A group is of neighbours in memory, which should be neighbours in the body: the fewer subblocks of nodes there are in the
 box around them, the less there is to put down. It has a CUDA block of its own, see
 :mod:`piavatar_envs.mpm.cuda.tile_grid` and :mod:`piavatar_envs.mpm.cuda.tile_grid`. What it adds up depends on its own
 particles only, and integers are added: runs repeat bit for bit, and an environment does the same in any batch. What few
@@ -25,45 +25,46 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.core.arrays import vec8
-from piavatar_envs.core.cuda_intrinsics import block_of_launch, environment_of, meet, thread_of_block
+from piavatar_envs.core.cuda_intrinsics import block_of_launch, environment_of, sync_block, thread_of_block
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.core.shared_memory import APPEND, native, set_number, word
+from piavatar_envs.core.shared_memory import APPEND, native, set_float_word, word
 from piavatar_envs.mpm.bspline import spline
-from piavatar_envs.mpm.cuda.block_grid import brick_native
+from piavatar_envs.mpm.cuda.block_grid import subblock_native
 from piavatar_envs.mpm.cuda.block_p2g import adding
 from piavatar_envs.mpm.cuda.tile_grid import (
+    CANDIDATES,
     CAPACITY,
-    DRIVEN,
     FASTEST,
+    FASTEST_KINEMATIC,
     HEAVIEST,
     KINEMATIC,
-    LEFT,
-    MASS_UNIT,
+    MASS_QUANTUM,
+    MAX_PARTICLE_QUANTA,
     MOMENTUM,
-    MOMENTUM_UNIT,
-    MORE,
+    MOMENTUM_QUANTUM,
+    NUM_CANDIDATES,
     PLACE,
+    REMAINING,
     SIZE,
-    TELLERS,
     THREADS,
-    UNITS,
     WORDS,
-    begin_turn,
-    bricks_around,
+    begin_pass,
     clear_nodes,
-    fetch_slots,
-    has_others,
-    has_turn,
-    in_group,
-    note_records,
-    per_unit_of,
-    put_down,
-    raised,
+    fetch_active,
+    flush_nodes,
+    has_contact_nodes,
+    in_pass,
+    inverse_quantum,
+    raise_quanta,
+    store_records,
+    subblocks_around,
+    tile_native,
     widen_box,
 )
-from piavatar_envs.mpm.p2g import Scattered, near_boundary, placed, prepare, scatters
+from piavatar_envs.mpm.p2g import Deposit, deposit_of, deposits, empty_deposit, near_boundary
 from piavatar_envs.mpm.types import (
     PAPER,
+    Accumulators,
     Blocks,
     Boundaries,
     Contact,
@@ -72,7 +73,6 @@ from piavatar_envs.mpm.types import (
     Moving,
     Particles,
     Step,
-    Sums,
     row,
 )
 
@@ -83,17 +83,17 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 
 #: Up to how many particles of an environment a group has so many: smaller worlds fill a GPU with small groups only. The
 #: numbers must not depend on the batch: units do on the group.
-SHARES = ((16384, 32), (65536, 64), (2**31, THREADS))
+TILE_SIZES = ((16384, 32), (65536, 64), (2**31, THREADS))
 #: Ways in which a body may be turned, of which a group's box should be small enough in each.
-_TURNS = Rotation.random(8, random_state=0).as_matrix()
+_ROTATIONS = Rotation.random(8, random_state=0).as_matrix()
 
 
-def share_of(per_env: int) -> int:
+def tile_size(per_env: int) -> int:
     """Particles of a group, at most, where an environment has ``per_env``."""
-    return next(share for most, share in SHARES if per_env <= most)
+    return next(share for most, share in TILE_SIZES if per_env <= most)
 
 
-def begin_groups(field: np.ndarray, rest: np.ndarray | None, dx: float) -> np.ndarray:
+def plan_tiles(field: np.ndarray, rest: np.ndarray | None, dx: float) -> np.ndarray:
     """First particles and velocity fields of groups, ``(G + 1, 2)`` int32; the last row says where the others end.
 
     A group is of one field, and is halved where the box around it would be too large: then it would go in turns, and a
@@ -104,7 +104,7 @@ def begin_groups(field: np.ndarray, rest: np.ndarray | None, dx: float) -> np.nd
         rest: where they are at rest [m], shape ``(P, 3)``; if not given, nothing is halved.
         dx: grid spacing [m].
     """
-    share, changes = share_of(len(field)), np.flatnonzero(np.diff(field)) + 1
+    share, changes = tile_size(len(field)), np.flatnonzero(np.diff(field)) + 1
     bounds = np.concatenate([[0], changes, [len(field)]])
     begins = np.concatenate([*(np.arange(*ends, share) for ends in pairwise(bounds)), [len(field)]])
     while rest is not None and (too_large := _too_large(rest, begins, dx)).any():
@@ -114,62 +114,67 @@ def begin_groups(field: np.ndarray, rest: np.ndarray | None, dx: float) -> np.nd
 
 
 def _too_large(rest: np.ndarray, begins: np.ndarray, dx: float) -> np.ndarray:
-    """Of which groups, of more than one particle, the box has too many bricks in one of ``_TURNS``, shape ``(G,)``."""
+    """Of which groups, of more than one particle, the box has too many subblocks in one of ``_ROTATIONS``, shape ``(G,)``."""
     most = np.zeros(len(begins) - 1)
-    for turn in _TURNS:
-        places = rest @ turn.T / dx
+    for tile_pass in _ROTATIONS:
+        places = rest @ tile_pass.T / dx
         edges = np.maximum.reduceat(places, begins[:-1]) - np.minimum.reduceat(places, begins[:-1])
         most = np.maximum(most, np.prod((edges + 3.0) / 2.0 + 1.0, axis=1))  # a stencil is three nodes long
     return (most > int(CAPACITY)) & (np.diff(begins) > 1)
 
 
 @wp.func_native(
-    in_group(
+    tile_native(
         APPEND
         + """
-const int place = append(room + MORE, __ballot_sync(ALL, tells), threadIdx.x & 31);
-if (tells) room[TELLERS + place] = threadIdx.x;
+const int place = append(arena + NUM_CANDIDATES, __ballot_sync(ALL, candidate), threadIdx.x & 31);
+if (candidate) arena[CANDIDATES + place] = threadIdx.x;
 """
     )
 )
-def note_teller(tells: bool):
-    """List the thread, if its particle ``tells`` its nodes more than momentum, in any order; all threads come here."""
+def list_candidate(candidate: bool):
+    """List the thread, if its particle ``candidate`` its nodes more than momentum, in any order; all threads come here."""
     ...
 
 
 @wp.func_native(
-    in_group(
+    tile_native(
         SIZE
         + """
-const int bricks = size[0] * size[1] * size[2];
-return 2 * bricks <= CAPACITY ? BRICK_WORDS * bricks : 0;
+const int subblocks = size[0] * size[1] * size[2];
+return 2 * subblocks <= CAPACITY ? SUBBLOCK_WORDS * subblocks : 0;
 """,
         "return 0;",
     )
 )
-def beyond_box() -> int:
+def spare_words() -> int:
     """Words from a node's to as many more for it, beyond those of the box; 0 where there is no room for these."""
     ...
 
 
 @wp.func
-def add_told(t: int, driven: Scattered, place: Scattered, drives: bool, to_place: int):
-    """:func:`tell_box` of how a particle is ``driven`` and of its ``place``."""
-    per_mass = per_unit_of(HEAVIEST)
+def add_candidate(t: int, driven: Deposit, place: Deposit, drives: bool, to_place: int):
+    """:func:`add_candidate_to_box` of how a particle is ``driven`` and of its ``place``."""
+    per_mass = inverse_quantum(HEAVIEST)
     per_way = 0.5 * per_mass  # up to 1.5 masses
-    k = per_unit_of(DRIVEN) * wp.vec3(driven.at_base[1], driven.at_base[2], driven.at_base[3])
+    k = inverse_quantum(FASTEST_KINEMATIC) * wp.vec3(driven.at_base[1], driven.at_base[2], driven.at_base[3])
     at_base = wp.vec4(
         per_mass * place.at_base[0], per_way * place.at_base[1], per_way * place.at_base[2], per_way * place.at_base[3]
     )
-    tell_box(
-        bricks_around(place.base), t, place.base, spline(place.f[0]), spline(place.f[1]), spline(place.f[2]), k,
+    add_candidate_to_box(
+        subblocks_around(place.base), t, place.base, spline(place.f[0]), spline(place.f[1]), spline(place.f[2]), k,
         at_base, per_way * place.A[0, 0], drives, to_place,
     )  # fmt: skip
 
 
 @wp.func
-def tell_nodes(
-    grid: Grid, particles: Particles, moving: Moving, failure: wp.array(dtype=int), sums: Sums, at: wp.vec4i
+def deposit_candidates(
+    grid: Grid,
+    particles: Particles,
+    moving: Moving,
+    failure: wp.array(dtype=int),
+    accumulators: Accumulators,
+    at: wp.vec4i,
 ):
     """Scatter what particles that tell their nodes have besides momentum; all threads come here, few groups do.
 
@@ -178,25 +183,25 @@ def tell_nodes(
     """
     e = at[0]
     t = thread_of_block()
-    tells = t < word(MORE)
-    p = at[1] - t + word(TELLERS + wp.where(tells, t, 0))
-    driven = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], KINEMATIC)
-    place = told_by(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], PLACE)
-    beyond = beyond_box()
+    candidate = t < word(NUM_CANDIDATES)
+    p = at[1] - t + word(CANDIDATES + wp.where(candidate, t, 0))
+    driven = candidate_deposit(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], KINEMATIC)
+    place = candidate_deposit(grid, particles, e, p, moving.x[e, p], moving.vk[e, p], PLACE)
+    beyond = spare_words()
     kinds = int(2)
     rounds = wp.where(beyond > 0, 1, kinds)
     for n in range(rounds):
         clear_nodes()
         if n == 0:  # what is added of places is no momentum, and as sound as the masses were
-            tells = raised(driven, tells, KINEMATIC, failure, e)
-        meet()
-        if tells:
-            add_told(t, driven, place, n == 0, wp.where(n == rounds - 1, beyond, -1))
-        meet()
+            candidate = raise_quanta(driven, candidate, KINEMATIC, failure, e)
+        sync_block()
+        if candidate:
+            add_candidate(t, driven, place, n == 0, wp.where(n == rounds - 1, beyond, -1))
+        sync_block()
         for k in range(kinds):
             if rounds == 1 or k == n:
-                put_down(grid, sums, failure, e, KINEMATIC + k, k * beyond)
-        meet()
+                flush_nodes(grid, accumulators, failure, e, KINEMATIC + k, k * beyond)
+        sync_block()
 
 
 @wp.func_native(native("return (first + (int)threadIdx.x) & 0x7fffffff;", "return first;"))
@@ -206,115 +211,117 @@ def particle_of_thread(first: int) -> int:
 
 
 @wp.func
-def begin_group(particles: Particles, sums: Sums):
+def begin_tile(particles: Particles, accumulators: Accumulators):
     """The group of a CUDA block: environment, particle of the thread, field, particle after the last.
 
     Nothing has been added yet; units are not smaller than those of the sums. All threads meet later.
     """
-    at_group = environment_of(block_of_launch(), particles.groups.shape[0] - 1)
+    at_group = environment_of(block_of_launch(), particles.tiles.shape[0] - 1)
     e = at_group[0]
-    begins = particles.groups[at_group[1]]
+    begins = particles.tiles[at_group[1]]
     field = begins[1]
     if thread_of_block() == 0:
-        mass = sums.mass_unit[row(e, sums.mass_unit.shape[0]), field]
-        momentum = sums.momentum_unit[row(e, sums.momentum_unit.shape[0]), field]
-        set_number(MASS_UNIT, mass)
-        set_number(MOMENTUM_UNIT, momentum)
-        set_number(HEAVIEST, UNITS * mass)
-        set_number(FASTEST, UNITS * momentum)
-        set_number(DRIVEN, UNITS * momentum)
-    begin_turn()
+        mass = accumulators.mass_quantum[row(e, accumulators.mass_quantum.shape[0]), field]
+        momentum = accumulators.momentum_quantum[row(e, accumulators.momentum_quantum.shape[0]), field]
+        set_float_word(MASS_QUANTUM, mass)
+        set_float_word(MOMENTUM_QUANTUM, momentum)
+        set_float_word(HEAVIEST, MAX_PARTICLE_QUANTA * mass)
+        set_float_word(FASTEST, MAX_PARTICLE_QUANTA * momentum)
+        set_float_word(FASTEST_KINEMATIC, MAX_PARTICLE_QUANTA * momentum)
+    begin_pass()
     clear_nodes()
-    return wp.vec4i(e, particle_of_thread(begins[0]), field, particles.groups[at_group[1] + 1][0])
+    return wp.vec4i(e, particle_of_thread(begins[0]), field, particles.tiles[at_group[1] + 1][0])
 
 
 @wp.func
-def begins_again():
+def next_pass():
     """Whether particles are left for another turn, which begins then; all threads come here."""
-    goes_on = word(LEFT) != 0
+    goes_on = word(REMAINING) != 0
     if goes_on:
-        meet()
-        begin_turn()
+        sync_block()
+        begin_pass()
         clear_nodes()
     return goes_on
 
 
 @wp.func
-def add_momentum(box: wp.vec3i, s: Scattered):
+def add_momentum(box: wp.vec3i, s: Deposit):
     """Add mass and momentum of a particle to the group's nodes."""
     add_to_box(
-        box, thread_of_block(), s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), per_unit_of(HEAVIEST),
-        per_unit_of(FASTEST),
+        box, thread_of_block(), s, spline(s.f[0]), spline(s.f[1]), spline(s.f[2]), inverse_quantum(HEAVIEST),
+        inverse_quantum(FASTEST),
     )  # fmt: skip
 
 
 @wp.struct
-class Turn:
+class TilePass:
     """A particle while its group scatters."""
 
     takes: bool  # whether it takes part
     ours: bool  # whether it has its turn
     base: wp.vec3i  # lowest node of its stencil
-    box: wp.vec3i  # where the bricks around that are, see :func:`bricks_around`
+    box: wp.vec3i  # where the subblocks around that are, see :func:`subblocks_around`
 
 
 @wp.func
-def add_turn(
+def add_pass(
     grid: Grid,
     blocks: Blocks,
     failure: wp.array(dtype=int),
     num_fields: int,
     at: wp.vec4i,
-    left: bool,
-    s: Scattered,
+    remaining: bool,
+    s: Deposit,
 ):
-    """Add up those of the particles that are ``left`` whose turn it is; ``s`` is what one scatters that is left.
+    """Add up those of the particles that are ``remaining`` whose turn it is; ``s`` is what one scatters that is left.
 
-    All threads come here, and to :func:`put_turn` then.
+    All threads come here, and to :func:`flush_pass` then.
     """
     e = at[0]
-    meet()  # not before memory has been asked for what particles have; a turn has begun then
-    takes = raised(s, left, MOMENTUM, failure, e)
+    sync_block()  # not before memory has been asked for what particles have; a turn has begun then
+    takes = raise_quanta(s, remaining, MOMENTUM, failure, e)
     widen_box(takes, s.base)
-    meet()
-    ours = has_turn(grid, takes, s.base)
-    box = bricks_around(s.base)
-    fetch_slots(grid, blocks, num_fields, e, at[2])
+    sync_block()
+    ours = in_pass(grid, takes, s.base)
+    box = subblocks_around(s.base)
+    fetch_active(grid, blocks, num_fields, e, at[2])
     if ours:
         add_momentum(box, s)
-    note_records(blocks, e)  # nobody needs them before
-    return Turn(takes, ours, s.base, box)
+    store_records(blocks, e)  # nobody needs them before
+    return TilePass(takes, ours, s.base, box)
 
 
 @wp.func
-def put_turn(
+def flush_pass(
     grid: Grid,
     step: Step,
     particles: Particles,
     moving: Moving,
     failure: wp.array(dtype=int),
-    sums: Sums,
+    accumulators: Accumulators,
     num_fields: int,
     at: wp.vec4i,
-    turn: Turn,
+    tile_pass: TilePass,
     near: bool,
 ):
     """Put down what has been added up; returns whether this particle is left then.
 
     A boundary may be ``near`` it. All threads have met since they added.
     """
-    tells = near or step.decoupling == PAPER  # which needs the gradient of kinematic momentum everywhere
+    candidate = near or step.decoupling == PAPER  # which needs the gradient of kinematic momentum everywhere
     # others are asked for only of who has a box
-    note_teller(turn.ours and (tells or (num_fields > 1 and has_others(turn.box, turn.base))))
-    put_down(grid, sums, failure, at[0], MOMENTUM, 0)
-    meet()
-    if word(MORE) != 0:
-        tell_nodes(grid, particles, moving, failure, sums, at)
-    return turn.takes and not turn.ours
+    list_candidate(
+        tile_pass.ours and (candidate or (num_fields > 1 and has_contact_nodes(tile_pass.box, tile_pass.base)))
+    )
+    flush_nodes(grid, accumulators, failure, at[0], MOMENTUM, 0)
+    sync_block()
+    if word(NUM_CANDIDATES) != 0:
+        deposit_candidates(grid, particles, moving, failure, accumulators, at)
+    return tile_pass.takes and not tile_pass.ours
 
 
 @wp.func
-def scatter_left(
+def add_remaining(
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -322,29 +329,29 @@ def scatter_left(
     boundaries: Boundaries,
     blocks: Blocks,
     failure: wp.array(dtype=int),
-    sums: Sums,
+    accumulators: Accumulators,
     num_fields: int,
     at: wp.vec4i,
-    left: bool,
+    remaining: bool,
 ):
-    """Scatter those of the particles that are ``left`` whose turn it is; returns whether this one is left then.
+    """Scatter those of the particles that are ``remaining`` whose turn it is; returns whether this one is left then.
 
     Written into a kernel's loop, ``s`` would be kept from turn to turn, and four times as many registers be spilled.
     """
     e = at[0]
-    s = Scattered()
-    if left:
-        s = prepare(grid, step, particles, moving, e, at[1], False)
-    turn = add_turn(grid, blocks, failure, num_fields, at, left, s)
-    meet()
+    s = Deposit()
+    if remaining:
+        s = deposit_of(grid, step, particles, moving, e, at[1], False)
+    tile_pass = add_pass(grid, blocks, failure, num_fields, at, remaining, s)
+    sync_block()
     # not before: the less a thread keeps while it waits for what particles have, the earlier it asks for it
     near = near_boundary(grid, boundaries, e, moving.x[e, wp.min(at[1], moving.x.shape[1] - 1)])
-    return put_turn(grid, step, particles, moving, failure, sums, num_fields, at, turn, near)
+    return flush_pass(grid, step, particles, moving, failure, accumulators, num_fields, at, tile_pass, near)
 
 
 # that leaves a thread 80 registers, all but a few of those that it asks for
 @wp.kernel(launch_bounds=(THREADS, 6))
-def runs_to_grid(
+def tiled_p2g(
     grid: Grid,
     step: Step,
     particles: Particles,
@@ -354,37 +361,37 @@ def runs_to_grid(
     blocks: Blocks,
     # in and out
     failure: wp.array(dtype=int),
-    sums: Sums,
+    accumulators: Accumulators,
 ):
-    """The same sums as :func:`piavatar_envs.mpm.p2g.particles_to_grid`.
+    """The same sums as :func:`piavatar_envs.mpm.p2g.p2g`.
 
     A CUDA block takes one group of an environment, a thread a particle; all of its threads come to what they do
     together.
     """
     reserved = wp.tile_empty(shape=(WORDS,), dtype=int, storage="shared")  # noqa: F841
-    at = begin_group(particles, sums)
-    left = bool(False)
+    at = begin_tile(particles, accumulators)
+    remaining = bool(False)
     if at[1] < at[3]:
-        left = scatters(blocks, moving, at[0], at[1], failure)
+        remaining = deposits(blocks, moving, at[0], at[1], failure)
     goes_on = bool(True)
     while goes_on:
-        left = scatter_left(
-            grid, step, particles, moving, boundaries, blocks, failure, sums, contact.num_fields, at, left
+        remaining = add_remaining(
+            grid, step, particles, moving, boundaries, blocks, failure, accumulators, contact.num_fields, at, remaining
         )  # fmt: skip
-        goes_on = begins_again()
+        goes_on = next_pass()
 
 
-def record_groups(graph: LaunchGraph, model: Model, inputs: list[Any], outputs: list[Any]) -> None:
+def record_tiled_p2g(graph: LaunchGraph, model: Model, inputs: list[Any], outputs: list[Any]) -> None:
     """Append the P2G of all groups of all environments; no CUDA block has two."""
-    share = share_of(model.num_particles)
-    threads = model.num_envs * (model.particles.groups.shape[0] - 1) * share
-    graph.launch(runs_to_grid, threads, inputs, outputs, block_dim=share)
+    share = tile_size(model.num_particles)
+    threads = model.num_envs * (model.particles.tiles.shape[0] - 1) * share
+    graph.launch(tiled_p2g, threads, inputs, outputs, block_dim=share)
 
 
 @wp.func
-def told_by(grid: Grid, particles: Particles, e: int, p: int, x: wp.vec3, vk: wp.vec3, kind: int):
+def candidate_deposit(grid: Grid, particles: Particles, e: int, p: int, x: wp.vec3, vk: wp.vec3, kind: int):
     """How particle ``p`` at ``x`` is driven, or its place ``w m (x_i - x_p) / dx`` and a seam's ``w m``."""
-    s = placed(grid, x)
+    s = empty_deposit(grid, x)
     m = particles.mass[row(e, particles.mass.shape[0]), p]
     if kind == KINEMATIC:
         k = m * vk
@@ -397,8 +404,8 @@ def told_by(grid: Grid, particles: Particles, e: int, p: int, x: wp.vec3, vk: wp
 
 @wp.func_native(
     adding(
-        unit=4,
-        before="for (int n = 0; n < 3; ++n) place_z[n] += upper_z[n] ? UNIT * BRICK : 0;",
+        scale=4,
+        before="for (int n = 0; n < 3; ++n) place_z[n] += upper_z[n] ? UNIT * SUBBLOCK : 0;",
         plane="const int first = UNIT * (box[0] + (far ? box[1] : 0));",
         line="const int first_of_line = first + line + UNIT * (upper ? box[2] : 0);",
         node="first_of_line + place_z[l]",
@@ -408,36 +415,36 @@ def told_by(grid: Grid, particles: Particles, e: int, p: int, x: wp.vec3, vk: wp
 def add_to_box(
     box: wp.vec3i,
     p: int,
-    s: Scattered,
+    s: Deposit,
     wx: wp.vec3,
     wy: wp.vec3,
     wz: wp.vec3,
     per_mass: float,
     per_momentum: float,
 ):
-    """:func:`add_to_bricks`, in bricks that lie in a row.
+    """:func:`add_to_subblocks`, in subblocks that lie in a row.
 
-    ``box`` has the word at which the first brick begins, and how far on the next ones along x and along y do.
+    ``box`` has the word at which the first subblock begins, and how far on the next ones along x and along y do.
     """
     ...
 
 
 @wp.func_native(
-    brick_native("""
+    subblock_native("""
 const int px = base[0] & 1, py = base[1] & 1, pz = base[2] & 1;
 const float k[3] = {driven[0], driven[1], driven[2]};
 #pragma unroll 1
 for (int m = 0; m < 9; ++m) {
-    int n = m + t % 9;  // who has the same nodes adds to others of them meanwhile
+    int n = m + t % 9;  // who has the same nodes adds to contact_nodes of them meanwhile
     n -= n > 8 ? 9 : 0;
     const int i = n * 11 >> 5, j = n - 3 * i;
-    int* const line = room + box[0] + (px + i > 1 ? box[1] : 0) + (py + j > 1 ? box[2] : 0)
+    int* const line = arena + box[0] + (px + i > 1 ? box[1] : 0) + (py + j > 1 ? box[2] : 0)
         + ((px + i) & 1) * ALONG_X + ((py + j) & 1) * ALONG_Y;
     const float w = (i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2]) * (j == 0 ? wy[0] : j == 1 ? wy[1] : wy[2]);
     const float way_x = place[1] + (float)i * change, way_y = place[2] + (float)j * change;
 #pragma unroll
     for (int l = 0; l < 3; ++l) {
-        int* const node = line + (pz + l > 1 ? BRICK : 0) + ((pz + l) & 1) * ALONG_Z;
+        int* const node = line + (pz + l > 1 ? SUBBLOCK : 0) + ((pz + l) & 1) * ALONG_Z;
         const float wl = w * wz[l];
         if (drives)
             for (int c = 0; c < 3; ++c) atomicAdd(node + 1 + c, __float2int_rn(wl * k[c]));
@@ -450,7 +457,7 @@ for (int m = 0; m < 9; ++m) {
 }
 """)
 )
-def tell_box(
+def add_candidate_to_box(
     box: wp.vec3i,
     t: int,
     base: wp.vec3i,
