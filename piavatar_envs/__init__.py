@@ -14,8 +14,9 @@ from piavatar_envs.tasks import add_task, place_of, task_modules
 if TYPE_CHECKING:
     from piavatar_envs.api.conformance import check_task
     from piavatar_envs.envs.task import Task
+    from piavatar_envs.mpm.materials import register_material
 
-__all__ = ["check_task", "register_game", "register_task"]
+__all__ = ["check_task", "register_game", "register_material", "register_task"]
 __version__ = "0.1.0"
 
 #: What Gymnasium calls for every id.
@@ -68,12 +69,16 @@ def register_game(name: str, task: type[Task] | str) -> None:
 
 
 def __getattr__(name: str) -> Any:
-    """``check_task``, whose imports are heavy, when it is first asked for."""
-    if name != "check_task":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from piavatar_envs.api.conformance import check_task
+    """Import ``check_task`` or ``register_material`` on first use, because their imports are heavy."""
+    if name == "check_task":
+        from piavatar_envs.api.conformance import check_task
 
-    return check_task
+        return check_task
+    if name == "register_material":
+        from piavatar_envs.mpm.materials import register_material
+
+        return register_material
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 for _env_id in task_modules():

@@ -37,6 +37,15 @@ class FrozenDict(dict):
         return FrozenDict, (dict(self),)
 
 
+def _check_material(name: str) -> str:
+    """Refuse a material that is not registered."""
+    from piavatar_envs.mpm.materials import check_material
+
+    return check_material(name)
+
+
+#: Name of a material of this package or of :func:`piavatar_envs.register_material`.
+MaterialName = Annotated[str, AfterValidator(_check_material)]
 MOST_SUBSTEPS = 10_000
 #: Greatest Young's modulus [Pa] and densities [kg/m^3] of soft matter: a hard plastic, thin smoke, the heaviest metal.
 MOST_MODULUS = 1.0e9
@@ -80,9 +89,7 @@ class PhysicsConfig(BaseModel):
         le=CFL_STABLE,
         description="largest c dt / dx a substep may have, c the P-wave speed; beyond 0.84 it is not stable [-]",
     )
-    material: Literal["neo_hookean", "fixed_corotated"] = Field(
-        "neo_hookean", description="elastic energy of the flesh"
-    )
+    material: MaterialName = Field("neo_hookean", description="elastic energy of the flesh")
     young_modulus: float = Field(1.0e5, ge=1.0, le=MOST_MODULUS, description="Young's modulus of the flesh [Pa]")
     soft_young_modulus: float | None = Field(
         None,
@@ -370,7 +377,6 @@ Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
 TopSpeed = Annotated[float, Field(ge=0.0, le=1.0e6)]
 Spin = Annotated[float, Field(ge=-1000.0, le=1000.0)]
-MaterialName = Literal["neo_hookean", "fixed_corotated"]
 
 
 class RegionConfig(BaseModel):

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Foundations below the physics: launch graphs, CUDA intrinsics, shared memory and array access."""

@@ -1,4 +1,12 @@
-"""TODO."""
+"""Vector types, and access to arrays with dense rows.
+
+Warp's own indexing supports any strides and negative indices, which costs ten instructions an address on a GPU. All
+arrays of this package have dense rows, so one multiplication finds an address.
+
+Matrices of particles are stored by component, ``(num_envs, 9, num_particles)``, row-major: neighbouring threads then
+read and write neighbouring words. Each component begins at a multiple of :data:`LINE` numbers, so that the store of a
+warp never straddles cache lines.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +16,21 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
-#: Partial sums of a chunk's corrections: momentum and angular momentum of the pulls (6), those of the lean alone (6).
 vec12 = wp.types.vector(length=12, dtype=wp.float32)
 
 
-#: Partial sums of a chunk: m, m x (3), m u (3), m x x^T (6), m x cross u (3).
 vec16 = wp.types.vector(length=16, dtype=wp.float32)
 
 
-#: What a grid node has: mass [kg], physical momentum (3), kinematic momentum (3), nothing. How it lies in memory is in
-#: :mod:`piavatar_envs.mpm.grid_arrays`.
+#: A node record (see :mod:`piavatar_envs.mpm.grid_arrays`), or up to eight numbers that are summed together.
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 
 
-#: Half of a record in fixed point, or an offset, see :mod:`piavatar_envs.mpm.grid_arrays`.
+#: Half of a node record in fixed point.
 vec4l = wp.types.vector(length=4, dtype=wp.int64)
 
 
-#: What eight subblocks, blocks or nodes around a particle have.
+#: One integer for each of the eight blocks, subblocks or nodes around a particle.
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 
 
@@ -34,37 +39,37 @@ _ROW = "rows.data[rows.shape[1] * e + p]"
 
 @wp.func_native("return values.data[n];")
 def int_at(values: wp.array(dtype=int), n: int) -> int:
-    """``values[n]``."""
+    """Return ``values[n]``."""
     ...
 
 
 @wp.func_native("return values.data[n];")
 def float_at(values: wp.array(dtype=float), n: int) -> float:
-    """``values[n]``."""
+    """Return ``values[n]``."""
     ...
 
 
 @wp.func_native(f"return {_ROW};")
 def number_at(rows: wp.array2d(dtype=float), e: int, p: int) -> float:
-    """``rows[e, p]``."""
+    """Return ``rows[e, p]``."""
     ...
 
 
 @wp.func_native(f"return {_ROW};")
 def vector_at(rows: wp.array2d(dtype=wp.vec3), e: int, p: int) -> wp.vec3:
-    """``rows[e, p]``."""
+    """Return ``rows[e, p]``."""
     ...
 
 
 @wp.func_native(f"wp::vec3 value;\nif (p >= first) value = {_ROW};\nreturn value;")
 def vector_from(rows: wp.array2d(dtype=wp.vec3), first: int, e: int, p: int) -> wp.vec3:
-    """``rows[e, p]``, or zero before ``first``: a branch of Warp's own would wait for what is asked for."""
+    """Return ``rows[e, p]``, or zero for ``p < first``, without a branch that waits for the load."""
     ...
 
 
 @wp.func_native(f"{_ROW} = value;")
 def set_vector(rows: wp.array2d(dtype=wp.vec3), e: int, p: int, value: wp.vec3):
-    """``rows[e, p] = value``."""
+    """Write ``rows[e, p] = value``."""
     ...
 
 
@@ -75,11 +80,11 @@ if (128 * thread < (int)sizeof(*rows.data) * count) asm volatile("prefetch.globa
 #endif
 """)
 def prefetch_rows(rows: wp.array2d(dtype=wp.vec3), e: int, p: int, count: int, thread: int):
-    """Let a GPU fetch ``rows[e, p : p + count]`` into its second-level cache: each thread a line of it."""
+    """Prefetch ``rows[e, p : p + count]`` into the L2 cache of a GPU, one line of 128 bytes a thread."""
     ...
 
 
-# Several rows are asked for at once, by 16 bytes.
+# Unrolled loads of 16 bytes keep several rows in flight.
 _ADD_ROWS = """
 constexpr int WORDS = %d;
 wp::vec_t<WORDS, wp::float32> sum;
@@ -102,13 +107,13 @@ return sum;
 
 @wp.func_native(_ADD_ROWS % 12)
 def add_rows12(rows: wp.array2d(dtype=vec12), e: int, first: int, last: int) -> vec12:
-    """Sum of ``rows[e, first : last]``, one after the other."""
+    """Return the sum of ``rows[e, first : last]``, added in order."""
     ...
 
 
 @wp.func_native(_ADD_ROWS % 16)
 def add_rows16(rows: wp.array2d(dtype=vec16), e: int, first: int, last: int) -> vec16:
-    """:func:`add_rows12` of sixteen numbers each."""
+    """Return the sum of ``rows[e, first : last]``, added in order."""
     ...
 
 
@@ -121,7 +126,7 @@ return wp::index(node, e, r);
 #endif
 """)
 def read_vec4(node: wp.array2d(dtype=wp.vec4), e: int, r: int) -> wp.vec4:
-    """``node[e, r]``, of the sensors or of what faces what, on a GPU in one load of 16 bytes."""
+    """Return ``node[e, r]``, on a GPU with one load of 16 bytes."""
     ...
 
 
@@ -133,7 +138,7 @@ wp::index(node, e, r) = value;
 #endif
 """)
 def write_vec4(node: wp.array2d(dtype=wp.vec4), e: int, r: int, value: wp.vec4):
-    """``node[e, r] = value`` in one store."""
+    """Write ``node[e, r] = value``, on a GPU with one store of 16 bytes."""
     ...
 
 
@@ -144,9 +149,9 @@ constexpr int STAGE = 96;  // words of a warp: 32 vectors
 __shared__ float stages[WP_TILE_BLOCK_DIM / 32 * STAGE];  // as many threads as the module is compiled for
 const int lane = threadIdx.x & 31;
 float* const stage = stages + (threadIdx.x >> 5) * STAGE;
-const bool here = __activemask() == ALL && blockDim.x <= WP_TILE_BLOCK_DIM;
+const bool whole = __activemask() == ALL && blockDim.x <= WP_TILE_BLOCK_DIM;
 bool together = false;
-if (here) {  // all threads of the warp go on to every exchange, or they would wait for each other for ever
+if (whole) {  // every thread of the warp must reach each exchange, or the warp deadlocks
     const int first = __shfl_sync(ALL, p, 0), row = __shfl_sync(ALL, e, 0);
     together = __all_sync(ALL, store && p == first + lane && e == row);
 }
@@ -175,7 +180,7 @@ auto put = [&](auto& into, const auto& value) {
 
 @wp.func_native(_STORE % (("put(into, value);",) * 2))
 def store_vector(into: wp.array2d(dtype=wp.vec3), e: int, p: int, value: wp.vec3, store: bool):
-    """``into[e, p] = value`` if ``store``; at best all threads of a warp come here."""
+    """Write ``into[e, p] = value`` if ``store``, in whole cache lines if all threads of the warp call this together."""
     ...
 
 
@@ -190,7 +195,7 @@ def store_pair(
     second_too: bool,
     store: bool,
 ):
-    """:func:`store_vector` of one, and of another if that is wanted, as all threads know."""
+    """Write one vector, and a second one if ``second_too``, equal for all threads; see :func:`store_vector`."""
     ...
 
 
@@ -206,11 +211,11 @@ def store_triple(
     three: wp.vec3,
     store: bool,
 ):
-    """:func:`store_vector` of three arrays."""
+    """Write three vectors; see :func:`store_vector`."""
     ...
 
 
-#: Components begin at multiples of so many numbers: a line of a GPU's cache.
+#: Numbers in a cache line of a GPU; components begin at multiples of it.
 LINE = 32
 
 
@@ -226,7 +231,7 @@ const int n = rows.strides[1] / 4;
     + "return wp::mat33(at[0], at[n], at[2 * n], at[3 * n], at[4 * n], at[5 * n], at[6 * n], at[7 * n], at[8 * n]);"
 )
 def matrix_at(rows: wp.array3d(dtype=float), e: int, p: int) -> wp.mat33:
-    """Matrix of particle ``p`` in environment ``e``."""
+    """Return the matrix of particle ``p`` in environment ``e``."""
     ...
 
 
@@ -243,30 +248,30 @@ def store_matrix(rows: wp.array3d(dtype=float), e: int, p: int, value: wp.mat33)
 
 
 def whole_lines(num_particles: int) -> int:
-    """Numbers that a component of so many particles takes."""
+    """Return how many numbers a component of ``num_particles`` particles occupies."""
     return -(-num_particles // LINE) * LINE
 
 
 def allocate_matrices(num_envs: int, num_particles: int, device: str) -> wp.array:
-    """Zeros."""
+    """Allocate zeros of shape ``(num_envs, 9, num_particles)``, each component aligned to :data:`LINE`."""
     return wp.zeros((num_envs, 9, whole_lines(num_particles)), dtype=float, device=device)[:, :, :num_particles]
 
 
 def matrices_of(components: wp.array | np.ndarray) -> np.ndarray:
-    """A copy as matrices, ``(..., 9, num_particles)`` to ``(..., num_particles, 3, 3)``."""
+    """Convert components to matrices, ``(..., 9, num_particles)`` to ``(..., num_particles, 3, 3)``; returns a copy."""
     values = components if isinstance(components, np.ndarray) else components.numpy()
     matrices = np.ascontiguousarray(np.moveaxis(values, -2, -1))  # on a CPU the values are the array's own memory
     return matrices.reshape(*values.shape[:-2], values.shape[-1], 3, 3)
 
 
 def components_of(matrices: np.ndarray) -> np.ndarray:
-    """The inverse of :func:`matrices_of`, in single precision."""
+    """Convert matrices to components in single precision: the inverse of :func:`matrices_of`."""
     values = np.asarray(matrices, np.float32)
     return np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-2], 9), -1, -2))
 
 
 def make_struct(struct: wp.Struct, **arrays: wp.array):
-    """Arrays bundled as one kernel argument."""
+    """Return an instance of ``struct`` with these arrays as its members."""
     instance = struct()
     for name, array in arrays.items():
         setattr(instance, name, array)

@@ -1,22 +1,11 @@
-"""The dynamic shared memory of a CUDA block, its room, as words of 4 bytes; a kernel reserves it as a tile.
+"""Threads of a launch: their indices, barriers, and reductions over the threads that share a piece of work.
 
-Warp's tiles are read and written by all threads together; here each goes its own way. Nothing here runs on a CPU.
+Such threads are a warp or a part of one on a GPU, and a single thread on a CPU. They are consecutive in the last
+dimension of the launch, a power of two, at most 32, and all call a reduction together. A sum is added in an order that
+is fixed, whatever the schedule and the number of environments.
 
-Which environment a thread of a launch takes part in.
-
-``wp.tid()`` of two dimensions divides 64-bit numbers, which costs a thread some sixty instructions, one after the
-other; 32 bits are enough, and a single environment needs no division.
-
-Reads and writes of arrays whose rows are dense, as all of this package's are: their address is one multiplication.
-
-An array of Warp may have any strides and be indexed from its end, which costs ten instructions an address on a GPU:
-half of what a sum over scattered particles would do. Rows of the same length have the same index then, too, where a
-loop over particles would keep an address for each of its arrays, more than it has registers for.
-
-Sums over the threads that share a piece of work: a warp, or a part of one, on a GPU; one thread on a CPU.
-
-A sum runs in an order that never changes, whatever the schedule and the number of environments. Threads that share a
-sum follow each other in the last dimension of the launch, are a power of two and at most 32, and all come to it.
+``wp.tid()`` of two dimensions divides 64-bit numbers, about sixty dependent instructions; the index functions here
+divide 32-bit numbers, or none at all for a single environment.
 """
 
 from __future__ import annotations
@@ -35,25 +24,25 @@ def cuda_native(cuda: str, otherwise: str = "") -> str:
 
 @wp.func_native(cuda_native("__syncwarp();"))
 def sync_warp():
-    """Wait for the other threads of the warp; all that have not ended come here."""
+    """Wait for the other threads of the warp; all that have not ended must call this."""
     ...
 
 
 @wp.func_native(cuda_native("return threadIdx.x;", "return 0;"))
 def thread_of_block() -> int:
-    """Place of a thread in its CUDA block."""
+    """Return the index of a thread in its CUDA block."""
     ...
 
 
 @wp.func_native(cuda_native("return blockIdx.x;", "return 0;"))
 def block_of_launch() -> int:
-    """Place of a CUDA block among those of a launch."""
+    """Return the index of a CUDA block in its launch."""
     ...
 
 
 @wp.func_native(cuda_native("return blockDim.x;", "return 1;"))
 def threads_of_block() -> int:
-    """Threads of a CUDA block."""
+    """Return the number of threads of a CUDA block."""
     ...
 
 
@@ -63,7 +52,7 @@ def sync_block():
     ...
 
 
-# the masks tell the compiler that neither is negative: array indices are not to be counted from the end
+# the masks let the compiler assume that neither is negative, which removes Warp's handling of negative indices
 @wp.func_native("""
 const unsigned all = (unsigned)thread, each = (unsigned)per_env;
 unsigned e = 0u;
@@ -71,50 +60,45 @@ if (all >= each) e = all / each;
 return wp::vec2i((int)(e & 0x7fffffffu), (int)((all - e * each) & 0x7fffffffu));
 """)
 def environment_of(thread: int, per_env: int) -> wp.vec2i:
-    """Environment, and place among its threads, of a thread of a launch over ``num_envs * per_env``."""
+    """Return environment and index within it of a thread of a launch over ``num_envs * per_env`` threads."""
     ...
 
 
-#: Threads of a CUDA block in the drive's launches over particles and over sums.
+#: Threads of a CUDA block in a controller's launches over particles and over sums.
 BLOCK = 128
-#: Particles of a thread, at most, in passes that wait for memory: it asks for what the next one has before it goes on
-#: with one. On an H200 of 1, 3 and 6 the last was best.
+#: Most particles of a thread in passes bound by memory latency, where it loads the next particle ahead of time.
 ROUNDS = 6
-#: Threads that would share the chunks of a bone, from which on each bone has a warp.
+#: Threads sharing the chunks of a bone from which on each bone has its own warp.
 MANY_THREADS = 8
 #: Threads that a multiprocessor can have.
 RESIDENT = 2048
 
 
 def warp_threads(device: str) -> int:
-    """Threads that share a chunk of a bone's particles, or the bones of an environment: a warp on a GPU."""
+    """Return how many threads share a chunk of a bone's particles, or the bones of an environment: a warp on a GPU."""
     return 32 if wp.get_device(device).is_cuda else 1
 
 
 def chunk_threads(device: str, chunks: int) -> int:
-    """Threads of a warp that add up the ``chunks`` of a bone, about two each; 0 if each bone has a warp of its own.
+    """Return how many threads add up the ``chunks`` of a bone, about two chunks each; 0 if each bone has its own warp.
 
-    A warp that goes from bone to bone waits for memory every time.
+    A warp that visits one bone after another waits for memory at each.
     """
     threads = min(warp_threads(device), 1 << max(0, (chunks - 1) // 2).bit_length())
     return threads if threads < MANY_THREADS else 0
 
 
 def particle_rounds(device: str, particles: int) -> int:
-    """Particles of a thread where there are so many in all: as many as leave a GPU full, up to :data:`ROUNDS`."""
+    """Return how many particles a thread processes: as many as still fill a GPU, at most :data:`ROUNDS`."""
     gpu = wp.get_device(device)
     return min(ROUNDS, max(1, particles // (gpu.sm_count * RESIDENT))) if gpu.is_cuda else 1
 
 
 def particle_threads(device: str, count: int, rounds: int) -> int:
-    """Threads that share ``count`` particles of a body in so many ``rounds``: on a GPU in whole CUDA blocks.
-
-    On a CPU it is one: there a thread costs 7 ns before it does anything, as much as what is done for a particle.
-    """
+    """Return how many threads share ``count`` particles in ``rounds`` rounds: whole CUDA blocks, one on a CPU."""
     return -(-count // (BLOCK * rounds)) * BLOCK if wp.get_device(device).is_cuda else 1
 
 
-# Warp finds a thread's place by divisions of 64 bits, which take a tenth of a short kernel's instructions.
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
 const unsigned blocks = ((unsigned)threads + {BLOCK - 1}u) / {BLOCK}u, row = blockIdx.x / blocks;
@@ -124,7 +108,7 @@ return wp::vec_t<2, wp::int32>(e, 0);
 #endif
 """)
 def first_particle(e: int, threads: int) -> wp.vec2i:
-    """Environment, on a CPU ``e``, and first particle of one of so many :func:`particle_threads`; there may be none."""
+    """Return environment and first particle of one of ``threads`` threads; the particle may not exist."""
     ...
 
 
@@ -136,7 +120,7 @@ return 1;
 #endif
 """)
 def threads_of_environment(num_envs: int) -> int:
-    """:func:`particle_threads` in a launch over ``(num_envs, particle_threads)``, by what is launched."""
+    """Return :func:`particle_threads` of the running launch over ``(num_envs, particle_threads)``."""
     ...
 
 
@@ -149,12 +133,11 @@ return wp::vec_t<3, wp::int32>(e, c, thread);
 #endif
 """)
 def place_in_chunks(e: int, c: int, thread: int, chunks: int) -> wp.vec3i:
-    """Environment, warp and lane in a launch over ``(num_envs, chunks, warp_threads)``, as Warp says, too."""
+    """Return environment, warp and lane in a launch over ``(num_envs, chunks, warp_threads)``."""
     ...
 
 
-# As numbers that are known when a kernel is compiled: loops over a body's bones have one round then or are gone, as is
-# all that a thread that is alone would do. That is a third of the instructions, and they must all be fetched.
+# Constants at compile time let the compiler drop loops over bones that have one round, and the code of single threads.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 return wp::vec_t<3, wp::int32>((int)blockIdx.x, (int)threadIdx.x & (block - 1), block);
@@ -163,9 +146,9 @@ return wp::vec_t<3, wp::int32>(e, 0, 1);
 #endif
 """)
 def place_in_block(e: int, block: int) -> wp.vec3i:
-    """Environment, thread and number of threads in a launch over ``(num_envs, block)``, a CUDA block each; or 0 of 1.
+    """Return environment, thread and number of threads in a launch over ``(num_envs, block)``, a CUDA block each.
 
-    On a CPU the launch is over ``(num_envs, 1)``, ``e`` as Warp says.
+    On a CPU the launch is over ``(num_envs, 1)`` and the result is ``(e, 0, 1)``.
     """
     ...
 
@@ -178,7 +161,7 @@ return wp::vec_t<2, wp::int32>(0, 1);
 #endif
 """)
 def warp_of_block() -> wp.vec2i:
-    """Which warp of its CUDA block a thread is in, and of how many; on a CPU of one."""
+    """Return index and number of warps of a thread's CUDA block; ``(0, 1)`` on a CPU."""
     ...
 
 
@@ -190,11 +173,11 @@ return wp::vec_t<2, wp::int32>(0, 1);
 #endif
 """)
 def lane_of_warp() -> wp.vec2i:
-    """Which thread of its warp a thread is, and of how many; on a CPU of one."""
+    """Return index and number of threads of a thread's warp; ``(0, 1)`` on a CPU."""
     ...
 
 
-# In every round a bone takes what its ancestor has found, who is twice as far as in the round before.
+# Each round doubles the distance to the ancestor whose value is accumulated.
 _OVER_ANCESTORS = """
 #if defined(__CUDA_ARCH__)
 int up = parent;
@@ -216,12 +199,12 @@ return value;
 
 
 def over_ancestors(count: int, each: str, then: str = "") -> str:
-    """A snippet for what the lanes of a warp have, a bone each, in ``value``, gathered from the root to the own bone.
+    """Return a snippet that accumulates ``value``, one bone a lane, from the root to each bone by pointer doubling.
 
     Args:
         count: numbers of a value.
-        each: what is done with number ``k`` of the ancestor ``up``, ``more``; below 0 there is none.
-        then: what is done after all of them, with what ``each`` may have kept in ``before``, of the value's own kind.
+        each: statement for number ``k``, given that of ancestor ``up`` as ``more``; ``up`` is negative above the root.
+        then: statement after all numbers; ``each`` may keep values in ``before``, of the type of ``value``.
     """
     return _OVER_ANCESTORS % {"count": count, "each": each, "then": then}
 
@@ -242,8 +225,7 @@ _SUM_MANY = (
 )
 
 
-# Each step halves the numbers that a thread goes on with, as well as the threads that go on with the same: 16 exchanges
-# instead of 80, and each of the numbers ends up with two threads.
+# Each step halves both the numbers a thread keeps and the threads that share them: 16 exchanges instead of 80.
 _HALVE = """
     const int lane = threadIdx.x & 31;
     float part[16];
@@ -273,25 +255,25 @@ _SUM_OF_WARP = (
 
 @wp.func_native(_SUM_ONE)
 def sum_threads(value: float, threads: int) -> float:
-    """Sum over ``threads`` threads, told to all of them."""
+    """Return the sum over ``threads`` threads to all of them."""
     ...
 
 
 @wp.func_native(_SUM_MANY % 6)
 def sum_threads6(value: vec8, threads: int) -> vec8:
-    """:func:`sum_threads` of six numbers."""
+    """Return the sum of six numbers over ``threads`` threads to all of them."""
     ...
 
 
 @wp.func_native(_SUM_MANY % 12)
 def sum_threads12(value: vec12, threads: int) -> vec12:
-    """:func:`sum_threads` of twelve numbers."""
+    """Return the sum of twelve numbers over ``threads`` threads to all of them."""
     ...
 
 
 @wp.func_native(_SUM_OF_WARP + _SUM_MANY % 16)
 def sum_threads16(value: vec16, threads: int) -> vec16:
-    """:func:`sum_threads` of sixteen numbers."""
+    """Return the sum of sixteen numbers over ``threads`` threads to all of them."""
     ...
 
 
@@ -302,7 +284,7 @@ for (int distance = threads >> 1; distance > 0; distance >>= 1) bits |= __shfl_x
 return bits;
 """)
 def or_of_threads(bits: int, threads: int) -> int:
-    """All bits that any thread of a warp has set, told to all of them."""
+    """Return the bitwise or over ``threads`` threads to all of them."""
     ...
 
 
@@ -317,7 +299,7 @@ for (int distance = threads >> 1; distance > 0; distance >>= 1) {
 return wp::vec_t<2, wp::float32>(value, (float)which);
 """)
 def max_of_threads(value: float, which: int, threads: int) -> wp.vec2:
-    """The largest value of the threads of a warp, and ``which`` of theirs it is, the lower of two; told to all."""
+    """Return the largest value over ``threads`` threads, and its ``which``, the lower one of equals."""
     ...
 
 
@@ -327,7 +309,7 @@ if (threads > 1) __syncwarp();
 #endif
 """)
 def sync_threads(threads: int):
-    """What one thread of a warp has stored, the others see from here on."""
+    """Make what a thread of the warp has stored visible to the others."""
     ...
 
 
@@ -339,7 +321,7 @@ return 0;
 #endif
 """)
 def highest_bit(bits: int) -> int:
-    """The highest of ``bits``, of which there are any; on a CPU nobody asks."""
+    """Return the index of the highest set bit, on a GPU; ``bits`` must not be 0."""
     ...
 
 
@@ -351,7 +333,7 @@ return 0;
 #endif
 """)
 def lane_of_thread() -> int:
-    """Place of a thread in its warp; 0 on a CPU."""
+    """Return the index of a thread in its warp; 0 on a CPU."""
     ...
 
 
@@ -363,7 +345,7 @@ return here;
 #endif
 """)
 def any_lane(here: bool) -> bool:
-    """Whether it is so ``here`` in any thread of the warp; all of its threads must come here."""
+    """Return whether ``here`` holds in any thread of the warp; all of its threads must call this."""
     ...
 
 
@@ -375,7 +357,7 @@ return here;
 #endif
 """)
 def lanes_with(here: bool) -> int:
-    """A bit for each thread of a warp, whether it is so ``here``; all of them come here. One bit on a CPU."""
+    """Return a mask of the threads of the warp for which ``here`` holds; all must call this. One bit on a CPU."""
     ...
 
 
@@ -387,5 +369,5 @@ return 1;
 #endif
 """)
 def lanes_of_warp() -> int:
-    """Threads of a warp; 1 on a CPU."""
+    """Return the number of threads of a warp; 1 on a CPU."""
     ...

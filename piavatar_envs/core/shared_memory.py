@@ -1,4 +1,8 @@
-"""TODO."""
+"""Dynamic shared memory of a CUDA block, addressed in words of 4 bytes.
+
+A kernel reserves the memory as a Warp tile; the functions here let every thread access it on its own, which Warp's
+tile operations do not. They do nothing on a CPU.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +14,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 def native(cuda: str, otherwise: str = "") -> str:
-    """A snippet that finds the room as ``arena``; on a CPU, where nobody launches it, ``otherwise``."""
+    """Return a CUDA snippet with the shared memory in scope as ``arena``, and ``otherwise`` for a CPU."""
     start = "extern __shared__ int piavatar_arena[];\nint* const arena = piavatar_arena;\n"
     return cuda_native(start + cuda, otherwise)
 
 
-#: In CUDA: the place of thread ``of`` among those of a warp in ``all``, which count on in a word, one after the other.
+#: CUDA helper: rank of lane ``of`` among the lanes set in ``all``, after reserving places for them in a counter.
 APPEND = """
 auto append = [](int* count, unsigned all, int of) {
     int begin = 0;
@@ -27,7 +31,7 @@ auto append = [](int* count, unsigned all, int of) {
 
 @wp.func_native(native("return arena[at];", "return 0;"))
 def word(at: int) -> int:
-    """Word ``at``."""
+    """Return word ``at``."""
     ...
 
 
@@ -39,55 +43,55 @@ def set_word(at: int, value: int):
 
 @wp.func_native(native("atomicOr(arena + at, bits);"))
 def or_word(at: int, bits: int):
-    """Set bits of word ``at``."""
+    """Set bits of word ``at`` atomically."""
     ...
 
 
 @wp.func_native(native("atomicAdd(arena + at, value);"))
 def add_word(at: int, value: int):
-    """Add to word ``at``."""
+    """Add to word ``at`` atomically."""
     ...
 
 
 @wp.func_native(native("return (arena[bits + (n >> 5)] >> (n & 31)) & 1;", "return false;"))
 def has_bit(bits: int, n: int) -> bool:
-    """Bit ``n`` of those that begin at a word."""
+    """Return bit ``n`` of the bit field that begins at word ``bits``."""
     ...
 
 
 @wp.func_native(native("return reinterpret_cast<const unsigned short*>(arena + at)[n];", "return 0;"))
 def half_word(at: int, n: int) -> int:
-    """Half word ``n`` after word ``at``."""
+    """Return half word ``n`` of the list that begins at word ``at``."""
     ...
 
 
 @wp.func_native(native("reinterpret_cast<unsigned short*>(arena + at)[n] = (unsigned short)value;"))
 def set_half_word(at: int, n: int, value: int):
-    """Write half word ``n`` after word ``at``."""
+    """Write half word ``n`` of the list that begins at word ``at``."""
     ...
 
 
 @wp.func_native(native("return reinterpret_cast<const unsigned char*>(arena + at)[n];", "return 0;"))
 def byte(at: int, n: int) -> int:
-    """Byte ``n`` after word ``at``."""
+    """Return byte ``n`` of the list that begins at word ``at``."""
     ...
 
 
 @wp.func_native(native("reinterpret_cast<unsigned char*>(arena + at)[n] = (unsigned char)value;"))
 def set_byte(at: int, n: int, value: int):
-    """Write byte ``n`` after word ``at``."""
+    """Write byte ``n`` of the list that begins at word ``at``."""
     ...
 
 
 @wp.func_native(native("if (value > __int_as_float(arena[at])) atomicMax(arena + at, __float_as_int(value));"))
 def max_float_word(at: int, value: float):
-    """Make the number in word ``at`` at least ``value``, which is not negative."""
+    """Raise the number in word ``at`` to at least ``value``, which must not be negative."""
     ...
 
 
 @wp.func_native(native("return __int_as_float(arena[at]);", "return 0.0f;"))
 def float_word(at: int) -> float:
-    """The number in word ``at``."""
+    """Return the number in word ``at``."""
     ...
 
 
@@ -105,13 +109,13 @@ for (int n = threadIdx.x; n < words / 4; n += blockDim.x) first[n] = four;
 """)
 )
 def fill_words(start: int, words: int, value: int):
-    """Write ``value`` to ``words`` words, a multiple of four; ``start`` is one, too."""
+    """Write ``value`` to ``words`` words from ``start`` on, both multiples of four; all threads share the work."""
     ...
 
 
 @wp.func
 def clear_words(start: int, words: int):
-    """Zero ``words`` words, a multiple of four; ``start`` is one, too."""
+    """Zero ``words`` words from ``start`` on, both multiples of four; all threads share the work."""
     fill_words(start, words, 0)
 
 
@@ -130,8 +134,8 @@ for (int n = threadIdx.x >> 5; n < words; n += warps) {
     )
 )
 def list_bits(bits: int, words: int, at: int, count: int):
-    """Write which bits of ``words`` words are set to half words from word ``at`` on, in any order.
+    """Write the indices of the set bits in ``words`` words as half words from word ``at`` on, in any order.
 
-    How many is added to word ``count``. All threads come here.
+    Their number is added to word ``count``. Every thread of the block must call this.
     """
     ...

@@ -1,1 +1,1 @@
-"""Material point method: continuum physics, batched over environments. Knows nothing of bones or rewards."""
+"""Material point method on a sparse grid: transfers, contact between bodies and with colliders, sensors."""

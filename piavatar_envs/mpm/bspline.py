@@ -1,8 +1,8 @@
-"""The quadratic B-spline and the layout of the grid: the only place that knows either.
+"""Quadratic B-spline, and the layout of nodes in blocks: the only module that knows either.
 
-A particle touches the 3 x 3 x 3 nodes ``base + (0..2)``. With ``f = (x - x_base) / dx`` in [0.5, 1.5) the weights
-along one axis are those of Jiang et al., "The Material Point Method for Simulating Continuum Materials" (SIGGRAPH
-2016 course), eq. 123.
+A particle touches the 3 x 3 x 3 nodes ``base + (0..2)``, its stencil. With ``f = (x - x_base) / dx`` in [0.5, 1.5) the
+weights along one axis are those of Jiang et al., "The Material Point Method for Simulating Continuum Materials"
+(SIGGRAPH 2016 course), eq. 123.
 """
 
 from __future__ import annotations
@@ -13,13 +13,24 @@ from piavatar_envs.mpm.types import Grid
 
 wp.set_module_options({"enable_backward": False})
 
-#: Nodes along an edge of a block; blocks are the unit in which the grid is stored and swept.
+#: Nodes along an edge of a block, the unit in which the grid is stored and updated.
 BLOCK = 4
 #: Nodes of a block.
 BLOCK_NODES = wp.constant(64)
 
 
-# A product that the compiler may fuse with what comes next would put a particle into one cell here, into another there
+@wp.struct
+class Stencil:
+    """Nodes around a particle and their weights along each axis."""
+
+    base: wp.vec3i  # lowest node
+    f: wp.vec3  # position from there, in grid spacings
+    wx: wp.vec3
+    wy: wp.vec3
+    wz: wp.vec3
+
+
+# Without fused multiply-add, so that every kernel assigns a particle to the same cell
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 return wp::vec3(
@@ -31,19 +42,19 @@ return (x - grid.origin) * grid.inv_dx;
 #endif
 """)
 def grid_position(grid: Grid, x: wp.vec3) -> wp.vec3:
-    """Position in units of the grid spacing, from the first node."""
+    """Return a position in grid spacings from the first node."""
     ...
 
 
 @wp.func
 def base_node(xg: wp.vec3):
-    """Lowest node of the stencil around a grid position."""
+    """Return the lowest node of the stencil around a grid position."""
     return wp.vec3i(int(wp.floor(xg[0] - 0.5)), int(wp.floor(xg[1] - 0.5)), int(wp.floor(xg[2] - 0.5)))
 
 
 @wp.func
 def stencil_inside(grid: Grid, base: wp.vec3i):
-    """Whether all 27 nodes of the stencil exist; nothing is added to ``base``, which may be the largest integer."""
+    """Return whether all 27 nodes of a stencil exist; safe for any ``base``, also the largest integer."""
     return (
         base[0] >= 0
         and base[1] >= 0
@@ -56,27 +67,16 @@ def stencil_inside(grid: Grid, base: wp.vec3i):
 
 @wp.func
 def spline(f: float):
-    """Weights of the three nodes along one axis, ``f`` in [0.5, 1.5) from the first of them."""
+    """Return the weights of the three nodes along one axis, for a position ``f`` in [0.5, 1.5) from the first."""
     a = 1.5 - f
     b = f - 1.0
     c = f - 0.5
     return wp.vec3(0.5 * a * a, 0.75 - b * b, 0.5 * c * c)
 
 
-@wp.struct
-class Stencil:
-    """Where a particle is among the nodes that it touches, and what these weigh along each axis."""
-
-    base: wp.vec3i  # lowest node
-    f: wp.vec3  # position from there, in grid spacings
-    wx: wp.vec3
-    wy: wp.vec3
-    wz: wp.vec3
-
-
 @wp.func
 def stencil_at(xg: wp.vec3):
-    """The stencil around a grid position."""
+    """Return the stencil around a grid position."""
     s = Stencil()
     s.base = base_node(xg)
     s.f = xg - wp.vec3(float(s.base[0]), float(s.base[1]), float(s.base[2]))
@@ -88,43 +88,43 @@ def stencil_at(xg: wp.vec3):
 
 @wp.func
 def node_in_block(i: int, j: int, k: int):
-    """Index of node ``(i, j, k)`` among the 64 of its block."""
+    """Return the index of node ``(i, j, k)`` among the 64 of its block."""
     return (((i & 3) * 4) + (j & 3)) * 4 + (k & 3)
 
 
 @wp.func
 def node_position(grid: Grid, i: int, j: int, k: int):
-    """World position of node ``(i, j, k)`` [m]."""
+    """Return the world position of node ``(i, j, k)`` [m]."""
     return grid.origin + grid.dx * wp.vec3(float(i), float(j), float(k))
 
 
 @wp.func
 def block_index(grid: Grid, i: int, j: int, k: int):
-    """Linear index of the block that holds node ``(i, j, k)``."""
+    """Return the linear index of the block that holds node ``(i, j, k)``."""
     return ((i >> 2) * grid.blocks[1] + (j >> 2)) * grid.blocks[2] + (k >> 2)
 
 
 @wp.func
 def blocks_touched(base: wp.vec3i):
-    """Blocks along each axis that the stencil at ``base`` lies in, 1 or 2; the second holds ``base + 2``."""
+    """Return how many blocks a stencil overlaps along each axis, 1 or 2; the second holds ``base + 2``."""
     return wp.vec3i(1 + ((base[0] & 3) >> 1), 1 + ((base[1] & 3) >> 1), 1 + ((base[2] & 3) >> 1))
 
 
 @wp.func
 def in_same_subblock(a: wp.vec3i, b: wp.vec3i):
-    """Whether two nodes lie in the same subblock of 2 x 2 x 2 nodes; then the stencils at them lie in the same blocks."""
+    """Return whether two nodes lie in the same subblock of 2 x 2 x 2 nodes: their stencils overlap the same blocks."""
     return (((a[0] ^ b[0]) | (a[1] ^ b[1]) | (a[2] ^ b[2])) >> 1) == 0
 
 
 @wp.func
 def node_of_block(corner: wp.vec3i, local: int):
-    """Node ``local`` of the block whose lowest node is ``corner``."""
+    """Return node ``local`` of the block whose lowest node is ``corner``."""
     return wp.vec3i(corner[0] + (local >> 4), corner[1] + ((local >> 2) & 3), corner[2] + (local & 3))
 
 
 @wp.func
 def block_corner(grid: Grid, block: int):
-    """Lowest node of a block."""
+    """Return the lowest node of a block."""
     bk = block % grid.blocks[2]
     bj = (block // grid.blocks[2]) % grid.blocks[1]
     bi = block // (grid.blocks[2] * grid.blocks[1])

@@ -1,27 +1,26 @@
-"""Contact between velocity fields: bodies that meet at a grid node push each other, and slide with friction.
+"""Contact between velocity fields: bodies that share a grid node push each other, and slide with friction.
 
-Every subject has a velocity field of its own (an avatar may have one for each limb), so that what meets at a node can
-separate again. Fields are compared in pairs, in a fixed order. A pair has *one* normal ``n``, which
-:mod:`piavatar_envs.mpm.contact_normals` finds, and exchanges one impulse along it (free slip, no tension) and one
-against the sliding (Coulomb)::
+Every subject has a velocity field of its own (an avatar may have one for each limb), so that bodies which share a node
+can separate again. Fields are paired in a fixed order. A pair has *one* normal ``n``, from
+:mod:`piavatar_envs.mpm.contact_normals`, and exchanges one impulse along it (free slip, no tension) and one against
+the sliding (Coulomb)::
 
     j = m_a m_b / (m_a + m_b) max(0, (v_a - v_b) . n),    friction at most mu j
 
-What ``a`` loses, ``b`` gains, at the same point: linear and angular momentum are kept to round-off. After Bardenhagen
-et al., "The Material-Point Method for Granular Materials" (2000) and, for the common normal, Huang et al., "Contact
-Algorithms for the Material Point Method in Impact and Penetration Simulation" (2011).
+The impulses are equal and opposite and act at the same point: linear and angular momentum are kept to round-off. After
+Bardenhagen et al., "The Material-Point Method for Granular Materials" (2000) and, for the common normal, Huang et al.,
+"Contact Algorithms for the Material Point Method in Impact and Penetration Simulation" (2011).
 
 PIAvatar (Han et al., arXiv 2606.21162) projects each field with a normal of its own towards the common velocity; the
 impulses of a node then do not add up to zero, and momentum is lost. It can be selected for comparison
 (``own_normals``); the sensors of pairs then stay empty.
 
-Fields meet long before their matter does, a grid spacing apart. A gate on the gap between their surfaces lets bodies
-come closer.
+Fields share nodes while their matter is still a grid spacing apart. A gate on the gap between their surfaces lets
+bodies come closer.
 
-The grid pass over blocks with several fields: bodies touch, boundaries are met, velocities become physical.
-
-Such blocks are few, so what the pass takes is the time that its threads wait for memory. Nearly all of them have two
-fields: :func:`solve_pair` keeps what it knows of those in registers, and asks for all of it at once.
+The kernel here updates the nodes of contact blocks: contact, then colliders, then physical velocities. Such blocks are
+few, and the kernel is bound by memory latency. Nearly all nodes have two fields: :func:`solve_pair` loads all of their
+data at once and keeps it in registers.
 """
 
 from __future__ import annotations
@@ -82,7 +81,10 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "
 
 @wp.func
 def coulomb(m_a: float, m_b: float, approach: wp.vec3, n: wp.vec3, friction: float):
-    """Impulse [N s] that stops the approach ``v_a - v_b`` of two masses along ``n`` and slows their sliding."""
+    """Return the impulse [N s] that stops the approach of two masses along ``n`` and slows their sliding.
+
+    ``approach`` is ``v_a - v_b`` [m/s].
+    """
     vn = wp.dot(approach, n)
     if vn <= 0.0:
         return wp.vec3(0.0)
@@ -96,9 +98,9 @@ def coulomb(m_a: float, m_b: float, approach: wp.vec3, n: wp.vec3, friction: flo
 
 @wp.func
 def store_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, mark: int, sensors: Sensors):
-    """Add a change of velocity [m/s] to a node's record, and keep the subject that has done most of it.
+    """Add a change of velocity [m/s] to the sensor record of a node, with the subject that has contributed most.
 
-    What ``touched`` says of the slot then is ``mark``.
+    ``mark`` is what ``touched`` of the active block is set to.
     """
     sensors.touched[e, r // BLOCK_NODES] = mark
     before = read_vec4(sensors.node, e, r)
@@ -121,7 +123,7 @@ def impulse_between(
     offset_b: wp.vec4,
     n_ab: wp.vec3,
 ):
-    """Impulse [N s] that field ``a`` gives ``b`` at a node, from records and offsets of both; zero without contact."""
+    """Return the impulse [N s] that field ``a`` gives ``b`` at a node, zero beyond the gate."""
     apart = offset_a / va[0] - offset_b / vb[0]
     distance = wp.dot(n_ab, wp.vec3(apart[0], apart[1], apart[2]))
     V_a = volume_at(grid, contact, e, a, va[0])
@@ -135,7 +137,7 @@ def impulse_between(
 
 @wp.func
 def store_pair_impulse(contact: Contact, e: int, a: int, b: int, J: wp.vec3, sensors: Sensors):
-    """Add the impulse that field ``a`` gives ``b`` to what is known of their subjects, if they have two."""
+    """Add the impulse that field ``a`` gives ``b`` to the sensor of their subjects, unless they are the same."""
     first = contact.subject[a]
     second = contact.subject[b]
     if first != second:
@@ -157,7 +159,7 @@ def collide_pair(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """Contact of the fields ``a < b`` at a node: equal and opposite impulses along one normal."""
+    """Apply contact of the fields ``a < b`` at a node: equal and opposite impulses along one normal."""
     ra = first_record(grid, blocks, e, a, block) + local
     rb = first_record(grid, blocks, e, b, block) + local
     va = read_record(node_velocity, e, ra)
@@ -190,7 +192,7 @@ def project_own_normals(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """The paper's rule: each field loses its approach to the common velocity, of a ``mask``, along its own normal."""
+    """Apply the paper's rule: each field loses its approach to the common velocity along its own normal."""
     m = float(0.0)
     p = wp.vec3()
     heaviest = int(0)
@@ -216,7 +218,7 @@ def project_own_normals(
                 out = wp.normalize(wp.vec3(offset[0], offset[1], offset[2]))
                 other = wp.where(f == heaviest, lowest_other(mask, f, contact.num_fields), heaviest)
                 mu = contact.friction[row(e, contact.friction.shape[0]), f * contact.num_fields + other]
-                # against a wall that moves with the common velocity
+                # contact with a wall that moves with the common velocity
                 J = coulomb(1.0, 1.0, 2.0 * (wp.vec3(v[1], v[2], v[3]) - common), out, mu)
                 write_record(node_velocity, e, r, v - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0))
                 store_contact(contact, e, r, other, -J, 1, sensors)
@@ -236,7 +238,7 @@ def collide_all(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """Contact of the fields of a ``mask`` at a node, of those that have told it where they are."""
+    """Apply contact between the fields of a ``mask`` at a node, those with all offsets."""
     if contact.own_normals != 0:
         project_own_normals(grid, contact, blocks, accumulators, mask, e, block, local, node_velocity, sensors)
         return
@@ -277,14 +279,14 @@ def finish_node(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """What comes after the contact of the fields of a node: boundaries are met, and velocities become physical."""
+    """Apply colliders after contact, and write physical velocities; limbs merged with a trunk copy its velocity."""
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
             total = read_record(node_velocity, e, r)
             if total[0] == MERGED:
-                # the trunk comes first: its velocity is final
+                # the trunk precedes its limbs: its velocity is final
                 t = first_record(grid, blocks, e, contact.trunk[f], block) + local
                 v = read_record(node_velocity, e, t)
                 write_record(node_velocity, e, r, vec8(0.0, v[1], v[2], v[3], v[4], v[5], v[6], 0.0))
@@ -318,7 +320,7 @@ def solve_node(
     local: int,
     mask: int,
 ):
-    """A node with any number of fields, those of ``mask``."""
+    """Update a node with any number of fields, those of ``mask``."""
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     present = int(0)
     candidates = int(0)
@@ -363,13 +365,13 @@ def solve_pair(
     a: int,
     b: int,
 ):
-    """:func:`solve_node` for a node with the two fields ``a < b``."""
+    """Update a node with the two fields ``a < b``; see :func:`solve_node`."""
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     corner = block_corner(grid, block)
     node = node_of_block(corner, local)
     ra = first_record(grid, blocks, e, a, block) + local
     rb = first_record(grid, blocks, e, b, block) + local
-    around_a, around_b = records_around(grid, blocks, e, node, a, b)  # asked for before it is known who needs them
+    around_a, around_b = records_around(grid, blocks, e, node, a, b)  # loaded early, to hide the latency
     va = read_record(node_velocity, e, ra)
     vb = read_record(node_velocity, e, rb)
     offset_a = offset_at(grid, accumulators, e, a, ra)
@@ -378,7 +380,7 @@ def solve_pair(
     candidates = has_all_candidates(blocks, e, ra) and has_all_candidates(blocks, e, rb)
     here_a = va[0] != 0.0
     here_b = vb[0] != 0.0
-    merged = vb[0] == MERGED  # only to a trunk, which comes first
+    merged = vb[0] == MERGED  # with a trunk, which precedes its limbs
     va = total_velocity(step, split, va)
     vb = total_velocity(step, split, vb)
     change_a = wp.vec4()
@@ -429,16 +431,14 @@ def solve_contact(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """Velocity of every node in blocks with several fields, whose sums have been taken.
+    """Update every node of the contact blocks, whose sums :mod:`piavatar_envs.mpm.contact_normals` has taken.
 
-    Bodies touch, boundaries are met; the rest is physical.
+    Bodies collide with each other, then with colliders; the written velocities are physical.
     """
     at = environment_of(wp.tid(), sweep.threads)
     e = at[0]
     thread = at[1]
-    end = wp.where(
-        exceeds_active_blocks(failure, e), 0, num_contact_nodes(blocks, e)
-    )  # else nobody has added up all particles
+    end = wp.where(exceeds_active_blocks(failure, e), 0, num_contact_nodes(blocks, e))  # else the sums are incomplete
     for visit in range(sweep.visits):
         first = thread * sweep.nodes + visit * sweep.stride
         block = contact_block_of(blocks, e, first)
@@ -451,11 +451,11 @@ def solve_contact(
             local = n % BLOCK_NODES
             if (mask & (mask - 1)) == last and contact.own_normals == 0:
                 solve_pair(
-                    grid, step, boundaries, contact, blocks, volume_gradient, accumulators, node_velocity, sensors, e, block, local,
-                    lowest_field(mask, contact.num_fields), b,
+                    grid, step, boundaries, contact, blocks, volume_gradient, accumulators, node_velocity, sensors, e,
+                    block, local, lowest_field(mask, contact.num_fields), b,
                 )  # fmt: skip
             else:
                 solve_node(
-                    grid, step, boundaries, contact, blocks, volume_gradient, accumulators, node_velocity, sensors, e, block, local,
-                    mask,
+                    grid, step, boundaries, contact, blocks, volume_gradient, accumulators, node_velocity, sensors, e,
+                    block, local, mask,
                 )  # fmt: skip

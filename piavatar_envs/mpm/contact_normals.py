@@ -1,14 +1,14 @@
-"""Which way two fields face each other at a node, and how far their surfaces are apart.
+"""Contact normals of a pair of fields at a node, and the gap between their surfaces.
 
-A normal from the gradients of two volumes at a *single* node tilts at edges, where a body's volume ends to the side as
-well: the front edge of a sliding block then ploughs through what it lies on, and brakes it like a friction of 0.15.
-Gradients are therefore summed over the neighbours ``k`` of a node at which the bodies meet, too, and most where most
-matter of both is, by the square of the reduced volume::
+A normal from the gradients of two volumes at a *single* node tilts at edges, where a body's volume also ends sideways:
+the front edge of a sliding block then ploughs through its support, which adds a friction of 0.15. Gradients are
+therefore summed over the neighbours ``k`` of a node that both bodies share, weighted by the square of the reduced
+volume::
 
     n_ab ~ sum_k c_k r_k^2 (V_a g_a - V_b g_b)_k,    r = V_a V_b / (V_a + V_b),    c = 1 / (1 + distance^2)
 
-with volumes ``V`` and their outward gradients ``g`` in grid units. The gradients' own weights ``V`` let the body that
-fills more of a node say more about the direction.
+with volumes ``V`` and their outward gradients ``g`` in grid units. The weights ``V`` give the body that fills more of a
+node more influence on the direction.
 """
 
 from __future__ import annotations
@@ -42,16 +42,15 @@ from piavatar_envs.mpm.types import Accumulators, Blocks, Contact, Grid, Sensors
 # on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
-#: Volume of two fields [cells] at a node below which there is nothing: less than the least mass has.
+#: Volume of two fields at a node [cells] below which it is empty: less than that of the smallest mass.
 EMPTY = wp.constant(1.0e-30)
-#: Mass of a record whose field has grown together with its subject's trunk at a node.
+#: Mass of a record whose field is merged with its subject's trunk at a node.
 MERGED = wp.constant(-1.0)
-
-#: Distance of the matter of two half-spaces that touch, as a node at any distance from their common surface sees it:
-#: ``TOUCHING - SLOPE (4 V_a V_b / (V_a + V_b)^2)^(1/4)`` grid spacings, to 0.011, from 0.81 at the surface to 1.5.
+#: Distance of the matter of two half-spaces in touch, seen from a node: ``TOUCHING - SLOPE (4 V_a V_b / (V_a +
+#: V_b)^2)^(1/4)`` grid spacings, to 0.011, from 0.81 at the surface to 1.5.
 TOUCHING = wp.constant(1.544)
 SLOPE = wp.constant(0.74)
-#: Distance that the matter at a node gains with a gap: the spline sees less of what goes away.
+#: Growth of that distance with a gap: the spline weighs receding matter less.
 PER_GAP = wp.constant(0.65)
 
 
@@ -68,11 +67,10 @@ def merge_limbs(
     # out
     node_velocity: wp.array2d(dtype=wp.vec4),
 ):
-    """Move the sums of a node to where its velocities will be, and join limbs to their trunk.
+    """Move the sums of a node to where its velocities will be, and merge limbs with their trunk.
 
-    They grow together where both have seam particles, those that are skinned to both, and have told the node so. Mass,
-    momentum *and* kinematic momentum are summed, or the shoulders would tear. Without the condition a hand would grow
-    to the belly.
+    They merge where both have seam particles (skinned to both), whose offsets are complete. Mass, momentum *and*
+    kinematic momentum are summed, or the shoulders would tear. Without the condition a hand would merge with the belly.
     """
     for f in range(contact.num_fields):
         if has_field(mask, f):
@@ -95,27 +93,27 @@ def merge_limbs(
 
 @wp.func
 def volume_at(grid: Grid, contact: Contact, e: int, f: int, m: float):
-    """Volume of mass ``m`` of a field in its reference state, in cells; 0 if there is none."""
+    """Return the volume of mass ``m`` of a field in its reference state [cells]; 0 without mass."""
     cells = grid.inv_dx * grid.inv_dx * grid.inv_dx / contact.density[row(e, contact.density.shape[0]), f]
     return wp.where(m > MASS_MIN, m * cells, 0.0)
 
 
 @wp.func
 def weighted_gradient(grid: Grid, V: float, m: float, offset: wp.vec4):
-    """Outward gradient of a volume at a node, times the volume; up to a factor common to all."""
+    """Return the outward gradient of a volume at a node times the volume, up to a common factor."""
     return (V * V * grid.inv_dx / m) * wp.vec3(offset[0], offset[1], offset[2])
 
 
 @wp.func
 def volume_gradient_from(grid: Grid, V: float, m: float, offset: wp.vec4):
-    """Weighted outward gradient and volume [cells] of a field of volume ``V`` and mass ``m`` with that ``offset``."""
+    """Return weighted outward gradient and volume [cells] of a field from its volume, mass and ``offset``."""
     outward = weighted_gradient(grid, V, m, offset)
     return wp.vec4(outward[0], outward[1], outward[2], V)
 
 
 @wp.func
 def volume_gradient_of(grid: Grid, contact: Contact, accumulators: Accumulators, e: int, f: int, r: int, m: float):
-    """:func:`volume_gradient_from` of field ``f`` of mass ``m`` at the node of record ``r``; nothing if there is none of it."""
+    """Return weighted outward gradient and volume [cells] of field ``f`` at record ``r``; zero without mass."""
     V = volume_at(grid, contact, e, f, m)
     facing = wp.vec4()
     if V > 0.0:
@@ -138,7 +136,7 @@ def store_volume_gradients(
     volume_gradient: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """What a node says of every field: its weighted outward gradient, and its volume [cells]; nothing has touched."""
+    """Write the weighted outward gradient and volume of every field of a node, and reset its ``touched`` flag."""
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
@@ -165,16 +163,14 @@ def find_volume_gradients(
     volume_gradient: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """What every node of a block with several fields says about the normals around it.
+    """Take the sums of the nodes in contact blocks, merge limbs with trunks, and write volume gradients.
 
-    Gradients and volumes of its fields, from which a pair makes its own summand: a third body has no say in it. Limbs
-    grow together with their trunks first. The nodes' sums then stand in ``node_velocity``.
+    Each pair forms its own term of a normal from them, so a third body does not affect it. The sums move to
+    ``node_velocity``.
     """
     at = environment_of(wp.tid(), sweep.threads)
     e = at[0]
-    end = wp.where(
-        exceeds_active_blocks(failure, e), 0, num_contact_nodes(blocks, e)
-    )  # else nobody has added up all particles
+    end = wp.where(exceeds_active_blocks(failure, e), 0, num_contact_nodes(blocks, e))  # else the sums are incomplete
     for visit in range(sweep.visits):
         first = at[1] * sweep.nodes + visit * sweep.stride
         block = contact_block_of(blocks, e, first)
@@ -200,10 +196,10 @@ def find_volume_gradients(
 
 @wp.func
 def records_around(grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int):
-    """First records of the fields ``a`` and ``b`` in the blocks of a node and its neighbours, two along each axis.
+    """Return the first records of two fields in the blocks of a node and its neighbours, two along each axis.
 
-    That of the lower neighbour comes first, and both are the same where all are in one. -1 where a block has not both
-    fields: it holds nothing that was written in this substep.
+    Lower neighbours come first; entries repeat where blocks coincide. -1 where a block is not active for both fields
+    and thus holds nothing written in this substep.
     """
     both = (1 << a) | (1 << b)
     of_a = vec8i()
@@ -221,7 +217,7 @@ def records_around(grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b
 
 @wp.func
 def component(of: vec8i, x: int, y: int, z: int):
-    """``of[4 x + 2 y + z]``; a GPU would put ``of`` into memory for an index."""
+    """Return ``of[4 x + 2 y + z]`` without dynamic indexing, which would move ``of`` from registers to memory."""
     lower = wp.where(y == 0, wp.where(z == 0, of[0], of[1]), wp.where(z == 0, of[2], of[3]))
     upper = wp.where(y == 0, wp.where(z == 0, of[4], of[5]), wp.where(z == 0, of[6], of[7]))
     return wp.where(x == 0, lower, upper)
@@ -229,23 +225,23 @@ def component(of: vec8i, x: int, y: int, z: int):
 
 @wp.func
 def in_grid(grid: Grid, node: wp.vec3i):
-    """Whether there is such a node."""
+    """Return whether a node exists."""
     low = wp.min(node[0], wp.min(node[1], node[2]))
     return low >= 0 and node[0] < grid.nodes[0] and node[1] < grid.nodes[1] and node[2] < grid.nodes[2]
 
 
 @wp.func
 def normal_term(c: float, of_a: wp.vec4, of_b: wp.vec4):
-    """What a node adds to a normal, times ``c`` for its distance, from what both its fields say."""
+    """Return the term that a node adds to a normal, from both fields' gradients and the weight ``c``."""
     reduced = of_a[3] * of_b[3] / wp.max(of_a[3] + of_b[3], EMPTY)
     return (c * reduced * reduced) * (of_a - of_b)
 
 
 @wp.func
 def normal_along(facing: wp.vec4):
-    """Unit vector along a sum of :func:`normal_term`; zero if there is no telling.
+    """Return the unit vector along a sum of :func:`normal_term`, zero if it vanishes.
 
-    Summands of nearly empty nodes are so small that their squares are not.
+    It is scaled first, because squares of the terms of nearly empty nodes underflow.
     """
     n_ab = wp.vec3(facing[0], facing[1], facing[2])
     largest = wp.max(wp.abs(n_ab))
@@ -256,7 +252,7 @@ def normal_along(facing: wp.vec4):
 
 @wp.func
 def neighbour_weight(distance_sq: float):
-    """How much a node around another says of its normal, by the square of their distance [grid spacings squared]."""
+    """Return the weight of a neighbouring node in a normal, from its squared distance [grid spacings squared]."""
     return 1.0 / (1.0 + distance_sq)
 
 
@@ -264,8 +260,8 @@ def neighbour_weight(distance_sq: float):
 def normal_from(
     grid: Grid, e: int, node: wp.vec3i, first_a: vec8i, first_b: vec8i, volume_gradient: wp.array2d(dtype=wp.vec4)
 ):
-    """:func:`shared_normal`, from the :func:`records_around` a node."""
-    # along an axis, the node's own block is the lower of the two unless the node is the first of it
+    """Return the normal of :func:`shared_normal` from the :func:`records_around` a node."""
+    # along an axis the node's own block is the lower of the two, unless the node is its first
     x = wp.where((node[0] & 3) == 0, 1, 0)
     y = wp.where((node[1] & 3) == 0, 1, 0)
     z = wp.where((node[2] & 3) == 0, 1, 0)
@@ -287,7 +283,7 @@ def normal_from(
                 counts = to_a >= 0 and in_grid(grid, at)
                 across = float((j - 1) * (j - 1) + (k - 1) * (k - 1))
                 c = wp.where(i == 1, neighbour_weight(across), neighbour_weight(1.0 + across))
-                # what does not count is the node itself, times 0: all are read before the first has come
+                # excluded neighbours read the node itself with weight 0: no branch delays the loads
                 of_a = read_vec4(volume_gradient, e, wp.where(counts, to_a + n, ra))
                 of_b = read_vec4(volume_gradient, e, wp.where(counts, to_b + n, rb))
                 facing += normal_term(wp.where(counts, c, 0.0), of_a, of_b)
@@ -298,16 +294,16 @@ def normal_from(
 def shared_normal(
     grid: Grid, blocks: Blocks, e: int, node: wp.vec3i, a: int, b: int, volume_gradient: wp.array2d(dtype=wp.vec4)
 ):
-    """Unit normal from field ``a`` to field ``b`` at a node; zero if there is no telling."""
+    """Return the unit normal from field ``a`` to field ``b`` at a node; zero if it is undefined."""
     first_a, first_b = records_around(grid, blocks, e, node, a, b)
     return normal_from(grid, e, node, first_a, first_b, volume_gradient)
 
 
 @wp.func
 def surface_gap(grid: Grid, V_a: float, V_b: float, distance: float):
-    """Gap of two surfaces [m], from their volumes at a node and the distance of their matter there along the normal.
+    """Return the gap between two surfaces [m], from volumes and distance of matter along the normal at a node.
 
-    Right to a tenth of a grid spacing from touch to a gap of 0.6; overlaps are underestimated.
+    Accurate to a tenth of a grid spacing from touch to a gap of 0.6; overlaps are underestimated.
     """
     share = 4.0 * V_a * V_b / ((V_a + V_b) * (V_a + V_b))
     return (distance - grid.dx * (TOUCHING - SLOPE * wp.sqrt(wp.sqrt(share)))) / PER_GAP

@@ -1,9 +1,8 @@
-"""Impulses of contact, added up over a control step in fixed point: in whatever order they come, the sum is the same.
+"""Contact sensors: impulses by subject, pair and body part over a control step, and penetration depths.
 
-A list an environment: of the colliders on every subject, of every pair of subjects, of every subject on every contact
-sensor, and the moments of the colliders' impulses.
-
-Contact sensors: impulses by body part and subject, and how deep bodies are in each other.
+Impulses are accumulated in fixed point, so that the sum does not depend on their order. The entries of an environment:
+colliders on every subject, every pair of subjects, every subject on every row of the contact sensor, and moments of the
+colliders' impulses.
 """
 
 from __future__ import annotations
@@ -33,36 +32,40 @@ from piavatar_envs.mpm.sparse_grid import (
 )
 from piavatar_envs.mpm.types import NEAR_FIELD, Blocks, Contact, Grid, Model, Particles, Sensors, row
 
-# unrolled, the stencil takes so many registers that a GPU has few threads at once
+# an unrolled stencil needs so many registers that a GPU runs few threads at once
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-
-#: Units in a newton second: sums are right to 1e-12 N s, and end at 8e6 N s.
+#: Quanta of a newton second: sums resolve 1e-12 N s and reach 8e6 N s.
 QUANTA_PER_NEWTON_SECOND = wp.constant(float(2**40))
+#: Volume fraction of another subject at which a particle lies on its surface.
+SURFACE = wp.constant(0.5)
+#: Slope of the volume fraction at a flat surface times the grid spacing: a step seen through the spline twice has the
+#: slope of the integral of its square, 11/20.
+SURFACE_SLOPE = wp.constant(0.55)
 
 
 @wp.func
 def boundary_entry(sensors: Sensors, subject: int):
-    """Place of the colliders' impulse on a subject."""
+    """Return the entry of the colliders' impulse on a subject."""
     return subject
 
 
 @wp.func
 def pair_entry(sensors: Sensors, pair: int):
-    """Place of a pair's impulse."""
+    """Return the entry of a pair's impulse."""
     return sensors.boundary_impulse.shape[1] + pair
 
 
 @wp.func
 def part_entry(sensors: Sensors, sensor: int, giver: int):
-    """Place of the impulse that subject ``giver`` has given a sensor."""
+    """Return the entry of the impulse that subject ``giver`` has given a sensor."""
     subjects = sensors.boundary_impulse.shape[1]
     return subjects + subjects * subjects + sensor * subjects + giver
 
 
 @wp.func
 def moment_entry(sensors: Sensors, subject: int):
-    """Place of the moment of the colliders' impulse on a subject."""
+    """Return the entry of the moment of the colliders' impulse on a subject."""
     return part_entry(sensors, sensors.part_impulse.shape[1], 0) + subject
 
 
@@ -75,7 +78,7 @@ def add_impulse(sensors: Sensors, e: int, entry: int, J: wp.vec3):
 
 @wp.func
 def impulse_at(sensors: Sensors, e: int, entry: int):
-    """Sum of an entry [N s]."""
+    """Return the sum of an entry [N s]."""
     x = float(sensors.accumulators[e, 3 * entry])
     y = float(sensors.accumulators[e, 3 * entry + 1])
     z = float(sensors.accumulators[e, 3 * entry + 2])
@@ -100,13 +103,13 @@ def clear_environment(e: int, sensors: Sensors):
 
 @wp.kernel
 def clear_sensors(sensors: Sensors):
-    """Forget the contacts of the last control step."""
+    """Zero the sensors of all environments."""
     clear_environment(wp.tid(), sensors)
 
 
 @wp.kernel
 def clear_masked_sensors(mask: wp.array(dtype=wp.bool), sensors: Sensors):
-    """Forget the contacts of the masked environments."""
+    """Zero the sensors of the masked environments."""
     e = wp.tid()
     if mask[e]:
         clear_environment(e, sensors)
@@ -114,7 +117,7 @@ def clear_masked_sensors(mask: wp.array(dtype=wp.bool), sensors: Sensors):
 
 @wp.kernel
 def read_impulses(sensors: Sensors):
-    """Write the impulses that have been added up since the sensors were cleared; a thread has an entry."""
+    """Convert the accumulated impulses to floating point, a thread an entry."""
     e, entry = wp.tid()
     subjects = sensors.boundary_impulse.shape[1]
     J = impulse_at(sensors, e, entry)
@@ -129,22 +132,15 @@ def read_impulses(sensors: Sensors):
         sensors.boundary_moment[e, entry - moment_entry(sensors, 0)] = J
 
 
-#: Volume fraction of another subject at which a particle lies on its surface.
-SURFACE = wp.constant(0.5)
-#: Slope of the volume fraction at a flat surface, times the grid spacing: a step seen through the spline twice has the
-#: slope of the integral of its square, 11/20.
-SURFACE_SLOPE = wp.constant(0.55)
-
-
 @wp.func
 def pick(w: wp.vec3, n: int):
-    """``w[n]``; where a loop is not unrolled, a GPU would put ``w`` into memory for it."""
+    """Return ``w[n]`` without dynamic indexing, which would move ``w`` from registers to memory."""
     return wp.where(n == 0, w[0], wp.where(n == 1, w[1], w[2]))
 
 
 @wp.func
 def touched_around(grid: Grid, blocks: Blocks, sensors: Sensors, e: int, f: int, base: wp.vec3i):
-    """Whether contact has changed velocities of field ``f`` in any block of a stencil."""
+    """Return whether contact has changed velocities of field ``f`` in any block of a stencil."""
     any = int(0)
     for i in range(2):  # see fields_around
         for j in range(2):
@@ -156,9 +152,9 @@ def touched_around(grid: Grid, blocks: Blocks, sensors: Sensors, e: int, f: int,
 
 @wp.func
 def change_at(sensors: Sensors, e: int, r: int):
-    """What contact has done to a record: change of velocity, and the subject that did most of it."""
+    """Return the change of velocity by contact at a record in this substep, and the subject that did most of it."""
     change = read_vec4(sensors.node, e, r)
-    # else it is of the past
+    # without the flag, the change is of an earlier substep
     return wp.where(sensors.touched[e, r // BLOCK_NODES] != 0, change, wp.vec4())
 
 
@@ -172,9 +168,9 @@ def add_sensor_impulse(sensors: Sensors, e: int, sensor: int, taken: wp.vec4):
 
 @wp.func
 def accumulate_share(sensors: Sensors, e: int, sensor: int, taken: wp.vec4, change: wp.vec4, share: float):
-    """Impulse that a particle has taken so far, and from whom, with its ``share`` [kg] of a node's change.
+    """Return the impulse of a particle and its giver, with its ``share`` [kg] of a node's change of velocity added.
 
-    As long as it comes from one subject it is added up before it is rounded.
+    Shares from one subject are summed before they are rounded.
     """
     if wp.length_sq(wp.vec3(change[0], change[1], change[2])) == 0.0:
         return taken
@@ -186,12 +182,12 @@ def accumulate_share(sensors: Sensors, e: int, sensor: int, taken: wp.vec4, chan
 
 @wp.func
 def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
-    """Impulse that contact gives particle ``p`` at grid position ``xg``, on its sensor, by the subject that gave it."""
+    """Add the contact impulse on particle ``p`` at grid position ``xg`` to its sensor, by giver."""
     sensor = particles.sensor[p]
     own = particles.field[p]
     stencil = stencil_at(xg)
     base = stencil.base
-    # nearly all particles leave here
+    # nearly all particles return here
     if sensor < 0 or fields_around(grid, blocks, base, e) == (1 << own):
         return
     if not touched_around(grid, blocks, sensors, e, own, base):
@@ -199,14 +195,14 @@ def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Se
     m = particles.mass[row(e, particles.mass.shape[0]), p]
     taken = wp.vec4()
     slab = wp.vec4i()
-    three = int(3)  # not a constant, where loops are unrolled: what few particles come to is as short as can be
+    three = int(3)  # a variable, to keep the loops of this rare code
     for i in range(three):
         if i == 0 or ((base[0] + i) & 3) == 0:
             slab = slab_records(grid, blocks, e, own, base, i, VECTORS)
         for j in range(three):
             at = line_of_records(slab, base, i, j)
             w = m * pick(stencil.wx, i) * pick(stencil.wy, j)
-            # all of a line are asked for before the first has answered
+            # all three loads are in flight before the first is used
             first = change_at(sensors, e, at[0])
             second = change_at(sensors, e, at[1])
             third = change_at(sensors, e, at[2])
@@ -218,7 +214,7 @@ def sense_particle(grid: Grid, particles: Particles, blocks: Blocks, sensors: Se
 
 @wp.func
 def sense_near_field(grid: Grid, particles: Particles, blocks: Blocks, sensors: Sensors, e: int, p: int, xg: wp.vec3):
-    """:func:`sense_particle` of one near which the grid pass has seen another field; nearly all leave here."""
+    """Call :func:`sense_particle` if the grid update has stored that another field is near."""
     base = base_node(xg)
     r = first_record(grid, blocks, e, particles.field[p], block_index(grid, base[0], base[1], base[2]))
     if blocks.near_field[e, r // BLOCK_NODES] != 0:
@@ -227,9 +223,9 @@ def sense_near_field(grid: Grid, particles: Particles, blocks: Blocks, sensors: 
 
 @wp.func
 def is_single_field(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i):
-    """Whether the grid pass has noted that a stencil of field ``f`` lies in no block of another one.
+    """Return whether the grid update has stored that a stencil of field ``f`` overlaps no block of another one.
 
-    It has noted nothing of blocks that have been marked since, nor where a gather does not ask for it.
+    Unknown, and false, for blocks activated since, and on paths that do not store it.
     """
     if blocks.near_field.shape[1] == 1:
         return False
@@ -240,7 +236,7 @@ def is_single_field(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i):
 
 
 def senses_in_g2p(model: Model) -> bool:
-    """Whether particles sense contact in the gather, that of large bodies on a GPU, and not in a launch of its own."""
+    """Return whether G2P adds contact impulses to the sensors, on the tiled path, instead of a kernel of its own."""
     senses = model.contact.num_fields > 1 and model.num_sensors > 0
     return senses and model.path not in ("plain", "block")
 
@@ -255,10 +251,10 @@ def sense_contact(
     # in and out
     sensors: Sensors,
 ):
-    """Impulse on every sensor, by the subject that gave it.
+    """Add the contact impulses on all particles to their sensors, by giver.
 
-    A particle takes its share ``w m`` of each node's change of velocity; summed over a subject's particles that is
-    the impulse at the nodes. Where three subjects meet at a node, all of it is booked on the one that did most.
+    A particle takes its share ``w m`` of each node's change of velocity; summed over a subject's particles that is the
+    impulse at the nodes. Where three subjects share a node, all of it counts for the one that did most.
     """
     e, p = wp.tid()
     xg = grid_position(grid, x[e, p])
@@ -278,9 +274,9 @@ def sense_penetration(
     # in and out
     penetration: wp.array2d(dtype=float),
 ):
-    """Deepest particle of a subject below the surface of another [m].
+    """Raise ``penetration`` to the depth of the deepest particle of a subject below the surface of another [m].
 
-    The surface is where the other's volume fraction, seen through the spline, is one half; depths are linear there
+    The surface is where the volume fraction of the other, seen through the spline, is one half; depths are linear there
     and end at 0.9 grid spacings.
     """
     e, p = wp.tid()
@@ -304,7 +300,7 @@ def sense_penetration(
                     for k in range(3):
                         if has_field(blocks.fields[e, block_index(grid, base[0] + i, base[1] + j, base[2] + k)], g):
                             r = record_of(grid, blocks, e, g, base[0] + i, base[1] + j, base[2] + k)
-                            # a block that the last gather has marked knows nothing yet
+                            # a block activated by the last G2P holds no velocities yet
                             if r < BLOCK_NODES * blocks.num_updated[e]:
                                 w = pick(stencil.wx, i) * pick(stencil.wy, j) * pick(stencil.wz, k)
                                 m += w * mass_of(node_velocity, e, r)

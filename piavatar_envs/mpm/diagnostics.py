@@ -1,4 +1,4 @@
-"""Conserved quantities, computed on the host in double precision: for tests and benchmarks, not for stepping."""
+"""Conserved quantities, computed on the host in double precision, for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Totals:
         mass: [kg].
         momentum: linear momentum [kg m/s], shape ``(3,)``.
         angular_momentum: about ``about`` [kg m^2/s], shape ``(3,)``, with the affine part.
-        momentum_scale: sum of ``m |v|`` [kg m/s], what a round-off error in the momentum is relative to.
+        momentum_scale: sum of ``m |v|`` [kg m/s], the scale of round-off errors of the momentum.
         kinetic: kinetic energy with the affine part [J].
         elastic: elastic energy [J].
     """
@@ -34,7 +34,7 @@ class Totals:
 
 
 def totals(model: Model, state: State, env: int = 0, select=slice(None), about=(0.0, 0.0, 0.0)) -> Totals:
-    """Conserved totals of the particles ``select`` of environment ``env``.
+    """Return the conserved totals of the particles ``select`` of environment ``env``.
 
     An affine velocity on quadratic splines carries the angular momentum ``m dx^2/4 axial(C)`` and the kinetic energy
     ``m dx^2/8 |C|^2`` (Jiang et al. 2015, supplement: ``D_p = dx^2/4 I``).
@@ -50,10 +50,10 @@ def totals(model: Model, state: State, env: int = 0, select=slice(None), about=(
     axial = np.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], axis=1)
     inertia = 0.25 * model.grid.dx**2
     elastic = 0.0
-    for index, module in enumerate(MATERIALS.values()):
+    for index, law in enumerate(MATERIALS.values()):
         chosen = material == index
         if chosen.any():
-            elastic += float((module.energy(F[chosen], mu[chosen], lam[chosen]) * volume[chosen]).sum())
+            elastic += float((law.energy(F[chosen], mu[chosen], lam[chosen]) * volume[chosen]).sum())
     return Totals(
         mass=float(m.sum()),
         momentum=(m[:, None] * v).sum(0),

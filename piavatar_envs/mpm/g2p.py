@@ -1,19 +1,18 @@
-"""Deformation-gradient decoupling: how prescribed motion is kept out of the elastic deformation.
+"""Grid-to-particle transfer (G2P), the advance of particles, and the update of the deformation gradient.
 
-The avatar's commanded motion must not strain its flesh, contact must. PIAvatar (Han et al., arXiv 2606.21162)
-decouples the two by ``F <- F (F^k)^-1`` with the deformation gradient ``F^k`` of the kinematic velocity. Variants:
+APIC (Jiang et al., "The Affine Particle-In-Cell Method", 2015). Commanded motion must not strain the flesh of an
+avatar, contact must. PIAvatar (Han et al., arXiv 2606.21162) decouples the two by ``F <- F (F^k)^-1`` with the
+deformation gradient ``F^k`` of the kinematic velocity. Variants:
 
 - ``"split"`` (default): physical and kinematic velocity are never mixed into one state, and prescribed motion only
-  turns the elastic deformation: ``F <- (I + dt grad u) Q F Q^T`` with ``Q = Cayley(dt w)`` and the spin ``w`` of the
-  bones that a particle follows, as it moves with its own ``vk``. It is the paper's decoupling with the round-off taken
-  out. (Half the curl of the grid's ``vk`` would do as well, and as exactly; but all nodes would have to know it.)
+  rotates the elastic deformation: ``F <- (I + dt grad u) Q F Q^T`` with ``Q = Cayley(dt w)`` and the spin ``w`` of the
+  bones that a particle follows. This is the paper's decoupling without its round-off. (Half the curl of the grid's
+  ``vk`` would serve as well, but every node would need it.)
 - ``"paper"``: one velocity state, ``v += vk_new - vk_old`` once a control step,
   ``F <- (I + dt grad v) F (I + dt grad vk)^-1``, with ``F^k`` restarting at the identity each substep.
-- ``"none"``: the same injection without decoupling, the plain MPM the paper compares with. (Overwriting the velocity
-  instead of adding the difference gives about 0.05 m where the paper prints 0.25.)
-- ``"no_stress"``: as ``"split"`` with the stress switched off, the paper's motivation figure: bodies merge.
-
-Grid-to-particle (G2P) transfer: APIC (Jiang et al., "The Affine Particle-In-Cell Method", 2015).
+- ``"none"``: the same injection without decoupling, the plain MPM that the paper compares with. (Overwriting the
+  velocity instead of adding the difference gives about 0.05 m where the paper prints 0.25.)
+- ``"no_stress"``: as ``"split"`` without stress, the paper's motivation figure: bodies merge.
 """
 
 from __future__ import annotations
@@ -52,16 +51,39 @@ from piavatar_envs.mpm.types import (
 # Warp's own unrolling hides the loops over the stencil from the C++ compiler, which turns them into vector code
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-
 I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+_NONFINITE = wp.constant(FAILURE_NONFINITE)
+_OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
+_CFL = wp.constant(FAILURE_CFL)
+
+
+@wp.struct
+class Advanced:
+    """A particle at the end of a substep; see :class:`piavatar_envs.mpm.types.State`."""
+
+    fault: int  # why it cannot go on: bits FAILURE_*; then it stays as it is
+    x: wp.vec3
+    u: wp.vec3
+    C: wp.mat33
+    F: wp.mat33
+
+
+@wp.struct
+class Gradients:
+    """Weighted sums over a stencil of a velocity (components 1 to 3), and of its products with the nodes' positions."""
+
+    mean: wp.vec4
+    along_x: wp.vec4  # by places from the lowest node [grid spacings]
+    along_y: wp.vec4
+    along_z: wp.vec4
 
 
 @wp.func
 def cayley(turn: wp.vec3):
-    """Rotation ``(I - W/2)^-1 (I + W/2)`` with ``W = skew(turn)`` [rad]; orthogonal to round-off for any ``turn``.
+    """Return the rotation ``(I - W/2)^-1 (I + W/2)`` with ``W = skew(turn)`` [rad], orthogonal for any ``turn``.
 
-    With ``a = turn / 2`` it has the closed form ``I + 2 (A + A A) / (1 + a.a)``, ``A = skew(a)``, where
-    ``A A = a a^T - a.a I``: written down, it takes a third of the operations.
+    With ``a = turn / 2`` and ``A = skew(a)`` the closed form is ``I + 2 (A + A A) / (1 + a.a)``, ``A A = a a^T - a.a
+    I``; written out, it takes a third of the operations.
     """
     a = 0.5 * turn
     square = wp.dot(a, a)
@@ -74,12 +96,11 @@ def cayley(turn: wp.vec3):
         b[0] * a[1] + b[2], rest + b[1] * a[1], b[1] * a[2] - b[0],
         b[0] * a[2] - b[1], b[1] * a[2] + b[0], rest + b[2] * a[2],
     )
-    # fmt: on
 
 
 @wp.func
 def advance_deformation(F: wp.mat33, grad_v: wp.mat33, grad_vk: wp.mat33, spin: wp.vec3, dt: float, decoupling: int):
-    """Deformation gradient after one substep.
+    """Return the deformation gradient after one substep.
 
     Args:
         F: deformation gradient before.
@@ -98,14 +119,9 @@ def advance_deformation(F: wp.mat33, grad_v: wp.mat33, grad_vk: wp.mat33, spin: 
     return step * F
 
 
-_NONFINITE = wp.constant(FAILURE_NONFINITE)
-_OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
-_CFL = wp.constant(FAILURE_CFL)
-
-
 @wp.func
 def fault_of(grid: Grid, step: Step, F: wp.mat33, advection: wp.vec3, at: wp.vec3):
-    """Why a particle cannot go on to ``at`` with deformation ``F``: bits ``FAILURE_*``, 0 if it can."""
+    """Return why a particle cannot move to ``at`` with deformation gradient ``F``: bits ``FAILURE_*``, 0 if it can."""
     if not wp.isfinite(wp.ddot(F, F)):
         return _NONFINITE
     if step.dt * wp.length(advection) > grid.dx:
@@ -115,32 +131,11 @@ def fault_of(grid: Grid, step: Step, F: wp.mat33, advection: wp.vec3, at: wp.vec
     return 0
 
 
-@wp.struct
-class Advanced:
-    """A particle at the end of a substep; see :class:`piavatar_envs.mpm.types.State`."""
-
-    fault: int  # why it cannot go on: bits FAILURE_*; then it stays as it is
-    x: wp.vec3
-    u: wp.vec3
-    C: wp.mat33
-    F: wp.mat33
-
-
-@wp.struct
-class Gradients:
-    """Weighted sums of a velocity of a stencil's nodes, in components 1 to 3, and those times the nodes' places."""
-
-    mean: wp.vec4
-    along_x: wp.vec4  # by places from the lowest node [grid spacings]
-    along_y: wp.vec4
-    along_z: wp.vec4
-
-
 @wp.func
 def gradient_of(grid: Grid, g: Gradients, f: wp.vec3):
-    """Gradient of a velocity at a particle that is ``f`` from the lowest node: ``(4 / dx^2) sum w v (x_i - x_p)^T``.
+    """Return the velocity gradient ``(4 / dx^2) sum w v (x_i - x_p)^T`` of quadratic splines, as in APIC [1/s].
 
-    That of quadratic splines, as APIC has it.
+    ``f`` is the position of the particle from the lowest node of its stencil.
     """
     scale = 4.0 * grid.inv_dx
     gx = scale * (g.along_x - f[0] * g.mean)
@@ -151,10 +146,7 @@ def gradient_of(grid: Grid, g: Gradients, f: wp.vec3):
 
 @wp.func
 def needs_kinematic(grid: Grid, step: Step, distance: float):
-    """Whether a particle must know the grid's kinematic velocity: the variant wants it, or a boundary is at hand.
-
-    ``distance`` is how far the particle is from any [m].
-    """
+    """Return whether a particle needs the grid's kinematic velocity: ``"paper"``, or a collider at ``distance`` [m]."""
     if step.decoupling == PAPER:
         return True
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
@@ -163,7 +155,7 @@ def needs_kinematic(grid: Grid, step: Step, distance: float):
 
 @wp.func
 def velocity_of(grid: Grid, physical: Gradients, f: wp.vec3):
-    """Physical velocity and its gradient of a particle that is ``f`` from the lowest node."""
+    """Return a particle with the physical velocity and gradient of the sums; ``f`` as in :func:`gradient_of`."""
     s = Advanced()
     s.u = wp.vec3(physical.mean[1], physical.mean[2], physical.mean[3])
     s.C = gradient_of(grid, physical, f)
@@ -174,9 +166,10 @@ def velocity_of(grid: Grid, physical: Gradients, f: wp.vec3):
 def carried_velocity(
     grid: Grid, boundaries: Boundaries, e: int, x: wp.vec3, vk: wp.vec3, kinematic: Gradients, needed: bool
 ):
-    """Kinematic velocity that carries a particle at ``x``: what the grid did not see of it enters no boundary.
+    """Return the kinematic velocity that carries a particle at ``x``, which must not enter colliders.
 
-    ``kinematic`` has nothing where it was not ``needed`` for, see :func:`needs_kinematic`.
+    Contact acts on the nodes' kinematic velocity; what the particle's own ``vk`` has beyond it is projected.
+    ``kinematic`` is empty unless it is ``needed``, see :func:`needs_kinematic`.
     """
     if not needed:
         return vk
@@ -195,7 +188,7 @@ def complete_advance(
     grad_vk: wp.mat33,
     spin: wp.vec3,
 ):
-    """``s`` with the rest of what becomes of a particle that was at ``x`` and is carried by ``advection``."""
+    """Return ``s`` with deformation gradient, position and fault, for a move from ``x`` with ``advection``."""
     decoupling = wp.where(step.decoupling == NO_STRESS, SPLIT, step.decoupling)
     s.F = advance_deformation(F, s.C, grad_vk, spin, step.dt, decoupling)
     s.x = x + step.dt * advection
@@ -219,9 +212,9 @@ def advance_particle(
     needed: bool,
     stencil: Stencil,
 ):
-    """Particle ``p`` a substep later; the blocks that it comes to are marked.
+    """Return particle ``p`` after the substep; activates the blocks that it enters.
 
-    It is carried by its *own* kinematic velocity, not by the grid-smoothed one: this is what makes tracking exact
+    A particle moves with its *own* kinematic velocity, not with the grid-smoothed one, which makes tracking exact
     (1e-5 m against 1e-2 m).
     """
     x = moved.x[e, p]
@@ -242,6 +235,42 @@ def advance_particle(
     return s
 
 
+@wp.func_native(
+    _LINES
+    + """
+const four* const halves = reinterpret_cast<const four*>(nodes);
+four mean = vector(0.0f, 0.0f, 0.0f, 0.0f), along_x = mean, along_y = mean, along_z = mean;
+#pragma unroll
+for (int i = 0; i < 3; ++i) {
+    four plane = vector(0.0f, 0.0f, 0.0f, 0.0f), plane_y = plane, plane_z = plane;
+#pragma unroll
+    for (int j = 0; j < 3; ++j)
+        with_line(i, j, [&](int first, int middle, int last) {
+            const four second = halves[middle] * wz[1], third = halves[last] * wz[2];
+            const four line = halves[first] * wz[0] + second + third;
+            plane = plane + line * wy[j];
+            plane_y = plane_y + line * ((float)j * wy[j]);
+            plane_z = plane_z + (second + third * 2.0f) * wy[j];
+        });
+    mean = mean + plane * wx[i];
+    along_x = along_x + plane * ((float)i * wx[i]);
+    along_y = along_y + plane_y * wx[i];
+    along_z = along_z + plane_z * wx[i];
+}
+wp::mat_t<4, 4, wp::float32> sums;
+for (int c = 0; c < 4; ++c)
+    sums.data[0][c] = mean[c], sums.data[1][c] = along_x[c], sums.data[2][c] = along_y[c], sums.data[3][c] = along_z[c];
+return sums;
+"""
+)
+def sum_lines(
+    nodes: wp.uint64,
+    lines: Lines,
+) -> wp.mat44:
+    """Return the sums over a stencil of halves of records at address ``nodes``: mean, and times x, y and z."""
+    ...
+
+
 @wp.func
 def sum_physical(
     grid: Grid,
@@ -251,14 +280,14 @@ def sum_physical(
     field: int,
     stencil: Stencil,
 ):
-    """Sums over a stencil of the nodes' physical velocity, on a GPU; on a CPU they are :func:`sum_lines`."""
+    """Return the sums of physical velocity over a stencil, on a GPU; a CPU uses :func:`sum_lines`."""
     base = stencil.base
     wx = stencil.wx
     wy = stencil.wy
     wz = stencil.wz
     g = Gradients()
     slab = wp.vec4i()
-    planes = int(3)  # not a constant: a GPU has too few registers for the loads of all three at once
+    planes = int(3)  # a variable, to keep the loop: unrolled, its loads need too many registers
     for i in range(planes):
         wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
         plane = wp.vec4()
@@ -288,11 +317,11 @@ def sum_kinematic(
     field: int,
     stencil: Stencil,
 ):
-    """Sums over a stencil of the kinematic velocity; few particles ask for them, so they are as short as can be."""
+    """Return the sums of kinematic velocity over a stencil; compact code, because few particles need it."""
     base = stencil.base
     wz = stencil.wz
     g = Gradients()
-    lines = int(9)  # not a constant: Warp would write them all down
+    lines = int(9)  # a variable, to keep the loop
     for n in range(lines):
         i = n // 3
         j = n % 3
@@ -309,6 +338,15 @@ def sum_kinematic(
 
 
 @wp.func
+def store_particle(moved: Moving, e: int, p: int, s: Advanced, store: bool):
+    """Write particle ``p`` if ``store``; all threads of a warp should call this together."""
+    store_pair(moved.x, moved.u, e, p, s.x, s.u, True, store)
+    if store:
+        store_matrix(moved.C, e, p, s.C)
+        store_matrix(moved.F, e, p, s.F)
+
+
+@wp.func
 def g2p_particle(
     grid: Grid,
     step: Step,
@@ -321,10 +359,7 @@ def g2p_particle(
     e: int,
     p: int,
 ):
-    """Particle ``p`` from the nodes: velocities and gradients, and with them position and deformation.
-
-    Also, how far it was from any boundary [m]. Blocks that it comes to are marked. See also :func:`g2p_particle_by_lines`.
-    """
+    """Return particle ``p`` after the substep, and its distance from the nearest collider [m], on a GPU."""
     x = moved.x[e, p]
     stencil = stencil_at(grid_position(grid, x))
     field = particles.field[p]
@@ -354,7 +389,7 @@ def g2p_particle_by_lines(
     e: int,
     p: int,
 ):
-    """:func:`g2p_particle` for a CPU, whose scatter has noted what is around a particle."""
+    """Return particle ``p`` after the substep, on a CPU, where P2G has stored the contact candidates."""
     x = moved.x[e, p]
     stencil = stencil_at(grid_position(grid, x))
     field = particles.field[p]
@@ -385,7 +420,7 @@ def g2p(
     moved: Moving,
     failure: wp.array(dtype=int),
 ):
-    """Move every particle with the grid, see :func:`g2p_particle_by_lines`."""
+    """Move every particle with the grid."""
     e, p = wp.tid()
     if blocks.frozen[e] != 0:
         return
@@ -395,48 +430,3 @@ def g2p(
         moved.u[e, p] = s.u
         store_matrix(moved.C, e, p, s.C)
         store_matrix(moved.F, e, p, s.F)
-
-
-@wp.func
-def store_particle(moved: Moving, e: int, p: int, s: Advanced, store: bool):
-    """All that a particle ``p`` has become, if ``store``; at best all threads of a warp come here."""
-    store_pair(moved.x, moved.u, e, p, s.x, s.u, True, store)
-    if store:
-        store_matrix(moved.C, e, p, s.C)
-        store_matrix(moved.F, e, p, s.F)
-
-
-@wp.func_native(
-    _LINES
-    + """
-const four* const halves = reinterpret_cast<const four*>(nodes);
-four mean = vector(0.0f, 0.0f, 0.0f, 0.0f), along_x = mean, along_y = mean, along_z = mean;
-#pragma unroll
-for (int i = 0; i < 3; ++i) {
-    four plane = vector(0.0f, 0.0f, 0.0f, 0.0f), plane_y = plane, plane_z = plane;
-#pragma unroll
-    for (int j = 0; j < 3; ++j)
-        with_line(i, j, [&](int first, int middle, int last) {
-            const four second = halves[middle] * wz[1], third = halves[last] * wz[2];
-            const four line = halves[first] * wz[0] + second + third;
-            plane = plane + line * wy[j];
-            plane_y = plane_y + line * ((float)j * wy[j]);
-            plane_z = plane_z + (second + third * 2.0f) * wy[j];
-        });
-    mean = mean + plane * wx[i];
-    along_x = along_x + plane * ((float)i * wx[i]);
-    along_y = along_y + plane_y * wx[i];
-    along_z = along_z + plane_z * wx[i];
-}
-wp::mat_t<4, 4, wp::float32> accumulators;
-for (int c = 0; c < 4; ++c)
-    accumulators.data[0][c] = mean[c], accumulators.data[1][c] = along_x[c], accumulators.data[2][c] = along_y[c], accumulators.data[3][c] = along_z[c];
-return accumulators;
-"""
-)
-def sum_lines(
-    nodes: wp.uint64,
-    lines: Lines,
-) -> wp.mat44:
-    """Weighted sum of the halves of records in ``nodes``, and those times the nodes' places along x, y and z."""
-    ...

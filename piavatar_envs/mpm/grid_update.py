@@ -1,4 +1,7 @@
-"""The grid pass: momentum to velocity, gravity, contact; clears what it reads."""
+"""Grid update: momentum becomes velocity, gravity and colliders act, accumulators are cleared.
+
+It covers the active blocks of one field; contact blocks are updated by :mod:`piavatar_envs.mpm.contact`.
+"""
 
 from __future__ import annotations
 
@@ -35,24 +38,22 @@ from piavatar_envs.mpm.types import (
     Step,
 )
 
-# on a GPU, divisions and roots to two units in the last place, in a few instructions instead of calls
+# fast_math: divisions and roots to two units in the last place, without function calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 #: Threads of a warp.
 LANES = 32
-
-#: Slots for which a large GPU has threads at once, and the fewest for which an environment gets them.
+#: Active blocks for which a large GPU has threads at once.
 BLOCKS_AT_ONCE = 132 * 28
-
+#: Fewest active blocks for which an environment gets threads.
 MIN_BLOCKS = 8
-
-#: Nodes of a slab of a block, the unit in which boundaries are looked for.
+#: Nodes of a slab of a block, the unit for which distances from colliders are evaluated.
 SLAB_NODES = wp.constant(16)
 
 
 @wp.func
 def total_velocity(step: Step, split: bool, s: vec8):
-    """Mass, velocity that contact acts on, and kinematic velocity of a node, from its sums."""
+    """Return mass, total velocity (on which contact acts) and kinematic velocity of a node from its sums ``s``."""
     m = s[0]
     if m <= MASS_MIN:
         return vec8(m, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -76,7 +77,7 @@ def collide_with_boundaries(
     total: vec8,
     sensors: Sensors,
 ):
-    """Total velocity of a field's matter at node ``at`` after contact with the boundaries; their impulse is sensed."""
+    """Return the total velocity of a field at node ``at`` after contact with colliders, and sense their impulse."""
     if total[0] <= MASS_MIN:
         return total
     offset = offset_at(grid, accumulators, e, f, r)
@@ -92,7 +93,7 @@ def collide_with_boundaries(
 
 @wp.func
 def physical_velocity(split: bool, total: vec8):
-    """Mass, physical and kinematic velocity from mass, total and kinematic velocity."""
+    """Return mass, physical and kinematic velocity from mass, total and kinematic velocity."""
     if total[0] <= MASS_MIN:
         return vec8()
     if split:
@@ -102,7 +103,7 @@ def physical_velocity(split: bool, total: vec8):
 
 @wp.func
 def slab_is_near(grid: Grid, boundaries: Boundaries, e: int, corner: wp.vec3i, local: int, reach: float):
-    """Whether a boundary is within ``reach`` [grid spacings] of the slab of 4 x 4 nodes of a block's node ``local``."""
+    """Return whether a collider is within ``reach`` [grid spacings] of the slab of 4 x 4 nodes with node ``local``."""
     slab = local // SLAB_NODES
     center = node_position(grid, corner[0] + slab, corner[1], corner[2]) + grid.dx * wp.vec3(0.0, 1.5, 1.5)
     return nearest_boundary(boundaries, e, center) < reach * grid.dx
@@ -110,16 +111,34 @@ def slab_is_near(grid: Grid, boundaries: Boundaries, e: int, corner: wp.vec3i, l
 
 @wp.func
 def block_is_near(grid: Grid, boundaries: Boundaries, e: int, corner: wp.vec3i):
-    """Whether particles whose base is in the block at ``corner`` may be near enough to a boundary to tell it."""
+    """Return whether particles based in the block at ``corner`` may be contact candidates because of a collider."""
     center = node_position(grid, corner[0], corner[1], corner[2]) + wp.vec3(2.5 * grid.dx)
     return nearest_boundary(boundaries, e, center) < NEAR_BLOCK * grid.dx
 
 
 @wp.func
 def node_position_in_block(grid: Grid, corner: wp.vec3i, local: int):
-    """Position of node ``local`` of the block with the lowest node ``corner`` [m]."""
+    """Return the position of node ``local`` of the block with the lowest node ``corner`` [m]."""
     node = node_of_block(corner, local)
     return node_position(grid, node[0], node[1], node[2])
+
+
+def blocks_at_once(model: Model) -> int:
+    """Return how many active blocks of an environment are updated at once; their warps then update further ones."""
+    if wp.get_device(model.device).is_cuda:
+        return min(model.max_active_blocks, max(MIN_BLOCKS, -(-BLOCKS_AT_ONCE // model.num_envs)))
+    return model.max_active_blocks
+
+
+def threads_per_active_block(model: Model) -> int:
+    """Return how many threads update an active block."""
+    return LANES if wp.get_device(model.device).is_cuda else 1
+
+
+@wp.func
+def nodes_of_lane():
+    """Return how many nodes of a block each of those threads updates."""
+    return BLOCK_NODES // lanes_of_warp()
 
 
 @wp.func
@@ -132,7 +151,7 @@ def update_free_node(
     loaded: vec4l,
     node_velocity: wp.array2d(dtype=wp.vec4),
 ):
-    """Velocity of a node that has been told nothing, from the sum that has ``loaded``: it has no kinematic one."""
+    """Write the velocity of a node without contact candidates, whose sum is ``loaded``; only the physical one."""
     total = total_velocity(step, False, finish_take(accumulators, e, quanta, r, loaded, False))
     write_physical(node_velocity, e, r, physical_velocity(False, total))
 
@@ -153,9 +172,9 @@ def update_candidate_node(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """Velocities of a node that may have been told where particles are and how they are driven.
+    """Write the velocities of a node that contact candidates may have added to.
 
-    A boundary may be ``near`` the matter there; ``corner`` is the lowest node of its block.
+    A collider may be ``near`` it; ``corner`` is the lowest node of its block.
     """
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     total = total_velocity(
@@ -184,9 +203,9 @@ def update_block(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """Sums of a slot's nodes to velocities; it is ``owner`` by a field, for a block, and some may have been ``candidates``.
+    """Write the velocities of an active block of field and block ``owner``, from its sums; a warp shares the nodes.
 
-    The threads of a warp share the nodes; the sums of each one's first two have ``loaded``.
+    ``candidates``: contact candidates have added to it. The sums of each thread's first two nodes are loaded already.
     """
     driven = candidates or step.decoupling == PAPER
     quanta = quanta_of(accumulators, e, owner[0])
@@ -197,13 +216,13 @@ def update_block(
         near = bool(False)
         for n in range(nodes_of_lane()):
             local = (r + n * lanes) % BLOCK_NODES
-            if n == 0 or lanes > 1 or local % SLAB_NODES == 0:  # a thread of a CPU goes from node to node
+            if n == 0 or lanes > 1 or local % SLAB_NODES == 0:  # a CPU thread visits the nodes in order
                 near = slab_is_near(grid, boundaries, e, corner, local, GATED_SLAB)
             update_candidate_node(
-                grid, step, boundaries, contact, accumulators, e, quanta, owner[0], r + n * lanes, corner, near, node_velocity,
-                sensors,
+                grid, step, boundaries, contact, accumulators, e, quanta, owner[0], r + n * lanes, corner, near,
+                node_velocity, sensors,
             )  # fmt: skip
-    else:  # most have nothing else to do
+    else:  # the usual case
         update_free_node(step, accumulators, e, quanta, r, loaded, node_velocity)
         update_free_node(step, accumulators, e, quanta, r + lanes, loaded_next, node_velocity)
         for n in range(2, nodes_of_lane()):  # on a CPU
@@ -220,9 +239,9 @@ def update_block(
 
 @wp.func
 def discard_nodes(accumulators: Accumulators, e: int, f: int, active: int):
-    """Forget the sums of a slot's nodes, of field ``f``; a warp shares them.
+    """Clear the accumulators of an active block of field ``f``; a warp shares the nodes.
 
-    Slots have run out: what has been added up is of some particles only, and nobody goes on from it.
+    Active blocks are exhausted: the sums are incomplete, and the environment has failed.
     """
     for n in range(nodes_of_lane()):
         r = BLOCK_NODES * active + lane_of_thread() + n * lanes_of_warp()
@@ -232,9 +251,9 @@ def discard_nodes(accumulators: Accumulators, e: int, f: int, active: int):
 
 @wp.func
 def store_near_field(grid: Grid, blocks: Blocks, e: int, active: int, owner: wp.vec2i):
-    """Note whether a stencil that begins in a slot's block, ``owner`` by a field, may lie in a block of another one.
+    """Store whether a stencil based in an active block may overlap a block of another field.
 
-    Nearly no particles of large bodies do, and their gather need not look around. All threads of a warp come here.
+    Nearly no particles of large bodies do, and their G2P skips the lookup. All threads of a warp must call this.
     """
     if blocks.near_field.shape[1] == 1:
         return
@@ -259,17 +278,16 @@ def update_grid(
     node_velocity: wp.array2d(dtype=wp.vec4),
     sensors: Sensors,
 ):
-    """Velocity of every node with mass in blocks of one field; a warp has every ``active_blocks``-th, on a CPU a thread.
+    """Write the velocity of every node with mass in blocks of one field; a warp has every ``active_blocks``-th of them.
 
-    Contact acts on the total velocity ``v = u + vk``; the rest is physical. Blocks with several fields are seen to by
-    :mod:`piavatar_envs.mpm.contact`, maybe at the same time.
+    Contact acts on the total velocity ``v = u + vk``; the result is physical. Contact blocks are updated by
+    :mod:`piavatar_envs.mpm.contact`, possibly in parallel.
 
-    Nodes have offsets and kinematic momentum only from particles that tell their place, see
-    :func:`piavatar_envs.mpm.p2g.is_contact_candidate`, and who scatters those notes in which slots. (Of the paper's variant
-    all have the latter, and groups scatter both.) Matter within the gate of a boundary is of such particles only, so
-    elsewhere nobody asks for boundaries.
+    Nodes have offsets and kinematic momentum only from contact candidates (the latter from all particles with
+    ``"paper"``), which flag the active blocks that they add to. Matter within the gate of a collider consists of
+    candidates only, so colliders are skipped elsewhere.
 
-    Where slots have run out, sums are forgotten: a part of the world may have been scattered that did not know of it.
+    Where active blocks are exhausted, sums are discarded: parallel P2G of another part may not have seen it.
     """
     at = environment_of(wp.tid(), active_blocks * lanes_of_warp())
     e = at[0]
@@ -283,10 +301,10 @@ def update_grid(
         loaded_next = load_accumulator(accumulators, e, first + lanes_of_warp())
         n = blocks.owner[e, active]
         candidates = accumulators.candidates[e, active] != 0
-        sync_warp()  # all is asked for before the first has answered, and read before it is written
+        sync_warp()  # every thread has read its flags before one of them clears them
         if at[1] == 0 and active == 0:
             blocks.num_updated[e] = used
-            blocks.frozen[e] = failure[e]  # the scatter has ended
+            blocks.frozen[e] = failure[e]  # P2G has ended
         if active < used:
             if candidates:
                 accumulators.candidates[e, active] = 0
@@ -303,26 +321,8 @@ def update_grid(
                     sensors.touched[e, active] = 0
             if alone:
                 update_block(
-                    grid, step, boundaries, contact, accumulators, loaded, loaded_next, e, active, owner, candidates, node_velocity,
-                    sensors,
+                    grid, step, boundaries, contact, accumulators, loaded, loaded_next, e, active, owner, candidates,
+                    node_velocity, sensors,
                 )  # fmt: skip
         active += active_blocks
         goes_on = active < used
-
-
-def blocks_at_once(model: Model) -> int:
-    """Slots of an environment that a grid pass begins with; who has one comes back for more."""
-    if wp.get_device(model.device).is_cuda:
-        return min(model.max_active_blocks, max(MIN_BLOCKS, -(-BLOCKS_AT_ONCE // model.num_envs)))
-    return model.max_active_blocks
-
-
-def threads_per_active_block(model: Model) -> int:
-    """Threads that a slot has in a grid pass."""
-    return LANES if wp.get_device(model.device).is_cuda else 1
-
-
-@wp.func
-def nodes_of_lane():
-    """Nodes of a block that each of them has."""
-    return BLOCK_NODES // lanes_of_warp()

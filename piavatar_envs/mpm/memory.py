@@ -1,4 +1,4 @@
-"""Memory of a simulation: how many blocks of nodes it may come to need, what that takes, and getting it."""
+"""Memory of a simulation: number of active blocks, estimates, and allocation."""
 
 from __future__ import annotations
 
@@ -15,47 +15,46 @@ from piavatar_envs.mpm.grid_arrays import choose_quanta
 from piavatar_envs.mpm.sparse_grid import UNASSIGNED, max_contact_blocks, tracks_contact_nodes
 from piavatar_envs.mpm.types import Accumulators, Blocks, Grid, Model, Scratch, Sensors, State
 
-#: Blocks with matter that a body may come to need, over those that it needs at rest. Random full-scale actions, also of
-#: random shapes, made it 1.2 times as many at most.
+#: Active blocks that a body may need, over those at rest. Random full-scale actions and shapes reached 1.2.
 ACTIVE_MARGIN = 1.7
-#: The same of a body with more particles than fit into shared memory.
+#: The same for a body with more particles than suit the block path.
 LARGE_MARGIN = 2.2
-#: Substeps after which blocks are marked anew: those that a fast body leaves behind need no slots any longer. In eight
-#: substeps nothing moves further than two blocks.
+#: Substeps between activations, which release the blocks that a fast body has left. In eight substeps nothing moves
+#: further than two blocks.
 ACTIVATION_INTERVAL = 8
-#: The same where groups scatter, whose marks take longer; and where one of their bodies is large. One of 2,300 blocks
-#: that goes a grid spacing a substep leaves some 1,600 behind in 16 of them, 2,500 in 25: there is room for that.
+#: The same on the tiled path, where activations take longer; and with a large body, whose margin holds what it leaves
+#: behind at a grid spacing a substep.
 TILED_INTERVAL, LARGE_INTERVAL = 16, 25
-#: Warp's strides are 32-bit: the records of an environment, of 64 bytes at most, take less than 2^31.
+#: Warp's strides are 32-bit: the records of an environment, of up to 64 bytes, must take less than 2^31 bytes.
 MAX_ACTIVE_BLOCKS = 2**31 // (64 * BLOCK**3)
 
 
 def bound_active_blocks(max_active_blocks: int | None, field: np.ndarray, grid: Grid, num_fields: int) -> int:
-    """Slots of an environment: as asked for, at most what its particles, of velocity fields ``field``, touch at once.
+    """Return the active blocks of an environment: as requested, at most what its particles can touch at once.
 
     Raises:
-        ValueError: there is none, or their records take more bytes than Warp's 32-bit strides can count.
+        ValueError: there is none, or their records exceed Warp's 32-bit strides.
     """
     count = np.bincount(field, minlength=num_fields)
     most = int(np.minimum(8 * count, grid.num_blocks).sum())
     active_blocks = most if max_active_blocks is None else min(max_active_blocks, most)
     if not 1 <= active_blocks < MAX_ACTIVE_BLOCKS:
         raise ValueError(
-            f"{active_blocks} blocks of nodes an environment: use at least 1 and less than {MAX_ACTIVE_BLOCKS} (a coarser dx, or "
-            f"max_active_blocks)"
+            f"{active_blocks} active blocks an environment: use at least 1 and less than {MAX_ACTIVE_BLOCKS}, by a "
+            f"coarser dx or max_active_blocks"
         )
     return active_blocks
 
 
 def estimate_active_blocks(rest: np.ndarray, field: np.ndarray | None, dx: float, margin: float | None = None) -> int:
-    """Slots that bodies will need, from how many they take where they are at rest.
+    """Return how many active blocks bodies will need, from their particles at rest.
 
     Args:
-        rest: positions of the particles [m], shape ``(num_particles, 3)``; how bodies lie to each other is immaterial.
+        rest: positions of the particles [m], shape ``(num_particles, 3)``; relative positions of bodies are irrelevant.
         field: their velocity fields, shape ``(num_particles,)``; the first for all if not given.
         dx: grid spacing [m].
-        margin: how many times as many slots a body may come to need, in another pose or shape, and while it goes on;
-            ``ACTIVE_MARGIN`` if not given, or ``LARGE_MARGIN``.
+        margin: factor for other poses and shapes, and for motion between activations; ``ACTIVE_MARGIN`` or
+            ``LARGE_MARGIN`` if not given.
     """
     field = np.zeros(len(rest), int) if field is None else field
     corners = np.array(np.meshgrid([0, 2], [0, 2], [0, 2])).reshape(3, -1).T
@@ -67,7 +66,7 @@ def estimate_active_blocks(rest: np.ndarray, field: np.ndarray | None, dx: float
             times = LARGE_MARGIN if len(own) > MOST_PARTICLES else ACTIVE_MARGIN
         base = np.floor(own / dx - 0.5).astype(int)
         counts = []
-        for shift in np.ndindex(2, 2, 2):  # the grid may lie to the body as it likes
+        for shift in np.ndindex(2, 2, 2):  # any alignment of the grid with the body
             touched = (base[:, None] + 2 * np.array(shift) + corners) // BLOCK
             counts.append(len(np.unique(touched.reshape(-1, 3), axis=0)))
         needed += math.ceil(times * max(counts)) + 8
@@ -75,7 +74,7 @@ def estimate_active_blocks(rest: np.ndarray, field: np.ndarray | None, dx: float
 
 
 def choose_activation_interval(path: str, field: np.ndarray) -> int:
-    """Substeps after which the blocks of particles of velocity fields ``field`` are marked anew."""
+    """Return the number of substeps between activations of blocks."""
     if path != "tiled":
         return ACTIVATION_INTERVAL
     return LARGE_INTERVAL if np.bincount(field).max() > MOST_PARTICLES else TILED_INTERVAL
@@ -89,10 +88,10 @@ def estimate_bytes(
     num_blocks: int = 0,
     path: str = "plain",
 ) -> int:
-    """Device memory of state and scratch [bytes].
+    """Estimate the device memory of state and scratch [bytes].
 
-    120 B a particle; 80 B a node of a slot, 48 more in fixed point, 32 less where sums are in shared memory, 32 more
-    where there are several fields; the map of blocks.
+    120 B a particle; 80 B a node, 48 more in fixed point, 32 less with sums in shared memory, 32 more with several
+    fields; and the map of blocks.
     """
     accumulators = 16 if path == "block" else (32 + 16) * (2 if path == "tiled" else 1)
     node = accumulators + 32 + (16 + 16 if num_fields > 1 else 0)
@@ -112,7 +111,7 @@ def check_memory(
     num_blocks: int = 0,
     path: str = "plain",
 ) -> None:
-    """Refuse a batch that does not fit.
+    """Check that a batch fits into memory.
 
     Raises:
         ValueError: the estimate exceeds the free memory of a CUDA device.
@@ -130,7 +129,7 @@ def check_memory(
 
 
 def allocate(model: Model) -> tuple[State, Scratch]:
-    """Zeroed state (identity deformation) and scratch."""
+    """Allocate zeroed state (identity deformation gradient) and scratch."""
     particles = (model.num_envs, model.num_particles)
     C, F = (allocate_matrices(*particles, model.device) for _ in range(2))
     F.assign(components_of(np.broadcast_to(np.eye(3), (*particles, 3, 3))))
@@ -164,7 +163,7 @@ def _zeros(model: Model, shape: int | tuple[int, ...], dtype: type) -> wp.array:
 
 
 def allocate_blocks(model: Model) -> Blocks:
-    """No block holds matter yet."""
+    """Allocate a sparse grid without active blocks."""
     n, count = model.num_envs, model.num_blocks
     return make_struct(
         Blocks,
@@ -183,7 +182,7 @@ def allocate_blocks(model: Model) -> Blocks:
 
 
 def allocate_accumulators(model: Model, velocity: wp.array) -> Accumulators:
-    """Zeroed sums of the nodes, and their units. Sums from shared memory come to the records of the ``velocity``."""
+    """Allocate zeroed accumulators; on the block path sums are written to the records of ``velocity``."""
     fixed, records = model.path == "tiled", (model.num_envs, int(BLOCK_NODES) * model.max_active_blocks)
     mass, momentum = choose_quanta(model.contact.density.numpy(), model.grid, model.step)
     floats, integers = ((1, 1), records) if fixed else (records, (1, 1))
@@ -201,7 +200,7 @@ def allocate_accumulators(model: Model, velocity: wp.array) -> Accumulators:
 
 
 def allocate_sensors(model: Model, records: tuple[int, int]) -> Sensors:
-    """Zeroed contact sensors, with ``records`` at the nodes."""
+    """Allocate zeroed contact sensors, with ``records`` at the nodes."""
     n, subjects = model.num_envs, model.contact.num_subjects
     rows = max(1, model.num_sensors)
     entries = subjects * (2 + subjects + rows)

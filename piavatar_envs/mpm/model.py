@@ -1,11 +1,4 @@
-"""How long a time step may be; in a file of its own, because settings know it before anybody needs Warp.
-
-Analytic solids in NumPy terms, and their upload.
-
-Velocity fields in NumPy terms: which subject owns them, and how they rub.
-
-From NumPy to device: choose the grid and the time step, refuse what cannot run, allocate.
-"""
+"""Model of a simulation: velocity fields, material points, grid, time step and path, from NumPy to the device."""
 
 from __future__ import annotations
 
@@ -35,13 +28,13 @@ from piavatar_envs.mpm.types import (
 wp.set_module_options({"enable_backward": False})
 
 
-#: Largest stable ``c dt / dx`` that was measured (0.84 to 1.04, less near incompressibility).
+#: Largest stable ``c dt / dx`` (measured 0.84 to 1.04, less near incompressibility).
 CFL_STABLE = 0.84
 
 
-#: One bit of an int32 a field; the sign is left alone.
+#: Most velocity fields: one bit of an int32 each, without the sign.
 MAX_FIELDS = 31
-#: Gap between two bodies' surfaces below which they touch [grid spacings].
+#: Gap between the surfaces of two bodies below which they are in contact [grid spacings].
 CONTACT_GATE = 0.15
 
 
@@ -53,7 +46,7 @@ class Fields:
         subject: subject of each field, counted from 0, the fields of a subject next to each other, its trunk first.
         friction: Coulomb coefficient of every pair of fields, shape ``(F, F)`` or one number.
         density: reference density of each field's matter [kg/m^3], shape ``(F,)`` or one number.
-        gate: gap between the surfaces of two fields below which they touch [grid spacings]; from 3 on any.
+        gate: gap between the surfaces of two fields below which they are in contact [grid spacings]; from 3 on any.
         normals: ``"shared"`` (one normal a pair) or ``"own"`` (the paper's rule, which loses momentum).
         num_sensors: rows of the contact sensor that particles refer to.
     """
@@ -76,7 +69,7 @@ class Fields:
         return max(self.subject) + 1
 
     def check(self) -> None:
-        """Refuse what the grid cannot hold.
+        """Check subjects, coefficients and densities.
 
         Raises:
             ValueError: too many fields, subjects out of order, a negative friction, an unknown rule for normals, or
@@ -105,7 +98,7 @@ class Fields:
             raise ValueError(f"gate={self.gate} must be a gap of at least 0 grid spacings")
 
     def upload(self, dx: float, rows: int, device: str) -> Contact:
-        """Kernel argument; ``rows`` (1 or ``num_envs``) copies of the densities and coefficients.
+        """Return the kernel argument, with ``rows`` (1 or ``num_envs``) copies of densities and coefficients.
 
         Raises:
             ValueError: see :meth:`check`.
@@ -128,7 +121,7 @@ class Fields:
 
 @dataclass(frozen=True)
 class MaterialPoints:
-    """Matter to simulate, in NumPy. Arrays have shape ``(1 or num_envs, num_particles)`` unless said otherwise.
+    """Matter to simulate, in NumPy. Arrays have shape ``(1 or num_envs, num_particles)`` unless stated otherwise.
 
     Attributes:
         volume: rest volume [m^3].
@@ -137,7 +130,7 @@ class MaterialPoints:
         poisson_ratio: Poisson's ratio.
         material: index of the constitutive model, see :func:`piavatar_envs.mpm.materials.material_index`.
         field: velocity field, shape ``(num_particles,)`` int; the first for all if not given.
-        seam: 1 where fields of a subject grow together, shape ``(num_particles,)``; nowhere if not given.
+        seam: 1 where fields of a subject merge, shape ``(num_particles,)``; nowhere if not given.
         sensor: row of the contact sensor, -1 for none, shape ``(num_particles,)`` int; none if not given.
     """
 
@@ -159,7 +152,7 @@ class MaterialPoints:
         poisson_ratio: float = 0.3,
         material: str = "neo_hookean",
     ) -> MaterialPoints:
-        """One material for all particles; ``volume`` [m^3] has shape ``([1 or num_envs,] num_particles)``."""
+        """Return points of one material; ``volume`` [m^3] has shape ``([1 or num_envs,] num_particles)``."""
         volume = np.atleast_2d(np.asarray(volume, np.float32))
         one = np.ones((1, volume.shape[1]), np.float32)
         index = np.full(one.shape, material_index(material), np.int32)
@@ -176,18 +169,18 @@ class MaterialPoints:
         return self.volume.shape[1]
 
     def sound_speed(self) -> float:
-        """Fastest elastic wave ``sqrt((lam + 2 mu) / rho)`` [m/s]."""
+        """Return the speed of the fastest elastic wave, ``sqrt((lam + 2 mu) / rho)`` [m/s]."""
         mu, lam = lame_parameters(self.young_modulus, self.poisson_ratio)
         return float(np.sqrt((lam + 2.0 * mu) / self.density).max())
 
 
 def choose_num_substeps(control_dt: float, dx: float, sound_speed: float, cfl: float = 0.5) -> int:
-    """Fewest substeps a control step with ``sound_speed * dt <= cfl * dx``."""
+    """Return the fewest substeps a control step with ``sound_speed * dt <= cfl * dx``."""
     return max(1, math.ceil(control_dt * sound_speed / (cfl * dx) - 1.0e-9))
 
 
 def check_num_substeps(num_substeps: int, control_dt: float, dx: float, sound_speed: float) -> None:
-    """Refuse a time step that is known to be unstable.
+    """Check the stability of the time step.
 
     Raises:
         ValueError: there is no substep, or ``sound_speed * dt / dx`` exceeds the largest stable value.
@@ -204,10 +197,10 @@ def check_num_substeps(num_substeps: int, control_dt: float, dx: float, sound_sp
 
 
 def make_grid(lower: Sequence[float], upper: Sequence[float], dx: float) -> Grid:
-    """Grid whose particles may move freely in the box ``lower`` to ``upper`` [m].
+    """Return a grid in which particles may move freely in the box ``lower`` to ``upper`` [m].
 
     Raises:
-        ValueError: the box is empty, or has more nodes than 32-bit indices count with room to spare.
+        ValueError: the box is empty, or has more nodes than 32-bit indices address with a margin.
     """
     lower, upper = np.asarray(lower, float), np.asarray(upper, float)
     if not (np.all(np.isfinite([lower, upper])) and np.all(upper > lower) and dx > 0.0):
@@ -225,11 +218,11 @@ def make_grid(lower: Sequence[float], upper: Sequence[float], dx: float) -> Grid
 
 
 def check_points(points: MaterialPoints, num_envs: int, fields: Fields) -> None:
-    """Refuse matter without mass and arrays that fit no environment.
+    """Check volumes, densities, fields and the number of rows.
 
     Raises:
         ValueError: a volume or density is not positive, an array has neither one row nor one an environment, or a
-            particle is of a velocity field that there is not.
+            particle refers to a velocity field that does not exist.
     """
     if points.field is not None and not (points.field.min() >= 0 and points.field.max() < fields.num_fields):
         raise ValueError(f"field={points.field.max()} of a particle: there are {fields.num_fields} velocity fields")
@@ -261,18 +254,28 @@ def build_model(
     rest: np.ndarray | None = None,
     path: str | None = None,
 ) -> Model:
-    """Constants of a simulation on ``device``.
+    """Return the constants of a simulation on ``device``.
 
-    ``num_substeps`` is chosen from the CFL limit unless given; the limit comes from the points, or from
-    ``sound_speed`` [m/s] where parameters will be randomised. ``max_active_blocks`` bounds the blocks with matter of an
-    environment, each field's counted; if not given, no state can exceed it. ``rest``, shape ``(P, 3)``, is where
-    particles are when their body is at rest [m]; on a GPU, those of large bodies are added up by compact groups then.
-    ``scatter`` is a key of ``PATHS``; if not given, ``"shared"`` on a GPU whose shared memory holds an environment's
-    grid; ``"tiled"`` on another one that can match within a warp; else ``"plain"``.
+    Args:
+        points: matter.
+        grid: background grid.
+        control_dt: control step [s].
+        num_envs: environments.
+        device: Warp device.
+        gravity: [m/s^2].
+        colliders: analytic colliders.
+        fields: velocity fields; a single body if not given.
+        decoupling: a key of ``DECOUPLING``.
+        num_substeps: substeps of a control step; from the CFL limit if not given.
+        cfl: Courant number ``c dt / dx`` of that choice.
+        sound_speed: elastic wave speed to design for [m/s], where parameters will be randomised.
+        max_active_blocks: most active blocks of an environment, over all fields; enough for any state if not given.
+        rest: positions at rest [m], shape ``(P, 3)``, from which tiles of large bodies are made compact.
+        path: one of ``PATHS``; if not given, ``"block"`` on a GPU whose shared memory holds an environment's grid, else
+            ``"tiled"`` on a GPU of compute capability 7.0 or more, else ``"plain"``.
 
     Raises:
-        ValueError: bad material, unstable time step, a scatter that the device does not know, or more memory than it
-            has.
+        ValueError: bad material, unstable time step, a path that the device does not support, or too little memory.
     """
     if decoupling not in DECOUPLING:
         raise ValueError(f"unknown decoupling {decoupling!r}; use one of {', '.join(DECOUPLING)}")
@@ -311,14 +314,14 @@ def build_model(
 
 
 def choose_path(path: str | None, device: str, field: np.ndarray, max_active_blocks: int, decoupling: str) -> str:
-    """How particles of velocity fields ``field`` reach the nodes, on a device.
+    """Return the path of P2G and G2P for particles of velocity fields ``field`` on a device.
 
     Raises:
-        ValueError: there is no such way, or not on this device or for that size.
+        ValueError: the path does not exist, or not on this device or for that size.
     """
     target = wp.get_device(device)
     matches = target.is_cuda and target.arch >= 70
-    # in shared memory nobody asks for the gradient of the kinematic velocity
+    # the block path has no gradient of the kinematic velocity
     fits = decoupling != "paper" and suits_block_path(device, field, max_active_blocks)
     if path is None:
         return "block" if fits else "tiled" if matches else "plain"
@@ -328,9 +331,9 @@ def choose_path(path: str | None, device: str, field: np.ndarray, max_active_blo
         raise ValueError(f"path={path!r} needs a GPU of compute capability 7.0 or more; {target} takes 'plain'")
     if path == "block" and not fits:
         raise ValueError(
-            f"path='shared' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
-            f"particles a body (here {largest_partition(field)}), {MOST_LISTED} in all ({len(field)}), few active_blocks "
-            f"({max_active_blocks}) and another decoupling than 'paper' ({decoupling!r}); {target} takes "
+            f"path='block' needs a GPU with 227 KiB of shared memory a CUDA block, at most {MOST_PARTICLES} "
+            f"particles a body (here {largest_partition(field)}), {MOST_LISTED} in all ({len(field)}), few active "
+            f"blocks ({max_active_blocks}) and another decoupling than 'paper' ({decoupling!r}); {target} takes "
             f"{('tiled' if matches else 'plain')!r}"
         )
     return path
@@ -339,7 +342,7 @@ def choose_path(path: str | None, device: str, field: np.ndarray, max_active_blo
 def upload_points(
     points: MaterialPoints, mu: np.ndarray, lam: np.ndarray, rest: np.ndarray | None, dx: float, device: str
 ) -> Particles:
-    """Per-particle constants on the device; ``rest`` and ``dx`` as for :func:`plan_tiles`."""
+    """Upload per-particle constants; ``rest`` and ``dx`` as for :func:`piavatar_envs.mpm.cuda.tiled_p2g.plan_tiles`."""
     particles, count = Particles(), points.num_particles
 
     def upload(value, dtype):

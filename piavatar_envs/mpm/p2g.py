@@ -1,12 +1,10 @@
-"""Sums over the lines of nodes of a stencil, on a CPU four numbers at a time.
-
-Of products and sums of ``vec4`` in functions of their own, a compiler for a CPU makes operations on two numbers, and
-none that multiplies and adds; here it sees all of them together.
-
-Particle-to-grid (P2G) transfer; the way back is in :mod:`piavatar_envs.mpm.g2p`.
+"""Particle-to-grid transfer (P2G); the way back is in :mod:`piavatar_envs.mpm.g2p`.
 
 APIC (Jiang et al., "The Affine Particle-In-Cell Method", 2015) with the MLS form of the stress force (Hu et al., "A
-Moving Least Squares Material Point Method", 2018, eq. 16). The physical and the kinematic momentum share one pass.
+Moving Least Squares Material Point Method", 2018, eq. 16). Physical and kinematic momentum share one pass.
+
+The sums over a stencil are written as native code with vectors of four numbers: of operations in separate functions, a
+C++ compiler for a CPU makes neither four-wide vectors nor fused multiply-adds.
 """
 
 from __future__ import annotations
@@ -39,11 +37,34 @@ from piavatar_envs.mpm.types import (
 # Warp's own unrolling hides the loops over the stencil from the C++ compiler, which turns them into vector code
 wp.set_module_options({"enable_backward": False, "max_unroll": 0})
 
-#: Units of momentum that a particle may have: those of 4,000 full cells that move a grid spacing in a time step.
+#: Most momentum quanta of a particle: those of 4,000 full cells that move a grid spacing a time step.
 MAX_QUANTA = wp.constant(float(2**48))
+_NONFINITE = wp.constant(FAILURE_NONFINITE)
+_BLOCKS = wp.constant(FAILURE_BLOCKS)
+_CFL = wp.constant(FAILURE_CFL)
 
 
-# Places of a line's nodes as piavatar_envs.mpm.sparse_grid has them, of all nine lines, one after the other.
+@wp.struct
+class Lines:
+    """The nine lines of a stencil along z: indices of their nodes in an array, and weights."""
+
+    of: Stencil
+    slab0: wp.vec4i  # places of the three planes, see :func:`piavatar_envs.mpm.sparse_grid.slab_records`
+    slab1: wp.vec4i
+    slab2: wp.vec4i
+
+
+@wp.struct
+class Deposit:
+    """Contribution of a particle to its nodes; the momentum ``m u + affine (x_i - x_p)`` is linear over the stencil."""
+
+    base: wp.vec3i  # lowest node of the stencil
+    f: wp.vec3  # position from there, in grid spacings
+    at_base: vec8  # mass, physical and kinematic momentum, at the lowest node
+    A: wp.mat33  # change of physical momentum from node to node, along the columns
+
+
+# Iteration over the nine lines of a stencil, with indices as in piavatar_envs.mpm.sparse_grid.
 _LINES = """
 #if defined(__clang__) && !defined(__CUDA_ARCH__)
 #pragma clang fp contract(fast)
@@ -55,7 +76,7 @@ auto vector = [](float a, float b, float c, float d) { return four(a, b, c, d); 
 #endif
 const int bx = lines.of.base[0] & 3, by = lines.of.base[1] & 3, bz = lines.of.base[2] & 3;
 const wp::vec3 wx = lines.of.wx, wy = lines.of.wy, wz = lines.of.wz;
-// calls what is to be done with the places of the three nodes of line j of plane i
+// calls visit with the indices of the three nodes of line j of plane i
 auto with_line = [&](int i, int j, auto visit) {
     const wp::vec_t<4, wp::int32>& slab = i == 0 ? lines.slab0 : i == 1 ? lines.slab1 : lines.slab2;
     const bool upper = by + j > 3;
@@ -66,19 +87,9 @@ auto with_line = [&](int i, int j, auto visit) {
 """
 
 
-@wp.struct
-class Lines:
-    """The nine lines of a stencil: where their nodes are in an array, and what they weigh."""
-
-    of: Stencil
-    slab0: wp.vec4i  # places of the three planes, see :func:`piavatar_envs.mpm.sparse_grid.slab_records`
-    slab1: wp.vec4i
-    slab2: wp.vec4i
-
-
 @wp.func
 def lines_of(grid: Grid, blocks: Blocks, e: int, field: int, stencil: Stencil, of_block: int):
-    """Lines of a stencil in an array of ``of_block`` entries a block."""
+    """Return the lines of a stencil in an array of ``of_block`` entries a block."""
     base = stencil.base
     s = Lines()
     s.of = stencil
@@ -93,7 +104,7 @@ def lines_of(grid: Grid, blocks: Blocks, e: int, field: int, stencil: Stencil, o
     return s
 
 
-# Who adds to the vectors of an environment; on a CPU no two threads have particles of the same.
+# Atomic on a GPU; on a CPU no two threads have particles of the same environment.
 _ADDING = """
 auto adding_to = [](auto& vectors, int e) {
     four* const first = reinterpret_cast<four*>(&wp::index(vectors, e, 0));
@@ -148,7 +159,7 @@ def add_lines(
     A: wp.mat33,
     driven: bool,
 ):
-    """Add mass, momentum that is ``at_base`` and changes by ``A``, and if ``driven`` kinematic momentum to nodes."""
+    """Add mass, momentum (``at_base`` plus ``A`` a node) and, if ``driven``, kinematic momentum to the nodes."""
     ...
 
 
@@ -180,36 +191,21 @@ def add_offset_lines(
     seam: float,
     dx: float,
 ):
-    """Tell the nodes where a particle is; ``lines`` are of ``VECTORS``."""
+    """Add the offsets of a contact candidate to the nodes; ``lines`` are of :data:`VECTORS`."""
     ...
 
 
 @wp.func
 def flag_candidate_blocks(accumulators: Accumulators, e: int, lines: Lines):
-    """Note that nodes in the blocks of a stencil have been told something; ``lines`` are of ``VECTORS``."""
-    for n in range(4):  # what is less by 4 is the last of two along z, see slab_records
+    """Flag the active blocks of a stencil as holding offsets; ``lines`` are of :data:`VECTORS`."""
+    for n in range(4):  # the +4 undoes the shift of upper blocks along z, see slab_records
         accumulators.candidates[e, (lines.slab0[n] + 4) // BLOCK_NODES] = 1
         accumulators.candidates[e, (lines.slab2[n] + 4) // BLOCK_NODES] = 1
 
 
-_NONFINITE = wp.constant(FAILURE_NONFINITE)
-_BLOCKS = wp.constant(FAILURE_BLOCKS)
-_CFL = wp.constant(FAILURE_CFL)
-
-
-@wp.struct
-class Deposit:
-    """What a particle adds to the nodes around it; momentum ``m u + affine (x_i - x_p)`` is linear over the stencil."""
-
-    base: wp.vec3i  # lowest node of the stencil
-    f: wp.vec3  # position from there, in grid spacings
-    at_base: vec8  # mass, physical and kinematic momentum, at the lowest node
-    A: wp.mat33  # change of physical momentum from node to node, along the columns
-
-
 @wp.func
 def empty_deposit(grid: Grid, x: wp.vec3):
-    """A particle at ``x`` that scatters nothing."""
+    """Return the deposit of a massless particle at ``x``."""
     s = Deposit()
     stencil = stencil_at(grid_position(grid, x))
     s.base = stencil.base
@@ -219,19 +215,19 @@ def empty_deposit(grid: Grid, x: wp.vec3):
 
 @wp.func
 def impulse_of_stress(grid: Grid, step: Step, volume: float, tau: wp.mat33):
-    """What a particle's Kirchhoff stress takes from its affine momentum in a substep [kg/s]."""
+    """Return the change of affine momentum by a Kirchhoff stress over a substep [kg/s] (Hu et al. 2018, eq. 16)."""
     return (4.0 * step.dt * grid.inv_dx * grid.inv_dx * volume) * tau
 
 
 @wp.func
 def affine_momentum(grid: Grid, m: float, C: wp.mat33, stress: wp.mat33):
-    """Change of a particle's momentum from node to node, that of its affine velocity less the impulse of ``stress``."""
+    """Return the change of momentum from node to node: that of the affine velocity less the impulse of ``stress``."""
     return grid.dx * (m * C - stress)
 
 
 @wp.func
 def with_momentum(s: Deposit, m: float, u: wp.vec3, k: wp.vec3, A: wp.mat33):
-    """``s`` with mass, physical momentum, which changes by ``A`` from node to node, and kinematic momentum."""
+    """Return ``s`` with mass, physical momentum, which changes by ``A`` from node to node, and kinematic momentum."""
     s.A = A
     q = m * u - A * s.f
     s.at_base = vec8(m, q[0], q[1], q[2], k[0], k[1], k[2], 0.0)
@@ -240,7 +236,7 @@ def with_momentum(s: Deposit, m: float, u: wp.vec3, k: wp.vec3, A: wp.mat33):
 
 @wp.func
 def stress_impulse(grid: Grid, step: Step, particles: Particles, e: int, p: int, F: wp.mat33):
-    """:func:`impulse_of_stress` of particle ``p`` with deformation ``F``."""
+    """Return :func:`impulse_of_stress` of particle ``p`` with deformation gradient ``F``."""
     tau = kirchhoff_stress(
         particles.material[row(e, particles.material.shape[0]), p],
         F,
@@ -252,15 +248,14 @@ def stress_impulse(grid: Grid, step: Step, particles: Particles, e: int, p: int,
 
 @wp.func
 def deposit_of(grid: Grid, step: Step, particles: Particles, moving: Moving, e: int, p: int, candidate: bool):
-    """What particle ``p`` of environment ``e`` scatters.
+    """Return the deposit of particle ``p`` of environment ``e``.
 
-    Kinematic momentum is for contact, which acts on the total velocity; elsewhere it would be added and taken off
-    again. So only particles add it that ``tell`` the nodes how they are driven. (The paper's variant needs its gradient
-    everywhere.)
+    Contact acts on the total velocity; away from it, kinematic momentum would be added and subtracted again. So only
+    contact candidates carry it (all particles with the ``"paper"`` decoupling, which needs its gradient).
     """
     s = empty_deposit(grid, moving.x[e, p])
     m = particles.mass[row(e, particles.mass.shape[0]), p]
-    C = matrix_at(moving.C, e, p)  # first used after the stress: its parameters are asked for before this has come
+    C = matrix_at(moving.C, e, p)  # loaded before the stress, which hides its latency
     stress = wp.mat33()
     if step.decoupling != NO_STRESS:
         stress = stress_impulse(grid, step, particles, e, p, matrix_at(moving.F, e, p))
@@ -272,7 +267,7 @@ def deposit_of(grid: Grid, step: Step, particles: Particles, moving: Moving, e: 
 
 @wp.func
 def momentum_bounds(s: Deposit):
-    """Bounds of the components of physical momentum that a particle has anywhere in its stencil [kg m/s]."""
+    """Return bounds of the components of physical momentum anywhere in the stencil [kg m/s]."""
     bounds = wp.vec3()
     for c in range(3):
         reach = wp.abs(s.A[c, 0]) + wp.abs(s.A[c, 1]) + wp.abs(s.A[c, 2])
@@ -282,24 +277,48 @@ def momentum_bounds(s: Deposit):
 
 
 @wp.func
-def takes_part(blocks: Blocks, e: int, failure: wp.array(dtype=int)):
-    """Whether an environment goes on. Where slots have run out, some particles have none.
+def fault_of_sums(s: Deposit, quantum: float):
+    """Return why a particle must not be added to fixed-point sums: bits ``FAILURE_*`` for not finite, or too large."""
+    columns = s.A * wp.vec3(1.0, 1.0, 1.0)
+    momentum = wp.vec3(s.at_base[1], s.at_base[2], s.at_base[3])
+    kinematic = wp.vec3(s.at_base[4], s.at_base[5], s.at_base[6])
+    if not wp.isfinite(wp.dot(momentum + kinematic + columns, wp.vec3(1.0, 1.0, 1.0))):
+        return _NONFINITE
+    most = wp.max(wp.max(wp.abs(momentum)), wp.max(wp.abs(kinematic)))
+    for i in range(3):
+        for j in range(3):
+            most = wp.max(most, wp.abs(s.A[i, j]))
+    return wp.where(most > MAX_QUANTA * quantum, _CFL, 0)
 
-    No scatter sets that flag, but a gather beside it may, of another part of the world: some go on then who have not
-    seen it, and the grid pass forgets what they add.
+
+@wp.func
+def fault_within(s: Deposit, bounds: wp.vec3, quantum: float):
+    """Return :func:`fault_of_sums`, evaluated only if the ``bounds`` of the momentum do not rule a fault out."""
+    fault = int(0)
+    if not bounds[0] + bounds[1] + bounds[2] < MAX_QUANTA * quantum:  # of what is no number, either
+        fault = fault_of_sums(s, quantum)
+    return fault
+
+
+@wp.func
+def takes_part(blocks: Blocks, e: int, failure: wp.array(dtype=int)):
+    """Return whether an environment takes part: it is not frozen, and has enough active blocks.
+
+    G2P of another part of the world may exhaust the active blocks in a parallel branch; particles that have not seen it
+    go on, and the grid update discards what they add.
     """
     return (blocks.frozen[e] | (failure[e] & _BLOCKS)) == 0
 
 
 @wp.func
 def has_finite_velocity(moving: Moving, e: int, p: int):
-    """Whether a particle's velocities are finite."""
+    """Return whether the velocities of a particle are finite."""
     return wp.isfinite(wp.length_sq(moving.u[e, p]) + wp.length_sq(moving.vk[e, p]))
 
 
 @wp.func
 def admitted(takes: bool, moves: bool, e: int, failure: wp.array(dtype=int)):
-    """Whether a particle that ``takes`` part is added up; one that does not move finitely flags its environment."""
+    """Return whether a particle is added; flags the environment if it takes part but does not move finitely."""
     if takes and not moves:
         wp.atomic_or(failure, e, _NONFINITE)
     return takes and moves
@@ -307,20 +326,20 @@ def admitted(takes: bool, moves: bool, e: int, failure: wp.array(dtype=int)):
 
 @wp.func
 def deposits(blocks: Blocks, moving: Moving, e: int, p: int, failure: wp.array(dtype=int)):
-    """Whether a particle takes part; one that is not finite flags its environment and does not."""
-    moves = has_finite_velocity(moving, e, p)  # asked for before it is known who takes part
+    """Return whether a particle is added; flags its environment if its velocity is not finite."""
+    moves = has_finite_velocity(moving, e, p)  # loaded before takes_part is known, to hide its latency
     return admitted(takes_part(blocks, e, failure), moves, e, failure)
 
 
 @wp.func
 def near_boundary(grid: Grid, boundaries: Boundaries, e: int, x: wp.vec3):
-    """Whether a particle at ``x`` is so near a boundary that its nodes must know where it is."""
+    """Return whether a collider is near enough to a particle at ``x`` to make it a contact candidate."""
     return nearest_boundary(boundaries, e, x) < NEAR_PARTICLE * grid.dx
 
 
 @wp.func
 def is_near_field(grid: Grid, particles: Particles, contact: Contact, blocks: Blocks, e: int, p: int, base: wp.vec3i):
-    """Whether another field is in a block of a particle's stencil."""
+    """Return whether another field is active in a block of a particle's stencil."""
     return contact.num_fields > 1 and fields_around(grid, blocks, base, e) != (1 << particles.field[p])
 
 
@@ -336,7 +355,7 @@ def is_contact_candidate(
     x: wp.vec3,
     base: wp.vec3i,
 ):
-    """Whether nodes must know where this particle is and how it is driven: another field or a boundary is near."""
+    """Return whether another field or a collider is near a particle, so that it adds offsets and kinematic momentum."""
     if is_near_field(grid, particles, contact, blocks, e, p, base):
         return True
     return near_boundary(grid, boundaries, e, x)
@@ -355,10 +374,7 @@ def p2g(
     failure: wp.array(dtype=int),
     accumulators: Accumulators,
 ):
-    """Sum mass, physical momentum with the stress impulse, and kinematic momentum on the nodes of a field.
-
-    The plain scatter: a thread a particle, which adds to one node after the other.
-    """
+    """Add mass, physical momentum with the stress impulse, and kinematic momentum to the nodes, a thread a particle."""
     e, p = wp.tid()
     if not deposits(blocks, moving, e, p, failure):
         return
@@ -375,27 +391,3 @@ def p2g(
         lines = lines_of(grid, blocks, e, field, stencil, VECTORS)
         add_offset_lines(accumulators, e, lines, s.at_base[0], particles.seam[p], grid.dx)
         flag_candidate_blocks(accumulators, e, lines)
-
-
-@wp.func
-def fault_of_sums(s: Deposit, quantum: float):
-    """Why a particle must not be added up, bits ``FAILURE_*``: an integer would hide what is no number or too large."""
-    columns = s.A * wp.vec3(1.0, 1.0, 1.0)
-    momentum = wp.vec3(s.at_base[1], s.at_base[2], s.at_base[3])
-    kinematic = wp.vec3(s.at_base[4], s.at_base[5], s.at_base[6])
-    if not wp.isfinite(wp.dot(momentum + kinematic + columns, wp.vec3(1.0, 1.0, 1.0))):
-        return _NONFINITE
-    most = wp.max(wp.max(wp.abs(momentum)), wp.max(wp.abs(kinematic)))
-    for i in range(3):
-        for j in range(3):
-            most = wp.max(most, wp.abs(s.A[i, j]))
-    return wp.where(most > MAX_QUANTA * quantum, _CFL, 0)
-
-
-@wp.func
-def fault_within(s: Deposit, bounds: wp.vec3, quantum: float):
-    """:func:`fault_of_sums`, asked for only where the ``bounds`` of what a particle has leave that open."""
-    fault = int(0)
-    if not bounds[0] + bounds[1] + bounds[2] < MAX_QUANTA * quantum:  # of what is no number, either
-        fault = fault_of_sums(s, quantum)
-    return fault

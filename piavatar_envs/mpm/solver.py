@@ -6,7 +6,7 @@ nodes' total velocity.
 
 ``model.path`` names the path of P2G and G2P. ``"plain"`` runs on any device. ``"tiled"`` sums tiles of particles of
 large bodies in shared memory before they reach the grid. ``"block"`` keeps the grid of an environment in the shared
-memory of CUDA blocks, so that P2G, the grid update and, for a single velocity field, G2P are one launch.
+memory of CUDA blocks, so that P2G, the grid update and, with a single velocity field, G2P are one launch.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ def record_substep(graph: LaunchGraph, model: Model, state: State, scratch: Scra
 
 
 def record_activation(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
-    """Append: release all blocks, and activate those that particles touch.
+    """Append: deactivate all blocks, and activate those that particles touch.
 
-    Between activations G2P adds the blocks that particles reach. A block that stays active without need costs time.
+    Between activations G2P adds the blocks that particles enter. A block that stays active without need costs time.
     """
     blocks = scratch.blocks
     graph.launch(deactivate_blocks, (model.num_envs, model.max_active_blocks), [model.grid], [blocks])
@@ -81,7 +81,7 @@ def record_activation(graph: LaunchGraph, model: Model, state: State, scratch: S
 def record_p2g(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
     """Append P2G: particles add mass, physical and kinematic momentum to the nodes around them."""
     m, moving = model, _moving(state)
-    if m.path == "block":  # with the grid update, and G2P where there is one field
+    if m.path == "block":  # includes the grid update, and G2P if there is a single field
         record_in_block(graph, model, state, scratch, moving)
         return
     inputs = [m.grid, m.step, m.particles, m.boundaries, m.contact, moving, scratch.blocks]
@@ -93,16 +93,15 @@ def record_p2g(graph: LaunchGraph, model: Model, state: State, scratch: Scratch)
 
 
 def record_grid_update(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
-    """Append the grid update: momentum becomes velocity, gravity and contact act, sensors add up impulses.
+    """Append the grid update: momentum becomes velocity, gravity and contact act, sensors accumulate impulses.
 
-    Blocks with several velocity fields are few, and contact there mostly waits for memory: the update of all other
-    blocks runs in parallel.
+    Contact blocks are few, and contact is bound by memory latency: all other blocks are updated in parallel.
     """
     m = model
     contact, update = LaunchGraph(graph.device), LaunchGraph(graph.device)
     if m.contact.num_fields > 1:
         _record_contact(contact, model, state, scratch)
-    if m.path != "block":  # else done in shared memory, with P2G
+    if m.path != "block":  # else included in P2G
         active_blocks = blocks_at_once(m)
         update.launch(
             update_grid,
@@ -123,7 +122,7 @@ def record_grid_update(graph: LaunchGraph, model: Model, state: State, scratch: 
 
 
 def _record_contact(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
-    """Append contact in the blocks with several fields: first the normals, then the impulses."""
+    """Append contact in contact blocks: first the normals, then the impulses."""
     m, blocks, accumulators = model, scratch.blocks, scratch.accumulators
     sweep = plan_sweep(m)
     graph.launch(
@@ -146,7 +145,7 @@ def record_g2p(graph: LaunchGraph, model: Model, state: State, scratch: Scratch)
     """Append G2P: particles take velocity and its gradient from the nodes, move, and update ``F``."""
     m = model
     if m.path == "block" and m.contact.num_fields == 1:
-        return  # done in shared memory, with P2G
+        return  # included in P2G
     inputs = [m.grid, m.step, m.particles, m.boundaries, scratch.velocity]
     outputs = [scratch.blocks, _moving(state), state.failure]
     if m.path == "plain":
@@ -176,8 +175,8 @@ def record_begin(
         model: the constants.
         state: the particles.
         scratch: the grid.
-        branches: launches that may run in parallel: they use neither sensors nor blocks, move no particles, and do not
-            read which environments have failed, because activation sets that.
+        branches: parallel branches to add: they use neither sensors nor blocks, move no particles, and do not read
+            failures, which activation sets.
     """
     sensors, marks = LaunchGraph(graph.device), LaunchGraph(graph.device)
     sensors.launch(clear_sensors, model.num_envs, [], [scratch.sensors])
@@ -186,7 +185,7 @@ def record_begin(
 
 
 def record_first_activation(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:
-    """Append: activate the blocks of all particles, and freeze the environments that have failed.
+    """Append the activation of the blocks of all particles, and freeze the environments that have failed.
 
     Required at the start of a control step, because a reset may have moved the particles.
     """
@@ -204,7 +203,7 @@ def record_end(
         model: the constants.
         state: the particles.
         scratch: the grid.
-        branches: launches that may run in parallel: they use no sensors, move no particles, and set no failure.
+        branches: parallel branches to add: they use no sensors, move no particles, and set no failure.
     """
     m, impulses, depths = model, LaunchGraph(graph.device), LaunchGraph(graph.device)
     entries = scratch.sensors.accumulators.shape[1] // 3

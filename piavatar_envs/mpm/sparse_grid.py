@@ -1,23 +1,15 @@
-"""What a warp of a GPU finds out together about the blocks around its particles: neighbours would ask for the same.
+"""Sparse grid: active blocks of 4 x 4 x 4 nodes, activated where particles are.
 
-The sparse grid: blocks of 4 x 4 x 4 nodes get room for their nodes' records when matter comes to them.
+A block of the grid has a bit for every velocity field with particles near it, and an active block, which stores node
+records, for each of those. Memory and time depend on the bodies, not on the empty space around them. On a GPU the order
+of activation is not deterministic; only addresses depend on it.
 
-A block has a bit for every velocity field with matter in it, and a slot for each of those. Slots are given out as
-particles arrive and taken back when blocks are marked anew, so memory and time depend on the bodies, not on the empty
-space around them. In which order they are given out is not determined on a GPU; nothing but addresses depends on it.
-
-Where the nodes of a stencil have their records: as few look-ups as its blocks allow, and little arithmetic.
-
-At which nodes of a field another one has been: there its particles tell their nodes where they are.
-
-Contact acts at nodes to which all particles of both fields have told that. Which these are must be known before the
-particles are scattered, whatever the order in which they are: it is known of the substep before. A field tells a node
-if another one was there then, and only fields that have told a node touch there. That is a substep after the second has
-come to it, with little weight unless it moves nearly a grid spacing in a time step. When blocks are marked anew, their
-slots are others, and fields tell all nodes of blocks that have several: who comes then touches at once.
-
-For :mod:`piavatar_envs.mpm.cuda.tiled_p2g`, where a group takes much longer if one of its particles tells; other
-scatters tell all nodes of blocks with several fields in every substep.
+A block that is active for several fields is a contact block. Contact in a contact block acts at the nodes to which all
+nearby particles of both fields have added their offsets. On the tiled path these *contact nodes* are known from the
+previous substep: the grid update sets the bit of a field's node if another field had mass there, and particles near
+such a node are contact candidates in the next substep. Contact thus begins a substep after the second field has come
+to a node, where it has little weight unless it moves nearly a grid spacing a time step. After an activation the bits
+of all nodes in contact blocks are set. The other paths treat every particle near a contact block as a candidate.
 """
 
 from __future__ import annotations
@@ -48,13 +40,32 @@ from piavatar_envs.mpm.types import (
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
-#: Threads of a CUDA block: four slots.
+#: Threads of a CUDA block of the grid update and contact kernels.
 THREADS = 128
-
-#: The same for blocks that have several fields.
+#: Contact blocks for which a large GPU has threads at once.
 CONTACT_BLOCKS_AT_ONCE = 132 * 6
-
+#: Fewest contact blocks for which an environment gets threads.
 MIN_CONTACT_BLOCKS = 2
+_BLOCKS = wp.constant(FAILURE_BLOCKS)
+_NONFINITE = wp.constant(FAILURE_NONFINITE)
+_OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
+#: ``Blocks.owner`` of an active block that is not in use.
+UNASSIGNED = wp.constant(-1)
+#: Entries of an active block in an array of one vector a node (``VECTORS``), and of halves of records (``HALVES``).
+VECTORS, HALVES = wp.constant(int(BLOCK_NODES)), wp.constant(2 * int(BLOCK_NODES))
+
+
+@wp.struct
+class Sweep:
+    """Distribution of an environment's nodes in contact blocks over threads; no threads if there is a single field.
+
+    Thread ``t`` visits the nodes from ``t * nodes + visit * stride`` on, ``nodes`` of them.
+    """
+
+    threads: int  # of an environment
+    visits: int  # most visits of a thread
+    nodes: int  # nodes of a visit
+    stride: int  # nodes from one visit to the next
 
 
 @wp.func_native("""
@@ -97,26 +108,17 @@ return wp::vec2i(-2, -2);
 #endif
 """)
 def share_of_blocks(grid: Grid, e: int, field: int, base: wp.vec3i, takes: bool) -> wp.vec2i:
-    """Blocks that a thread sees to of those that the stencils of the warp touch, each block once; -1 for none.
+    """Distribute the blocks that the stencils of a warp overlap over its threads, each block once; -1 for none.
 
-    ``base`` is the lowest node of the thread's own stencil, if it ``takes`` part. -2 if every thread has to see to its
-    own: their blocks are too many, or not all threads of a warp have come with the same environment and field.
+    ``base`` is the lowest node of the thread's own stencil, ignored unless it ``takes`` part. Returns -2 if every
+    thread must handle its own blocks: they are too many, or the threads differ in environment or field.
     """
     ...
 
 
-_BLOCKS = wp.constant(FAILURE_BLOCKS)
-_NONFINITE = wp.constant(FAILURE_NONFINITE)
-_OUT_OF_GRID = wp.constant(FAILURE_OUT_OF_GRID)
-
-
-#: What ``owner`` says of a slot that nobody has got yet.
-UNASSIGNED = wp.constant(-1)
-
-
 @wp.func
 def has_field(mask: int, f: int):
-    """Whether bit ``f`` of a block's mask is set."""
+    """Return whether bit ``f`` of a block's mask is set."""
     return ((mask >> f) & 1) != 0
 
 
@@ -128,7 +130,7 @@ return mask != 0 ? __builtin_ctz(mask) : num_fields;
 #endif
 """)
 def lowest_field(mask: int, num_fields: int) -> int:
-    """First field of a mask; ``num_fields`` if it is empty."""
+    """Return the first field of a mask, ``num_fields`` if it is empty."""
     ...
 
 
@@ -140,13 +142,13 @@ return mask != 0 ? 32 - __builtin_clz(mask) : 0;
 #endif
 """)
 def end_of_fields(mask: int) -> int:
-    """One more than the last field of a mask; 0 if it is empty."""
+    """Return one more than the last field of a mask, 0 if it is empty."""
     ...
 
 
 @wp.func
 def lowest_other(mask: int, f: int, num_fields: int):
-    """First field of a mask that is not ``f``."""
+    """Return the first field of a mask that is not ``f``."""
     other = lowest_field(mask, num_fields)
     if other == f:
         other = f + 1
@@ -157,23 +159,23 @@ def lowest_other(mask: int, f: int, num_fields: int):
 
 @wp.func
 def fields_around(grid: Grid, blocks: Blocks, base: wp.vec3i, e: int):
-    """Fields that have matter in any block of a stencil."""
+    """Return the mask of fields that are active in any block of a stencil."""
     mask = int(0)
-    for i in range(2):  # a block may come twice: so all are asked for before the first has answered
+    for i in range(2):  # loads of repeated blocks, instead of branches, keep all eight loads in flight
         for j in range(2):
             for k in range(2):
                 mask = mask | blocks.fields[e, block_index(grid, base[0] + 2 * i, base[1] + 2 * j, base[2] + 2 * k)]
     return mask
 
 
-# A GPU finds out anew: to write it down and read it takes as long
+# Recomputing is as fast as a load on a GPU
 @wp.func_native(f"""
 #if !defined(__CUDA_ARCH__)
 wp::index(blocks.candidate, e, p) = candidate ? {int(CANDIDATE)} | (near_field ? {int(NEAR_FIELD)} : 0) : 0;
 #endif
 """)
 def store_candidate(blocks: Blocks, e: int, p: int, candidate: bool, near_field: bool):
-    """Note whether particle ``p`` tells its nodes where it is, and whether that is because another field is beside."""
+    """Store whether particle ``p`` is a contact candidate, and whether because of another field; on a CPU only."""
     ...
 
 
@@ -185,13 +187,13 @@ return {int(CANDIDATE) | int(NEAR_FIELD)};
 #endif
 """)
 def candidate_bits(blocks: Blocks, e: int, p: int) -> int:
-    """Bits ``CANDIDATE`` and ``NEAR_FIELD`` of particle ``p``; what may be, where nobody notes what is."""
+    """Return the bits ``CANDIDATE`` and ``NEAR_FIELD`` of particle ``p``; both on a GPU, where they are not stored."""
     ...
 
 
 @wp.func
 def fields_beyond(grid: Grid, blocks: Blocks, corner: wp.vec3i, e: int):
-    """Fields with matter in any block that a stencil may lie in whose lowest node is in the block at ``corner``."""
+    """Return the mask of fields active in any block that a stencil based in the block at ``corner`` may overlap."""
     mask = int(0)
     for n in range(8):
         x = wp.min(corner[0] + 4 * (n >> 2), 4 * (grid.blocks[0] - 1))
@@ -203,10 +205,9 @@ def fields_beyond(grid: Grid, blocks: Blocks, corner: wp.vec3i, e: int):
 
 @wp.func
 def fields_next(grid: Grid, blocks: Blocks, block: int, e: int, n: int):
-    """Fields with matter in the ``n``-th of the eight blocks that a stencil may lie in which begins in a ``block``.
+    """Return the mask of fields active in the ``n``-th of eight blocks that a stencil based in ``block`` may overlap.
 
-    Where the grid ends, in another block instead: no stencil begins there, and to look for neither row nor column takes
-    no division.
+    At the upper ends of the grid it is that of another block, which is harmless: no stencil is based there.
     """
     beyond = block + ((n >> 2) * grid.blocks[1] + ((n >> 1) & 1)) * grid.blocks[2] + (n & 1)
     return blocks.fields[e, wp.min(beyond, grid.num_blocks - 1)]
@@ -214,31 +215,31 @@ def fields_next(grid: Grid, blocks: Blocks, block: int, e: int, n: int):
 
 @wp.func
 def first_record(grid: Grid, blocks: Blocks, e: int, f: int, block: int):
-    """Record of the first node of a block that holds matter of field ``f``."""
+    """Return the record of the first node of a block, which must be active for field ``f``."""
     return BLOCK_NODES * blocks.active[e, f * grid.num_blocks + block]
 
 
 @wp.func
 def record_of(grid: Grid, blocks: Blocks, e: int, f: int, i: int, j: int, k: int):
-    """Record of node ``(i, j, k)``, whose block must hold matter of field ``f``."""
+    """Return the record of node ``(i, j, k)``, whose block must be active for field ``f``."""
     return first_record(grid, blocks, e, f, block_index(grid, i, j, k)) + node_in_block(i, j, k)
 
 
 @wp.func
 def num_active(blocks: Blocks, e: int):
-    """Slots of environment ``e`` that mean something, though more may have been asked for."""
+    """Return the number of active blocks of environment ``e``."""
     return wp.min(blocks.num_active[e], blocks.owner.shape[1])
 
 
 @wp.func
 def field_and_block(grid: Grid, owner: int):
-    """Field and block that a slot belongs to, from what ``owner`` says of it."""
+    """Return field and block of an active block from its ``owner``."""
     return wp.vec2i(owner // grid.num_blocks, owner % grid.num_blocks)
 
 
 @wp.func
 def list_contact_block(blocks: Blocks, e: int, block: int, before: int):
-    """Note that a block which had the fields ``before`` gets another one, if that is its second."""
+    """List a block as a contact block if its fields ``before`` this activation were exactly one."""
     if before != 0 and (before & (before - 1)) == 0:
         n = wp.atomic_add(blocks.num_contact_blocks, e, 1)
         if n < blocks.contact_blocks.shape[1]:
@@ -247,25 +248,25 @@ def list_contact_block(blocks: Blocks, e: int, block: int, before: int):
 
 @wp.func
 def num_contact_nodes(blocks: Blocks, e: int):
-    """Nodes of the blocks of environment ``e`` that have several fields."""
+    """Return the number of nodes in the contact blocks of environment ``e``."""
     return BLOCK_NODES * wp.min(blocks.num_contact_blocks[e], blocks.contact_blocks.shape[1])
 
 
 @wp.func
 def exceeds_active_blocks(failure: wp.array(dtype=int), e: int):
-    """Whether slots have run out: some particles have none. No scatter and no grid pass sets that flag."""
+    """Return whether an environment lacks active blocks; neither P2G nor the grid update sets that flag."""
     return (failure[e] & _BLOCKS) != 0
 
 
 @wp.func
 def contact_block_of(blocks: Blocks, e: int, n: int):
-    """Block with the ``n``-th of :func:`num_contact_nodes`, nonsense beyond: who asks need not know their number yet."""
+    """Return the contact block of node ``n`` of :func:`num_contact_nodes`; safe, but meaningless, beyond them."""
     return blocks.contact_blocks[e, wp.min(n // BLOCK_NODES, blocks.contact_blocks.shape[1] - 1)]
 
 
 @wp.func
 def activate_block(grid: Grid, blocks: Blocks, block: int, field: int, e: int, failure: wp.array(dtype=int)):
-    """See that a field has a slot in a block; too few slots flag the environment."""
+    """Activate a block for a field; flags the environment if there are too few active blocks."""
     bit = 1 << field
     if (blocks.fields[e, block] & bit) != 0:
         return
@@ -284,7 +285,7 @@ def activate_block(grid: Grid, blocks: Blocks, block: int, field: int, e: int, f
 
 @wp.func
 def activate_stencil(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: int, failure: wp.array(dtype=int)):
-    """:func:`activate_block` of all blocks that a stencil touches."""
+    """Activate all blocks that a stencil overlaps."""
     touched = blocks_touched(base)
     for i in range(touched[0]):
         for j in range(touched[1]):
@@ -295,7 +296,7 @@ def activate_stencil(grid: Grid, blocks: Blocks, base: wp.vec3i, field: int, e: 
 
 @wp.kernel
 def deactivate_blocks(grid: Grid, blocks: Blocks):
-    """No block holds matter; the slots are taken back by :func:`reset_active_blocks`."""
+    """Deactivate all blocks; :func:`reset_active_blocks` resets their number."""
     e, active = wp.tid()
     if active < num_active(blocks, e):
         blocks.fields[e, blocks.owner[e, active] % grid.num_blocks] = 0
@@ -304,7 +305,7 @@ def deactivate_blocks(grid: Grid, blocks: Blocks):
 
 @wp.kernel
 def reset_active_blocks(failure: wp.array(dtype=int), blocks: Blocks):
-    """No slot is in use."""
+    """Reset the numbers of active blocks and contact blocks."""
     e = wp.tid()
     blocks.num_active[e] = 0
     blocks.num_contact_blocks[e] = 0
@@ -313,10 +314,10 @@ def reset_active_blocks(failure: wp.array(dtype=int), blocks: Blocks):
 
 @wp.kernel
 def freeze(failure: wp.array(dtype=int), blocks: Blocks):
-    """From now on environments that have failed take no part.
+    """Freeze the environments that have failed.
 
-    Threads of one launch must not stop at what others of it have found, or what a failed environment is left with would
-    depend on their order.
+    Threads must not stop at failures that others of the same launch have found, or the state that a failed environment
+    keeps would depend on their order.
     """
     e = wp.tid()
     blocks.frozen[e] = failure[e]
@@ -331,9 +332,9 @@ def activate_particle_blocks(
     blocks: Blocks,
     failure: wp.array(dtype=int),
 ):
-    """Mark the blocks of all particles, wherever they have been put; one outside the grid flags its environment.
+    """Activate the blocks of all particles; a particle outside the grid flags its environment.
 
-    A warp marks each block once, where it can: the first to come all find it without a mark.
+    The threads of a warp activate each block once where possible: neighbouring particles share blocks.
     """
     e, p = wp.tid()
     field = particles.field[p]
@@ -357,28 +358,24 @@ def activate_particle_blocks(
             activate_block(grid, blocks, mine[n], field, e, failure)
 
 
-#: What a block has in an array of a vector a node, and in one of halves of records.
-VECTORS, HALVES = wp.constant(int(BLOCK_NODES)), wp.constant(2 * int(BLOCK_NODES))
-
-
 @wp.func_native("return (wp::uint64)&wp::index(blocks.active, e, n);")
 def active_address(blocks: Blocks, e: int, n: int) -> wp.uint64:
-    """Address of ``blocks.active[e, n]``, for :func:`active_from`."""
+    """Return the address of ``blocks.active[e, n]``, for :func:`active_from`."""
     ...
 
 
 @wp.func_native("return reinterpret_cast<const int*>(address)[n];")
 def active_from(address: wp.uint64, n: int) -> int:
-    """The ``n``-th slot from an address: neighbours are found without looking for the row again."""
+    """Return the ``n``-th entry from an address, so that neighbours need no second row lookup."""
     ...
 
 
 @wp.func
 def slab_records(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i, i: int, of_block: int):
-    """Where the blocks of the nodes ``base + (i, ...)`` of a stencil begin in an array, for :func:`line_of_records`.
+    """Return where the blocks of the nodes ``base + (i, ...)`` begin in an array, for :func:`line_of_records`.
 
-    The slab lies in two blocks along y and two along z; where it does not, the second repeats the first. What is found
-    holds for all slabs of a stencil in the same blocks. A block has ``of_block`` entries, ``VECTORS`` or ``HALVES``.
+    The slab overlaps at most two blocks along y and two along z; if fewer, entries repeat. The result holds for all
+    slabs of the stencil in the same blocks. A block has ``of_block`` entries, :data:`VECTORS` or :data:`HALVES`.
     """
     block = block_index(grid, base[0] + i, base[1], base[2])
     active_blocks = active_address(blocks, e, f * grid.num_blocks + block)
@@ -399,7 +396,7 @@ def slab_records(grid: Grid, blocks: Blocks, e: int, f: int, base: wp.vec3i, i: 
 
 @wp.func
 def ends_of_line(slab: wp.vec4i, base: wp.vec3i, i: int, j: int):
-    """Places of the nodes ``base + (i, j, 0)`` and, less 2, ``base + (i, j, 2)``; see :func:`slab_records`."""
+    """Return the indices of node ``base + (i, j, 0)`` and, less 2, ``base + (i, j, 2)``; see :func:`slab_records`."""
     y = (base[1] & 3) + j
     in_block = 16 * ((base[0] + i) & 3) + 4 * (y & 3) + (base[2] & 3)
     return wp.vec2i(wp.where(y > 3, slab[2], slab[0]) + in_block, wp.where(y > 3, slab[3], slab[1]) + in_block)
@@ -407,19 +404,19 @@ def ends_of_line(slab: wp.vec4i, base: wp.vec3i, i: int, j: int):
 
 @wp.func
 def line_of_records(slab: wp.vec4i, base: wp.vec3i, i: int, j: int):
-    """Places of the nodes ``base + (i, j, 0..2)`` of a stencil, ``slab`` those of the blocks of ``i``."""
+    """Return the indices of the nodes ``base + (i, j, 0..2)`` of a stencil, from the ``slab`` of ``i``."""
     ends = ends_of_line(slab, base, i, j)
     return wp.vec3i(ends[0], wp.where((base[2] & 3) == 3, ends[1], ends[0]) + 1, ends[1] + 2)
 
 
 def tracks_contact_nodes(model: Model) -> bool:
-    """Whether that is noted, and not told everywhere."""
+    """Return whether contact nodes are tracked from one substep to the next."""
     return model.path == "tiled" and model.contact.num_fields > 1
 
 
 @wp.func
 def initial_contact_nodes(blocks: Blocks, e: int, active: int):
-    """Bits of a slot's nodes that are told where particles are when blocks have just been marked: all or none."""
+    """Return the bits of the nodes of an active block after an activation: all in a contact block, else none."""
     candidates = int(0)
     if active < num_active(blocks, e):
         mask = blocks.fields[e, blocks.owner[e, active] % blocks.fields.shape[1]]
@@ -430,7 +427,7 @@ def initial_contact_nodes(blocks: Blocks, e: int, active: int):
 
 @wp.kernel
 def reset_contact_nodes(blocks: Blocks):
-    """Blocks have been marked."""
+    """Reset the contact nodes after an activation of blocks."""
     e, active = wp.tid()
     candidates = initial_contact_nodes(blocks, e, active)
     blocks.contact_nodes[e, 2 * active] = candidates
@@ -439,13 +436,13 @@ def reset_contact_nodes(blocks: Blocks):
 
 @wp.func
 def has_node_bit(words: wp.array2d(dtype=int), e: int, first: int, local: int):
-    """Whether a node of a block has its bit, of the two words from ``first`` on."""
+    """Return the bit of node ``local`` in the two words from ``first`` on."""
     return ((words[e, first + local // 32] >> (local & 31)) & 1) != 0
 
 
 @wp.func
 def store_node_bits(words: wp.array2d(dtype=int), e: int, first: int, local: int, here: bool):
-    """Give a node of a block its bit, or take it away; all threads of a warp, with half a block, come here."""
+    """Store the bit of a node of a block; all threads of a warp, which has half a block, must call this."""
     bits = lanes_with(here)
     if lane_of_thread() == 0:
         words[e, first + local // 32] = bits
@@ -453,19 +450,13 @@ def store_node_bits(words: wp.array2d(dtype=int), e: int, first: int, local: int
 
 @wp.func
 def had_contact(contact_nodes: wp.array2d(dtype=int), e: int, r: int):
-    """Whether the node of a field's record ``r`` had another field in the substep whose bits these are.
-
-    In the next, all particles of its own field have told it where they are.
-    """
+    """Return whether another field had mass at the node of record ``r`` in the previous substep."""
     return has_node_bit(contact_nodes, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES)
 
 
 @wp.func
 def has_all_candidates(blocks: Blocks, e: int, r: int):
-    """Whether all particles have told the node of a field's record ``r``, in a block that has several, where they are.
-
-    They have where nobody notes who is where.
-    """
+    """Return whether all particles near the node of record ``r`` of a contact block have added offsets to it."""
     if blocks.contact_nodes.shape[1] == 1:
         return True
     return had_contact(blocks.contact_nodes, e, r)
@@ -473,29 +464,19 @@ def has_all_candidates(blocks: Blocks, e: int, r: int):
 
 @wp.func
 def store_contact_node(blocks: Blocks, e: int, r: int, here: bool):
-    """Note whether others are ``here``, at the node of record ``r``; all threads of a warp, with half a block, do."""
+    """Store whether another field is ``here`` at the node of record ``r``; all threads of a warp must call this."""
     if blocks.contact_nodes.shape[1] == 1:
         return
     store_node_bits(blocks.contact_nodes, e, 2 * (r // BLOCK_NODES), r % BLOCK_NODES, here)
 
 
-@wp.struct
-class Sweep:
-    """Who takes which nodes of blocks that have several fields; nobody where there are none."""
-
-    threads: int  # of an environment
-    turns: int  # that a thread may have
-    share: int  # nodes of a thread in a turn
-    stride: int  # nodes from one turn to the next
-
-
 def max_contact_blocks(model: Model) -> int:
-    """Most blocks of an environment that can have several fields, and so several slots; 1 where there is but one."""
+    """Return the most contact blocks of an environment, at least 1."""
     return max(1, model.max_active_blocks // 2) if model.contact.num_fields > 1 else 1
 
 
 def plan_sweep(model: Model) -> Sweep:
-    """How the threads of each environment walk over its blocks that have several fields."""
+    """Return the distribution of contact blocks over threads."""
     nodes, blocks = int(BLOCK_NODES), 1
     sweep = Sweep()
     if model.contact.num_fields == 1:

@@ -43,7 +43,7 @@ def meet(simulate) -> Callable[..., Matter]:
         bodies: Sequence[dict],
         friction: np.ndarray | float = 0.0,
         gate: float = CONTACT_GATE,
-        normals: str = "block",
+        normals: str = "shared",
         spacing: float = 0.025,
         stiffness: float = 100.0,
         domain: Sequence[Sequence[float]] = ((-1.0, -0.8, -0.8), (1.0, 0.8, 0.8)),

@@ -30,7 +30,7 @@ def test_impulses_are_the_changes_of_momentum(meet, normals):
         assert np.abs(parts[0, 1] - change[0]).max() < 1e-5 * scale
         assert np.abs(parts[1, 0] - change[1]).max() < 1e-5 * scale
         assert not parts[0, 0].any() and not parts[1, 1].any()
-        if normals == "block":
+        if normals == "shared":
             pairs = sensors.pair_impulse.numpy()[0].reshape(2, 2, 3)
             assert np.abs(pairs[0, 1] - change[0]).max() < 1e-5 * scale
             assert not pairs[1, 0].any()  # only a < b is kept

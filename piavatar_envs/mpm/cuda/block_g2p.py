@@ -1,7 +1,4 @@
-"""The grid pass of a body whose nodes are in the shared memory of its CUDA block.
-
-The gather of a body from the velocities in the shared memory of its CUDA block.
-"""
+"""Grid update and G2P of a body whose nodes are in the shared memory of its CUDA block."""
 
 from __future__ import annotations
 
@@ -76,9 +73,9 @@ def updated_node(
     quantum: float,
     speed: float,
 ):
-    """Velocity of node ``n`` of a round, from its sums; the units are those of one field, if it is the only.
+    """Return the velocities of node ``n`` of a round; ``quantum`` and ``speed`` are those of a single field.
 
-    See :func:`piavatar_envs.mpm.grid_update.update_grid`. In a block with several fields they stay sums.
+    See :func:`piavatar_envs.mpm.grid_update.update_grid`. In contact blocks it returns the sums themselves.
     """
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
     several = contact.num_fields > 1
@@ -89,7 +86,7 @@ def updated_node(
     f = int(0)
     m = float(quantum)
     q = quantum * speed
-    if near or several:  # others need not wait to know
+    if near or several:  # the others skip the load
         owner = blocks.owner[e, place // BLOCK_SUBBLOCKS]
         block = block_of(grid, contact, owner)
         if several:
@@ -128,7 +125,10 @@ def update_subblocks(
     first: int,
     writes: bool,
 ):
-    """Sums of a round's nodes to velocities; where it ``writes``, outside. All threads come here."""
+    """Convert the sums of a round's nodes to velocities, in place, or to global memory if it ``writes``.
+
+    All threads must call this.
+    """
     quantum = mass_quantum_of(0)
     speed = float_word(SPEED)
     count = 8 * subblocks_of_round(arena, first)
@@ -153,7 +153,7 @@ def clear_untouched(
     e: int,
     partition: wp.vec3i,
 ):
-    """Records of nodes that no particle touches, in slots that the fields use; nothing has touched anything yet."""
+    """Zero the records of untouched nodes in active blocks of a partition's fields, and ``touched`` flags."""
     for r in range(thread_of_block(), BLOCK_NODES * num_active(blocks, e), threads_of_block()):
         active = r // BLOCK_NODES
         if has_field(partition[2], blocks.owner[e, active] // grid.num_blocks):
@@ -165,11 +165,11 @@ def clear_untouched(
 
 @wp.func
 def kinematic_from_subblocks(arena: Arena, subblocks: vec8i, stencil: Stencil):
-    """Kinematic velocity of a stencil's nodes, in components 1 to 3; few particles ask for it."""
+    """Return the kinematic velocity of a stencil in components 1 to 3; compact code, because few particles need it."""
     base = stencil.base
     wz = stencil.wz
     mean = wp.vec4()
-    lines = int(9)  # not a constant: it is as short as can be
+    lines = int(9)  # a variable, to keep the loop
     for n in range(lines):
         at = line_in_subblocks(subblocks, base, n // 3, n % 3)
         w = stencil.wx[n // 3] * stencil.wy[n % 3]
@@ -181,13 +181,13 @@ def kinematic_from_subblocks(arena: Arena, subblocks: vec8i, stencil: Stencil):
 
 @wp.func
 def physical_from_subblocks(subblocks: vec8i, stencil: Stencil):
-    """Sums over a stencil, see :func:`piavatar_envs.mpm.g2p.sum_physical`."""
+    """Return the sums over a stencil of :func:`piavatar_envs.mpm.g2p.sum_physical`."""
     base = stencil.base
     wx = stencil.wx
     wy = stencil.wy
     wz = stencil.wz
     g = Gradients()
-    planes = int(3)  # not a constant: too few registers for the loads of all three at once
+    planes = int(3)  # a variable, to keep the loop: unrolled, its loads need too many registers
     for i in range(planes):
         wi = wp.where(i == 0, wx[0], wp.where(i == 1, wx[1], wx[2]))
         plane = wp.vec4()
@@ -221,13 +221,13 @@ def g2p_from_subblocks(
     e: int,
     p: int,
 ):
-    """Particle ``p`` from the nodes, see :func:`piavatar_envs.mpm.g2p.g2p_particle`."""
+    """Return particle ``p`` after the substep; see :func:`piavatar_envs.mpm.g2p.g2p_particle`."""
     x = moved.x[e, p]
     stencil = stencil_at(grid_position(grid, x))
     subblocks = subblocks_around(grid, blocks, arena, e, particles.field[p], stencil.base, 0)
     kinematic = Gradients()
     needed = bool(False)
-    if has_bit(arena.candidates, p):  # who is that near a boundary tells its place
+    if has_bit(arena.candidates, p):  # only a candidate can be that near a collider
         needed = needs_kinematic(grid, step, nearest_boundary(boundaries, e, x))
     if needed:
         kinematic.mean = kinematic_from_subblocks(arena, subblocks, stencil)
@@ -252,7 +252,7 @@ def g2p_all(
     fails: bool,
     outside: bool,
 ):
-    """Move all particles, unless the environment ``fails``; velocities are in the room or ``outside``."""
+    """Move all particles unless the environment ``fails``; velocities are in shared memory or ``outside`` of it."""
     t = thread_of_block()
     count = moved.x.shape[1]
     if outside:

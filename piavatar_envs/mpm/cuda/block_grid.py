@@ -1,27 +1,22 @@
-"""Which worlds have their grids in shared memory, in what parts, and what lies where there.
+"""Block per environment: which worlds it suits, its partitions, and the layout of the grid in shared memory.
 
-The bodies of an environment have CUDA blocks of their own where they share no velocity field: until contact they have
-nothing to do with each other.
+Bodies that share no velocity field have nothing to do with each other until contact. The particles of an environment
+are split into such partitions, and each has its own CUDA block.
 
-The grid of a small body in the shared memory of one CUDA block: where its nodes lie there, and how to get at them.
+A small body touches two thousand nodes. They fit into the shared memory of a CUDA block, where an integer is added a
+hundred times as fast as in global memory. There they lie in subblocks of 2 x 2 x 2 nodes, numbered anew in every
+substep as particles touch them; more subblocks than fit are processed in several rounds.
 
-A small body touches two thousand nodes. They fit into the memory that a multiprocessor shares among the threads of a
-CUDA block, where an integer is added a hundred times as fast as in the GPU's own. There they lie in subblocks of 2 x 2 x 2
-nodes, numbered anew in every substep as the particles touch them; what touches more than fit goes in several rounds.
+The accumulators have 32 bits. Masses count quanta of 2^-27 of a field's heaviest particle, so a node may hold 16 of
+them; if one overflows, the environment repeats the sums with quanta eight times as large. Momenta count the mass
+quantum times a speed that no particle of the field exceeds, a power of two chosen in every substep. So the integers are
+used to the full, and contributions are rounded much as floating-point numbers would be.
 
-An integer has 32 bits. Of mass they count units of 2^-27 of a field's heaviest particle, so a node may hold 16 of them;
-where one gets more, the environment counts anew, eight units as one. Of momentum they count such units at a speed that
-none of the field's particles exceeds, a power of two, in every substep another: so the integers are used to the full,
-and what a particle adds is rounded as a floating-point number would be.
-
-Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; for every subblock of every slot a half word, its
-number; a bit for every particle; a byte for every slot; the subblocks' own places; subblocks of four words a node; three more
-of every node, in the same order. A subblock has a word in each of the 32 banks, and its place in the subblock says in which:
-threads that add to different nodes of the eight, or to different words of the four, do not wait for each other.
-
-Which subblocks of nodes a body touches, and which of its particles tell their places.
-
-What the words of nodes in shared memory count: units of mass, and speeds that momenta are counted at.
+Arena, in words of 4 bytes: header; a half word for every subblock of every active block, its number; a bit for every
+particle; a byte for every active block; the subblocks' places; subblocks of four words a node; three more words a node,
+in the same order. A subblock has a word in each of the 32 banks, and the position within the subblock selects the bank:
+threads that add to different nodes of the eight, or different words of the four, do not conflict. Nothing here runs on
+a CPU.
 """
 
 from __future__ import annotations
@@ -55,27 +50,56 @@ from piavatar_envs.mpm.types import Arena, Blocks, Boundaries, Contact, Grid, Mo
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
-
-#: Words of a room of which two fit into a multiprocessor, and of one that takes it all; with what stores take of it.
+#: Words of an arena of which two fit into a multiprocessor, and of one that fills it, with the staging memory of
+#: stores.
 SMALL_ARENA, LARGE_ARENA = 27_008, 54_272
-#: Threads of their CUDA blocks.
+#: Threads of the CUDA blocks of either arena.
 SMALL_THREADS, LARGE_THREADS = 320, 640
-#: Slots of a part up to which the small one does: they are more than will be used, and half of their nodes.
+#: Active blocks of a partition up to which the small arena suffices: more than it will use, and half of their nodes.
 SMALL_ACTIVE_BLOCKS = 210
-#: Particles of a part up to which its CUDA block has no more to do than others have time for.
+#: Most particles of a partition: its CUDA block must not take longer than those of other bodies.
 MOST_PARTICLES = 8192
-#: Particles of an environment, which are listed in half words.
+#: Most particles of an environment, whose indices are half words.
 MOST_LISTED = 2**16
+#: Words of a node: mass and physical momentum, later physical velocity and padding, for loads of 16 bytes.
+NODE_WORDS = wp.constant(4)
+#: Further words of a node: kinematic momentum, later kinematic velocity.
+KINEMATIC_WORDS = wp.constant(3)
+#: Words of a subblock of 2 x 2 x 2 nodes, as many as there are banks, and its further words.
+SUBBLOCK_WORDS, KINEMATIC_SUBBLOCK_WORDS = wp.constant(8 * NODE_WORDS), wp.constant(8 * KINEMATIC_WORDS)
+#: Subblocks of a block.
+BLOCK_SUBBLOCKS = wp.constant(8)
+#: Words of the header: subblocks in use; bits FAILURE_*; contact candidates; mass lost [LOST_QUANTA]; quanta in a
+#: field's heaviest particle; listed candidates; and for each of at most 32 fields the mass of its heaviest particle
+#: [kg], the speed of its fastest, and the speed that scales its momentum quantum [m/s].
+HEADER = wp.constant(104)
+COUNT, FAULTS, NUM_CANDIDATES, LOST, QUANTA, LISTED = (wp.constant(n) for n in range(6))
+HEAVIEST, FASTEST, SPEED = (wp.constant(n) for n in (8, 40, 72))
+#: Mass quanta of a field's heaviest particle, unless a node overflows.
+MAX_MASS_QUANTA = wp.constant(float(2**27))
+#: Number of an untouched subblock, and of one that is touched but not numbered yet.
+NO_SUBBLOCK, TOUCHED = wp.constant(0xFFFF), wp.constant(0xFFFE)
+#: Flag of a subblock's place: above the index, a bit for each of its planes across x that is near a collider.
+PLACES = wp.constant(0x4000)
+#: Flag of an active block that may hold contact candidates, above the bits of its four slabs.
+MAY_CONTACT = wp.constant(16)
+#: Least speed that scales a momentum quantum [m/s].
+SLOWEST = wp.constant(2.0**-20)
+#: Mass quanta of a field's heaviest particle in the sums of offsets.
+OFFSET_QUANTA = wp.constant(2.0**20)
+#: Mass quanta in which the mass that particles gave and nodes lack is counted. An overflowed word misses at least 2^20
+#: of these; rounding stays far below half of that.
+LOST_QUANTA, MAX_LOST = wp.constant(2**12), wp.constant(2**19)
 
 
 def partitions_of(field: np.ndarray) -> list[tuple[int, int, int]]:
-    """The shortest runs of particles that share no velocity field, each for a CUDA block of its own.
+    """Return the shortest runs of particles that share no velocity field, each for a CUDA block of its own.
 
     Args:
         field: velocity fields of the particles, shape ``(num_particles,)``.
 
     Returns:
-        First particle, one after the last, and bits of the fields, of every part.
+        First particle, one after the last, and bits of the fields, of every partition.
     """
     last = {int(f): int(np.flatnonzero(field == f)[-1]) for f in np.unique(field)}
     partitions, first, end = [], 0, 0
@@ -88,12 +112,12 @@ def partitions_of(field: np.ndarray) -> list[tuple[int, int, int]]:
 
 
 def largest_partition(field: np.ndarray) -> int:
-    """Particles of the largest part."""
+    """Return the number of particles of the largest partition."""
     return max(end - first for first, end, _ in partitions_of(field))
 
 
 def suits_block_path(device: str, field: np.ndarray, max_active_blocks: int) -> bool:
-    """Whether environments with such particles may have CUDA blocks of their own, and enough shared memory."""
+    """Return whether the device has enough shared memory for a block per environment with these particles."""
     target = wp.get_device(device)
     few = largest_partition(field) <= MOST_PARTICLES and len(field) <= MOST_LISTED
     if not (target.is_cuda and target.arch >= 80 and few):
@@ -104,9 +128,9 @@ def suits_block_path(device: str, field: np.ndarray, max_active_blocks: int) -> 
 
 
 def needs_large_arena(model: Model, partitions: list[tuple[int, int, int]]) -> bool:
-    """Whether rooms of these ``partitions`` take a multiprocessor each: nodes need it, or there are enough of them.
+    """Return whether arenas should fill a multiprocessor each: the nodes need it, or there are enough multiprocessors.
 
-    A large room has more threads, and what they add up are integers: the result is the same.
+    A large arena has more threads; the integer sums, and thus the results, are the same.
     """
     share = max(end - first for first, end, _ in partitions) / model.num_particles
     if share * model.max_active_blocks > SMALL_ACTIVE_BLOCKS:
@@ -115,7 +139,7 @@ def needs_large_arena(model: Model, partitions: list[tuple[int, int, int]]) -> b
 
 
 def plan_arena(model: Model) -> tuple[Arena, bool]:
-    """Where things lie in a room, and whether it is a large one."""
+    """Return the layout of the arena, and whether it is a large one."""
     arena = Arena()
     if model.path != "block":
         return arena, False
@@ -138,36 +162,19 @@ def _multiple_of_4(words: int) -> int:
     return -(-words // 4) * 4
 
 
-#: Words of a node: mass and physical momentum, later physical velocity and nothing, for loads of 16 bytes.
-NODE_WORDS = wp.constant(4)
-#: Words that it has elsewhere: kinematic momentum, later kinematic velocity.
-KINEMATIC_WORDS = wp.constant(3)
-#: Words of a subblock of 2 x 2 x 2 nodes, as many as there are banks, and those that it has elsewhere.
-SUBBLOCK_WORDS, KINEMATIC_SUBBLOCK_WORDS = wp.constant(8 * NODE_WORDS), wp.constant(8 * KINEMATIC_WORDS)
-#: Subblocks of a block of 4 x 4 x 4 nodes.
-BLOCK_SUBBLOCKS = wp.constant(8)
-#: Words of the header: subblocks in use; bits FAILURE_*; particles that tell their places; mass that has been lost
-#: [LOST_UNITS]; units in a field's heaviest particle; how many particles are listed; and of every field, of which there
-#: are 32 at most, for they are bits of a block's mask: the mass of its heaviest particle [kg], the speed of its
-#: fastest, and the speed that its momenta are counted at [m/s].
-HEADER = wp.constant(104)
-COUNT, FAULTS, NUM_CANDIDATES, LOST, QUANTA, LISTED = (wp.constant(n) for n in range(6))
-HEAVIEST, FASTEST, SPEED = (wp.constant(n) for n in (8, 40, 72))
-#: Units of mass in a field's heaviest particle, if no node holds too much.
-MAX_MASS_QUANTA = wp.constant(float(2**27))
-#: No subblock has this number; nor this one, which those have that are to be numbered.
-NO_SUBBLOCK, TOUCHED = wp.constant(0xFFFF), wp.constant(0xFFFE)
-#: What a subblock's place has besides its slot and its number there: a bit for each of its planes of nodes across x.
-PLACES = wp.constant(0x4000)
-
-
 def subblock_native(cuda: str, otherwise: str = "") -> str:
-    """A snippet that knows the header's words, the strides of the nodes of a subblock, and :func:`kinematic_of`."""
+    """Return a snippet with the header's words, the strides of a subblock's nodes, and ``kinematic_of`` in scope."""
     z, rest = int(NODE_WORDS), int(KINEMATIC_WORDS)
     strides = f"constexpr int ALONG_Z = {z}, ALONG_Y = {2 * z}, ALONG_X = {4 * z}, SUBBLOCK = {8 * z};\n"
     words = f"COUNT = {int(COUNT)}, TOUCHED = {int(TOUCHED)}, PLACES = {int(PLACES)}"
     of = f"[](const auto& in, int at) {{ return in.kinematic + (at - in.subblocks) / {z} * {rest}; }}"
     return native(f"constexpr int {words};\n{strides}auto kinematic_of = {of};\n{cuda}", otherwise)
+
+
+@wp.func_native(native("return __uint_as_float((__float_as_uint(x) + 0x7fffffu) & 0xff800000u);", "return x;"))
+def power_of_two(x: float) -> float:
+    """Return the least power of two that is not below ``x``, which must not be negative."""
+    ...
 
 
 @wp.func_native(
@@ -180,7 +187,7 @@ const unsigned char* const slabs = reinterpret_cast<const unsigned char*>(arena 
 const int lane = threadIdx.x & 31;
 for (int n = threadIdx.x; n - lane < most; n += blockDim.x) {
     const bool touched = n < most && number[n] == TOUCHED;
-    // of the four slabs of a block a subblock has the first or the last two
+    // a subblock covers the first or the last two of the four slabs of a block
     const int planes = touched ? slabs[n >> 3] >> ((n & 4) >> 1) & 3 : 0;
     const bool own = touched && (planes != 0) == by_boundaries;
     const int next = append(arena + COUNT, __ballot_sync(0xffffffffu, own), lane);
@@ -190,34 +197,34 @@ for (int n = threadIdx.x; n - lane < most; n += blockDim.x) {
     )
 )
 def number_subblocks(numbers: int, places: int, near: int, most: int, by_boundaries: bool):
-    """Number the touched subblocks of ``most`` that boundaries are near, or those that none is, and note their places.
+    """Number the touched subblocks of ``most`` that are near colliders, or those that are not, and store their places.
 
-    All threads come here; which number a subblock gets depends on who comes first, and nothing depends on that.
+    All threads must call this; the order of the numbers varies, and no result depends on it.
     """
     ...
 
 
 @wp.func
 def subblocks_of_round(arena: Arena, first: int):
-    """How many subblocks there are in a round of those from the ``first`` on."""
+    """Return the number of subblocks in the round that begins at subblock ``first``."""
     return wp.min(word(COUNT) - first, arena.capacity)
 
 
 @wp.func
 def node_word(arena: Arena, n: int):
-    """Word at which node ``n`` of a round begins, eight a subblock."""
+    """Return the word at which node ``n`` of a round begins, eight nodes a subblock."""
     return arena.subblocks + NODE_WORDS * n
 
 
 @wp.func
 def kinematic_word(arena: Arena, n: int):
-    """Word at which the kinematic momentum of node ``n`` of a round begins."""
+    """Return the word at which the kinematic momentum of node ``n`` of a round begins."""
     return arena.kinematic + KINEMATIC_WORDS * n
 
 
 @wp.func
 def kinematic_of(arena: Arena, at: int):
-    """The same of the node that begins at word ``at``."""
+    """Return the word of the kinematic momentum of the node that begins at word ``at``."""
     return kinematic_word(arena, (at - arena.subblocks) >> 2)
 
 
@@ -230,16 +237,16 @@ def clear_subblocks(arena: Arena, first: int):
 
 @wp.func
 def in_flagged_plane(flagged: int, n: int):
-    """Whether the plane of node ``n`` of a round has its bit in the ``flagged`` place of the subblock."""
+    """Return whether the plane of node ``n`` of a round is near a collider, from the flagged place of its subblock."""
     return (flagged & (PLACES << ((n >> 2) & 1))) != 0
 
 
-# of two subblocks along an axis the upper one lies in the next block if the lower one is a block's second; a thread asks
-# for no slot twice: reads of a warp in many places are what keeps a multiprocessor busy
+# of two subblocks along an axis the upper one lies in the next block if the lower one is the second of its block; no
+# active block is loaded twice, because scattered loads of a warp are the bottleneck
 _AROUND = """
 const int ny = grid.blocks[1], nz = grid.blocks[2];
-const int* const active_blocks =
-    &wp::index(blocks.active, e, field * grid.num_blocks + ((base[0] >> 2) * ny + (base[1] >> 2)) * nz + (base[2] >> 2));
+const int block = ((base[0] >> 2) * ny + (base[1] >> 2)) * nz + (base[2] >> 2);
+const int* const active_blocks = &wp::index(blocks.active, e, field * grid.num_blocks + block);
 const bool next_x = base[0] & 2, next_y = base[1] & 2, next_z = base[2] & 2;
 int needed[8] = {};
 #pragma unroll
@@ -260,7 +267,7 @@ for (int b = 0; b < 8; ++b) {
 
 @wp.func_native(subblock_native(_AROUND + "return n;", "return wp::vec_t<8, wp::int32>();"))
 def places_around(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i) -> vec8i:
-    """Where the subblocks of a stencil have their half words: 8 slot + subblock in block, for x, y and z lower and upper."""
+    """Return the places of a stencil's subblocks, 8 active block + subblock in block: x, y and z lower and upper."""
     ...
 
 
@@ -269,7 +276,7 @@ def places_around(grid: Grid, blocks: Blocks, e: int, field: int, base: wp.vec3i
         _AROUND
         + """
 const unsigned short* const number = reinterpret_cast<const unsigned short*>(arena + layout.numbers);
-for (int b = 0; b < 8; ++b)  // the last subblock takes what is not of this round
+for (int b = 0; b < 8; ++b)  // the last subblock collects what belongs to other rounds
     n[b] = layout.subblocks + SUBBLOCK * (int)min((unsigned)(number[n[b]] - first), (unsigned)layout.capacity);
 return n;
 """,
@@ -279,7 +286,7 @@ return n;
 def subblocks_around(
     grid: Grid, blocks: Blocks, layout: Arena, e: int, field: int, base: wp.vec3i, first: int
 ) -> vec8i:
-    """Words at which the subblocks of a stencil begin, in a round of subblocks from the ``first`` on."""
+    """Return the words at which the subblocks of a stencil begin, in the round from subblock ``first`` on."""
     ...
 
 
@@ -298,7 +305,7 @@ return wp::vec3i(line + lower_z + pz * ALONG_Z, line + second, line + upper_z + 
     )
 )
 def line_in_subblocks(subblocks: vec8i, base: wp.vec3i, i: int, j: int) -> wp.vec3i:
-    """Words at which the nodes ``base + (i, j, 0..2)`` begin."""
+    """Return the words at which the nodes ``base + (i, j, 0..2)`` begin."""
     ...
 
 
@@ -312,7 +319,7 @@ return wp::vec_t<4, wp::float32>(0.0f, v.x, v.y, v.z);
     )
 )
 def physical_at(at: int) -> wp.vec4:
-    """Nothing, and the physical velocity of the node that begins at a word."""
+    """Return zero and the physical velocity of the node that begins at a word."""
     ...
 
 
@@ -326,7 +333,7 @@ return wp::vec_t<4, wp::float32>(0.0f, v[0], v[1], v[2]);
     )
 )
 def kinematic_at(at: int) -> wp.vec4:
-    """Nothing, and the kinematic velocity of the node that has it at a word."""
+    """Return zero and the kinematic velocity stored at a word."""
     ...
 
 
@@ -340,7 +347,7 @@ return wp::vec_t<4, wp::int32>(v.x, v.y, v.z, v.w);
     )
 )
 def sums_at(at: int) -> wp.vec4i:
-    """Mass and physical momentum of the node that begins at a word."""
+    """Return mass and physical momentum of the node that begins at a word."""
     ...
 
 
@@ -352,17 +359,13 @@ for (int c = 0; c < 3; ++c) k[c] = value[4 + c];
 """)
 )
 def set_velocities(at: int, kinematic: int, value: vec8):
-    """Write what :func:`physical_at` and :func:`kinematic_at` read, of one node, where its sums were."""
+    """Write the velocities of a node over its sums, as :func:`physical_at` and :func:`kinematic_at` read them."""
     ...
-
-
-#: Bit of a slot whose particles may tell their places; the bits of its four slabs come before.
-MAY_CONTACT = wp.constant(16)
 
 
 @wp.func
 def block_of(grid: Grid, contact: Contact, owner: int):
-    """The block that a slot holds, of whatever field; a division, where there are several."""
+    """Return the block of an active block from its ``owner``; a division only if there are several fields."""
     block = owner
     if contact.num_fields > 1:
         block = owner % grid.num_blocks
@@ -371,7 +374,7 @@ def block_of(grid: Grid, contact: Contact, owner: int):
 
 @wp.func
 def record_of_place(place: int, node: int):
-    """Record of node ``node`` of 2 x 2 x 2 of a subblock."""
+    """Return the record of node ``node`` of the 2 x 2 x 2 nodes of the subblock at a place."""
     subblock = place % BLOCK_SUBBLOCKS
     i = ((subblock >> 2) << 1) + (node >> 2)
     j = (((subblock >> 1) & 1) << 1) + ((node >> 1) & 1)
@@ -381,13 +384,13 @@ def record_of_place(place: int, node: int):
 
 @wp.func
 def place_of_record(r: int):
-    """Place of the subblock that a record's node is in, see :func:`record_of_place`."""
+    """Return the place of the subblock that holds a record's node; see :func:`record_of_place`."""
     return BLOCK_SUBBLOCKS * (r // BLOCK_NODES) + ((r >> 5) & 1) * 4 + ((r >> 3) & 1) * 2 + ((r >> 1) & 1)
 
 
 @wp.func
 def end_of_partition(blocks: Blocks, failure: wp.array(dtype=int), e: int, partition: wp.vec3i):
-    """One after the last particle of a part that takes part: where the environment does not, they may be anywhere."""
+    """Return the end of a partition's particles, its begin if the environment takes no part."""
     end = partition[1]
     if not takes_part(blocks, e, failure):
         end = partition[0]
@@ -396,7 +399,7 @@ def end_of_partition(blocks: Blocks, failure: wp.array(dtype=int), e: int, parti
 
 @wp.func
 def note_boundaries(grid: Grid, boundaries: Boundaries, contact: Contact, blocks: Blocks, arena: Arena, e: int):
-    """Find the slabs of every slot that a boundary is near, and whether its particles may tell their places."""
+    """Store for every active block which slabs are near colliders, and whether it may hold contact candidates."""
     for active in range(thread_of_block(), num_active(blocks, e), threads_of_block()):
         owner = blocks.owner[e, active]
         corner = block_corner(grid, block_of(grid, contact, owner))
@@ -425,7 +428,7 @@ def touch_subblocks(
     field: int,
     places: vec8i,
 ):
-    """Mark the subblocks of a particle's stencil, which are at ``places``, and note whether it tells its place."""
+    """Mark the subblocks of a particle's stencil, at ``places``, and store whether it is a contact candidate."""
     max_float_word(HEAVIEST + field, mass)
     for b in range(8):
         set_half_word(arena.numbers, places[b], TOUCHED)
@@ -450,7 +453,7 @@ def touch_with_all(
     end: int,
     x: wp.array2d(dtype=wp.vec3),
 ):
-    """:func:`touch_subblocks` with the particles from ``begin`` to ``end``, three of a thread at a time."""
+    """Call :func:`touch_subblocks` for the particles from ``begin`` to ``end``, three of a thread at a time."""
     r = row(e, particles.mass.shape[0])
     step = threads_of_block()
     for p in range(begin + thread_of_block(), end, 3 * step):
@@ -488,9 +491,9 @@ def lay_out_arena(
     partition: wp.vec3i,
     x: wp.array2d(dtype=wp.vec3),
 ):
-    """Number the subblocks that particles touch, and find the particles that tell their places.
+    """Number the subblocks that particles touch, and find the contact candidates.
 
-    Subblocks that no boundary is near come first, so that few warps have to do with boundaries at their nodes.
+    Subblocks away from colliders come first, so that few warps handle nodes near colliders.
     """
     clear_words(0, arena.numbers)
     fill_words(arena.numbers, arena.candidates - arena.numbers, -1)  # NO_SUBBLOCK twice
@@ -508,30 +511,21 @@ def lay_out_arena(
     sync_block()
 
 
-#: Slowest speed that momenta are counted at [m/s].
-SLOWEST = wp.constant(2.0**-20)
-#: Units of mass in a field's heaviest particle where places are told.
-OFFSET_QUANTA = wp.constant(2.0**20)
-#: Units of mass in which is counted what particles have given and nodes have not got. Where a word has run over, 2^20
-#: are missing at least; what is rounded is far less than half of that.
-LOST_QUANTA, MAX_LOST = wp.constant(2**12), wp.constant(2**19)
-
-
 @wp.func
 def mass_quantum_of(field: int):
-    """Mass that a word counts [kg], a power of two."""
+    """Return the mass quantum of a field [kg], a power of two."""
     return power_of_two(float_word(HEAVIEST + field)) / float_word(QUANTA)
 
 
 @wp.func
 def offset_quantum_of(field: int):
-    """Mass that a word of places counts [kg]: more than it does of masses, for they are seen to after these."""
+    """Return the mass quantum of a field in sums of offsets [kg], coarser than that of masses."""
     return power_of_two(float_word(HEAVIEST + field)) / OFFSET_QUANTA
 
 
 @wp.func
 def speed_of(s: Deposit, physical: float):
-    """A bound of the momenta that a particle adds, by its mass [m/s]; of the ``physical`` ones it is known [kg m/s]."""
+    """Return a bound of a particle's momenta by its mass [m/s]; ``physical`` bounds the physical one [kg m/s]."""
     most = physical
     for c in range(3):
         most = wp.max(most, wp.abs(s.at_base[4 + c]))
@@ -540,13 +534,13 @@ def speed_of(s: Deposit, physical: float):
 
 @wp.func
 def speed_for(fastest: float):
-    """A power of two that the fastest particle will not exceed, if it does not gain a quarter at once."""
+    """Return a power of two that the fastest particle will not exceed unless it gains a quarter at once [m/s]."""
     return wp.max(SLOWEST, power_of_two(1.25 * fastest))
 
 
 @wp.func
 def speeds_known(arena: Arena, partition: wp.vec3i):
-    """Whether there is a speed at which to count the momenta of every field."""
+    """Return whether every field of a partition has a speed that scales its momentum quantum."""
     known = bool(True)
     for f in range(arena.speed.shape[1]):
         known = known and (float_word(SPEED + f) > 0.0 or not has_field(partition[2], f))
@@ -555,9 +549,9 @@ def speeds_known(arena: Arena, partition: wp.vec3i):
 
 @wp.func
 def quanta_suffice(arena: Arena, partition: wp.vec3i, first: int, given: int):
-    """Whether momenta have been counted at speeds that no particle exceeds, and no word counts more than it can.
+    """Return whether no particle exceeded its field's speed and no accumulator overflowed.
 
-    All threads come here; their particles have ``given`` so much mass [LOST_UNITS].
+    All threads must call this; their particles have ``given`` that much mass [LOST_QUANTA].
     """
     known = speeds_known(arena, partition)
     if known:
@@ -574,9 +568,9 @@ def quanta_suffice(arena: Arena, partition: wp.vec3i, first: int, given: int):
 
 @wp.func
 def rescale_quanta(arena: Arena, partition: wp.vec3i):
-    """Count the momenta of fields that were too fast at higher speeds, and in larger units if words were too small.
+    """Raise the momentum quanta of fields that were too fast, and the mass quanta if accumulators overflowed.
 
-    All threads come here.
+    All threads must call this.
     """
     f = thread_of_block()
     sync_block()
@@ -587,9 +581,3 @@ def rescale_quanta(arena: Arena, partition: wp.vec3i):
         if slow and has_field(partition[2], f):
             set_float_word(SPEED + f, speed_for(float_word(FASTEST + f)))
     sync_block()
-
-
-@wp.func_native(native("return __uint_as_float((__float_as_uint(x) + 0x7fffffu) & 0xff800000u);", "return x;"))
-def power_of_two(x: float) -> float:
-    """The least power of two that is not below ``x``, which is positive or 0."""
-    ...

@@ -1,9 +1,7 @@
-"""What a particle adds to the nodes around it in the shared memory of a CUDA block.
+"""P2G into the shared memory of a CUDA block, with integer sums.
 
-The scatter of a body into the shared memory of its CUDA block: integers are added up.
-
-Where they lie is in :mod:`piavatar_envs.mpm.cuda.block_grid`. The result does not depend on the order of the threads,
-and not on how many subblocks there is room for.
+The layout is in :mod:`piavatar_envs.mpm.cuda.block_grid`. The result depends neither on the order of the threads nor on
+the number of subblocks that fit.
 """
 
 from __future__ import annotations
@@ -68,15 +66,19 @@ from piavatar_envs.mpm.types import (
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
+_CFL = wp.constant(FAILURE_CFL)
+_NONFINITE = wp.constant(FAILURE_NONFINITE)
+#: A particle that moves or is driven further in a substep [grid spacings] has failed, and is not added.
+MOST_CELLS = wp.constant(8.0)
 
-# Threads that add to the same bank wait for each other. So each has an order of its own, as the bits of its particle's
-# number say: two of them that of the four words of a node; one that of the nodes along each axis, first the lower or
-# the upper one of a subblock, then the other, and last what is left
+
+# Additions to the same bank conflict. So each thread has its own order, from the bits of its particle's index: two bits
+# for the four words of a node, and one for each axis, which selects the lower or the upper node of a subblock first
 _ADD = """
 constexpr int UNIT = %(scale)d;
 const int px = s.base[0] & 1, py = s.base[1] & 1, pz = s.base[2] & 1;
 const int order = p & 3, order_x = (p >> 2 ^ px) & 1, order_y = (p >> 3 ^ py) & 1, order_z = (p >> 4 ^ pz) & 1;
-// a word at the lowest node, and how it changes along the axes; a mass does not
+// a word at the lowest node, and its change along the axes; a mass does not change
 float q[4] = {s.at_base[0] * per_mass}, along[4][3] = {};
 for (int c = 0; c < 3; ++c) {
     q[1 + c] = s.at_base[1 + c] * per_momentum;
@@ -133,15 +135,15 @@ for (int n = 0; n < 3; ++n) {
 
 
 def adding(scale: int, before: str, plane: str, line: str, node: str, unrolled: int) -> str:
-    """The snippet that adds a particle to nodes in subblocks, from its pieces.
+    """Return the snippet that adds a particle to nodes in subblocks, from its pieces.
 
     Args:
-        scale: what places are counted in, 1 for words, 4 for bytes.
-        before: what is to be known before all planes of the stencil.
-        plane: what is to be known of one that lies ``far``, in the upper subblocks along x, or not.
-        line: what is to be known of one of its lines, in the ``upper`` subblocks along y or not.
-        node: the place of the first word of node ``l`` of the line.
-        unrolled: planes, and lines of a plane, that the compiler writes down.
+        scale: unit of addresses: 1 for words, 4 for bytes.
+        before: statement before all planes of the stencil.
+        plane: statement for a plane, which lies ``far``, in the upper subblocks along x, or not.
+        line: statement for one of its lines, in the ``upper`` subblocks along y or not.
+        node: address of the first word of node ``l`` of the line.
+        unrolled: planes, and lines of a plane, that the compiler unrolls.
     """
     pieces = {"scale": scale, "before": before, "plane": plane, "line": line, "node": node, "unrolled": unrolled}
     return subblock_native(_ADD % pieces)
@@ -195,13 +197,13 @@ for (int n = 0; n < 9; ++n) {
 def add_kinematic(
     layout: Arena, subblocks: vec8i, s: Deposit, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, per_momentum: float
 ):
-    """Add the kinematic momentum of a particle; few have one, so this is as short as can be."""
+    """Add the kinematic momentum of a particle; compact code, because few particles have one."""
     ...
 
 
 @wp.func
 def share_of_round(arena: Arena, subblocks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3):
-    """Share of a particle that its nodes in subblocks of this round get."""
+    """Return the share of a particle that its nodes in subblocks of this round get."""
     share = float(0.0)
     lines = int(9)
     for n in range(lines):
@@ -233,14 +235,8 @@ for (int j = 0; j < 3; ++j)
 def add_place(
     subblocks: vec8i, base: wp.vec3i, wx: wp.vec3, wy: wp.vec3, wz: wp.vec3, i: int, mass: float, seam: float
 ):
-    """Tell plane ``i`` of a stencil where a particle is: ``w m (x_i - x_p) / dx``, and ``w m`` of a seam; in units."""
+    """Add offsets ``w m (x_i - x_p) / dx`` and a seam's ``w m`` to plane ``i`` of a contact candidate's stencil."""
     ...
-
-
-_CFL = wp.constant(FAILURE_CFL)
-_NONFINITE = wp.constant(FAILURE_NONFINITE)
-#: A particle that goes or is driven further than this in a substep [grid spacings] has failed, and is not added up.
-MOST_CELLS = wp.constant(8.0)
 
 
 @wp.func
@@ -255,7 +251,7 @@ def add_particle_offset(
     first: int,
     x: wp.array2d(dtype=wp.vec3),
 ):
-    """Where a particle is, to the subblocks that a plane of its stencil is in."""
+    """Add the offsets of particle ``p`` to the subblocks of a plane of its stencil."""
     field = particles.field[p]
     s = empty_deposit(grid, x[e, p])
     m = particles.mass[row(e, particles.mass.shape[0]), p] / offset_quantum_of(field)
@@ -276,16 +272,16 @@ def add_offsets(
     # out
     accumulators: Accumulators,
 ):
-    """Where particles are, to the nodes' offsets, from those that tell it; the subblocks are left clear.
+    """Add the offsets of all contact candidates to the nodes' accumulators; clears the subblocks before and after.
 
-    Where there is one field, only nodes near a boundary are told; the grid pass forgets what they have been told.
+    With a single field only nodes near colliders receive them; the grid update clears them.
     """
     t = thread_of_block()
     several = arena.speed.shape[1] > 1
     clear_subblocks(arena, first)
     sync_block()
-    # they are few, and would leave most threads of many warps idle: where there is room behind the subblocks, they are
-    # listed, which is in one round only, for all but the last are full
+    # candidates are few and would leave most threads of many warps idle: they are listed behind the subblocks where
+    # memory is left, which is in the last round only
     listed = arena.subblocks + SUBBLOCK_WORDS * subblocks_of_round(arena, first)
     if word(NUM_CANDIDATES) <= 2 * (arena.subblocks + SUBBLOCK_WORDS * arena.capacity - listed):
         list_bits(arena.candidates, arena.near - arena.candidates, listed, LISTED)
@@ -333,9 +329,9 @@ def add_momenta(
     adds: bool,
     clears: bool,
 ):
-    """Find the fastest particle of every field, and where it ``adds``, add masses and momenta of all to the subblocks.
+    """Find the fastest particle of every field and, if it ``adds``, add masses and momenta of all to the subblocks.
 
-    Returns the mass that the particles of a thread give [LOST_UNITS].
+    Returns the mass that the particles of a thread give [LOST_QUANTA].
     """
     t = thread_of_block()
     given = int(0)
@@ -348,9 +344,7 @@ def add_momenta(
     sync_block()
     for p in range(partition[0] + t, end_of_partition(blocks, failure, e, partition), threads_of_block()):
         field = particles.field[p]
-        s = deposit_of(
-            grid, step, particles, moving, e, p, has_bit(arena.candidates, p)
-        )  # asks for all that it needs at once
+        s = deposit_of(grid, step, particles, moving, e, p, has_bit(arena.candidates, p))  # all loads at once
         if has_finite_velocity(moving, e, p):
             bounds = momentum_bounds(s)
             quantum = accumulators.momentum_quantum[row(e, accumulators.momentum_quantum.shape[0]), field]
@@ -359,7 +353,7 @@ def add_momenta(
             if fault != 0:
                 wp.atomic_or(failure, e, fault)
                 or_word(FAULTS, fault)
-            elif speed * step.dt > MOST_CELLS * grid.dx:  # it would blur the sums of the others
+            elif speed * step.dt > MOST_CELLS * grid.dx:  # its quanta would be too coarse for the others
                 wp.atomic_or(failure, e, _CFL)
             else:
                 max_float_word(FASTEST + field, speed)
@@ -399,7 +393,7 @@ def p2g_round(
     first: int,
     clear: bool,
 ):
-    """Sums of the subblocks from the ``first`` on, in units that hold. The subblocks may be ``clear``."""
+    """Sum the subblocks from ``first`` on, with quanta that suffice. The subblocks may be ``clear``."""
     hold = bool(False)
     unused = bool(clear)
     while not hold:

@@ -1,10 +1,10 @@
-"""A substep of small environments on a GPU: each has a CUDA block of its own, and its grid in shared memory.
+"""Block-per-environment path: a substep of small bodies with their grids in shared memory.
 
-Where there is one velocity field, one launch is the substep: scatter, grid pass and gather. Where there are several, it
-is the scatter and the grid pass of blocks with one field; the nodes of others get their sums, on which contact works.
+With a single velocity field one launch is the substep: P2G, grid update and G2P. With several it covers P2G and the
+grid update of blocks with one field; nodes of contact blocks get their sums, from which contact continues.
 
-Integers are added, so the result does not depend on the order of the threads: runs repeat bit for bit, and an
-environment does the same in any batch. See :mod:`piavatar_envs.mpm.cuda.block_grid` for units and for how nodes lie.
+Sums are integers, so the result does not depend on the order of the threads: runs repeat bit for bit, and an
+environment gives the same result in any batch. Quanta and layout are in :mod:`piavatar_envs.mpm.cuda.block_grid`.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def run_substep(
     partition: wp.vec3i,
     with_g2p: bool,
 ):
-    """Scatter and grid pass of a part of an environment; it ``with_g2p``, too, if there is one velocity field."""
+    """Run P2G and the grid update of a partition of an environment, and G2P if ``with_g2p``, for a single field."""
     t = thread_of_block()
     lay_out_arena(grid, particles, boundaries, contact, blocks, arena, failure, e, partition, moved.x)
     count = word(COUNT)
@@ -80,7 +80,7 @@ def run_substep(
     if t == 0:
         blocks.num_updated[e] = num_active(blocks, e)
         set_float_word(QUANTA, MAX_MASS_QUANTA)
-        if with_g2p:  # else the bits of other parts come and go
+        if with_g2p:  # else other partitions may set bits meanwhile
             or_word(FAULTS, failure[e])
     if t < contact.num_fields and has_field(partition[2], t):
         set_float_word(SPEED + t, arena.speed[e, t])
@@ -88,7 +88,7 @@ def run_substep(
         clear_untouched(grid, blocks, arena, node_velocity, sensors, e, partition)
     sync_block()
     rounds = (count + arena.capacity - 1) // arena.capacity
-    passes = wp.where(rounds > 1, 2 * rounds, rounds)  # the first ones to find units that hold in all
+    passes = wp.where(rounds > 1, 2 * rounds, rounds)  # the first ones find quanta that suffice in all rounds
     for n in range(passes):
         first = (n % rounds) * arena.capacity
         settles = n >= passes - rounds
@@ -114,11 +114,11 @@ def run_substep(
 
 @cache
 def substep_kernel(large: bool, with_g2p: bool) -> wp.Kernel:
-    """:func:`run_substep` in a room, over ``(num_envs, partitions threads)``; made when asked for, for compiling takes time.
+    """Return :func:`run_substep` as a kernel over ``(num_envs, partitions * threads)``, created on first use.
 
     Args:
-        large: the room takes a multiprocessor; else there are two in one.
-        with_g2p: the launch is the whole substep.
+        large: whether the arena fills a multiprocessor; else two share one.
+        with_g2p: whether the launch is the whole substep.
     """
     words, threads, at_once = (LARGE_ARENA, LARGE_THREADS, 1) if large else (SMALL_ARENA, SMALL_THREADS, 2)
     name = f"{'substep' if with_g2p else 'nodes'}_in_{'large' if large else 'small'}_room"
@@ -127,8 +127,7 @@ def substep_kernel(large: bool, with_g2p: bool) -> wp.Kernel:
         name=name,
         module="unique",
         launch_bounds=(threads, at_once),
-        # an eighth faster: divisions and roots to two units in the last place, and logarithms to 4e-7, in a few
-        # instructions instead of calls
+        # fast_math: divisions and roots to two units in the last place, logarithms to 4e-7, without function calls
         module_options={"enable_backward": False, "default_grid_stride": False, "fast_math": True},
     )
     def substep_in_room(
@@ -151,7 +150,8 @@ def substep_kernel(large: bool, with_g2p: bool) -> wp.Kernel:
         partition = arena.partition[t // threads]
         reserved = wp.tile_empty(shape=(words,), dtype=int, storage="shared")  # noqa: F841
         run_substep(
-            grid, step, particles, boundaries, contact, arena, blocks, moved, failure, accumulators, node_velocity, sensors,
+            grid, step, particles, boundaries, contact, arena, blocks, moved, failure, accumulators, node_velocity,
+            sensors,
             e, partition, with_g2p,
         )  # fmt: skip
 
@@ -160,13 +160,13 @@ def substep_kernel(large: bool, with_g2p: bool) -> wp.Kernel:
 
 @wp.kernel
 def reset_speeds(arena: Arena):
-    """The speeds at which momenta are counted are found anew: what comes then depends on the state alone."""
+    """Reset the speeds that scale momentum quanta, so that results depend on the state alone."""
     e, f = wp.tid()
     arena.speed[e, f] = 0.0
 
 
 def record_in_block(graph: LaunchGraph, model: Model, state: State, scratch: Scratch, moving: Moving) -> None:
-    """Append the substep: all of it where there is one field, else up to contact."""
+    """Append the substep: all of it with a single field, else up to contact."""
     threads = LARGE_THREADS if scratch.large_arena else SMALL_THREADS
     with_g2p = model.contact.num_fields == 1
     graph.launch(

@@ -1,20 +1,18 @@
-"""The nodes of a group of particles in the shared memory of its CUDA block, in CUDA: where they lie.
+"""Tiles: the nodes around a tile of particles in shared memory, and their sums.
 
-They are those of a box around the particles' stencils, in subblocks of 2 x 2 x 2 nodes, so where a node is follows from
-where it is on the grid. A group whose box has too many subblocks goes in turns: each takes the particles that are near the
-first of those that are left, and a box around that one. Whose turn comes when depends on the particles' places only.
+The nodes are those of a box around the particles' stencils, in subblocks of 2 x 2 x 2 nodes, so the address of a node
+follows from its position on the grid. A tile whose box has too many subblocks is processed in passes: each takes the
+particles near the first remaining one, with a box around that. The order of passes depends on positions only.
 
-Nothing here runs on a CPU. In words of 4 bytes, the room has: a header; of every subblock its record, which nodes have got
-mass, and where it is in its block; whose particles tell their nodes more than momentum; four sums of every node, one
-subblock after the other. A subblock has a word in each of the 32 banks, as in :mod:`piavatar_envs.mpm.cuda.block_grid`.
+Arena, in words of 4 bytes: header; for every subblock its record, a mask of its nodes with mass, and its position in
+its block; the list of contact candidates; four sums a node, subblock after subblock. A subblock has a word in each of
+the 32 banks, as in :mod:`piavatar_envs.mpm.cuda.block_grid`. Nothing here runs on a CPU.
 
-The sums of a group of particles in shared memory, put down on the nodes.
-
-What particles add has a scalar and a vector that is linear over the stencil. It is counted in units of the group: 2^-25
-of the most that any of its particles has, a power of two, and not less than what the sums outside count. So integers
-are added in any order, and put down exactly. A weight is 27/64 at most: 128 summands stay below 2^31. (Units four times
-as large would do with a fused addition to make an integer of a summand, but a body that drifts through the grid makes
-the same errors again and again: it lost 1e-5 of its momentum in 300 substeps.)
+A particle contributes a scalar and a vector that is linear over the stencil. Both are counted in quanta of the tile:
+2^-25 of the most that any of its particles has, a power of two, and not less than the quanta of the accumulators. So
+integers are added in any order and flushed exactly. A weight is at most 27/64: 128 summands stay below 2^31. (Quanta
+four times as large would allow a fused addition to round, but a body that drifts through the grid repeats the same
+errors and lost 1e-5 of its momentum in 300 substeps.)
 """
 
 from __future__ import annotations
@@ -28,18 +26,16 @@ from piavatar_envs.mpm.types import FAILURE_CFL, Accumulators, Blocks, Grid
 
 wp.set_module_options({"enable_backward": False})
 
-#: What is added up: mass and momentum; kinematic momentum; places and seams.
+#: Kinds of sums: mass and momentum; kinematic momentum; offsets and seams.
 MOMENTUM, KINEMATIC, PLACE = (wp.constant(n) for n in range(3))
-
-
-#: Particles of a group, at most, a thread each.
+#: Most particles of a tile, a thread each.
 THREADS = 128
-#: Subblocks that there is room for, enough for a box of ``REACH`` grid spacings to each side of a particle.
+#: Subblocks that fit, enough for a box of ``REACH`` grid spacings to each side of a particle.
 CAPACITY = wp.constant(128)
 REACH = wp.constant(3)
-#: Words of the header: how many tell their nodes more than momentum; whether some are left for another turn; the first
-#: of these; the most that a particle has of mass [kg], momentum, kinematic momentum [kg m/s], and the sums' own units;
-#: the least and the greatest lowest node of a stencil, along three axes, and whether any of the nodes has others.
+#: Words of the header: number of contact candidates; whether particles remain for another pass; the first of them; the
+#: most that a particle has of mass [kg], momentum and kinematic momentum [kg m/s]; quanta of the accumulators; least
+#: and greatest lowest node of a stencil along three axes, and between them whether any node is a contact node.
 NUM_CANDIDATES, REMAINING, FIRST = (wp.constant(n) for n in range(3))
 HEAVIEST, FASTEST, FASTEST_KINEMATIC = (wp.constant(n) for n in range(3, 6))
 MASS_QUANTUM, MOMENTUM_QUANTUM = (wp.constant(n) for n in (6, 7))
@@ -49,17 +45,17 @@ MASSIVE = wp.constant(int(RECORDS) + int(CAPACITY))
 WITHIN = wp.constant(int(MASSIVE) + int(CAPACITY))
 CANDIDATES = wp.constant(int(WITHIN) + int(CAPACITY))
 NODES = wp.constant(-(-(int(CANDIDATES) + THREADS) // 32) * 32)
-#: Words of a room.
+#: Words of an arena.
 WORDS = wp.constant(int(NODES) + int(SUBBLOCK_WORDS) * int(CAPACITY))
-#: Units of the most that a particle has.
+#: Quanta of the most that a particle has.
 MAX_PARTICLE_QUANTA = wp.constant(float(2**25))
-#: What a subblock has besides its place in its block: whether there is matter of another field there; then bits of its
-#: nodes, those that had another field.
+#: Flags of a subblock above its position in its block: it is in a contact block; then bits of its contact nodes.
 SEVERAL_FIELDS, CONTACT_NODES = wp.constant(1 << 30), wp.constant(256)
-
 #: The least power of two that is not below the positive number in a word.
 POWER = "auto power_of_two = [](int word) { return __int_as_float((word + 0x7fffff) & 0x7f800000); };"
-#: How many subblocks a box has along each axis, none if nobody is in it.
+
+
+#: Subblocks of the box along each axis, none if the box is empty.
 SIZE = """
 int lowest[3], size[3];
 for (int c = 0; c < 3; ++c) {
@@ -70,8 +66,9 @@ for (int c = 0; c < 3; ++c) {
 
 
 def tile_native(cuda: str, otherwise: str = "") -> str:
-    """A snippet that knows what lies where."""
-    names = "CAPACITY REACH NUM_CANDIDATES REMAINING FIRST HEAVIEST FASTEST FASTEST_KINEMATIC MASS_QUANTUM MOMENTUM_QUANTUM LOWEST HIGHEST RECORDS"
+    """Return a snippet with the words of the arena in scope."""
+    names = "CAPACITY REACH NUM_CANDIDATES REMAINING FIRST HEAVIEST FASTEST FASTEST_KINEMATIC MASS_QUANTUM"
+    names += " MOMENTUM_QUANTUM LOWEST HIGHEST RECORDS"
     names += " HAS_CONTACT_NODES MASSIVE WITHIN CANDIDATES NODES SUBBLOCK_WORDS SEVERAL_FIELDS CONTACT_NODES"
     values = {name: globals()[name] for name in names.split()} | {"KINEMATIC": KINEMATIC, "PLACE": PLACE}
     known = ", ".join(f"{name} = {int(value)}" for name, value in values.items())
@@ -89,7 +86,7 @@ if (blockDim.x == 128) {  // the usual case without a loop
 """)
 )
 def clear_nodes():
-    """Nothing has been added to any node."""
+    """Zero the sums of all nodes."""
     ...
 
 
@@ -101,7 +98,7 @@ for (int c = 0; c < 3; ++c) arena[LOWEST + c] = 0x7fffffff, arena[HIGHEST + c] =
 """)
 )
 def begin_pass():
-    """Nobody is in the box, and nobody tells anything."""
+    """Reset the box and the list of contact candidates."""
     ...
 
 
@@ -118,7 +115,7 @@ if (takes && most > *of_vector) atomicMax(of_vector, most);
 """)
 )
 def raise_maxima(takes: bool, kind: int, scalar: float, momentum: float):
-    """See that the group's units are large enough for a particle's momenta; all threads of a warp come here."""
+    """Raise the tile's maxima to a particle's mass and momentum; all threads of a warp must call this."""
     ...
 
 
@@ -139,7 +136,7 @@ for (int c = 0; c < 3; ++c) atomicMin(arena + LOWEST + c, low[c]), atomicMax(are
 """)
 )
 def widen_box(takes: bool, base: wp.vec3i):
-    """See that a stencil is in the box; all threads of a warp come here."""
+    """Widen the box to a stencil; all threads of a warp must call this."""
     ...
 
 
@@ -166,9 +163,10 @@ return takes;
     )
 )
 def in_pass(grid: Grid, takes: bool, base: wp.vec3i) -> bool:
-    """Whether it is a particle's turn: that of all who take part, or of some, for whom the box is made smaller.
+    """Return whether a particle is in this pass: any that takes part, or is in a smaller box if the box is too large.
 
-    All threads come here, and have met since the box was widened. Whether some are left is in word ``REMAINING``.
+    All threads must call this after a barrier that follows :func:`widen_box`. Word ``REMAINING`` says whether some
+    remain.
     """
     ...
 
@@ -186,7 +184,7 @@ return wp::vec_t<3, wp::int32>(first, along_x, along_y);
     )
 )
 def subblocks_around(base: wp.vec3i) -> wp.vec3i:
-    """Word at which the subblock of a stencil's lowest node begins, and how far on its neighbors along x and y do."""
+    """Return the word at which the subblock of a stencil's lowest node begins, and the strides along x and y."""
     ...
 
 
@@ -196,7 +194,7 @@ def subblocks_around(base: wp.vec3i) -> wp.vec3i:
         + """
 const int subblocks = size[0] * size[1] * size[2];
 for (int n = threadIdx.x; n < subblocks; n += blockDim.x) {
-    // halves are so far from any border that a quotient need not be exact, and a whole number's takes longer
+    // division of floats is faster, and exact enough for halves
     const int line = (int)(((float)n + 0.5f) / (float)size[2]), plane = (int)(((float)line + 0.5f) / (float)size[1]);
     const int i = lowest[0] + plane, j = lowest[1] + line - plane * size[1], l = lowest[2] + n - line * size[2];
     const int block = ((i >> 1) * grid.blocks[1] + (j >> 1)) * grid.blocks[2] + (l >> 1);
@@ -215,7 +213,7 @@ for (int n = threadIdx.x; n < subblocks; n += blockDim.x) {
     )
 )
 def fetch_active(grid: Grid, blocks: Blocks, num_fields: int, e: int, field: int):
-    """Ask for the slots of the subblocks' blocks, which nobody waits for before :func:`store_records`."""
+    """Start the loads of the subblocks' active blocks, which :func:`store_records` waits for."""
     ...
 
 
@@ -231,7 +229,7 @@ for (int n = threadIdx.x; n < subblocks; n += blockDim.x) {
     const int active = arena[RECORDS + n], within = arena[WITHIN + n];
     arena[RECORDS + n] = 128 * active + (within & ~SEVERAL_FIELDS);
     if (within & SEVERAL_FIELDS) {
-        // of half a block, two planes of 16 nodes, those of a subblock: two nodes along each axis
+        // from half a block, two planes of 16 nodes, the subblock's: two nodes along each axis
         const unsigned half = wp::index(blocks.contact_nodes, e, 2 * active + (within >> 5 & 1));
         const unsigned two = half >> (within & 10) & 0x330033u, four = (two | two >> 2) & 0xf000fu;
         const int contact_nodes = (four | four >> 12) & 0xff;
@@ -243,10 +241,7 @@ for (int n = threadIdx.x; n < subblocks; n += blockDim.x) {
     )
 )
 def store_records(blocks: Blocks, e: int):
-    """Find the record of every subblock's first node, of its momentum, and which of its nodes had another field.
-
-    The slots are those that the same threads have fetched.
-    """
+    """Store the first record of every subblock, and its contact nodes, from what the same thread has fetched."""
     ...
 
 
@@ -271,7 +266,7 @@ return all != 0;
     )
 )
 def has_contact_nodes(box: wp.vec3i, base: wp.vec3i) -> bool:
-    """Whether any node of the stencil at ``base`` had another field, its subblocks :func:`subblocks_around` it."""
+    """Return whether any node of the stencil at ``base`` is a contact node; see :func:`subblocks_around`."""
     ...
 
 
@@ -282,13 +277,24 @@ def has_contact_nodes(box: wp.vec3i, base: wp.vec3i) -> bool:
     )
 )
 def inverse_quantum(at: int) -> float:
-    """One over the unit for what has the most in word ``at``; exact, however the module divides."""
+    """Return one over the quantum for the maximum in word ``at``; exact, with any division mode."""
     ...
 
 
 @wp.func
+def bounded(s: Deposit, quantum: float, failure: wp.array(dtype=int), e: int):
+    """Return the most momentum of a particle in its stencil [kg m/s]; -1 and a failure if it cannot be added."""
+    bounds = momentum_bounds(s)
+    fault = fault_within(s, bounds, quantum)
+    if fault != 0:
+        wp.atomic_or(failure, e, fault)
+        return -1.0
+    return wp.max(bounds)
+
+
+@wp.func
 def raise_quanta(s: Deposit, takes: bool, kind: int, failure: wp.array(dtype=int), e: int):
-    """Whether a particle can be added up; if so, the group's units are raised to its momenta. All threads come here."""
+    """Return whether a particle can be added; if so, raise the tile's maxima to it. All threads must call this."""
     momentum = float(0.0)
     if takes:
         momentum = bounded(s, float_word(MOMENTUM_QUANTUM), failure, e)
@@ -302,17 +308,17 @@ def raise_quanta(s: Deposit, takes: bool, kind: int, failure: wp.array(dtype=int
 {POWER}{SIZE}
 const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5, c = lane & 3;  // of four accumulators
 int warps = blockDim.x >> 5;
-asm volatile("" : "+r"(warps));  // or a compiler finds it anew for each subblock
+asm volatile("" : "+r"(warps));  // keeps the compiler from recomputing it for each subblock
 const int subblocks = size[0] * size[1] * size[2];
 const bool is_place = kind == PLACE, of_mass = c == 0 || is_place;
 const int word = kind == 0 ? c : c + 3 & 3;  // a vector begins where the mass was, if there is none
 const int within = (lane & 16) + (lane >> 1 & 4) + (lane >> 2 & 1) + (kind == KINEMATIC ? 64 : 0);
 const unsigned mass_of_node = 1u << (lane & 28);
-// the tile's units are not smaller than those of the accumulators: shifted, they are exact
+// the tile's quanta are at least those of the accumulators: shifted, they are exact
 float quantum = power_of_two(arena[of_mass ? HEAVIEST : kind == KINEMATIC ? FASTEST_KINEMATIC : FASTEST]);
 quantum *= is_place && c > 0 ? 0x1p-24f : 0x1p-25f;
 const int shift = __float_as_int(quantum) - arena[of_mass ? MASS_QUANTUM : MOMENTUM_QUANTUM] >> 23;
-// a loop for what comes first and one for the rest: threads that branch in it would wait for each other
+// a loop of its own for masses, which come first: no divergent branches within
 struct First {{ enum {{ IS = 1 }}; }};
 struct Later {{ enum {{ IS = 0 }}; }};
 auto put_subblocks = [&](auto which, auto add) {{
@@ -322,20 +328,20 @@ auto put_subblocks = [&](auto which, auto add) {{
         const int sum = *from, record = arena[n] + within;
         int& massive = arena[n - RECORDS + MASSIVE];
         if (decltype(which)::IS) massive = __ballot_sync(ALL, sum != 0);  // written by all threads, the same
-        if (sum != 0 && (massive & mass_of_node)) add(record, sum);  // who adds no mass adds nothing
+        if (sum != 0 && (massive & mass_of_node)) add(record, sum);  // without mass, the rest is rounding
     }}
 }};
 auto put = [&](auto add) {{
     if (kind == 0) put_subblocks(First(), add);
     else put_subblocks(Later(), add);
 }};
-// memory takes the four numbers of a node at a time
+// the four numbers of a node are one memory sector
 auto red = [](size_t to, int record, long long added) {{
     size_t node;
     asm("mad.wide.s32 %0, %1, %2, %3;" : "=l"(node) : "r"(record), "r"(32), "l"(to));
     asm volatile("red.global.add.u64 [%0], %1;" :: "l"(node), "l"(added) : "memory");
 }};
-// what places have of records has no halves
+// records of offsets have no halves
 auto own = [&](int record) {{ return is_place ? (record >> 1 & ~63) + (record & 63) : record; }};
 if (is_place)
     for (int n = threadIdx.x; n < subblocks; n += blockDim.x)
@@ -351,7 +357,8 @@ if (!is_place && __all_sync(ALL, shift < 18)) {{
         red(to, record, added);
     }});
 }} else {{
-    void* const records = is_place ? (void*)&wp::index(accumulators.offset_fixed, e, 0) : &wp::index(accumulators.fixed, e, 0);
+    void* const records
+        = is_place ? (void*)&wp::index(accumulators.offset_fixed, e, 0) : &wp::index(accumulators.fixed, e, 0);
     const size_t to = __cvta_generic_to_global(records) + 8 * word;
     const int most_counted = shift > 48 ? 0 : shift < 18 ? 0x7fffffff : 1 << (48 - shift);
     put([&](int record, int sum) {{
@@ -363,20 +370,8 @@ if (too_much) atomicOr(&wp::index(failure, e), {FAILURE_CFL});
 """)
 )
 def flush_nodes(grid: Grid, accumulators: Accumulators, failure: wp.array(dtype=int), e: int, kind: int, start: int):
-    """Add what the nodes have got of a ``kind`` to the sums outside; sums that are too large are not.
+    """Add the nodes' sums of a ``kind`` to the accumulators, four threads a node; sums that are too large fail.
 
-    It begins ``start`` words after the nodes' first. Four threads a node. Masses come first; slots whose nodes are told
-    places are noted.
+    They begin ``start`` words after the first. Masses must be flushed first; offsets flag their active blocks.
     """
     ...
-
-
-@wp.func
-def bounded(s: Deposit, quantum: float, failure: wp.array(dtype=int), e: int):
-    """The most momentum that a particle has anywhere in its stencil [kg m/s]; -1 if it must not be added up."""
-    bounds = momentum_bounds(s)
-    fault = fault_within(s, bounds, quantum)
-    if fault != 0:
-        wp.atomic_or(failure, e, fault)
-        return -1.0
-    return wp.max(bounds)

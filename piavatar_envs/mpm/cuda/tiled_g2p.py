@@ -1,4 +1,4 @@
-"""G2P of large bodies on a GPU, and what their P2G (:mod:`piavatar_envs.mpm.cuda.tiled_p2g`) adds up and what not."""
+"""G2P of large bodies on a GPU."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ from piavatar_envs.mpm.types import (
     Step,
 )
 
-# divisions and roots to two units in the last place, and logarithms to 4e-7, in a few instructions instead of calls: a
-# warp with a few particles waits for its instructions as much as for its numbers
+# fast_math: divisions and roots to two units in the last place, logarithms to 4e-7, without function calls
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False, "fast_math": True})
 
 _NONFINITE = wp.constant(FAILURE_NONFINITE)
 _CFL = wp.constant(FAILURE_CFL)
-#: Threads of a CUDA block of the gather.
+#: Threads of a CUDA block of G2P.
 THREADS = 128
 
 
@@ -44,10 +43,10 @@ def tiled_g2p(
     failure: wp.array(dtype=int),
     sensors: Sensors,
 ):
-    """Move every particle with the grid, see :func:`piavatar_envs.mpm.g2p.g2p_particle`.
+    """Move every particle with the grid; see :func:`piavatar_envs.mpm.g2p.g2p_particle`.
 
-    Unlike the gather of a CPU it has its loops unrolled, and its threads store together. If it ``senses``, it does the
-    work of :func:`piavatar_envs.mpm.contact_sensors.sense_contact` first.
+    Unlike G2P on a CPU its loops are unrolled, and the threads of a warp store together. If ``senses`` is not 0, it
+    first does the work of :func:`piavatar_envs.mpm.contact_sensors.sense_contact`.
     """
     at = environment_of(wp.tid(), particles.field.shape[0])
     e = at[0]

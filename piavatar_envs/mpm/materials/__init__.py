@@ -1,38 +1,153 @@
-"""Constitutive models: one file a material (energy in NumPy for its test, Kirchhoff stress for the kernels).
+"""Materials: constitutive models, one file each, found by the registry here.
 
-To add one: write ``materials/name.py`` with ``energy`` and ``kirchhoff_stress``, add it to :data:`MATERIALS` and to
-the dispatch in :func:`kirchhoff_stress`. The tests run over :data:`MATERIALS`.
+A file of this folder is a material. It defines ``NAME``, ``kirchhoff_stress(F, mu, lam)``, a ``wp.func`` that returns
+the Kirchhoff stress [Pa], and ``energy(F, mu, lam)``, the energy density [Pa] in NumPy, of which the stress must be the
+derivative, ``tau = (d psi / d F) F^T``. :func:`register_material` adds a material from elsewhere.
 """
 
 from __future__ import annotations
 
-from types import ModuleType
+import importlib
+import pkgutil
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
-from piavatar_envs.mpm.materials import fixed_corotated, neo_hookean
-
 wp.set_module_options({"enable_backward": False})
 
-#: Material name -> its module; the position is the integer that particles carry.
-MATERIALS: dict[str, ModuleType] = {"neo_hookean": neo_hookean, "fixed_corotated": fixed_corotated}
-_FIXED_COROTATED = wp.constant(1)
+
+@dataclass(frozen=True)
+class Material:
+    """A constitutive model.
+
+    Attributes:
+        name: its name in settings.
+        kirchhoff_stress: ``wp.func`` of deformation gradient, shear modulus and first Lame parameter [Pa].
+        energy: NumPy function of the same arguments, ``F`` of shape ``(..., 3, 3)``, to energy density [Pa].
+    """
+
+    name: str
+    kirchhoff_stress: wp.Function
+    energy: Callable[[np.ndarray, float, float], np.ndarray]
+
+
+#: The usual material, which the dispatch evaluates last.
+DEFAULT = "neo_hookean"
+
+
+def _own_materials() -> dict[str, Material]:
+    """Return the materials of this folder by name."""
+    modules = [importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__)]
+    return {module.NAME: Material(module.NAME, module.kirchhoff_stress, module.energy) for module in modules}
+
+
+#: Every material by name; particles carry its position.
+MATERIALS: dict[str, Material] = _own_materials()
+_OWN = frozenset(MATERIALS)
+
+
+def _otherwise(stress: wp.Function) -> wp.Function:
+    """Return a dispatch function that evaluates one material for any index."""
+
+    @wp.func(name="kirchhoff_stress_otherwise")
+    def otherwise(material: int, F: wp.mat33, mu: float, lam: float):
+        return stress(F, mu, lam)
+
+    return otherwise
+
+
+def _choice(index: int, stress: wp.Function, others: wp.Function) -> wp.Function:
+    """Return a dispatch function that evaluates the material ``index``, and ``others`` for the rest."""
+
+    @wp.func(name=f"kirchhoff_stress_{index}")
+    def choice(material: int, F: wp.mat33, mu: float, lam: float):
+        if material == index:
+            return stress(F, mu, lam)
+        return others(material, F, mu, lam)
+
+    return choice
+
+
+def _dispatch() -> wp.Function:
+    """Return the dispatch over all materials."""
+    stress = _otherwise(MATERIALS[DEFAULT].kirchhoff_stress)
+    for index, (name, material) in enumerate(MATERIALS.items()):
+        if name != DEFAULT:
+            stress = _choice(index, material.kirchhoff_stress, stress)
+    return stress
+
+
+_chain = _dispatch()
+
+
+@wp.func
+def kirchhoff_stress(material: int, F: wp.mat33, mu: float, lam: float):
+    """Return the Kirchhoff stress of a particle of any registered material [Pa]."""
+    return _chain(material, F, mu, lam)
+
+
+def register_material(
+    name: str, kirchhoff_stress: wp.Function, energy: Callable[[np.ndarray, float, float], np.ndarray]
+) -> None:
+    """Make a material available to settings and to :class:`piavatar_envs.mpm.model.MaterialPoints`.
+
+    Worlds that exist already are not affected. Registering a name again replaces the material.
+
+    Args:
+        name: its name in settings, a Python identifier.
+        kirchhoff_stress: a ``wp.func`` of deformation gradient (``wp.mat33``), shear modulus and first Lame parameter
+            [Pa] to the Kirchhoff stress [Pa], ``wp.mat33``.
+        energy: the energy density [Pa] in NumPy, of ``F`` of shape ``(..., 3, 3)`` and the same moduli.
+
+    Raises:
+        TypeError: the stress is not a ``wp.func``, or the energy not callable.
+        ValueError: the name is no identifier, or belongs to a material of this package.
+    """
+    if not isinstance(kirchhoff_stress, wp.Function) or not callable(energy):
+        raise TypeError(f"material {name!r}: kirchhoff_stress must be a wp.func, and energy a function")
+    if not name.isidentifier() or name in _OWN:
+        raise ValueError(f"material name {name!r}: use an identifier other than {', '.join(sorted(_OWN))}")
+    MATERIALS[name] = Material(name, kirchhoff_stress, energy)
+    _rebuild()
+
+
+def _rebuild() -> None:
+    """Build the dispatch anew, and have Warp compile the kernels that use it anew."""
+    global _chain
+    _chain = _dispatch()
+    modules, stack = set(), [wp.get_module(__name__)]
+    while stack:
+        module = stack.pop()
+        if module not in modules:
+            modules.add(module)
+            module.mark_modified()
+            stack += module.dependents
 
 
 def material_index(name: str) -> int:
-    """Integer of a material.
+    """Return the position of a material in :data:`MATERIALS`.
+
+    Raises:
+        ValueError: there is no such material.
+    """
+    return list(MATERIALS).index(check_material(name))
+
+
+def check_material(name: str) -> str:
+    """Return the name of a registered material.
 
     Raises:
         ValueError: there is no such material.
     """
     if name not in MATERIALS:
-        raise ValueError(f"unknown material {name!r}; use one of {', '.join(MATERIALS)}")
-    return list(MATERIALS).index(name)
+        raise ValueError(f"unknown material {name!r}; use one of {', '.join(MATERIALS)}, or register_material")
+    return name
 
 
 def lame_parameters(young_modulus, poisson_ratio):
-    """Shear modulus and first Lame parameter [Pa] from Young's modulus [Pa] and Poisson's ratio.
+    """Return shear modulus and first Lame parameter [Pa] from Young's modulus [Pa] and Poisson's ratio.
 
     Raises:
         ValueError: Poisson's ratio is not in [0, 0.5), or the modulus is negative.
@@ -50,16 +165,8 @@ def lame_parameters(young_modulus, poisson_ratio):
 
 
 @wp.func
-def kirchhoff_stress(material: int, F: wp.mat33, mu: float, lam: float):
-    """Kirchhoff stress of a particle of any material [Pa]."""
-    if material == _FIXED_COROTATED:
-        return fixed_corotated.kirchhoff_stress(F, mu, lam)
-    return neo_hookean.kirchhoff_stress(F, mu, lam)
-
-
-@wp.func
 def von_mises_stress(tau: wp.mat33, J: float):
-    """Von Mises equivalent of the Cauchy stress ``tau / J`` [Pa]: ``sqrt(3/2) |deviator|``."""
+    """Return the von Mises equivalent of the Cauchy stress ``tau / J`` [Pa]: ``sqrt(3/2) |deviator|``."""
     mean = (tau[0, 0] + tau[1, 1] + tau[2, 2]) / 3.0
     deviator = tau - wp.diag(wp.vec3(mean))
     return wp.sqrt(1.5 * wp.ddot(deviator, deviator)) / wp.max(J, 1.0e-3)

@@ -12,7 +12,9 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Most Newton steps. Convergence is quadratic: 3 do for stretches near one, 6 for stretches of 1/20 to 20.
+NAME = "fixed_corotated"
+
+#: Most Newton steps. Convergence is quadratic: 3 suffice for stretches near one, 6 for stretches of 1/20 to 20.
 _NEWTON_STEPS = wp.constant(8)
 #: Squared distance of ``R`` and ``R^-T`` from which one more step reaches single precision.
 _CONVERGED = wp.constant(1.0e-6)
@@ -20,7 +22,7 @@ _SINGULAR = wp.constant(1.0e-6)
 
 
 def energy(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
-    """Energy density [Pa] of deformation gradients ``F``, shape ``(..., 3, 3)``, ``det F > 0``."""
+    """Return the energy density [Pa] of deformation gradients ``F``, shape ``(..., 3, 3)``, ``det F > 0``."""
     stretches = np.linalg.svd(F, compute_uv=False)
     J = np.linalg.det(F)
     return mu * ((stretches - 1.0) ** 2).sum(-1) + 0.5 * lam * (J - 1.0) ** 2
@@ -28,9 +30,9 @@ def energy(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
 
 @wp.func
 def polar_rotation(F: wp.mat33):
-    """Orthogonal factor of ``F = R S`` by scaled Newton iteration; the identity if ``F`` is singular."""
+    """Return the orthogonal factor of ``F = R S`` by scaled Newton iteration; the identity if ``F`` is singular."""
     R = F
-    steps = int(_NEWTON_STEPS)  # not a constant, or the loop would be unrolled into most of the scatter's instructions
+    steps = int(_NEWTON_STEPS)  # a variable, to keep the loop: unrolled, it would be most of P2G's code
     for _n in range(steps):
         # the rows of R^-T are cross products of those of R, over the determinant
         yz = wp.cross(R[1], R[2])
@@ -49,7 +51,7 @@ def polar_rotation(F: wp.mat33):
 
 @wp.func
 def kirchhoff_stress(F: wp.mat33, mu: float, lam: float):
-    """Kirchhoff stress ``tau = (d psi / d F) F^T`` [Pa]."""
+    """Return the Kirchhoff stress ``tau = (d psi / d F) F^T`` [Pa]."""
     R = polar_rotation(F)
     J = wp.determinant(F)
     return 2.0 * mu * ((F - R) * wp.transpose(F)) + wp.diag(wp.vec3(lam * (J - 1.0) * J))

@@ -12,13 +12,15 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+NAME = "neo_hookean"
+
 #: Volume ratio below which the logarithm is continued linearly.
 J_MIN = 0.05
 _J_MIN = wp.constant(J_MIN)
 
 
 def energy(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
-    """Energy density [Pa] of deformation gradients ``F``, shape ``(..., 3, 3)``."""
+    """Return the energy density [Pa] of deformation gradients ``F``, shape ``(..., 3, 3)``."""
     J = np.linalg.det(F)
     log_j = np.where(J > J_MIN, np.log(np.maximum(J, J_MIN)), np.log(J_MIN) + J / J_MIN - 1.0)
     return 0.5 * mu * ((F**2).sum((-1, -2)) - 3.0) - mu * log_j + 0.5 * lam * log_j**2
@@ -26,7 +28,7 @@ def energy(F: np.ndarray, mu: float, lam: float) -> np.ndarray:
 
 @wp.func
 def kirchhoff_stress(F: wp.mat33, mu: float, lam: float):
-    """Kirchhoff stress ``tau = (d psi / d F) F^T`` [Pa]."""
+    """Return the Kirchhoff stress ``tau = (d psi / d F) F^T`` [Pa]."""
     J = wp.determinant(F)
     Jc = wp.max(J, _J_MIN)
     ratio = J / Jc  # one where the logarithm holds
