@@ -163,11 +163,11 @@ def test_the_programs_are_recorded_once(make_batch, env_id):
 
 
 @pytest.mark.parametrize(("task", "moves"), [("PIAvatar/KickBall-v0", False), ("PIAvatar/Stand-v0", True)])
-def test_what_goes_beside_marks_and_sensors(make_env, task, moves):
-    """Avatars begin while blocks are marked, and are tracked while sensors are read; not those that move particles."""
+def test_what_runs_parallel_to_activation_and_sensors(make_env, task, moves):
+    """Avatars begin during activation, and are tracked while sensors are read, unless they move particles."""
     launches = make_env(task).unwrapped.batch.step_graph._launches
-    forks = {launch.kernel.key: launch.fork for launch in reversed(launches)}  # of the first launch of each
+    sections = {launch.kernel.key: launch.section for launch in reversed(launches)}  # of the first launch of each
     begins = "set_springs" if moves else "begin_control"
-    assert forks[begins] == forks["activate_particle_blocks"] == forks["clear_sensors"] > 0
-    assert (forks["track_bones"] == forks["read_impulses"] > 0) != moves
-    assert ("put_in_place" in forks) == moves and forks.get("put_in_place", 0) in (0, forks["track_bones"])
+    assert sections[begins] == sections["activate_particle_blocks"] == sections["clear_sensors"] > 0
+    assert (sections["track_bones"] == sections["read_impulses"] > 0) != moves
+    assert ("put_in_place" in sections) == moves and sections.get("put_in_place", 0) in (0, sections["track_bones"])

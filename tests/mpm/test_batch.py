@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 
-from piavatar_envs.core.launch_graph import LaunchGraph, compile_graphs
 from piavatar_envs.mpm.materials import MATERIALS
 from piavatar_envs.mpm.model import MaterialPoints
-from piavatar_envs.mpm.solver import record_substep
-from tests.gpu_on_cpu import NAME as GPU_ON_CPU
 
 ARRAYS = ("x", "u", "C", "F")
 SCENE = {"gravity": (0.0, 0.0, -9.81), "planes": [((0.1, 0.0, 1.0), -0.11, 0.5)], "num_substeps": 25, "margin": 0.3}
 COUNT = 512
-
-wp.set_module_options({"enable_backward": False})
 
 
 def start(sim, seeds):
@@ -87,7 +81,7 @@ def test_wrong_number_of_rows_is_refused(simulate):
         simulate(num_envs=3, points=MaterialPoints(**points), **SCENE)
 
 
-def test_program_equals_eager_launches(simulate):
+def test_captured_graph_equals_eager_launches(simulate):
     replayed = start(simulate(num_envs=2, **SCENE), (1, 2)).run(2)
     eager = start(simulate(num_envs=2, **SCENE), (1, 2))
     for _ in range(2):
@@ -96,7 +90,7 @@ def test_program_equals_eager_launches(simulate):
 
 
 def test_substeps_equal_control_steps(simulate):
-    """25 substeps in one graph equal 25 graphs of one, which mark their blocks anew each time."""
+    """25 substeps in one graph equal 25 graphs of one, which activate their blocks each time."""
     whole = start(simulate(**SCENE), (1,)).run(2)
     split = start(simulate(**{**SCENE, "num_substeps": 1}, control_dt=whole.model.step.dt), (1,)).run(50)
     for array in ARRAYS:
@@ -111,83 +105,9 @@ def test_timed_reports_every_kernel(simulate):
     each = {deposits.get(sim.model.path), "update_grid", "g2p"}
     if sim.model.path == "block":
         once |= {"reset_speeds"}
-        each = {"substep_in_large_room"}
+        each = {"substep_in_large_arena"}
     assert set(seconds) == once | each
     assert all(value > 0.0 for value in seconds.values())
-    marks = {
-        "deactivate_blocks",
-        "reset_active_blocks",
-        "activate_particle_blocks",
-    }  # at the start, and after 8, 16 and 24 substeps
-    assert len(sim.graph) == len(once - marks) + 4 * len(marks) + len(each) * 25
-
-
-def test_a_program_that_has_run_is_closed(simulate, device):
-    sim = simulate(**SCENE).run()
-    with pytest.raises(RuntimeError, match=r"cannot append .*has run"):
-        record_substep(sim.graph, sim.model, sim.state, sim.scratch, 0)
-    assert len(LaunchGraph(device)) == 0
-
-
-@wp.kernel
-def count_runs(runs: wp.array(dtype=int)):
-    runs[wp.tid()] += 1
-
-
-@wp.kernel
-def forget(condition: wp.array(dtype=int)):
-    condition[0] = 0
-
-
-def test_a_program_with_a_condition_runs_where_it_holds(device):
-    """The condition is asked once, before the first launch: the graph itself may change it."""
-    if wp.get_device(device).is_cuda and device != GPU_ON_CPU and not wp.is_conditional_graph_supported():
-        pytest.skip("graphs of this CUDA have no branches")
-    condition, runs = wp.zeros(1, dtype=int, device=device), wp.zeros(3, dtype=int, device=device)
-    graph = LaunchGraph(device, condition)
-    graph.launch(forget, 1, [], [condition])
-    graph.launch(count_runs, 3, [], [runs])
-    for holds, expected in ((0, 0), (1, 1), (0, 1), (2, 2), (0, 2)):
-        condition.assign(np.array([holds], np.int32))
-        graph.run()
-        assert runs.numpy().tolist() == [expected] * 3
-        graph.run()  # it has been forgotten
-        assert runs.numpy().tolist() == [expected] * 3
-    condition.assign(np.array([1], np.int32))
-    graph.run_eager()
-    assert runs.numpy().tolist() == [3] * 3 and condition.numpy()[0] == 0
-
-
-def test_programs_are_compiled_together(device, monkeypatch):
-    """A module is loaded once, whoever launches its kernels; what is appended later is compiled with the first run."""
-    loaded, load = [], wp.load_module
-    monkeypatch.setattr(wp, "load_module", lambda m, *args, **kwargs: loaded.append(m) or load(m, *args, **kwargs))
-    runs, condition = wp.zeros(3, dtype=int, device=device), wp.ones(1, dtype=int, device=device)
-    first, second = LaunchGraph(device), LaunchGraph(device)
-    for graph in (first, second):
-        graph.launch(count_runs, 3, [], [runs])
-        graph.launch(forget, 1, [], [condition])
-    compile_graphs([first, second])
-    assert loaded == [count_runs.module] and not first.unbound and not second.unbound
-    compile_graphs([first, second])
-    assert len(loaded) == 1
-    first.launch(count_runs, 3, [], [runs])
-    assert len(first.unbound) == 1
-    first.run()
-    second.run()
-    assert runs.numpy().tolist() == [3] * 3
-
-
-def test_a_launch_with_wrong_arguments_is_refused_before_anything_runs(device):
-    runs, graph = wp.zeros(3, dtype=int, device=device), LaunchGraph(device)
-    graph.launch(count_runs, 3, [], [runs])
-    graph.launch(count_runs, 3, [runs, 1.0])
-    with pytest.raises(RuntimeError, match="count_runs"):
-        graph.run()
-    assert runs.numpy().tolist() == [0] * 3
-
-
-@pytest.mark.parametrize("shape, dtype", [((2,), int), ((1,), float), ((1, 1), int)])
-def test_bad_conditions(device, shape, dtype):
-    with pytest.raises(ValueError, match=r"use \(1,\) int32"):
-        LaunchGraph(device, wp.zeros(shape, dtype=dtype, device=device))
+    activation = {"deactivate_blocks", "reset_active_blocks", "activate_particle_blocks"}
+    activations = 4  # before substeps 0, 8, 16 and 24
+    assert len(sim.graph) == len(once - activation) + activations * len(activation) + len(each) * 25

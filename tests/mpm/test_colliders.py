@@ -10,10 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.mpm.colliders import (
     COLLIDER_KINDS,
-    CONTACT_GATE,
-    GATED_SLAB,
-    NEAR_BLOCK,
-    NEAR_PARTICLE,
     boundary_contact,
     move_colliders,
     nearest_boundary,
@@ -393,22 +389,3 @@ def test_what_rests_keeps_its_bits_and_what_turns_stays_a_rotation(device):
     assert before[1][0, [0, 2]].tobytes() == after[1][0, [0, 2]].tobytes()
     assert np.abs(before[1][0, 1] - after[1][0, 1]).max() > 0.1
     assert np.linalg.norm(after[1][0, 1]) == pytest.approx(1.0, abs=1e-6)
-
-
-def furthest(center, lower, upper):
-    """Largest distance of a point of a box from ``center``, along whose axes its corners decide."""
-    return np.linalg.norm(np.maximum(np.abs(np.subtract(upper, center)), np.abs(np.subtract(lower, center))))
-
-
-def test_nothing_beyond_the_limits_is_asked_about_boundaries():
-    """A distance changes by no more than the way: what is within a limit's reach of matter must not be left out.
-
-    In grid spacings. A slab is the nodes ``(0, 0..3, 0..3)``, its middle ``(0, 1.5, 1.5)``; a stencil's nodes are up to
-    1.5 away from its particle along each axis, and so is the middle of the matter at a node; the particles whose lowest
-    nodes are in a block are 0.5 to 4.5 from its corner.
-    """
-    slab = furthest((0.0, 1.5, 1.5), (0.0, 0.0, 0.0), (0.0, 3.0, 3.0))
-    stencil = furthest((0.0, 0.0, 0.0), (-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
-    assert CONTACT_GATE + stencil + slab < GATED_SLAB < CONTACT_GATE + stencil + slab + 0.1
-    block = furthest((2.5, 2.5, 2.5), (0.5, 0.5, 0.5), (4.5, 4.5, 4.5))
-    assert NEAR_PARTICLE + block < NEAR_BLOCK < NEAR_PARTICLE + block + 0.1

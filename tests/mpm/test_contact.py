@@ -79,7 +79,7 @@ def test_prescribed_motion_meets_bodies_like_momentum(meet, share):
 
 
 def test_blocks_with_several_fields_are_listed_once(meet):
-    """As bodies come to them; what has been is forgotten with the marks."""
+    """In the order of activation, and from each activation anew."""
     third = {"box": ((-0.1, -0.1, 0.1), (0.1, 0.1, 0.2)), "velocity": (0.6, 0.0, -3.0)}
     sim = meet([LEFT, RIGHT, third], friction=0.4)
     blocks = sim.scratch.blocks
@@ -129,7 +129,7 @@ def test_equal_bodies_exchange_their_velocities(meet):
 def test_bodies_that_separate_are_not_held(meet, equal, speed, device):
     """No tension, and no friction on what leaves: each does what it would do with the other afar, to the bit.
 
-    In the same kernels and groups of particles: a GPU has others for a world of one body.
+    On the same path and in the same tiles: a GPU uses another path for a single body.
     """
     path = "plain" if device == "cpu" else "tiled"
     bodies = [LEFT | {"velocity": (-speed, 0.3, 0.0)}, RIGHT | {"velocity": (speed, 0.3, 0.0)}]
@@ -155,7 +155,7 @@ def test_bodies_side_by_side_leave_each_other_alone(meet):
 def test_far_bodies_do_not_know_each_other(meet, device):
     """A node with one field is untouched, though the two do share blocks of nodes: 3.5 spacings lie between them.
 
-    To the bit; on a GPU to round-off, for there another kernel sees to the nodes of shared blocks.
+    To the bit; on a GPU to round-off, because contact blocks are updated by another kernel.
     """
     far = {"ball": ((0.29, 0.02, 0.01), 0.06), "velocity": (0.0, 1.0, 0.0)}
     plane = [((0.0, 0.0, 1.0), -0.11, 0.5)]

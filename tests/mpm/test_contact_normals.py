@@ -41,7 +41,7 @@ def look_at_nodes(
     gap: wp.array(dtype=float),
     position: wp.array(dtype=wp.vec3),
 ):
-    """The nodes of the blocks that both fields share, where the first of them has its slot."""
+    """Evaluate the nodes of contact blocks, by the active blocks of the first field."""
     active, local = wp.tid()
     if active >= blocks.num_active[0]:
         return

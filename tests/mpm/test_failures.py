@@ -35,7 +35,7 @@ FAULTS = {
 def three(simulate, device, request):
     """Three environments in free fall onto the ground, each with another velocity; a fresh start each call.
 
-    On a GPU also with the scatters of large bodies.
+    On a GPU also on the tiled path.
     """
     if request.param is not None and device == "cpu":
         pytest.skip("only the plain path is for a CPU")

@@ -102,7 +102,7 @@ def count_up(stride: int, records: wp.array2d(dtype=wp.vec4), mass: wp.array(dty
 
 @pytest.mark.parametrize("stride", [1, 3])
 def test_records_have_two_halves(device, stride):
-    """Those of a slot's 64 nodes lie one after the other, first the physical ones."""
+    """The physical halves of a block's 64 nodes come first, then the kinematic ones."""
     start = np.random.default_rng(2).integers(0, 99, (stride, 2, 64, 4)).astype(np.float32)
     records = wp.array(start.reshape(1, -1, 4), dtype=wp.vec4, device=device)
     mass = wp.zeros(RECORDS, dtype=float, device=device)

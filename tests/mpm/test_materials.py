@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
+
 import numpy as np
 import pytest
 import warp as wp
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
+import piavatar_envs
+from piavatar_envs.config.schema import PhysicsConfig
 from piavatar_envs.mpm.materials import (
     MATERIALS,
     kirchhoff_stress,
@@ -90,14 +95,16 @@ def deformations(kind):
     return F.astype(np.float32).astype(float)
 
 
-def energy_gradient(module, F, step=1e-6):
+def energy_gradient(material, F, step=1e-6):
     """Central differences of the energy density with respect to F, shape (P, 3, 3) [Pa]."""
     gradient = np.empty_like(F)
     for i in range(3):
         for j in range(3):
             delta = np.zeros((3, 3))
             delta[i, j] = step
-            gradient[:, i, j] = (module.energy(F + delta, MU, LAM) - module.energy(F - delta, MU, LAM)) / (2.0 * step)
+            gradient[:, i, j] = (material.energy(F + delta, MU, LAM) - material.energy(F - delta, MU, LAM)) / (
+                2.0 * step
+            )
     return gradient
 
 
@@ -200,3 +207,62 @@ def test_bad_materials_are_refused():
             lame_parameters(1e5, [0.3, poisson_ratio])
     with pytest.raises(ValueError, match="young_modulus=-1"):
         lame_parameters([1.0, -1.0], 0.3)
+
+
+#: St. Venant-Kirchhoff, as a user would write it in a module of their own.
+USERS_MATERIAL = """
+import numpy as np
+import warp as wp
+
+
+@wp.func
+def stress(F: wp.mat33, mu: float, lam: float):
+    E = 0.5 * (wp.transpose(F) * F - wp.identity(n=3, dtype=float))
+    S = 2.0 * mu * E + lam * wp.trace(E) * wp.identity(n=3, dtype=float)
+    return F * S * wp.transpose(F)
+
+
+def energy(F, mu, lam):
+    E = 0.5 * (np.swapaxes(F, -1, -2) @ F - np.eye(3))
+    return mu * (E**2).sum((-1, -2)) + 0.5 * lam * np.trace(E, axis1=-2, axis2=-1) ** 2
+"""
+
+
+@pytest.fixture
+def users_material(tmp_path, monkeypatch):
+    """A material registered from a module outside the package."""
+    (tmp_path / "users_material.py").write_text(USERS_MATERIAL)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    module = importlib.import_module("users_material")
+    piavatar_envs.register_material("st_venant_kirchhoff", module.stress, module.energy)
+    yield "st_venant_kirchhoff"
+    del MATERIALS["st_venant_kirchhoff"], sys.modules["users_material"]
+
+
+def test_a_registered_material_is_one_like_any_other(stress, simulate, users_material):
+    """Its stress is the derivative of its energy, a body of it vibrates without gaining energy, settings accept it."""
+    F = deformations("moderate")
+    expected = energy_gradient(MATERIALS[users_material], F) @ np.swapaxes(F, 1, 2)
+    np.testing.assert_allclose(stress(users_material, F), expected, atol=1e-5 * np.abs(expected).max())
+    before = energy_gradient(MATERIALS["neo_hookean"], F) @ np.swapaxes(F, 1, 2)
+    np.testing.assert_allclose(stress("neo_hookean", F), before, atol=1e-5 * np.abs(before).max())
+    sim = simulate(num_substeps=20, material=users_material)
+    sim.set(u=0.5 * np.sin(8.0 * sim.rest[:, [1, 2, 0]]))
+    history = [sim.totals(), *(sim.run().totals() for _ in range(10))]
+    energy = np.array([t.kinetic + t.elastic for t in history])
+    assert sim.failures == [0]
+    assert max(t.elastic for t in history) > 0.05 * energy[0]
+    assert np.diff(energy).max() < 1e-3 * energy[0]
+    assert PhysicsConfig(material=users_material).material == users_material
+    with pytest.raises(ValueError, match=r"'jelly'.*st_venant_kirchhoff"):
+        PhysicsConfig(material="jelly")
+
+
+def test_bad_registrations_are_refused():
+    law = MATERIALS["neo_hookean"]
+    with pytest.raises(ValueError, match="'neo_hookean'"):
+        piavatar_envs.register_material("neo_hookean", law.kirchhoff_stress, law.energy)
+    with pytest.raises(ValueError, match="'not a name'"):
+        piavatar_envs.register_material("not a name", law.kirchhoff_stress, law.energy)
+    with pytest.raises(TypeError, match="'mine'"):
+        piavatar_envs.register_material("mine", law.energy, law.energy)

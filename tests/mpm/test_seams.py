@@ -75,7 +75,7 @@ def test_halves_without_a_seam_push_each_other(simulate):
 
 
 def test_prescribed_motion_grows_together_too(simulate):
-    """Kinematic momentum is summed like the physical one: a strained bar that is told to turn does not tear."""
+    """Kinematic momentum is summed like the physical one: a strained bar with prescribed rotation does not tear."""
     runs = []
     for sim in (bar(simulate), bar(simulate, 0.0)):
         turning = np.cross([0.0, 3.0, 0.0], sim.rest)

@@ -121,7 +121,7 @@ def substep_kernel(large: bool, with_g2p: bool) -> wp.Kernel:
         with_g2p: whether the launch is the whole substep.
     """
     words, threads, at_once = (LARGE_ARENA, LARGE_THREADS, 1) if large else (SMALL_ARENA, SMALL_THREADS, 2)
-    name = f"{'substep' if with_g2p else 'nodes'}_in_{'large' if large else 'small'}_room"
+    name = f"{'substep' if with_g2p else 'nodes'}_in_{'large' if large else 'small'}_arena"
 
     @wp.kernel(
         name=name,
@@ -130,7 +130,7 @@ def substep_kernel(large: bool, with_g2p: bool) -> wp.Kernel:
         # fast_math: divisions and roots to two units in the last place, logarithms to 4e-7, without function calls
         module_options={"enable_backward": False, "default_grid_stride": False, "fast_math": True},
     )
-    def substep_in_room(
+    def substep_in_arena(
         grid: Grid,
         step: Step,
         particles: Particles,
@@ -155,7 +155,7 @@ def substep_kernel(large: bool, with_g2p: bool) -> wp.Kernel:
             e, partition, with_g2p,
         )  # fmt: skip
 
-    return substep_in_room
+    return substep_in_arena
 
 
 @wp.kernel

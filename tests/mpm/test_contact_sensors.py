@@ -1,4 +1,4 @@
-"""Contact sensors tell what contact did; batches, failures and the scratch of worlds with several bodies."""
+"""Contact sensors; batches, failures and the scratch of worlds with several bodies."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_impulses_are_the_changes_of_momentum(meet, normals):
 def test_penetration_of_a_known_overlap(meet, device, overlap, density, path):
     """The centre of the deepest particle, a quarter of a spacing inside its body; the bodies are at rest."""
     if device == "cpu" and path:
-        pytest.skip("a CPU has but one way to scatter")
+        pytest.skip("a CPU has only the plain path")
     into = {"box": ((-overlap * DX, -0.1, -0.1), (0.2 - overlap * DX, 0.1, 0.1)), "density": density}
     sim = meet([CUBE, into], num_substeps=1, control_dt=1e-4, path=path).run()
     expected = max(0.0, overlap - 0.25) * DX
@@ -56,9 +56,9 @@ def test_penetration_of_a_known_overlap(meet, device, overlap, density, path):
 
 @pytest.mark.parametrize("path", ["tiled"])
 def test_penetration_of_bodies_that_go_on(meet, device, path):
-    """Into blocks that the last gather has marked, of which a grid pass knows nothing yet."""
+    """They enter blocks that the last G2P has activated, which hold no velocities yet."""
     if device == "cpu":
-        pytest.skip("a CPU has but one way to scatter")
+        pytest.skip("a CPU has only the plain path")
     for substeps in (1, 2, 5, 9):
         settings = {"num_substeps": substeps, "control_dt": 1e-3 * substeps}
         sims = [meet([BLOCK, BALL], path=way, **settings) for way in ("plain", path)]

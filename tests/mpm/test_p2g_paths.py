@@ -1,4 +1,4 @@
-"""All ways from particles to nodes give the same physics, and those in fixed point the same bits every time."""
+"""All paths of P2G give the same physics, and those in fixed point the same bits every time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pytest
 import warp as wp
 
 from piavatar_envs.core.launch_graph import LaunchGraph
-from piavatar_envs.mpm.cuda import tiled_p2g as tiled_p2g
-from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, partitions_of, suits_block_path
+from piavatar_envs.mpm.cuda import tiled_p2g
+from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, partitions_of
 from piavatar_envs.mpm.cuda.tile_grid import CAPACITY
 from piavatar_envs.mpm.grid_arrays import choose_quanta
-from piavatar_envs.mpm.memory import ACTIVE_MARGIN, LARGE_MARGIN, choose_activation_interval, estimate_active_blocks
+from piavatar_envs.mpm.memory import ACTIVE_MARGIN, LARGE_MARGIN, estimate_active_blocks
 from piavatar_envs.mpm.model import MaterialPoints, choose_path
 from piavatar_envs.mpm.p2g import MAX_QUANTA
 from piavatar_envs.mpm.solver import record_first_activation, record_p2g
@@ -30,8 +30,8 @@ PLANE = [((0.0, 0.0, 1.0), -0.11, 0.5)]
 
 
 @pytest.fixture
-def scatter(request, device):
-    """A way to scatter; those of a GPU only there."""
+def path(request, device):
+    """A path of P2G; those of a GPU only there."""
     if request.param != "plain" and device == "cpu":
         pytest.skip("only the plain path is for a CPU")
     return request.param
@@ -62,7 +62,7 @@ def records_of(sums):
 
 
 def node_sums(sim):
-    """Mass, momenta and offsets of every node that has a slot, by field and block: ``{(env, of both): (64, 10)}``."""
+    """Mass, momenta and offsets of the nodes of active blocks, ``{(env, owner): (64, 10)}``."""
     model, scratch, graph = sim.model, sim.scratch, LaunchGraph(sim.model.device)
     record_first_activation(graph, model, sim.state, scratch)
     record_p2g(graph, model, sim.state, scratch)
@@ -130,7 +130,7 @@ def test_sums_are_those_of_the_equations(collide, path):
 
 
 @pytest.mark.parametrize("path", [name for name in PATHS if name != "block"], indirect=True)
-def test_slots_whose_nodes_are_told_something_are_noted(meet, path):
+def test_active_blocks_whose_nodes_are_told_something_are_noted(meet, path):
     """The grid pass asks no others for offsets and kinematic momentum; it leaves nothing of what it has read."""
     bar = {"box": ((-0.8, -0.1, -0.1), (0.0, 0.1, 0.1)), "velocity": (0.2, 0.1, 0.0)}  # from a wall to a cube
     wall = [((1.0, 0.0, 0.0), -0.81, 0.5)]
@@ -151,8 +151,8 @@ def test_slots_whose_nodes_are_told_something_are_noted(meet, path):
 
 @pytest.mark.parametrize("path", [name for name in PATHS if name != "block"], indirect=True)
 @pytest.mark.parametrize("edges", [(4.0, 4.0, 2.4), (7.0, 5.0, 2.4)])
-def test_what_particles_tell_in_boxes_of_any_size(simulate, path, edges):
-    """How they are driven and where they are is added up by groups at once, or, where subblocks are many, in turns."""
+def test_contact_candidates_in_boxes_of_any_size(simulate, path, edges):
+    """Kinematic momentum and offsets of candidates, which a tile adds at once or, in large boxes, in two rounds."""
     rng = np.random.default_rng(7)
     sim = simulate(rest=rng.uniform(0.3, 1.0, (30, 3)), planes=[((0.0, 0.0, 1.0), 0.0, 0.5)], path=path)
     dx = float(sim.model.grid.dx)
@@ -171,7 +171,7 @@ def test_what_particles_tell_in_boxes_of_any_size(simulate, path, edges):
 
 @pytest.mark.parametrize("path", [name for name in PATHS if name != "block"], indirect=True)
 def test_particles_far_apart(simulate, path):
-    """They touch more subblocks of nodes than a group has room for, and go in turns."""
+    """They touch more subblocks than a tile can hold, which then needs several passes."""
     rng = np.random.default_rng(6)
     sim = simulate(rest=rng.uniform(-0.5, 0.5, (300, 3)), path=path)
     sim.set(u=rng.normal(0.0, 1.0, (300, 3)))
@@ -183,7 +183,7 @@ def test_particles_far_apart(simulate, path):
 
 
 @pytest.mark.parametrize("path", ["tiled"], indirect=True)
-def test_who_adds_no_mass_adds_nothing(simulate, path):
+def test_without_mass_nothing_is_added(simulate, path):
     """Light particles are fast: their momentum counts, their mass is less than a unit.
 
     A node with momentum and no mass would be skipped, and keep it for who comes there later.
@@ -212,7 +212,7 @@ def test_sums_too_large_for_their_words_fail(simulate, device, share, failure):
 
 
 @pytest.mark.parametrize("path", [name for name in PATHS if name != "plain"], indirect=True)
-def test_scatters_agree(collide, path):
+def test_paths_agree(collide, path):
     """With the plain one, to what round-off makes of a collision."""
     other, plain = collide(path=path, max_active_blocks=SLOTS).run(2), collide(path="plain").run(2)
     for e in range(3):
@@ -221,8 +221,8 @@ def test_scatters_agree(collide, path):
 
 
 @pytest.mark.parametrize("share", [32, 64, 128])
-def test_groups_of_any_size_agree(collide, device, monkeypatch, share):
-    """Their units are their own, and some groups go in turns."""
+def test_tiles_of_any_size_agree(collide, device, monkeypatch, share):
+    """Tiles have their own quanta, and some need several passes."""
     if device == "cpu":
         pytest.skip("tiles are a GPU's")
     monkeypatch.setattr(tiled_p2g, "TILE_SIZES", ((2**31, share),))
@@ -233,7 +233,7 @@ def test_groups_of_any_size_agree(collide, device, monkeypatch, share):
 
 
 def test_subblocks_that_do_not_fit_go_in_rounds(collide, device):
-    """Integers are added up: how many subblocks shared memory holds at once changes no bit of the sums."""
+    """Sums are integers: how many subblocks shared memory holds at once changes no bit of the sums."""
     if device == "cpu":
         pytest.skip("shared memory is a GPU's")
     once, often = (collide(path="block", max_active_blocks=SLOTS) for _ in range(2))
@@ -246,7 +246,7 @@ def test_subblocks_that_do_not_fit_go_in_rounds(collide, device):
         )
 
 
-def test_a_large_room_gives_the_same(simulate, equal, device, monkeypatch):
+def test_a_large_arena_gives_the_same(simulate, equal, device, monkeypatch):
     """One world has it to itself; in a batch there are two in a multiprocessor."""
     if device == "cpu":
         pytest.skip("shared memory is a GPU's")
@@ -269,25 +269,8 @@ def test_a_large_room_gives_the_same(simulate, equal, device, monkeypatch):
         ([2, 1, 0, 2], [(0, 4, 0b111)]),
     ],
 )
-def test_parts_share_no_field(field, partitions):
+def test_partitions_share_no_field(field, partitions):
     assert partitions_of(np.array(field)) == partitions
-
-
-@pytest.mark.parametrize(
-    ("bodies", "particles", "active_blocks", "suits"),
-    [
-        (1, 8192, 300, True),
-        (1, 8193, 300, False),
-        (8, 8000, 1000, True),
-        (9, 8000, 1000, False),
-        (1, 2000, 3000, False),
-    ],
-)
-def test_what_shared_memory_holds(monkeypatch, bodies, particles, active_blocks, suits):
-    """Bodies that a CUDA block has time for, particles that half words count, slots that there is room for."""
-    h200 = SimpleNamespace(is_cuda=True, arch=90, max_shared_memory_per_block=227 * 1024)
-    monkeypatch.setattr(wp, "get_device", lambda name: h200)
-    assert suits_block_path("cuda:0", np.repeat(np.arange(bodies), particles), active_blocks) is suits
 
 
 @pytest.mark.parametrize(
@@ -323,7 +306,7 @@ def test_a_crowd_is_counted_in_larger_units(simulate, device, copies):
         assert sim.failures == [0]
         np.testing.assert_allclose(sim.get("u"), np.tile([0.3, -0.2, 0.1], (len(rest), 1)), atol=1e-5)
         moved.append(sim.get("x"))
-    np.testing.assert_array_equal(*moved[1:])  # one round's gather is another kernel
+    np.testing.assert_array_equal(*moved[1:])  # with a single round G2P reads shared memory
 
 
 @pytest.mark.parametrize("path", ["block", "tiled"], indirect=True)
@@ -338,7 +321,7 @@ def test_runs_repeat_bit_for_bit(collide, path):
         np.testing.assert_array_equal(found, getattr(second.scratch.sensors, name).numpy(), err_msg=name)
 
 
-def test_units_are_powers_of_two(collide):
+def test_quanta_are_powers_of_two(collide):
     """So that numbers go in and out of fixed point without a factor that would drain momentum."""
     sim = collide()
     for unit in choose_quanta(np.array([[900.0, 1000.0, 7800.0]]), sim.model.grid, sim.model.step):
@@ -349,7 +332,7 @@ def test_units_are_powers_of_two(collide):
     assert (mass > 0.7 * cell / 2**36).all() and (mass < 1.5 * cell / 2**36).all()
 
 
-def test_too_few_slots_fail_one_environment(simulate):
+def test_too_few_active_blocks_fail_one_environment(simulate):
     """A body that flies apart needs more blocks than there are: that environment fails, says so, and can be reset."""
     sim = simulate(num_envs=2, num_substeps=10, max_active_blocks=40, margin=1.0)
     together = sim.state.x.numpy().copy()
@@ -365,8 +348,8 @@ def test_too_few_slots_fail_one_environment(simulate):
     np.testing.assert_array_equal(sim.state.x.numpy(), fresh.state.x.numpy())
 
 
-def test_slots_that_run_out_in_flight(simulate):
-    """A body that leaves its blocks within a control step, with no slot to spare."""
+def test_active_blocks_that_run_out_in_flight(simulate):
+    """A body that leaves its blocks within a control step, with no active block to spare."""
     still = simulate(num_substeps=10).run()
     used = int(still.scratch.blocks.num_active.numpy()[0])
     assert simulate(num_substeps=10, max_active_blocks=used).run().failures == [0]
@@ -374,7 +357,7 @@ def test_slots_that_run_out_in_flight(simulate):
     assert moving.run().failures == [16] and moving.accumulators_are_clear
 
 
-def test_fast_bodies_leave_their_slots_behind(simulate):
+def test_fast_bodies_leave_their_blocks_behind(simulate):
     """20 m/s: in a control step the body sweeps many times the blocks that it ever needs at once."""
     active_blocks = estimate_active_blocks(simulate().rest, None, 0.05)
     sim = (
@@ -386,8 +369,8 @@ def test_fast_bodies_leave_their_slots_behind(simulate):
     np.testing.assert_allclose(sim.get("x") - sim.rest, np.tile([2.0, 0.0, 0.0], (len(sim.rest), 1)), atol=1e-3)
 
 
-def test_large_bodies_have_more_slots_to_leave_behind(simulate, device):
-    """Their groups are marked anew every 25 substeps, in which this one goes 13 grid spacings."""
+def test_large_bodies_have_more_blocks_to_leave_behind(simulate, device):
+    """Blocks are activated every 25 substeps, in which this body moves 13 grid spacings."""
     box = {"lower": (-0.3, -0.675, -0.675), "upper": (0.3, 0.675, 0.675), "spacing": 0.05}
     rest = simulate(**box).rest
     assert len(rest) > MOST_PARTICLES
@@ -402,27 +385,15 @@ def test_large_bodies_have_more_slots_to_leave_behind(simulate, device):
         assert sim.model.activation_interval == 25 and sim.run().failures == failures
 
 
-@pytest.mark.parametrize(
-    ("path", "counts", "marks"),
-    [
-        ("plain", [9_000], 8),
-        ("tiled", [8_192, 8_192], 16),
-        ("tiled", [100, 8_193], 25),
-    ],
-)
-def test_marks_are_as_rare_as_there_is_room_for(path, counts, marks):
-    assert choose_activation_interval(path, np.repeat(np.arange(len(counts)), counts)) == marks
-
-
-def test_slots_do_not_grow_with_the_grid(simulate):
+def test_active_blocks_do_not_grow_with_the_grid(simulate):
     """Slots are as many as the body touches, whatever the size of the grid."""
     near, far = simulate(margin=0.3).run(), simulate(margin=3.0).run()
     assert near.scratch.blocks.num_active.numpy()[0] <= 27 and far.scratch.blocks.num_active.numpy()[0] <= 27
     assert far.model.num_blocks > 20 * near.model.num_blocks
 
 
-def test_groups_are_compact_and_of_one_field():
-    """Two clouds of particles in one order, two fields: whoever is far from the others has a group of their own."""
+def test_tiles_are_compact_and_of_one_field():
+    """Two clouds of particles in one order, two fields: particles far from the others have a tile of their own."""
     rng = np.random.default_rng(7)
     near, far = rng.uniform(0.0, 0.05, (200, 3)), rng.uniform(0.0, 0.05, (56, 3)) + [0.0, 2.0, 0.0]
     rest, field = np.concatenate([near, far, near[:30]]), np.repeat([3, 1], [256, 30])

@@ -150,22 +150,24 @@ def test_too_fine_grid():
         make_grid((0, 0, 0), (1, 1, 1), 9e-4)
 
 
-def test_slots(model_of):
+def test_active_blocks_are_bounded(model_of):
     """As many as all particles can touch at once, fewer if asked for; a record's stride is 32-bit."""
     blocks = model_of().num_blocks
     assert model_of().max_active_blocks == min(8 * 8, blocks) and model_of(max_active_blocks=5).max_active_blocks == 5
     for active_blocks in (0, -1):
-        with pytest.raises(ValueError, match=rf"{active_blocks} blocks of nodes.*at least 1"):
+        with pytest.raises(ValueError, match=rf"{active_blocks} active blocks.*at least 1"):
             model_of(max_active_blocks=active_blocks)
     fine = make_grid((0, 0, 0), (4, 4, 4), 0.005)
     field = np.zeros(10**6, int)
     assert memory.bound_active_blocks(memory.MAX_ACTIVE_BLOCKS - 1, field, fine, 1) * 64 * 64 < 2**31
-    with pytest.raises(ValueError, match=rf"{memory.MAX_ACTIVE_BLOCKS} blocks.*less than {memory.MAX_ACTIVE_BLOCKS}"):
+    with pytest.raises(
+        ValueError, match=rf"{memory.MAX_ACTIVE_BLOCKS} active blocks.*less than {memory.MAX_ACTIVE_BLOCKS}"
+    ):
         memory.bound_active_blocks(memory.MAX_ACTIVE_BLOCKS, field, fine, 1)
 
 
-def test_unknown_scatter_is_refused(model_of, device):
-    with pytest.raises(ValueError, match=r"unknown scatter 'heap'.*plain, runs"):
+def test_unknown_path_is_refused(model_of, device):
+    with pytest.raises(ValueError, match=r"'heap'.*plain, tiled, block"):
         model_of(path="heap")
     if device == "cpu":
         with pytest.raises(ValueError, match=r"path='tiled' needs a GPU.*cpu takes 'plain'"):

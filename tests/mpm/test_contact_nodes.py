@@ -1,4 +1,4 @@
-"""Who is noted to have other fields at a node."""
+"""Contact nodes: nodes at which another field had mass in the previous substep."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from piavatar_envs.mpm.sparse_grid import THREADS, plan_sweep
 
 @pytest.fixture
 def heap(meet, three_boxes, device):
-    """Three boxes that come together on a floor, added up by groups."""
+    """Three boxes that come together on a floor, on the tiled path."""
     if device == "cpu":
         pytest.skip("tiles are a GPU's")
     return meet(three_boxes, num_substeps=5, planes=[((0.0, 0.0, 1.0), -0.11, 0.5)], path="tiled", control_dt=0.005)
 
 
-def test_bits_are_nodes_where_others_have_mass(heap):
+def test_contact_nodes_are_where_another_field_has_mass(heap):
     """Of every field in every block that has several; none elsewhere."""
     heap.run(2)
     blocks, count = heap.scratch.blocks, heap.model.num_blocks
@@ -40,15 +40,15 @@ def test_bits_are_nodes_where_others_have_mass(heap):
     np.testing.assert_array_equal(bits[:used], expected)
 
 
-def shared_slots(blocks) -> np.ndarray:
-    """Slots of blocks that have several fields."""
+def in_contact_blocks(blocks) -> np.ndarray:
+    """Return the active blocks that lie in contact blocks."""
     count, owner = int(blocks.num_active.numpy()[0]), blocks.owner.numpy()[0]
     fields = blocks.fields.numpy()[0][owner[:count] % blocks.fields.shape[1]]
     return np.flatnonzero(fields & (fields - 1))
 
 
-def told_by_scatter(sim) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets and kinematic momentum [units] of all slots' nodes, scattered as bits are now; no sums are left."""
+def deposited(sim) -> tuple[np.ndarray, np.ndarray]:
+    """Run P2G, return offsets and kinematic momentum [quanta] of all nodes, and clear the accumulators."""
     model, sums = sim.model, sim.scratch.accumulators
     graph = LaunchGraph(model.device)
     record_p2g(graph, model, sim.state, sim.scratch)
@@ -60,14 +60,14 @@ def told_by_scatter(sim) -> tuple[np.ndarray, np.ndarray]:
     return offsets, kinematic
 
 
-def test_a_node_with_a_bit_is_told_by_all_around(heap):
+def test_all_particles_near_a_contact_node_add_to_it(heap):
     """Bits here and there, few enough for a particle to have one at its nodes and most others to have none."""
     heap.set(vk=np.random.default_rng(3).normal(0.0, 0.3, heap.state.vk.numpy().shape))
-    marks = LaunchGraph(heap.model.device)
-    record_first_activation(marks, heap.model, heap.state, heap.scratch)
-    marks.run()
-    whole = told_by_scatter(heap)  # who has just been marked tells all nodes
-    active_blocks = shared_slots(heap.scratch.blocks)
+    activation = LaunchGraph(heap.model.device)
+    record_first_activation(activation, heap.model, heap.state, heap.scratch)
+    activation.run()
+    whole = deposited(heap)  # after an activation all nodes of contact blocks are contact nodes
+    active_blocks = in_contact_blocks(heap.scratch.blocks)
     nodes = np.argwhere(whole[0][active_blocks].any(2) & whole[1][active_blocks].any(2))
     nodes = np.random.default_rng(4).choice(nodes, 5, replace=False)
     chosen = np.zeros((heap.model.max_active_blocks, 64), bool)
@@ -75,7 +75,7 @@ def test_a_node_with_a_bit_is_told_by_all_around(heap):
     heap.scratch.blocks.contact_nodes.assign(
         np.packbits(chosen, axis=1, bitorder="little").view(np.int32).reshape(1, -1)
     )
-    for found, expected in zip(told_by_scatter(heap), whole, strict=True):
+    for found, expected in zip(deposited(heap), whole, strict=True):
         scale = np.abs(expected).max()
         assert np.abs(expected[chosen]).max() > 0.01 * scale
         np.testing.assert_allclose(found[chosen], expected[chosen], atol=1e-5 * scale)
@@ -83,15 +83,15 @@ def test_a_node_with_a_bit_is_told_by_all_around(heap):
 
 
 @pytest.mark.parametrize("candidates", [True, False])
-def test_contact_acts_only_where_fields_have_told(heap, candidates):
-    """All nodes have offsets; whether they count as told is what bits say."""
+def test_contact_acts_only_at_contact_nodes(heap, candidates):
+    """All nodes have offsets; the bits decide at which of them contact acts."""
     heap.run(2)
     model, scratch = heap.model, heap.scratch
-    marks, contact, sweep = LaunchGraph(model.device), LaunchGraph(model.device), plan_sweep(model)
-    record_first_activation(marks, model, heap.state, scratch)
-    record_p2g(marks, model, heap.state, scratch)
-    marks.run()
-    assert (scratch.blocks.contact_nodes.numpy()[0].reshape(-1, 2)[shared_slots(scratch.blocks)] == -1).all()
+    activation, contact, sweep = LaunchGraph(model.device), LaunchGraph(model.device), plan_sweep(model)
+    record_first_activation(activation, model, heap.state, scratch)
+    record_p2g(activation, model, heap.state, scratch)
+    activation.run()
+    assert (scratch.blocks.contact_nodes.numpy()[0].reshape(-1, 2)[in_contact_blocks(scratch.blocks)] == -1).all()
     if not candidates:
         scratch.blocks.contact_nodes.zero_()
     inputs = [model.grid, model.contact, sweep, scratch.blocks, heap.state.failure]
@@ -110,4 +110,4 @@ def test_contact_acts_only_where_fields_have_told(heap, candidates):
     outputs = [scratch.accumulators, scratch.velocity, scratch.sensors]
     contact.launch(solve_contact, sweep.threads, inputs, outputs, block_dim=THREADS)
     contact.run()
-    assert scratch.sensors.touched.numpy()[0][shared_slots(scratch.blocks)].any() == candidates
+    assert scratch.sensors.touched.numpy()[0][in_contact_blocks(scratch.blocks)].any() == candidates
