@@ -310,7 +310,7 @@ def allocate(declaration: Any, num_envs: int, device: str, **given: Any) -> Any:
         declared, build = inspect.get_annotations(declaration, eval_str=True), declaration
     else:
         declared = {name: variable.type for name, variable in declaration.vars.items()}
-        build = partial(group, declaration)
+        build = partial(make_struct, declaration)
     values = {}
     for name, kind in declared.items():
         value = given.get(name, NUM_JOINTS)

@@ -101,8 +101,8 @@ def test_timed_reports_every_kernel(simulate):
     sim = simulate(**SCENE)
     seconds = sim.graph.timed(1)
     once = {"deactivate_blocks", "reset_active_blocks", "activate_particle_blocks", "freeze", "read_impulses"}
-    deposits = {"plain": "p2g", "tiled": "tiled_p2g"}
-    each = {deposits.get(sim.model.path), "update_grid", "g2p"}
+    tiled = sim.model.path == "tiled"
+    each = {"tiled_p2g" if tiled else "p2g", "update_grid", "tiled_g2p" if tiled else "g2p"}
     if sim.model.path == "block":
         once |= {"reset_speeds"}
         each = {"substep_in_large_arena"}

@@ -53,10 +53,10 @@ from piavatar_envs.core.arrays import number_at, store_pair, store_vector, vec8,
 from piavatar_envs.core.cuda_intrinsics import (
     BLOCK,
     first_particle,
-    sync_block,
-    sync_threads,
     place_in_block,
     sum_threads12,
+    sync_block,
+    sync_threads,
     threads_of_environment,
     warp_of_block,
 )
