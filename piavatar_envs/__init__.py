@@ -5,6 +5,7 @@ Nothing heavy is imported and no GPU is touched until an environment is made.
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register, registry
@@ -13,12 +14,28 @@ from piavatar_envs.tasks import add_task, place_of, task_modules
 
 if TYPE_CHECKING:
     from piavatar_envs.api.conformance import check_task
+    from piavatar_envs.avatar.body.sources import register_source
+    from piavatar_envs.avatar.motion import register_motion
     from piavatar_envs.envs.task import Task
     from piavatar_envs.mpm.materials import register_material
 
-__all__ = ["check_task", "register_game", "register_material", "register_task"]
+__all__ = [
+    "check_task",
+    "register_game",
+    "register_material",
+    "register_motion",
+    "register_source",
+    "register_task",
+]
 __version__ = "0.1.0"
 
+#: Modules of the public functions that are imported on first use.
+_LAZY = {
+    "check_task": "api.conformance",
+    "register_material": "mpm.materials",
+    "register_motion": "avatar.motion",
+    "register_source": "avatar.body.sources",
+}
 #: What Gymnasium calls for every id.
 ENTRY_POINT = "piavatar_envs.api.gym_env:AvatarEnv"
 
@@ -69,16 +86,10 @@ def register_game(name: str, task: type[Task] | str) -> None:
 
 
 def __getattr__(name: str) -> Any:
-    """Import ``check_task`` or ``register_material`` on first use, because their imports are heavy."""
-    if name == "check_task":
-        from piavatar_envs.api.conformance import check_task
-
-        return check_task
-    if name == "register_material":
-        from piavatar_envs.mpm.materials import register_material
-
-        return register_material
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Import a public function on first use, because its module imports much."""
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
 
 
 for _env_id in task_modules():

@@ -16,6 +16,7 @@ from piavatar_envs.config.load import dump_yaml, load_config, parse_assignments,
 from piavatar_envs.config.schema import (
     FROZEN,
     AvatarConfig,
+    AvatarSourceConfig,
     ColliderConfig,
     ControlConfig,
     EnvConfig,
@@ -35,6 +36,7 @@ from piavatar_envs.config.schema import (
 __all__ = [
     "FROZEN",
     "AvatarConfig",
+    "AvatarSourceConfig",
     "ColliderConfig",
     "ConfigError",
     "ControlConfig",

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
+from piavatar_envs.avatar.body.sources import check_source
 from piavatar_envs.config.load import ConfigError, load_config
 from piavatar_envs.mpm.model import CFL_STABLE
 
@@ -206,6 +207,17 @@ class TorqueControlConfig(BaseModel):
 
 #: The settings of either kind of control; those of the other kind are refused.
 ControlConfig = Annotated[PoseControlConfig | TorqueControlConfig, Field(discriminator="mode")]
+
+
+class AvatarSourceConfig(BaseModel):
+    """Where the body comes from; see :mod:`piavatar_envs.avatar.body.sources`."""
+
+    model_config = FROZEN
+
+    source: Annotated[str, AfterValidator(check_source)] = Field(
+        "embedded", description="embedded (the body of this package), or a source of your own by its name"
+    )
+    path: str | None = Field(None, description="file or folder of the body, for sources that read one")
 
 
 class ShapeConfig(BaseModel):
@@ -414,6 +426,9 @@ class AvatarConfig(BaseModel):
     control: Annotated[dict[str, Any], AfterValidator(_of_control)] = Field(
         default_factory=dict, description="settings of its control, such as tone; all avatars have the same mode"
     )
+    avatar: Annotated[dict[str, Any], _settings_of(AvatarSourceConfig)] = Field(
+        default_factory=dict, description="settings of its source, such as source"
+    )
     shape: Annotated[dict[str, Any], _settings_of(ShapeConfig)] = Field(
         default_factory=dict, description="settings of its shape"
     )
@@ -518,6 +533,7 @@ class EnvConfig(BaseModel):
 
     physics: PhysicsConfig = Field(default_factory=PhysicsConfig, description="the continuum")
     control: ControlConfig = Field(default_factory=PoseControlConfig, description="how actions move the body")
+    avatar: AvatarSourceConfig = Field(default_factory=AvatarSourceConfig, description="where the body comes from")
     shape: ShapeConfig = Field(default_factory=ShapeConfig, description="the body's shape")
     randomize: RandomizeConfig = Field(
         default_factory=RandomizeConfig, description="what every episode draws anew, besides the task and the shape"

@@ -26,10 +26,12 @@ from piavatar_envs.avatar.body.muscles import attachment_rates, firmness, make_m
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.body.soft_tissue import bone_distance, inert_share, softness
+from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.controller import JointSettings
 from piavatar_envs.avatar.types import DriveSettings
 from piavatar_envs.config import (
     AvatarConfig,
+    AvatarSourceConfig,
     ConfigError,
     ControlConfig,
     EnvConfig,
@@ -182,6 +184,18 @@ def drive_settings(control: ControlConfig) -> DriveSettings:
     )
 
 
+def load_avatar(settings: AvatarSourceConfig) -> AvatarAsset:
+    """Return the body that the settings name.
+
+    Raises:
+        ConfigError: the source refuses them, or finds no file.
+    """
+    try:
+        return load_asset(settings.source, settings.path)
+    except (OSError, TypeError, ValueError) as error:
+        raise ConfigError(f"avatar: {error}") from None
+
+
 def shape_parameters(asset: AvatarAsset, shape: ShapeConfig) -> np.ndarray:
     """Those of the body as it is configured, shape ``(S,)``.
 
@@ -230,7 +244,7 @@ class Flesh:
     @property
     def settings(self) -> tuple:
         """All that decides which bodies are drawn: avatars with equal settings have equal ones."""
-        return self.physics, self.shape, self.control.soft_tissue, self.avatar.regions
+        return self.asset, self.physics, self.shape, self.control.soft_tissue, self.avatar.regions
 
     @property
     def drawn_on_host(self) -> bool:
@@ -362,6 +376,17 @@ class Flesh:
         if not inside.any():
             raise ConfigError(f"scene.avatars: no flesh of {region.joints} is {region.beyond} m from the bones")
         return inside
+
+
+def check_shape_names(flesh: Sequence[Flesh]) -> None:
+    """Refuse random shapes of bodies that have different shape parameters.
+
+    Raises:
+        ConfigError: the parameters of one would be observed under the names of another.
+    """
+    names = {body.asset.shape_names for body in flesh}
+    if len(names) > 1 and any(body.shape.randomize for body in flesh):
+        raise ConfigError("shape.randomize=True needs avatars with the same shape parameters; use one avatar.source")
 
 
 def shape_ranges(flesh: Sequence[Flesh]) -> dict[str, Parameter]:

@@ -12,11 +12,10 @@ import warp as wp
 from piavatar_envs.avatar.avatar import Avatar
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
-from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.controller import Controller
 from piavatar_envs.avatar.pose_control.controller import PoseController
 from piavatar_envs.avatar.torque_control.controller import LONGEST_SUBSTEP, TorqueController
-from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig
+from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
 from piavatar_envs.config.schema import MOST_SUBSTEPS, select_joints
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider, make_boundaries, place_colliders
@@ -25,7 +24,7 @@ from piavatar_envs.mpm.memory import allocate, estimate_active_blocks
 from piavatar_envs.mpm.model import build_model, choose_num_substeps, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
-from piavatar_envs.sim.bodies import Flesh, Shapes, drive_settings
+from piavatar_envs.sim.bodies import Flesh, Shapes, check_shape_names, drive_settings, load_avatar
 from piavatar_envs.sim.checks import STRUCK, check_beside_solids, commanded_speed, fastest_blow, fastest_thing
 from piavatar_envs.sim.prop_geometry import PropPoints
 from piavatar_envs.sim.props import PropSet, check_apart, check_places
@@ -77,7 +76,7 @@ class Simulation:
             domain: where particles may go.
             scene: what is in the world; the configuration's own if not given.
             avatar_names: of the avatars; ``agent_0`` ... if not given.
-            asset: the body; the embedded one if not given.
+            asset: the body of all avatars; those of their sources if not given.
             impulses: the greatest that a bone may get at once [N s], by joint.
 
         Raises:
@@ -86,14 +85,17 @@ class Simulation:
         """
         self.config, self.num_envs, self.device = config, num_envs, check_device(device)
         self.scene = scene or config.scene
-        self.asset = asset or load_asset()
-        physics = config.physics
+        avatars = self.scene.avatars or (AvatarConfig(),)
+        assets = [asset or load_avatar(replace(config.avatar, avatar.avatar)) for avatar in avatars]
+        self.asset, physics = assets[0], config.physics
         self.dx = float(np.ptp(self.asset.mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[physics.fidelity]
         spacing = spacing_for(self.dx)
-        sampled = sample_particles(self.asset, spacing)
-        avatars = self.scene.avatars or (AvatarConfig(),)
         names = avatar_names or [f"agent_{index}" for index in range(len(avatars))]
-        self.flesh = [Flesh(config, avatar, self.asset, sampled, num_envs) for avatar in avatars]
+        self.flesh = [
+            Flesh(config, avatar, own, sample_particles(own, spacing), num_envs)
+            for avatar, own in zip(avatars, assets, strict=True)
+        ]
+        check_shape_names(self.flesh)
         solids = [prop_points(prop, spacing) for prop in self.scene.props]
         matter = [prop_matter(p, points, physics) for p, points in zip(self.scene.props, solids, strict=True)]
         rows = num_envs if solids or any(flesh.shape.randomize for flesh in self.flesh) else 1

@@ -10,7 +10,6 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import NUM_ACTUATED, NUM_JOINTS, joint_index
-from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.kinematics import pose_body
 from piavatar_envs.avatar.motion import load_motion
 from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_log, turn_about_z
@@ -25,7 +24,7 @@ from piavatar_envs.envs.observations import ObservationTerm, write_rotation, wri
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.types import row
-from piavatar_envs.sim.bodies import shape_parameters
+from piavatar_envs.sim.bodies import load_avatar, shape_parameters
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.ranges import Margin, Weight
@@ -346,7 +345,7 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
     def __init__(self, config: TrackMotionConfig) -> None:
         super().__init__(config)
         dt = config.physics.control_dt
-        asset = load_asset()
+        asset = load_avatar(config.avatar)
         body = asset.shape(shape_parameters(asset, config.shape))
         self.pelvis_height = float(body.joints[0, 2])
         try:

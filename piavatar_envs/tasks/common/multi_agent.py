@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from pydantic import Field
 
+from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion.keyframes import Key, animate
@@ -20,6 +21,7 @@ from piavatar_envs.envs.actions import ActionSpec
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import Sensors, row
+from piavatar_envs.sim.bodies import load_avatar
 from piavatar_envs.tasks.common.fall import FallConfig, heights_of, is_down, least_heights
 from piavatar_envs.tasks.common.ranges import Weight
 from piavatar_envs.tasks.common.root_command import record_root_clamp
@@ -67,9 +69,14 @@ class Stance:
         local_rotations: of all joints, wxyz, the root's relative to the heading, shape ``(22, 4)``.
     """
 
-    def __init__(self, key: Key) -> None:
-        """Pose the mean body as ``key`` says, at any time."""
-        joints = load_asset().mean_body().joints
+    def __init__(self, key: Key, asset: AvatarAsset | None = None) -> None:
+        """Pose the mean body.
+
+        Args:
+            key: the pose, at any time.
+            asset: the body; the embedded one if not given.
+        """
+        joints = (asset or load_asset()).mean_body().joints
         keys = [dataclasses.replace(key, time=time) for time in (0.0, 1.0)]
         self.local_rotations = animate("stance", keys, joints).local_rotations[0]
 
@@ -256,7 +263,7 @@ class RingTask(Task):
 
     def __init__(self, config: RingConfig) -> None:
         super().__init__(config)
-        self.joints, self.stance = select_joints(config.joints), Stance(self.stance_key)
+        self.joints, self.stance = select_joints(config.joints), Stance(self.stance_key, load_avatar(config.avatar))
 
     @property
     def start_radius(self) -> float:
