@@ -25,7 +25,7 @@ def main(
     only: Annotated[tuple[str, ...], tyro.conf.arg(help="names of the pages to write; all if not given")] = (),
     device: Annotated[str, tyro.conf.arg(help="where to simulate the pictures: cpu, cuda, ...")] = "cpu",
 ) -> int:
-    """Write the pages; the exit status is 1 if a task leaves something unsaid.
+    """Write the pages; the exit status is 1 if a task lacks documentation.
 
     Args:
         pictures: draw the pictures, too.

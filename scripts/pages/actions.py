@@ -1,4 +1,4 @@
-"""The section of a page that says what actions are."""
+"""The section of a page on actions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scripts.pages.markdown import code, number, page, table
 
 
 def actions_section(facts: Facts) -> str:
-    """What the components of an action are, by default and under the other kinds of control."""
+    """Describe the components of an action, by default and under the other kinds of control."""
     spec, dt, posed = facts.actions, facts.config.physics.control_dt, facts.config.control.mode == "pose"
     lower, upper = np.degrees(facts.task.limits())
     joints, root = [], []
@@ -30,7 +30,7 @@ def actions_section(facts: Facts) -> str:
             "## Actions",
             f"Components are clipped to [-1, 1]. Each joint has three: {meaning}",
             table(("slice", "components", *step, "range of x [deg]", "of y [deg]", "of z [deg]"), joints),
-            "The commanded root moves, too:" if root else "",
+            "The commanded root moves as well:" if root else "",
             table(("slice", "component", "at 1, a step", "direction"), root) if root else "",
             _under_torques(facts) if posed else _under_others(facts),
         ]
@@ -38,7 +38,7 @@ def actions_section(facts: Facts) -> str:
 
 
 def _of_poses() -> str:
-    """What a joint's components are where poses move the body."""
+    """Describe a joint's components under pose control."""
     return (
         "the rotation vector by which its local rotation is turned in the step, in the bone's own axes. In the rest "
         "pose these are the world's: the avatar faces -y, its left is +x. `joint_speed_limit` scales them, and the "
@@ -47,40 +47,40 @@ def _of_poses() -> str:
 
 
 def _of_targets(facts: Facts) -> str:
-    """What they are by default where torques do: joint targets."""
+    """Describe a joint's components under torque control, by default joint targets."""
     return (
         "the rotation vector that its spring pulls to, relative to the parent bone. In the rest pose the axes are the "
         f"world's: the avatar faces -y, its left is +x. 0 is {_middle(facts)}, 1 and -1 are the ends of the range "
         "below, and in between the target is proportional to the component. Springs have the greatest torques of "
-        "their joints as limits; nothing holds the body but the ground and what `root_assist` gives."
+        "their joints as limits; only the ground and `root_assist` hold the body."
     )
 
 
 def _middle(facts: Facts) -> str:
-    """The pose that targets are counted from."""
+    """Name the pose that targets are counted from."""
     return "the task's reference pose" if facts.task.targets_about_reference else "the rest pose"
 
 
 def _under_others(facts: Facts) -> str:
-    """What actions are under the other kinds of control, where joint targets are the default."""
+    """Describe the other kinds of control, where joint targets are the default."""
     size = facts.task.action_spec().size
     return (
         'With `control="torque"` a component is a share of the greatest torque of the joint about that axis. With '
-        f'`"pose"` there are {size} components, toes and what a task lets the root do included: they turn the '
+        f'`"pose"` there are {size} components, including the toes and root actions of the task: they turn the '
         "commanded pose, and the root wrench holds the body."
     )
 
 
 def _under_torques(facts: Facts) -> str:
-    """What actions are where torques move the body."""
+    """Describe actions under torque control."""
     size = facts.task.action_spec().under("pd").size
     about = _middle(facts)
     terms = ", ".join(f"{code(term.name)} ({term.size}, {term.unit})" for term in JOINT_TERMS)
     return (
         f'With `control="pd"` or `"torque"` there are {size} components: neither the root nor the toes act. Under '
-        f'`"pd"` a component asks for an angle: 0 is {about}, 1 and -1 are the ends of the ranges above. Under '
-        '`"torque"` it is a share of the greatest torque of the joint about that axis. Nothing holds the body then but '
-        f"the ground and what `root_assist` gives, no root lets go, and {terms} are observed, too."
+        f'`"pd"` a component is a target angle: 0 is {about}, 1 and -1 are the ends of the ranges above. Under '
+        '`"torque"` it is a share of the greatest torque of the joint about that axis. Only the ground '
+        f"and `root_assist` hold the body then, no root lets go, and {terms} are observed as well."
     )
 
 

@@ -10,7 +10,7 @@ from scripts.pages.text import NOTE
 
 
 def index_page(found: Sequence[tuple[Entry, Facts]]) -> str:
-    """The list of all pages."""
+    """Return the list of all pages."""
     head = ("environment", "task", "actions", "observations")
     single = [_index_row(entry, facts) for entry, facts in found if not entry.multi]
     multi = [(*_index_row(entry, facts), str(len(facts.agents))) for entry, facts in found if entry.multi]

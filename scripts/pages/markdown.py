@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; cells may hold Markdown, but neither lines nor bars of their own.
+    """Return a table; cells may hold Markdown, but neither lines nor bars of their own.
 
     Raises:
         ValueError: a row that is not as wide as the head.
@@ -20,26 +20,26 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def code(text: object) -> str:
-    """Text as code."""
+    """Return text as code."""
     return f"`{text}`"
 
 
 def listed(names: Iterable[object]) -> str:
-    """Names as code, with commas."""
+    """Return names as code, with commas."""
     return ", ".join(code(name) for name in names)
 
 
 def number(value: float) -> str:
-    """A number to four digits, never in a form that depends on its type: 5, 0.1333, 1e+06."""
+    """Return a number to four digits, never in a form that depends on its type: 5, 0.1333, 1e+06."""
     return f"{value:.4g}"
 
 
 def sentence(text: str) -> str:
-    """A clause with a capital, unless it begins with code, and a full stop."""
+    """Return a clause with a capital, unless it begins with code, and a full stop."""
     text = " ".join(text.split())
     return f"{text[:1].upper()}{text[1:]}{'' if text.endswith(('.', '!', '?')) else '.'}"
 
 
 def page(blocks: Iterable[str]) -> str:
-    """Blocks with blank lines between them; empty ones are left out."""
+    """Join blocks with blank lines between them; empty ones are left out."""
     return "\n\n".join(block.strip("\n") for block in blocks if block) + "\n"

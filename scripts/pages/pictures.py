@@ -14,7 +14,7 @@ SIZE = {"width": 640, "height": 480}
 
 
 def draw(entry: Entry, path: Path, device: str = "cpu", seed: int = 0) -> None:
-    """Play to the moment that the task's picture shall show, or to the end of the episode, and write a PNG.
+    """Play to the moment of the task's picture, or to the end of the episode, and write a PNG.
 
     Raises:
         ImportError: the extra ``render`` is not installed.
@@ -38,7 +38,7 @@ def draw(entry: Entry, path: Path, device: str = "cpu", seed: int = 0) -> None:
 
 
 def actions(kind: str | Mapping[str, float], names: Sequence[str], seconds: float, dt: float, seed: int) -> np.ndarray:
-    """Actions until the picture, shape ``(steps, len(names))``: zero, random swings, or constant ones by component.
+    """Return the actions until the picture, shape ``(steps, len(names))``: zero, random swings, or constant.
 
     Raises:
         ValueError: an unknown kind or component.

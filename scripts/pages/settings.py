@@ -1,4 +1,4 @@
-"""Settings of a configuration as rows: name, default, unit, what is allowed, what it means."""
+"""Settings of a configuration as rows: name, default, unit, allowed values, meaning."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def sections_of(config: EnvConfig) -> list[Section]:
 def _sections(
     name: str, description: str, model: type[BaseModel], values: BaseModel | None, usual: BaseModel | None
 ) -> Iterator[Section]:
-    """The section of ``model`` and all below; without ``values``, with the model's defaults."""
+    """Return the section of ``model`` and all below; without ``values``, with the model's defaults."""
     rows, below = [], []
     for key, field in model.model_fields.items():
         path, nested = f"{name}.{key}" if name else key, _model(field.annotation)
@@ -83,7 +83,7 @@ def _sections(
 
 
 def _union(path: str, field: FieldInfo, value: BaseModel, usual: BaseModel | None) -> Iterator[Section]:
-    """The sections of a discriminated union: its tag, and the other settings of each model."""
+    """Return the sections of a discriminated union: its tag, and the other settings of each model."""
     tag, variants = field.discriminator, variants_of(field)
     meaning = "; ".join(model.model_fields[tag].description or "" for model in models_of(field))
     default = getattr(value, tag)
@@ -118,21 +118,21 @@ def _model(annotation: Any) -> type[BaseModel] | None:
 
 
 def _item_model(annotation: Any) -> type[BaseModel] | None:
-    """The model whose instances a list or tuple holds."""
+    """Return the model of a list's or tuple's entries."""
     if get_origin(annotation) in (tuple, list):
         return _model(get_args(annotation)[0])
     return None
 
 
 def shown(value: Any) -> str:
-    """A default as code; required if there is none."""
+    """Return a default as code, or "required" if there is none."""
     return "required" if value is PydanticUndefined else code(literal(value))
 
 
 def literal(value: Any) -> str:
-    """A value as a reader would write it, without quotes around the names of a mapping."""
+    """Return a value as a reader would write it, without quotes around the names of a mapping."""
     if isinstance(value, BaseModel):
-        # what a reader wants to know of an entry is what sets it apart
+        # only the settings that set an entry apart
         return literal(value.model_dump(exclude_defaults=True))
     if isinstance(value, float):
         return f"{value:g}"
@@ -146,7 +146,7 @@ def literal(value: Any) -> str:
 
 
 def allowed(field: FieldInfo) -> str:
-    """Range, choices or type of a field."""
+    """Return the range, choices or type of a field."""
     return _allowed(field.annotation, field.metadata)
 
 
@@ -174,7 +174,7 @@ def _allowed(annotation: Any, metadata: Any = ()) -> str:
 
 
 def _several(annotation: Any) -> str:
-    """The plural: what a list holds."""
+    """Name the entries of a list, in the plural."""
     if _model(annotation):
         return "entries, see below"
     if get_origin(annotation) is Annotated:
@@ -186,12 +186,12 @@ def _several(annotation: Any) -> str:
 
 
 def _flat(metadata: Any) -> list[Any]:
-    """Limits of an ``Annotated``: plain ones, and those inside a pydantic ``Field``."""
+    """Return the limits of an ``Annotated``: plain ones, and those inside a pydantic ``Field``."""
     return [limit for item in metadata for limit in (item.metadata if isinstance(item, FieldInfo) else [item])]
 
 
 def _limits(metadata: Any) -> str:
-    """An interval or a one-sided bound: ``[0, 1]``, ``(0, 0.2]``, ``> 0``, ``<= 5``."""
+    """Return an interval or a one-sided bound: ``[0, 1]``, ``(0, 0.2]``, ``> 0``, ``<= 5``."""
     found = {
         name: value
         for limit in metadata

@@ -29,10 +29,10 @@ FRAMES = {
     "bone": "the axes of the bone itself",
     "-": "",
 }
-#: What the views put into ``info``, beside the task's metrics.
+#: Keys that the views put into ``info`` beside the task's metrics.
 INFO_DOCS = {
     "success": "whether the state is a success, see above",
-    "failure": "why the simulation gave up; `None` while it has not",
+    "failure": "reason for which the simulation has failed; `None` while it has not",
     "root_force": "force of the root wrench on the body, its mean over the step, in the world [N]",
     "root_torque": "its torque about the body's centre of mass [N m]",
     "root_let_go": "whether the root wrench has let go; it does not take hold again in the episode",
@@ -63,7 +63,7 @@ observations, infos = env.reset(seed=0)
 
 
 def entry_page(entry: Entry, facts: Facts) -> str:
-    """The page of an environment."""
+    """Return the page of an environment."""
     task = entry.task
     return page(
         [
@@ -95,7 +95,7 @@ def _relative(path: os.PathLike[str]) -> str:
 
 
 def _caption(entry: Entry) -> str:
-    """What a user must set to see the picture."""
+    """Return the settings of the picture, if it has any."""
     settings = entry.task.picture_settings
     return f"*In the picture: {listed(f'{key}={value!r}' for key, value in settings.items())}.*" if settings else ""
 
@@ -106,7 +106,7 @@ def _usage(entry: Entry) -> str:
 
 
 def _duration(seconds: float) -> str:
-    """A time step, as a fraction where it is one."""
+    """Return a time step, as a fraction where it is one."""
     rate = round(1.0 / seconds)
     return f"1/{rate} s" if rate > 1 and abs(rate * seconds - 1.0) < 1e-9 else f"{number(seconds)} s"
 
@@ -154,20 +154,20 @@ def _observations(facts: Facts) -> str:
 
 
 def _parameters(facts: Facts) -> str:
-    others = " (one's own, then those of the others, counted on from oneself)" if facts.agents else ""
+    others = " (the agent's own, then those of the others, counted on from it)" if facts.agents else ""
     text = (
         "With `observe_parameters=True` the observation ends with the term `parameters`, all that the episode has "
         "drawn, each from its range to [-1, 1]: the factors of `randomize` and the parameters of random shapes"
         f"{others}, then what the task draws, and last `clock`, the share of the episode that is over. With "
         '`control="pd"` or `"torque"` each avatar\'s own end with `root_assist`, as it is now.'
     )
-    drawn = [p for p in facts.task.drawn() if p.low < p.high]
+    parameters = [p for p in facts.task.drawn() if p.low < p.high]
     rows = [
         (code(p.name), p.unit, f"{number(p.low)} to {number(p.high)}{', logarithmic' if p.log else ''}", p.description)
-        for p in drawn
+        for p in parameters
     ]
-    told = table(("drawn by the task", "unit", "range", "meaning"), rows) if rows else ""
-    return page(["## Parameters", text, told])
+    drawn = table(("drawn by the task", "unit", "range", "meaning"), rows) if rows else ""
+    return page(["## Parameters", text, drawn])
 
 
 def _described(terms: Sequence[Term]) -> list[tuple[str, str]]:
@@ -199,7 +199,7 @@ def _episode(entry: Entry, facts: Facts) -> str:
             f"{number(control.release_height)} m in height (`release_height`)"
         )
     failures = ", ".join(f"{code(name)} ({FAILURE_DOCS[name]})" for name in FAILURE_NAMES.values())
-    ends.append(f'the simulation gives up; `info["failure"]` says why: {failures}')
+    ends.append(f'the simulation fails; `info["failure"]` gives the reason: {failures}')
     return page(
         [
             "## Episode",
@@ -211,7 +211,7 @@ def _episode(entry: Entry, facts: Facts) -> str:
 
 
 def info_docs(entry: Entry) -> dict[str, str]:
-    """Meaning of every key of ``info`` that is known."""
+    """Return the meaning of every known key of ``info``."""
     return INFO_DOCS | {one.name: f"{one.description} [{one.unit}]" for one in entry.task.metrics}
 
 
@@ -240,8 +240,8 @@ def _arguments(entry: Entry, facts: Facts) -> str:
     text = (
         f'{code(maker)} takes `render_mode` (`None`, `"rgb_array"`, or `"human"`: live in a web browser), `device` (of '
         'Warp: `"cpu"` or `"cuda:0"`), '
-        f"{more}`config` (a mapping or a YAML file, where `None` is `null`) and, by keyword, every setting below: its "
-        'last name will do, as in `tone=0.3`; the whole one can be given as `**{"control.tone": 0.3}`. The unit `-` is '
+        f"{more}`config` (a mapping or a YAML file, where `None` is `null`) and, by keyword, every setting below. Its "
+        'last name is enough, as in `tone=0.3`; the whole name is given as `**{"control.tone": 0.3}`. The unit `-` is '
         "that of a pure number."
     )
     return page(
@@ -262,6 +262,6 @@ def _settings_table(settings: Sequence[Setting]) -> str:
 
 
 def _folded(section: Section) -> str:
-    """A table that opens on a click: most readers look for the task's own."""
+    """Return a table that opens on a click: most readers look for the task's own settings."""
     name = f"<code>{section.name}</code>: {section.description}" if section.name else "top level"
     return f"<details>\n<summary>{name}</summary>\n\n{_settings_table(section.settings)}\n\n</details>"

@@ -35,7 +35,7 @@ def add_game(name: str, task: type[Task] | str) -> None:
 
     Args:
         name: a name and a version: ``"tag_v0"``. A game from elsewhere that has it already is replaced.
-        task: its class, or ``"module:Class"``, imported when it is first asked for.
+        task: its class, or ``"module:Class"``, imported when it is first needed.
 
     Raises:
         TypeError: the task is neither.

@@ -1,4 +1,4 @@
-"""Boxing: strike the other's head and trunk with the arms, and guard one's own."""
+"""Boxing: strike the other's head and trunk with the arms, and guard your own."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ class BoxingTask(RingTask):
     """Strike, and do not get struck."""
 
     Config = BoxingConfig
-    description = "strike the other's head and trunk with the arms, and guard one's own"
+    description = "strike the other's head and trunk with the arms, and guard your own"
     observation_terms = (RING_CENTRE,)
     rewards = (
         Term("hit", "the points of this step's blows, at most `head_points + torso_points` for each other agent"),
