@@ -256,7 +256,7 @@ def record_control_step(
     """
     world = (model, state, scratch)
     begins = graph.branches(controllers, lambda controller, own: controller.record_begin(own))
-    record_begin(graph, *world, beside=begins)  # activates blocks
+    record_begin(graph, *world, branches=begins)  # activates blocks
     for step in range(model.num_substeps):
         graph.parallel_for_each(
             controllers, lambda c, own, step=step: c.record_before_substep(own, state, scratch, step)
@@ -270,7 +270,7 @@ def record_control_step(
     ends = graph.branches(range(len(avatars)), end)
     # sensors read the particles where the substeps have left them
     in_order = any(controller.moves_particles for controller in controllers)
-    record_end(graph, *world, beside=() if in_order else ends)
+    record_end(graph, *world, branches=() if in_order else ends)
     if in_order:
         graph.parallel(*ends)
 
