@@ -28,7 +28,7 @@ from piavatar_envs.envs.episodes import (
 from piavatar_envs.envs.observer import Observer
 from piavatar_envs.envs.state import SETTINGS, check_arrays, check_settings, settings_rows
 from piavatar_envs.envs.task import Task
-from piavatar_envs.sim.props import check_places
+from piavatar_envs.sim.checks import check_places
 from piavatar_envs.sim.world import Simulation
 
 
@@ -172,7 +172,7 @@ class BatchEnv(EpisodeArrays):
         self.count_graph.run()
         self.simulation.shapes.draw(self.mask, self.seed, self.episode)
         self.reset_graph.run()
-        self.simulation.shapes.fall_behind()
+        self.simulation.shapes.mark_stale()
         return self.observation
 
     # the step
@@ -277,6 +277,6 @@ class BatchEnv(EpisodeArrays):
             array.assign(state[name])
         for avatar in self.simulation.shapes.of_host:
             self.simulation.shapes.adopt(avatar, state[f"shape.{avatar}"])
-        self.simulation.shapes.fall_behind()
+        self.simulation.shapes.mark_stale()
         self.restarts += 1
         self.observe_graph.run()

@@ -1,34 +1,86 @@
-"""A soft prop among the particles: placed at reset, tracked as the rigid body it nearly is, made lighter or heavier.
-
-The soft props of a world: where they start, how heavy they are, where they are now.
-"""
+"""Soft props of a world: their particles and matter, their motion after a reset, and their tracked rigid motion."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from itertools import permutations
 
 import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.tracking import kabsch_rotation, point_inertia, spin_of
-from piavatar_envs.config import ColliderConfig, ConfigError, PropConfig
+from piavatar_envs.config import ColliderConfig, ConfigError, PhysicsConfig, PropConfig
+from piavatar_envs.config.schema import LEAST_DENSITY, MOST_DENSITY
 from piavatar_envs.core.arrays import store_matrix
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.materials import lame_parameters
 from piavatar_envs.mpm.model import MaterialPoints
 from piavatar_envs.mpm.types import Kinematic, Model, Particles, State, row
+from piavatar_envs.sim import prop_geometry as geometry
 from piavatar_envs.sim.prop_geometry import PropPoints
-from piavatar_envs.sim.scene import Domain
 
 wp.set_module_options({"enable_backward": False})
 
 
+def prop_points(prop: PropConfig, spacing: float) -> PropPoints:
+    """Fill a prop's solid with particles of this ``spacing`` [m].
+
+    Raises:
+        ConfigError: the size does not fit the shape, a mesh has no file, or the solid is too thin.
+    """
+    sizes = {"sphere": 1, "box": 3, "capsule": 2, "mesh": 1}
+    if len(prop.size) != sizes[prop.shape]:
+        raise ConfigError(
+            f"prop {prop.name}: size={list(prop.size)} must be {sizes[prop.shape]} numbers for a {prop.shape}"
+        )
+    try:
+        if prop.shape == "mesh":
+            if prop.file is None:
+                raise ValueError("shape='mesh' needs a file")
+            return geometry.mesh(prop.file, spacing, scale=prop.size[0])
+        if prop.shape == "box":
+            return geometry.box(prop.size, spacing)
+        return getattr(geometry, prop.shape)(*prop.size, spacing)
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"prop {prop.name}: {error}") from None
+
+
+def prop_matter(prop: PropConfig, points: PropPoints, physics: PhysicsConfig) -> MaterialPoints:
+    """Return the matter of a prop; without a configured modulus its waves are as fast as the flesh's.
+
+    Raises:
+        ConfigError: the mass is too small or too great for the size.
+    """
+    volume = float(points.volume.sum())
+    density = prop.density if prop.mass is None else prop.mass / volume
+    if not LEAST_DENSITY <= density <= MOST_DENSITY:
+        raise ConfigError(
+            f"prop {prop.name!r}: mass={prop.mass:.3g} kg in {volume:.3g} m^3 is a density of {density:.3g} kg/m^3, "
+            f"which must be in [{LEAST_DENSITY:g}, {MOST_DENSITY:g}]; use a mass in "
+            f"[{LEAST_DENSITY * volume:.3g}, {MOST_DENSITY * volume:.3g}] kg, or another size"
+        )
+    young = prop.young_modulus
+    if young is None:
+        # equal P-wave modulus over density
+        young = physics.young_modulus * density / physics.density
+        young *= _wave_factor(physics.poisson_ratio) / _wave_factor(prop.poisson_ratio)
+    return MaterialPoints.uniform(points.volume, density, young, prop.poisson_ratio, prop.material)
+
+
+def _wave_factor(poisson_ratio: float) -> float:
+    """Return the P-wave modulus over Young's modulus."""
+    return (1.0 - poisson_ratio) / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
+
+
+def turn_of(config: PropConfig | ColliderConfig) -> Rotation:
+    """Return the initial rotation of a prop or collider."""
+    return Rotation.from_quat(np.roll(config.rotation, -1))
+
+
 @wp.struct
 class Prop:
-    """Constants of one prop, which occupies particles ``first ... first + count`` of each environment."""
+    """Constants of a prop, whose particles are ``first ... first + count`` of each environment."""
 
     first: int
     count: int
@@ -37,11 +89,28 @@ class Prop:
 
 @wp.struct
 class PropMatter:
-    """What a prop is made of at its nominal density."""
+    """Matter of a prop at its nominal density."""
 
     density: float  # [kg/m^3]
     mu: float  # shear modulus [Pa]
     lam: float  # first Lame parameter [Pa]
+
+
+def upload_prop(points: PropPoints, first: int, device: str) -> Prop:
+    """Upload the constants of a prop whose particles begin at index ``first``."""
+    prop = Prop()
+    prop.first, prop.count = int(first), len(points.rest)
+    prop.rest = wp.array(points.rest, dtype=wp.vec3, device=device)
+    return prop
+
+
+def nominal_matter(matter: MaterialPoints) -> PropMatter:
+    """Return the nominal density and moduli of a prop."""
+    nominal = PropMatter()
+    nominal.density = float(matter.density[0, 0])
+    mu, lam = lame_parameters(matter.young_modulus[0, 0], matter.poisson_ratio[0, 0])
+    nominal.mu, nominal.lam = float(mu), float(lam)
+    return nominal
 
 
 @dataclass
@@ -56,7 +125,7 @@ class PropState:
 
     @classmethod
     def allocate(cls, num_envs: int, num_props: int, device: str) -> PropState:
-        """At the origin, at rest."""
+        """Allocate props at the origin and at rest."""
         shape = (num_envs, num_props)
         upright = np.tile(np.array([0.0, 0.0, 0.0, 1.0], np.float32), (*shape, 1))
         return cls(
@@ -68,8 +137,125 @@ class PropState:
         )
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """A copy of every array on the host."""
+        """Return copies of all arrays on the host."""
         return {field.name: getattr(self, field.name).numpy().copy() for field in fields(self)}
+
+    def assign(self, configs: Sequence[PropConfig]) -> None:
+        """Set the configured motion of the props in every environment."""
+        if not configs:
+            return
+        turns = np.array([config.rotation for config in configs], np.float64)
+        turns = np.roll(turns / np.linalg.norm(turns, axis=1, keepdims=True), -1, axis=1)
+        motion = {name: [getattr(config, name) for config in configs] for name in ("position", "velocity", "spin")}
+        for name, values in (motion | {"rotation": turns}).items():
+            array = getattr(self, name)
+            array.assign(np.repeat(np.array(values, np.float32)[None], len(array), 0))
+
+
+class PropSet:
+    """Props of every environment; arrays are ``(num_envs, num_props)``, quaternions Warp's ``xyzw``.
+
+    Attributes:
+        names: of the props.
+        points: their particles (NumPy).
+        state: their tracked rigid motion, updated by :meth:`record_tracking`.
+        spawn: their motion after a reset: the scene's, until the reset of a task overwrites it.
+        density: their density after a reset [kg/m^3], likewise.
+        mass: mass of each at its density in the scene [kg].
+        volume: volume of each [m^3].
+    """
+
+    def __init__(
+        self,
+        configs: Sequence[PropConfig],
+        points: Sequence[PropPoints],
+        matter: Sequence[MaterialPoints],
+        first: Sequence[int],
+        fields_of: Sequence[int],
+        model: Model,
+    ) -> None:
+        """Upload the constants of the props.
+
+        Args:
+            configs: settings of each prop.
+            points: particles of each.
+            matter: matter of each.
+            first: index of the first particle of each.
+            fields_of: velocity field of each.
+            model: constants of the world.
+        """
+        self.names = tuple(config.name for config in configs)
+        self.points, self.model, self.fields_of = tuple(points), model, tuple(fields_of)
+        n, device = model.num_envs, model.device
+        self.props = [upload_prop(own, begin, device) for own, begin in zip(points, first, strict=True)]
+        self.matter = [nominal_matter(own) for own in matter]
+        self.volume = np.array([float(own.volume.sum()) for own in points])
+        self.mass = np.array([m.density * own.volume.sum() for m, own in zip(self.matter, points, strict=True)])
+        density = np.array([[m.density for m in self.matter] or [1.0]], np.float32)
+        self.density = wp.array(np.repeat(density, n, 0), dtype=float, device=device)
+        self.state = PropState.allocate(n, max(1, len(configs)), device)
+        self.spawn = PropState.allocate(n, max(1, len(configs)), device)
+        self.spawn.assign(configs)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def index(self, name: str) -> int:
+        """Return the column of the prop ``name``.
+
+        Raises:
+            ValueError: there is no such prop.
+        """
+        if name not in self.names:
+            raise ValueError(f"there is no prop {name!r}; use one of {', '.join(self.names) or 'none'}")
+        return self.names.index(name)
+
+    def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
+        """Record the launches that set density and motion of the masked environments' props."""
+        particles, n = self.model.particles, self.model.num_envs
+        for index, (prop, matter) in enumerate(zip(self.props, self.matter, strict=True)):
+            graph.launch(
+                scale_density,
+                (n, prop.count),
+                [mask, prop, self.density[:, index], matter, particles.volume],
+                [particles.mass, particles.mu, particles.lam],
+            )
+            column = self.fields_of[index]
+            graph.launch(copy_masked, n, [mask, self.density[:, index]], [self.model.contact.density[:, column]])
+            self.record_place(graph, state, mask, index)
+
+    def record_place(self, graph: LaunchGraph, state: State, mask: wp.array, index: int) -> None:
+        """Record the launch that sets prop ``index`` of the masked environments in the motion of ``spawn``, unstrained.
+
+        Within an episode, before the physics of a step, this throws a prop or removes it from play.
+        """
+        prop, spawn = self.props[index], self.spawn
+        graph.launch(
+            place_prop,
+            (self.model.num_envs, prop.count),
+            [mask, prop, index, spawn.position, spawn.rotation, spawn.velocity, spawn.spin],
+            [state.x, state.u, state.C, state.F, state.kinematic],
+        )
+
+    def record_tracking(self, graph: LaunchGraph, state: State) -> None:
+        """Record the launches that fit a rigid motion to the particles of each prop."""
+        s = self.state
+        for index, prop in enumerate(self.props):
+            graph.launch(
+                track_prop,
+                self.model.num_envs,
+                [prop, index, self.model.particles, state.x, state.u, state.vk, state.failure],
+                [s.position, s.rotation, s.velocity, s.spin, s.deformation],
+            )
+
+    def arrays(self) -> dict[str, wp.array]:
+        """Return the arrays of a checkpoint by name; empty without props."""
+        if not self.names:
+            return {}
+        found = {f"props.{field.name}": getattr(self.state, field.name) for field in fields(self.state)}
+        found["props.density"] = self.density
+        found["contact.density"] = self.model.contact.density
+        return found | {f"matter.{name}": getattr(self.model.particles, name) for name in ("mass", "mu", "lam")}
 
 
 @wp.kernel
@@ -88,9 +274,9 @@ def place_prop(
     F: wp.array3d(dtype=float),
     driven: Kinematic,
 ):
-    """Particles of prop ``index`` in the masked environments into rigid motion, unstrained; over ``(E, count)``.
+    """Set prop ``index`` of the masked environments in rigid motion, unstrained; over ``(num_envs, count)``.
 
-    Materials are isotropic, so the deformation gradient of a turned prop may as well be the identity.
+    Materials are isotropic, so the deformation gradient of a turned prop can be the identity.
     """
     e, p = wp.tid()
     if not mask[e]:
@@ -121,15 +307,15 @@ def track_prop(
     spin: wp.array2d(dtype=wp.vec3),
     deformation: wp.array2d(dtype=float),
 ):
-    """Mass-weighted rigid fit to prop ``index``, over ``(E,)``. A failed environment keeps its last.
+    """Fit a rigid motion to prop ``index``, weighted by mass; over ``(num_envs,)``.
 
-    One thread sums in order: the result does not depend on the schedule.
+    A failed environment keeps its last fit. One thread sums in order, so that the result is reproducible.
     """
     e = wp.tid()
     if failure[e] != 0:
         return
     r = row(e, particles.mass.shape[0])
-    origin = x[e, prop.first]  # sums about a point of the prop lose fewer digits than about the world's origin
+    origin = x[e, prop.first]  # sums about a point of the prop lose fewer digits than sums about the world's origin
     mass = float(0.0)
     mx = wp.vec3()
     mv = wp.vec3()
@@ -175,10 +361,10 @@ def scale_density(
     mu: wp.array2d(dtype=float),
     lam: wp.array2d(dtype=float),
 ):
-    """Give a prop a density ``(E,)`` [kg/m^3] in the masked environments; over ``(E, count)``.
+    """Set the density ``(num_envs,)`` [kg/m^3] of a prop in the masked environments; over ``(num_envs, count)``.
 
-    Its moduli follow, so that the wave speed ``sqrt((lam + 2 mu) / rho)``, and with it the largest stable time step,
-    stays. ``mass``, ``mu`` and ``lam`` need a row for every environment.
+    Moduli scale with density, which keeps the wave speed ``sqrt((lam + 2 mu) / rho)`` and thus the largest stable time
+    step. ``mass``, ``mu`` and ``lam`` need a row for every environment.
     """
     e, p = wp.tid()
     if not mask[e]:
@@ -190,205 +376,6 @@ def scale_density(
     lam[e, q] = ratio * matter.lam
 
 
-#: How far a prop may reach out of the domain when it begins [grid spacings]: the grid holds it, and walls push it back.
-OVERLAP = 0.5
-
-
-class PropSet:
-    """Props of every environment; arrays are ``(num_envs, num_props)``, quaternions Warp's ``xyzw``.
-
-    Attributes:
-        names: of the props.
-        points: their particles (NumPy).
-        state: where they are, as Kabsch sees them; recomputed whenever particles have moved.
-        spawn: where a reset puts them; the scene's poses, until a task's reset writes others for masked environments.
-        density: that a reset gives them [kg/m^3], likewise.
-        mass: of each at its density in the scene [kg].
-    """
-
-    def __init__(
-        self,
-        configs: Sequence[PropConfig],
-        points: Sequence[PropPoints],
-        matter: Sequence[MaterialPoints],
-        first: Sequence[int],
-        fields_of: Sequence[int],
-        model: Model,
-    ) -> None:
-        """Upload.
-
-        Args:
-            configs: of the props.
-            points: their particles.
-            matter: their material.
-            first: first particle of each.
-            fields_of: velocity field of each.
-            model: constants of the world.
-        """
-        self.names = tuple(config.name for config in configs)
-        self.points, self.model, self.fields_of = tuple(points), model, tuple(fields_of)
-        n, device = model.num_envs, model.device
-        self.state = PropState.allocate(n, max(1, len(configs)), device)
-        self.spawn = PropState.allocate(n, max(1, len(configs)), device)
-        self.props: list[Prop] = []
-        self.matter: list[PropMatter] = []
-        for index in range(len(configs)):
-            prop = Prop()
-            prop.first, prop.count = int(first[index]), len(points[index].rest)
-            prop.rest = wp.array(points[index].rest, dtype=wp.vec3, device=device)
-            self.props.append(prop)
-            nominal = PropMatter()
-            nominal.density = float(matter[index].density[0, 0])
-            mu, lam = lame_parameters(matter[index].young_modulus[0, 0], matter[index].poisson_ratio[0, 0])
-            nominal.mu, nominal.lam = float(mu), float(lam)
-            self.matter.append(nominal)
-        self.mass = np.array([m.density * p.volume.sum() for m, p in zip(self.matter, points, strict=True)])
-        self.volume = np.array([float(p.volume.sum()) for p in points])
-        density = np.array([[m.density for m in self.matter] or [1.0]], np.float32)
-        self.density = wp.array(np.repeat(density, n, 0), dtype=float, device=device)
-        for name, pad in (("position", 0.0), ("velocity", 0.0), ("spin", 0.0)):
-            rows = np.array([getattr(config, name) for config in configs] or [[pad] * 3], np.float32)
-            getattr(self.spawn, name).assign(np.repeat(rows[None], n, 0))
-        turns = np.array([config.rotation for config in configs] or [[1.0, 0.0, 0.0, 0.0]], np.float64)
-        turns = np.roll(turns / np.linalg.norm(turns, axis=1, keepdims=True), -1, axis=1).astype(np.float32)
-        self.spawn.rotation.assign(np.repeat(turns[None], n, 0))
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def index(self, name: str) -> int:
-        """Column of the prop ``name``.
-
-        Raises:
-            ValueError: there is no such prop.
-        """
-        if name not in self.names:
-            raise ValueError(f"there is no prop {name!r}; there are {', '.join(self.names) or 'none'}")
-        return self.names.index(name)
-
-    def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
-        """Append: give the props of the masked environments their density, and put them where ``spawn`` says."""
-        particles, n = self.model.particles, self.model.num_envs
-        for index, (prop, matter) in enumerate(zip(self.props, self.matter, strict=True)):
-            graph.launch(
-                scale_density,
-                (n, prop.count),
-                [mask, prop, self.density[:, index], matter, particles.volume],
-                [particles.mass, particles.mu, particles.lam],
-            )
-            column = self.fields_of[index]
-            graph.launch(copy_masked, n, [mask, self.density[:, index]], [self.model.contact.density[:, column]])
-            self.record_place(graph, state, mask, index)
-
-    def record_place(self, graph: LaunchGraph, state: State, mask: wp.array, index: int) -> None:
-        """Append: put prop ``index`` of the masked environments where ``spawn`` says, unstrained; its matter stays.
-
-        In the middle of an episode, before the physics of a step, this throws or takes away a prop.
-        """
-        prop, spawn = self.props[index], self.spawn
-        graph.launch(
-            place_prop,
-            (self.model.num_envs, prop.count),
-            [mask, prop, index, spawn.position, spawn.rotation, spawn.velocity, spawn.spin],
-            [state.x, state.u, state.C, state.F, state.kinematic],
-        )
-
-    def record_tracking(self, graph: LaunchGraph, state: State) -> None:
-        """Append: track the props as their particles are now."""
-        s = self.state
-        for index, prop in enumerate(self.props):
-            graph.launch(
-                track_prop,
-                self.model.num_envs,
-                [prop, index, self.model.particles, state.x, state.u, state.vk, state.failure],
-                [s.position, s.rotation, s.velocity, s.spin, s.deformation],
-            )
-
-    def arrays(self) -> dict[str, wp.array]:
-        """Arrays of a checkpoint, by name; none without props."""
-        if not self.names:
-            return {}
-        found = {f"props.{field.name}": getattr(self.state, field.name) for field in fields(self.state)}
-        found["props.density"] = self.density
-        found["contact.density"] = self.model.contact.density
-        return found | {f"matter.{name}": getattr(self.model.particles, name) for name in ("mass", "mu", "lam")}
-
-
-def check_places(
-    domain: Domain,
-    dx: float,
-    configs: Sequence[PropConfig],
-    points: Sequence[PropPoints],
-    places: Mapping[str, Sequence[Sequence[float]]],
-) -> None:
-    """Refuse props that would begin outside the domain, where their first step is their last.
-
-    Args:
-        domain: where particles may go.
-        dx: grid spacing [m].
-        configs: of the props, turned as they begin.
-        points: their particles.
-        places: of their centres of mass [m], by name.
-
-    Raises:
-        ConfigError: a prop would reach out of the domain; or a name is no prop's.
-    """
-    solids = {config.name: (config, solid.rest) for config, solid in zip(configs, points, strict=True)}
-    box = np.array([domain.lower, domain.upper])
-    for name, centres in places.items():
-        if name not in solids:
-            raise ConfigError(f"there is no prop {name!r} to be placed; there are {', '.join(solids) or 'none'}")
-        config, rest = solids[name]
-        turned = _turned(config, rest)
-        reach = np.array([turned.min(0), turned.max(0)])
-        for centre in centres:
-            inside = (centre + reach[0] >= box[0] - OVERLAP * dx) & (centre + reach[1] <= box[1] + OVERLAP * dx)
-            if not inside.all():
-                _refuse_place(name, centre, int(np.argmin(inside)), box, box - reach)
-
-
-def turn_of(config: PropConfig | ColliderConfig) -> Rotation:
-    """How a thing is turned as it begins."""
-    return Rotation.from_quat(np.roll(config.rotation, -1))
-
-
-def _turned(config: PropConfig, rest: np.ndarray) -> np.ndarray:
-    """Particles of a prop about its centre of mass as it begins [m], shape ``(P, 3)``."""
-    return turn_of(config).apply(rest)
-
-
-def check_apart(dx: float, configs: Sequence[PropConfig], points: Sequence[PropPoints]) -> None:
-    """Refuse props of which one would begin with its middle in another: they would fly apart.
-
-    Args:
-        dx: grid spacing [m].
-        configs: of the props.
-        points: their particles.
-
-    Raises:
-        ConfigError: there are such.
-    """
-    turned = [_turned(config, solid.rest) for config, solid in zip(configs, points, strict=True)]
-    for (one, _), (other, rest) in permutations(zip(configs, turned, strict=True), 2):
-        middle = np.subtract(one.position, other.position)
-        if one.name != other.name and np.linalg.norm(rest - middle, axis=1).min() < dx:  # names are checked elsewhere
-            at = [round(float(value), 3) for value in one.position]
-            raise ConfigError(
-                f"prop {one.name!r} would begin at {at} m, inside of {other.name!r}; place them side by side"
-            )
-
-
-def _refuse_place(name: str, centre: Sequence[float], axis: int, box: np.ndarray, room: np.ndarray) -> None:
-    """Say that a prop at ``centre`` reaches out of ``box`` along ``axis``; ``room`` is for its centre [m]."""
-    along, at = "xyz"[axis], [round(float(value), 3) for value in centre]
-    low, high = room[:, axis]
-    remedy = f"place it with {along} in [{low:.3g}, {high:.3g}] m" if low <= high else "make it smaller"
-    raise ConfigError(
-        f"prop {name!r} would begin at {at} m and reach out of the domain, which ends at "
-        f"{along}={box[0, axis]:.3g} and {box[1, axis]:.3g} m; {remedy}"
-    )
-
-
 @wp.kernel
 def copy_masked(
     mask: wp.array(dtype=wp.bool),
@@ -396,7 +383,7 @@ def copy_masked(
     # out
     target: wp.array(dtype=float),
 ):
-    """Copy the masked environments' values."""
+    """Copy the values of the masked environments; over ``(num_envs,)``."""
     e = wp.tid()
     if mask[e]:
         target[e] = value[e]

@@ -1,7 +1,4 @@
-"""The box in which bodies may move.
-
-All matter of a world in one list: avatars first, then props; their velocity fields, friction and sensors.
-"""
+"""The scene: the domain, and all matter of a world in one list, with its velocity fields, friction and sensors."""
 
 from __future__ import annotations
 
@@ -11,28 +8,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from piavatar_envs.avatar.body.sampling import LIMB_GROUPS, limb_groups
-from piavatar_envs.config import ConfigError, PhysicsConfig, PropConfig, SceneConfig
-from piavatar_envs.config.schema import LEAST_DENSITY, MOST_DENSITY
+from piavatar_envs.config import ConfigError, PhysicsConfig, SceneConfig
 from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.model import Fields, MaterialPoints
-from piavatar_envs.sim import prop_geometry as geometry
 from piavatar_envs.sim.bodies import NUM_PARTS, Flesh
-from piavatar_envs.sim.prop_geometry import PropPoints
 
-#: More room for bodies that nothing holds up: as far as one reaches when it falls [m].
+#: The name of the floor.
+GROUND = "ground"
+#: Distance by which the domain of bodies without a held root is wider: the reach of a falling body [m].
 FALL = 1.2
 
 
 @dataclass(frozen=True)
 class Domain:
-    """Box in which particles may move [m]; leaving it is a failure.
+    """Box in which particles may move [m]; a particle that leaves it ends the episode with a failure.
 
-    The default holds a body with outstretched limbs wherever its root may be before it lets go.
+    The default has room for a body with outstretched limbs wherever its root may be before the wrench is released.
 
     Attributes:
         lower, upper: corners [m].
-        fenced: whether walls belong to the world, such as ropes around a ring: they stand there also for one body
-            alone, and where nothing holds bodies up.
+        fenced: whether walls belong to the world, such as ropes around a ring, so that they stand there for a single
+            body as well, and the domain is not widened for falls.
     """
 
     lower: tuple[float, float, float] = (-1.6, -1.6, -0.3)
@@ -40,25 +36,25 @@ class Domain:
     fenced: bool = False
 
     def around(self, places: Sequence[Sequence[float]]) -> Domain:
-        """The box moved to every one of ``places`` (x, y) [m], and what holds them all."""
+        """Return the box that contains this one moved to each of ``places`` (x, y) [m]."""
         at = np.array([(*place[:2], 0.0) for place in places])
         lower, upper = np.array(self.lower) + at.min(0), np.array(self.upper) + at.max(0)
         return Domain(tuple(lower.tolist()), tuple(upper.tolist()))
 
     def including(self, *points: Sequence[float]) -> Domain:
-        """The smallest box that holds this one and ``points`` [m]."""
+        """Return the smallest box that contains this one and ``points`` [m]."""
         every = np.array([self.lower, self.upper, *points])
         return Domain(tuple(every.min(0).tolist()), tuple(every.max(0).tolist()))
 
     def for_falls(self, walled: bool) -> Domain:
-        """The box for bodies that nothing holds up; ``walled`` says whether walls stand around it."""
+        """Return the box for bodies without a held root, wider by :data:`FALL` unless it is fenced and ``walled``."""
         if walled and self.fenced:
             return self
         aside = np.array([FALL, FALL, 0.0])
         return Domain(tuple((np.array(self.lower) - aside).tolist()), tuple((np.array(self.upper) + aside).tolist()))
 
     def walls(self) -> tuple[Collider, ...]:
-        """Smooth planes at the sides and the top of the box."""
+        """Return smooth planes at the sides and the top of the box."""
         walls = []
         for axis in range(3):
             normal = np.eye(3)[axis]
@@ -67,20 +63,17 @@ class Domain:
         return tuple(walls)
 
 
-GROUND = "ground"
-
-
 @dataclass(frozen=True)
 class Subjects:
-    """The matter of a world.
+    """The matter of a world: avatars, then props, each a subject.
 
     Attributes:
-        names: of the subjects, avatars first.
-        first: first particle of every subject, and one past the last.
+        names: of the subjects.
+        first: index of the first particle of every subject, and the number of particles.
         matter: all particles.
-        fields: velocity fields, friction between them, sensors (``NUM_PARTS`` rows an avatar).
-        colliders: the ground, the scene's own, with their friction for every field, and the walls.
-        collider_names: of those but the walls.
+        fields: velocity fields, friction between them, sensors (``NUM_PARTS`` rows per avatar).
+        colliders: the ground and the scene's colliders, with their friction for every field, and the walls.
+        collider_names: of the colliders but the walls.
     """
 
     names: tuple[str, ...]
@@ -89,54 +82,6 @@ class Subjects:
     fields: Fields
     colliders: tuple[Collider, ...]
     collider_names: tuple[str, ...]
-
-
-def prop_points(prop: PropConfig, spacing: float) -> PropPoints:
-    """Particles of a prop.
-
-    Raises:
-        ConfigError: the size does not fit the shape, a mesh has no file, or the solid is too thin.
-    """
-    sizes = {"sphere": 1, "box": 3, "capsule": 2, "mesh": 1}
-    if len(prop.size) != sizes[prop.shape]:
-        raise ConfigError(f"prop {prop.name}: size={list(prop.size)} of a {prop.shape} has {sizes[prop.shape]} numbers")
-    try:
-        if prop.shape == "mesh":
-            if prop.file is None:
-                raise ValueError("shape='mesh' needs a file")
-            return geometry.mesh(prop.file, spacing, scale=prop.size[0])
-        if prop.shape == "box":
-            return geometry.box(prop.size, spacing)
-        return getattr(geometry, prop.shape)(*prop.size, spacing)
-    except (ValueError, OSError) as error:
-        raise ConfigError(f"prop {prop.name}: {error}") from None
-
-
-def prop_matter(prop: PropConfig, points: PropPoints, physics: PhysicsConfig) -> MaterialPoints:
-    """A prop as matter. Without a modulus of its own its waves are as fast as the flesh's.
-
-    Raises:
-        ConfigError: its mass is too small or too great for its size.
-    """
-    volume = float(points.volume.sum())
-    density = prop.density if prop.mass is None else prop.mass / volume
-    if not LEAST_DENSITY <= density <= MOST_DENSITY:
-        raise ConfigError(
-            f"prop {prop.name!r}: mass={prop.mass:.3g} kg in {volume:.3g} m^3 is a density of {density:.3g} kg/m^3, "
-            f"which must be in [{LEAST_DENSITY:g}, {MOST_DENSITY:g}]; use a mass in "
-            f"[{LEAST_DENSITY * volume:.3g}, {MOST_DENSITY * volume:.3g}] kg, or another size"
-        )
-    young = prop.young_modulus
-    if young is None:
-        # the P-wave modulus over the density is the flesh's
-        young = physics.young_modulus * density / physics.density
-        young *= _wave_factor(physics.poisson_ratio) / _wave_factor(prop.poisson_ratio)
-    return MaterialPoints.uniform(points.volume, density, young, prop.poisson_ratio, prop.material)
-
-
-def _wave_factor(poisson_ratio: float) -> float:
-    """P-wave modulus over Young's modulus."""
-    return (1.0 - poisson_ratio) / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
 
 
 def assemble(
@@ -148,66 +93,94 @@ def assemble(
     walls: Sequence[Collider],
     rows: int,
 ) -> Subjects:
-    """Put all matter together.
+    """Assemble the matter of a world.
 
     Args:
-        scene: props and colliders in the order of ``props``.
+        scene: props in the order of ``props``, colliders, friction.
         physics: friction of the flesh on the ground.
         avatar_names: names of the avatars.
-        flesh: their matter.
+        flesh: matter of the avatars.
         props: matter of the scene's props.
-        walls: solids besides the scene's, without friction.
+        walls: further colliders, without friction.
         rows: rows of the arrays of matter, 1 or ``num_envs``.
 
     Raises:
-        ConfigError: a name is given twice, or a pair names what is not there.
+        ConfigError: a name is given twice, or a pair of friction is unknown or impossible.
     """
     names = (*avatar_names, *(prop.name for prop in scene.props))
     solids = ((GROUND,) if scene.ground else ()) + tuple(collider.name for collider in scene.colliders)
-    everything = names + solids
-    twice = [name for name in everything if everything.count(name) > 1]
-    if twice:
-        raise ConfigError(f"scene: the name {twice[0]!r} is given twice; avatars, props and colliders need their own")
+    _check_names((*names, *solids))
     parts = [body.matter() for body in flesh] + list(props)
     first = np.cumsum([0, *(part.num_particles for part in parts)])
-    owner, local, seam = [], [], []  # subject of every field; field within the subject and seam of every particle
-    for subject, part in enumerate(parts):
-        if subject < len(flesh) and scene.self_contact:
-            sampled = flesh[subject].sampled
-            group, grown = limb_groups(sampled.skin_joints, sampled.skin_weights)
-            owner += [subject] * len(LIMB_GROUPS)
-        else:
-            group, grown = np.zeros(part.num_particles, np.int32), np.zeros(part.num_particles, np.float32)
-            owner += [subject]
-        local.append(owner.index(subject) + group)
-        seam.append(grown)
-    sensor = np.full(first[-1], -1)
-    for index, body in enumerate(flesh):
-        sensor[first[index] : first[index + 1]] = index * NUM_PARTS + body.part
-    density = [float((p.density[0] * p.volume[0]).sum() / p.volume[0].sum()) for p in parts]
-    pairs = _frictions(scene, physics, names, solids)
-    owner_index = np.array(owner)
+    owner, field, seam = _velocity_fields(scene, flesh, parts)
+    frictions = _frictions(scene, physics, names, solids)
     fields = Fields(
-        subject=tuple(owner),
-        friction=pairs[: len(names), : len(names)][np.ix_(owner_index, owner_index)],
-        density=np.array(density)[owner_index],
+        subject=tuple(owner.tolist()),
+        friction=frictions[: len(names), : len(names)][np.ix_(owner, owner)],
+        density=np.array([_mean_density(part) for part in parts])[owner],
         gate=scene.contact_gate,
         normals=scene.contact_normals,
         num_sensors=len(flesh) * NUM_PARTS,
     )
-    colliders = (*_colliders(scene, pairs[: len(names), len(names) :][owner_index]), *walls)
-    matter = replace(_join(parts, rows), field=np.concatenate(local), seam=np.concatenate(seam), sensor=sensor)
+    colliders = (*_colliders(scene, frictions[: len(names), len(names) :][owner]), *walls)
+    matter = replace(_join(parts, rows), field=field, seam=seam, sensor=_sensors(flesh, first))
     return Subjects(names, tuple(int(i) for i in first), matter, fields, colliders, solids)
 
 
+def _check_names(names: Sequence[str]) -> None:
+    """Refuse a name that is given twice.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ConfigError(f"scene: the name {twice[0]!r} is given twice; avatars, props and colliders need their own")
+
+
+def _velocity_fields(
+    scene: SceneConfig, flesh: Sequence[Flesh], parts: Sequence[MaterialPoints]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the subject of every velocity field, and field and seam of every particle.
+
+    A subject has one field, or with ``self_contact`` an avatar has one for torso, arms and legs each.
+    """
+    owner, field, seam = [], [], []
+    for subject, part in enumerate(parts):
+        if subject < len(flesh) and scene.self_contact:
+            sampled = flesh[subject].sampled
+            group, grown = limb_groups(sampled.skin_joints, sampled.skin_weights)
+            count = len(LIMB_GROUPS)
+        else:
+            group, grown = np.zeros(part.num_particles, np.int32), np.zeros(part.num_particles, np.float32)
+            count = 1
+        field.append(len(owner) + group)
+        seam.append(grown)
+        owner += [subject] * count
+    return np.array(owner), np.concatenate(field), np.concatenate(seam)
+
+
+def _sensors(flesh: Sequence[Flesh], first: np.ndarray) -> np.ndarray:
+    """Return the contact sensor of every particle: that of its body part, -1 for props."""
+    sensor = np.full(first[-1], -1)
+    for index, body in enumerate(flesh):
+        sensor[first[index] : first[index + 1]] = index * NUM_PARTS + body.part
+    return sensor
+
+
+def _mean_density(part: MaterialPoints) -> float:
+    """Return the mean density of a subject [kg/m^3], in its first row."""
+    return float((part.density[0] * part.volume[0]).sum() / part.volume[0].sum())
+
+
 def _frictions(scene: SceneConfig, physics: PhysicsConfig, names: Sequence[str], solids: Sequence[str]) -> np.ndarray:
-    """Coulomb coefficients of subjects (rows) on subjects and solids (columns)."""
+    """Return Coulomb coefficients of subjects (rows) on subjects and solids (columns)."""
     everything = [*names, *solids]
     table = np.full((len(names), len(everything)), scene.body_friction)
     for column, name in enumerate(solids, start=len(names)):
         table[:, column] = next((c.friction for c in scene.colliders if c.name == name), physics.friction)
     for prop in scene.props:
-        # two surfaces rub as much as the smoother of them
+        # the smoother of two surfaces decides
         row = names.index(prop.name)
         table[row, len(names) :] = np.minimum(table[row, len(names) :], prop.friction)
     _check_pairs(scene, names, everything)
@@ -220,32 +193,34 @@ def _frictions(scene: SceneConfig, physics: PhysicsConfig, names: Sequence[str],
 
 
 def _check_pairs(scene: SceneConfig, names: Sequence[str], everything: Sequence[str]) -> None:
-    """Refuse pairs of what is not there, of two that cannot touch, and such as come twice.
+    """Refuse pairs with an unknown name, pairs that cannot touch, and pairs that are given twice.
 
     Raises:
         ConfigError: there is one.
     """
-    told: set[frozenset[str]] = set()
+    known: set[frozenset[str]] = set()
     for pair in scene.pair_friction:
         for name in (pair.a, pair.b):
             if name not in everything:
-                raise ConfigError(f"scene.pair_friction: there is no {name!r}; there are {', '.join(everything)}")
-        if frozenset((pair.a, pair.b)) in told:
-            raise ConfigError(f"scene.pair_friction: {pair.a!r} and {pair.b!r} come twice; leave one of them out")
-        told.add(frozenset((pair.a, pair.b)))
+                raise ConfigError(f"scene.pair_friction: there is no {name!r}; use two of {', '.join(everything)}")
+        if frozenset((pair.a, pair.b)) in known:
+            raise ConfigError(f"scene.pair_friction: {pair.a!r} and {pair.b!r} are given twice; leave one of them out")
+        known.add(frozenset((pair.a, pair.b)))
         is_prop = pair.a in (prop.name for prop in scene.props)
         if pair.a == pair.b and (is_prop or not scene.self_contact):
             remedy = "leave it out" if is_prop else "leave it out, or set scene.self_contact=true"
-            raise ConfigError(f"scene.pair_friction: {pair.a!r} does not touch itself; {remedy}")
+            raise ConfigError(f"scene.pair_friction: {pair.a!r} cannot touch itself; {remedy}")
         if pair.a not in names and pair.b not in names:
-            raise ConfigError(f"scene.pair_friction: {pair.a!r} and {pair.b!r} are solids, they never touch")
+            raise ConfigError(
+                f"scene.pair_friction: {pair.a!r} and {pair.b!r} are both solids, which cannot touch; leave them out"
+            )
 
 
 def _colliders(scene: SceneConfig, frictions: np.ndarray) -> tuple[Collider, ...]:
-    """The ground and the scene's solids, ``frictions`` of shape ``(fields, solids)``.
+    """Return the ground and the scene's colliders; ``frictions`` has shape ``(fields, solids)``.
 
     Raises:
-        ConfigError: one of the scene's is none.
+        ConfigError: a collider is not a valid solid.
     """
     ground = [Collider.plane((0.0, 0.0, 1.0), 0.0, tuple(frictions[:, 0]))] if scene.ground else []
     others = [
@@ -261,7 +236,7 @@ def _colliders(scene: SceneConfig, frictions: np.ndarray) -> tuple[Collider, ...
 
 
 def _join(parts: Sequence[MaterialPoints], rows: int) -> MaterialPoints:
-    """Matter of several subjects side by side."""
+    """Concatenate the matter of several subjects."""
 
     def side_by_side(name: str) -> np.ndarray:
         arrays = [getattr(part, name) for part in parts]

@@ -46,7 +46,7 @@ def test_errors_are_one_line_with_key_value_and_limit(settings, words):
 
 def test_environment_settings_of_the_command_line_win_over_the_file():
     config = load_training({"env": {"fidelity": "tiny", "tone": 0.5}}, {"env.tone": 0.25, "seed": 3})
-    assert env_config(config).drive.tone == 0.25
+    assert env_config(config).control.tone == 0.25
     assert env_config(config).physics.fidelity == "tiny"
     assert config.seed == 3
 

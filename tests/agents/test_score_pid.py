@@ -24,6 +24,6 @@ def test_scores_are_those_of_the_episodes_and_go_into_the_table(device, tmp_path
     assert all(row["episodes"] == 3 and row["first_seed"] == 1_000_000 for row in report["results"])
     assert report["results"][2]["return_mean"] != report["results"][0]["return_mean"]
     assert report["config"]["design"]["unloaded"] == 0.5
-    assert (out / "config.yaml").read_text().count("control: torque") == 1
+    assert (out / "config.yaml").read_text().count("mode: torque") == 1
     table = scores.scores({"pid_stand": report})
     assert [row["agent"] for row in table] == ["random", "zero", "PID"]

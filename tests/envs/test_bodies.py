@@ -140,7 +140,7 @@ def test_avatars_draw_apart_from_bodies_that_are_shaped_once(device):
     assert pools[0].bodies is pools[1].bodies
     assert not np.array_equal(pools[0].index.numpy(), pools[1].index.numpy())
     for avatar, flesh in enumerate(simulation.flesh):
-        flesh.fall_behind()
+        flesh.mark_stale()
         for env in range(n):
             assert constants_of(simulation, env, avatar)["mass"].sum() == pytest.approx(flesh.points.mass[env].sum())
 

@@ -26,7 +26,7 @@ def test_boxes_hold_the_bones_of_the_body_that_was_drawn(make_batch, pool):
     for seeds in ([0, 1, 2], [31, 32, 33]):
         batch.reset(seeds=seeds)
         batch.step()
-        batch.simulation.shapes.fall_behind()
+        batch.simulation.shapes.mark_stale()
         workspace = batch.simulation.controllers[0].joints._workspace
         middle, half = workspace.middle.numpy().copy(), workspace.half.numpy().copy()
         boxes = np.stack([middle - half, middle + half])

@@ -12,7 +12,7 @@ from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_in
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.mpm.model import choose_num_substeps
 from piavatar_envs.multi import listed_games, load_game
-from piavatar_envs.sim.checks import STRUCK, lever
+from piavatar_envs.sim.time_step import STRUCK, lever
 from piavatar_envs.sim.world import Simulation
 from piavatar_envs.tasks import load_task, task_modules
 
