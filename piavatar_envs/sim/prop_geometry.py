@@ -1,10 +1,8 @@
-"""Surfaces of simple solids for pictures, fine enough to bend with the particles below them.
+"""Particles of soft props: closed solids filled on a lattice, with the surface for pictures.
 
-From a closed solid to the particles of a soft prop: places, volumes, and a surface for pictures.
-
-Particles sit in the cells of a regular lattice that fits the solid's bounding box, each at the centroid of what it
-stands for. A few point masses turn more easily than the solid they stand for (eight in a cube by a quarter), so the
-lattice is stretched a little until its second moments, and with them the inertia, are the solid's.
+Particles sit in the cells of a regular lattice that fits the solid's bounding box, each at the centroid of its matter.
+A few point masses turn more easily than the solid they stand for (eight in a cube by a quarter), so the lattice is
+stretched until its second moments, and with them the inertia, are the solid's.
 """
 
 from __future__ import annotations
@@ -23,14 +21,288 @@ from piavatar_envs.mpm.colliders import COLLIDER_KINDS, solid_distance
 
 wp.set_module_options({"enable_backward": False})
 
-
+MESH_FORMATS = (".glb", ".obj", ".off", ".ply", ".stl")
+MIN_PARTICLES = 8
+MAX_CELLS = 200_000  # of the lattice around a solid
+MIN_CELLS = 2  # along each axis, because one layer has no orientation
+SUBDIVISIONS = 3  # points per axis and cell that measure the part of it inside
+MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
+MAX_MISSED = 0.25  # share of a mesh's volume that the lattice may miss or count twice
 SEGMENTS = 32  # around a round surface
 RINGS = 8  # from a pole to the equator
 SQUARES = 6  # along each edge of a box
 
 
+@dataclass(frozen=True, eq=False)
+class PropPoints:
+    """Particles and surface of a prop in a frame about its centre of mass; arrays are read-only.
+
+    Attributes:
+        rest: particles [m], shape ``(P, 3)`` float32.
+        volume: their volumes [m^3], which add up to the solid's, shape ``(P,)`` float64.
+        vertices: surface for pictures [m], shape ``(V, 3)`` float32.
+        faces: its triangles, outward, shape ``(T, 3)`` int32.
+    """
+
+    rest: np.ndarray
+    volume: np.ndarray
+    vertices: np.ndarray
+    faces: np.ndarray
+
+    def __post_init__(self):
+        for array in vars(self).values():
+            array.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.rest)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solid:
+    """A solid in a frame about its centre of mass; ``spread`` is the mean of ``x x^T`` over it [m^2]."""
+
+    name: str
+    distance: Callable[[np.ndarray], np.ndarray]  # signed, negative inside [m]
+    volume: float
+    spread: np.ndarray
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def sphere(radius: float, spacing: float) -> PropPoints:
+    """Fill a ball with particles.
+
+    Args:
+        radius: its radius [m].
+        spacing: spacing of the particles [m]; a smaller ball still has eight.
+
+    Raises:
+        ValueError: a length is not positive, or the lattice is too large.
+    """
+    _check_lengths("sphere", radius=radius, spacing=spacing)
+    distance = primitive_distance("sphere", (radius, 0.0, 0.0))
+    spread = np.eye(3) * radius**2 / 5.0
+    volume = 4.0 / 3.0 * np.pi * radius**3
+    return _particles(_Solid("sphere", distance, volume, spread, *round_surface(radius, 0.0)), spacing)
+
+
+def box(half_size: Sequence[float], spacing: float) -> PropPoints:
+    """Fill a box with particles.
+
+    Args:
+        half_size: half edges along x, y and z [m].
+        spacing: spacing of the particles [m]; a shorter edge still has two.
+
+    Raises:
+        ValueError: a length is not positive, or the lattice is too large.
+    """
+    half = np.asarray(half_size, dtype=np.float64)
+    if half.shape != (3,):
+        raise ValueError(f"box half_size={half_size!r} must be three lengths [m], along x, y and z")
+    _check_lengths("box", spacing=spacing, **{f"half_size[{axis}]": length for axis, length in enumerate(half)})
+    distance = primitive_distance("box", half)
+    return _particles(_Solid("box", distance, 8.0 * half.prod(), np.diag(half**2) / 3.0, *box_surface(half)), spacing)
+
+
+def capsule(radius: float, half_length: float, spacing: float) -> PropPoints:
+    """Fill a capsule along z with particles.
+
+    Args:
+        radius: radius of the cylinder and of the half balls at its ends [m].
+        half_length: half the length of the cylinder [m].
+        spacing: spacing of the particles [m]; a thinner capsule still has two across.
+
+    Raises:
+        ValueError: a length is not positive, or the lattice is too large.
+    """
+    _check_lengths("capsule", radius=radius, half_length=half_length, spacing=spacing)
+    distance = primitive_distance("capsule", (radius, half_length, 0.0))
+    tube, ends = 2.0 * np.pi * radius**2 * half_length, 4.0 / 3.0 * np.pi * radius**3
+    # a half ball has its centroid at 3/8 of the radius from the flat side, and a mean square of a fifth of radius^2
+    across = tube * radius**2 / 4.0 + ends * radius**2 / 5.0
+    along = tube * half_length**2 / 3.0
+    along += ends * (radius**2 / 5.0 + half_length**2 + 0.75 * radius * half_length)
+    spread = np.diag([across, across, along]) / (tube + ends)
+    return _particles(
+        _Solid("capsule", distance, tube + ends, spread, *round_surface(radius, half_length)),
+        spacing,
+    )
+
+
+def mesh(path: str | Path, spacing: float, scale: float = 1.0) -> PropPoints:
+    """Fill the solid of a watertight mesh with particles; only the triangles of the file are read.
+
+    Args:
+        path: the file, in one of :data:`MESH_FORMATS`.
+        spacing: spacing of the particles [m].
+        scale: length of the file's unit [m], 0.001 for millimetres.
+
+    Raises:
+        ImportError: the optional package trimesh is missing.
+        FileNotFoundError: there is no such file.
+        ValueError: the file is no closed mesh of a known format, or the solid is too thin for the spacing.
+    """
+    path = Path(path)
+    _check_lengths(path.name, spacing=spacing, scale=scale)
+    shape = _load(path)
+    shape.apply_scale(scale)
+    shape.apply_translation(-shape.center_mass)
+    vertices, faces = shape.vertices.astype(np.float32), shape.faces.astype(np.int32)
+    inertia = shape.moment_inertia  # of density one
+    spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / shape.volume
+    surface = ClosedSurface(vertices, faces)
+    return _particles(_Solid(path.name, surface.distance, float(shape.volume), spread, vertices, faces), spacing)
+
+
+def _load(path: Path):
+    """Load a file as a ``trimesh.Trimesh`` that is closed and faces outward."""
+    try:
+        import trimesh
+    except ImportError:
+        raise ImportError("a prop from a mesh needs trimesh: pip install piavatar-envs[props]") from None
+    if path.suffix.lower() not in MESH_FORMATS:
+        raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(MESH_FORMATS)}")
+    if not path.is_file():
+        raise FileNotFoundError(f"no mesh at {path}")
+    try:
+        # a stream, not a path: no materials or buffers are looked up beside it
+        stream, kind = io.BytesIO(path.read_bytes()), path.suffix.lower()[1:]
+        loaded = trimesh.load(stream, file_type=kind, force="mesh", process=True, skip_materials=True)
+        # once more without texture coordinates, which split vertices along their seams
+        faces = getattr(loaded, "faces", np.empty((0, 3), np.int64))
+        shape = trimesh.Trimesh(loaded.vertices, faces, process=True)  # validate would turn a cavity inside out
+        shape.update_faces(shape.nondegenerate_faces())
+    except Exception as error:  # parsers of foreign files raise anything
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(f"{path.name} is not a readable {path.suffix} mesh: {reason}") from None
+    if len(shape.faces) == 0:
+        raise ValueError(f"{path.name} has no triangles; export a solid, not points, curves or an empty scene")
+    if not shape.is_watertight:
+        bad = (np.bincount(shape.edges_unique_inverse) != 2).sum()
+        raise ValueError(f"{path.name} is not watertight ({bad} edges without two sides); close it and export it again")
+    if not shape.is_winding_consistent:
+        raise ValueError(f"{path.name} has triangles of both orientations; make its normals consistent")
+    if shape.volume < 0.0:
+        shape.invert()
+    return shape
+
+
+@wp.kernel
+def _primitive_distance_kernel(
+    kind: int,
+    size: wp.vec3,
+    points: wp.array(dtype=wp.vec3),
+    # out
+    distance: wp.array(dtype=float),
+):
+    """Store the signed distance of every point; over ``(points,)``."""
+    i = wp.tid()
+    distance[i] = solid_distance(kind, size, points[i])[3]
+
+
+def primitive_distance(kind: str, size: Sequence[float]) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the signed distance of a collider's shape, ``(N, 3)`` to ``(N,)`` [m], evaluated on the CPU."""
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        where = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device="cpu")
+        out = wp.empty(len(points), dtype=float, device="cpu")
+        inputs = [COLLIDER_KINDS[kind], wp.vec3(*map(float, size)), where]
+        wp.launch(_primitive_distance_kernel, len(points), inputs, [out], device="cpu")
+        return out.numpy()
+
+    return distance
+
+
+def _check_lengths(name: str, **lengths: float) -> None:
+    """Refuse lengths that are not positive and finite.
+
+    Raises:
+        ValueError: there is one.
+    """
+    for key, value in lengths.items():
+        if not (np.isfinite(value) and value > 0.0):
+            raise ValueError(f"{name} {key}={value} must be positive and finite; lengths are in metres")
+
+
+def _particles(solid: _Solid, spacing: float) -> PropPoints:
+    """Fill a solid with particles whose volumes and second moments add up to the solid's.
+
+    Raises:
+        ValueError: the lattice is too large, or too coarse for the solid.
+    """
+    places, share, caught = _lattice(solid, spacing)
+    if len(places) < MIN_PARTICLES or abs(caught / solid.volume - 1.0) > MAX_MISSED:
+        raise ValueError(
+            f"{solid.name} is too thin for spacing={spacing:g} m: {len(places)} particles (at least {MIN_PARTICLES}) "
+            f"with {caught / solid.volume:.0%} of its volume; use a spacing under {0.5 * spacing:g} m or a larger shape"
+        )
+    rest = _stretched(places, share, solid.spread)
+    beyond = solid.distance(rest) > 0.0
+    rest[beyond] = places[beyond]
+    centre = (
+        share @ rest
+    )  # differs a little from the centre of a coarsely sampled mesh; the surface moves with the particles
+    surface = (solid.vertices - centre).astype(np.float32)
+    return PropPoints((rest - centre).astype(np.float32), share * solid.volume, surface, solid.faces)
+
+
+def _lattice(solid: _Solid, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return particles [m] ``(P, 3)``, their shares of the volume ``(P,)``, and the volume of all cells [m^3]."""
+    low, high = (end(solid.vertices, axis=0).astype(np.float64) for end in (np.min, np.max))
+    counts = np.maximum(np.round((high - low) / spacing), MIN_CELLS)
+    if counts.prod() > MAX_CELLS:
+        larger = spacing * (counts.prod() / MAX_CELLS) ** (1.0 / 3.0)
+        raise ValueError(
+            f"{solid.name} at spacing={spacing:g} m has {counts.prod():.3g} cells (at most {MAX_CELLS}); "
+            f"use a spacing above {larger:.2g} m"
+        )
+    edge = (high - low) / counts
+    cells = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in counts], indexing="ij"), axis=-1).reshape(-1, 3)
+    centres = low + cells * edge
+    steps = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS - 0.5
+    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * edge
+    fine = centres[:, None, :] + offsets
+    distance = solid.distance(centres)
+    inside = np.repeat(distance[:, None] < 0.0, len(offsets), axis=1)
+    # a point nearer to the centre than the surface is on the centre's side, so only the others need a query
+    unsure = np.abs(distance)[:, None] <= np.linalg.norm(offsets, axis=1)
+    inside[unsure] = solid.distance(fine[unsure]) < 0.0
+    caught = inside.mean() * (high - low).prod()
+    kept = np.flatnonzero(inside.mean(axis=1) >= MIN_FILL)
+    if len(kept) == 0:
+        return np.empty((0, 3)), np.empty(0), caught
+    # a cell without a particle adds its matter to the nearest particle
+    owner = np.full(len(centres), -1)
+    owner[kept] = np.arange(len(kept))
+    owner, points = np.repeat(owner, inside.sum(axis=1)), fine[inside]
+    owner[owner < 0] = cKDTree(centres[kept]).query(points[owner < 0])[1]
+    count = np.bincount(owner)
+    places = np.stack([np.bincount(owner, points[:, axis]) for axis in range(3)], axis=1) / count[:, None]
+    # a centroid outside the solid, as between two fingers, moves to the nearest point inside
+    gap = solid.distance(places) >= 0.0
+    places[gap] = points[cKDTree(points).query(places[gap])[1]]
+    return places, count / count.sum(), caught
+
+
+def _stretched(places: np.ndarray, share: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Map places about their mean ``(P, 3)`` so that the mean of ``x x^T`` is ``spread`` [m^2].
+
+    The symmetric one of all such linear maps moves the points least.
+    """
+    centred = places - share @ places
+    root = _power(np.einsum("p,pi,pj->ij", share, centred, centred), 0.5)
+    back = _power(root, -1.0)
+    return centred @ (back @ _power(root @ spread @ root, 0.5) @ back)
+
+
+def _power(matrix: np.ndarray, exponent: float) -> np.ndarray:
+    """Return a power of a symmetric matrix, its eigenvalues bounded away from zero."""
+    values, axes = np.linalg.eigh(matrix)
+    return (axes * np.maximum(values, 1e-12 * values[-1]) ** exponent) @ axes.T
+
+
 def round_surface(radius: float, half_length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Surface of a capsule along z, or of a ball where ``half_length`` [m] is zero.
+    """Triangulate a capsule along z, or a ball if ``half_length`` [m] is zero.
 
     Returns:
         Vertices [m] ``(V, 3)`` float32 and outward triangles ``(T, 3)`` int32.
@@ -60,7 +332,7 @@ def round_surface(radius: float, half_length: float) -> tuple[np.ndarray, np.nda
 
 
 def box_surface(half_size: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Surface of a box; every side has vertices of its own, so that its edges are shaded sharp.
+    """Triangulate a box, with separate vertices for every side so that edges are shaded sharp.
 
     Returns:
         Vertices [m] ``(V, 3)`` float32 and outward triangles ``(T, 3)`` int32.
@@ -75,279 +347,9 @@ def box_surface(half_size: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         for sign in (1.0, -1.0):
             side = np.empty((SQUARES + 1, SQUARES + 1, 3))
             side[..., axis] = sign
-            side[..., (axis + 1) % 3] = sign * ticks[:, None]  # turned with the side, so that it faces outward
+            side[..., (axis + 1) % 3] = sign * ticks[:, None]  # the sign makes the side face outward
             side[..., (axis + 2) % 3] = ticks[None, :]
             faces.append(squares + len(vertices) * (SQUARES + 1) ** 2)
             vertices.append(side.reshape(-1, 3))
     corners = np.concatenate(vertices) * np.asarray(half_size, dtype=np.float64)
     return corners.astype(np.float32), np.concatenate(faces).astype(np.int32)
-
-
-MESH_FORMATS = (".glb", ".obj", ".off", ".ply", ".stl")
-MIN_PARTICLES = 8
-MAX_CELLS = 200_000  # of the lattice around a solid
-MIN_CELLS = 2  # along each axis: one layer could not tell how it is turned
-SUBDIVISIONS = 3  # points per axis and cell that decide how much of it is inside
-MIN_FILL = 0.3  # share of a cell that must be inside for a particle of its own
-MAX_MISSED = 0.25  # share of a mesh's volume that the lattice may miss or count twice
-
-
-@dataclass(frozen=True, eq=False)
-class PropPoints:
-    """The matter of a prop, in a frame about its centre of mass. Arrays are read-only.
-
-    Attributes:
-        rest: particles [m], shape ``(P, 3)`` float32.
-        volume: their volumes [m^3], which add up to the solid's, shape ``(P,)`` float64.
-        vertices: surface for pictures [m], shape ``(V, 3)`` float32.
-        faces: its triangles, outward, shape ``(T, 3)`` int32.
-    """
-
-    rest: np.ndarray
-    volume: np.ndarray
-    vertices: np.ndarray
-    faces: np.ndarray
-
-    def __post_init__(self):
-        for array in vars(self).values():
-            array.setflags(write=False)
-
-    def __len__(self) -> int:
-        return len(self.rest)
-
-
-@dataclass(frozen=True, eq=False)
-class _Solid:
-    """A solid in a frame about its centre of mass: ``spread`` is the mean of ``x x^T`` over it [m^2]."""
-
-    name: str
-    distance: Callable[[np.ndarray], np.ndarray]  # signed, negative inside [m]
-    volume: float
-    spread: np.ndarray
-    vertices: np.ndarray
-    faces: np.ndarray
-
-
-def sphere(radius: float, spacing: float) -> PropPoints:
-    """A ball.
-
-    Args:
-        radius: its radius [m].
-        spacing: of the particles [m]; a ball smaller than that still has eight.
-
-    Raises:
-        ValueError: a length is not positive, or the lattice too large.
-    """
-    _check_lengths("sphere", radius=radius, spacing=spacing)
-    distance = primitive_distance("sphere", (radius, 0.0, 0.0))
-    spread = np.eye(3) * radius**2 / 5.0
-    volume = 4.0 / 3.0 * np.pi * radius**3
-    return _particles(_Solid("sphere", distance, volume, spread, *round_surface(radius, 0.0)), spacing)
-
-
-def box(half_size: Sequence[float], spacing: float) -> PropPoints:
-    """A box.
-
-    Args:
-        half_size: half its edges along x, y and z [m].
-        spacing: of the particles [m]; along an edge shorter than that there are still two.
-
-    Raises:
-        ValueError: a length is not positive, or the lattice too large.
-    """
-    half = np.asarray(half_size, dtype=np.float64)
-    if half.shape != (3,):
-        raise ValueError(f"box half_size={half_size!r} needs three lengths [m], along x, y and z")
-    _check_lengths("box", spacing=spacing, **{f"half_size[{axis}]": length for axis, length in enumerate(half)})
-    distance = primitive_distance("box", half)
-    return _particles(_Solid("box", distance, 8.0 * half.prod(), np.diag(half**2) / 3.0, *box_surface(half)), spacing)
-
-
-def capsule(radius: float, half_length: float, spacing: float) -> PropPoints:
-    """A capsule along z.
-
-    Args:
-        radius: of the cylinder and of the half balls at its ends [m].
-        half_length: half the length of the cylinder [m].
-        spacing: of the particles [m]; across a capsule thinner than that there are still two.
-
-    Raises:
-        ValueError: a length is not positive, or the lattice too large.
-    """
-    _check_lengths("capsule", radius=radius, half_length=half_length, spacing=spacing)
-    distance = primitive_distance("capsule", (radius, half_length, 0.0))
-    tube, ends = 2.0 * np.pi * radius**2 * half_length, 4.0 / 3.0 * np.pi * radius**3
-    # of a half ball: the centroid is 3/8 of the radius from its flat side, the mean square a fifth of its square
-    across = tube * radius**2 / 4.0 + ends * radius**2 / 5.0
-    along = tube * half_length**2 / 3.0
-    along += ends * (radius**2 / 5.0 + half_length**2 + 0.75 * radius * half_length)
-    spread = np.diag([across, across, along]) / (tube + ends)
-    return _particles(
-        _Solid("capsule", distance, tube + ends, spread, *round_surface(radius, half_length)),
-        spacing,
-    )
-
-
-def mesh(path: str | Path, spacing: float, scale: float = 1.0) -> PropPoints:
-    """A solid from a file with a watertight mesh. Only its triangles are read, no materials and no other files.
-
-    Args:
-        path: the file, in one of :data:`MESH_FORMATS`.
-        spacing: of the particles [m].
-        scale: length [m] of the file's unit: 0.001 for millimetres.
-
-    Raises:
-        ImportError: the optional package trimesh is missing.
-        FileNotFoundError: there is no such file.
-        ValueError: not a closed mesh of a known format, or too thin for the spacing.
-    """
-    path = Path(path)
-    _check_lengths(path.name, spacing=spacing, scale=scale)
-    shape = _load(path)
-    shape.apply_scale(scale)
-    shape.apply_translation(-shape.center_mass)
-    vertices, faces = shape.vertices.astype(np.float32), shape.faces.astype(np.int32)
-    inertia = shape.moment_inertia  # of density one
-    spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / shape.volume
-    surface = ClosedSurface(vertices, faces)
-    return _particles(_Solid(path.name, surface.distance, float(shape.volume), spread, vertices, faces), spacing)
-
-
-def _load(path: Path):
-    """The mesh of a file, a ``trimesh.Trimesh`` that is closed and faces outward."""
-    try:
-        import trimesh
-    except ImportError:
-        raise ImportError("a prop from a mesh needs trimesh: pip install piavatar-envs[props]") from None
-    if path.suffix.lower() not in MESH_FORMATS:
-        raise ValueError(f"{path.name}: unknown mesh format {path.suffix!r}; use one of {', '.join(MESH_FORMATS)}")
-    if not path.is_file():
-        raise FileNotFoundError(f"no mesh at {path}")
-    try:
-        # a stream, not a path: no materials or buffers are looked up beside it
-        stream, kind = io.BytesIO(path.read_bytes()), path.suffix.lower()[1:]
-        loaded = trimesh.load(stream, file_type=kind, force="mesh", process=True, skip_materials=True)
-        # once more without texture coordinates, which split vertices along their seams
-        faces = getattr(loaded, "faces", np.empty((0, 3), np.int64))
-        shape = trimesh.Trimesh(loaded.vertices, faces, process=True)  # validate would turn a cavity inside out
-        shape.update_faces(shape.nondegenerate_faces())
-    except Exception as error:  # whatever a parser of foreign files trips over
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ValueError(f"{path.name} is no readable {path.suffix} mesh: {reason}") from None
-    if len(shape.faces) == 0:
-        raise ValueError(f"{path.name} holds no triangles; export a solid, not points, curves or an empty scene")
-    if not shape.is_watertight:
-        bad = (np.bincount(shape.edges_unique_inverse) != 2).sum()
-        raise ValueError(f"{path.name} is not watertight ({bad} edges without two sides); close it and export it again")
-    if not shape.is_winding_consistent:
-        raise ValueError(f"{path.name} has triangles that face inward beside others; make its normals consistent")
-    if shape.volume < 0.0:
-        shape.invert()
-    return shape
-
-
-@wp.kernel
-def _primitive_distance_kernel(
-    kind: int,
-    size: wp.vec3,
-    points: wp.array(dtype=wp.vec3),
-    # out
-    distance: wp.array(dtype=float),
-):
-    i = wp.tid()
-    distance[i] = solid_distance(kind, size, points[i])[3]
-
-
-def primitive_distance(kind: str, size: Sequence[float]) -> Callable[[np.ndarray], np.ndarray]:
-    """Signed distances [m] ``(N, 3)`` to ``(N,)`` of a collider's shape; on the CPU whatever the simulation runs on."""
-
-    def distance(points: np.ndarray) -> np.ndarray:
-        where = wp.array(np.asarray(points, np.float32), dtype=wp.vec3, device="cpu")
-        out = wp.empty(len(points), dtype=float, device="cpu")
-        inputs = [COLLIDER_KINDS[kind], wp.vec3(*map(float, size)), where]
-        wp.launch(_primitive_distance_kernel, len(points), inputs, [out], device="cpu")
-        return out.numpy()
-
-    return distance
-
-
-def _check_lengths(name: str, **lengths: float) -> None:
-    """Refuse lengths that are not positive and finite."""
-    for key, value in lengths.items():
-        if not (np.isfinite(value) and value > 0.0):
-            raise ValueError(f"{name} {key}={value} must be positive and finite; lengths are in metres")
-
-
-def _particles(solid: _Solid, spacing: float) -> PropPoints:
-    """Fill a solid.
-
-    Raises:
-        ValueError: the lattice is too large, or too coarse for the solid.
-    """
-    places, share, caught = _lattice(solid, spacing)
-    if len(places) < MIN_PARTICLES or abs(caught / solid.volume - 1.0) > MAX_MISSED:
-        raise ValueError(
-            f"{solid.name} is too thin for spacing={spacing:g} m: {len(places)} particles (at least {MIN_PARTICLES}) "
-            f"with {caught / solid.volume:.0%} of its volume; use a spacing under {0.5 * spacing:g} m or a larger shape"
-        )
-    rest = _stretched(places, share, solid.spread)
-    beyond = solid.distance(rest) > 0.0
-    rest[beyond] = places[beyond]
-    centre = share @ rest  # not quite that of a coarsely sampled mesh; the surface stays around its particles
-    surface = (solid.vertices - centre).astype(np.float32)
-    return PropPoints((rest - centre).astype(np.float32), share * solid.volume, surface, solid.faces)
-
-
-def _lattice(solid: _Solid, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Particles [m] ``(P, 3)``, their shares of the volume ``(P,)``, and the volume that the lattice caught [m^3]."""
-    low, high = (end(solid.vertices, axis=0).astype(np.float64) for end in (np.min, np.max))
-    counts = np.maximum(np.round((high - low) / spacing), MIN_CELLS)
-    if counts.prod() > MAX_CELLS:
-        larger = spacing * (counts.prod() / MAX_CELLS) ** (1.0 / 3.0)
-        raise ValueError(
-            f"{solid.name} at spacing={spacing:g} m has {counts.prod():.3g} cells (at most {MAX_CELLS}); "
-            f"use a spacing above {larger:.2g} m"
-        )
-    edge = (high - low) / counts
-    cells = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in counts], indexing="ij"), axis=-1).reshape(-1, 3)
-    centres = low + cells * edge
-    steps = (np.arange(SUBDIVISIONS) + 0.5) / SUBDIVISIONS - 0.5
-    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) * edge
-    fine = centres[:, None, :] + offsets
-    distance = solid.distance(centres)
-    inside = np.repeat(distance[:, None] < 0.0, len(offsets), axis=1)
-    # a point nearer to the centre than the surface is on the centre's side: only the others need a query
-    unsure = np.abs(distance)[:, None] <= np.linalg.norm(offsets, axis=1)
-    inside[unsure] = solid.distance(fine[unsure]) < 0.0
-    caught = inside.mean() * (high - low).prod()
-    kept = np.flatnonzero(inside.mean(axis=1) >= MIN_FILL)
-    if len(kept) == 0:
-        return np.empty((0, 3)), np.empty(0), caught
-    # matter of a cell without a particle of its own belongs to the nearest that has one
-    owner = np.full(len(centres), -1)
-    owner[kept] = np.arange(len(kept))
-    owner, points = np.repeat(owner, inside.sum(axis=1)), fine[inside]
-    owner[owner < 0] = cKDTree(centres[kept]).query(points[owner < 0])[1]
-    count = np.bincount(owner)
-    places = np.stack([np.bincount(owner, points[:, axis]) for axis in range(3)], axis=1) / count[:, None]
-    # between two fingers of a mesh the centroid may be outside: then the nearest point inside
-    gap = solid.distance(places) >= 0.0
-    places[gap] = points[cKDTree(points).query(places[gap])[1]]
-    return places, count / count.sum(), caught
-
-
-def _stretched(places: np.ndarray, share: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Places about their mean ``(P, 3)``, mapped so that the mean of ``x x^T`` is ``spread`` [m^2].
-
-    Of all linear maps that do this, the symmetric one: it moves the points least.
-    """
-    centred = places - share @ places
-    root = _power(np.einsum("p,pi,pj->ij", share, centred, centred), 0.5)
-    back = _power(root, -1.0)
-    return centred @ (back @ _power(root @ spread @ root, 0.5) @ back)
-
-
-def _power(matrix: np.ndarray, exponent: float) -> np.ndarray:
-    """Power of a symmetric matrix, its eigenvalues kept off zero."""
-    values, axes = np.linalg.eigh(matrix)
-    return (axes * np.maximum(values, 1e-12 * values[-1]) ** exponent) @ axes.T

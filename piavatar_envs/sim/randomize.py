@@ -1,17 +1,18 @@
-"""Bodies and worlds that differ from episode to episode: factors on mass, stiffness and friction.
+"""Randomised episodes: factors on mass, stiffness and friction, drawn at every reset.
 
-At every reset the masked environments draw factors, uniform in their logarithm, on the device and from (seed, episode)
-alone: nothing waits for the host, and environment ``i`` of a batch draws what a single one of its seed draws. A factor
-multiplies all constants that follow from it, each from its nominal value, so that none of them drifts or disagrees:
+The masked environments draw factors, uniform in their logarithm, on the device and from (seed, episode) alone, so that
+environment ``i`` of a batch draws what a single environment of its seed draws. A factor multiplies all constants that
+depend on it, each from its nominal value, so that none of them drifts:
 
-- *mass*: an avatar's density: the mass of its particles and of its bones, hence the inertia that the drive fits, the
-  limits of the root wrench (which are in body weights), the strength and the springs of its joints under torques (a
-  heavier body is a stronger one), and the reference density of its velocity fields;
-- *stiffness*: its moduli;
+- *mass*: an avatar's density, and with it the mass of its particles and bones, the limits of the root wrench (which are
+  in body weights), strength and springs of its joints under torque control (a heavier body is a stronger one), and the
+  reference density of its velocity fields;
+- *stiffness*: the moduli of its flesh;
 - *ground friction*: coefficients on the ground, walls and colliders; *body friction*: those between bodies.
 
-Only what is randomised gets a row for each environment. The time step is that of the stiffest and lightest body that
-can be drawn (:func:`fastest_wave`): were it a sample's, environments of a batch would not be single environments.
+Only constants that vary get a row for each environment. The time step is that of the stiffest and lightest body that
+can be drawn (:func:`fastest_wave`), not of a sample, since otherwise an environment of a batch would differ from the
+single environment.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class Parameter:
         return self.low + share * (self.high - self.low)
 
 
-#: Factors of a world, then those of each avatar: their settings, in the order of the columns, with what they are.
+#: Factors of a world, then those of each avatar: setting and description, in the order of the columns.
 OF_WORLD = {
     "ground_friction_factor": "friction with the ground, walls and colliders",
     "body_friction_factor": "friction between bodies",
@@ -70,7 +71,7 @@ OF_AVATAR = {"mass_factor": "density", "stiffness_factor": "Young's modulus"}
 
 
 def fastest_wave(config: RandomizeConfig, flesh: Iterable[MaterialPoints]) -> float:
-    """Speed of the fastest elastic wave [m/s] in any of ``flesh`` that ``config`` can draw; it sets the time step."""
+    """Return the speed of the fastest elastic wave [m/s] in ``flesh`` that ``config`` can draw."""
     fastest = max(matter.sound_speed() for matter in flesh)
     return fastest * math.sqrt(config.stiffness_factor[1] / config.mass_factor[0])
 
@@ -80,9 +81,9 @@ class _Scaled:
     """Constants that a factor multiplies, ``value = factor * nominal``.
 
     Attributes:
-        factor: its column.
+        factor: column of the factor.
         nominal: shape ``(1 or num_envs, K)``.
-        value: what kernels read, shape ``(num_envs, K)``.
+        value: the product, which kernels read, shape ``(num_envs, K)``.
     """
 
     factor: int
@@ -92,7 +93,7 @@ class _Scaled:
 
 @dataclass
 class _Body:
-    """Nominal masses of an avatar whose mass is random, for shapes to change: particles, bones, all of it [kg]."""
+    """Nominal masses of an avatar of random mass [kg]: of particles, of bones, and in total."""
 
     mass: wp.array
     bone_mass: wp.array
@@ -101,11 +102,11 @@ class _Body:
 
 @dataclass
 class Randomization:
-    """The factors of every environment, and the constants of the world that follow them.
+    """The factors of every environment, and the constants of the world that they scale.
 
     Attributes:
-        config: ranges.
-        model, avatars: the world; constants that are randomised get their own rows.
+        config: ranges of the factors.
+        model, avatars: the world, whose randomised constants get rows of their own.
         factors: shape ``(num_envs, factors)``, 1 until a reset; the world's, then those of each avatar.
     """
 
@@ -137,10 +138,11 @@ class Randomization:
                     self._scale(column + 1, self.model.particles, name, f"matter.{name}", own)
 
     def _varies(self, name: str) -> bool:
+        """Return whether the range of a factor is more than 1."""
         return getattr(self.config, name) != UNCHANGED
 
     def parameters(self) -> tuple[tuple[Parameter, ...], tuple[Parameter, ...]]:
-        """What is drawn: for the world, and for each avatar."""
+        """Return the drawn parameters of the world, and those of each avatar."""
         found = [
             tuple(
                 Parameter(name, "-", *getattr(self.config, name), f"factor on {what}", log=True)
@@ -152,30 +154,34 @@ class Randomization:
         return found[0], found[1]
 
     def column(self, name: str, avatar: int = 0) -> wp.array:
-        """The factor of the setting ``name`` in every environment, shape ``(num_envs,)``."""
+        """Return the factor of the setting ``name`` in every environment, shape ``(num_envs,)``."""
         if name in OF_WORLD:
             return self.factors[:, list(OF_WORLD).index(name)]
         return self.factors[:, len(OF_WORLD) + avatar * len(OF_AVATAR) + list(OF_AVATAR).index(name)]
 
     def _scale(self, factor: int, holder: Any, name: str, key: str, part: slice = slice(None)) -> wp.array:
-        """Let a factor multiply columns ``part`` of the array ``name`` of ``holder``; returns their nominal values."""
+        """Let a factor multiply columns ``part`` of the array ``name`` of ``holder``; return their nominal values."""
         array = _own_rows(holder, name, self.model.num_envs)
         self._kept[key] = array
         return self._add(factor, array[:, part], array.numpy()[:1, part])
 
     def _add(self, factor: int, value: wp.array, nominal: np.ndarray) -> wp.array:
+        """Let a factor multiply an array; return its uploaded nominal values."""
         copy = wp.array(np.ascontiguousarray(nominal, np.float32), dtype=float, device=self.model.device)
         self._scaled.append(_Scaled(factor, copy, value))
         return copy
 
     def _scale_mass(self, factor: int, index: int, avatar: Avatar) -> None:
-        """All that an avatar's density decides. Masses of random shapes have nominal rows of their own."""
+        """Let a factor multiply all constants that depend on an avatar's density.
+
+        Masses of random shapes have nominal rows of their own.
+        """
         n, body, contact = self.model.num_envs, avatar.body, self.model.contact
         own = slice(body.first, body.first + body.count)
         rows = body.rest.shape[0]
         mass = _own_rows(self.model.particles, "mass", n)
         bone_mass = _own_rows(body, "bone_mass", n)
-        _own_rows(body, "rest_center", n)  # whoever reads the bones' masses by row reads their centres alike
+        _own_rows(body, "rest_center", n)  # kernels read masses and centres of bones by the same row
         avatar.body_mass = total = wp.array(
             np.broadcast_to(avatar.body_mass.numpy(), n).copy(), dtype=float, device=self.model.device
         )
@@ -190,13 +196,13 @@ class Randomization:
         self._scale(factor, contact, "density", "contact.density", slice(int(fields[0]), int(fields[-1]) + 1))
 
     def set_nominal_mass(self, avatar: int, env: int, mass: np.ndarray, bone_mass: np.ndarray) -> None:
-        """Another shape of an avatar in ``env``: what a factor of 1 would make of it, from the next reset on.
+        """Set the nominal masses of an avatar in ``env``, for another shape, from the next reset on.
 
         Args:
-            avatar: index of the avatar; its shape must be random.
-            env: environment.
-            mass: of its particles [kg], shape ``(P,)``.
-            bone_mass: of its bones [kg], shape ``(22,)``.
+            avatar: index of the avatar, whose shape must be random.
+            env: index of the environment.
+            mass: masses of its particles [kg], shape ``(P,)``.
+            bone_mass: masses of its bones [kg], shape ``(22,)``.
         """
         if avatar in self._bodies:
             body = self._bodies[avatar]
@@ -208,9 +214,9 @@ class Randomization:
                 array[env].assign(np.ascontiguousarray(value, np.float32))
 
     def nominal_mass(self, avatar: int) -> dict[str, wp.array]:
-        """Where masses [kg] of an avatar belong before a factor multiplies them, ``(num_envs, ...)`` by name.
+        """Return the arrays of an avatar's masses [kg] before a factor multiplies them, ``(num_envs, ...)`` by name.
 
-        Those of its particles, of its bones, of all of it; its shape must be random.
+        They are those of its particles, of its bones, and the total; its shape must be random.
         """
         if avatar in self._bodies:
             return dict(vars(self._bodies[avatar]))
@@ -220,7 +226,7 @@ class Randomization:
         return {"mass": mass, "bone_mass": drive.body.bone_mass, "body_mass": drive.body_mass.reshape((n, 1))}
 
     def record_reset(self, graph: LaunchGraph, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
-        """Append: the masked environments draw their factors, and their constants follow. Nothing if nothing varies."""
+        """Record the launches by which the masked environments draw factors and scale their constants."""
         if not self._scaled:
             return
         graph.launch(draw_factors, self.factors.shape, [mask, seed, episode, self._bounds], [self.factors])
@@ -229,12 +235,12 @@ class Randomization:
             graph.launch(scale_rows, scaled.value.shape, [mask, factor, scaled.nominal], [scaled.value])
 
     def arrays(self) -> dict[str, wp.array]:
-        """Arrays of a checkpoint, by name: what was drawn, and what follows from it."""
+        """Return the arrays of a checkpoint by name: factors, and the constants that they scale."""
         return {"randomize.factors": self.factors, **self._kept} if self._scaled else {}
 
 
 def _own_rows(holder: Any, name: str, rows: int) -> wp.array:
-    """The array ``name`` of ``holder``, with ``rows`` rows from now on; to be called before a launch binds it."""
+    """Return the array ``name`` of ``holder`` with ``rows`` rows; to be called before a launch binds the array."""
     array = getattr(holder, name)
     if array.shape[0] != rows:
         array = wp.array(np.repeat(array.numpy(), rows, 0), dtype=array.dtype, device=array.device)
@@ -251,9 +257,9 @@ def draw_factors(
     # out
     factors: wp.array2d(dtype=float),
 ):
-    """Factors of the masked environments, uniform in their logarithm, over ``(num_envs, factors)``.
+    """Draw the factors of the masked environments, uniform in their logarithm; over ``(num_envs, factors)``.
 
-    Each draws apart: whether another one varies makes no difference to it.
+    Each factor has an index of its own, so that it does not depend on which others vary.
     """
     e, n = wp.tid()
     if not mask[e]:
@@ -272,7 +278,7 @@ def scale_rows(
     # out
     value: wp.array2d(dtype=float),
 ):
-    """``value = factor * nominal`` in the masked environments."""
+    """Set ``value = factor * nominal`` in the masked environments; over ``(num_envs, K)``."""
     e, k = wp.tid()
     if mask[e]:
         value[e, k] = factor[e] * nominal[row(e, nominal.shape[0]), k]
