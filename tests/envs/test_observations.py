@@ -82,7 +82,7 @@ def observed(batch, env: int = 0) -> dict[str, np.ndarray]:
 TOLERANCE = {"joint_rotations": 3e-5, "root_orientation": 3e-5, "bone_velocities": 2e-5, "stress": 2e-5}
 
 
-@pytest.mark.parametrize("settings", [{}, {"shape.randomize": True, "tone": 0.2}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"shape.randomize": True, "density": 900.0}], ids=str)
 def test_values_are_those_of_the_particles(make_batch, env_id, settings):
     batch = make_batch(env_id, 2, **settings)
     batch.reset(seeds=[5, 9])

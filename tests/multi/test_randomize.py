@@ -9,7 +9,7 @@ from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.parameters import PARAMETERS
 from piavatar_envs.sim.randomize import OF_AVATAR, Parameter
-from tests.envs.test_randomize import VARIED, by_name, check_term, constants_of, factors_of
+from tests.sim.randomized import VARIED, by_name, check_term, constants_of, factors_of
 
 #: Draws that tasks leave out by default.
 DRAWN = {"high_five_v0": {"hand": "random", "impulse": (1.0, 2.0)}}

@@ -106,7 +106,7 @@ def test_a_fixed_shape_is_the_same_in_every_episode(make_env):
 
 def test_without_randomize_no_other_body_is_taken(make_env):
     env = make_env("PIAvatar/Reach-v0")
-    with pytest.raises(ValueError, match=r"shape\.randomize=True"):
+    with pytest.raises(ValueError, match=r"shape\.randomize=False"):
         env.batch.simulation.shapes.give(0, env.batch.simulation.flesh[0].base_parameters)
 
 

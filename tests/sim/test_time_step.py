@@ -120,7 +120,7 @@ def test_too_few_substeps_are_refused_with_the_number_that_would_do(device):
     with pytest.raises(ConfigError, match=r"num_substeps=9: 'ball', at up to 60\.5 m/s, .*; use at least 15"):
         world(device, scene=scene, num_substeps=9)
     assert world(device, scene=scene, num_substeps=15).model.num_substeps == 15
-    with pytest.raises(ConfigError, match=r"waves of 1\.16e\+05 m/s .* need \d+ substeps .*, and 10000 is the limit"):
+    with pytest.raises(ConfigError, match=r"1\.16e\+05 m/s .* need \d+ substeps .*10000"):
         world(device, young_modulus=1e9, density=0.1)
 
 
