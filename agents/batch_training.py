@@ -21,7 +21,7 @@ from agents.config import MOST_ENVS, MOST_RUNS, EvaluationSettings, first_traini
 from agents.evaluate import Agent, play_beside_baselines
 from agents.files import made
 from agents.report import Curve, conclude, draw_curve, versions
-from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import (
     FROZEN,
     ConfigError,
@@ -178,7 +178,7 @@ def conclude_batch(
 ) -> None:
     """Evaluate what was learned; leaves ``results.json`` and the curve. Arguments are as for :func:`run`."""
     task = new_task(config, find_task)
-    batch = BatchedEpisodes(task, config.evaluation.episodes, device)
+    batch = EpisodeHost(task, config.evaluation.episodes, device)
     results = play_beside_baselines("trained", learned.agent, batch, config.evaluation.first_seed)
     batch.close()
     learned.curve.save(folder / "curve.csv")

@@ -31,7 +31,7 @@ from agents.intervals import (
     share_interval_over_seeds,
     wilson,
 )
-from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.mpm.types import failure_name
 
 Agent = Callable[[np.ndarray], np.ndarray]
@@ -251,7 +251,7 @@ def _play_round(agent: Agent, venv: VecEnv, first_seed: int) -> list[Episode]:
     return episodes
 
 
-def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Evaluation:
+def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evaluation:
     """Let an agent play one episode in every environment of a batch, to their ends.
 
     Args:
@@ -290,7 +290,7 @@ def play(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> Ev
     return Evaluation(name, episodes)
 
 
-def play_beside_baselines(name: str, agent: Agent, batch: BatchedEpisodes, first_seed: int) -> list[Evaluation]:
+def play_beside_baselines(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> list[Evaluation]:
     """What zero, random and the agent's actions come to, all in the same episodes; as :func:`play`."""
     players = {other: in_every_seat(player) for other, player in baselines(batch.action_size, first_seed).items()}
     return [play(player, act, batch, first_seed) for player, act in {**players, name: agent}.items()]

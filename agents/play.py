@@ -29,7 +29,7 @@ from agents.files import RESULTS, check_figures, check_writable
 from agents.report import show_table, versions, write_results
 from agents.sb3.config import load_training
 from agents.sb3.workers import EnvFactory, start_workers
-from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.core.rng import check_seeds
 from piavatar_envs.doctor import quiet_warp
@@ -215,7 +215,7 @@ def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
         watch_env(made, lambda seen: agent(seen[None, None])[0, 0], first, options.port, lambda: begin_round(agent, 1))
 
 
-def score_run(agent: Agent, batch: BatchedEpisodes, first: int, options: Options, env: dict[str, Any]) -> None:
+def score_run(agent: Agent, batch: EpisodeHost, first: int, options: Options, env: dict[str, Any]) -> None:
     """Play an episode in every environment of a batch, show the figures, and write them if the command line says so.
 
     Args:
@@ -320,7 +320,7 @@ def main(args: list[str] | None = None) -> None:
         episodes = (options.episodes or run.evaluation.episodes) if scores else 1
         first = first_seed(run, options)
         check_seeds(first, max(episodes, options.film_episodes), "first_seed")
-        batch = BatchedEpisodes(task, episodes, options.device)
+        batch = EpisodeHost(task, episodes, options.device)
         agent = run.make_agent(batch.layout, batch.action_size)
     with in_a_line(OSError, ImportError):
         if scores:

@@ -20,7 +20,7 @@ from agents.config import MOST_RUNS, EvaluationSettings, first_training_seed
 from agents.evaluate import in_every_seat, over_seeds, play, random_agent
 from agents.files import RESULTS, claim, plain, read_json, write_json
 from agents.report import versions
-from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import ConfigError, load_config, parse_assignments
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.tasks import load_task
@@ -44,7 +44,7 @@ class Options:
     device: str = "cpu"
 
 
-def score(batch: BatchedEpisodes, first_seed: int, count: int) -> dict[str, Any]:
+def score(batch: EpisodeHost, first_seed: int, count: int) -> dict[str, Any]:
     """One row for ``count`` streams of random actions.
 
     Args:
@@ -77,7 +77,7 @@ def main(args: list[str] | None = None) -> None:
         env_id, env = environment_of(options.run)
         task_class = load_task(env_id)
         config = load_config(task_class.Config, dict(env), parse_assignments(options.settings))
-        batch = BatchedEpisodes(task_class(config), options.evaluation.episodes, options.device)
+        batch = EpisodeHost(task_class(config), options.evaluation.episodes, options.device)
     row = score(batch, options.evaluation.first_seed, options.seeds)
     batch.close()
     row["first_seed"] = options.evaluation.first_seed

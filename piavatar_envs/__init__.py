@@ -5,7 +5,7 @@ Nothing heavy is imported and no GPU is touched until an environment is made.
 
 from __future__ import annotations
 
-from importlib import import_module
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from gymnasium.envs.registration import register, registry
@@ -18,8 +18,20 @@ if TYPE_CHECKING:
     from piavatar_envs.avatar.motion import register_motion
     from piavatar_envs.envs.task import Task
     from piavatar_envs.mpm.materials import register_material
+    from piavatar_envs.tasks.games import register_game
+
+#: Public names with heavy imports, and the modules that define them.
+_LAZY = {
+    "Task": "piavatar_envs.envs.task",
+    "check_task": "piavatar_envs.api.conformance",
+    "register_game": "piavatar_envs.tasks.games",
+    "register_material": "piavatar_envs.mpm.materials",
+    "register_motion": "piavatar_envs.avatar.motion",
+    "register_source": "piavatar_envs.avatar.body.sources",
+}
 
 __all__ = [
+    "Task",
     "check_task",
     "register_game",
     "register_material",
@@ -29,14 +41,7 @@ __all__ = [
 ]
 __version__ = "0.1.0"
 
-#: Modules of the public functions that are imported on first use.
-_LAZY = {
-    "check_task": "api.conformance",
-    "register_material": "mpm.materials",
-    "register_motion": "avatar.motion",
-    "register_source": "avatar.body.sources",
-}
-#: What Gymnasium calls for every id.
+#: Called by Gymnasium for every id.
 ENTRY_POINT = "piavatar_envs.api.gym_env:AvatarEnv"
 
 
@@ -45,9 +50,9 @@ def _register(env_id: str, task: str) -> None:
         id=env_id,
         entry_point=ENTRY_POINT,
         vector_entry_point="piavatar_envs.api.vector_env:AvatarVectorEnv",
-        # the time limit lives inside, so that a saved state holds it
+        # the time limit is part of the environment, so that a saved state holds it
         max_episode_steps=None,
-        # the task a second time, where nobody who makes the id can replace it
+        # the task a second time, because a caller of gym.make can replace the first
         kwargs={"task": task, "registered": [env_id, task]},
     )
 
@@ -57,39 +62,29 @@ def register_task(env_id: str, task: type[Task] | str) -> None:
 
     Args:
         env_id: a namespace of your own, a name and a version: ``"Mine/Hop-v0"``. Registering it again replaces it.
-        task: a subclass of :class:`piavatar_envs.envs.task.Task`, or ``"module:Class"``, imported when it is made.
+        task: a subclass of :class:`piavatar_envs.Task`, or ``"module:Class"``, imported when it is made.
 
     Raises:
         TypeError: the task is neither.
         ValueError: an id without namespace or version, or one of this package.
     """
     add_task(env_id, task)
-    registry.pop(env_id, None)  # without Gymnasium's warning: a notebook's cell is often run twice
-    # by what a process that has not run this can import
+    registry.pop(env_id, None)  # without Gymnasium's warning, because notebook cells are run repeatedly
+    # by a name that a process without this registration can import
     _register(env_id, place_of(env_id, task))
 
 
-def register_game(name: str, task: type[Task] | str) -> None:
-    """Make a task of several agents a game for :mod:`piavatar_envs.multi` and the command line; see docs/tasks.md.
-
-    Args:
-        name: a name and a version: ``"tag_v0"``. Registering it again replaces it.
-        task: a subclass of :class:`piavatar_envs.envs.task.Task`, or ``"module:Class"``, imported when it is made.
-
-    Raises:
-        TypeError: the task is neither.
-        ValueError: a name without a version, or that of a game of this package.
-    """
-    from piavatar_envs.tasks.games import add_game
-
-    add_game(name, task)
-
-
 def __getattr__(name: str) -> Any:
-    """Import a public function on first use, because its module imports much."""
+    """Import a public name of :data:`_LAZY` when it is first used."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+    found = getattr(importlib.import_module(_LAZY[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})
 
 
 for _env_id in task_modules():

@@ -1,6 +1,6 @@
 """The command line: ``python -m piavatar_envs list | doctor | play | watch``.
 
-Only what ``--help`` needs is imported here; each command imports its own work, so that help comes at once.
+Each command imports its own modules, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def doctor_command(
     compile: Annotated[bool, tyro.conf.arg(help="compile every kernel now, and take the time")] = False,
     device: Device = "cpu",
 ) -> None:
-    """Show what this machine offers: devices, versions, kernel cache, extras, memory of the default environment.
+    """Show this machine's devices, versions, kernel cache and extras, and the memory of the default environment.
 
     Args:
         json: machine-readable output.
@@ -67,7 +67,7 @@ def play_command(
     color: Annotated[Literal["skin", "strain"], tyro.conf.arg(help="colour of the body in the video")] = "skin",
     config: Overrides = (),
 ) -> None:
-    """Play an environment and print its return and metrics; to a video, if asked.
+    """Play an environment, print its return and metrics, and write a video if given a file.
 
     Args:
         env_id: the environment, e.g. PIAvatar/Reach-v0.
@@ -109,11 +109,11 @@ def watch_command(
 
 
 def prepare(env_id: str, config: tuple[str, ...]) -> dict[str, Any]:
-    """What is the same before anything is played: the id is known, Warp is quiet; returns the settings.
+    """Check the id, silence Warp, and return the settings.
 
     Raises:
         ImportError: there is no such module.
-        ValueError: there is no such environment, or what should be a setting is none.
+        ValueError: there is no such environment, or an assignment is not a setting.
     """
     from piavatar_envs import doctor
     from piavatar_envs.config import parse_assignments
@@ -125,7 +125,7 @@ def prepare(env_id: str, config: tuple[str, ...]) -> dict[str, Any]:
 
 
 def check_id(env_id: str) -> None:
-    """Refuse what is not in the list, in either spelling; of a task of one's own, ``module:id``, import the module.
+    """Refuse an id that is not in the list, in either spelling; import the module of ``module:id``.
 
     Raises:
         ImportError: there is no such module.
@@ -139,7 +139,7 @@ def check_id(env_id: str) -> None:
 
 
 def registered_ids() -> list[str]:
-    """The ids in Gymnasium's registry, with those of tasks of one's own, sorted; then the modules of several agents."""
+    """Return the registered ids, sorted, with those of users' tasks; then the modules of several agents."""
     import gymnasium
 
     from piavatar_envs import ENTRY_POINT  # importing the package registers the ids
@@ -151,13 +151,13 @@ def registered_ids() -> list[str]:
 
 
 def describe(env_id: str) -> str:
-    """First line of the docstring of the task's file, read without importing it; empty if there is none.
+    """Return the first line of the docstring of a task's file, read without importing it; empty if there is none.
 
     ``PIAvatar/TrackMotion-v0`` is described by ``tasks/track_motion.py``, ``sumo_v0`` by ``tasks/games/sumo.py``.
     """
     namespace, _, _ = env_id.rpartition("/")
     if namespace not in ("", NAMESPACE):
-        return ""  # of somebody else's
+        return ""  # of another package
     if namespace:
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", env_id.partition("/")[2].partition("-v")[0]).lower()
         path = Path(__file__).parent / "tasks" / f"{name}.py"
@@ -170,7 +170,7 @@ def describe(env_id: str) -> str:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run a command; what a user got wrong ends in one line and exit status 2."""
+    """Run a command; a user's mistake ends in one line and exit status 2."""
     commands = {"list": list_command, "doctor": doctor_command, "play": play_command, "watch": watch_command}
     try:
         tyro.extras.subcommand_cli_from_dict(

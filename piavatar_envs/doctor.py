@@ -1,4 +1,4 @@
-"""What this machine offers: devices, versions, the kernel cache, extras, and what an environment will cost."""
+"""Report on this machine: devices, versions, kernel cache, extras, and the memory of an environment."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ EXTRAS = {
 
 
 def examine() -> dict[str, Any]:
-    """The whole report, as plain values fit for JSON."""
+    """Collect the report, as plain values fit for JSON."""
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -48,7 +48,7 @@ def examine() -> dict[str, Any]:
 
 
 def package_version(name: str) -> str | None:
-    """Version of an installed distribution, or None."""
+    """Return the version of an installed distribution, or None."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -56,7 +56,7 @@ def package_version(name: str) -> str | None:
 
 
 def devices() -> list[dict[str, Any]]:
-    """Warp's devices: alias, name, kind, and on a GPU its memory [GiB] and architecture."""
+    """List Warp's devices: alias, name, kind, and of a GPU memory [GiB] and architecture."""
     wp = quiet_warp()
     found = []
     for device in wp.get_devices():
@@ -70,7 +70,7 @@ def devices() -> list[dict[str, Any]]:
 
 
 def cpu_model() -> str:
-    """The CPU's name as its maker calls it, where the system tells."""
+    """Return the CPU's model name, where the system reports it."""
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -81,7 +81,7 @@ def cpu_model() -> str:
 
 
 def kernel_cache() -> dict[str, Any]:
-    """Where compiled kernels are kept, and how much: path, bytes, modules."""
+    """Return path, bytes and number of modules of the kernel cache."""
     wp = quiet_warp()
     root = Path(wp.config.kernel_cache_dir)
     sizes = [file.stat().st_size for file in root.rglob("*") if file.is_file()] if root.is_dir() else []
@@ -90,7 +90,7 @@ def kernel_cache() -> dict[str, Any]:
 
 
 def memory_estimate() -> dict[str, Any]:
-    """One environment with default settings: particles, grid nodes, substeps a step, bytes of state and grid."""
+    """Return particles, grid nodes, substeps a step and bytes of one environment with default settings."""
     from piavatar_envs.config import EnvConfig
     from piavatar_envs.mpm.bspline import BLOCK_NODES
     from piavatar_envs.mpm.memory import estimate_bytes
@@ -106,7 +106,7 @@ def memory_estimate() -> dict[str, Any]:
 
 
 def find_device(device: str) -> str:
-    """Name of a Warp device; Warp says nothing meanwhile.
+    """Return the name of a Warp device; Warp prints nothing.
 
     Raises:
         ValueError: there is no such device.
@@ -122,7 +122,7 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
 
     Args:
         device: a Warp device.
-        environments: also step each environment once, because some kernels exist only once one asks for them.
+        environments: also step each environment once, because some kernels are generated for their sizes.
 
     Raises:
         ValueError: Warp has no such device.
@@ -132,9 +132,9 @@ def compile_kernels(device: str, *, environments: bool = True) -> float:
 
     target = wp.get_device(find_device(device))
     start = time.perf_counter()
-    rooms = ("core", "mpm", "avatar", "sim", "envs", "tasks", "render") + (("multi",) if _found("pettingzoo") else ())
-    for room in rooms:
-        package = importlib.import_module(f"piavatar_envs.{room}")
+    folders = ("core", "mpm", "avatar", "sim", "envs", "tasks", "render") + (("multi",) if _found("pettingzoo") else ())
+    for folder in folders:
+        package = importlib.import_module(f"piavatar_envs.{folder}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             importlib.import_module(module.name)
     acquire(target)
@@ -168,15 +168,15 @@ def show(report: dict[str, Any], *, as_json: bool = False) -> None:
         remedy = f'pip install "piavatar-envs[{name}]"'
         table.add_row(f"extra {name}", f"missing {', '.join(missing)}: {remedy}" if missing else "present")
     size = report["default_env"]
-    told = f"{size['particles']} particles, {size['nodes']} grid nodes, {size['substeps']} substeps a step"
-    table.add_row("default env", f"{told}: {size['bytes'] / 2**20:.1f} MiB each")
+    shape = f"{size['particles']} particles, {size['nodes']} grid nodes, {size['substeps']} substeps a step"
+    table.add_row("default env", f"{shape}: {size['bytes'] / 2**20:.1f} MiB each")
     if "compile" in report:
         table.add_row("compiled", f"for {report['compile']['device']} in {report['compile']['seconds']} s")
     Console(highlight=False, soft_wrap=True, markup=False).print(table)
 
 
 def quiet_warp() -> ModuleType:
-    """Warp, initialised without its banner, which would spoil the JSON on stdout."""
+    """Return Warp, initialised without its banner, which would spoil the JSON on stdout."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING

@@ -1,4 +1,4 @@
-"""A rollout of any environment, of one agent or several: return, metrics and, if asked, a video."""
+"""Rollout of any environment, of one agent or several: return, metrics and an optional video."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 @dataclass
 class Rollout:
-    """What a rollout came to.
+    """Result of a rollout.
 
     Attributes:
         steps: steps played.
-        returns: undiscounted return of each episode that was begun, in order; the last may be cut short.
-        failures: what ended episodes that failed, in order.
+        returns: undiscounted return of each episode that began, in order; the last may be incomplete.
+        failures: causes of the episodes that failed, in order.
         metrics: the numbers of the last step's ``info``, by dotted name.
     """
 
@@ -52,7 +52,7 @@ def play(
     """Play ``env_id`` for some steps, beginning a new episode whenever one ends; without ``steps``, one episode.
 
     Args:
-        env_id: a registered id, or a module of several agents such as ``sumo_v0``, with or without what it stands in.
+        env_id: a registered id, or a module of several agents such as ``sumo_v0``, with or without its package.
         agent: "random" (uniform in the action space) or "zero".
         video: the .mp4 or .gif to write, or None.
         steps: number of steps.
@@ -68,7 +68,7 @@ def play(
     if steps is not None and steps < 1:
         raise ValueError(f"steps={steps} must be >= 1")
     if video is not None:
-        check_suffix(video)  # before the kernels are compiled, not after the rollout
+        check_suffix(video)  # before the kernels are compiled
     settings = settings_of(device, overrides)
     if video is not None:
         settings = {"render_mode": "rgb_array", "color": color, **settings}
@@ -86,7 +86,7 @@ def play(
 
 
 def check_agent(agent: str, seed: int) -> None:
-    """Refuse what is no agent of this file, and what seeds none.
+    """Refuse an unknown agent, and a seed out of range.
 
     Raises:
         ValueError: it is neither random nor zero, or the seed is outside [0, 2^32).
@@ -97,29 +97,29 @@ def check_agent(agent: str, seed: int) -> None:
 
 
 def settings_of(device: str, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What an environment is made with.
+    """Return the arguments that an environment is made with.
 
     Raises:
-        ValueError: the overrides ask for a way to show it, which is not theirs to say.
+        ValueError: the overrides set the render mode.
     """
     if "render_mode" in (overrides or {}):
         raise ValueError("render_mode is no setting here; use play --video FILE for a film, or watch for the live view")
     return {"device": device, **(overrides or {})}
 
 
-def make(env_id: str, settings: Mapping[str, Any]) -> gymnasium.Env | Together:
-    """The environment of a registered id, or of a module of several agents.
+def make(env_id: str, settings: Mapping[str, Any]) -> gymnasium.Env | JointEnv:
+    """Make the environment of a registered id, or of a module of several agents.
 
     Raises:
         ImportError: an extra is not installed.
         ValueError: an unknown module, a setting out of range.
     """
     name = listed_name(env_id)
-    return gymnasium.make(name, **settings) if "/" in name else Together(name, settings)
+    return gymnasium.make(name, **settings) if "/" in name else JointEnv(name, settings)
 
 
-class Together:
-    """Several agents played as one: the reward is their sum, actions are theirs side by side."""
+class JointEnv:
+    """Several agents played as one: rewards are summed, actions have a row for each agent."""
 
     def __init__(self, name: str, settings: Mapping[str, Any]) -> None:
         """Build the module ``name`` of :mod:`piavatar_envs.multi`.
@@ -135,7 +135,7 @@ class Together:
 
     @property
     def unwrapped(self) -> AvatarParallelEnv:
-        """The world itself."""
+        """The environment of the module."""
         return self.env
 
     def reset(self, seed: int | None = None) -> tuple[None, dict[str, Any]]:
@@ -143,7 +143,7 @@ class Together:
         return None, self.env.reset(seed=seed)[1]
 
     def step(self, actions: np.ndarray) -> tuple[None, float, bool, bool, dict[str, Any]]:
-        """Advance those who are still in; ``info`` is by agent."""
+        """Advance the agents that are still in; ``info`` is by agent."""
         index = {name: row for row, name in enumerate(self.env.possible_agents)}
         chosen = {name: actions[index[name]] for name in self.env.agents}
         _, rewards, _, truncations, infos = self.env.step(chosen)
@@ -153,20 +153,20 @@ class Together:
         return None, sum(rewards.values()), over and not any(truncations.values()), over, info
 
     def render(self) -> np.ndarray | None:
-        """The scene."""
+        """Draw the scene."""
         return self.env.render()
 
     def close(self) -> None:
-        """Free what was opened."""
+        """Close the environment."""
         self.env.close()
 
 
-def _frames(env: gymnasium.Env | Together, agent: str, steps: int | None, seed: int, rollout: Rollout) -> Iterator[Any]:
-    """Play, book into ``rollout``, and yield a picture of each state (None without a render mode)."""
+def _frames(env: gymnasium.Env | JointEnv, agent: str, steps: int | None, seed: int, rollout: Rollout) -> Iterator[Any]:
+    """Play, add to ``rollout``, and yield a picture of each state (None without a render mode)."""
     env.action_space.seed(seed)
     still = np.zeros(env.action_space.shape, dtype=env.action_space.dtype)
     finished = True
-    name = env.name if isinstance(env, Together) else env.spec.id
+    name = env.name if isinstance(env, JointEnv) else env.spec.id
     with tqdm(total=steps, desc=name, unit="step", disable=None) as bar:
         while steps is None or rollout.steps < steps:
             if finished:
@@ -187,7 +187,7 @@ def _frames(env: gymnasium.Env | Together, agent: str, steps: int | None, seed: 
 
 
 def numbers(info: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
-    """The finite scalars of a nested ``info``, by dotted name; vectors and text are left out."""
+    """Return the scalars of a nested ``info``, by dotted name; vectors and text are left out."""
     found: dict[str, float] = {}
     for key, value in info.items():
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""An environment played for ever in a web browser, of one agent or several, under the hands of who watches."""
+"""Endless play of an environment in a web browser, of one agent or several, with a control panel."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from piavatar_envs.api.live import Live
-from piavatar_envs.play import Together, check_agent, make, numbers, settings_of
+from piavatar_envs.api.pictures import Live
+from piavatar_envs.play import JointEnv, check_agent, make, numbers, settings_of
 from piavatar_envs.render.live import PORT, check_port, import_viser
 from piavatar_envs.render.panel import Panel
 
 #: From an observation (None where there are several agents) to an action.
 Act = Callable[[Any], np.ndarray]
 #: Time between two looks at the panel while nothing moves, and between two tables [s].
-_REST, _TELL_EVERY = 0.05, 0.2
+_REST, _TABLE_EVERY = 0.05, 0.2
 
 
 def watch(
@@ -31,7 +31,7 @@ def watch(
     """Play ``env_id`` in a web browser until Ctrl-C.
 
     Args:
-        env_id: a registered id, or a module of several agents such as ``sumo_v0``, with or without what it stands in.
+        env_id: a registered id, or a module of several agents such as ``sumo_v0``, with or without its package.
         agent: "random" (uniform in the action space) or "zero".
         seed: of the first reset and of the random actions; later episodes go on from it.
         device: a Warp device.
@@ -45,7 +45,7 @@ def watch(
     check_agent(agent, seed)
     check_port(port)
     settings = settings_of(device, overrides)
-    import_viser()  # before the kernels are compiled, not after
+    import_viser()  # before the kernels are compiled
     with suppress(KeyboardInterrupt):
         env = make(env_id, settings)
         env.action_space.seed(seed)
@@ -54,17 +54,17 @@ def watch(
 
 
 def watch_env(
-    env: gymnasium.Env | Together,
+    env: gymnasium.Env | JointEnv,
     act: Act,
     seed: int = 0,
     port: int = PORT,
     begin: Callable[[], None] = lambda: None,
 ) -> None:
-    """Let somebody play in a web browser for ever; closes the environment when an exception ends it.
+    """Play in a web browser until an exception ends it; then close the environment.
 
     Args:
         env: made without a render mode.
-        act: who plays.
+        act: chooses the actions.
         seed: of the first reset.
         port: of this machine, or the next one that is free.
         begin: called before every episode.
@@ -89,17 +89,17 @@ def watch_env(
 
 
 class Show:
-    """A play without end, a turn at a time.
+    """Endless play, a turn at a time.
 
     Attributes:
-        panel: what the visitors ask for.
+        panel: the controls in the browser.
     """
 
-    def __init__(self, env: gymnasium.Env | Together, act: Act, begin: Callable[[], None], live: Live) -> None:
+    def __init__(self, env: gymnasium.Env | JointEnv, act: Act, begin: Callable[[], None], live: Live) -> None:
         """Open the view and its panel; :meth:`begin` comes next."""
         self.panel = Panel(live.view.server, live.color)
         self._env, self._act, self._begin, self._live = env, act, begin, live
-        self._name = env.name if isinstance(env, Together) else env.spec.id
+        self._name = env.name if isinstance(env, JointEnv) else env.spec.id
         self._dt = env.unwrapped.config.physics.control_dt
         self._over = False
 
@@ -109,10 +109,10 @@ class Show:
         self._observation, _ = self._env.reset(seed=seed)
         self._over, self._steps, self._return, self._info = False, 0, 0.0, {}
         self._live.begin()
-        self._tell()
+        self._fill_table()
 
     def turn(self) -> None:
-        """A step, a new episode or, where neither is wanted, a rest."""
+        """Step, begin an episode or, while paused, rest."""
         panel, live = self.panel, self._live
         if panel.take_episode():
             self.begin()
@@ -131,16 +131,16 @@ class Show:
         self._return += float(reward)
         self._over = terminated or truncated
         live.step(panel.speed)
-        if self._over or not panel.playing or live.pace.clock() - self._told_at >= _TELL_EVERY:
-            self._tell()
+        if self._over or not panel.playing or live.pace.clock() - self._table_at >= _TABLE_EVERY:
+            self._fill_table()
 
-    def _tell(self) -> None:
-        """Fill the table; not every step, because a browser takes longer to set it than to draw the scene."""
-        self._told_at = self._live.pace.clock()
+    def _fill_table(self) -> None:
+        """Fill the table; not in every step, because a browser takes longer for it than for the scene."""
+        self._table_at = self._live.pace.clock()
         terms = {
             name.replace("reward_terms.", ""): f"{value:+.3f}"
             for name, value in numbers(self._info).items()
             if "reward_terms." in name
         }
         about = {"step": str(self._steps), "time": f"{self._steps * self._dt:.2f} s", "return": f"{self._return:.2f}"}
-        self.panel.tell(self._name, about | terms)
+        self.panel.show_table(self._name, about | terms)

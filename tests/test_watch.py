@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from piavatar_envs import cli, watch
-from piavatar_envs.api.live import Live, Pace
+from piavatar_envs.api.pictures import Live, Pace
 from piavatar_envs.play import make
 from tests.api.test_live import FakeTime
 
@@ -63,11 +63,11 @@ def test_the_panel_pauses_steps_and_begins_anew(open_show):
     for _ in range(3):
         show.turn()
     assert steps_done(env) == 1 and show.panel._play.label == "Play"
-    show.panel.ask_for_step()
+    show.panel.request_step()
     for _ in range(3):
         show.turn()
     assert steps_done(env) == 2 and "| step | 2 |" in table(show)
-    show.panel.ask_for_episode()
+    show.panel.request_episode()
     show.turn()
     assert steps_done(env) == 0 and len(begun) == 2 and "| step | 0 |" in table(show)
     show.panel.play(True)
@@ -109,7 +109,7 @@ def test_the_panel_changes_the_colour_also_while_it_stands_still(open_show):
 
 def test_the_panel_tells_of_the_reward(open_show):
     show, *_ = open_show("PIAvatar/Reach-v0")
-    show.panel.ask_for_step()
+    show.panel.request_step()
     show.turn()
     told = table(show)
     assert "PIAvatar/Reach-v0" in told and f"| return | {show._return:.2f} |" in told
@@ -120,7 +120,7 @@ def test_the_panel_tells_of_the_reward(open_show):
 def test_worlds_of_several_agents_are_watched_too(open_show):
     pytest.importorskip("pettingzoo")
     show, *_ = open_show("sumo_v0")
-    show.panel.ask_for_step()
+    show.panel.request_step()
     show.turn()
     assert "| agent_0.control |" in table(show) and "| agent_1.control |" in table(show)
     assert {"/world/body_0", "/world/body_1"} <= set(show._live.view._nodes)

@@ -19,7 +19,7 @@ from agents.pid.agent import Design, make_pid_agent
 from agents.play import check_film, film
 from agents.report import conclude, versions
 from agents.sb3.workers import EnvFactory
-from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import load_config, parse_assignments
 from piavatar_envs.doctor import quiet_warp
 from piavatar_envs.tasks import listed_name, load_task
@@ -60,7 +60,7 @@ def main(args: list[str] | None = None) -> None:
         task_class = load_task(env_id)
         config = load_config(task_class.Config, {"control": "torque"}, parse_assignments(options.settings))
         agent = make_pid_agent(env_id, config.model_dump(mode="json"), options.design)
-        batch = BatchedEpisodes(task_class(config), episodes, options.device)
+        batch = EpisodeHost(task_class(config), episodes, options.device)
     results = play_beside_baselines("PID", in_every_seat(agent), batch, first)
     batch.close()
     settings = {"env_id": env_id, "env": config.model_dump(mode="json"), "design": asdict(options.design)}

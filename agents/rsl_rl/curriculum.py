@@ -72,7 +72,7 @@ class HelpedEnv(AvatarRslEnv):
         """
         if self.settings.rollouts is not None and self.steps % self.rollout_steps == 0:
             self.help = self.share() * self._spread
-        self.episodes.api.write(self.help, [group.simulation.controllers[0].assist for group in self.episodes.groups])
+        self.host.api.write(self.help, [group.simulation.controllers[0].assist for group in self.host.groups])
         self.steps += 1
         stepped = super().step(actions)
         _, _, ended, extras = stepped

@@ -127,7 +127,7 @@ class Runner(OnPolicyRunner):
         return helped | {
             "iterations": self.iterations,
             "algorithm": self.alg.save(),
-            "envs": self.env.episodes.get_state(),
+            "envs": self.env.host.get_state(),
             "returns": [list(log.rewbuffer), list(log.lenbuffer)],
             "playing": [log.cur_reward_sum, log.cur_episode_length],
             "logged": [log.tot_timesteps, log.tot_time],
@@ -137,7 +137,7 @@ class Runner(OnPolicyRunner):
 
     def _restore(self, saved: dict[str, Any]) -> None:
         self.alg.load(saved["algorithm"], None, strict=True)  # the adapted learning rate is the optimizer's
-        self.env.episodes.set_state(as_arrays(saved["envs"]))
+        self.env.host.set_state(as_arrays(saved["envs"]))
         log = self.logger
         for own, latest in zip((log.rewbuffer, log.lenbuffer), saved["returns"], strict=True):
             own.extend(latest)
@@ -202,7 +202,7 @@ def kl_targets(config: RslTraining) -> list[float]:
 def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
     """The settings by which rsl_rl appends mirrored steps to every minibatch."""
     terms = [env.observation_layout[name] for name in env.groups["policy"]]
-    spec = env.episodes.groups[0].action_spec
+    spec = env.host.groups[0].action_spec
     mirror = Mirror(terms, spec.joints, env.device, spec.root)
 
     def append(

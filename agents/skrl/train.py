@@ -66,8 +66,8 @@ class Worlds(AvatarSkrlMultiEnv):
         begun = super().reset(seed, options)
         if self.saved is None:
             return begun
-        self.episodes.set_state(self.saved)
-        return self._seen(self.episodes.observation()), {"alive": self._by_agent(self.episodes.alive())}
+        self.host.set_state(self.saved)
+        return self._named(self.host.observation()), {"alive": self._by_agent(self.host.alive())}
 
 
 class WorldMAPPO(MAPPO):
@@ -132,7 +132,7 @@ class WorldMAPPO(MAPPO):
 
     def _check_finite(self) -> None:
         networks = {f"{name} {part}": network for name, own in self.models.items() for part, network in own.items()}
-        actions = torch.as_tensor(joint_agent(self)(self.env.episodes.observation()))
+        actions = torch.as_tensor(joint_agent(self)(self.env.host.observation()))
         rate = "mappo.learning_rate", self.cfg.learning_rate[self.possible_agents[0]][0]
         check_finite(networks, {"an action": actions}, self._steps, rate, self.checkpoint and self.checkpoint.path)
 
@@ -143,7 +143,7 @@ class WorldMAPPO(MAPPO):
                 name: {part: module.state_dict() for part, module in modules.items()}
                 for name, modules in self._modules()
             },
-            "envs": self.env.episodes.get_state(),
+            "envs": self.env.host.get_state(),
             "playing": [self._steps, self._totals],
             "curve": self.curve.state(),
             "random": random_states(),

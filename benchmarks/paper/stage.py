@@ -128,7 +128,7 @@ class Stage:
 
     Attributes:
         simulation: the physics.
-        task: what a :class:`~piavatar_envs.api.picture.Picture` of the stage asks for.
+        task: what a :class:`~piavatar_envs.api.pictures.Picture` of the stage asks for.
     """
 
     def __init__(self, act: Act, fidelity: str = "coarse", device: str = "cpu") -> None:
@@ -246,7 +246,7 @@ def perform(act: Act, fidelity: str = "coarse", device: str = "cpu", steps: int 
             stage.step()
         seen.append(_look(stage))
         if step in moments:
-            from piavatar_envs.api.picture import Picture
+            from piavatar_envs.api.pictures import Picture
 
             picture = picture or Picture(stage, RenderConfig(width=size, height=size, color=act.view.color))
             frames.append(picture.frame(0, stage.dt * (step - shown)))

@@ -173,7 +173,7 @@ class World:
             api = "torch" if torch_can_use(device) else "numpy"
             self.through = f"gym.make_vec, {api}"
             self.env = gym.make_vec(ONE_AVATAR, num_envs=num_envs, fidelity=fidelity, device=device, array_api=api)
-            self.groups = list(self.env.unwrapped.episodes.groups)
+            self.groups = list(self.env.unwrapped.host.groups)
             size = self.env.action_space.shape
 
             def draw() -> Any:

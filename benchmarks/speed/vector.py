@@ -25,8 +25,7 @@ import warp as wp
 
 from benchmarks import runner
 from benchmarks.speed import timing
-from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.api.same_step import step_and_reset
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import load_config, parse_assignments
 from piavatar_envs.core.launch_graph import LaunchGraph, available_cores
 from piavatar_envs.envs.batch_env import BatchEnv
@@ -119,7 +118,7 @@ class Stepper:
 class Trainer:
     """A batch as a trainer steps it: its own actions in, copies out, SAME_STEP."""
 
-    def __init__(self, batched: BatchedEpisodes) -> None:
+    def __init__(self, batched: EpisodeHost) -> None:
         self.batched = batched
         shape = (batched.num_envs, batched.num_agents, batched.action_size)
         if batched.api.name == "torch":
@@ -133,7 +132,7 @@ class Trainer:
 
     def step(self) -> None:
         """One step, everything that a learner stores copied, new episodes where one has ended."""
-        step_and_reset(self.batched, self._draw())
+        self.batched.step_and_reset(self._draw())
 
 
 def rates(step: Callable[[], None], num_envs: int, options: Options) -> np.ndarray:
@@ -166,7 +165,7 @@ def measure(world: str, num_envs: int, options: Options) -> dict[str, Any]:
     api = "torch" if torch_can_use(options.device) else "numpy"
     try:
         task = make_task(world, options.fidelity)
-        batched = BatchedEpisodes(task, num_envs, options.device, api, num_threads=1)
+        batched = EpisodeHost(task, num_envs, options.device, api, num_threads=1)
         batched.reset([*range(num_envs)])
         (batch,) = batched.groups
         stepper = Stepper(batch)
@@ -199,9 +198,7 @@ def measure(world: str, num_envs: int, options: Options) -> dict[str, Any]:
 def scaling(world: str, num_envs: int, options: Options) -> dict[str, Any]:
     """How much faster two threads are than one, in turns, so that a slower minute of the machine hits both."""
     trainers = {
-        threads: Trainer(
-            BatchedEpisodes(make_task(world, options.fidelity), num_envs, options.device, "numpy", threads)
-        )
+        threads: Trainer(EpisodeHost(make_task(world, options.fidelity), num_envs, options.device, "numpy", threads))
         for threads in (1, 2)
     }
     for trainer in trainers.values():

@@ -1,1 +1,1 @@
-"""Thin views of the batched environment: Gymnasium and its kin."""
+"""Views of the batched environment: Gymnasium, PettingZoo, Stable-Baselines3, skrl and rsl_rl."""

@@ -1,4 +1,4 @@
-"""What callers get and give: NumPy arrays or torch tensors, always copies of what lives on the device."""
+"""Arrays of the views: NumPy arrays or torch tensors, always copies of the arrays on the device."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ ARRAY_APIS = ("numpy", "torch")
 
 
 class ArrayApi(Protocol):
-    """How arrays of one kind come from Warp and go there.
+    """Conversion between Warp's arrays and arrays of one kind.
 
-    ``read`` joins the arrays of a batch's groups along the first dimension; what it returns is the caller's own.
+    The arrays of a host's groups are joined along the first dimension, the environment.
     """
 
     name: str
 
     def read(self, arrays: Sequence[wp.array]) -> Array:
-        """The arrays one after the other, a copy."""
+        """Copy the arrays, one after the other."""
         ...
 
     def actions(self, actions: Any, shape: tuple[int, ...], names: Sequence[str]) -> Array:
-        """What a caller gave as actions, checked before anything changes."""
+        """Check a caller's actions and convert them; nothing has changed if they are refused."""
         ...
 
     def write(self, values: Array, arrays: Sequence[wp.array]) -> None:
@@ -38,39 +38,39 @@ class ArrayApi(Protocol):
         ...
 
     def split(self, observation: Array, layout: ObservationLayout) -> dict[str, Array]:
-        """A flat observation by name, copies along the last axis."""
+        """Split a flat observation by name, into copies along the last axis."""
         ...
 
     def finite(self, values: Array) -> Array:
-        """``values`` with zeros for what is not finite; may be the same array."""
+        """Replace numbers that are not finite by zeros; may return the same array."""
         ...
 
     def shown(self, values: Array, mask: Array | None = None) -> Array:
-        """``values`` (a row an environment) as callers get them, their own; zeros outside ``mask``."""
+        """Convert ``values`` (a row an environment) to the type that views return; zeros outside ``mask``."""
         ...
 
     def repeated(self, mask: Array | None, num_envs: int, count: int) -> Array:
-        """``count`` copies of a mask, shape ``(count, num_envs)``; of all True if there is none."""
+        """Copy a mask, or all True if there is none, ``count`` times: shape ``(count, num_envs)``."""
         ...
 
     def from_host(self, mask: np.ndarray) -> Array:
-        """A mask of the host as an array of this kind."""
+        """Convert a mask of the host to an array of this kind."""
         ...
 
     def may_hold(self, mask: Array) -> bool:
-        """Whether ``mask`` may be True anywhere; False only if that is known without waiting."""
+        """Return False if ``mask`` is False everywhere and reading it does not make the host wait."""
         ...
 
     def rows(self, values: Any, mask: Array) -> Array:
-        """Observations of the environments in ``mask``: their own where arrays may hold objects, else a whole batch."""
+        """Select the observations of the environments in ``mask``: as objects, or as a whole batch of tensors."""
         ...
 
     def begin(self) -> None:
-        """Before launches: what the caller's library still has to do comes first."""
+        """Order the launches that follow after pending work of the caller's library."""
         ...
 
     def end(self) -> None:
-        """After launches: what the caller's library does next comes later."""
+        """Order later work of the caller's library after the launches."""
         ...
 
 
@@ -80,11 +80,11 @@ class NumpyArrays:
     name = "numpy"
 
     def read(self, arrays: Sequence[wp.array]) -> np.ndarray:
-        """The arrays one after the other, a copy."""
+        """Copy the arrays, one after the other."""
         return np.concatenate([array.numpy() for array in arrays])
 
     def actions(self, actions: Any, shape: tuple[int, ...], names: Sequence[str]) -> np.ndarray:
-        """The actions as float32.
+        """Convert the actions to float32.
 
         Raises:
             ValueError: a wrong shape, or a component that is not finite.
@@ -99,34 +99,34 @@ class NumpyArrays:
             start += len(array)
 
     def split(self, observation: np.ndarray, layout: ObservationLayout) -> dict[str, np.ndarray]:
-        """A flat observation by name, copies along the last axis."""
+        """Split a flat observation by name, into copies along the last axis."""
         return layout.split(observation)
 
     def finite(self, values: np.ndarray) -> np.ndarray:
-        """``values`` with zeros for what is not finite."""
+        """Replace numbers that are not finite by zeros."""
         return np.nan_to_num(values, posinf=0.0, neginf=0.0)
 
     def shown(self, values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-        """``values`` as callers get them: numbers in double precision, as in Gymnasium's own vectors; a copy."""
+        """Copy ``values``, numbers in double precision as in Gymnasium's own vectors."""
         values = values.astype(np.float64 if values.ndim == 1 and values.dtype.kind == "f" else values.dtype)
         if mask is not None:
             values[~mask] = None if values.dtype == object else 0
         return values
 
     def repeated(self, mask: np.ndarray | None, num_envs: int, count: int) -> np.ndarray:
-        """``count`` copies of a mask, or of all True."""
+        """Copy a mask, or all True, ``count`` times."""
         return np.ones((count, num_envs), bool) if mask is None else np.tile(mask, (count, 1))
 
     def from_host(self, mask: np.ndarray) -> np.ndarray:
-        """The mask itself."""
+        """Return the mask."""
         return mask
 
     def may_hold(self, mask: np.ndarray) -> bool:
-        """Whether ``mask`` is True anywhere."""
+        """Return whether ``mask`` is True anywhere."""
         return bool(mask.any())
 
     def rows(self, values: Any, mask: np.ndarray) -> np.ndarray:
-        """An array of objects: the observation of every environment in ``mask``, None elsewhere."""
+        """Return an array of objects: the observation of every environment in ``mask``, None elsewhere."""
         rows = np.full(len(mask), None, object)
         for env in np.flatnonzero(mask):
             named = isinstance(values, dict)
@@ -134,19 +134,19 @@ class NumpyArrays:
         return rows
 
     def begin(self) -> None:
-        """Reading an array waits for the device: nothing to do."""
+        """Do nothing: reading an array waits for the device."""
 
     def end(self) -> None:
-        """Reading an array waits for the device: nothing to do."""
+        """Do nothing: reading an array waits for the device."""
 
 
 class TorchArrays:
-    """Tensors on the environment's own device: nothing crosses the bus, and the host never waits."""
+    """Tensors on the environments' device, without copies to the host and without waiting."""
 
     name = "torch"
 
     def __init__(self, device: str) -> None:
-        """Find torch.
+        """Import torch.
 
         Args:
             device: Warp device.
@@ -163,30 +163,30 @@ class TorchArrays:
         self._torch, self._device = torch, wp.get_device(device)
         self.device = torch.device(wp.device_to_torch(self._device))
         if self._device.is_cuda and not torch.cuda.is_available():
-            raise ValueError(f"device={device!r} is known to Warp but not to this torch, which has no CUDA")
+            raise ValueError(f"device={device!r} is a device of Warp, but this torch has no CUDA")
         self._views: dict[int, tuple[wp.array, Any]] = {}
         self._streams: dict[int, wp.Stream] = {}
 
     def view(self, array: wp.array) -> Any:
-        """A tensor on the memory of ``array``, made once: it is overwritten by the next launch."""
+        """Return a tensor on the memory of ``array``, made once; the next launch overwrites it."""
         if id(array) not in self._views:
-            # the array is kept, so that no other one can get its id
-            # a tensor made in inference mode, where some learners step, could not be written to outside of it
+            # the array is kept, because its id could be reused; a tensor made in inference mode, in which some
+            # learners step, could not be written to outside of it
             with self._torch.inference_mode(False):
                 self._views[id(array)] = array, wp.to_torch(array, requires_grad=False)
         return self._views[id(array)][1]
 
     def read(self, arrays: Sequence[wp.array]) -> Any:
-        """The arrays one after the other, a copy."""
+        """Copy the arrays, one after the other."""
         if len(arrays) == 1:
             return self.view(arrays[0]).clone()
         return self._torch.cat([self.view(array) for array in arrays])
 
     def actions(self, actions: Any, shape: tuple[int, ...], names: Sequence[str]) -> Any:
-        """The actions as a tensor on the device.
+        """Convert the actions to a tensor on the device.
 
-        Values of a tensor are not looked at, the host would have to wait for them: a component that is not finite
-        acts as zero and ends its environment with ``failure="action"``. NumPy arrays are checked as ever.
+        The values of a tensor are not checked, because the host would have to wait for them: a component that is not
+        finite acts as zero and ends its environment with ``failure="action"``. NumPy arrays are checked.
 
         Raises:
             ValueError: a wrong shape, type or device, or a component of a NumPy array that is not finite.
@@ -210,49 +210,49 @@ class TorchArrays:
             start += len(array)
 
     def split(self, observation: Any, layout: ObservationLayout) -> dict[str, Any]:
-        """A flat observation by name, copies along the last axis."""
+        """Split a flat observation by name, into copies along the last axis."""
         return {name: observation[..., term.slice].clone() for name, term in layout.items()}
 
     def finite(self, values: Any) -> Any:
-        """``values`` with zeros for what is not finite."""
+        """Replace numbers that are not finite by zeros."""
         return self._torch.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
     def shown(self, values: Any, mask: Any | None = None) -> Any:
-        """``values`` as callers get them; with a mask a copy."""
+        """Return ``values``; with a mask a copy."""
         if mask is None:
             return values
         return values.masked_fill(~mask.reshape(-1, *[1] * (values.dim() - 1)), 0)
 
     def repeated(self, mask: Any | None, num_envs: int, count: int) -> Any:
-        """``count`` copies of a mask, or of all True."""
+        """Copy a mask, or all True, ``count`` times."""
         if mask is None:
             return self._torch.ones((count, num_envs), dtype=self._torch.bool, device=self.device)
         return mask.expand(count, num_envs).clone()
 
     def from_host(self, mask: np.ndarray) -> Any:
-        """The mask as a tensor on the device."""
+        """Copy the mask to the device."""
         return self._torch.tensor(mask, device=self.device)
 
     def may_hold(self, mask: Any) -> bool:
-        """True: the host would have to wait to know."""
+        """Return True, because the host would have to wait for the mask."""
         return True
 
     def rows(self, values: Any, mask: Any) -> Any:
-        """All of ``values``."""
+        """Return all of ``values``."""
         return values
 
     def begin(self) -> None:
-        """Warp's stream waits for torch's; the host does not."""
+        """Let Warp's stream wait for torch's, without the host."""
         if self._device.is_cuda:
             self._device.stream.wait_stream(self._torch_stream())
 
     def end(self) -> None:
-        """Torch's stream waits for Warp's; the host does not."""
+        """Let torch's stream wait for Warp's, without the host."""
         if self._device.is_cuda:
             self._torch_stream().wait_stream(self._device.stream)
 
     def _torch_stream(self) -> wp.Stream:
-        """Torch's current stream, which callers may change, as Warp knows it."""
+        """Return torch's current stream, which callers may change, as a stream of Warp."""
         stream = self._torch.cuda.current_stream(self.device)
         if stream.cuda_stream not in self._streams:
             self._streams[stream.cuda_stream] = wp.stream_from_torch(stream)
@@ -260,7 +260,7 @@ class TorchArrays:
 
 
 def find_array_api(name: str, device: str) -> ArrayApi:
-    """The kind of arrays called ``name``.
+    """Return the kind of arrays called ``name``.
 
     Raises:
         ImportError: torch is asked for and not installed.

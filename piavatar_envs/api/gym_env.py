@@ -1,4 +1,4 @@
-"""The single-environment view: ``gymnasium.Env`` over a batch of one."""
+"""Gymnasium's view of one environment: ``gymnasium.Env``."""
 
 from __future__ import annotations
 
@@ -9,24 +9,29 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from piavatar_envs.api.copies import Copied
-from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
-from piavatar_envs.api.seeds import checked_seed
-from piavatar_envs.api.view import EpisodeView
+from piavatar_envs.api.host import EpisodeHost, Settings, SingleView, checked_seed
+from piavatar_envs.api.pictures import RENDER_MODES, check_render_mode
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_registered
 
 
-class AvatarEnv(Copied, EpisodeView, gym.Env):
+class AvatarEnv(SingleView, gym.Env):
     """One soft avatar and a task.
 
-    Observations are a flat float32 vector, or a dictionary with ``obs_mode="dict"``; ``observation_layout`` says what
-    lies where. Actions are in [-1, 1], see ``action_names``: increments of the joints' rotations, their
-    targets or torques on them, as ``control`` says.
+    Observations are a flat float32 vector, or a dictionary with ``obs_mode="dict"``; ``observation_layout`` lists the
+    terms. Actions are in [-1, 1], one component for each of ``action_names``. The setting ``control`` makes them
+    increments of joint rotations, joint targets or joint torques.
 
-    ``info`` holds the reward's terms (``info["reward_terms"]``), the task's metrics, ``success``, ``failure`` (None, or
-    why the simulation gave up: then ``terminated`` is True and the next reset starts afresh), and the root wrench used.
+    ``info`` holds the reward's terms (``info["reward_terms"]``), the task's metrics, ``success``, ``failure`` and the
+    root wrench. ``failure`` is None, or the reason why the simulation has failed: then ``terminated`` is True and the
+    next reset begins a new episode.
+
+    Attributes:
+        host: holds the environment.
+        batch: the environment on the device.
+        config: the settings.
+        action_names: of every component of the action.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 30}
@@ -47,44 +52,43 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
             render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
-            registered: for Gymnasium alone: the id that is made, and the task that it was registered for.
+            registered: set by Gymnasium only: the id, and the task that it is registered for.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
             ImportError: ``render_mode="human"`` without the extra ``live``.
-            ValueError: an unknown task or one that is not the id's, an unknown render mode or device.
+            ValueError: an unknown task or one that the id is not registered for, an unknown render mode or device.
         """
         task_class = load_registered(task, registered)
         settings = load_config(task_class.Config, config, overrides)
         made = {"task": task_class, "render_mode": render_mode, "device": device, "config": settings}
         self._build = partial(AvatarEnv.__init__, **made)
-        self._episode = Episode(task_class(settings).alone(), render_mode, device)
-        self.batch, self.config = self._episode.batch, settings
-        self.render_mode, self._over = render_mode, False
-        self.metadata = {**self.metadata, "render_fps": self._episode.frame_rate}
-        self.action_names: tuple[str, ...] = self._episode.action_names
-        self.action_space = self._episode.action_space()
-        self.observation_space = self._episode.observation_space()
+        self.config, self.render_mode, self._over = settings, check_render_mode(render_mode), False
+        self.host = EpisodeHost(task_class(settings).alone(), 1, device, render_mode=render_mode)
+        self.metadata = {**self.metadata, "render_fps": self.host.frame_rate}
+        self.action_names = self.host.action_names
+        self.action_space = self.host.action_space()
+        self.observation_space = self.host.observation_space()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode.
 
         Args:
             seed: of this and all following episodes. Without one, the next episode of the seed before.
-            options: none are known.
+            options: none are accepted.
 
         Raises:
-            ValueError: an option that is not known, or a seed outside [0, 2^32).
+            ValueError: any option, or a seed outside [0, 2^32).
         """
         if options:
             raise ValueError(f"unknown reset options {sorted(options)}; there are none")
         if seed is not None:
-            seed = checked_seed(seed)  # before it changes the generator
+            seed = checked_seed(seed)  # before it changes Gymnasium's generator
         super().reset(seed=seed)
-        self._episode.begin(seed)
+        self.host.reset(seed)
         self._over = False
-        return self._episode.observation(0), self._episode.info(0)
+        return self._observation(0), self._info(0)
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance by one control step; warns if the episode has ended before.
@@ -93,21 +97,21 @@ class AvatarEnv(Copied, EpisodeView, gym.Env):
             ValueError: an action of the wrong shape, or one that is not finite; nothing has changed then.
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        episode = self._episode
-        episode.check_ready("step")
+        host = self.host
+        host.check_ready("step")
         if self._over:
             gym.logger.warn("step() after the end of the episode, which goes on as it was; call reset() before")
-        episode.advance(episode.check_action(action)[None])
-        outcome = episode.reward(0), episode.terminated(0), episode.truncated()
-        self._over = outcome[1] or outcome[2]
-        return episode.observation(0), *outcome, episode.step_info(0)
+        host.advance(host.api.actions(action, (host.action_size,), host.action_names)[None, None])
+        terminated, truncated = bool(host.terminated()[0, 0]), bool(host.truncated()[0])
+        self._over = terminated or truncated
+        return self._observation(0), float(host.reward()[0, 0]), terminated, truncated, self._info(0, stepped=True)
 
     def set_state(self, state: dict[str, np.ndarray]) -> Any:
-        """Restore what :meth:`get_state` returned; returns the observation.
+        """Restore the result of :meth:`get_state`; returns the observation.
 
         Raises:
             ValueError: the state is of another environment, of other settings or not finite; nothing has changed then.
         """
-        self._episode.restore(state)
+        self.host.set_state(state)
         self._over = False
-        return self._episode.observation(0)
+        return self._observation(0)

@@ -1,4 +1,4 @@
-"""The view of several agents: ``pettingzoo.ParallelEnv`` over a batch of one."""
+"""PettingZoo's view of several agents: ``pettingzoo.ParallelEnv`` of one environment."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from piavatar_envs.api.copies import Copied
-from piavatar_envs.api.episode import RENDER_MODES, Episode, Settings
-from piavatar_envs.api.view import EpisodeView
+from piavatar_envs.api.host import EpisodeHost, Settings, SingleView, checked_seed
+from piavatar_envs.api.pictures import RENDER_MODES, check_render_mode
 from piavatar_envs.config import load_config, replace
 from piavatar_envs.envs.batch_env import check_count
 from piavatar_envs.envs.task import Task
@@ -23,24 +22,25 @@ try:
 except ImportError as error:
     raise ImportError("several agents need PettingZoo; install it with: pip install 'piavatar-envs[multi]'") from error
 
-# the worlds have PettingZoo from here, so that each says what to install if it is not there
+# the modules in multi/ import PettingZoo from here, so that each reports the extra to install
 __all__ = ["AECEnv", "AvatarParallelEnv", "parallel_to_aec"]
 
 
-class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
+class AvatarParallelEnv(SingleView, ParallelEnv):
     """Several soft avatars and a task; each avatar is an agent.
 
-    Observations and actions are as those of :class:`~piavatar_envs.api.gym_env.AvatarEnv`, by agent, and so is
-    ``info``. An agent that is terminated leaves ``agents``; its avatar stays in the world as a passive body. All leave
-    when the clock has run out, and when the simulation gave up (``failure``).
+    Observations, actions and ``info`` are those of :class:`~piavatar_envs.api.gym_env.AvatarEnv`, by agent. An agent
+    that is terminated leaves ``agents``; its avatar stays in the world as a passive body. All leave when the clock has
+    run out, and when the simulation has failed (``failure``).
 
     Attributes:
         possible_agents: names of all agents.
-        agents: names of those that act in the next step.
+        agents: names of the agents that act in the next step.
         observation_spaces, action_spaces: by agent.
         state_space: of :meth:`state`.
         action_names: of every component of an agent's action.
         config: the settings.
+        host: holds the environment.
         batch: the environment on the device.
     """
 
@@ -57,7 +57,7 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
         """Build the environment.
 
         Args:
-            task: its class, or for tasks of one's own the id.
+            task: its class, or the id of a registered task of your own.
             render_mode: None, ``"rgb_array"`` or ``"human"``: a live view in a web browser, in real time at most.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
@@ -68,7 +68,7 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
             ImportError: ``render_mode="human"`` without the extra ``live``.
-            ValueError: an unknown task, render mode or device, or no time at all.
+            ValueError: an unknown task, render mode or device, or less than one control step.
         """
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
@@ -77,28 +77,28 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
             self.config = replace(self.config, episode_seconds=max_cycles * self.config.physics.control_dt)
         made = {"task": task_class, "render_mode": render_mode, "device": device, "config": self.config, "name": name}
         self._build = partial(AvatarParallelEnv.__init__, **made)
-        self._episode = Episode(task_class(self.config), render_mode, device)
-        self.batch, self.render_mode = self._episode.batch, render_mode
+        self.render_mode = check_render_mode(render_mode)
+        self.host = EpisodeHost(task_class(self.config), 1, device, render_mode=render_mode)
         self.metadata: dict[str, Any] = {
             "name": name or task_class.__module__.rpartition(".")[2],
             "render_modes": list(RENDER_MODES),
-            "render_fps": self._episode.frame_rate,
+            "render_fps": self.host.frame_rate,
             "is_parallelizable": True,
         }
-        self.possible_agents = list(self.batch.task.agent_names)
+        self.possible_agents = list(self.host.task.agent_names)
         self.agents: list[str] = []
         self._index = {name: index for index, name in enumerate(self.possible_agents)}
-        self.action_names = self._episode.action_names
-        self.action_spaces = {name: self._episode.action_space() for name in self.possible_agents}
-        self.observation_spaces = {name: self._episode.observation_space() for name in self.possible_agents}
-        self.state_space = self._episode.state_space()
+        self.action_names = self.host.action_names
+        self.action_spaces = {name: self.host.action_space() for name in self.possible_agents}
+        self.observation_spaces = {name: self.host.observation_space() for name in self.possible_agents}
+        self.state_space = self.host.state_space()
 
     def observation_space(self, agent: str) -> gym.Space:
-        """Space of what ``agent`` sees: always the same object."""
+        """Return the observation space of ``agent``, always the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> gym.Space:
-        """Space of what ``agent`` does: always the same object."""
+        """Return the action space of ``agent``, always the same object."""
         return self.action_spaces[agent]
 
     def reset(
@@ -108,18 +108,18 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
 
         Args:
             seed: of this and all following episodes. Without one, the next episode of the seed before.
-            options: none are known; ignored, as PettingZoo's own test asks.
+            options: ignored, as PettingZoo's own test requires.
 
         Returns:
             Observations and infos by agent.
 
         Raises:
             ValueError: a seed outside [0, 2^32).
-            gymnasium.error.Error: what is no seed.
+            gymnasium.error.Error: a seed that is not a whole number.
         """
-        self._episode.begin(seed)
-        self.agents = self._playing()
-        return self._observations(), {name: self._episode.info(self._index[name]) for name in self.agents}
+        self.host.reset(None if seed is None else checked_seed(seed))
+        self.agents = self._acting()
+        return self._observations(), {name: self._info(self._index[name]) for name in self.agents}
 
     def step(
         self, actions: Mapping[str, np.ndarray]
@@ -130,30 +130,30 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
             actions: of every agent in ``agents``, and of no other.
 
         Returns:
-            Observations, rewards, terminations, truncations and infos of those who acted.
+            Observations, rewards, terminations, truncations and infos of the agents that acted.
 
         Raises:
-            ValueError: an action that is missing, of an agent that does not play, of the wrong shape or not finite;
+            ValueError: an action that is missing, of an agent that does not act, of the wrong shape or not finite;
                 nothing has changed then.
             gymnasium.error.ResetNeeded: before the first reset, or all agents have left.
         """
-        episode = self._episode
-        episode.check_ready("step")
+        host = self.host
+        host.check_ready("step")
         if not self.agents:
             raise gym.error.ResetNeeded("all agents have left; call reset() before step()")
-        episode.advance(self._checked(actions))
-        acted, truncated = self.agents, episode.truncated()
-        outcome = {name: self._index[name] for name in acted}
-        terminations = {name: episode.terminated(agent) for name, agent in outcome.items()}
+        host.advance(self._checked(actions)[None])
+        acted = {name: self._index[name] for name in self.agents}
+        terminated, truncated, reward = host.terminated()[0], bool(host.truncated()[0]), host.reward()[0]
+        terminations = {name: bool(terminated[agent]) for name, agent in acted.items()}
         truncations = {name: truncated and not terminations[name] for name in acted}
         observations = self._observations()
-        rewards = {name: episode.reward(agent) for name, agent in outcome.items()}
-        infos = {name: episode.step_info(agent) for name, agent in outcome.items()}
-        self.agents = self._playing()
+        rewards = {name: float(reward[agent]) for name, agent in acted.items()}
+        infos = {name: self._info(agent, stepped=True) for name, agent in acted.items()}
+        self.agents = self._acting()
         return observations, rewards, terminations, truncations, infos
 
     def _checked(self, actions: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Actions ``(agents, action_size)``, zero for those who have left."""
+        """Return actions ``(agents, action_size)``, zero for agents that have left."""
         if not isinstance(actions, Mapping):
             kind = type(actions).__name__
             raise ValueError(f"actions are a {kind}; give a dictionary of one for each of {', '.join(self.agents)}")
@@ -161,33 +161,34 @@ class AvatarParallelEnv(Copied, EpisodeView, ParallelEnv):
         strange = [name for name in actions if name not in self.agents]
         if missing or strange:
             what = f"no action for {', '.join(missing)}" if missing else f"an action for {', '.join(map(str, strange))}"
-            raise ValueError(f"{what}; those who act are {', '.join(self.agents)}")
-        rows = np.zeros((len(self.possible_agents), self.batch.action_spec.size), np.float32)
+            raise ValueError(f"{what}; the agents that act are {', '.join(self.agents)}")
+        host = self.host
+        rows = np.zeros((len(self.possible_agents), host.action_size), np.float32)
         for name in self.agents:
             try:
-                rows[self._index[name]] = self._episode.check_action(actions[name])
+                rows[self._index[name]] = host.api.actions(actions[name], (host.action_size,), host.action_names)
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from None
         return rows
 
-    def _playing(self) -> list[str]:
-        """Who acts in the next step."""
+    def _acting(self) -> list[str]:
+        """Return the names of the agents that act in the next step."""
         alive = self.batch.alive.numpy()[0] & ~self.batch.truncated.numpy()[0]
         return [name for name, index in self._index.items() if alive[index]]
 
     def _observations(self) -> dict[str, Any]:
-        return {name: self._episode.observation(self._index[name]) for name in self.agents}
+        return {name: self._observation(self._index[name]) for name in self.agents}
 
     def state(self) -> np.ndarray:
-        """The flat observations of all agents one after the other, also of those who have left, for central critics."""
-        return self._episode.flat_observations()
+        """Return the flat observations of all agents, also of those that have left, for central critics."""
+        return self.host.observation()[0].flatten()
 
     def set_state(self, state: dict[str, np.ndarray]) -> dict[str, Any]:
-        """Restore what :meth:`get_state` returned, and who plays; returns the observations of these.
+        """Restore the result of :meth:`get_state` and the acting agents; returns their observations.
 
         Raises:
             ValueError: the state is of another environment, of other settings or not finite; nothing has changed then.
         """
-        self._episode.restore(state)
-        self.agents = self._playing()
+        self.host.set_state(state)
+        self.agents = self._acting()
         return self._observations()

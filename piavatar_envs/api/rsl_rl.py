@@ -1,4 +1,4 @@
-"""The view for rsl_rl: its ``VecEnv`` over a batch, observations as TensorDicts of groups.
+"""View for rsl_rl: its ``VecEnv``, with observations as TensorDicts of groups.
 
 ::
 
@@ -13,11 +13,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.api.copies import Copied
-from piavatar_envs.api.episode import Settings
-from piavatar_envs.api.same_step import means, step_and_reset
-from piavatar_envs.api.view import BatchedView
+from piavatar_envs.api.host import EpisodeHost, HostView, Settings
 from piavatar_envs.config import ConfigError, EnvConfig, load_config
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
@@ -30,12 +26,12 @@ except ImportError as error:
     raise ImportError("this view needs rsl_rl; install it with: pip install 'piavatar-envs[rsl]'") from error
 
 
-class AvatarRslEnv(Copied, BatchedView, VecEnv):
+class AvatarRslEnv(HostView, VecEnv):
     """One avatar in each environment, for rsl_rl's runners.
 
-    There is an episode from the start: runners never reset. An environment that ends is reset in the same step; what
-    its last observation was, rsl_rl does not ask (it bootstraps a time-out from the value before the step), but
-    ``extras["final_observations"]`` holds it. All tensors are the caller's own, and live on ``device``.
+    Episodes begin when the view is built, because runners never reset. An environment that ends is reset in the same
+    step; ``extras["final_observations"]`` holds its last observation, although rsl_rl does not use it (it bootstraps a
+    time-out from the value before the step). All tensors are copies on ``device``.
 
     Attributes:
         num_envs, num_actions: numbers of environments and of an action's components.
@@ -44,7 +40,7 @@ class AvatarRslEnv(Copied, BatchedView, VecEnv):
         cfg: the settings as plain values, for rsl_rl's loggers.
         config: the settings.
         groups: names of the terms in every observation group.
-        episodes: the environments on the device.
+        host: holds the environments.
     """
 
     def __init__(
@@ -78,23 +74,23 @@ class AvatarRslEnv(Copied, BatchedView, VecEnv):
         """
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
-        # a copy begins no episodes
+        # a copy is built by _make, which begins no episodes
         made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarRslEnv._make, task=task_class, **made)
         self._build(self)
-        self.num_envs, self.num_actions = num_envs, self.episodes.action_size
-        self.device = self.episodes.api.device
-        self.max_episode_length = self.episodes.groups[0].max_steps
+        self.num_envs, self.num_actions = num_envs, self.host.action_size
+        self.device = self.host.api.device
+        self.max_episode_length = self.host.groups[0].max_steps
         self.cfg = self.config.model_dump(mode="json")
         self.groups = self._checked_groups(groups)
         self.reset(seed)
 
     def _make(self, task: type[Task], num_envs: int, device: str, num_threads: int | None, config: EnvConfig) -> None:
         """Build the environments."""
-        self.episodes = BatchedEpisodes(task(config).alone(), num_envs, device, "torch", num_threads)
+        self.host = EpisodeHost(task(config).alone(), num_envs, device, "torch", num_threads)
 
     def _checked_groups(self, groups: Mapping[str, Sequence[str]] | None) -> dict[str, tuple[str, ...]]:
-        layout = self.episodes.layout
+        layout = self.host.layout
         if groups is None:
             by_term = self.config.obs_mode == "dict"
             return {name: (name,) for name in layout} if by_term else {"policy": tuple(layout)}
@@ -107,23 +103,23 @@ class AvatarRslEnv(Copied, BatchedView, VecEnv):
 
     @property
     def unwrapped(self) -> AvatarRslEnv:
-        """Itself."""
+        """This view."""
         return self
 
     @property
     def step_dt(self) -> float:
-        """Time of a control step [s]; rsl_rl's random network distillation asks for it."""
+        """Time of a control step [s], which rsl_rl's random network distillation reads."""
         return self.config.physics.control_dt
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """How far every episode is towards its time limit, in control steps, ``(num_envs,)`` int64.
+        """Control steps of every episode counted towards its time limit, ``(num_envs,)`` int64.
 
-        Setting it brings the limits nearer, as runners do to spread the ends of the first episodes
-        (``init_at_random_ep_len``). The world's own clock, by which clips and gaits go on, stays.
+        Runners set it to spread the ends of the first episodes (``init_at_random_ep_len``). This brings the time limits
+        nearer, and leaves the clock by which clips and gaits advance.
         """
-        ahead = self.episodes.read(lambda group: group.head_start)
-        return (self.episodes.read(lambda group: group.step_count) + ahead).long()
+        ahead = self.host.read(lambda group: group.head_start)
+        return (self.host.read(lambda group: group.step_count) + ahead).long()
 
     @episode_length_buf.setter
     def episode_length_buf(self, steps: torch.Tensor) -> None:
@@ -133,8 +129,8 @@ class AvatarRslEnv(Copied, BatchedView, VecEnv):
         if steps.is_floating_point() and not bool((steps == steps.round()).all()):
             raise ValueError(f"episode_length_buf={steps.tolist()} must be whole numbers of control steps")
         clocks = steps.to(self.device).clamp(0, self.max_episode_length - 1)
-        ahead = clocks - self.episodes.read(lambda group: group.step_count)
-        self.episodes.api.write(ahead, [group.head_start for group in self.episodes.groups])
+        ahead = clocks - self.host.read(lambda group: group.step_count)
+        self.host.api.write(ahead, [group.head_start for group in self.host.groups])
 
     def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
         """Begin an episode in every environment; returns the observations and empty extras.
@@ -145,12 +141,12 @@ class AvatarRslEnv(Copied, BatchedView, VecEnv):
         Raises:
             ValueError: a seed outside [0, 2^32).
         """
-        self.episodes.reset(seed)
+        self.host.reset(seed)
         return self.get_observations(), {}
 
     def get_observations(self) -> TensorDict:
-        """What the avatars see, by group, each ``(num_envs, size)``."""
-        return self.grouped(self.episodes.observation())
+        """Return the observations by group, each ``(num_envs, size)``."""
+        return self.grouped(self.host.observation())
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Advance by one control step.
@@ -167,18 +163,18 @@ class AvatarRslEnv(Copied, BatchedView, VecEnv):
         Raises:
             ValueError: actions of a wrong shape, type or device; nothing has changed then.
         """
-        done = step_and_reset(self.episodes, actions[:, None])
+        done = self.host.step_and_reset(actions[:, None])
         extras = {
             "time_outs": done.truncated[:, 0],
-            "log": means(done.infos, self.episodes.task.metric_names),
+            "log": done.means(self.host.task.metric_names),
             "final_observations": self.grouped(done.final_observation),
             "info": done.infos[0],
         }
         return self.grouped(done.observation), done.reward[:, 0], done.ended.long(), extras
 
     def grouped(self, observation: torch.Tensor) -> TensorDict:
-        """Flat observations ``(n, 1, observation_size)`` by group, as the runner's networks take them."""
-        layout = self.episodes.layout
+        """Split flat observations ``(n, 1, observation_size)`` into the groups that the runner's networks take."""
+        layout = self.host.layout
         groups = {
             group: torch.cat([observation[:, 0, layout[name].slice] for name in names], dim=-1)
             for group, names in self.groups.items()
@@ -187,4 +183,4 @@ class AvatarRslEnv(Copied, BatchedView, VecEnv):
 
     def close(self) -> None:
         """End the threads."""
-        self.episodes.close()
+        self.host.close()

@@ -1,4 +1,4 @@
-"""The view of Stable-Baselines3: its ``VecEnv`` over the vector of environments, SAME_STEP."""
+"""Stable-Baselines3's view: its ``VecEnv`` over the vector of environments, SAME_STEP."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from piavatar_envs.api.infos import single_infos
-from piavatar_envs.api.vector_env import AvatarVectorEnv
+from piavatar_envs.api.vector_env import AvatarVectorEnv, single_infos
 from piavatar_envs.envs.task import Task
 
 try:
@@ -26,9 +25,10 @@ Indices = int | Iterable[int] | None
 class SB3VecEnv(VecEnv):
     """Many environments for ``PPO("MlpPolicy", SB3VecEnv("KickBall-v0", num_envs=64, device="cuda"))``.
 
-    What ends begins anew in the same step: the observation it ended with is ``info["terminal_observation"]``, and
-    ``info["TimeLimit.truncated"]`` says whether only the clock has run out. ``info["is_success"]`` is what
-    Stable-Baselines3 logs as ``rollout/success_rate``; put a ``VecMonitor`` around this for returns and lengths.
+    An environment that ends begins its next episode in the same step: its last observation is
+    ``info["terminal_observation"]``, and ``info["TimeLimit.truncated"]`` is True if only the clock has run out.
+    Stable-Baselines3 logs ``info["is_success"]`` as ``rollout/success_rate``; wrap this in a ``VecMonitor`` for returns
+    and lengths.
 
     Attributes:
         vector: the environments.
@@ -51,11 +51,11 @@ class SB3VecEnv(VecEnv):
             task: id of the task, this suite's with or without the namespace, or its class.
             num_envs: number of environments.
             render_mode: None or ``"rgb_array"``.
-            device: Warp device, ``"cpu"`` or ``"cuda:0"``; what leaves are NumPy arrays either way.
+            device: Warp device, ``"cpu"`` or ``"cuda:0"``; the arrays are NumPy's either way.
             config: settings as a mapping, a YAML file or a configuration.
             num_threads: threads that share the environments on a CPU; one a core if not given.
-            step_infos: whether ``infos`` tell of every step, or only of the last one of an episode. A thousand
-                dictionaries a step cost more than the thousand environments on a GPU.
+            step_infos: whether every step has infos, or only the last one of an episode. A thousand dictionaries a
+                step cost more than the thousand environments on a GPU.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
@@ -81,7 +81,7 @@ class SB3VecEnv(VecEnv):
         """Begin episodes: of the seed given to :meth:`seed` before, or the next ones.
 
         Raises:
-            ValueError: options were set; none are known.
+            ValueError: options were set; none are accepted.
         """
         if any(self._options):
             raise ValueError(f"unknown reset options {sorted(set().union(*self._options))}; there are none")
@@ -107,8 +107,7 @@ class SB3VecEnv(VecEnv):
         observation, reward, terminated, truncated, infos = self.vector.step(self._actions)
         ended = terminated | truncated
         final, last = infos.pop("final_info", {}), infos.pop("final_obs", None)
-        told = self._step_infos or ended.any()
-        now = single_infos(infos, self.num_envs) if told else []
+        now = single_infos(infos, self.num_envs) if self._step_infos or ended.any() else []
         rows = [row | {"TimeLimit.truncated": False} if self._step_infos else {} for row in now]
         rows = rows or [{} for _ in range(self.num_envs)]
         for env, info in enumerate(single_infos(final, self.num_envs)):
@@ -122,25 +121,23 @@ class SB3VecEnv(VecEnv):
         return observation, reward.astype(np.float32), ended, rows
 
     def assist_root(self, share: float | np.ndarray) -> None:
-        """Help the pelvis from now on: one share in [0, 1], or one an environment; ``control="pd"`` or ``"torque"``.
-
-        Resets leave it.
+        """Set the share of root assistance from now on: one in [0, 1], or one an environment; resets keep it.
 
         Raises:
-            ValueError: it is out of range, of another shape, or the pose is driven.
+            ValueError: it is out of range, of another shape, or the control is ``"pose"``.
         """
         self.vector.assist_root(share)
 
     def close(self) -> None:
-        """Free what the environments hold."""
+        """Free the renderers and end the threads."""
         self.vector.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A picture of every environment, None without ``render_mode="rgb_array"``."""
+        """Draw every environment; None without ``render_mode="rgb_array"``."""
         return self.vector.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """An attribute of the vector, once for every environment: they share it.
+        """Return an attribute of the vector, once for every environment: they share it.
 
         Raises:
             AttributeError: there is none of this name.
@@ -149,42 +146,42 @@ class SB3VecEnv(VecEnv):
         return self.vector.attr_of_some(self._some(indices), attr_name)
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Set an attribute of one's own, which all environments share and nothing of this package reads.
+        """Set an attribute of your own, which all environments share and this package does not read.
 
         Raises:
-            ValueError: ``indices`` are not all of them, a setting, or what the environments are made with.
+            ValueError: ``indices`` are not all of them, or the name is a setting or an attribute of the vector itself.
         """
         if set(self._some(indices)) != set(range(self.num_envs)):
             raise ValueError(f"set_attr({attr_name!r}): environments of a batch share their attributes; leave indices")
         self.vector.set_attr(attr_name, [value] * self.num_envs)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any) -> list:
-        """Call what a single environment would have, for some environments; see :meth:`AvatarVectorEnv.call`.
+        """Call a method of single environments, for some of them; see :meth:`AvatarVectorEnv.call`.
 
         ``env_method("reset", seed=7, indices=2)`` begins an episode in one environment and returns a list of its
         observation and info, as :meth:`AvatarEnv.reset` does; the others go on.
 
         Raises:
-            AttributeError: the environments of a batch have no such method of their own.
+            AttributeError: there is no such method of single environments.
             IndexError: there is no such environment.
         """
         envs = self._some(indices)
-        if method_name == "reset" and not self.vector.episodes.ready:
-            self.reset()  # those that are not meant, by their seeds
+        if method_name == "reset" and not self.vector.host.ready:
+            self.reset()  # the other environments begin by their own seeds
         return self.vector.call_some(envs, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
-        """Whether environments are wrapped: environments of a batch never are."""
+        """Return False for every environment: environments of a batch are never wrapped."""
         return [False for _ in self._some(indices)]
 
     def _some(self, indices: Indices) -> list[int]:
-        """The environments meant, counted from 0; as in a list, negative ones count from the end.
+        """Return the environments that ``indices`` select, counted from 0; negative ones count from the end.
 
         Raises:
             IndexError: there is no such environment.
         """
         envs = list(self._get_indices(indices))
-        strange = [env for env in envs if not -self.num_envs <= env < self.num_envs]
-        if strange:
-            raise IndexError(f"indices={strange}: there are num_envs={self.num_envs}; use 0 to {self.num_envs - 1}")
+        unknown = [env for env in envs if not -self.num_envs <= env < self.num_envs]
+        if unknown:
+            raise IndexError(f"indices={unknown}: there are num_envs={self.num_envs}; use 0 to {self.num_envs - 1}")
         return [env % self.num_envs for env in envs]

@@ -1,4 +1,4 @@
-"""The views for skrl: dictionaries of torch tensors, a row an environment. Needs torch; skrl's wrappers do the rest.
+"""Views for skrl's wrappers: dictionaries of torch tensors, a row an environment. Needs torch.
 
 One avatar::
 
@@ -20,24 +20,19 @@ from typing import Any
 
 import gymnasium as gym
 
-from piavatar_envs.api import spaces
 from piavatar_envs.api.arrays import Array
-from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.api.copies import Copied
-from piavatar_envs.api.episode import Settings
-from piavatar_envs.api.same_step import Transition, means, step_and_reset
-from piavatar_envs.api.view import BatchedView
+from piavatar_envs.api.host import EpisodeHost, HostView, Settings, Transition
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_task
 
 
-class AvatarSkrlEnv(Copied, BatchedView):
-    """One avatar in each environment, as skrl's wrapper ``"isaaclab-single-agent"`` wants it.
+class AvatarSkrlEnv(HostView):
+    """One avatar in each environment, for skrl's wrapper ``"isaaclab-single-agent"``.
 
     An environment that ends is reset in the same step: the observation returned is the first of its next episode, and
     ``info["final_obs"]`` is the last one of the episode, where ``info["_final_obs"]`` is True. Elsewhere the two are
-    the same. All tensors are the caller's own, and live on ``device``.
+    the same. All tensors are copies on ``device``.
 
     Attributes:
         num_envs: number of environments.
@@ -45,7 +40,7 @@ class AvatarSkrlEnv(Copied, BatchedView):
         single_observation_space: ``{"policy": space}`` of one environment.
         single_action_space: of one environment.
         config: the settings.
-        episodes: the environments on the device.
+        host: holds the environments.
     """
 
     def __init__(
@@ -76,14 +71,14 @@ class AvatarSkrlEnv(Copied, BatchedView):
         self.config = load_config(task_class.Config, config, overrides)
         made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarSkrlEnv.__init__, task=task_class, **made)
-        self.episodes = BatchedEpisodes(task_class(self.config).alone(), num_envs, device, "torch", num_threads)
-        self.num_envs, self.device = num_envs, self.episodes.api.device
-        self.single_observation_space = gym.spaces.Dict({"policy": self.episodes.observation_space()})
-        self.single_action_space = self.episodes.action_space()
+        self.host = EpisodeHost(task_class(self.config).alone(), num_envs, device, "torch", num_threads)
+        self.num_envs, self.device = num_envs, self.host.api.device
+        self.single_observation_space = gym.spaces.Dict({"policy": self.host.observation_space()})
+        self.single_action_space = self.host.action_space()
 
     @property
     def unwrapped(self) -> AvatarSkrlEnv:
-        """Itself."""
+        """This view."""
         return self
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -91,7 +86,7 @@ class AvatarSkrlEnv(Copied, BatchedView):
 
         Args:
             seed: environment ``i`` plays the episodes of ``seed + i``. Without one, the next of the seed before.
-            options: none are known; ignored.
+            options: ignored.
 
         Returns:
             ``{"policy": observation}``, the observation ``(num_envs, size)``, or a dictionary of such with
@@ -100,8 +95,8 @@ class AvatarSkrlEnv(Copied, BatchedView):
         Raises:
             ValueError: a seed outside [0, 2^32).
         """
-        self.episodes.reset(seed)
-        return {"policy": self._seen(self.episodes.observation())}, {}
+        self.host.reset(seed)
+        return {"policy": self._named(self.host.observation())}, {}
 
     def step(self, actions: Array) -> tuple[dict[str, Any], Array, Array, Array, dict[str, Any]]:
         """Advance by one control step.
@@ -119,39 +114,39 @@ class AvatarSkrlEnv(Copied, BatchedView):
             ValueError: actions of a wrong shape, type or device; nothing has changed then.
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        done = step_and_reset(self.episodes, _joint([actions], self.num_envs, self.episodes.action_size))
+        done = self.host.step_and_reset(_joint([actions], self.num_envs, self.host.action_size))
         info = {
             **done.infos[0],
-            "final_obs": {"policy": self._seen(done.final_observation)},
+            "final_obs": {"policy": self._named(done.final_observation)},
             "_final_obs": done.ended,
-            "episode": means(done.infos, self.episodes.task.metric_names),
+            "episode": done.means(self.host.task.metric_names),
         }
         outcome = done.reward[:, 0], done.terminated[:, 0], done.truncated[:, 0]
-        return {"policy": self._seen(done.observation)}, *outcome, info
+        return {"policy": self._named(done.observation)}, *outcome, info
 
-    def _seen(self, observation: Array) -> Any:
-        return self.episodes.named(observation[:, 0])
+    def _named(self, observation: Array) -> Any:
+        return self.host.named(observation[:, 0])
 
     def close(self) -> None:
         """End the threads."""
-        self.episodes.close()
+        self.host.close()
 
 
-class AvatarSkrlMultiEnv(Copied, BatchedView):
-    """Several avatars in each environment, dictionaries by agent, as skrl's ``"isaaclab-multi-agent"`` wants them.
+class AvatarSkrlMultiEnv(HostView):
+    """Several avatars in each environment, dictionaries by agent, for skrl's wrapper ``"isaaclab-multi-agent"``.
 
-    All agents are always there, because the batch is: an agent that is out keeps its rows while the others of its world
-    go on. There its reward is 0, ``terminated`` stays True, its actions are ignored, and it observes what its body,
-    passive by now, would see. A world ends with its last agent, or with its clock (then ``truncated`` is True for those
-    still in), and is reset in the same step. ``infos`` says what a learner must know of that:
+    The arrays always have rows for all agents: an agent that is out keeps its rows while the others of its world go on.
+    There its reward is 0, ``terminated`` stays True, its actions are ignored, and its observation is that of its
+    passive body. A world ends with its last agent, or with its clock (then ``truncated`` is True for agents still in),
+    and is reset in the same step. A learner needs these entries of ``infos``:
 
-    - ``infos["acted"][agent]`` ``(num_envs,)`` bool: the step was the agent's own. Others should not be learned from.
+    - ``infos["acted"][agent]`` ``(num_envs,)`` bool: the agent acted in this step; do not learn from other rows.
     - ``infos["alive"][agent]`` ``(num_envs,)`` bool: it acts in the next step.
-    - ``infos["final_obs"][agent]``, ``infos["final_state"]``: to what the step led, also where the world was reset
-      (``infos["_final_obs"]``, ``(num_envs,)`` bool); elsewhere they are what was returned.
+    - ``infos["final_obs"][agent]``, ``infos["final_state"]``: the observations to which the step led, also where the
+      world was reset (``infos["_final_obs"]``, ``(num_envs,)`` bool); elsewhere the same as those returned.
     - ``infos[agent]``: metrics, ``reward_terms``, ``success``, ``failure`` (bits) and the root's wrench, a row a world.
 
-    All tensors are the caller's own, and live on ``device``.
+    All tensors are copies on ``device``.
 
     Attributes:
         num_envs: number of worlds.
@@ -160,7 +155,7 @@ class AvatarSkrlMultiEnv(Copied, BatchedView):
         observation_spaces, action_spaces: of one world, by agent.
         state_space: of :meth:`state`, of one world.
         config: the settings.
-        episodes: the worlds on the device.
+        host: holds the worlds.
     """
 
     def __init__(
@@ -175,7 +170,7 @@ class AvatarSkrlMultiEnv(Copied, BatchedView):
         """Build the worlds.
 
         Args:
-            task: its class, such as ``piavatar_envs.multi.high_five_v0.TASK``, or for tasks of one's own the id.
+            task: its class, such as ``piavatar_envs.multi.high_five_v0.TASK``, or the id of a registered task.
             num_envs: number of worlds.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
@@ -191,21 +186,21 @@ class AvatarSkrlMultiEnv(Copied, BatchedView):
         self.config = load_config(task_class.Config, config, overrides)
         made = {"num_envs": num_envs, "device": device, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarSkrlMultiEnv.__init__, task=task_class, **made)
-        self.episodes = BatchedEpisodes(task_class(self.config), num_envs, device, "torch", num_threads)
-        self.num_envs, self.device = num_envs, self.episodes.api.device
-        self.possible_agents = list(self.episodes.task.agent_names)
-        self.action_spaces = {name: self.episodes.action_space() for name in self.possible_agents}
-        self.observation_spaces = {name: self.episodes.observation_space() for name in self.possible_agents}
-        self.state_space = spaces.state_space(self.episodes.groups[0])
+        self.host = EpisodeHost(task_class(self.config), num_envs, device, "torch", num_threads)
+        self.num_envs, self.device = num_envs, self.host.api.device
+        self.possible_agents = list(self.host.task.agent_names)
+        self.action_spaces = {name: self.host.action_space() for name in self.possible_agents}
+        self.observation_spaces = {name: self.host.observation_space() for name in self.possible_agents}
+        self.state_space = self.host.state_space()
 
     @property
     def unwrapped(self) -> AvatarSkrlMultiEnv:
-        """Itself."""
+        """This view."""
         return self
 
     @property
     def agents(self) -> list[str]:
-        """All agents: a world whose last one is out has begun anew."""
+        """All agents: a world without any has been reset."""
         return list(self.possible_agents)
 
     @property
@@ -218,7 +213,7 @@ class AvatarSkrlMultiEnv(Copied, BatchedView):
 
         Args:
             seed: world ``i`` plays the episodes of ``seed + i``. Without one, the next episode of the seed before.
-            options: none are known; ignored.
+            options: ignored.
 
         Returns:
             Observations ``(num_envs, size)`` by agent, or dictionaries of such with ``obs_mode="dict"``; and infos.
@@ -226,8 +221,8 @@ class AvatarSkrlMultiEnv(Copied, BatchedView):
         Raises:
             ValueError: a seed outside [0, 2^32).
         """
-        self.episodes.reset(seed)
-        return self._seen(self.episodes.observation()), {"alive": self._by_agent(self.episodes.alive())}
+        self.host.reset(seed)
+        return self._named(self.host.observation()), {"alive": self._by_agent(self.host.alive())}
 
     def step(self, actions: Mapping[str, Array]) -> tuple[dict[str, Any], ...]:
         """Advance by one control step.
@@ -247,43 +242,43 @@ class AvatarSkrlMultiEnv(Copied, BatchedView):
         if set(actions) != set(self.possible_agents):
             raise ValueError(f"actions of {sorted(actions)}; give one for each of {', '.join(self.possible_agents)}")
         rows = [actions[name] for name in self.possible_agents]
-        done = step_and_reset(self.episodes, _joint(rows, self.num_envs, self.episodes.action_size))
+        done = self.host.step_and_reset(_joint(rows, self.num_envs, self.host.action_size))
         flags = (self._by_agent(values) for values in (done.reward, done.terminated, done.truncated))
-        return self._seen(done.observation), *flags, self._infos(done)
+        return self._named(done.observation), *flags, self._infos(done)
 
     def _infos(self, done: Transition) -> dict[str, Any]:
         return {
             **dict(zip(self.possible_agents, done.infos, strict=True)),
             "acted": self._by_agent(done.acted),
-            "alive": self._by_agent(self.episodes.alive()),
-            "final_obs": self._seen(done.final_observation),
+            "alive": self._by_agent(self.host.alive()),
+            "final_obs": self._named(done.final_observation),
             "final_state": done.final_observation.flatten(1),
             "_final_obs": done.ended,
-            "episode": means(done.infos, self.episodes.task.metric_names),
+            "episode": done.means(self.host.task.metric_names),
         }
 
     def state(self) -> Array:
-        """The flat observations of all agents one after the other, ``(num_envs, size)``, for central critics."""
-        self.episodes.check_ready("state")
-        return self.episodes.observation().flatten(1)
+        """Return the flat observations of all agents, ``(num_envs, size)``, for central critics."""
+        self.host.check_ready("state")
+        return self.host.observation().flatten(1)
 
-    def _seen(self, observation: Array) -> dict[str, Any]:
-        return {name: self.episodes.named(seen) for name, seen in self._by_agent(observation).items()}
+    def _named(self, observation: Array) -> dict[str, Any]:
+        return {name: self.host.named(seen) for name, seen in self._by_agent(observation).items()}
 
     def _by_agent(self, values: Array) -> dict[str, Array]:
-        """``values`` ``(num_envs, num_agents, ...)`` by agent, copies that share nothing."""
+        """Split ``values`` ``(num_envs, num_agents, ...)`` by agent into separate copies."""
         return {name: values[:, index].clone() for index, name in enumerate(self.possible_agents)}
 
     def close(self) -> None:
         """End the threads."""
-        self.episodes.close()
+        self.host.close()
 
 
 def _joint(rows: list[Array], num_envs: int, size: int) -> Array:
-    """Actions ``(num_envs, num_agents, size)`` from those of every agent.
+    """Stack the actions of every agent to ``(num_envs, num_agents, size)``.
 
     Raises:
-        ValueError: an agent's have a wrong shape.
+        ValueError: the actions of an agent have a wrong shape.
     """
     import torch
 

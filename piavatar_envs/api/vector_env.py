@@ -1,11 +1,8 @@
-"""What single environments are asked for by name: ``call``, ``get_attr``, ``set_attr``, as of Gymnasium's vectors.
-
-The view of many environments: ``gymnasium.vector.VectorEnv`` over a batch.
-"""
+"""Gymnasium's view of many environments: ``gymnasium.vector.VectorEnv``, and its calls of single environments."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
 
@@ -15,62 +12,59 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from piavatar_envs.api.arrays import Array
-from piavatar_envs.api.batched import BatchedEpisodes
-from piavatar_envs.api.copies import Copied, check_state
-from piavatar_envs.api.episode import BATCH_RENDER_MODES, Settings, check_batch_render_mode
-from piavatar_envs.api.infos import outcome, single_infos, standing, vector_format
-from piavatar_envs.api.picture import Pictures
-from piavatar_envs.api.view import BatchedView
+from piavatar_envs.api.host import EpisodeHost, HostView, Settings, failure_names
+from piavatar_envs.api.pictures import BATCH_RENDER_MODES, check_batch_render_mode
 from piavatar_envs.config import EnvConfig, load_config
 from piavatar_envs.config.load import setting_keys
+from piavatar_envs.envs.state import check_state
 from piavatar_envs.envs.task import Task
 from piavatar_envs.tasks import load_registered
 
 #: Attributes of a single environment that the vector has under another name.
 _SINGLE = {"action_space": "single_action_space", "observation_space": "single_observation_space"}
-#: Attributes of a single environment that are not one thing of all of them, and where there is the like.
-_ELSEWHERE = {
-    "batch": "the environments are stepped together in vector.episodes",
-    "np_random": "what an environment draws follows from its seed and its episode, without a generator",
+#: Attributes of a single environment that the environments of a vector lack, with the reason.
+_MISSING = {
+    "batch": "the environments are stepped together in vector.host",
+    "np_random": "random numbers of an environment follow from its seed and its episode, without a generator",
 }
 
 
-class Each:
-    """A vector that can be asked as if it were a tuple of single environments.
+class VectorCalls:
+    """Calls of single environments by name, as Gymnasium's vectors have them: ``call``, ``get_attr``, ``set_attr``.
 
-    They share their attributes, and what is asked of all of them is answered as often as there are environments. Of
-    their methods there are those that make sense one by one.
+    The environments share their attributes; a value is returned once for every environment. Callable are the methods
+    that make sense for one environment while the others go on.
 
     Attributes:
         config: the settings.
-        episodes: the environments.
-        num_envs: how many.
+        host: holds the environments.
+        num_envs: number of environments.
         _own: names of the attributes that the vector was built with.
     """
 
     config: EnvConfig
-    episodes: BatchedEpisodes
+    host: EpisodeHost
     num_envs: int
     _own: frozenset[str]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call what every single environment has: ``reset``, ``render``, ``get_state``, ``set_state``, ``assist_root``.
+        """Call ``reset``, ``render``, ``get_state``, ``set_state`` or ``assist_root`` of every environment.
 
         Args:
-            name: of the method; of anything else it is :meth:`get_attr`.
+            name: of the method; other attributes are read as by :meth:`get_attr`.
             *args: of the method, the same for all.
             **kwargs: likewise.
 
         Returns:
-            What each single environment would have returned.
+            The result that each single environment would have returned.
 
         Raises:
-            AttributeError: environments of a vector have no such method of their own.
+            AttributeError: there is no such method of single environments.
         """
         return tuple(self.call_some(range(self.num_envs), name, *args, **kwargs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every single environment.
+        """Return an attribute of every single environment.
 
         Raises:
             AttributeError: there is none of this name.
@@ -78,14 +72,14 @@ class Each:
         return tuple(self.attr_of_some(range(self.num_envs), name))
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of one's own, which all environments share and nothing of this package reads.
+        """Set an attribute of your own, which all environments share and this package does not read.
 
         Args:
             name: of the attribute.
-            values: its value; a list or a tuple has one for every environment, all the same.
+            values: its value; or a list or tuple of equal values, one for every environment.
 
         Raises:
-            ValueError: different values or a wrong number of them, a setting, or what the vector is made of.
+            ValueError: different values or a wrong number of them, a setting, or an attribute of the vector itself.
         """
         values = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
         if len(values) != self.num_envs:
@@ -94,31 +88,31 @@ class Each:
             raise ValueError(
                 f"set_attr({name!r}): the environments share their attributes; give one value for all of them"
             )
-        if name in self._own or name in _SINGLE or name in _ELSEWHERE or hasattr(type(self), name):
-            raise ValueError(f"set_attr({name!r}): it is what the environments are made with; make others")
+        if name in self._own or name in _SINGLE or name in _MISSING or hasattr(type(self), name):
+            raise ValueError(f"set_attr({name!r}): it is part of the environments; make new ones")
         if any(name in (key, *key.split(".")) for key in setting_keys(type(self.config))):
             raise ValueError(
-                f"set_attr({name!r}): settings hold for as long as the environments live; make others with {name}=..., "
-                "or have episodes draw it from a range, where the settings have one"
+                f"set_attr({name!r}): settings are fixed when environments are made; make new ones with {name}=..., "
+                "or let episodes draw it from a range, where the settings have one"
             )
         setattr(self, name, values[0])
 
     def attr_of_some(self, envs: Sequence[int], name: str) -> list[Any]:
-        """An attribute as single environments have it, for each of ``envs``.
+        """Return an attribute of single environments, for each of ``envs``.
 
         Raises:
             AttributeError: there is none of this name.
         """
         if name == "np_random_seed":
-            seeds = np.concatenate([group.seed.numpy() for group in self.episodes.groups]).view(np.uint32)
+            seeds = np.concatenate([group.seed.numpy() for group in self.host.groups]).view(np.uint32)
             return [int(seeds[env]) for env in envs]
-        if name in _ELSEWHERE:
-            raise AttributeError(f"environments of a vector have no {name!r} of their own: {_ELSEWHERE[name]}")
+        if name in _MISSING:
+            raise AttributeError(f"environments of a vector have no {name!r} of their own: {_MISSING[name]}")
         value = getattr(self, _SINGLE.get(name, name))
         return [value for _ in envs]
 
     def call_some(self, envs: Sequence[int], name: str, *args: Any, **kwargs: Any) -> list[Any]:
-        """As :meth:`call`, for each of ``envs``; the others go on."""
+        """Call a method as :meth:`call` does, for each of ``envs``; the others go on."""
         own = {"reset": self._reset_some, "get_state": self._states, "set_state": self._set_states}
         own |= {"render": self._frames, "assist_root": self._assist_some}
         if name in own:
@@ -126,24 +120,24 @@ class Each:
         if not callable(getattr(type(self), name, None)):
             return self.attr_of_some(envs, name)
         raise AttributeError(
-            f"{name!r} is not for single environments of a vector, which are stepped and closed together; they have "
-            f"{', '.join(map(repr, sorted(own)))}, everything else is the vector's own"
+            f"{name!r} is not a call of single environments of a vector, which are stepped and closed together; "
+            f"callable are {', '.join(map(repr, sorted(own)))}"
         )
 
     def _reset_some(
         self, envs: Sequence[int], *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> list[tuple[Any, dict[str, Any]]]:
-        """Begin episodes, each of the same seed or the next one of its own."""
+        """Begin episodes, each of the same seed, or the next one of its own seed."""
         mask = self._mask(envs)
-        if not (self.episodes.ready or mask.all()):
+        if not (self.host.ready or mask.all()):
             self.reset()
         seeds = [seed if held else None for held in mask]
         observation, infos = self.reset(seed=seeds, options={**(options or {}), "reset_mask": mask})
-        told = single_infos(infos, self.num_envs)
-        return [(_row(observation, env), told[env]) for env in envs]
+        rows = single_infos(infos, self.num_envs)
+        return [(_row(observation, env), rows[env]) for env in envs]
 
     def _states(self, envs: Sequence[int]) -> list[dict[str, np.ndarray]]:
-        state = self.episodes.get_state()
+        state = self.host.get_state()
         return [{name: value[env : env + 1].copy() for name, value in state.items()} for env in envs]
 
     def _set_states(self, envs: Sequence[int], state: dict[str, np.ndarray]) -> list[Any]:
@@ -151,11 +145,11 @@ class Each:
         check_state(state, 1)
         others = ~self._mask(envs)
         if others.any():
-            self.episodes.check_ready("set_state")
-        present, given = self.episodes.get_state(), {}
+            self.host.check_ready("set_state")
+        present, given = self.host.get_state(), {}
         for name, value in state.items():
             given[name] = np.repeat(value, self.num_envs, axis=0)
-            # what does not fit is refused below, with the reason
+            # an array that does not fit is refused by set_state, with the reason
             if name in present and given[name].shape == present[name].shape:
                 given[name][others] = present[name][others]
         observation = self.set_state(given)
@@ -169,7 +163,7 @@ class Each:
         if self._mask(envs).all():
             self.assist_root(share)
             return [None for _ in envs]
-        raise ValueError("assist_root by name is for all environments; give the vector's own a share for each of them")
+        raise ValueError("assist_root by name is for all environments; give vector.assist_root() a share for each")
 
     def _mask(self, envs: Sequence[int]) -> np.ndarray:
         mask = np.zeros(self.num_envs, bool)
@@ -178,31 +172,31 @@ class Each:
 
 
 def _row(observation: Any, env: int) -> Any:
-    """One environment's part of observations."""
+    """Return the observation of one environment."""
     if isinstance(observation, dict):
         return {name: value[env] for name, value in observation.items()}
     return observation[env]
 
 
-class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
-    """Many worlds of one soft avatar and a task, stepped at once.
+class AvatarVectorEnv(VectorCalls, HostView, VectorEnv):
+    """Many environments of one soft avatar and a task, stepped at once.
 
-    Environment ``i`` is the single environment of seed ``seed + i``, bit for bit. Its ``info`` is the single
-    one's in Gymnasium's vector format: arrays, and beside each ``name`` the mask ``_name`` of environments that it
-    holds for. With ``array_api="torch"`` all of it are tensors on the environments' device and nothing in :meth:`step`
-    makes the host wait; then ``info["failure"]`` are bits (``piavatar_envs.mpm.types.failure_name`` knows their names),
-    and under SAME_STEP ``info["final_obs"]`` is a whole batch of observations; ``_final_obs`` says which ended.
+    Environment ``i`` equals the single environment of seed ``seed + i``, bit for bit. Infos have Gymnasium's vector
+    format: arrays, and beside each ``name`` the mask ``_name`` of the environments that it holds for. With
+    ``array_api="torch"`` all arrays are tensors on the environments' device and :meth:`step` never makes the host wait;
+    then ``info["failure"]`` are bits (``piavatar_envs.mpm.types.failure_name`` returns their names), and under
+    SAME_STEP ``info["final_obs"]`` is a whole batch of observations, of which ``_final_obs`` marks those that ended.
 
-    When an episode ends, ``metadata["autoreset_mode"]`` says what happens, as Gymnasium defines it. The terminal
-    observation is what :meth:`step` returns, except under SAME_STEP, where it is in ``info["final_obs"]``:
+    At the end of an episode ``metadata["autoreset_mode"]`` applies, as Gymnasium defines it. :meth:`step` returns the
+    terminal observation, except under SAME_STEP, where it is in ``info["final_obs"]``:
 
     - NEXT_STEP: the next :meth:`step` ignores the action of this environment (which is checked all the same) and
       begins its next episode instead.
-    - SAME_STEP: the same step begins the next episode; what it ended with is in ``final_obs`` and ``final_info``.
+    - SAME_STEP: the same step begins the next episode; the end of the last one is in ``final_obs`` and ``final_info``.
     - DISABLED: the caller resets, with ``reset(options={"reset_mask": ...})``, before the next :meth:`step`.
 
     Attributes:
-        episodes: the environments.
+        host: holds the environments.
         config: their settings.
         action_names: of every component of an action.
     """
@@ -234,17 +228,17 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
             render_mode: None or ``"rgb_array"``.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
-            array_api: what goes in and comes out: ``"numpy"`` or ``"torch"`` (on ``device``).
-            autoreset_mode: what happens at the end of an episode; an ``AutoresetMode`` or its value.
+            array_api: kind of arrays: ``"numpy"`` or ``"torch"`` (on ``device``).
+            autoreset_mode: an ``AutoresetMode`` or its value, see above.
             num_threads: threads that share the environments on a CPU; one a core if not given. Changes no result.
-            registered: for Gymnasium alone: the id that is made, and the task that it was registered for.
+            registered: set by Gymnasium only: the id, and the task that it is registered for.
             **overrides: settings that win over ``config``, such as ``fidelity="tiny"``.
 
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
             ImportError: ``array_api="torch"`` and torch is not installed.
-            ValueError: an unknown task or one that is not the id's, an unknown render mode, device, kind of arrays or
-                autoreset mode, or no environments.
+            ValueError: an unknown task or one that the id is not registered for, an unknown render mode, device, kind
+                of arrays or autoreset mode, or no environments.
         """
         self.render_mode, self.autoreset_mode = check_batch_render_mode(render_mode), _autoreset_mode(autoreset_mode)
         task_class = load_registered(task, registered)
@@ -252,19 +246,16 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
         made = {"num_envs": num_envs, "render_mode": render_mode, "device": device, "array_api": array_api}
         made |= {"autoreset_mode": self.autoreset_mode, "num_threads": num_threads, "config": self.config}
         self._build = partial(AvatarVectorEnv.__init__, task=task_class, **made)
-        self.episodes = BatchedEpisodes(task_class(self.config).alone(), num_envs, device, array_api, num_threads)
+        task = task_class(self.config).alone()
+        self.host = EpisodeHost(task, num_envs, device, array_api, num_threads, render_mode)
         self.num_envs = num_envs
-        self.metadata = {
-            **self.metadata,
-            "render_fps": round(1.0 / self.config.physics.control_dt),
-            "autoreset_mode": self.autoreset_mode,
-        }
-        self.action_names = self.episodes.action_names
-        self.single_action_space = self.episodes.action_space()
-        self.single_observation_space = self.episodes.observation_space()
+        frame_rate = self.host.frame_rate
+        self.metadata = {**self.metadata, "render_fps": frame_rate, "autoreset_mode": self.autoreset_mode}
+        self.action_names = self.host.action_names
+        self.single_action_space = self.host.action_space()
+        self.single_observation_space = self.host.observation_space()
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._pictures = Pictures(self.episodes.group_of, self.config.render)
         self._own = frozenset(vars(self))
 
     def reset(
@@ -276,7 +267,7 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
             seed: of these and all following episodes: of environment ``i`` it is ``seed + i``, or ``seed[i]``. Without
                 one (None), the next episode of the seed before.
             options: ``{"reset_mask": mask}`` resets some environments only, ``mask`` a NumPy array of ``num_envs`` bool
-                with at least one True; it is removed from ``options``. Nothing else is known.
+                with at least one True; it is removed from ``options``. There are no other options.
 
         Returns:
             Observations of all environments, and infos of those that were reset.
@@ -285,23 +276,23 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
             TypeError: options that are no dict, or a mask that is not a NumPy array of bool.
             ValueError: a mask of the wrong shape or without any True, an unknown option, a wrong number of seeds, or a
                 seed outside [0, 2^32); nothing has changed then.
-            gymnasium.error.Error: what is no seed, or a first reset with a mask that leaves environments out.
+            gymnasium.error.Error: a seed that is not a whole number, or a first reset that leaves environments out.
         """
         mask = self._reset_mask(options)
-        self.episodes.reset(seed, mask)
+        self.host.reset(seed, mask)
         if mask is not None:
-            del options["reset_mask"]  # not before: who is refused may try again
+            del options["reset_mask"]  # after the reset, so that a refused call changes nothing
         super().reset(seed=int(seed) if isinstance(seed, (int, np.integer)) else None)
-        held = None if mask is None else self.episodes.api.from_host(mask)
-        return self._observation(), self._in_vector_format(self._standing(), held)
+        held = None if mask is None else self.host.api.from_host(mask)
+        return self._observation(), self._in_vector_format(self.host.status(0), held)
 
     def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray | None:
-        """The mask in ``options``."""
+        """Return the mask in ``options``, if there is one."""
         if options is not None and not isinstance(options, dict):
             raise TypeError(f"options are of type {type(options).__name__}; use a dict")
-        strange = sorted(set(options or {}) - {"reset_mask"})
-        if strange:
-            raise ValueError(f"unknown reset options {strange}; there is only 'reset_mask'")
+        unknown = sorted(set(options or {}) - {"reset_mask"})
+        if unknown:
+            raise ValueError(f"unknown reset options {unknown}; there is only 'reset_mask'")
         if not options:
             return None
         mask = options["reset_mask"]
@@ -326,53 +317,55 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
 
         Raises:
             ValueError: a wrong shape, type or device, or (NumPy) a component that is not finite; nothing has changed
-                then. A tensor's values are not looked at: what is not finite acts as zero and ends its environment with
-                the failure ``"action"``.
+                then. The values of a tensor are not checked on the host: a component that is not finite acts as zero
+                and ends its environment with the failure ``"action"``.
             gymnasium.error.ResetNeeded: before the first reset; under DISABLED (NumPy) also where an environment has
                 ended and was not reset.
         """
-        episodes = self.episodes
-        episodes.check_ready("step")
-        shape = self.num_envs, episodes.action_size
-        actions = episodes.api.actions(actions, shape, self.action_names)[:, None]
+        host = self.host
+        host.check_ready("step")
+        actions = host.api.actions(actions, (self.num_envs, host.action_size), self.action_names)[:, None]
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             return self._step_or_reset(actions)
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
             return self._step_and_reset(actions)
         self._check_none_ended()
-        episodes.advance(actions)
-        return self._observation(), *self._outcome(), self._in_vector_format(self._standing() | self._worth())
+        host.advance(actions)
+        return self._observation(), *self._ends(), self._in_vector_format(host.status(0) | host.outcome(0))
 
     def _step_or_reset(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """NEXT_STEP: what ended in the step before begins anew (where it was stepped on, nothing of that is left)."""
-        episodes = self.episodes
-        ended = episodes.find_ended()
-        episodes.advance(actions)
-        episodes.reset_ended()
-        reward, terminated, truncated = self._outcome()
-        infos = self._in_vector_format(self._standing())
-        if episodes.api.may_hold(~ended):
-            infos |= self._in_vector_format(self._worth(), ~ended)
-        return self._observation(), episodes.api.shown(reward, ~ended), terminated, truncated, infos
+        """Step, and reset the environments that ended in the step before (NEXT_STEP).
+
+        These are stepped as well, which the reset undoes.
+        """
+        host = self.host
+        ended = host.find_ended()
+        host.advance(actions)
+        host.reset_ended()
+        reward, terminated, truncated = self._ends()
+        infos = self._in_vector_format(host.status(0))
+        if host.api.may_hold(~ended):
+            infos |= self._in_vector_format(host.outcome(0), ~ended)
+        return self._observation(), host.api.shown(reward, ~ended), terminated, truncated, infos
 
     def _step_and_reset(self, actions: Array) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """SAME_STEP: what ends begins anew at once, and what it ended with is kept in the infos."""
-        episodes = self.episodes
-        api = episodes.api
-        episodes.advance(actions)
-        ended, observation, outcome = episodes.find_ended(), self._observation(), self._outcome()
-        worth = self._worth()
-        infos = self._in_vector_format(worth, ~ended) if api.may_hold(~ended) else {}
+        """Step, and reset the environments that end; the infos keep the end of their episodes (SAME_STEP)."""
+        host = self.host
+        api = host.api
+        host.advance(actions)
+        ended, observation, ends = host.find_ended(), self._observation(), self._ends()
+        outcome = host.outcome(0)
+        infos = self._in_vector_format(outcome, ~ended) if api.may_hold(~ended) else {}
         if api.may_hold(ended):
             infos["final_obs"], infos["_final_obs"] = api.rows(observation, ended), api.shown(ended)
-            infos |= self._in_vector_format({"final_info": self._standing() | worth}, ended)
-            episodes.reset_ended()
+            infos |= self._in_vector_format({"final_info": host.status(0) | outcome}, ended)
+            host.reset_ended()
             observation = self._observation()
-        return observation, *outcome, infos | self._in_vector_format(self._standing())
+        return observation, *ends, infos | self._in_vector_format(host.status(0))
 
     def _check_none_ended(self) -> None:
-        """DISABLED: refuse to step on where the host knows that an episode has ended."""
-        ended = self.episodes.find_ended() if self.episodes.api.name == "numpy" else np.zeros(1, bool)
+        """Refuse a step after the end of an episode (DISABLED), where the arrays are on the host."""
+        ended = self.host.find_ended() if self.host.api.name == "numpy" else np.zeros(1, bool)
         if ended.any():
             raise gym.error.ResetNeeded(
                 f"environments {np.flatnonzero(ended).tolist()} have ended and autoreset_mode is DISABLED; call "
@@ -380,64 +373,84 @@ class AvatarVectorEnv(Copied, Each, BatchedView, VectorEnv):
             )
 
     def _observation(self) -> Any:
-        """What the avatars see, by name with ``obs_mode="dict"``."""
-        return self.episodes.named(self.episodes.observation()[:, 0])
+        """Return the observations, by name with ``obs_mode="dict"``."""
+        return self.host.named(self.host.observation()[:, 0])
 
-    def _outcome(self) -> tuple[Array, Array, Array]:
-        """Rewards, terminations and truncations."""
-        episodes = self.episodes
-        reward = episodes.api.shown(episodes.reward()[:, 0])
-        return reward, episodes.terminated()[:, 0], episodes.truncated()
-
-    def _standing(self) -> dict[str, Any]:
-        return standing(self.episodes.read, self.episodes.api, 0)
-
-    def _worth(self) -> dict[str, Any]:
-        return outcome(self.episodes.read, self.episodes.task, 0)
+    def _ends(self) -> tuple[Array, Array, Array]:
+        """Return rewards, terminations and truncations."""
+        host = self.host
+        return host.api.shown(host.reward()[:, 0]), host.terminated()[:, 0], host.truncated()
 
     def _in_vector_format(self, values: dict[str, Any], mask: Array | None = None) -> dict[str, Any]:
-        return vector_format(values, self.episodes.api, self.num_envs, mask)
+        """Format values by name as Gymnasium's vectors do: zeros outside ``mask``, and a mask ``_name`` beside each.
+
+        Failures become names (None for none) in NumPy's arrays; a tensor keeps the bits.
+        """
+        api = self.host.api
+        masks = iter(api.repeated(mask, self.num_envs, _count(values)))
+
+        def put(values: Mapping[str, Any]) -> dict[str, Any]:
+            found: dict[str, Any] = {}
+            for name, value in values.items():
+                if isinstance(value, Mapping):
+                    found[name] = put(value)
+                else:
+                    found[name] = api.shown(failure_names(value) if name == "failure" else value, mask)
+                found[f"_{name}"] = next(masks)
+            return found
+
+        return put(values)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture of every environment, ``(height, width, 3)`` uint8, with ``render_mode="rgb_array"``, else None.
+        """Draw every environment, ``(height, width, 3)`` uint8, with ``render_mode="rgb_array"``; else return None.
 
         Raises:
             ImportError: the extra ``render`` is not installed.
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        if self.render_mode is None:
-            gym.logger.warn('render() needs environments made with render_mode="rgb_array"')
-            return None
-        self.episodes.check_ready("render")
-        return tuple(self._pictures.frame(env) for env in range(self.num_envs))
+        return self.host.render()
 
     def close_extras(self, **_kwargs: Any) -> None:
         """Free the renderer's windows and end the threads."""
-        self._pictures.close()
-        self.episodes.close()
-
-    def get_state(self) -> dict[str, np.ndarray]:
-        """Everything that the future depends on; :meth:`set_state` restores it, bit for bit.
-
-        The first dimension of every array is the environment; whether one is about to be reset is part of it.
-        """
-        return self.episodes.get_state()
+        self.host.close()
 
     def set_state(self, state: dict[str, np.ndarray]) -> Any:
-        """Restore what :meth:`get_state` returned; returns the observations.
+        """Restore the result of :meth:`get_state`; returns the observations.
 
         Raises:
             ValueError: the state is of other environments, of other settings or not finite; nothing has changed then.
         """
-        self.episodes.set_state(state)
+        self.host.set_state(state)
         return self._observation()
 
 
+def single_infos(infos: Mapping[str, Any], num_envs: int) -> list[dict[str, Any]]:
+    """Split infos in vector format into one dictionary an environment, of the values that the masks grant it."""
+    rows: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+    for name, mask in infos.items():
+        if not name.startswith("_") or name[1:] not in infos:
+            continue
+        values = infos[name[1:]]
+        if isinstance(values, dict):
+            values = single_infos(values, num_envs)
+        elif values.ndim == 1:
+            values = values.tolist()
+        for env, held in enumerate(mask.tolist()):
+            if held:
+                rows[env][name[1:]] = values[env]
+    return rows
+
+
+def _count(values: Mapping[str, Any]) -> int:
+    """Count the names in a mapping and in those within it."""
+    return sum(1 + (_count(value) if isinstance(value, Mapping) else 0) for value in values.values())
+
+
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    """The mode itself.
+    """Return the mode.
 
     Raises:
-        ValueError: there is no such mode.
+        ValueError: it is unknown.
     """
     try:
         return AutoresetMode(mode)

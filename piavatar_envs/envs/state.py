@@ -19,6 +19,62 @@ from piavatar_envs.config.errors import shown
 SETTINGS = "env.settings"
 #: Settings without effect on the future, and the setting that a state holds as a number of its own.
 _SHOWN, _BEGUN_WITH = ("render", "obs_mode"), "root_assist"
+#: Arrays that may hold numbers that are not finite: the next step finds them and ends the episode with a failure.
+_FOUND_BY_STEPS = ("particles.x", "particles.u", "particles.C", "particles.F")
+#: How the names of shares of root assistance end.
+_ASSIST = ".assist"
+
+
+def check_state(state: Any, num_envs: int) -> None:
+    """Refuse a state that does not fit ``num_envs`` environments, or that holds numbers out of range.
+
+    Raises:
+        ValueError: no mapping, an array of another number of environments, or a number that is not finite. Exempt are
+            numbers that the next step finds, and environments that have failed, except for arrays that resets keep.
+    """
+    if not isinstance(state, Mapping):
+        raise ValueError(f"the state is a {type(state).__name__} without any arrays; use what get_state() returned")
+    arrays = {name: np.asarray(value) for name, value in state.items()}
+    for name, value in arrays.items():
+        if value.shape[:1] != (num_envs,):
+            expected = (num_envs, *value.shape[1:])
+            raise ValueError(f"state[{name!r}] has shape {value.shape}, expected {expected} for num_envs={num_envs}")
+    failed = np.zeros(num_envs, bool)
+    failure = arrays.get("particles.failure")
+    if failure is not None and failure.dtype.kind == "i":
+        failed = failure.reshape(num_envs, -1).any(1)
+    for name, value in arrays.items():
+        if value.dtype.kind == "f" and name not in _FOUND_BY_STEPS:
+            kept = _kept_by_resets(name)
+            _check_finite(name, value, failed & (not kept))
+            if kept:
+                _check_range(name, value, 1.0 if name.endswith(_ASSIST) else np.inf)
+
+
+def _kept_by_resets(name: str) -> bool:
+    """Return whether resets keep an array or parts of it: materials of bodies, and the root assistance."""
+    return name.startswith(("matter.", "contact.")) or name.endswith(_ASSIST)
+
+
+def _check_range(name: str, value: np.ndarray, most: float) -> None:
+    """Refuse numbers that are negative or above ``most``."""
+    bad = (value < 0.0) | (value > most)
+    if bad.any():
+        first = tuple(np.argwhere(bad)[0].tolist())
+        limit = f" and <= {most:g}" if np.isfinite(most) else ""
+        raise ValueError(
+            f"state[{name!r}]{list(first)}={value[first]} must be >= 0{limit}; use what get_state() returned"
+        )
+
+
+def _check_finite(name: str, value: np.ndarray, failed: np.ndarray) -> None:
+    """Refuse numbers that are not finite where the environment has not failed."""
+    bad = ~np.isfinite(value)
+    if bad.any():
+        bad[failed] = False
+    if bad.any():
+        first = tuple(np.argwhere(bad)[0].tolist())
+        raise ValueError(f"state[{name!r}]{list(first)} is {value[first]}, not finite; use what get_state() returned")
 
 
 def settings_rows(config: BaseModel, num_envs: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What the two back ends have in common: how they are asked for a picture."""
+"""Interface of the two back ends: a shot in, a picture out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from piavatar_envs.render.shadow import GroundShadow
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """Where a picture is taken from.
+    """Camera of one picture.
 
     Attributes:
         eye: the camera's position [m], shape ``(3,)``.
@@ -29,7 +29,7 @@ class Shot:
 
     @property
     def up(self) -> tuple[float, float, float]:
-        """What is up in the picture: z, or y where the camera looks straight down or up."""
+        """Direction that points up in the picture: z, or y where the camera looks straight down or up."""
         way = np.asarray(self.target, np.float64) - self.eye
         steep = np.hypot(way[0], way[1]) < 1e-3 * abs(way[2])
         return (0.0, 1.0, 0.0) if steep else (0.0, 0.0, 1.0)
@@ -41,7 +41,7 @@ class Backend(Protocol):
     def draw(
         self, topology: Topology, vertices: np.ndarray, colors: np.ndarray, shadow: GroundShadow, shot: Shot
     ) -> np.ndarray:
-        """One picture.
+        """Draw one picture.
 
         Args:
             topology: the triangles; a new object where they changed.
@@ -51,10 +51,10 @@ class Backend(Protocol):
             shot: where the picture is taken from.
 
         Returns:
-            The picture, shape ``(height, width, 3)`` uint8; the caller's own.
+            The picture, shape ``(height, width, 3)`` uint8, a copy.
         """
         ...
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Free the window and the buffers."""
         ...

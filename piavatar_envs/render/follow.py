@@ -1,4 +1,4 @@
-"""What the camera looks around: the ground point below what it follows, after which it glides."""
+"""Camera that glides after a point on the ground."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ HOST = "127.0.0.1"
 PORT = 8080
 #: Ports that are tried, one after the other.
 _TRIES = 1000
-#: All that moves hangs from it, and it moves against what the camera follows: cameras are left to those who hold them.
+#: Parent of all meshes; it moves against the followed point, because browsers control their cameras themselves.
 _WORLD = "/world"
 _GROUND_SIZE = 40.0
 #: A warm sun, a cool sky and what the ground gives back, as in the pictures; bytes.
@@ -36,10 +36,10 @@ _KEY_LIGHT, _SKY_LIGHT, _GROUND_LIGHT = (255, 243, 226), (216, 228, 250), (206, 
 
 
 def import_viser() -> ModuleType:
-    """The library.
+    """Import the library.
 
     Raises:
-        ImportError: it is not installed; says how to.
+        ImportError: it is not installed; names the extra.
     """
     try:
         import viser
@@ -51,7 +51,7 @@ def import_viser() -> ModuleType:
 
 
 def check_port(port: int) -> None:
-    """Refuse a port from which on there are not enough to try.
+    """Refuse a port that is followed by fewer ports than are tried.
 
     Raises:
         ValueError: it is outside [1, 64536].
@@ -61,18 +61,18 @@ def check_port(port: int) -> None:
 
 
 class LiveView:
-    """Shows scenes to every browser that looks at :attr:`url`.
+    """Shows scenes in every browser that opens :attr:`url`.
 
     Attributes:
         server: the library's, for panels.
-        url: where to look.
+        url: address of the view.
     """
 
     def __init__(self, camera: Camera | None = None, port: int = PORT) -> None:
-        """Start the server, and say where it is.
+        """Start the server, and print its address.
 
         Args:
-            camera: where a browser looks from at first; as a picture's, by default.
+            camera: first view of a browser; that of a picture by default.
             port: of this machine, or the next one that is free.
 
         Raises:
@@ -85,9 +85,9 @@ class LiveView:
         self._nodes: dict[str, viser.MeshHandle] = {}
         with _silence():
             self.server: viser.ViserServer = library.ViserServer(HOST, port, "piavatar-envs", verbose=False)
-        # any page that a browser of this machine has open may send what the hidden button would: no tunnel is opened
+        # a page of any site could press the hidden button, so no public tunnel may be opened
         self.server.request_share_url = lambda *_arguments, **_more: None
-        atexit.register(self.close)  # or the library tells of it itself
+        atexit.register(self.close)  # without it the library prints a message of its own
         self.url = f"http://{HOST}:{self.server.get_port()}"
         self._set_up(self._follower.camera)
         self._closed = False
@@ -121,10 +121,10 @@ class LiveView:
         self._scale = self.server.gui.add_image(np.rint(255.0 * scale).astype(np.uint8), visible=False, format="png")
 
     def show(self, scene: Scene, elapsed: float | None) -> None:
-        """Show a scene. Meshes that were there are moved, not made anew.
+        """Show a scene; meshes that exist are moved, not made anew.
 
         Args:
-            scene: all that is to be seen.
+            scene: the scene description.
             elapsed: simulated time since the last one [s], in which the camera glides after what it follows; None where
                 it jumps there.
         """
@@ -146,7 +146,7 @@ class LiveView:
         self._scale.visible = bool(strained)
 
     def _place(self, name: str, vertices: np.ndarray, faces: np.ndarray, color: tuple[int, int, int]) -> None:
-        """Put a mesh where it is; only what has changed is sent."""
+        """Add or update a mesh; the library sends changes only."""
         node = self._nodes.get(name)
         if node is None:
             self._nodes[name] = self.server.scene.add_mesh_simple(name, vertices, faces, color=color)
@@ -182,13 +182,13 @@ def _bytes(color: Color) -> tuple[int, int, int]:
 
 
 class _Muted(io.TextIOBase):
-    """A standard output that does not let the library tell of itself, from whatever thread; all else passes."""
+    """Standard output that drops the lines of the library, from any thread."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write, or do not."""
+        """Write a text, unless it is the library's."""
         return len(text) if "viser" in text else self._stream.write(text)
 
     def flush(self) -> None:
@@ -198,6 +198,6 @@ class _Muted(io.TextIOBase):
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """The library is quiet within it: it tells of itself, whether asked to or not."""
+    """Drop the library's output within a block, because ``verbose=False`` leaves some of it."""
     with contextlib.redirect_stdout(_Muted(sys.stdout)):
         yield

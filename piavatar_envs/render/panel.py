@@ -1,4 +1,4 @@
-"""What the visitors of a live view can ask for, and what they are told, beside the scene."""
+"""Controls and a table beside the scene of a live view."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ COLORS = ("skin", "strain")
 
 
 class Panel:
-    """Buttons and a table in the browser. Clicks come from other threads: they only leave a wish here.
+    """Buttons and a table in the browser; clicks arrive in other threads, and are only stored here.
 
     Attributes:
-        playing: whether the simulation shall run.
-        speed: simulated over real time, at most.
+        playing: whether the simulation runs.
+        speed: greatest ratio of simulated to real time.
         color: of the bodies, ``"skin"`` or ``"strain"``.
     """
 
@@ -38,41 +38,41 @@ class Panel:
         self._color = gui.add_dropdown("Colour", COLORS, initial_value=color)
         self._text = gui.add_markdown("")
         self._play.on_click(lambda _event: self.play(not self.playing))
-        self._step.on_click(lambda _event: self.ask_for_step())
-        self._begin.on_click(lambda _event: self.ask_for_episode())
+        self._step.on_click(lambda _event: self.request_step())
+        self._begin.on_click(lambda _event: self.request_episode())
         self._speed.on_update(lambda _event: setattr(self, "speed", self._speed.value))
         self._color.on_update(lambda _event: setattr(self, "color", self._color.value))
 
     def play(self, playing: bool) -> None:
-        """Let it run, or stand still."""
+        """Run or pause."""
         self.playing = playing
         self._play.label = "Pause" if playing else "Play"
 
-    def ask_for_step(self) -> None:
-        """Stand still after one more step."""
+    def request_step(self) -> None:
+        """Pause after one more step."""
         self.play(False)
         self._single_step = True
 
-    def ask_for_episode(self) -> None:
+    def request_episode(self) -> None:
         """Begin a new episode before the next step."""
         self._new_episode = True
 
     def take_step(self) -> bool:
-        """Whether to make a step now; a single one that was asked for is granted once."""
-        asked, self._single_step = self._single_step, False
-        return asked or self.playing
+        """Return whether to step now; a requested single step counts once."""
+        requested, self._single_step = self._single_step, False
+        return requested or self.playing
 
     def take_episode(self) -> bool:
-        """Whether a new episode was asked for since the last call."""
-        asked, self._new_episode = self._new_episode, False
-        return asked
+        """Return whether a new episode was requested since the last call."""
+        requested, self._new_episode = self._new_episode, False
+        return requested
 
-    def tell(self, title: str, values: Mapping[str, str]) -> None:
+    def show_table(self, title: str, values: Mapping[str, str]) -> None:
         """Show a table.
 
         Args:
-            title: above it.
-            values: what stands beside each name.
+            title: above the table.
+            values: by name, a row each.
         """
         rows = [f"| {name} | {value} |" for name, value in values.items()]
         self._text.content = "\n".join([f"**{title}**", "", "| | |", "| :-- | --: |", *rows])

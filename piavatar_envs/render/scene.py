@@ -1,4 +1,4 @@
-"""What a picture shows: bodies, markers and the camera. Plain data, no graphics library."""
+"""Scene description: bodies, markers and the camera, as plain data without a graphics library."""
 
 from __future__ import annotations
 
@@ -183,14 +183,14 @@ class Camera:
     follow: float = 0.15
 
     def glide(self, center: np.ndarray, before: np.ndarray, now: np.ndarray, seconds: float) -> np.ndarray:
-        """Where it is after a time [s] in which the point that it follows has gone straight from one place to another.
+        """Return the centre after a time [s] in which the followed point has moved straight from one place to another.
 
-        The solution of ``dc/dt = k (p - c)``: however often it is asked for on the way, it comes to the same.
+        The solution of ``dc/dt = k (p - c)``, which does not depend on the number of calls on the way.
 
         Args:
-            center: where it was [m].
-            before: where the point was [m].
-            now: where it is [m].
+            center: of the camera, before [m].
+            before: the followed point, before [m].
+            now: the followed point, now [m].
             seconds: the time, not negative.
         """
         if self.follow == 0.0 or seconds == 0.0:

@@ -21,7 +21,7 @@ _KEY_LIGHT = np.array([1.12, 1.06, 0.985], dtype=np.float32)
 _SKY_LIGHT = np.array([0.43, 0.455, 0.50], dtype=np.float32)
 _GROUND_LIGHT = np.array([0.27, 0.245, 0.225], dtype=np.float32)
 _RIM_LIGHT = np.array([0.34, 0.38, 0.44], dtype=np.float32)
-#: Light bleeds around the terminator, red furthest: what tells skin from plastic.
+#: Light bleeds around the terminator, red furthest, as in skin.
 _WRAP = np.array([0.30, 0.19, 0.14], dtype=np.float32)
 _SHININESS = 5  # as a power of two: cheaper by squaring
 _SPECULAR = 0.09

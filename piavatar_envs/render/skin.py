@@ -24,14 +24,14 @@ _MIN_RELATIVE_OVERLAP = 0.05
 
 
 class SkinnedSurface(Protocol):
-    """What :class:`Skin` needs of an asset: the skinning of its vertices."""
+    """Skinning of an asset's vertices."""
 
     skin_joints: np.ndarray
     skin_weights: np.ndarray
 
 
 class RestShape(Protocol):
-    """What :class:`Skin` needs of a shaped body: its rest pose."""
+    """Rest pose of a shaped body."""
 
     vertices: np.ndarray
     joints: np.ndarray
@@ -178,7 +178,7 @@ def _select(
     distance: np.ndarray, index: np.ndarray, overlap: np.ndarray, compatible: np.ndarray, num_neighbours: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Nearest compatible candidates of each row and their weights, both ``(rows, num_neighbours)``."""
-    # A vertex that shares bones with nobody takes the nearest particles.
+    # A vertex that shares no bone with any candidate takes the nearest particles.
     compatible = np.where(compatible.any(axis=1, keepdims=True), compatible, True)
     overlap = np.where(compatible, np.maximum(overlap, 1e-6), 0.0)
     order = np.argsort(np.where(compatible, distance, np.inf), axis=1, kind="stable")[:, : num_neighbours + 1]

@@ -109,13 +109,13 @@ def _write_gif(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
 
 
 def _gif_durations(count: int, fps: float) -> list[int]:
-    """How long each frame is shown [ms], in whole hundredths of a second that do not drift from ``fps``."""
+    """Return the duration of each frame [ms], in whole hundredths of a second that do not drift from ``fps``."""
     begins = np.rint(np.arange(count + 1) * 100.0 / min(fps, _GIF_FASTEST))
     return (10 * np.diff(begins)).astype(int).tolist()
 
 
 def _checked(frame: np.ndarray, shape: tuple[int, ...] | None, count: int) -> np.ndarray:
-    """The frame as contiguous bytes; refuses what is not a picture of the first one's size."""
+    """Return the frame as contiguous bytes, and refuse one of another type or size than the first."""
     frame = np.asarray(frame)
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
         raise ValueError(f"frame {count} is {frame.dtype} of shape {frame.shape}; give uint8 (H, W, 3)")

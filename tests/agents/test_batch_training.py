@@ -8,7 +8,7 @@ from pydantic import Field
 
 from agents.batch_training import BatchTraining
 from agents.evaluate import Episode, in_every_seat, play, zero_agent
-from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
 
@@ -29,7 +29,7 @@ def rowing(observation: np.ndarray) -> np.ndarray:
 def test_every_episode_is_the_one_a_single_env_would_play(make_env, device):
     """Environments of a batch end at different times, but no step after the end counts."""
     task = load_task("PIAvatar/Reach-v0")
-    batch = BatchedEpisodes(task(load_config(task.Config, None, SETTINGS)), 3, device)
+    batch = EpisodeHost(task(load_config(task.Config, None, SETTINGS)), 3, device)
     calls = []
 
     def agent(observation: np.ndarray) -> np.ndarray:
@@ -62,13 +62,13 @@ def test_falls_and_pushes_are_told(device):
     """Without any action a body falls, before its time."""
     task = load_task("PIAvatar/PushRecovery-v0")
     config = load_config(task.Config, {"fidelity": "tiny", "throw_interval": 0.4, "episode_seconds": 3.0})
-    batch = BatchedEpisodes(task(config), 4, device)
+    batch = EpisodeHost(task(config), 4, device)
     found = play("zero", in_every_seat(zero_agent(batch.action_size)), batch, first_seed=3)
     assert all(episode.terminated and episode.steps < 90 for episode in found.episodes)
     assert sum(row["episodes"] for row in found.row()["by_push"]) == 4
     assert max(episode.push for episode in found.episodes) > config.hit_impulse
     short = load_config(task.Config, {"fidelity": "tiny", "episode_seconds": 0.1})
-    still = BatchedEpisodes(task(short), 2, device)
+    still = EpisodeHost(task(short), 2, device)
     for episode in play("zero", in_every_seat(zero_agent(batch.action_size)), still, first_seed=3).episodes:
         assert not episode.terminated and episode.steps == 3 and episode.push == 0.0
     batch.close()

@@ -29,13 +29,13 @@ def test_it_falls_in_equal_steps_and_some_have_none(device):
     had = []
     for _ in range(9):
         env.step(still)
-        had.append(np.concatenate([group.simulation.controllers[0].assist.numpy() for group in env.episodes.groups]))
+        had.append(np.concatenate([group.simulation.controllers[0].assist.numpy() for group in env.host.groups]))
     expected = [0.8] * 3 + [0.4] * 3 + [0.0] * 3
     np.testing.assert_allclose(had, np.outer(expected, [0.0, 0.5, 1.0]), atol=1e-7)
     env.close()
     alone = HelpedEnv(settings, 3, "Stand-v0", 1, device, {"fidelity": "tiny"})
     alone.step(still[:1])
-    assert alone.episodes.groups[0].simulation.controllers[0].assist.numpy().tolist() == pytest.approx([0.8])
+    assert alone.host.groups[0].simulation.controllers[0].assist.numpy().tolist() == pytest.approx([0.8])
     alone.close()
 
 
@@ -53,7 +53,7 @@ def test_it_falls_after_success_and_rises_after_failure(device, task, expected):
     still = torch.zeros(3, env.num_actions, device=env.device)
     for shares in np.repeat(expected, 3, axis=0):
         _, _, _, extras = env.step(still)
-        groups = env.episodes.groups
+        groups = env.host.groups
         had = np.concatenate([group.simulation.controllers[0].assist.numpy() for group in groups])
         np.testing.assert_allclose(had, shares, atol=1e-6)
         assert float(extras["log"]["Task/help"]) == pytest.approx(shares.mean(), abs=1e-6)

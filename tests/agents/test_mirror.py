@@ -7,21 +7,21 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra train")
 
 from agents.rsl_rl.ppo import Mirror  # noqa: E402
-from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
+from piavatar_envs.api.host import EpisodeHost  # noqa: E402
 from piavatar_envs.config import load_config  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 
 STANDING = ("Stand-v0", "PushRecovery-v0", "Walk-v0", "GetUp-v0")
 
 
-def batch(name: str, num_envs: int, device: str, **settings) -> BatchedEpisodes:
+def batch(name: str, num_envs: int, device: str, **settings) -> EpisodeHost:
     """A small body that stands exactly in its rest pose."""
     task = load_task(name)
     config = load_config(task.Config, {"fidelity": "tiny", **settings})
-    return BatchedEpisodes(task(config), num_envs, device, "torch", 1)
+    return EpisodeHost(task(config), num_envs, device, "torch", 1)
 
 
-def mirror_of(episodes: BatchedEpisodes) -> Mirror:
+def mirror_of(episodes: EpisodeHost) -> Mirror:
     return Mirror(episodes.layout.values(), episodes.groups[0].action_spec.joints, episodes.api.device)
 
 

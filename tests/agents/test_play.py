@@ -15,7 +15,7 @@ pytest.importorskip("stable_baselines3", reason="needs the extra train")
 from agents import play, scores  # noqa: E402
 from agents.play import open_run  # noqa: E402
 from agents.sb3 import train  # noqa: E402
-from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
+from piavatar_envs.api.host import EpisodeHost  # noqa: E402
 from piavatar_envs.config import load_config  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 
@@ -88,7 +88,7 @@ def test_it_plays_live_as_it_does_in_an_evaluation(kind, device, tmp_path, capsy
     play.main([str(tmp_path / "run"), "--live", "--port", "8500", "--first-seed", "7", "--device", device])
     run = open_run(tmp_path / "run")
     task = load_task(run.env_id)
-    batch = BatchedEpisodes(task(load_config(task.Config, run.env)), 1, device)
+    batch = EpisodeHost(task(load_config(task.Config, run.env)), 1, device)
     (episode,) = play.play("trained", run.make_agent(batch.layout, batch.action_size), batch, 7).episodes
     assert totals == [(7, 8500, pytest.approx(episode.total, rel=1e-4))]
 
@@ -109,7 +109,7 @@ def test_it_plays_live_as_it_does_in_an_evaluation(kind, device, tmp_path, capsy
 )
 def test_what_cannot_be_played_is_refused(options, words, device, tmp_path, capsys, monkeypatch):
     run_of("ppo", tmp_path / "run", device)
-    for builder in ("BatchedEpisodes", "EnvFactory"):
+    for builder in ("EpisodeHost", "EnvFactory"):
         monkeypatch.setattr(play, builder, None)  # nothing is built
     with pytest.raises(SystemExit, match=f"error: .*{words}"):
         play.main([str(tmp_path / "run"), *options, "--device", device])

@@ -95,7 +95,7 @@ def test_a_training_that_is_refused_leaves_no_folder(setting, words, device, tmp
 
 def test_scores_are_not_written_over_a_training(ended, tmp_path, device, monkeypatch):
     for module in (score_pid, score_random):
-        monkeypatch.setattr(module, "BatchedEpisodes", None)  # nothing is built
+        monkeypatch.setattr(module, "EpisodeHost", None)  # nothing is built
     monkeypatch.setattr(demo, "prepare", None)
     kept = {name: tmp_path / name for name in ("checkpoint.pt", "policy.pt", "policy.zip")}
     for name, folder in kept.items():
@@ -115,7 +115,7 @@ def test_figures_that_cannot_be_written_are_refused_before_anything_is_played(pl
     (tmp_path / "file").touch()
     (tmp_path / "folder.json").mkdir()
     for module in (play, score_pid, score_random):
-        monkeypatch.setattr(module, "BatchedEpisodes", None)
+        monkeypatch.setattr(module, "EpisodeHost", None)
     out = str(tmp_path / place)
     for main in (play.main, scores.main, compare.main):
         assert any(words in refused(main, str(ended), "--out", out) for words in ("cannot be written", "is a folder"))
@@ -143,7 +143,7 @@ def test_figures_that_cannot_be_written_are_refused_before_anything_is_played(pl
     ],
 )
 def test_policies_play_only_what_they_were_trained_for(settings, words, ended, device, monkeypatch):
-    monkeypatch.setattr(play, "BatchedEpisodes", None)
+    monkeypatch.setattr(play, "EpisodeHost", None)
     assert words in refused(play.main, str(ended), *settings, "--device", device)
 
 

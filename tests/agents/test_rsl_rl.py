@@ -17,7 +17,7 @@ from agents.checkpoint import Checkpoint  # noqa: E402
 from agents.rsl_rl import ppo as rsl_algorithm  # noqa: E402
 from agents.rsl_rl import train as rsl_ppo  # noqa: E402
 from agents.rsl_rl.policy import RslTraining  # noqa: E402
-from piavatar_envs.api.batched import BatchedEpisodes  # noqa: E402
+from piavatar_envs.api.host import EpisodeHost  # noqa: E402
 from piavatar_envs.avatar.motion import deepmimic  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
 from tests.agents.killing import flat, run_killed  # noqa: E402
@@ -68,7 +68,7 @@ def test_training_changes_the_policy_repeats_and_depends_on_its_seed(device, tmp
     assert apart("a", "b") == 0.0
     assert apart("a", "c") > 1e-2 and apart("a", "short") > 1e-5
     rng = np.random.default_rng(0)
-    layout = BatchedEpisodes(new_task(config, load_task), 1, device).layout
+    layout = EpisodeHost(new_task(config, load_task), 1, device).layout
     seen, changed = rng.normal(size=(2, 4, 1, layout.size)).astype(np.float32)
     chosen = layout["target_position"].slice
     changed[..., chosen] = seen[..., chosen]

@@ -13,7 +13,7 @@ from agents import score_random, scores
 from agents.config import first_training_seed
 from agents.evaluate import in_every_seat, over_seeds, play, random_agent
 from agents.pid import score as score_pid
-from piavatar_envs.api.batched import BatchedEpisodes
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
 
@@ -36,7 +36,7 @@ def test_every_seed_is_a_stream_of_its_own_in_the_same_episodes(run, device, tmp
     env = report["config"]["env"]
     assert env == json.loads((run / "results.json").read_text())["config"]["env"]
     task = load_task("Stand-v0")
-    batch = BatchedEpisodes(task(load_config(task.Config, env)), 2, device)
+    batch = EpisodeHost(task(load_config(task.Config, env)), 2, device)
     agents = [random_agent(batch.action_size, first_training_seed(seed)) for seed in range(3)]
     rows = [play("random", in_every_seat(agent), batch, 1_000_000).row() for agent in agents]
     batch.close()
@@ -55,6 +55,6 @@ def test_what_is_no_run_and_one_seed_are_refused(run, tmp_path, monkeypatch):
     (tmp_path / "results.json").write_text("{}")
     with pytest.raises(SystemExit, match=r"has no config.env_id and config.env"):
         score_random.main([str(tmp_path)])
-    monkeypatch.setattr(score_random, "BatchedEpisodes", None)  # nothing is built
+    monkeypatch.setattr(score_random, "EpisodeHost", None)  # nothing is built
     with pytest.raises(SystemExit, match="seeds=1 must be >= 2"):
         score_random.main([str(run), "--seeds", "1"])

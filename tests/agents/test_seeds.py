@@ -66,5 +66,5 @@ def test_environments_of_rsl_rl_begin_with_the_run_s_episodes(device):
 
     config = load_batched(RslTraining, load_task, {"seed": 5, "num_envs": 3, "env": {"fidelity": "tiny"}})
     env = rsl_ppo.make_env(config, new_task(config, load_task), device)
-    assert env.episodes.read(lambda group: group.seed).tolist() == [seeds.first_training_seed(5) + n for n in range(3)]
+    assert env.host.read(lambda group: group.seed).tolist() == [seeds.first_training_seed(5) + n for n in range(3)]
     env.close()

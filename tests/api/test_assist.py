@@ -55,7 +55,7 @@ def batches(env) -> list:
     """The environments behind a view."""
     if hasattr(env, "batch"):
         return [env.batch]
-    return getattr(env, "vector", env).episodes.groups
+    return getattr(env, "vector", env).host.groups
 
 
 def pelvis_heights(env, agent: int = 0) -> np.ndarray:

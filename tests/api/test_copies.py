@@ -157,10 +157,10 @@ def test_another_process_goes_on(make_env, same):
 def play_vector(vector) -> list:
     answers = []
     for action in actions_of(vector, 9, seed=1):
-        ended = np.array(vector.episodes.find_ended().tolist())
+        ended = np.array(vector.host.find_ended().tolist())
         if vector.autoreset_mode == AutoresetMode.DISABLED and ended.any():
             answers.append(vector.reset(options={"reset_mask": ended}))
-        answers.append(vector.step(vector.episodes.api.from_host(action)))
+        answers.append(vector.step(vector.host.api.from_host(action)))
     return answers
 
 
@@ -177,7 +177,7 @@ def test_vectors_go_on(make_vec, same, mode, steps):
         vector.step(action)
     assert_copies_go_on(vector, same, play_vector)
     other = copy.deepcopy(vector)
-    assert other.autoreset_mode is mode and len(other.episodes.groups) == len(vector.episodes.groups)
+    assert other.autoreset_mode is mode and len(other.host.groups) == len(vector.host.groups)
     other.close()
 
 
@@ -234,7 +234,7 @@ def play_learners(view, steps: int = 9, seed: int = 1) -> list:
     """What a view for learners returns on the way over the ends of its episodes."""
     import torch
 
-    episodes, rng = view.episodes, np.random.default_rng(seed)
+    episodes, rng = view.host, np.random.default_rng(seed)
     answers = []
     for _ in range(steps):
         actions = rng.uniform(-1.0, 1.0, (episodes.num_agents, view.num_envs, episodes.action_size))
@@ -254,7 +254,7 @@ def test_views_for_learners_go_on(device, make, arrays_in, equal):
     expected = list(arrays_in(play_learners(view)))
     assert len(expected) > 50
     for other in copies.values():
-        assert other.config == view.config and len(other.episodes.groups) == len(view.episodes.groups)
+        assert other.config == view.config and len(other.host.groups) == len(view.host.groups)
         assert getattr(other, "groups", None) == getattr(view, "groups", None)
         assert other.note == view.note and other.note is not view.note
         found = list(arrays_in(play_learners(other)))
@@ -291,8 +291,8 @@ def test_nobody_watches_a_copy_before_its_reset(device):
     env.reset(seed=0)
     other = copy.deepcopy(env)
     other.step(actions_of(env, 1, seed=0)[0])
-    assert other.render_mode == "human" and other._episode._live._view is None
+    assert other.render_mode == "human" and other.host.live._view is None
     other.reset()
-    assert other._episode._live._view is not None
+    assert other.host.live._view is not None
     env.close()
     other.close()

@@ -215,9 +215,7 @@ def test_the_camera_can_be_moved(device):
         frame = env.render().astype(int)
         skin = frame[..., 0] - frame[..., 2] > 30  # redder than ground and sky
         shown[name] = np.ptp(np.argwhere(skin), axis=0) / 96.0 if skin.any() else np.zeros(2)
-        assert (
-            env.unwrapped._episode._pictures._opened[0].renderer._follower.center == 0.0
-        ).all() or camera is not front
+        assert (env.unwrapped.host.pictures._opened[0].renderer._follower.center == 0.0).all() or camera is not front
         env.close()
     assert shown["front"][0] > 0.6 and shown["front"][1] > 1.5 * shown["aside"][1] > 0.1
     assert 0.05 < shown["above"][0] < 0.3 and shown["task"][0] > 0.5
@@ -237,7 +235,7 @@ def test_the_camera_is_where_time_has_brought_it(device):
         ).unwrapped
 
     def centre(env) -> np.ndarray:
-        return env._episode._pictures._opened[0].renderer._follower.center
+        return env.host.pictures._opened[0].renderer._follower.center
 
     def go(env, aside: float, every: int) -> None:
         action = np.zeros(env.action_space.shape, np.float32)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from piavatar_envs.api.gym_env import AvatarEnv
-from piavatar_envs.api.live import Pace
+from piavatar_envs.api.pictures import Pace
+from piavatar_envs.envs.batch_env import BatchEnv
 
 
 class FakeTime:
@@ -42,7 +43,7 @@ def make_human(device):
         settings = {"device": device, "fidelity": "tiny", **settings}
         env = gymnasium.make(env_id, render_mode="human", disable_env_checker=True, **settings)
         time = FakeTime()
-        env.unwrapped._episode._live.pace = time.pace()
+        env.unwrapped.host.live.pace = time.pace()
         made.append(env)
         return env, time
 
@@ -53,7 +54,7 @@ def make_human(device):
 
 def shown(env) -> dict[str, np.ndarray]:
     """Vertices of what the view holds, by name."""
-    return {name: node.vertices for name, node in env.unwrapped._episode._live.view._nodes.items()}
+    return {name: node.vertices for name, node in env.unwrapped.host.live.view._nodes.items()}
 
 
 @pytest.mark.parametrize("color", ["skin", "strain"])
@@ -108,12 +109,11 @@ def test_resets_and_steps_update_the_view_by_themselves(make_human, env_id):
 def test_steps_take_no_less_than_their_time(make_human, monkeypatch, work, slept):
     """Of a control step of 1/30 s only what is left is slept, and nothing where it took longer."""
     env, time = make_human("PIAvatar/Reach-v0")
-    batch = env.unwrapped.batch
-    step = batch.step
-    monkeypatch.setattr(batch, "step", lambda: (step(), time.work(work)))
+    step = BatchEnv.step
+    monkeypatch.setattr(BatchEnv, "step", lambda batch: (step(batch), time.work(work)))
     env.reset(seed=0)
     time.work(-time.now)
-    env.unwrapped._episode._live.pace.begin()
+    env.unwrapped.host.live.pace.begin()
     for _ in range(6):
         env.step(np.zeros(env.action_space.shape, np.float32))
     assert time.slept == pytest.approx([slept] * 6 if slept else [])
@@ -132,7 +132,7 @@ def test_what_sleep_oversleeps_does_not_add_up():
 def test_what_is_quicker_than_a_screen_is_not_all_sent(make_human, monkeypatch):
     env, _ = make_human("PIAvatar/Reach-v0", control_dt=0.005)
     env.reset(seed=0)
-    live, sent = env.unwrapped._episode._live, []
+    live, sent = env.unwrapped.host.live, []
     monkeypatch.setattr(live.view, "show", lambda scene, elapsed: sent.append(elapsed))
     for _ in range(40):
         env.step(np.zeros(env.action_space.shape, np.float32))
@@ -143,19 +143,19 @@ def test_closing_stops_the_server(make_human):
     env, _ = make_human("PIAvatar/Reach-v0")
     env.close()
     env.reset(seed=0)
-    view = env.unwrapped._episode._live.view
+    view = env.unwrapped.host.live.view
     env.close()
     env.close()
     assert view._closed
     env.step(np.zeros(env.action_space.shape, np.float32))
-    assert env.unwrapped._episode._live._view is None, "only what begins anew opens it again"
+    assert env.unwrapped.host.live._view is None, "only what begins anew opens it again"
 
 
 def test_nothing_is_opened_before_the_first_reset(make_human):
     env, _ = make_human("PIAvatar/Reach-v0")
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.unwrapped.render()
-    assert env.unwrapped._episode._live._view is None
+    assert env.unwrapped.host.live._view is None
 
 
 def test_a_missing_viser_shows_at_once(monkeypatch, device):

@@ -97,12 +97,12 @@ def test_logs_are_means_of_what_info_says(env):
     for _ in range(3):
         _, reward, _, extras = env.step(drawn(env, rng))
     info, log = extras["info"], extras["log"]
-    assert set(log) == {"Task/success"} | {f"Task/{name}" for name in env.episodes.task.metric_names} | {
-        f"Reward/{name}" for name in env.episodes.task.reward_names
+    assert set(log) == {"Task/success"} | {f"Task/{name}" for name in env.host.task.metric_names} | {
+        f"Reward/{name}" for name in env.host.task.reward_names
     }
-    for name in env.episodes.task.metric_names:
+    for name in env.host.task.metric_names:
         assert log[f"Task/{name}"].item() == pytest.approx(info[name].mean().item(), rel=1e-5)
-    terms = sum(log[f"Reward/{name}"].item() for name in env.episodes.task.reward_names)
+    terms = sum(log[f"Reward/{name}"].item() for name in env.host.task.reward_names)
     assert terms == pytest.approx(reward.mean().item(), rel=1e-4)
 
 

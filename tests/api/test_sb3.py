@@ -124,7 +124,7 @@ def test_attributes_are_shared_and_methods_are_few(make_sb3, make_env, equal):
     assert np.array_equal(vector.vector.get_state()["particles.x"][0], others)
     with pytest.raises(ValueError, match="pose"):
         vector.env_method("reset", options={"pose": 1}, indices=0)
-    with pytest.raises(AttributeError, match="'step' is not for single environments"):
+    with pytest.raises(AttributeError, match="'step' is not a call of single environments"):
         vector.env_method("step", None)
     vector.set_options({"pose": 1})
     with pytest.raises(ValueError, match="pose"):

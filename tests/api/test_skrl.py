@@ -87,7 +87,7 @@ def play_and_compare(arena, ring, equal, world: int, actions: list[dict]) -> Non
     resets = 0
     for step, act in enumerate(actions):
         if step == 2:
-            knock_down(arena.episodes, (1, 1))
+            knock_down(arena.host, (1, 1))
             if world == 1:
                 knock_down(ring, (0, 1))
         playing = list(ring.agents)
@@ -130,7 +130,7 @@ def test_every_world_is_the_one_that_pettingzoo_shows(arena, ring, equal, world)
 def test_a_world_ends_with_its_last_agent_and_begins_anew(arena):
     arena.reset(seed=1)
     still = {name: torch.zeros_like(action) for name, action in drawn(arena, np.random.default_rng(0)).items()}
-    knock_down(arena.episodes, (0, 0), (0, 1), (0, 2), (1, 2))
+    knock_down(arena.host, (0, 0), (0, 1), (0, 2), (1, 2))
     observed, _, terminated, truncated, infos = arena.step(still)
     assert infos["_final_obs"].tolist() == [True, False]
     for index, name in enumerate(arena.agents):

@@ -204,7 +204,7 @@ def test_a_yaml_file_configures(tmp_path, device):
     path.write_text("episode_seconds: 0.5\nphysics: {fidelity: tiny, control_dt: 0.05}\n")
     vector = AvatarVectorEnv("Reach-v0", 2, device=device, config=path, alpha=0.2)
     assert vector.config.control.alpha == 0.2 and vector.metadata["render_fps"] == 20
-    assert vector.episodes.groups[0].max_steps == 10
+    assert vector.host.groups[0].max_steps == 10
     vector.close()
 
 

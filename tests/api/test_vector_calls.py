@@ -146,7 +146,7 @@ def assert_refused(vector, action, cases) -> None:
         with pytest.raises(ValueError, match=told):
             vector.step(spoil(action))
         assert bytes_of(vector.get_state()) == before
-    assert not any(group.action.numpy().any() for group in vector.episodes.groups)
+    assert not any(group.action.numpy().any() for group in vector.host.groups)
 
 
 @pytest.mark.parametrize("array_api", ["numpy", "torch"])
@@ -167,7 +167,7 @@ def test_a_tensor_that_is_not_finite_acts_as_zero_and_ends_its_environment(make_
     vector = make_vec(env_id, 3, array_api="torch", autoreset_mode=AutoresetMode.SAME_STEP)
     vector.reset(seed=1)
     following = vector.reset()[0]
-    bad = torch.full(vector.action_space.shape, 0.5, device=vector.episodes.api.device)
+    bad = torch.full(vector.action_space.shape, 0.5, device=vector.host.api.device)
     vector.reset(seed=1)
     expected, *_, clean = vector.step(bad)
     assert not clean["_final_info"].any()
@@ -208,11 +208,11 @@ def test_returned_arrays_are_the_callers(make_vec, env_id, arrays_in, array_api,
         assert all(np.array_equal(_on_host(a), b) for a, b in zip(arrays, kept, strict=True)), "written to afterwards"
     spoilt = run(spoil=True)[1]
     assert np.array_equal(spoilt[-1][0], copies[-1][0])
-    if vector.episodes.device != "cpu":
+    if vector.host.device != "cpu":
         return
     buffers = [
         array.numpy()
-        for group in vector.episodes.groups
+        for group in vector.host.groups
         for array in (*group.arrays().values(), group.observation, group.reward, group.terms, group.metrics, group.mask)
     ]
     flat = [_on_host(array) for arrays in returned[-2:] for array in arrays]
@@ -228,7 +228,7 @@ def _on_host(array) -> np.ndarray:
 def _tensor(vector, action: np.ndarray):
     import torch
 
-    return torch.from_numpy(action.copy()).to(vector.episodes.api.device)
+    return torch.from_numpy(action.copy()).to(vector.host.api.device)
 
 
 @pytest.mark.parametrize(("mode", "obs_mode"), [("NextStep", "dict"), ("SameStep", "flat"), ("Disabled", "flat")])
@@ -251,7 +251,7 @@ def test_tensors_say_what_arrays_say(make_vec, env_id, equal, mode, obs_mode):
             for i in [i for i, value in enumerate(a) if value is not None]:
                 compare(a[i], b[i], f"{where}[{i}]")
         else:
-            assert isinstance(b, torch.Tensor) and b.device == tensor.episodes.api.device
+            assert isinstance(b, torch.Tensor) and b.device == tensor.host.api.device
             assert b.dtype == {"f": torch.float32, "b": torch.bool}[a.dtype.kind], where
             assert equal(a.astype(b.cpu().numpy().dtype), b.cpu().numpy()), where
 
@@ -267,7 +267,7 @@ def test_a_step_with_tensors_never_makes_the_host_wait(make_vec, env_id, monkeyp
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
         vector = make_vec(env_id, 3, array_api="torch", autoreset_mode=mode, **SHORT)
         vector.reset(seed=0)
-        action = torch.zeros(vector.action_space.shape, device=vector.episodes.api.device)
+        action = torch.zeros(vector.action_space.shape, device=vector.host.api.device)
         vector.step(action)
         with monkeypatch.context() as patch:
             for name in ("synchronize", "synchronize_device", "synchronize_stream"):
@@ -312,8 +312,8 @@ def test_threads_change_nothing(make_vec, env_id, same):
     actions, runs = None, []
     for threads in (1, 3):
         vector = make_vec(env_id, 3, num_threads=threads, autoreset_mode=AutoresetMode.SAME_STEP, **SHORT)
-        if vector.episodes.device == "cpu":
-            assert len(vector.episodes.groups) == threads
+        if vector.host.device == "cpu":
+            assert len(vector.host.groups) == threads
         actions = actions_of(vector, 8)
         runs.append([vector.reset(seed=8)])
         for action in actions[:3]:
@@ -363,9 +363,9 @@ def test_threads_never_capture_at_once(device):
     vector, fresh = (AvatarVectorEnv("KickBall-v0", 3, **settings) for _ in range(2))
     vector.reset(seed=1)
     fresh.set_state(vector.get_state())
-    assert not fresh.episodes.find_ended().any()
-    fresh.episodes.reset_ended()
-    assert all(group.reset_graph.is_captured for group in fresh.episodes.groups)
+    assert not fresh.host.find_ended().any()
+    fresh.host.reset_ended()
+    assert all(group.reset_graph.is_captured for group in fresh.host.groups)
     vector.close()
     fresh.close()
 

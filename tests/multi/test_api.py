@@ -329,9 +329,9 @@ def spoiled(world, how: str) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("how", "told"),
     [
-        ("missing", "no action for LAST; those who act are agent_0, "),
+        ("missing", "no action for LAST; the agents that act are agent_0, "),
         ("nobody", "no action for agent_0, agent_1"),
-        ("stranger", "an action for agent_99; those who act are agent_0, agent_1"),
+        ("stranger", "an action for agent_99; the agents that act are agent_0, agent_1"),
         ("shape", r"LAST: action has shape \(3,\)"),
         ("nan", r"LAST: action\[1\] \(.*\) is nan"),
         ("none", "LAST: action has shape"),
@@ -452,7 +452,7 @@ def test_a_world_is_watched(games, game_name, device, play):
     pytest.importorskip("viser")
     world = fresh(games, game_name, device).parallel_env(render_mode="human")
     world.reset(seed=0)
-    view = world._episode._live.view
+    view = world.host.live.view
     bodies = [f"/world/body_{index}" for index in range(len(world.possible_agents))]
     before = [view._nodes[name].vertices.copy() for name in bodies]
     play(world, 2, np.random.default_rng(0))

@@ -139,7 +139,7 @@ def test_the_world_goes_on_without_those_who_are_out(make_game, play, same):
     assert world.agents == ["agent_0", "agent_2", "agent_3"] and infos["agent_0"]["standing"] == 3
     # its actions are not wanted any more
     idle = {name: np.zeros(world.action_space(name).shape) for name in world.possible_agents}
-    with pytest.raises(ValueError, match="an action for agent_1; those who act are agent_0, agent_2, agent_3"):
+    with pytest.raises(ValueError, match="an action for agent_1; the agents that act are agent_0, agent_2, agent_3"):
         world.step(idle)
     height = pelvises(world)[1, 2]
     rows = play(world, 10)

@@ -16,7 +16,7 @@ from piavatar_envs.render import Skin
 
 @dataclass(frozen=True)
 class Subject:
-    """A shaped body and what fills it."""
+    """A shaped body with its particles and skin."""
 
     asset: AvatarAsset
     body: ShapedBody

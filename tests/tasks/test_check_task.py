@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 import piavatar_envs
-from piavatar_envs.api.batched import BatchedEpisodes
 from piavatar_envs.api.conformance import TaskError
+from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import ConfigError
 from piavatar_envs.core.rng import STREAM_TASK, generator
 from piavatar_envs.envs.observations import ObservationTerm
@@ -118,7 +118,7 @@ class Honest(Task):
 
 def problems_of(fault: int, device: str, steps: int = 6, **options) -> tuple[str, ...]:
     task = type("Broken", (Honest,), {"fault": int(fault)})
-    with pytest.raises(TaskError, match=r"^Broken does not keep what environments promise:\n- ") as told:
+    with pytest.raises(TaskError, match=r"^Broken .*:\n- ") as told:
         piavatar_envs.check_task(task, steps, device, **options)
     return told.value.problems
 
@@ -169,11 +169,11 @@ def test_ranges_and_constants_are_as_declared(device):
 def test_views_that_share_or_take_everything_are_noticed(device, monkeypatch):
     with monkeypatch.context() as patched:
         taken = lambda self, action: self.advance(np.nan_to_num(action)[..., : self.action_size])  # noqa: E731
-        patched.setattr(BatchedEpisodes, "step", taken)
+        patched.setattr(EpisodeHost, "step", taken)
         found = problems_of(0, device)
         assert ["is not refused" in problem for problem in found] == [True, True], found
     if device == "cpu":
-        monkeypatch.setattr(BatchedEpisodes, "read", lambda self, array_of: array_of(self.groups[0]).numpy())
+        monkeypatch.setattr(EpisodeHost, "read", lambda self, array_of: array_of(self.groups[0]).numpy())
         assert any("shares memory with" in problem for problem in problems_of(0, device))
 
 

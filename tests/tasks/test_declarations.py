@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.api.conformance import FiniteWatch, TaskError, check_task
+from piavatar_envs.api.conformance import TaskError, WriteMonitor, check_task
 from piavatar_envs.config import EnvConfig, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.envs.task import NAMES_OF_INFO, Metric, Task, TaskArray, Term
@@ -142,11 +142,11 @@ def test_no_metric_can_take_a_name_of_info(make_env, env_id):
 )
 def test_columns_beyond_those_declared_are_seen(device, declared, found):
     task = made(**declared)
-    watch = FiniteWatch(task)
+    watch = WriteMonitor(task)
     batch = BatchEnv(task, 3, device)
     batch.reset(seeds=[0, 1, 2])
     batch.step()
-    assert watch.beyond() == found and watch.names() == []
+    assert watch.undeclared() == found and watch.not_finite() == []
     columns = min(2, task.columns[0])
     assert batch.terms.shape == (3, 1, 2) and (batch.terms.numpy()[:, 0, :columns] == 1.0).all()
     assert batch.reward.numpy().tolist() == [[float(columns)]] * 3

@@ -16,7 +16,7 @@ from piavatar_envs.tasks import check_task_class, instead_of, load_task
 if TYPE_CHECKING:
     from piavatar_envs.envs.task import Task
 
-#: Games from elsewhere by name, see :func:`add_game`.
+#: Games from elsewhere by name, see :func:`register_game`.
 _added: dict[str, type[Task] | str] = {}
 
 
@@ -30,12 +30,12 @@ def listed_games() -> tuple[str, ...]:
     return (*game_modules(), *_added)
 
 
-def add_game(name: str, task: type[Task] | str) -> None:
-    """Let :func:`load_game_task` find a game that is not of this package.
+def register_game(name: str, task: type[Task] | str) -> None:
+    """Make a task of several agents a game for :mod:`piavatar_envs.multi` and the command line; see docs/tasks.md.
 
     Args:
         name: a name and a version: ``"tag_v0"``. A game from elsewhere that has it already is replaced.
-        task: its class, or ``"module:Class"``, imported when it is first needed.
+        task: a subclass of :class:`piavatar_envs.Task`, or ``"module:Class"``, imported when it is first used.
 
     Raises:
         TypeError: the task is neither.

@@ -1,4 +1,4 @@
-"""Single environments of a vector, asked for by name: Gymnasium's own vector of them is what the answers must equal."""
+"""Calls of single environments of a vector equal those of Gymnasium's own vector of them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_some_take_over_a_state_and_the_others_go_on(pair, equal):
     vector, _ = pair
     first = vector.get_state()
     [seen] = vector.call_some([1], "set_state", vector.call("get_state")[0])
-    both = vector.episodes.observation()[:, 0]
+    both = vector.host.observation()[:, 0]
     assert equal(seen, both[1]) and equal(both[0], both[1])
     assert equal(vector.get_state()["particles.x"][0], first["particles.x"][0])
     bad = vector.call("get_state")[0]
@@ -67,39 +67,39 @@ def test_some_take_over_a_state_and_the_others_go_on(pair, equal):
         vector.call("set_state", first)
 
 
-def test_what_single_environments_cannot_do_says_so(pair):
+def test_calls_that_single_environments_lack_are_refused(pair):
     vector, _ = pair
     for name in ("step", "close", "vector_step_wait"):
         with pytest.raises(AttributeError, match=name):
             vector.call(name, None)
-    with pytest.raises(AttributeError, match="'assist_root', 'get_state', 'render', 'reset', 'set_state', everything"):
+    with pytest.raises(AttributeError, match="'assist_root', 'get_state', 'render', 'reset', 'set_state'"):
         vector.call("step", np.zeros(3))
 
 
-def test_help_is_given_to_all(make_vec):
+def test_root_assistance_is_set_for_all(make_vec):
     vector = make_vec("PIAvatar/Stand-v0", 2)
     vector.reset(seed=0)
     assert vector.call("assist_root", 0.25) == (None, None)
     assert vector.get_state()["controller_0.assist"].tolist() == [0.25, 0.25]
-    with pytest.raises(ValueError, match="give the vector's own a share for each"):
+    with pytest.raises(ValueError, match="a share for each"):
         vector.call_some([0], "assist_root", 0.5)
 
 
-def test_attributes_of_ones_own_are_shared(device):
+def test_users_attributes_are_shared(device):
     vector = AvatarVectorEnv(REACH, 2, device=device, fidelity="tiny")
     vector.set_attr("note", 3)
     vector.set_attr("list", [[1, 2], [1, 2]])
     vector.set_attr("note", (4, 4))
     assert vector.get_attr("note") == (4, 4) and vector.list == [1, 2]
     refused = {
-        "note": ([1, 2], "share their attributes; give one value"),
+        "note": ([1, 2], "share their attributes"),
         "list": ([1, 2, 3], "there are 3 values for num_envs=2"),
-        "tone": (0.5, r"settings hold for as long as the environments live; make others with tone=\.\.\."),
-        "control.tone": (0.5, "settings hold"),
-        "config": (None, "what the environments are made with"),
-        "render_mode": ("rgb_array", "what the environments are made with"),
-        "observation_space": (None, "what the environments are made with"),
-        "step": (None, "what the environments are made with"),
+        "tone": (0.5, r"settings are fixed .* tone=\.\.\."),
+        "control.tone": (0.5, "settings are fixed"),
+        "config": (None, "part of the environments"),
+        "render_mode": ("rgb_array", "part of the environments"),
+        "observation_space": (None, "part of the environments"),
+        "step": (None, "part of the environments"),
     }
     for name, (value, words) in refused.items():
         with pytest.raises(ValueError, match=words):
@@ -118,7 +118,7 @@ def test_some_begin_before_the_others_have(device):
     vector.close()
 
 
-def test_tensors_are_told_one_by_one(make_vec, equal):
+def test_tensors_are_split_by_environment(make_vec, equal):
     torch = pytest.importorskip("torch")
     vector, arrays = make_vec(REACH, 2, array_api="torch", **SHORT), make_vec(REACH, 2, **SHORT)
     for (seen, info), (expected, told) in zip(vector.call("reset", seed=3), arrays.call("reset", seed=3), strict=True):

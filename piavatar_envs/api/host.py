@@ -1,0 +1,562 @@
+"""Host side of the environments: one :class:`EpisodeHost` holds one or many, the views of this folder reshape it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import warp as wp
+from gymnasium.utils import seeding
+
+from piavatar_envs.api.arrays import Array, find_array_api
+from piavatar_envs.api.pictures import Live, Pictures
+from piavatar_envs.avatar.torque_control.controller import checked_assist
+from piavatar_envs.config import EnvConfig
+from piavatar_envs.core.launch_graph import available_cores
+from piavatar_envs.core.rng import NUM_SEEDS, check_seeds
+from piavatar_envs.envs.batch_env import BatchEnv, check_count
+from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.envs.state import check_settings, check_state
+from piavatar_envs.envs.task import Task
+from piavatar_envs.mpm.types import failure_name
+from piavatar_envs.sim.world import check_device
+
+#: Types in which settings are given.
+Settings = EnvConfig | Mapping[str, Any] | str | Path | None
+
+
+class EpisodeHost:
+    """``num_envs`` environments of a task: arrays in, copies out. Nothing resets by itself.
+
+    Environments and agents are counted from 0; the first dimension of every array is the environment, the second (where
+    there is one) the agent. With ``array_api="torch"`` neither :meth:`step` nor :meth:`reset_ended` nor any of the
+    arrays makes the host wait for the device, unless bodies have random shapes: those are drawn on the host.
+
+    On a CPU the environments are split into groups, each stepped by its own thread, because Warp's launches release the
+    GIL. Environments are independent, so the results are the same for any number of threads.
+
+    Attributes:
+        groups: the batches, one after the other; one on a GPU.
+        api: the kind of arrays.
+        task, config: the task and its settings.
+        num_envs, num_agents: number of environments, and of agents in each.
+        layout, action_size, action_names: of an agent's flat observation and of its action.
+        device: name of the Warp device.
+        ready: whether there has been a reset.
+        pictures: draws single environments.
+        live: the live view of the only environment, or None.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int = 1,
+        device: str = "cpu",
+        array_api: str = "numpy",
+        num_threads: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Build the environments.
+
+        Args:
+            task: the task.
+            num_envs: number of environments.
+            device: Warp device, ``"cpu"`` or ``"cuda:0"``.
+            array_api: ``"numpy"`` or ``"torch"``.
+            num_threads: threads on a CPU; as many as there are cores if not given. A GPU needs none.
+            render_mode: None, ``"rgb_array"`` or, of one environment, ``"human"``.
+
+        Raises:
+            ConfigError: settings that contradict each other.
+            ImportError: ``array_api="torch"`` without torch, or ``render_mode="human"`` without the extra ``live``.
+            ValueError: no environments or threads, an unknown device or kind of arrays.
+        """
+        check_count("num_envs", num_envs)
+        if num_threads is not None:
+            check_count("num_threads", num_threads, ", or None for one a core")
+        device = check_device(device)
+        self.api = find_array_api(array_api, device)
+        threads = min(num_threads or available_cores(), num_envs) if wp.get_device(device).is_cpu else 1
+        sizes = [len(part) for part in np.array_split(np.arange(num_envs), threads)]
+        # a task holds the arrays of one batch
+        tasks = [task, *(type(task)(task.config) for _ in sizes[1:])]
+        self.groups = [BatchEnv(own, size, device) for own, size in zip(tasks, sizes, strict=True)]
+        self._splits = np.cumsum(sizes)[:-1]
+        self._pool = ThreadPoolExecutor(threads - 1, "piavatar") if threads > 1 else None
+        self._captured: set[Callable[[BatchEnv], Any]] = set()
+        self.task, self.config, self.num_envs, self.device = task, task.config, num_envs, device
+        first = self.groups[0]
+        self.num_agents, self.layout, self.action_size = first.num_agents, first.layout, first.action_spec.size
+        self.action_names: tuple[str, ...] = tuple(first.action_spec.names())
+        self.ready, self.render_mode = False, render_mode
+        self.pictures = Pictures(self.group_of, self.config.render)
+        self.live = Live(first, self.config.render.color) if render_mode == "human" else None
+
+    @property
+    def frame_rate(self) -> int:
+        """Control steps a second."""
+        return round(1.0 / self.config.physics.control_dt)
+
+    # spaces
+
+    def action_space(self) -> gym.spaces.Box:
+        """Return a new space of the actions of one agent of one environment."""
+        return gym.spaces.Box(-1.0, 1.0, (self.action_size,), np.float32)
+
+    def observation_space(self) -> gym.Space:
+        """Return a new, unbounded space of the observations of one agent: a Box, or a Dict with ``obs_mode="dict"``."""
+        if self.config.obs_mode == "dict":
+            return gym.spaces.Dict({name: _unbounded(term.size) for name, term in self.layout.items()})
+        return _unbounded(self.layout.size)
+
+    def state_space(self) -> gym.spaces.Box:
+        """Return a new space of the flat observations of all agents of one environment, one after the other."""
+        return _unbounded(self.num_agents * self.layout.size)
+
+    # episodes
+
+    def reset(self, seeds: int | Sequence[int | None] | None = None, mask: np.ndarray | None = None) -> None:
+        """Begin new episodes.
+
+        Environments that were never seeded are different every time, as Gymnasium requires.
+
+        Args:
+            seeds: of the environments' next and all following episodes: of environment ``i`` it is ``seeds + i``, or
+                ``seeds[i]``. Without seeds, or where one is None, the next episode of the seed before.
+            mask: environments to reset, shape ``(num_envs,)`` bool; all if not given.
+
+        Raises:
+            ValueError: a mask or seeds of the wrong shape, or a seed outside [0, 2^32); nothing has changed then.
+            gymnasium.error.Error: a seed that is not a whole number.
+            gymnasium.error.ResetNeeded: the first reset is not of all environments.
+        """
+        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ValueError(f"the mask has shape {mask.shape} and type {mask.dtype}; use ({self.num_envs},) bool")
+        if not (self.ready or mask.all()):
+            raise gym.error.ResetNeeded("the first reset() must be of all environments: leave out the mask")
+        seeds = self._checked_seeds(seeds)
+        self.api.begin()
+        starts = np.split(np.arange(self.num_envs), self._splits)
+        for group, own in zip(self.groups, starts, strict=True):
+            group.reset(mask[own], [seeds[env] for env in own])
+        self.api.end()
+        self._captured.add(BatchEnv.reset_masked)
+        self.ready = True
+        if self.live:
+            self.live.begin()
+
+    def _checked_seeds(self, seeds: int | Sequence[int | None] | None) -> list[int | None]:
+        n = self.num_envs
+        if seeds is None:
+            seeds = [None] * n
+        elif isinstance(seeds, (Set, Mapping)):  # without an order that the caller has chosen
+            raise ValueError(f"seed is a {type(seeds).__name__}; use a whole number, or a list of one an environment")
+        elif isinstance(seeds, (str, bytes)) or not np.iterable(seeds):
+            first = checked_seed(seeds)
+            check_seeds(first, n)
+            seeds = [first + env for env in range(n)]
+        else:
+            seeds = [None if seed is None else checked_seed(seed) for seed in seeds]
+        if len(seeds) != n:
+            raise ValueError(f"there are {len(seeds)} seeds for num_envs={n} environments")
+        if not self.ready:
+            drawn = seeding.np_random(None)[0].integers(NUM_SEEDS, size=n)
+            seeds = [int(own) if seed is None else seed for seed, own in zip(seeds, drawn, strict=True)]
+        return seeds
+
+    def check_ready(self, call: str) -> None:
+        """Refuse ``call`` before the first reset.
+
+        Raises:
+            gymnasium.error.ResetNeeded: there was none.
+        """
+        if not self.ready:
+            raise gym.error.ResetNeeded(f"call reset() before {call}()")
+
+    def step(self, actions: Any) -> None:
+        """Advance all environments by one control step; one whose episode has ended stays ended.
+
+        Args:
+            actions: shape ``(num_envs, num_agents, action_size)``: an array of NumPy, or a float32 tensor on the
+                environments' device.
+
+        Raises:
+            ValueError: a wrong shape, type or device, or (NumPy) a component that is not finite; nothing has changed
+                then. A tensor's component that is not finite acts as zero and ends its environment with
+                ``failure="action"``.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        self.check_ready("step")
+        self.advance(self.api.actions(actions, (self.num_envs, self.num_agents, self.action_size), self.action_names))
+
+    def advance(self, actions: Array) -> None:
+        """Advance by one control step under actions that the caller has checked; at most in real time with a view."""
+        self.api.write(actions, [group.action for group in self.groups])
+        self._run(BatchEnv.step)
+        if self.live:
+            self.live.step()
+
+    def find_ended(self) -> Array:
+        """Find the environments whose agents are all out or whose clock has run out, ``(num_envs,)`` bool.
+
+        :meth:`reset_ended` resets these, also when other steps have come in between.
+        """
+        self._run(BatchEnv.find_ended)
+        return self.read(lambda group: group.mask)
+
+    def reset_ended(self) -> None:
+        """Begin the next episode of the environments found by :meth:`find_ended`, and of no others.
+
+        Rewards, terms and metrics stay those of the last step; flags and observations are of the new episode.
+        """
+        self._run(BatchEnv.reset_masked)
+
+    def step_and_reset(self, actions: Array) -> Transition:
+        """Advance all environments, and begin the next episode of those that end (SAME_STEP, as Gymnasium calls it).
+
+        Args:
+            actions: as :meth:`step` takes them.
+
+        Raises:
+            ValueError: actions of a wrong shape, type or device; nothing has changed then.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        self.check_ready("step")
+        acted = self.alive()
+        self.step(actions)
+        terminated, final = self.terminated(), self.observation()
+        truncated = self.truncated()[:, None] & ~terminated
+        infos = [self.status(agent) | self.outcome(agent) for agent in range(self.num_agents)]
+        ended = self.find_ended()
+        self.reset_ended()
+        return Transition(self.observation(), final, self.reward(), terminated, truncated, ended, acted, infos)
+
+    def _run(self, graph: Callable[[BatchEnv], Any]) -> None:
+        """Run a method of every group, each in its own thread."""
+        self.api.begin()
+        if self._pool is None or graph not in self._captured:
+            # Warp records one graph at a time, so the first runs follow each other
+            for group in self.groups:
+                graph(group)
+            self._captured.add(graph)
+        else:
+            running = [self._pool.submit(graph, group) for group in self.groups[1:]]
+            graph(self.groups[0])
+            for result in running:
+                result.result()
+        self.api.end()
+
+    # arrays of all environments, always copies
+
+    def read(self, array_of: Callable[[BatchEnv], wp.array]) -> Array:
+        """Copy an array of all environments; ``array_of`` selects it in a group."""
+        return self.api.read([array_of(group) for group in self.groups])
+
+    def observation(self) -> Array:
+        """Return flat observations ``(num_envs, num_agents, observation_size)`` float32."""
+        return self.read(lambda group: group.observation)
+
+    def named(self, observation: Array) -> dict[str, Array] | Array:
+        """Split ``observation``, flat along its last axis, by name with ``obs_mode="dict"``; else keep it."""
+        return self.api.split(observation, self.layout) if self.config.obs_mode == "dict" else observation
+
+    def reward(self) -> Array:
+        """Return the reward of the last step, ``(num_envs, num_agents)`` float32."""
+        return self.read(lambda group: group.reward)
+
+    def terminated(self) -> Array:
+        """Return whether the episode has ended for an agent, ``(num_envs, num_agents)`` bool."""
+        return self.read(lambda group: group.terminated)
+
+    def truncated(self) -> Array:
+        """Return whether the clock has run out for agents that are still in, ``(num_envs,)`` bool."""
+        return self.read(lambda group: group.truncated)
+
+    def alive(self) -> Array:
+        """Return which agents act in the next step if the clock has not run out, ``(num_envs, num_agents)`` bool."""
+        return self.read(lambda group: group.alive)
+
+    # infos
+
+    def status(self, agent: int) -> dict[str, Array]:
+        """Return the part of an agent's info that holds at any time, a row an environment.
+
+        ``failure`` are bits ``FAILURE_*``.
+        """
+
+        def drive(name: str) -> Array:
+            return self.read(lambda batch: getattr(batch.simulation.avatars[agent].state, name))
+
+        return {
+            "success": self.read(lambda batch: batch.success)[:, agent],
+            "failure": self.read(lambda batch: batch.failure),
+            # a failed environment may hold numbers that are not finite, which must not leave the suite
+            "root_force": self.api.finite(drive("wrench_force")),
+            "root_torque": self.api.finite(drive("wrench_torque")),
+            "root_let_go": drive("let_go") != 0,
+        }
+
+    def outcome(self, agent: int) -> dict[str, Any]:
+        """Return the part of an agent's info that a step adds: metrics, reward and cost terms, a row an environment."""
+
+        def named(names: tuple[str, ...], array_of: Callable[[BatchEnv], wp.array]) -> dict[str, Array]:
+            # an array without names has one column without meaning
+            values = self.read(array_of)[:, agent] if names else None
+            return {name: values[:, index] for index, name in enumerate(names)}
+
+        task = self.task
+        found: dict[str, Any] = named(task.metric_names, lambda batch: batch.metrics)
+        found["reward_terms"] = named(task.reward_names, lambda batch: batch.terms)
+        if task.costs:
+            found["cost"] = self.read(lambda batch: batch.cost)[:, agent]
+            found["cost_terms"] = named(task.cost_names, lambda batch: batch.cost_terms)
+        return found
+
+    # state
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Copy everything that the future depends on to the host; the first dimension is the environment."""
+        states = [group.get_state() for group in self.groups]
+        return {name: np.concatenate([state[name] for state in states]) for name in states[0]}
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Restore the result of :meth:`get_state`, under any number of threads.
+
+        Raises:
+            ValueError: the state is of another environment, another number or other settings, or not finite; nothing
+                has changed then.
+        """
+        check_state(state, self.num_envs)
+        check_settings(state, self.config)  # of all environments, before any of the groups has changed
+        self.adopt(state, ready=True)
+        if self.live:
+            self.live.begin()
+
+    def adopt(self, state: dict[str, np.ndarray], ready: bool) -> None:
+        """Take over the state of another host and whether it is ready; a live view opens at the next reset."""
+        parts = {name: np.split(np.asarray(value), self._splits) for name, value in state.items()}
+        self.api.begin()
+        for index, group in enumerate(self.groups):
+            group.set_state({name: part[index] for name, part in parts.items()})
+        self.api.end()
+        self.ready = ready
+
+    def assist_root(self, share: float | np.ndarray) -> None:
+        """Set the share of root assistance from now on; see :meth:`BatchEnv.assist_root`.
+
+        Raises:
+            ValueError: it is out of range, of another shape, or the control has none; nothing has changed then.
+        """
+        parts = np.split(checked_assist(share, self.num_envs), self._splits)
+        for group, part in zip(self.groups, parts, strict=True):
+            group.assist_root(part)
+
+    def group_of(self, env: int) -> tuple[BatchEnv, int]:
+        """Return the batch that holds environment ``env``, and its index there."""
+        group = int(np.searchsorted(self._splits, env, side="right"))
+        return self.groups[group], env - ([0, *self._splits][group])
+
+    # pictures
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Draw every environment, ``(height, width, 3)`` uint8, with ``render_mode="rgb_array"``; else return None.
+
+        With ``"human"`` resets and steps update the live view.
+
+        Raises:
+            ImportError: the extra ``render`` is not installed.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self.render_mode is None:
+            gym.logger.warn('render() needs an environment made with render_mode="rgb_array"')
+            return None
+        self.check_ready("render")
+        return None if self.live else tuple(self.pictures.frame(env) for env in range(self.num_envs))
+
+    def close(self) -> None:
+        """Free the renderers, stop the live view and end the threads; closing twice is fine.
+
+        Later steps run in one thread.
+        """
+        self.pictures.close()
+        if self.live:
+            self.live.close()
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+
+@dataclass(frozen=True)
+class Transition:
+    """A control step of all environments, after which those that ended stand at the start of their next episode.
+
+    Attributes:
+        observation: from which the next step begins, ``(num_envs, num_agents, observation_size)``.
+        final_observation: to which this step led; where nothing ended it is the same.
+        reward: ``(num_envs, num_agents)``; zero for an agent that was out before.
+        terminated: ``(num_envs, num_agents)`` bool; stays True while the others go on.
+        truncated: ``(num_envs, num_agents)`` bool, the clock has run out for an agent that was still in.
+        ended: ``(num_envs,)`` bool, the next episode has begun: the last agent is out, or the clock has run out.
+        acted: ``(num_envs, num_agents)`` bool, agents that were in when the step began.
+        infos: of every agent, a row an environment, as they were when the step ended.
+    """
+
+    observation: Array
+    final_observation: Array
+    reward: Array
+    terminated: Array
+    truncated: Array
+    ended: Array
+    acted: Array
+    infos: Sequence[dict[str, Any]]
+
+    def means(self, metrics: Sequence[str]) -> dict[str, Array]:
+        """Average over environments and agents, for loggers: success, the reward's terms and ``metrics``, by name.
+
+        Of tensors only.
+        """
+        infos = self.infos
+        shown = {"Task/success": [info["success"].float() for info in infos]}
+        shown |= {f"Task/{name}": [info[name] for info in infos] for name in metrics}
+        shown |= {f"Reward/{name}": [info["reward_terms"][name] for info in infos] for name in infos[0]["reward_terms"]}
+        return {
+            name: sum(value.nan_to_num(0.0, 0.0, 0.0).mean() for value in values) / len(infos)
+            for name, values in shown.items()
+        }
+
+
+class HostView:
+    """Base of all views of an :class:`EpisodeHost`; ``copy.deepcopy`` and ``pickle`` copy it.
+
+    A copy goes on as the view does, on a CPU bit for bit. Devices, graphs and threads cannot be copied, so a copy is
+    built anew with the same arguments, and gets the view's state and all its other attributes: agents that act, random
+    generators, spaces, and attributes that users have added. Pictures begin anew: windows, the camera's glide, the live
+    view.
+
+    Attributes:
+        host: holds the environments.
+        _build: the constructor, or as much of it as makes ``_built``, with all arguments but the view; importable, so
+            that another process can call it.
+        _built: names of the attributes that are not copied; a copy of a closed view is open.
+    """
+
+    host: EpisodeHost
+    _build: Callable[[Any], None]
+    _built: ClassVar[tuple[str, ...]] = ("host", "closed")
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = {name: value for name, value in vars(self).items() if name not in self._built}
+        return {"kept": kept, "ready": self.host.ready, "state": self.host.get_state()}
+
+    def __setstate__(self, copied: dict[str, Any]) -> None:
+        kept = copied["kept"]
+        kept["_build"](self)
+        vars(self).update(kept)
+        self.host.adopt(copied["state"], copied["ready"])
+
+    @property
+    def observation_layout(self) -> ObservationLayout:
+        """Name, slice, unit and frame of every term in the flat observation of an agent."""
+        return self.host.layout
+
+    def assist_root(self, share: float | np.ndarray) -> None:
+        """Set the share of root assistance from now on, in [0, 1]; for ``control="pd"`` and ``"torque"``.
+
+        Every avatar of an environment gets its share, and resets keep it.
+
+        Args:
+            share: of all environments, or of each, shape ``(num_envs,)``.
+
+        Raises:
+            ValueError: it is out of range, of another shape, or the control is ``"pose"``.
+        """
+        self.host.assist_root(share)
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return everything that the future depends on; ``set_state()`` restores it, bit for bit.
+
+        The first dimension of every array is the environment; a pending reset is part of it.
+        """
+        return self.host.get_state()
+
+
+class SingleView(HostView):
+    """Base of the views of one environment."""
+
+    @property
+    def batch(self) -> BatchEnv:
+        """The environment on the device, a batch of one."""
+        return self.host.groups[0]
+
+    def _observation(self, agent: int) -> Any:
+        """Copy the observation of an agent: a flat vector, or a dictionary with ``obs_mode="dict"``."""
+        return self.host.named(self.host.observation()[0, agent])
+
+    def _info(self, agent: int, stepped: bool = False) -> dict[str, Any]:
+        """Return the info of an agent, with the outcome of the last step where there was one."""
+        outcome = self.host.outcome(agent) if stepped else {}
+        return _first_row(self.host.status(agent) | outcome)
+
+    def render(self) -> np.ndarray | None:
+        """Draw the scene as ``(height, width, 3)`` uint8 with ``render_mode="rgb_array"``; else return None.
+
+        With ``"human"`` resets and steps update the live view.
+
+        Raises:
+            ImportError: the extra ``render`` is not installed.
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        frames = self.host.render()
+        return frames[0] if frames else None
+
+    def close(self) -> None:
+        """Free the renderer's window, and stop the live view; closing twice is fine."""
+        self.host.close()
+
+
+def checked_seed(seed: Any) -> int:
+    """Return a seed as Gymnasium takes it, below 2^32.
+
+    Raises:
+        ValueError: a seed outside [0, 2^32).
+        gymnasium.error.Error: it is not a whole number.
+    """
+    seed = int(seed) if isinstance(seed, np.integer) else seed
+    if isinstance(seed, int):
+        check_seeds(seed)  # first, because Gymnasium raises its own Error for a negative one
+    seeding.np_random(seed)
+    return seed
+
+
+def failure_names(bits: Array) -> Array:
+    """Return the names of failures, None for none; of tensors the bits, which need no copy to the host."""
+    if not isinstance(bits, np.ndarray):
+        return bits
+    names = np.full(len(bits), None, object)
+    for env in np.flatnonzero(bits):
+        names[env] = failure_name(int(bits[env]))
+    return names
+
+
+def _first_row(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the only environment's values as Python's numbers, vectors as arrays."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            found[name] = _first_row(value)
+        elif name == "failure":
+            found[name] = failure_names(value)[0]
+        else:
+            found[name] = value[0] if value.ndim > 1 else value[0].item()
+    return found
+
+
+def _unbounded(size: int) -> gym.spaces.Box:
+    """Return the space of all vectors of ``size`` float32."""
+    return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)

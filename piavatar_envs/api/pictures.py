@@ -1,0 +1,345 @@
+"""Pictures of the environments of a batch: scene descriptions, frames, and the live view in a web browser.
+
+The renderer is imported when the first picture is drawn, so that environments without pictures start quickly.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from piavatar_envs.config import RenderConfig
+from piavatar_envs.core.arrays import matrices_of
+from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.sim.bodies import Flesh
+
+if TYPE_CHECKING:
+    from piavatar_envs.render import Body, Marker, Scene, Skin
+    from piavatar_envs.render.live import LiveView
+
+#: Render modes of one environment, and of a batch: a live view shows one.
+RENDER_MODES = ("rgb_array", "human")
+BATCH_RENDER_MODES = ("rgb_array",)
+#: Least time between two scenes sent to a browser [s]: no screen shows more.
+_LEAST_INTERVAL = 1.0 / 60.0
+
+
+def check_render_mode(render_mode: str | None, modes: tuple[str, ...] = RENDER_MODES) -> str | None:
+    """Return a render mode of one environment.
+
+    Raises:
+        ValueError: it is unknown.
+    """
+    if render_mode is not None and render_mode not in modes:
+        known = f"{', '.join(['None', *modes[:-1]])} or {modes[-1]}"
+        raise ValueError(f"render_mode={render_mode!r} is not known; use {known}")
+    return render_mode
+
+
+def check_batch_render_mode(render_mode: str | None) -> str | None:
+    """Return a render mode of a batch of environments.
+
+    Raises:
+        ValueError: it is unknown, or the live view.
+    """
+    if render_mode == "human":
+        raise ValueError(
+            "render_mode='human' is a live view of one environment, and this is a batch; use rgb_array here, or "
+            "watch one: gym.make(id, render_mode='human') or python -m piavatar_envs watch ID"
+        )
+    return check_render_mode(render_mode, BATCH_RENDER_MODES)
+
+
+class SceneReader:
+    """Reads scene descriptions from a batch: skins, props, colliders and the task's markers."""
+
+    def __init__(self, batch: BatchEnv) -> None:
+        """Bake the surfaces of the props; skins follow when they are first drawn."""
+        from piavatar_envs.render import SolidSurface
+
+        self.batch = batch
+        self._skins: dict[tuple[int, bytes], Skin] = {}
+        self._solids = [SolidSurface(p.rest, p.vertices, p.faces) for p in batch.simulation.props.points]
+
+    def scene(self, env: int, color: Literal["skin", "strain"] = "skin") -> Scene:
+        """Describe the scene of environment ``env`` now, the bodies in their own colour or coloured by strain."""
+        from piavatar_envs.render import Scene, Sphere
+
+        task, x = self.batch.task, self.batch.simulation.state.x.numpy()[env]
+        bodies = self._avatars(env, x, color) + self._props(env, x)
+        markers = [Sphere(*m) if isinstance(m, tuple) else m for m in task.markers(self.batch, env)]
+        roots = [avatar.tracked.position.numpy()[env, 0] for avatar in self.batch.simulation.avatars]
+        follow = np.mean(roots, axis=0) if task.camera_follows else None
+        return Scene(bodies, markers + self._colliders(env), follow)
+
+    def _skin(self, env: int, avatar: int, flesh: Flesh) -> Skin:
+        """Return the skin of an avatar's present body; a body that comes back is not baked again."""
+        from piavatar_envs.render import Skin
+
+        key = (avatar, flesh.shape_parameters[env].tobytes())
+        if key not in self._skins:
+            points, row = flesh.points, min(env, len(flesh.points.rest) - 1)
+            shaped = flesh.asset.shape(flesh.shape_parameters[env])
+            self._skins = {other: skin for other, skin in self._skins.items() if other[0] != avatar}
+            self._skins[key] = Skin(flesh.asset, shaped, points.rest[row], points.skin_joints, points.skin_weights)
+        return self._skins[key]
+
+    def _avatars(self, env: int, x: np.ndarray, color: str) -> list[Body]:
+        from scipy.spatial.transform import Rotation
+
+        from piavatar_envs.render import PALETTE, Body, strain_magnitude
+
+        simulation, bodies = self.batch.simulation, []
+        for index, (flesh, avatar) in enumerate(zip(simulation.flesh, simulation.avatars, strict=True)):
+            own, skin = slice(avatar.body.first, avatar.body.first + avatar.body.count), self._skin(env, index, flesh)
+            rotations = Rotation.from_quat(avatar.tracked.rotation.numpy()[env]).as_matrix()
+            vertices = skin.deform(rotations, avatar.tracked.position.numpy()[env], x[own])
+            scalars = None
+            if color == "strain":
+                F = matrices_of(simulation.state.F.numpy()[env])
+                scalars = skin.interpolate(strain_magnitude(F[own]))
+            bodies.append(Body(vertices, flesh.asset.faces, color=PALETTE[index % len(PALETTE)], scalars=scalars))
+        return bodies
+
+    def _props(self, env: int, x: np.ndarray) -> list[Body]:
+        from scipy.spatial.transform import Rotation
+
+        from piavatar_envs.render import PROP, Body
+
+        props, bodies = self.batch.simulation.props, []
+        for index, (prop, solid) in enumerate(zip(props.props, self._solids, strict=True)):
+            rotation = Rotation.from_quat(props.state.rotation.numpy()[env, index]).as_matrix()
+            particles = x[prop.first : prop.first + prop.count]
+            vertices = solid.deform(rotation, props.state.position.numpy()[env, index], particles)
+            bodies.append(Body(vertices, solid.faces, color=PROP))
+        return bodies
+
+    def _colliders(self, env: int) -> list[Marker]:
+        """Describe the scene's boxes, spheres and capsules; planes are not drawn."""
+        from scipy.spatial.transform import Rotation
+
+        from piavatar_envs.render import PROP, Box, Capsule, Sphere
+
+        boundaries, shapes = self.batch.simulation.model.boundaries, []
+        for index, collider in enumerate(self.batch.simulation.subjects.colliders):
+            position = boundaries.position.numpy()[env, index]
+            rotation = Rotation.from_quat(boundaries.rotation.numpy()[env, index]).as_matrix()
+            if collider.kind == "box":
+                shapes.append(Box(position, np.array(collider.size), rotation=rotation))
+            elif collider.kind == "sphere":
+                shapes.append(Sphere(position, collider.size[0], color=PROP))
+            elif collider.kind == "capsule":
+                shapes.append(Capsule(position, *collider.size, rotation=rotation))
+        return shapes
+
+
+class Progress:
+    """Simulated time of an environment between two pictures."""
+
+    def __init__(self, batch: BatchEnv, env: int) -> None:
+        """Start without a picture."""
+        self._batch, self._env = batch, env
+        self._last: tuple[int, ...] | None = None
+
+    def since_last(self) -> float | None:
+        """Return the simulated time since the last call [s]; None at first, and if time has jumped since.
+
+        Time jumps where another episode has begun, and where a state was restored.
+        """
+        batch = self._batch
+        counters = (batch.seed, batch.episode, batch.step_count)
+        now = (batch.restarts, *(int(array.numpy()[self._env]) for array in counters))
+        before, self._last = self._last, now
+        if before is None or now[:3] != before[:3] or now[3] < before[3]:
+            return None
+        return (now[3] - before[3]) * batch.config.physics.control_dt
+
+
+class Picture:
+    """Draws environments of a batch with one renderer."""
+
+    def __init__(self, batch: BatchEnv, config: RenderConfig) -> None:
+        """Open the renderer.
+
+        Raises:
+            ImportError: the extra ``render`` is not installed.
+        """
+        from piavatar_envs.render import Camera, Renderer
+
+        self.config, task = config, batch.task
+        self.renderer = Renderer(config.width, config.height, Camera(task.camera_position, task.camera_target))
+        self._scenes = SceneReader(batch)
+
+    def cut(self) -> None:
+        """Let the camera jump to the next scene instead of gliding there."""
+        self.renderer.reset_camera()
+
+    def frame(self, env: int, elapsed: float) -> np.ndarray:
+        """Draw the scene of environment ``env``, ``(height, width, 3)`` uint8, a time [s] after the last picture."""
+        scene = self._scenes.scene(env, self.config.color)
+        return self.renderer.render(scene.bodies, scene.markers, follow=scene.follow, elapsed=elapsed)
+
+    def close(self) -> None:
+        """Close the renderer."""
+        self.renderer.close()
+
+
+class Pictures:
+    """Pictures of any environments, each with a camera of its own, opened when it is first drawn."""
+
+    def __init__(self, place: Callable[[int], tuple[BatchEnv, int]], config: RenderConfig) -> None:
+        """Open nothing yet.
+
+        Args:
+            place: returns the batch that holds an environment, and its index there.
+            config: size and colours.
+        """
+        self._place, self._config = place, config
+        self._opened: dict[int, Picture] = {}
+        self._progress: dict[int, Progress] = {}
+
+    def frame(self, env: int) -> np.ndarray:
+        """Draw the scene of environment ``env``, ``(height, width, 3)`` uint8.
+
+        Raises:
+            ImportError: the extra ``render`` is not installed.
+        """
+        batch, own = self._place(env)
+        if env not in self._opened:
+            self._opened[env], self._progress[env] = Picture(batch, self._config), Progress(batch, own)
+        elapsed = self._progress[env].since_last()
+        if elapsed is None:
+            self._opened[env].cut()
+        return self._opened[env].frame(own, elapsed or 0.0)
+
+    def close(self) -> None:
+        """Close all renderers."""
+        for picture in self._opened.values():
+            picture.close()
+        self._opened.clear()
+
+
+class Pace:
+    """Holds a loop back to a given time a turn; a slower loop is not delayed."""
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], None] = time.sleep):
+        """Begin the first turn.
+
+        Args:
+            clock: returns the time [s].
+            sleep: waits for a time [s].
+        """
+        self.clock, self._sleep = clock, sleep
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a turn now."""
+        self._began = self.clock()
+
+    def wait(self, seconds: float) -> None:
+        """Sleep for the rest of a turn of that length, and begin the next one."""
+        due, now = self._began + seconds, self.clock()
+        if due <= now:
+            self._began = now
+            return
+        self._sleep(due - now)
+        # from the due time, because a sleep ends late and the delays would add up
+        self._began = due
+
+    def rest(self, seconds: float) -> None:
+        """Sleep, and begin a turn."""
+        self._sleep(seconds)
+        self.begin()
+
+
+class Live:
+    """Shows an environment in a web browser while it is simulated, at most in real time.
+
+    The server starts with the first scene.
+
+    Attributes:
+        color: of the bodies, ``"skin"`` or ``"strain"``; may be changed at any time.
+        pace: holds the steps back.
+    """
+
+    def __init__(
+        self,
+        batch: BatchEnv,
+        color: Literal["skin", "strain"] = "skin",
+        port: int | None = None,
+        env: int = 0,
+        pace: Pace | None = None,
+    ) -> None:
+        """Open nothing yet.
+
+        Args:
+            batch: holds the environment.
+            color: of the bodies.
+            port: of this machine, or the next one that is free.
+            env: index of the environment in the batch.
+            pace: holds the steps back to real time; by the computer's clock if not given.
+
+        Raises:
+            ImportError: the extra ``live`` is not installed.
+        """
+        from piavatar_envs.render.live import PORT, import_viser
+
+        import_viser()  # so that a missing library is reported before the first reset
+        self.color, self.pace = color, pace or Pace()
+        self._batch, self._port, self._env = batch, PORT if port is None else port, env
+        self._progress, self._scenes = Progress(batch, env), SceneReader(batch)
+        self._view: LiveView | None = None
+        self._shown, self._behind = 0.0, False
+
+    @property
+    def view(self) -> LiveView:
+        """The view; the first use opens it.
+
+        Raises:
+            ValueError: a port out of range.
+        """
+        if self._view is None:
+            from piavatar_envs.render import Camera
+            from piavatar_envs.render.live import LiveView
+
+            task = self._batch.task
+            self._view = LiveView(Camera(task.camera_position, task.camera_target), self._port)
+        return self._view
+
+    def begin(self) -> None:
+        """Show the scene after a reset, and begin a control step now."""
+        self.show()
+        self.pace.begin()
+
+    def step(self, speed: float = 1.0) -> None:
+        """Show the scene after a control step, and wait for the rest of its time.
+
+        Args:
+            speed: greatest ratio of simulated to real time.
+        """
+        self._behind = True
+        if self._view is not None and self.pace.clock() - self._shown >= _LEAST_INTERVAL:
+            self.show()
+        self.pace.wait(self._batch.config.physics.control_dt / speed)
+
+    def catch_up(self) -> None:
+        """Show the last step, if it followed the one before too soon to be sent."""
+        if self._behind and self._view is not None:
+            self.show()
+
+    def show(self) -> None:
+        """Show the present scene."""
+        self._shown, self._behind = self.pace.clock(), False
+        self.view.show(self._scenes.scene(self._env, self.color), self._progress.since_last())
+
+    def close(self) -> None:
+        """Stop the server, if it was started; closing twice is fine.
+
+        A reset opens it again, a step does not.
+        """
+        if self._view is not None:
+            self._view.close()
+            self._view = None
