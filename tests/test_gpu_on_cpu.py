@@ -1,4 +1,4 @@
-"""Threads of a GPU on a CPU: they tell each other what those of a GPU do, as CUDA's programming guide has it."""
+"""Emulated GPU threads exchange values as the CUDA programming guide specifies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BLOCK = 96
 
 
 def on_gpu(cuda: str) -> str:
-    """A snippet in CUDA, and nothing for a CPU."""
+    """Return a CUDA snippet that returns -1 on a CPU."""
     return f"#if defined(__CUDA_ARCH__)\n{cuda}\n#else\nreturn -1;\n#endif\n"
 
 
@@ -29,13 +29,13 @@ return warps[0] + warps[1] + warps[2] + 1000 * (int)blockIdx.x;
 """)
 )
 def sum_of_block(value: int) -> int:
-    """The block's sum, and a thousand times its number."""
+    """Return the block's sum plus a thousand times its index."""
     ...
 
 
 @wp.func_native(on_gpu("return (int)__ballot_sync(0xffffffffu, value > 0);"))
-def who_is_positive(value: int) -> int:
-    """Bits of the warp's threads."""
+def positive_lanes(value: int) -> int:
+    """Return a mask of lanes."""
     ...
 
 
@@ -47,71 +47,71 @@ else
     return (int)__activemask();
 """)
 )
-def who_is_here(value: int) -> int:
-    """Bits of the warp's threads that have gone the same way."""
+def active_lanes(value: int) -> int:
+    """Return a mask of the lanes in the same branch."""
     ...
 
 
 @wp.func_native(on_gpu("return (int)__match_any_sync(0xffffffffu, value);"))
-def who_has_the_same(value: int) -> int:
-    """Bits of the warp's threads."""
+def lanes_with_equal_values(value: int) -> int:
+    """Return a mask of lanes."""
     ...
 
 
 @wp.func_native(on_gpu("return __reduce_max_sync(0xffffffffu, value) - __shfl_sync(0xffffffffu, value, 7);"))
 def greatest_over_the_seventh(value: int) -> int:
-    """The warp's greatest value, less that of its seventh thread."""
+    """Return the warp's greatest value less that of its seventh lane."""
     ...
 
 
 @wp.kernel
-def ask(value: wp.array(dtype=int), question: int, answer: wp.array(dtype=int)):
+def evaluate(value: wp.array(dtype=int), question: int, answer: wp.array(dtype=int)):
     t = wp.tid()
     if t >= value.shape[0]:
         return
     if question == 0:
         answer[t] = sum_of_block(value[t])
     elif question == 1:
-        answer[t] = who_is_positive(value[t])
+        answer[t] = positive_lanes(value[t])
     elif question == 2:
-        answer[t] = who_is_here(value[t])
+        answer[t] = active_lanes(value[t])
     elif question == 3:
-        answer[t] = who_has_the_same(value[t])
+        answer[t] = lanes_with_equal_values(value[t])
     else:
         answer[t] = greatest_over_the_seventh(value[t])
 
 
 @pytest.fixture(scope="module")
 def answers():
-    """Asks the threads of so many values; the last of their block end before."""
+    """Evaluate a question for each value; surplus threads of the last block end early."""
 
-    def ask_all(question: int, values: np.ndarray) -> np.ndarray:
+    def evaluate_all(question: int, values: np.ndarray) -> np.ndarray:
         value = wp.array(values, dtype=int, device="cpu")
         answer = wp.zeros(len(values), dtype=int, device="cpu")
         threads = -(-len(values) // BLOCK) * BLOCK
-        wp.launch(ask, threads, [value, question], [answer], device="cpu", block_dim=BLOCK)
+        wp.launch(evaluate, threads, [value, question], [answer], device="cpu", block_dim=BLOCK)
         return answer.numpy()
 
     with gpu_on_cpu():
-        yield ask_all
+        yield evaluate_all
 
 
 def test_the_cpu_is_itself_before_and_after():
-    """The same kernel has nothing for a CPU; contexts may be inside each other."""
+    """The same kernel returns -1 on a plain CPU; contexts may be nested."""
     value, found = wp.ones(4, dtype=int, device="cpu"), []
     for inside in (False, True, False):
         answer = wp.zeros(4, dtype=int, device="cpu")
         if inside:
             with gpu_on_cpu() as name, gpu_on_cpu():
-                wp.launch(ask, BLOCK, [value, 1], [answer], device=name, block_dim=BLOCK)
+                wp.launch(evaluate, BLOCK, [value, 1], [answer], device=name, block_dim=BLOCK)
         else:
-            wp.launch(ask, 4, [value, 1], [answer], device="cpu")
+            wp.launch(evaluate, 4, [value, 1], [answer], device="cpu")
         found.append(answer.numpy().tolist())
     assert found == [[-1] * 4, [0b1111] * 4, [-1] * 4]
 
 
 def bits(yes: np.ndarray) -> np.ndarray:
-    """Of the warps' threads, told to all of each."""
+    """Return the ballot of every warp, for each of its threads."""
     whole = np.zeros(-(-len(yes) // 32) * 32, bool)
     whole[: len(yes)] = yes
     masks = (whole.reshape(-1, 32) * (1 << np.arange(32, dtype=np.uint64))).sum(1)
@@ -133,7 +133,7 @@ def test_ballots(answers, values):
     np.testing.assert_array_equal(answers(1, values), bits(values > 0))
 
 
-def test_who_goes_another_way_is_not_here(answers, values):
+def test_lanes_of_another_branch_are_not_active(answers, values):
     expected = np.where(values > 0, bits(values > 0), bits(values <= 0))
     np.testing.assert_array_equal(answers(2, values), expected)
 
@@ -145,7 +145,7 @@ def test_matches(answers, values):
     np.testing.assert_array_equal(answers(3, values), expected)
 
 
-def test_reductions_are_of_those_who_are_there(answers, values):
+def test_reductions_are_over_the_active_lanes(answers, values):
     expected = [values[t // 32 * 32 :][:32].max() - values[t // 32 * 32 + 7] for t in range(len(values))]
     np.testing.assert_array_equal(answers(4, values), expected)
 
@@ -162,20 +162,20 @@ __syncthreads();
 return seen;
 """)
 )
-def what_the_first_has_written(value: int) -> int:
-    """What the block's first thread has written, for sure only if all have a positive value."""
+def written_by_the_first(value: int) -> int:
+    """Return what the first thread has written; reliable only if all values are positive."""
     ...
 
 
 @wp.kernel
 def read_what_is_written(value: wp.array(dtype=int), answer: wp.array(dtype=int)):
     t = wp.tid()
-    answer[t] = what_the_first_has_written(value[t])
+    answer[t] = written_by_the_first(value[t])
 
 
 @pytest.mark.parametrize("waits", [True, False])
 def test_a_missing_barrier_shows(waits):
-    """In one of two blocks the first thread is not the first to run."""
+    """In one of two blocks the first thread does not run first."""
     value = wp.full(2 * BLOCK, 1 if waits else 0, dtype=int, device="cpu")
     answer = wp.zeros(2 * BLOCK, dtype=int, device="cpu")
     with gpu_on_cpu():
@@ -185,16 +185,16 @@ def test_a_missing_barrier_shows(waits):
 
 def test_single_threads_would_be_a_cpus(answers):
     with pytest.raises(RuntimeError, match="block_dim=1"):
-        wp.launch(ask, 4, [wp.ones(4, dtype=int, device="cpu"), 1], device="cpu", block_dim=1)
+        wp.launch(evaluate, 4, [wp.ones(4, dtype=int, device="cpu"), 1], device="cpu", block_dim=1)
 
 
-def test_what_is_not_known_is_refused():
-    with pytest.raises(RuntimeError, match="another way"):
+def test_unknown_modules_are_refused():
+    with pytest.raises(RuntimeError, match="format unknown"):
         on_cpu("void nothing() {}")
     source = '#include "deterministic.h"\n'
     for way, arguments in (("forward", "payload->args"), ("backward", "payload->args, payload->adj_args")):
         source += "    const size_t task_index = payload->block_first + (size_t)lane;\n"
         source += f"    k_cpu_kernel_{way}<false>(*dim, task_index, {arguments});\n"
     assert on_cpu(source).count("gpu::begin(lane") == on_cpu(source).count("gpu::end()") == 2
-    with pytest.raises(RuntimeError, match=r"asm.*tell"):
+    with pytest.raises(RuntimeError, match=r"asm.*replacement"):
         on_cpu(source + 'asm volatile("brkpt;");\n')

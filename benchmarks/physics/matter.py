@@ -1,4 +1,4 @@
-"""Small bodies of matter, without an avatar: what benchmarks of the continuum and the tests of ``mpm`` are made of."""
+"""Small bodies of matter without an avatar, for benchmarks of the continuum and the tests of ``mpm``."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Matter:
         return self
 
     def push(self, damping: float = 0.0, acceleration: np.ndarray | None = None) -> Matter:
-        """From now on damp all velocities at a rate [1/s] and push each particle [m/s^2]; needs ``pushed=True``."""
+        """Damp all velocities from now on at a rate [1/s] and push each particle [m/s^2]; needs ``pushed=True``."""
         dt = self.model.step.dt
         self.keep.assign(np.array([np.exp(-damping * dt)], np.float32))
         kick = np.zeros(self.rest.shape) if acceleration is None else dt * acceleration
@@ -77,7 +77,7 @@ class Matter:
         return totals(self.model, self.state, env, **kwargs)
 
     def of(self, field: int) -> np.ndarray:
-        """Mask of a velocity field's particles."""
+        """Return the mask of a velocity field's particles."""
         return self.model.particles.field.numpy() == field
 
     @property
@@ -85,7 +85,7 @@ class Matter:
         """Whether no node holds anything that a later substep would add to."""
         sums = self.scratch.accumulators
         arrays = [sums.fixed, sums.offset, sums.offset_fixed, sums.candidates]
-        if self.model.path != "block":  # whose sums are written, not added up
+        if self.model.path != "block":  # where sums are written, not added
             arrays.append(sums.value)
         return not any(array.numpy().any() for array in arrays)
 
@@ -96,14 +96,14 @@ class Matter:
 
 
 def lattice(lower: Sequence[float], upper: Sequence[float], spacing: float) -> np.ndarray:
-    """Centres of the cells of edge ``spacing`` [m] that fill a box, shape ``(num_particles, 3)``."""
+    """Return the centres of the cells of edge ``spacing`` [m] that fill a box, shape ``(num_particles, 3)``."""
     counts = np.round(np.subtract(upper, lower) / spacing).astype(int)
     axes = [low + spacing * (np.arange(count) + 0.5) for low, count in zip(lower, counts, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def ball(center: Sequence[float], radius: float, spacing: float) -> np.ndarray:
-    """Points of a lattice in a ball, those of a mirrored centre mirrored."""
+    """Return the points of a lattice in a ball; a mirrored centre gives mirrored points."""
     reach = spacing * np.ceil(radius / spacing)
     points = lattice([-reach] * 3, [reach] * 3, spacing)
     return points[np.linalg.norm(points, axis=1) < radius] + center
@@ -127,9 +127,9 @@ def build_matter(
     device: str = "cpu",
     **kwargs,
 ) -> Matter:
-    """A box of matter at rest, or the points ``rest`` in it.
+    """Build a box of matter at rest, or the points ``rest`` in it.
 
-    With velocity fields, the contact sensors tell of one control step.
+    With velocity fields, the contact sensors cover one control step.
 
     Args:
         lower: corner of the box [m]; without ``rest`` it is full.
@@ -144,7 +144,7 @@ def build_matter(
         density: likewise [kg/m^3].
         material: likewise.
         gravity: [m/s^2].
-        pushed: whether :meth:`Matter.push` shall have an effect.
+        pushed: whether :meth:`Matter.push` has an effect.
         planes: normal, offset [m] and friction [-] of each.
         device: Warp device.
         **kwargs: for ``build_model``.

@@ -1,10 +1,10 @@
-"""What the package has for a GPU, on a CPU: for tests of what comes out, not of how fast.
+"""GPU kernels emulated on a CPU, to test their results, not their speed.
 
-Its kernels for a GPU ask for shared memory, and for what the threads of a warp or of a CUDA block tell each other. Warp
-can run the threads of a block on a CPU, as fibers that take turns (``wp.config.enable_cpu_blocks``); ``threads.h`` has
-the rest. Inside :func:`gpu_on_cpu` the package takes the CPU for a GPU, and such kernels are compiled with the CUDA in
-them. It also shows what hangs on the order of the threads, shared memory that is read before it is written or written
-beyond its end, and threads that wait for ever; not what only happens at the same time, nor what a GPU rounds otherwise.
+The package's GPU kernels use shared memory and exchanges within a warp or a CUDA block. Warp can run the threads of a
+block on a CPU as fibers (``wp.config.enable_cpu_blocks``); ``threads.h`` has the rest. Inside :func:`gpu_on_cpu` the
+package treats the CPU as a GPU, and its kernels are compiled with their CUDA snippets. The emulation reveals results
+that depend on the order of threads, shared memory that is read before it is written or written beyond its end, and
+deadlocks. It does not reveal races of truly concurrent threads, nor differences in rounding.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from typing import Any
 import warp as wp
 from warp._src import build, context
 
-#: By which Warp knows the CPU that the package takes for a GPU.
+#: Warp device name of the emulated GPU.
 NAME = "gpu_on_cpu"
-#: Threads of a CUDA block, if a launch says nothing else.
+#: Threads of a CUDA block unless a launch sets them.
 THREADS = 256
 _HEADER = Path(__file__).with_name("threads.h")
 
-#: Where Warp's modules for a CPU include its own headers, begin and end a thread.
+#: Lines in Warp's generated CPU modules: its headers, the begin and the end of a thread.
 _INCLUDES = '#include "deterministic.h"\n'
 _BEGIN = "    const size_t task_index = payload->block_first + (size_t)lane;\n"
 _RUN = r"(    \w+_cpu_kernel_(?:for|back)ward<false>\(\*dim, task_index, payload->args(?:, payload->adj_args)?\);\n)"
-#: What a snippet has as its shared memory, and how many words a kernel reserves.
-_ROOM = "extern __shared__ int piavatar_arena[];"
+#: Declaration of shared memory in a snippet, and the words that a kernel reserves.
+_ARENA = "extern __shared__ int piavatar_arena[];"
 _RESERVED = r"tile_alloc_empty<wp::int32,wp::tile_shape_t<(\d+)>"
-#: Instructions in PTX, and what they do.
+#: PTX instructions and their replacements.
 _PTX = (
     (
         r'asm\("mad\.wide\.s32 %0, %1, %2, %3;"\s*: "=l"\((.*?)\) : "r"\((.*)\), "r"\((.*?)\), "l"\((.*?)\)\);',
@@ -48,13 +48,9 @@ _PTX = (
         r"*(wp::int64*)(\1) += \2;",
     ),
     (
-        r'asm volatile\("red\.global\.add\.f32 \[%0\], %1;"\s*:: "l"\((.*?)\), "f"\((.*)\) : "memory"\);',
-        r"*(wp::float32*)(\1) += \2;",
-    ),
-    (
         r'asm volatile\("cp\.async\.ca\.shared\.global \[%0\], \[%1\], 4;"\s*'
         r':: "r"\((.*?)\), "l"\((.*?)\) : "memory"\);',
-        r"*(wp::int32*)((char*)gpu::room + \1) = *(const wp::int32*)(\2);",
+        r"*(wp::int32*)((char*)gpu::arena + \1) = *(const wp::int32*)(\2);",
     ),
     (r'asm volatile\("cp\.async\.wait_all;" ::: "memory"\);', ""),
     (r'asm volatile\("" : "\+[rf]"\(.*?\)\);', ""),
@@ -63,14 +59,14 @@ _PTX = (
 
 
 def on_cpu(source: str) -> str:
-    """A module that Warp has generated for blocks on a CPU, with the CUDA of its snippets instead of what is beside it.
+    """Return a module that Warp has generated for blocks on a CPU, with the CUDA branches of its snippets.
 
     Raises:
-        RuntimeError: it is not as this version of Warp writes it, or has instructions in PTX that are not known here.
+        RuntimeError: its format is not that of the known Warp version, or it has unknown PTX instructions.
     """
     words = max((int(words) for words in re.findall(_RESERVED, source)), default=0)
-    source = source.replace(_INCLUDES, f'{_INCLUDES}#define GPU_ROOM_WORDS {words}\n#include "{_HEADER}"\n', 1)
-    source = source.replace("__CUDA_ARCH__", "GPU_ARCH").replace(_ROOM, "int* const piavatar_arena = gpu::room;")
+    source = source.replace(_INCLUDES, f'{_INCLUDES}#define GPU_ARENA_WORDS {words}\n#include "{_HEADER}"\n', 1)
+    source = source.replace("__CUDA_ARCH__", "GPU_ARCH").replace(_ARENA, "int* const piavatar_arena = gpu::arena;")
     for pattern, replacement in _PTX:
         source = re.sub(pattern, replacement, source)
     begin = """\
@@ -80,21 +76,21 @@ def on_cpu(source: str) -> str:
     threads = source.count(_BEGIN)
     source, ended = re.subn(_RUN, r"\1    gpu::end();\n", source.replace(_BEGIN, begin))
     if _HEADER.name not in source or threads != ended or threads == 0:
-        raise RuntimeError(f"Warp {wp.__version__} writes modules for a CPU in another way than {__file__} knows")
+        raise RuntimeError(f"Warp {wp.__version__} generates CPU modules in a format unknown to {__file__}")
     if unknown := re.search(r"\basm\b.*", source):
-        raise RuntimeError(f"{unknown.group()}: tell {__file__} what this does")
+        raise RuntimeError(f"{unknown.group()}: add its replacement to {__file__}")
     return source
 
 
 class Stream:
-    """What is launched there runs at once, and nobody need wait."""
+    """A stream whose launches run at once."""
 
     def wait_stream(self, other: Any) -> None:
         """Nothing to do."""
 
 
 class EmulatedGpu(str):
-    """A name of the CPU that says it were an H200."""
+    """A device name with the properties of an H200."""
 
     is_cuda, is_cpu, arch, sm_count, max_shared_memory_per_block = True, False, 90, 132, 227 * 1024
     free_memory = 2**37
@@ -103,16 +99,16 @@ class EmulatedGpu(str):
 
 
 def _own_cache() -> Path:
-    """Where to keep what is compiled: not with what a plain CPU has, nor with that of other emulations."""
+    """Return a kernel cache apart from that of plain CPU kernels and of other versions of the emulation."""
     known = hashlib.sha256(_HEADER.read_bytes() + Path(__file__).read_bytes()).hexdigest()[:8]
     return Path(wp.config.kernel_cache_dir) / f"{NAME}_{known}"
 
 
 @contextmanager
 def gpu_on_cpu() -> Iterator[str]:
-    """Let the package build and run on the CPU what it has for a GPU; gives the name of the device.
+    """Build and run GPU kernels on the CPU; yields the name of the device.
 
-    What is built inside belongs to it. Inside another one, it changes nothing.
+    Worlds that are built inside must not be used outside. Nested contexts have no effect.
     """
     wp.init()
     if NAME in context.runtime.device_map:
@@ -127,7 +123,7 @@ def gpu_on_cpu() -> Iterator[str]:
     def threads_of_block(device: Any, block_dim: int | None) -> int:
         threads = resolve(device, THREADS if block_dim is None else block_dim)
         if threads == 1:
-            raise RuntimeError("block_dim=1 would run what is beside the CUDA; use 2 threads or more")
+            raise RuntimeError("block_dim=1 would run the CPU branches of snippets; use 2 threads or more")
         return threads
 
     def build_cpu(obj_path: str, cpp_path: str, *args: Any, **kwargs: Any) -> Any:

@@ -1,132 +1,132 @@
-// The threads of a CUDA block on a CPU: what the package's snippets in CUDA ask for, on the fibers of Warp's runtime.
+// Threads of a CUDA block on a CPU: the CUDA functions that the package's snippets use, on the fibers of Warp's runtime.
 //
-// The modules that Warp generates include it, see __init__.py. A block's threads run one at a time, and others go on
-// where one waits; so nothing here need be atomic. Every other block begins with its last thread: where results hang on
-// who comes first, most tests see it. Shared memory begins with what is no number, and nobody may write behind it.
+// Included by the modules that Warp generates, see __init__.py. The threads of a block run one at a time and switch
+// where one waits, so nothing here is atomic. Every other block starts with its last thread, which reveals results that
+// depend on the order of threads. Shared memory is initialised with NaN, and a guard behind it must stay unchanged.
 #pragma once
 
 namespace gpu {
 
 constexpr int THREADS = WP_TILE_BLOCK_DIM;
-enum State { RUNS, MEETS_BLOCK, MEETS_WARP, LOOKS_AROUND, GONE };
+enum State { RUNS, AT_BLOCK_BARRIER, AT_WARP_BARRIER, AT_ACTIVE_MASK, ENDED };
 
 struct Thread {
     State state;
-    unsigned mask;  // whom it meets; then who has come
-    int place;  // where in the source it looks around
-    unsigned long long value;  // what it tells the others
-    unsigned long long told[32];  // what those who have come have told
+    unsigned mask;  // lanes that it waits for; afterwards those that arrived
+    int place;  // source line of its query of active lanes
+    unsigned long long value;  // value that it exchanges
+    unsigned long long received[32];  // values of the lanes that arrived
 };
 
 constexpr int GUARD = 1024, BLANK = 0x7fc0dead;
-constexpr int MOST_TURNS = 4096 * THREADS;  // far more than it takes all to come where they wait for each other
+constexpr int MAX_SWITCHES = 4096 * THREADS;  // far more switches than any barrier needs
 
 static Thread threads[THREADS];
 static unsigned block, blocks, blocks_begun;
-static int count, left, turns;
-alignas(16) static int room[GPU_ROOM_WORDS + GUARD];  // the block's shared memory, and what must stay as it is
+static int count, left, switches;
+alignas(16) static int arena[GPU_ARENA_WORDS + GUARD];  // the block's shared memory and the guard
 
-// place in the block of the fiber that runs
+// index in the block of the running fiber
 inline int own()
 {
     const int fiber = wp_cpu_get_thread_idx();
     return blocks_begun % 2 != 0 ? fiber : count - 1 - fiber;
 }
 
-// a fiber begins; the first does so first, and says which of all threads the block begins with
+// begins a fiber; fiber 0 begins first and sets up the block
 inline void begin(int fiber, size_t all, size_t first)
 {
     if (fiber != 0) return;
     count = left = all - first < THREADS ? (int)(all - first) : THREADS;
-    for (int t = 0; t < THREADS; ++t) threads[t].state = t < count ? RUNS : GONE;
-    for (int& word : room) word = BLANK;
-    block = first / THREADS, blocks = (all + THREADS - 1) / THREADS, turns = 0;
+    for (int t = 0; t < THREADS; ++t) threads[t].state = t < count ? RUNS : ENDED;
+    for (int& word : arena) word = BLANK;
+    block = first / THREADS, blocks = (all + THREADS - 1) / THREADS, switches = 0;
     ++blocks_begun;
 }
 
 inline void end()
 {
-    threads[own()].state = GONE;
-    turns = 0;
+    threads[own()].state = ENDED;
+    switches = 0;
     if (--left > 0) return;
     for (int n = 0; n < GUARD; ++n)
-        if (room[GPU_ROOM_WORDS + n] != BLANK) _wp_assert("shared memory is written beyond its end", __FILE__, __LINE__);
+        if (arena[GPU_ARENA_WORDS + n] != BLANK) _wp_assert("shared memory is written beyond its end", __FILE__, __LINE__);
 }
 
-// let others go on
+// switch to other fibers
 inline void wait()
 {
-    if (++turns > MOST_TURNS) _wp_assert("threads of a block wait for each other for ever", __FILE__, __LINE__);
+    if (++switches > MAX_SWITCHES) _wp_assert("threads of a block wait for each other for ever", __FILE__, __LINE__);
     wp_cpu_tile_sync();
 }
 
-inline void go_on(Thread& thread) { thread.state = RUNS, turns = 0; }
+inline void resume(Thread& thread) { thread.state = RUNS, switches = 0; }
 
-// those of a warp, by its first thread, of whom something is so
-template <class F> unsigned who(int first, F is_so)
+// mask of the lanes of a warp, by its first thread, for which a predicate holds
+template <class F> unsigned lanes_where(int first, F holds)
 {
     unsigned mask = 0;
     for (int lane = 0; lane < 32 && first + lane < THREADS; ++lane)
-        if (is_so(threads[first + lane])) mask |= 1u << lane;
+        if (holds(threads[first + lane])) mask |= 1u << lane;
     return mask;
 }
 
-// those of a warp who have come go on together
-inline void go_on(int first, unsigned here)
+// resume the lanes that have arrived together
+inline void resume(int first, unsigned here)
 {
     for (int lane = 0; lane < 32; ++lane)
         if (here >> lane & 1u) {
             threads[first + lane].mask = here;
-            go_on(threads[first + lane]);
+            resume(threads[first + lane]);
         }
 }
 
-// all that have not ended come here
-inline void meet_block()
+// barrier of all threads that have not ended
+inline void block_barrier()
 {
     Thread& self = threads[own()];
-    self.state = MEETS_BLOCK;
-    while (self.state == MEETS_BLOCK) {
+    self.state = AT_BLOCK_BARRIER;
+    while (self.state == AT_BLOCK_BARRIER) {
         bool all = true;
-        for (int t = 0; t < THREADS && all; ++t) all = threads[t].state == MEETS_BLOCK || threads[t].state == GONE;
+        for (int t = 0; t < THREADS && all; ++t) all = threads[t].state == AT_BLOCK_BARRIER || threads[t].state == ENDED;
         if (all) {
             for (int t = 0; t < THREADS; ++t)
-                if (threads[t].state == MEETS_BLOCK) go_on(threads[t]);
+                if (threads[t].state == AT_BLOCK_BARRIER) resume(threads[t]);
         } else
             wait();
     }
 }
 
-// all of a mask that have not ended come here, and learn what the others tell
-inline Thread& meet_warp(unsigned mask, unsigned long long value)
+// barrier of the lanes of a mask that have not ended, with an exchange of values
+inline Thread& warp_exchange(unsigned mask, unsigned long long value)
 {
     const int t = own(), first = t & ~31;
     Thread& self = threads[t];
-    self.value = value, self.mask = mask, self.state = MEETS_WARP;
-    while (self.state == MEETS_WARP) {
-        const unsigned others = mask & who(first, [](const Thread& one) { return one.state != GONE; });
-        const auto comes = [=](const Thread& one) { return one.state == MEETS_WARP && one.mask == mask; };
-        const unsigned here = others & who(first, comes);
-        if (here == others) {
+    self.value = value, self.mask = mask, self.state = AT_WARP_BARRIER;
+    while (self.state == AT_WARP_BARRIER) {
+        const unsigned expected = mask & lanes_where(first, [](const Thread& one) { return one.state != ENDED; });
+        const auto arrives = [=](const Thread& one) { return one.state == AT_WARP_BARRIER && one.mask == mask; };
+        const unsigned here = expected & lanes_where(first, arrives);
+        if (here == expected) {
             for (int lane = 0; lane < 32; ++lane)
                 for (int n = 0; here >> lane & 1u && n < 32; ++n)
-                    threads[first + lane].told[n] = here >> n & 1u ? threads[first + n].value : 0;
-            go_on(first, here);
+                    threads[first + lane].received[n] = here >> n & 1u ? threads[first + n].value : 0;
+            resume(first, here);
         } else
             wait();
     }
     return self;
 }
 
-// who has come to the same place when nobody of the warp can go on: they are as much together as they can be
-inline unsigned look_around(int place)
+// lanes at the same source line when no lane of the warp can run: the largest set that can be active together
+inline unsigned active_mask(int place)
 {
     const int t = own(), first = t & ~31;
     Thread& self = threads[t];
-    self.place = place, self.state = LOOKS_AROUND;
-    while (self.state == LOOKS_AROUND) {
-        if (who(first, [](const Thread& one) { return one.state == RUNS; }) == 0)
-            go_on(first, who(first, [=](const Thread& one) { return one.state == LOOKS_AROUND && one.place == place; }));
+    self.place = place, self.state = AT_ACTIVE_MASK;
+    while (self.state == AT_ACTIVE_MASK) {
+        if (lanes_where(first, [](const Thread& one) { return one.state == RUNS; }) == 0)
+            resume(first, lanes_where(first, [=](const Thread& one) { return one.state == AT_ACTIVE_MASK && one.place == place; }));
         else
             wait();
     }
@@ -159,8 +159,8 @@ struct Index { unsigned x; };
 #define gridDim (gpu::Index{gpu::blocks})
 #define __shared__ static
 #define __align__(bytes) __attribute__((aligned(bytes)))
-#define __syncthreads() gpu::meet_block()
-#define __activemask() gpu::look_around(__LINE__)
+#define __syncthreads() gpu::block_barrier()
+#define __activemask() gpu::active_mask(__LINE__)
 
 struct alignas(16) int4 { int x, y, z, w; };
 struct alignas(16) longlong2 { long long x, y; };
@@ -176,42 +176,33 @@ inline int __float2int_rn(float x)
     if (x != x) return 0;
     return x >= 0x1p31f ? 0x7fffffff : x < -0x1p31f ? (int)0x80000000 : (int)rintf(x);
 }
-inline long long __float2ll_rn(float x)  // what is no number becomes the least, unlike in 32 bits
-{
-    if (x != x || x < -0x1p63f) return -0x7fffffffffffffffll - 1;
-    return x >= 0x1p63f ? 0x7fffffffffffffffll : (long long)rintf(x);
-}
 inline float rsqrtf(float x) { return 1.0f / sqrtf(x); }
-inline float __fmaf_rn(float a, float b, float c) { return fmaf(a, b, c); }
 #pragma clang optimize off
-// rounded, never fused with what comes after
-inline float __fadd_rn(float a, float b) { volatile float sum = a + b; return sum; }
+// rounded, never fused
 inline float __fmul_rn(float a, float b) { volatile float product = a * b; return product; }
 #pragma clang optimize on
-inline float fminf(float a, float b) { return a != a || b < a ? b : a; }
 inline int __popc(unsigned x) { return __builtin_popcount(x); }
 inline int __clz(int x) { return x == 0 ? 32 : __builtin_clz((unsigned)x); }
 inline int __ffs(unsigned x) { return __builtin_ffs((int)x); }
-template <class T> T __ldg(const T* at) { return *at; }
 
 inline int min(int a, int b) { return a < b ? a : b; }
 inline int max(int a, int b) { return a > b ? a : b; }
 inline unsigned min(unsigned a, unsigned b) { return a < b ? a : b; }
 inline unsigned max(unsigned a, unsigned b) { return a > b ? a : b; }
 
-inline void __syncwarp(unsigned mask = 0xffffffffu) { gpu::meet_warp(mask, 0); }
+inline void __syncwarp(unsigned mask = 0xffffffffu) { gpu::warp_exchange(mask, 0); }
 inline unsigned __ballot_sync(unsigned mask, bool yes)
 {
-    const auto& self = gpu::meet_warp(mask, yes);
+    const auto& self = gpu::warp_exchange(mask, yes);
     unsigned all = 0;
-    for (int n = 0; n < 32; ++n) all |= (unsigned)self.told[n] << n;
+    for (int n = 0; n < 32; ++n) all |= (unsigned)self.received[n] << n;
     return all;
 }
 inline bool __any_sync(unsigned mask, bool yes) { return __ballot_sync(mask, yes) != 0u; }
 inline bool __all_sync(unsigned mask, bool yes) { return __ballot_sync(mask, !yes) == 0u; }
 template <class T> T __shfl_sync(unsigned mask, T value, int lane)
 {
-    return gpu::from_bits<T>(gpu::meet_warp(mask, gpu::bits_of(value)).told[lane & 31]);
+    return gpu::from_bits<T>(gpu::warp_exchange(mask, gpu::bits_of(value)).received[lane & 31]);
 }
 template <class T> T __shfl_xor_sync(unsigned mask, T value, int distance)
 {
@@ -219,10 +210,10 @@ template <class T> T __shfl_xor_sync(unsigned mask, T value, int distance)
 }
 template <class T> unsigned __match_any_sync(unsigned mask, T value)
 {
-    const auto& self = gpu::meet_warp(mask, gpu::bits_of(value));
+    const auto& self = gpu::warp_exchange(mask, gpu::bits_of(value));
     unsigned same = 0;
     for (int n = 0; n < 32; ++n)
-        if (self.mask >> n & 1u && self.told[n] == gpu::bits_of(value)) same |= 1u << n;
+        if (self.mask >> n & 1u && self.received[n] == gpu::bits_of(value)) same |= 1u << n;
     return same;
 }
 template <class T> unsigned __match_all_sync(unsigned mask, T value, int* all)
@@ -233,10 +224,10 @@ template <class T> unsigned __match_all_sync(unsigned mask, T value, int* all)
 }
 template <class T, class F> T reduced(unsigned mask, T value, F of)
 {
-    const auto& self = gpu::meet_warp(mask, gpu::bits_of(value));
+    const auto& self = gpu::warp_exchange(mask, gpu::bits_of(value));
     T result = value;
     for (int n = 0; n < 32; ++n)
-        if (self.mask >> n & 1u) result = of(result, gpu::from_bits<T>(self.told[n]));
+        if (self.mask >> n & 1u) result = of(result, gpu::from_bits<T>(self.received[n]));
     return result;
 }
 template <class T> T __reduce_max_sync(unsigned mask, T value)
@@ -262,7 +253,6 @@ template <class T, class V> T atomicAdd(T* at, V v) { return changed(at, [=](T b
 template <class T, class V> T atomicMax(T* at, V v) { return changed(at, [=](T b) { return b > (T)v ? b : (T)v; }); }
 template <class T, class V> T atomicMin(T* at, V v) { return changed(at, [=](T b) { return b < (T)v ? b : (T)v; }); }
 template <class T, class V> T atomicOr(T* at, V v) { return changed(at, [=](T b) { return (T)(b | (T)v); }); }
-template <class T> T atomicCAS(T* at, T expected, T v) { return changed(at, [=](T b) { return b == expected ? v : b; }); }
 
 inline size_t __cvta_generic_to_global(const void* at) { return (size_t)at; }
-inline size_t __cvta_generic_to_shared(const void* at) { return (size_t)((const char*)at - (const char*)gpu::room); }
+inline size_t __cvta_generic_to_shared(const void* at) { return (size_t)((const char*)at - (const char*)gpu::arena); }

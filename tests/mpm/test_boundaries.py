@@ -65,7 +65,7 @@ def test_impulse_is_the_change_of_momentum(simulate, decoupling):
     start, dt = sim.totals(), sim.model.control_dt
     for n in range(1, 16):
         now = sim.run().totals()
-        impulse = sim.scratch.sensors.boundary_impulse.numpy()[0, 0]  # nobody has cleared it
+        impulse = sim.scratch.sensors.boundary_impulse.numpy()[0, 0]  # not cleared in between
         expected = now.momentum - start.momentum - n * dt * now.mass * gravity
         assert np.abs(impulse - expected).max() < 1e-5 * start.momentum_scale
     assert impulse[2] > 0.5 * n * dt * now.mass * 9.81
@@ -108,7 +108,7 @@ def test_nothing_passes_a_plane(simulate, how, speed):
     assert 0.0 < total < speed  # restitution
 
 
-def test_what_tells_the_nodes_how_it_is_driven_goes_no_other_way(simulate):
+def test_contact_candidates_without_contact_move_like_others(simulate):
     """Kinematic momentum is for contact: a body just above the ground does what it does where there is none."""
     spin = np.array([0.5, -1.0, 2.0])
     free, candidates = (simulate(**BLOCK, planes=planes, num_substeps=15) for planes in ([], [(GROUND, -0.02, 0.5)]))

@@ -69,7 +69,7 @@ def test_penetration_of_bodies_that_go_on(meet, device, path):
 
 
 def test_sensors_forget(meet):
-    """They tell of one control step."""
+    """They cover one control step."""
     sim = meet([BLOCK, BALL], control_dt=1.0 / 60.0).run(2)
     sensors = sim.scratch.sensors
     assert sensors.pair_impulse.numpy().any() and sensors.part_impulse.numpy().any()

@@ -105,7 +105,7 @@ def test_environment_runs_again_after_a_reset(three):
 
 
 def test_healthy_flags_of_other_causes_are_kept(three):
-    """A flag that somebody else has raised freezes the environment, and stays."""
+    """A flag of another cause freezes the environment, and stays."""
     sim = three()
     sim.state.failure.assign(np.array([8, 0, 0], np.int32))
     sim.run()

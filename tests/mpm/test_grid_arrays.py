@@ -44,7 +44,7 @@ def take_all(
 def test_fixed_sums(device, driven):
     """A record with mass is cleared when it is taken, one without is not touched.
 
-    Where nobody is driven, kinematic momentum is left alone, also beside a node of the same warp where somebody is.
+    Without contact candidates kinematic momentum is not touched, also next to a node of the same warp with some.
     """
     rng, shape = np.random.default_rng(1), (2, SLOTS, 2, 64, 4)  # environments, slots, halves, nodes
     numbers = rng.integers(-(2**50), 2**50, shape)

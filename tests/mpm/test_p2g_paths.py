@@ -289,8 +289,8 @@ def test_device_and_size_choose_the_path(monkeypatch, particles, active_blocks, 
 
 
 @pytest.mark.parametrize("copies", [60, 80, 100, 140, 300])
-def test_a_crowd_is_counted_in_larger_units(simulate, device, copies):
-    """Where a node holds more than sixteen particles of one field, words would run over; so often that nobody sees it.
+def test_a_crowd_is_counted_in_larger_quanta(simulate, device, copies):
+    """A node with more than sixteen particles of one field overflows its words, which must be noticed each time.
 
     A corner of the box is crowded; the sums of the others must not depend on the rounds that subblocks go in.
     """
