@@ -15,7 +15,7 @@ from benchmarks.paper.poses import random_directions, random_poses, random_shape
 from benchmarks.physics.rig import Rig, World
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.mpm.diagnostics import Totals, totals
 
 CONTROL_STEPS = 45  # one and a half seconds
@@ -79,13 +79,13 @@ def plan(seeds: int, quick: bool, world: World) -> Iterator[Callable[[], Iterato
     standing = replace(free, gravity=9.81, ground=True)
     for tone in TONES:
         for alpha in ALPHAS:
-            drive = DriveSettings(tone=tone, alpha=alpha, root="free")
-            yield lambda drive=drive: struck_free(free, drive, seeds, steps)
+            control = PoseControlConfig(tone=tone, alpha=alpha, root="free", free_motion=False)
+            yield lambda control=control: struck_free(free, control, seeds, steps)
     for tone in TONES:
-        yield lambda tone=tone: hit_by_balls(standing, DriveSettings(tone=tone), seeds, steps)
+        yield lambda tone=tone: hit_by_balls(standing, PoseControlConfig(tone=tone), seeds, steps)
 
 
-def struck_free(world: World, drive: DriveSettings, seeds: int, steps: int) -> Iterator[dict[str, Any]]:
+def struck_free(world: World, control: PoseControlConfig, seeds: int, steps: int) -> Iterator[dict[str, Any]]:
     """A body adrift without gravity, struck on the chest or on a forearm: a row for each."""
     rng = np.random.default_rng(3)
     bones = np.repeat([joint_index(name) for name in STRIKES], seeds)
@@ -93,27 +93,27 @@ def struck_free(world: World, drive: DriveSettings, seeds: int, steps: int) -> I
     directions = np.tile(random_directions(rng, seeds), (len(STRIKES), 1))
     shapes = np.tile(random_shapes(load_asset(), rng, seeds), (len(STRIKES), 1))
     poses = np.tile(random_poses(rng, seeds, POSE_RANGE)[0], (len(STRIKES), 1, 1))
-    rig = Rig(world, drive, shapes)
+    rig = Rig(world, control, shapes)
     course = follow(rig, poses, bones, size[:, None] * directions, steps)
     for index, (name, impulse) in enumerate(STRIKES.items()):
         mine = slice(index * seeds, (index + 1) * seeds)
-        row = _row(f"struck {name}, {impulse:g} N s, adrift", world, drive, course, mine, seeds)
+        row = _row(f"struck {name}, {impulse:g} N s, adrift", world, control, course, mine, seeds)
         yield row | {"bone": name, "impulse_n_s": impulse} | _conservation(course, mine)
 
 
-def hit_by_balls(world: World, drive: DriveSettings, seeds: int, steps: int) -> Iterator[dict[str, Any]]:
+def hit_by_balls(world: World, control: PoseControlConfig, seeds: int, steps: int) -> Iterator[dict[str, Any]]:
     """A standing body, its root held by the wrench, and what balls would give its chest from the front."""
     rng = np.random.default_rng(4)
     shapes = np.tile(random_shapes(load_asset(), rng, seeds), (len(BALLS), 1))
     size = np.repeat([ball.impulse for ball in BALLS], seeds)
-    rig = Rig(world, drive, shapes)
+    rig = Rig(world, control, shapes)
     bones = np.full(len(shapes), joint_index("spine3"))
     poses = np.zeros((len(shapes), 22, 3))
     course = follow(rig, poses, bones, size[:, None] * np.array([0.0, 1.0, 0.0]), steps)
     for index, ball in enumerate(BALLS):
         mine = slice(index * seeds, (index + 1) * seeds)
-        row = _row(f"ball {ball.mass:g} kg at {ball.speed:g} m/s, standing", world, drive, course, mine, seeds)
-        peak, settled = ball.measured[drive.tone]
+        row = _row(f"ball {ball.mass:g} kg at {ball.speed:g} m/s, standing", world, control, course, mine, seeds)
+        peak, settled = ball.measured[control.tone]
         yield row | {
             "bone": "spine3",
             "ball_kg": ball.mass,
@@ -148,7 +148,9 @@ def follow(rig: Rig, poses: np.ndarray, bones: np.ndarray, impulses: np.ndarray,
     )
 
 
-def _row(case: str, world: World, drive: DriveSettings, course: Course, mine: slice, seeds: int) -> dict[str, Any]:
+def _row(
+    case: str, world: World, control: PoseControlConfig, course: Course, mine: slice, seeds: int
+) -> dict[str, Any]:
     """What every struck body has: mean over seeds and standard deviation."""
     alive = np.arange(len(course.alive))[mine][course.alive[mine]]
     error, shape = np.degrees(course.joint_error[:, alive]), 1e3 * course.shape_error[:, alive]
@@ -164,14 +166,14 @@ def _row(case: str, world: World, drive: DriveSettings, course: Course, mine: sl
         "settled_strain": strain[-LAST:].mean(0),
     }
     row: dict[str, Any] = {
-        "case": f"{case}, tone {drive.tone:g}, alpha {drive.alpha:g}",
+        "case": f"{case}, tone {control.tone:g}, alpha {control.alpha:g}",
         "table": None,
         "study": "recovery",
         "decoupling": world.decoupling,
         "fidelity": world.fidelity,
         "disturbed": True,
-        "tone": drive.tone,
-        "alpha": drive.alpha,
+        "tone": control.tone,
+        "alpha": control.alpha,
         "seeds": seeds,
         "failed_bodies": seeds - len(alive),
         "recovered": f"{len(known)}/{len(recovery)}",

@@ -21,7 +21,8 @@ from benchmarks.paper.poses import passing_through, random_directions, random_po
 from benchmarks.physics.rig import Rig, World
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.config import PoseControlConfig
+from piavatar_envs.config import replace as changed
 from piavatar_envs.core.launch_graph import LaunchGraph
 
 VARIANTS = ("split", "paper", "none")
@@ -30,9 +31,9 @@ SUBSTEPS = 100  # a pose
 STEPS_PER_POSE = 20  # of the smooth sequence: joints turn at 1 to 5 rad/s
 STRUCK_BONE, STRIKE = "left_elbow", 3.0  # [N s]: a forearm at 2 to 3 m/s
 #: Nothing but the kinematic velocity moves the body: no pull of any kind, no wrench.
-BARE = DriveSettings(tone=0.0, alpha=0.0, root="free")
+BARE = PoseControlConfig(tone=0.0, alpha=0.0, root="free", free_motion=False)
 #: What the environments use, without the root wrench, which would take up the momentum of a strike.
-TENSED = DriveSettings(root="free")
+TENSED = PoseControlConfig(root="free", free_motion=False)
 
 
 @dataclass(frozen=True)
@@ -82,15 +83,18 @@ def plan(options: Options, world: World) -> Iterator[Any]:
     """Every measurement, as a function that yields its rows."""
     medium = replace(world, fidelity="medium")
     runs = [(replace(world, decoupling=v), BARE, options.seeds) for v in VARIANTS]
-    runs += [(replace(world, decoupling=v), replace(BARE, mode="reference"), options.seeds) for v in ("paper", "none")]
+    runs += [
+        (replace(world, decoupling=v), changed(BARE, {"command": "reference"}), options.seeds)
+        for v in ("paper", "none")
+    ]
     if options.medium_seeds:
         runs += [(replace(medium, decoupling=v), BARE, options.medium_seeds) for v in VARIANTS]
-    for where, drive, seeds in runs:
-        yield lambda where=where, drive=drive, seeds=seeds: table_1(options, where, drive, seeds)
+    for where, control, seeds in runs:
+        yield lambda where=where, control=control, seeds=seeds: table_1(options, where, control, seeds)
     for variant in VARIANTS:
         where = replace(world, decoupling=variant)
         yield lambda where=where: table_1(options, where, TENSED, options.seeds, strike=STRIKE)
-    target = replace(BARE, mode="target")
+    target = changed(BARE, {"command": "target"})
     for variant in VARIANTS:
         where = replace(world, decoupling=variant)
         yield lambda where=where: table_2(options, where, target, options.poses)
@@ -99,7 +103,7 @@ def plan(options: Options, world: World) -> Iterator[Any]:
         where = replace(world, decoupling=variant)
         yield lambda where=where: table_2(options, where, target, smooth, STEPS_PER_POSE)
     # the environments' own time step and pulls; jumps are too fast for that step
-    usual = replace(TENSED, mode="target")
+    usual = changed(TENSED, {"command": "target"})
     yield lambda: table_2(options, replace(world, num_substeps=None), usual, smooth, STEPS_PER_POSE)
     for variant in VARIANTS:
         where = replace(world, decoupling=variant)
@@ -113,20 +117,20 @@ def plan(options: Options, world: World) -> Iterator[Any]:
 
 
 def table_1(
-    options: Options, world: World, drive: DriveSettings, seeds: int, strike: float = 0.0
+    options: Options, world: World, control: PoseControlConfig, seeds: int, strike: float = 0.0
 ) -> Iterator[dict[str, Any]]:
     """Rows of Table 1: distance to the commanded shape after one, two, three and four poses.
 
     With ``strike`` [N s], a forearm is struck before the second pose, in a random direction.
     """
-    samples = [run_sequences(world, drive, options.sequences, seed, strike) for seed in range(seeds)]
+    samples = [run_sequences(world, control, options.sequences, seed, strike) for seed in range(seeds)]
     for frame in range(FRAMES):
         substeps = SUBSTEPS * (frame + 1)
         yield {
-            "case": label("table 1", world, drive, strike) + f", {substeps} substeps",
+            "case": label("table 1", world, control, strike) + f", {substeps} substeps",
             "table": 1,
             "decoupling": world.decoupling,
-            "drive": drive.mode,
+            "drive": control.command,
             "fidelity": world.fidelity,
             "disturbed": strike > 0.0,
             "substeps": substeps,
@@ -134,15 +138,15 @@ def table_1(
             "seeds": seeds,
             "poses_per_seed": FRAMES * options.sequences,
             "failed_bodies": sum(sample[frame]["failed"] for sample in samples),
-            "tone": drive.tone,
-            "alpha": drive.alpha,
+            "tone": control.tone,
+            "alpha": control.alpha,
             "strike_n_s": strike,
             "paper": paper.table_1(world.decoupling, substeps) if not strike else None,
         }
 
 
 def run_sequences(
-    world: World, drive: DriveSettings, sequences: int, seed: int, strike: float = 0.0
+    world: World, control: PoseControlConfig, sequences: int, seed: int, strike: float = 0.0
 ) -> list[dict[str, float]]:
     """One repetition of Table 1: metrics after each of the four poses, over all bodies of the repetition."""
     rng = np.random.default_rng([seed, 1])
@@ -158,7 +162,7 @@ def run_sequences(
     failed = np.zeros(FRAMES, int)
     seconds = np.zeros(FRAMES)
     for group in groups:
-        rig = Rig(world, drive, shapes[group])
+        rig = Rig(world, control, shapes[group])
         for frame in range(FRAMES):
             if strike and frame == 1:
                 rig.strike(np.full(len(group), joint_index(STRUCK_BONE)), strike * directions[group])
@@ -180,7 +184,7 @@ def run_sequences(
 def table_2(
     options: Options,
     world: World,
-    drive: DriveSettings,
+    control: PoseControlConfig,
     poses: int,
     steps_per_pose: int = 1,
     strike: float = 0.0,
@@ -194,7 +198,7 @@ def table_2(
     shapes = np.concatenate([random_shapes(load_asset(), rng, 2)[seed % 2][None] for seed, rng in enumerate(rngs)])
     courses = [passing_through(*random_poses(rng, poses), steps_per_pose) for rng in rngs]
     rotations, shifts = (np.stack(parts, axis=1) for parts in zip(*courses, strict=True))
-    rig = Rig(world, drive, shapes)
+    rig = Rig(world, control, shapes)
     frames: list[list[dict[str, float]]] = [[] for _ in rngs]
     failures = 0
     for step in range(len(rotations)):
@@ -214,10 +218,10 @@ def table_2(
         sample["distance_m"] = sample.pop("mean_distance_m")
     how = "a jump a pose" if steps_per_pose == 1 else f"{steps_per_pose} steps a pose"
     yield {
-        "case": label("table 2", world, drive, strike) + f", {how}, {rig.model.num_substeps} substeps a step",
+        "case": label("table 2", world, control, strike) + f", {how}, {rig.model.num_substeps} substeps a step",
         "table": 2,
         "decoupling": world.decoupling,
-        "drive": drive.mode,
+        "drive": control.command,
         "fidelity": world.fidelity,
         "disturbed": strike > 0.0,
         "substeps": rig.model.num_substeps,
@@ -227,8 +231,8 @@ def table_2(
         "seeds": options.seeds,
         "steps_per_seed": len(rotations),
         "failed_bodies": failures,
-        "tone": drive.tone,
-        "alpha": drive.alpha,
+        "tone": control.tone,
+        "alpha": control.alpha,
         "strike_n_s": strike,
         "paper": paper.table_2() if not strike else None,
     }
@@ -268,9 +272,9 @@ def time_tracking(rig: Rig, repeats: int = 20) -> float:
     return float(np.median(runs))
 
 
-def label(what: str, world: World, drive: DriveSettings, strike: float) -> str:
+def label(what: str, world: World, control: PoseControlConfig, strike: float) -> str:
     """The case of a row, for people."""
-    return f"{what}: {world.decoupling}, {drive.mode}, {world.fidelity}" + (", struck" if strike else "")
+    return f"{what}: {world.decoupling}, {control.command}, {world.fidelity}" + (", struck" if strike else "")
 
 
 if __name__ == "__main__":

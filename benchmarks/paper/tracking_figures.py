@@ -13,7 +13,7 @@ from benchmarks.paper import metrics as paper
 from benchmarks.paper.poses import random_poses, random_shapes
 from benchmarks.physics.rig import Rig, World
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.core.arrays import matrices_of
 
 COLORS = {"split": "#1b7f79", "paper": "#d1495b", "none": "#8d6a9f"}
@@ -103,9 +103,9 @@ def draw_strain(path: Path, world: World) -> None:
     shapes, panels = random_shapes(load_asset(), rng, 1), []
     with Renderer(SIZE, SIZE, Camera(position=(1.1, -3.7, 1.25), target=(0.0, 0.0, 0.98))) as renderer:
         for decoupling, title in TITLES.items():
-            drive = DriveSettings(tone=0.0, alpha=0.0, root="free")
+            control = PoseControlConfig(tone=0.0, alpha=0.0, root="free", free_motion=False)
             where = replace(world, decoupling=decoupling)
-            rig = Rig(where, drive, shapes)
+            rig = Rig(where, control, shapes)
             for rotation, shift in zip(rotations, shifts, strict=True):
                 rig.step(rotation[None], shift[None])
             points = rig.points

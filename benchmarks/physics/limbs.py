@@ -14,7 +14,7 @@ from benchmarks.physics.rig import Rig, World, joint_gaps
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, forward_kinematics, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
-from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 
@@ -65,7 +65,7 @@ class Limbs:
             fidelity=options.fidelity, num_substeps=None, gravity=gravity, ground=ground, device=options.device
         )
         asset = load_asset()
-        self.rig = Rig(world, DriveSettings(), asset.parameters()[None])
+        self.rig = Rig(world, PoseControlConfig(), asset.parameters()[None])
         self.rig.reset(rotations[None])
         rates = np.full((1, self.rig.points.num_points), rate) if rate > 0.0 else None
         none = np.zeros((1, 1 + NUM_JOINTS))

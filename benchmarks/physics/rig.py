@@ -16,12 +16,14 @@ from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, skin
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.pose_control.controller import PoseController
-from piavatar_envs.avatar.types import DriveSettings, Tracked
+from piavatar_envs.avatar.types import Tracked
+from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.core.arrays import matrices_of
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
+from piavatar_envs.sim.bodies import pose_control
 from piavatar_envs.sim.world import GRID_PER_HEIGHT, record_control_step
 from piavatar_envs.tasks.track_motion import apply_impulse
 
@@ -31,7 +33,7 @@ LOWER, UPPER = (-1.6, -1.6, -0.7), (1.6, 1.6, 2.6)  # room enough for bodies tha
 
 @dataclass(frozen=True)
 class World:
-    """Everything about a batch but its bodies and its drive.
+    """Everything about a batch but its bodies and its control.
 
     Attributes:
         fidelity: resolution, as in the environments.
@@ -60,7 +62,7 @@ class Rig:
         flesh: particles that track no bone, shape ``(P,)`` bool.
     """
 
-    def __init__(self, world: World, drive: DriveSettings, shapes: np.ndarray) -> None:
+    def __init__(self, world: World, control: PoseControlConfig, shapes: np.ndarray) -> None:
         """Build a body for each row of ``shapes`` (shape parameters, ``(num_envs, S)``) and place them."""
         self.world, self.num_envs = world, len(shapes)
         asset = self.asset = load_asset()
@@ -91,7 +93,7 @@ class Rig:
         )
         self.state, self.scratch = allocate(self.model)
         self.avatar = Avatar(self.points, 0, self.model)
-        self.controller = PoseController(self.avatar, drive)
+        self.controller = PoseController(self.avatar, pose_control(control, self.model))
         self._record()
         self.reset()
 

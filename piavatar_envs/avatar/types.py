@@ -7,7 +7,6 @@ has carried a bone within this control step. A body occupies particles ``first .
 from __future__ import annotations
 
 import inspect
-import math
 from dataclasses import dataclass, is_dataclass
 from functools import partial
 from typing import Any
@@ -16,7 +15,6 @@ import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.core.arrays import make_struct, vec8, vec12, vec16
-from piavatar_envs.mpm.types import Model
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,68 +25,14 @@ TONE_RATE = 30.0
 ROOT_RATE = 10.0
 #: Decay of motion between bones at any tone [1/s]; without it a limp body rings like rubber.
 DAMPING = 3.0
-STANDARD_GRAVITY = 9.81
-
-
-@dataclass(frozen=True)
-class DriveSettings:
-    """Parameters of a drive in user terms.
-
-    Attributes:
-        mode: ``"increment"``, or ``"target"``: velocity from the tracked pose to the goal itself, the protocol of the
-            paper's Table 2, for undisturbed reproduction only (on a disturbed body it fights the physical velocity);
-            or ``"reference"``: velocity from the last commanded pose to the next, whatever the body did (open loop).
-        tone: how firmly bones return to the commanded pose, 0 to 1.
-        alpha: share of a shape error that shape preservation may undo in a control step, 0 to 1.
-        shape_preservation: ``"physical"`` (keeps momentum) or ``"kinematic"`` (the paper's term in ``vk``).
-        root: ``"wrench"`` holds the commanded root, ``"free"`` lets the body fly.
-        free_motion: take the rigid part out of commanded motion, so that it carries no unreacted momentum. A body
-            whose root has let go moves so in any case.
-        max_force: limit of the root force, in units of mass times standard gravity.
-        max_torque: limit of the root torque, in units of mass times standard gravity times one metre.
-        max_tilt: tilt error at which the root lets go [rad].
-        max_horizontal_error: horizontal root error at which it lets go [m].
-        max_height_error: height error at which it lets go [m].
-    """
-
-    mode: str = "increment"
-    tone: float = 1.0
-    alpha: float = 0.3
-    shape_preservation: str = "physical"
-    root: str = "wrench"
-    free_motion: bool = False
-    max_force: float = 2.0
-    max_torque: float = 0.7
-    max_tilt: float = math.radians(45.0)
-    max_horizontal_error: float = 0.5
-    max_height_error: float = 0.4
-
-    def kernel_parameters(self, model: Model) -> PoseControl:
-        """The same as a kernel argument."""
-        drive = PoseControl()
-        drive.dt, drive.control_dt, drive.num_substeps = model.step.dt, model.control_dt, model.num_substeps
-        drive.mode = {"increment": 0, "target": 1, "reference": 2}[self.mode]
-        rate = self.alpha / model.control_dt
-        drive.shape_rate = rate if self.shape_preservation == "physical" else 0.0
-        drive.kinematic_shape_rate = rate if self.shape_preservation == "kinematic" else 0.0
-        drive.tone_rate, drive.damping = TONE_RATE * self.tone, DAMPING
-        drive.free_motion = int(self.free_motion)
-        drive.gravity = model.step.gravity
-        drive.root_rate = ROOT_RATE if self.root == "wrench" else 0.0
-        drive.max_force = self.max_force * STANDARD_GRAVITY
-        drive.max_torque = self.max_torque * STANDARD_GRAVITY
-        drive.max_tilt_cos = math.cos(self.max_tilt)
-        drive.max_horizontal_error, drive.max_height_error = self.max_horizontal_error, self.max_height_error
-        return drive
-
+#: What a control step of the pose controller does with a command, by its setting ``control.command``.
+COMMANDS = {"increment": 0, "target": 1, "reference": 2}
+COMMAND_TARGET = wp.constant(COMMANDS["target"])
+COMMAND_REFERENCE = wp.constant(COMMANDS["reference"])
 
 #: All that a particle blends over its bones, and what it has blended, see :mod:`piavatar_envs.avatar.skinning`.
 vec44 = wp.types.vector(length=44, dtype=wp.float32)
 vec24 = wp.types.vector(length=24, dtype=wp.float32)
-
-DRIVE_INCREMENT = wp.constant(0)
-DRIVE_TARGET = wp.constant(1)
-DRIVE_REFERENCE = wp.constant(2)
 
 
 @wp.struct
@@ -122,25 +66,28 @@ class Body:
 
 @wp.struct
 class PoseControl:
-    """Parameters of the drive. Rates are natural frequencies of critically damped pulls [1/s]."""
+    """Parameters of the pose controller, named like the settings of ``control`` that they follow from.
+
+    Rates are natural frequencies of critically damped pulls [1/s].
+    """
 
     dt: float  # substep [s]
     control_dt: float  # control step [s]
     num_substeps: int
-    mode: int  # DRIVE_INCREMENT, DRIVE_TARGET or DRIVE_REFERENCE
+    command: int  # one of COMMANDS
     shape_rate: float  # physical shape preservation, alpha / control_dt
     kinematic_shape_rate: float  # the paper's shape preservation inside vk; breaks momentum
-    tone_rate: float  # pull towards the commanded pose, 30 tone
+    tone_rate: float  # pull towards the commanded pose, TONE_RATE tone
     damping: float  # decay of motion between bones [1/s]
     free_motion: int  # 1: commanded motion carries no net momentum (0: not until the root wrench has let go)
     gravity: wp.vec3
     # root wrench
     root_rate: float  # 0: none
-    max_force: float  # [m/s^2], a force limit over the mass
-    max_torque: float  # [m^2/s^2], a torque limit over the mass
-    max_tilt_cos: float
-    max_horizontal_error: float  # [m]
-    max_height_error: float  # [m]
+    max_root_force: float  # [m/s^2], a force limit over the mass
+    max_root_torque: float  # [m^2/s^2], a torque limit over the mass
+    release_tilt_cos: float
+    release_distance: float  # horizontal [m]
+    release_height: float  # [m]
 
 
 @wp.struct

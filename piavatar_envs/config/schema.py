@@ -116,10 +116,10 @@ class PoseControlConfig(BaseModel):
     model_config = FROZEN
 
     mode: Literal["pose"] = Field("pose", description="pose: actions are increments of a pose that moves the body")
-    command: Literal["increment", "target"] = Field(
+    command: Literal["increment", "target", "reference"] = Field(
         "increment",
-        description="increment (the tracked pose moves by the command's change) or target (the tracked pose moves to "
-        "the commanded one; only for undisturbed reproduction)",
+        description="increment (the tracked pose moves by the command's change), target (the tracked pose moves to "
+        "the commanded one) or reference (open loop); target and reference only for undisturbed reproduction",
     )
     tone: float = Field(1.0, ge=0.0, le=1.0, description="resistance of the pose to contact: 0 limp, 1 tensed [-]")
     alpha: float = Field(0.3, ge=0.0, le=1.0, description="shape preservation, as a share of a control step [-]")

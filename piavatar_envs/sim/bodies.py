@@ -8,6 +8,7 @@ constant that depends on the shape.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,13 +24,12 @@ from piavatar_envs.avatar.body.sampling import ParticleSet, morph
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, body_part_of_joint, joint_index
 from piavatar_envs.avatar.body.soft_tissue import bone_distance, inert_share, softness
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.torque_control.controller import JointSettings
-from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.avatar.torque_control.controller import TorqueControl
+from piavatar_envs.avatar.types import COMMANDS, DAMPING, ROOT_RATE, TONE_RATE, PoseControl
 from piavatar_envs.config import (
     AvatarConfig,
     AvatarSourceConfig,
     ConfigError,
-    ControlConfig,
     EnvConfig,
     PoseControlConfig,
     RegionConfig,
@@ -46,6 +46,8 @@ from piavatar_envs.sim.randomize import Parameter, Randomization
 wp.set_module_options({"enable_backward": False})
 
 NUM_PARTS = len(BODY_PARTS)
+#: Gravity in which force limits in body weights are counted [m/s^2].
+STANDARD_GRAVITY = 9.81
 #: First number of the seeds of a pool's shapes.
 POOL_SEED = 20_260
 #: Arrays of :class:`~piavatar_envs.avatar.types.Body` that depend on the shape.
@@ -135,7 +137,7 @@ class Flesh:
         )
         return points, volume[None]
 
-    def joint_settings(self) -> JointSettings | None:
+    def torque_control(self) -> TorqueControl | None:
         """Return the parameters of torque control; None under pose control.
 
         Raises:
@@ -155,12 +157,12 @@ class Flesh:
         sampled = self.sampled
         distance = bone_distance(sampled.rest_positions, sampled.bone)
         firm = firmness(sampled.skin_joints, sampled.skin_weights)
-        return JointSettings(
+        return TorqueControl(
             muscles=make_muscles(control.joint_stiffness, control.joint_damping, control.strength),
-            assist=control.root_assist,
-            attachment=attachment_rates(sampled.depth, distance, firm, *control.flesh_rate),
-            firm=(sampled.bone >= 0) & control.firm_bones,
-            solid=control.bone_contact,
+            root_assist=control.root_assist,
+            flesh_rate=attachment_rates(sampled.depth, distance, firm, *control.flesh_rate),
+            firm_bones=(sampled.bone >= 0) & control.firm_bones,
+            bone_contact=control.bone_contact,
         )
 
     def masses(self, volume: np.ndarray) -> np.ndarray:
@@ -225,22 +227,23 @@ class Flesh:
         return inside
 
 
-def drive_settings(control: ControlConfig) -> DriveSettings:
-    """Return the parameters of a drive; those of commanded poses are the defaults under torques."""
-    d = control if isinstance(control, PoseControlConfig) else PoseControlConfig()
-    return DriveSettings(
-        mode=d.command,
-        tone=d.tone,
-        alpha=d.alpha,
-        shape_preservation=d.shape_preservation,
-        root=d.root,
-        free_motion=d.moves_freely,
-        max_force=d.max_root_force,
-        max_torque=d.max_root_torque,
-        max_tilt=d.release_tilt,
-        max_horizontal_error=d.release_distance,
-        max_height_error=d.release_height,
-    )
+def pose_control(settings: PoseControlConfig, model: Model) -> PoseControl:
+    """Return the parameters of a pose controller as kernels take them."""
+    rate = settings.alpha / model.control_dt
+    physical = settings.shape_preservation == "physical"
+    control = PoseControl()
+    control.dt, control.control_dt, control.num_substeps = model.step.dt, model.control_dt, model.num_substeps
+    control.command = COMMANDS[settings.command]
+    control.shape_rate, control.kinematic_shape_rate = (rate, 0.0) if physical else (0.0, rate)
+    control.tone_rate, control.damping = TONE_RATE * settings.tone, DAMPING
+    control.free_motion = int(settings.moves_freely)
+    control.gravity = model.step.gravity
+    control.root_rate = ROOT_RATE if settings.root == "wrench" else 0.0
+    control.max_root_force = settings.max_root_force * STANDARD_GRAVITY
+    control.max_root_torque = settings.max_root_torque * STANDARD_GRAVITY
+    control.release_tilt_cos = math.cos(settings.release_tilt)
+    control.release_distance, control.release_height = settings.release_distance, settings.release_height
+    return control
 
 
 def load_avatar(settings: AvatarSourceConfig) -> AvatarAsset:

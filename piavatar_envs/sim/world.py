@@ -25,7 +25,7 @@ from piavatar_envs.mpm.memory import allocate, estimate_active_blocks
 from piavatar_envs.mpm.model import build_model, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
-from piavatar_envs.sim.bodies import Flesh, Shapes, check_shape_names, drive_settings, load_avatar
+from piavatar_envs.sim.bodies import Flesh, Shapes, check_shape_names, load_avatar, pose_control
 from piavatar_envs.sim.checks import check_apart, check_beside_solids, check_places
 from piavatar_envs.sim.props import PropSet, prop_matter, prop_points
 from piavatar_envs.sim.randomize import Randomization, fastest_wave
@@ -123,7 +123,7 @@ class Simulation:
             for avatar, asset in zip(self._avatar_configs, self._assets, strict=True)
         ]
         check_shape_names(self.flesh)
-        self._torque = [flesh.joint_settings() for flesh in self.flesh]
+        self._torque = [flesh.torque_control() for flesh in self.flesh]
         self._solids = [prop_points(prop, spacing) for prop in self.scene.props]
         self._prop_matter = [
             prop_matter(prop, points, physics) for prop, points in zip(self.scene.props, self._solids, strict=True)
@@ -192,7 +192,7 @@ class Simulation:
         self.controllers: list[Controller] = [
             TorqueController(avatar, flesh.points, torque)
             if torque
-            else PoseController(avatar, drive_settings(flesh.control))
+            else PoseController(avatar, pose_control(flesh.control, self.model))
             for avatar, flesh, torque in zip(self.avatars, self.flesh, self._torque, strict=True)
         ]
 

@@ -16,13 +16,14 @@ from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index, skin
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.pose_control.controller import PoseController
-from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.colliders import Collider
 from piavatar_envs.mpm.diagnostics import Totals, totals
 from piavatar_envs.mpm.memory import allocate
 from piavatar_envs.mpm.model import MaterialPoints, build_model, make_grid
 from piavatar_envs.mpm.types import Model, Scratch, State
+from piavatar_envs.sim.bodies import pose_control
 from piavatar_envs.sim.world import record_control_step
 
 DENSITY = 1000.0
@@ -282,7 +283,7 @@ def build_rig(
     mass = volume * np.float32(DENSITY)
     points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, inert)
     avatar = Avatar(points, others, model)
-    controller = PoseController(avatar, DriveSettings(**settings))
+    controller = PoseController(avatar, pose_control(PoseControlConfig(**{"free_motion": False} | settings), model))
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)
     reset_graph, step_graph = LaunchGraph(device), LaunchGraph(device)
     avatar.record_reset(reset_graph, state, mask)

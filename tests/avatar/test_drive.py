@@ -79,7 +79,7 @@ def test_increments_are_added_to_the_tracked_pose_on_the_right(make_rig, wild_po
 
 
 def test_target_mode_goes_to_the_goal_itself(make_rig, wild_pose):
-    rig, _, command, step = displaced(make_rig, wild_pose, mode="target")
+    rig, _, command, step = displaced(make_rig, wild_pose, command="target")
     rig.step()
     reached = Rotation.from_matrix(rig.tracked_local())
     assert ((command * step).inv() * reached).magnitude().max() < 1e-4
@@ -101,12 +101,12 @@ def test_a_step_forward_is_a_step_where_the_body_faces(make_rig):
 # ---- reaching poses without strain
 
 
-@pytest.mark.parametrize("mode", ["increment", "target"])
+@pytest.mark.parametrize("command", ["increment", "target"])
 @pytest.mark.parametrize("root", ["wrench", "free"])
 @pytest.mark.parametrize(("num_substeps", "scale", "frames"), [(15, LIVELY, 15), (100, WILD, 4)])
-def test_random_poses_are_reached_and_strain_nothing(make_rig, wild_pose, mode, root, num_substeps, scale, frames):
+def test_random_poses_are_reached_and_strain_nothing(make_rig, wild_pose, command, root, num_substeps, scale, frames):
     rng = np.random.default_rng(2)
-    rig = make_rig(mode=mode, root=root, num_substeps=num_substeps)
+    rig = make_rig(command=command, root=root, num_substeps=num_substeps)
     for _ in range(frames):
         rig.command(wild_pose(rng, scale), rig.points.joints[0, 0] + rng.normal(size=3) * 0.03)
         rig.step()
@@ -117,7 +117,7 @@ def test_random_poses_are_reached_and_strain_nothing(make_rig, wild_pose, mode, 
     assert rig.joint_errors().max() < 1e-4
 
 
-@pytest.mark.parametrize("settings", [{}, {"mode": "target"}, {"free_motion": True}], ids=["add", "target", "free"])
+@pytest.mark.parametrize("settings", [{}, {"command": "target"}, {"free_motion": True}], ids=["add", "target", "free"])
 def test_strain_turns_with_the_bones(make_rig, wild_pose, settings):
     """``Q F Q^T`` of flesh that one bone moves; unstrained flesh would not tell by what it is turned."""
     rig = make_rig(root="free", tone=0.0, alpha=0.0, decoupling="no_stress", num_substeps=60, **settings)
@@ -150,7 +150,7 @@ def test_the_papers_decoupling_is_worse_but_no_decoupling_is_worst(make_rig, wil
     means = {}
     for decoupling in ("split", "paper", "none"):
         rng = np.random.default_rng(4)
-        rig = make_rig(root="free", mode="target", decoupling=decoupling, num_substeps=60)
+        rig = make_rig(root="free", command="target", decoupling=decoupling, num_substeps=60)
         errors = []
         for _ in range(4):
             rig.command(wild_pose(rng, 0.4))

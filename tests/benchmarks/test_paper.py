@@ -17,7 +17,7 @@ from benchmarks.paper.stage import Act, keyed, perform
 from benchmarks.physics.rig import Rig, World
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.types import DriveSettings
+from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.mpm.diagnostics import totals
 
 
@@ -50,7 +50,7 @@ def test_errors_of_a_body_that_was_moved_by_hand(tiny: World):
 
 
 def test_a_strike_gives_its_impulse_once_and_to_its_body_only(tiny: World):
-    rig = Rig(tiny, DriveSettings(root="free"), mean_shapes(2))
+    rig = Rig(tiny, PoseControlConfig(root="free", free_motion=False), mean_shapes(2))
     impulse = np.array([[0.0, 0.0, 0.0], [1.0, -2.0, 0.5]])
     rig.strike([joint_index("head"), joint_index("left_elbow")], impulse)
     for _ in range(2):

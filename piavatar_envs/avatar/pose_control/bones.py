@@ -12,8 +12,8 @@ import warp as wp
 from piavatar_envs.avatar.rotation import finite_turn, quat_exp, quat_log, rigid_matrix, turn_about_z
 from piavatar_envs.avatar.skinning import LEAN, PLACE, SPIN, STEP, TURN, VELOCITY, store_record
 from piavatar_envs.avatar.types import (
-    DRIVE_REFERENCE,
-    DRIVE_TARGET,
+    COMMAND_REFERENCE,
+    COMMAND_TARGET,
     Anchor,
     Body,
     Carry,
@@ -50,12 +50,12 @@ def begin_control(
     step = quat_log(wp.quat_inverse(command_rotation[e, b]) * goal_rotation[e, b])
     command_increment[e, b] = step
     increment[e, b] = step
-    if control.mode == DRIVE_TARGET:
+    if control.command == COMMAND_TARGET:
         increment[e, b] = quat_log(wp.quat_inverse(tracked_local[e, b]) * goal_rotation[e, b])
     if b == 0:
-        if control.mode == DRIVE_TARGET:
+        if control.command == COMMAND_TARGET:
             root_increment[e] = goal_root[e] - tracked_position[e, 0]
-        elif control.mode == DRIVE_REFERENCE:
+        elif control.command == COMMAND_REFERENCE:
             root_increment[e] = goal_root[e] - command_root[e]
         else:
             # a commanded step forward is a step where the body faces

@@ -25,7 +25,7 @@ from piavatar_envs.avatar.pose_control.kernels import (
     warps_of_body,
 )
 from piavatar_envs.avatar.segment_sums import GROUPS, sum_corrections, sum_moments, sum_motion, warps_of
-from piavatar_envs.avatar.types import Command, DriveSettings, PoseWorkspace, RootState, allocate
+from piavatar_envs.avatar.types import COMMANDS, Command, PoseControl, PoseWorkspace, RootState, allocate
 from piavatar_envs.core.arrays import make_struct
 from piavatar_envs.core.cuda_intrinsics import BLOCK, chunk_threads, particle_rounds, particle_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
@@ -45,14 +45,13 @@ class PoseController:
     #: The end of a control step only takes over the command.
     moves_particles = False
 
-    def __init__(self, avatar: Avatar, settings: DriveSettings) -> None:
-        self.avatar, model = avatar, avatar.model
-        self.parameters = settings.kernel_parameters(model)
+    def __init__(self, avatar: Avatar, parameters: PoseControl) -> None:
+        self.avatar, self.parameters, model = avatar, parameters, avatar.model
         self.in_one_launch = wp.get_device(model.device).is_cpu
         self._injects = model.step.decoupling in (DECOUPLING["paper"], DECOUPLING["none"])
         self._chunk_threads = chunk_threads(model.device, int(np.diff(avatar.body.chunk_start.numpy()).max()))
         n, state, tracked = model.num_envs, avatar.state, avatar.tracked
-        if settings.mode == "reference":
+        if parameters.command == COMMANDS["reference"]:
             self._start = state.command_rotation, state.command_root
         else:
             self._start = tracked.local, tracked.position[:, 0]

@@ -82,18 +82,18 @@ def hold_root(
     tilt_cos = wp.dot(wp.quat_rotate(q, up), wp.quat_rotate(q_command, up))
     horizontal = wp.sqrt(error[0] * error[0] + error[1] * error[1])
     if (
-        tilt_cos < control.max_tilt_cos
-        or horizontal > control.max_horizontal_error
-        or wp.abs(error[2]) > control.max_height_error
+        tilt_cos < control.release_tilt_cos
+        or horizontal > control.release_distance
+        or wp.abs(error[2]) > control.release_height
     ):
         root.let_go[e] = 1
     if root.let_go[e] != 0:
         return
     I = whole.inertia[e]
     a = critical_pull(control.root_rate, control.dt, error, whole.velocity[e]) - control.gravity
-    a = clamp_length(a, control.max_force)
+    a = clamp_length(a, control.max_root_force)
     torque = I * critical_pull(control.root_rate, control.dt, quat_log(q_command * wp.quat_inverse(q)), whole.spin[e])
-    torque = clamp_length(torque, control.max_torque * mass)
+    torque = clamp_length(torque, control.max_root_torque * mass)
     if not (wp.isfinite(a) and wp.isfinite(torque)):
         return  # the MPM substep flags the failure
     wrench.linear[e] = a

@@ -327,22 +327,22 @@ _HEAD, _FOOT = wp.constant(joint_index("head")), wp.constant(joint_index("left_f
 
 
 @dataclass(frozen=True, eq=False)
-class JointSettings:
-    """How the joints of an avatar are driven.
+class TorqueControl:
+    """Parameters of a torque controller, named like the settings of ``control`` that they follow from.
 
     Attributes:
         muscles: of the reference adult; those of the body follow from its weight times its height.
-        assist: of the pelvis at first, 0 to 1.
-        attachment: rates of the pulls that hold flesh to bones, shape ``(P,)`` [1/s].
-        firm: which particles are put into their places on the bones after every control step, shape ``(P,)`` bool.
-        solid: whether bones stop at boundaries.
+        root_assist: of the pelvis at first, 0 to 1.
+        flesh_rate: rates of the pulls that hold flesh to bones, shape ``(P,)`` [1/s].
+        firm_bones: particles that are put into their places on the bones after every control step, ``(P,)`` bool.
+        bone_contact: whether bones stop at boundaries.
     """
 
     muscles: Muscles
-    assist: float
-    attachment: np.ndarray
-    firm: np.ndarray
-    solid: bool
+    root_assist: float
+    flesh_rate: np.ndarray
+    firm_bones: np.ndarray
+    bone_contact: bool
 
 
 @wp.kernel
@@ -459,19 +459,19 @@ class TorqueController:
             rotations and root, as commands; None where they begin at rest. To be set before a reset is recorded.
     """
 
-    def __init__(self, avatar: Avatar, points: BodyPoints, settings: JointSettings) -> None:
+    def __init__(self, avatar: Avatar, points: BodyPoints, parameters: TorqueControl) -> None:
         """Allocate.
 
         Args:
             avatar: the avatar, whose goals the springs pull to.
             points: the body that it was built from.
-            settings: of the joints.
+            parameters: of the joints.
         """
-        n, model, muscles = avatar.model.num_envs, avatar.model, settings.muscles
+        n, model, muscles = avatar.model.num_envs, avatar.model, parameters.muscles
         self.avatar = avatar
         rows = np.zeros((n, 1 + NUM_JOINTS))
-        flesh = settings.attachment[None], settings.firm
-        self.joints = ArticulatedBody(points, avatar.body, model, rows, rows, *flesh, settings.solid)
+        flesh = parameters.flesh_rate[None], parameters.firm_bones
+        self.joints = ArticulatedBody(points, avatar.body, model, rows, rows, *flesh, parameters.bone_contact)
         self.joints.set_strength(muscles.lower, muscles.upper, n)
         ranges = muscles.range_lower, muscles.range_upper
         locked = [joint_index(name) for name in LOCKED_JOINTS]
@@ -488,7 +488,7 @@ class TorqueController:
         gains = [spring_rows(values).astype(np.float32) for values in (muscles.stiffness, muscles.damping)]
         stiffness, damping = (wp.array(values, dtype=float, device=model.device) for values in gains)
         self.gains = make_struct(Springs, stiffness=stiffness, damping=damping)
-        self.assist = wp.full(n, settings.assist, dtype=float, device=model.device)
+        self.assist = wp.full(n, parameters.root_assist, dtype=float, device=model.device)
         # the height that goes with the joints' span in the first body
         joints, rest = points.joints[0], points.rest[0]
         span = float(joints[joint_index("head"), 2] - joints[joint_index("left_foot"), 2])
