@@ -37,7 +37,7 @@ from piavatar_envs.tasks import listed_name
 
 
 class BatchTraining(BaseModel):
-    """What a training on a batch depends on; a library's settings come in a subclass."""
+    """Settings of a training on a batch; a library's own settings come in a subclass."""
 
     model_config = FROZEN
 
@@ -58,7 +58,7 @@ class BatchTraining(BaseModel):
 
     @property
     def first_seed(self) -> int:
-        """Seed of the first environment's episodes; environment ``i`` plays those of ``first_seed + i``."""
+        """Return the seed of environment 0's episodes; environment ``i`` plays those of ``first_seed + i``."""
         return first_training_seed(self.seed)
 
 
@@ -73,7 +73,7 @@ def load_batched(
     source: Mapping[str, Any] | str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> Training:
-    """A resolved configuration: what ``env`` left to the task's defaults is filled in.
+    """Load a configuration and fill in the task's defaults for what ``env`` leaves open.
 
     Args:
         cls: of the library's training.
@@ -98,7 +98,7 @@ def load_batched(
 
 @dataclass(frozen=True)
 class Learned:
-    """What a library hands back.
+    """Result of a library's training.
 
     Attributes:
         agent: the trained policy's mean action, as :func:`play` takes it.
@@ -110,7 +110,7 @@ class Learned:
 
 
 def iterations_of(checkpoint: Checkpoint, asked: int) -> int:
-    """How many iterations a training has had when it begins or goes on.
+    """Return the iterations that a training has had when it begins or resumes.
 
     Raises:
         ConfigError: more than are asked for.
@@ -144,7 +144,7 @@ def run(
     learn: Callable[[Training, Task, Path, str, Checkpoint], Learned],
     args: list[str] | None = None,
 ) -> None:
-    """The command line of a script: train as a file says, evaluate, leave ``results.json`` and a curve.
+    """Run a training script: train as a file says, evaluate, and write ``results.json`` and a curve.
 
     Args:
         name: of the script.
@@ -176,7 +176,7 @@ def run(
 def conclude_batch(
     name: str, config: BatchTraining, find_task: FindTask, learned: Learned, folder: Path, device: str
 ) -> None:
-    """Evaluate what was learned; leaves ``results.json`` and the curve. Arguments are as for :func:`run`."""
+    """Evaluate a trained agent and write ``results.json`` and the curve. Arguments are as for :func:`run`."""
     task = new_task(config, find_task)
     batch = EpisodeHost(task, config.evaluation.episodes, device)
     results = play_beside_baselines("trained", learned.agent, batch, config.evaluation.first_seed)
@@ -191,7 +191,7 @@ def conclude_batch(
 
 
 def new_task(config: BatchTraining, find_task: FindTask) -> Task:
-    """The task of a resolved configuration; every batch needs one of its own, which holds its arrays."""
+    """Build the task of a resolved configuration; every batch needs one of its own, which holds its arrays."""
     task_class = find_task(config.env_id)
     settings: EnvConfig = load_config(task_class.Config, config.env)
     return task_class(settings)

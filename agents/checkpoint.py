@@ -41,7 +41,7 @@ PACKAGES = (
 
 
 class Checkpoint:
-    """What a run goes on from, and where it leaves the next one.
+    """Checkpoint of a run: the state that it resumes from, and the file for the next one.
 
     Attributes:
         path: of the file.
@@ -49,7 +49,7 @@ class Checkpoint:
     """
 
     def __init__(self, folder: Path, script: str, config: BaseModel, device: str, resume: bool) -> None:
-        """Begin or go on.
+        """Read the checkpoint of a folder, or prepare for a new training.
 
         Args:
             folder: of the run; exists.
@@ -87,7 +87,7 @@ class Checkpoint:
         self.state = self._read()
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Keep a state in place of the one before: nested containers of tensors, arrays and plain values."""
+        """Replace the saved state by a new one: nested containers of tensors, arrays and plain values."""
         content = {"format": FORMAT, "about": self._about, "state": as_tensors(state)}
         write_whole(self.path, lambda file: torch.save(content, file))
 
@@ -103,7 +103,7 @@ class Checkpoint:
         return content["state"]
 
     def _compare(self, was: dict[str, Any]) -> None:
-        """Refuse what would not go on as it began."""
+        """Refuse a checkpoint that another version, configuration, script or device wrote."""
         for section, remedy in (
             ("versions", "install that version, or begin anew in another folder with --out"),
             ("config", "give the same settings, or begin anew in another folder with --out"),
@@ -133,7 +133,7 @@ UNREADABLE = (
 
 
 def load_whole(path: Path, device: str) -> Any:
-    """What ``torch.save`` has written, without running code that it might carry; torch does not look at its check sums.
+    """Load a file of ``torch.save`` without running code that it might contain, and verify its checksums.
 
     Raises:
         Exception: of :data:`UNREADABLE`, the file is damaged or another's.
@@ -145,18 +145,18 @@ def load_whole(path: Path, device: str) -> Any:
 
 
 def first_line(error: Exception) -> str:
-    """What an error says first; of one that says nothing, its name."""
+    """Return the first line of an error's message, or the error's name if the message is empty."""
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def no_policy(path: Path, seen: int, action_size: int, error: Exception) -> ConfigError:
-    """What to raise for a file without a policy that sees ``seen`` numbers and gives ``action_size``."""
+    """Build the error for a file without a policy of ``seen`` inputs and ``action_size`` outputs."""
     size = f"that sees {seen} numbers and gives {action_size}"
     return ConfigError(f"{path} holds no policy of its config.yaml {size}: {first_line(error)}")
 
 
 def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Leaves of nested dictionaries by dotted name; one without any is as if it were not there."""
+    """Return leaves of nested dictionaries by dotted name; empty dictionaries vanish."""
     found: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, Mapping):
@@ -167,13 +167,13 @@ def flattened(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Dotted names of what is not alike in nested dictionaries, in order, each with its value in both (or None)."""
+    """Return dotted names of leaves that differ between two nested dictionaries, each with both values (or None)."""
     old, new = flattened(before), flattened(now)
     return [(name, old.get(name), new.get(name)) for name in sorted(old | new) if old.get(name) != new.get(name)]
 
 
 def learned_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """As :func:`differences` of two configurations of trainings, but only what a training does depend on so far."""
+    """Return :func:`differences` of two trainings that learning so far depends on."""
     falls = any(flattened(now).get(name) is not None for name in FALLING)
     free = [name for name in FREE if not (falls and name in LENGTHS)]
     return [
@@ -184,7 +184,7 @@ def learned_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> list
 
 
 def as_tensors(value: Any) -> Any:
-    """Nested plain containers with tensors in place of NumPy's arrays, and Python's numbers in place of its scalars."""
+    """Replace NumPy arrays in nested plain containers by tensors, and NumPy scalars by Python numbers."""
     if isinstance(value, Mapping):
         return {name: as_tensors(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -196,7 +196,7 @@ def as_tensors(value: Any) -> Any:
 
 
 def as_arrays(value: Any) -> Any:
-    """What :func:`as_tensors` was given, with NumPy's arrays in place of all tensors."""
+    """Replace tensors in nested plain containers by NumPy arrays, the inverse of :func:`as_tensors`."""
     if isinstance(value, Mapping):
         return {name: as_arrays(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -205,14 +205,14 @@ def as_arrays(value: Any) -> Any:
 
 
 def seed_all(seed: int) -> None:
-    """Seed the generators that Python, NumPy and torch share among all who draw."""
+    """Seed the global generators of Python, NumPy and torch."""
     random.seed(seed)
     np.random.seed(seed)
     torch.manual_seed(seed)
 
 
 def random_states() -> dict[str, Any]:
-    """Where the generators of :func:`seed_all` are."""
+    """Return the states of the generators that :func:`seed_all` seeds."""
     kind, keys, position, has_gauss, gauss = np.random.get_state()
     return {
         "python": random.getstate(),
@@ -223,7 +223,7 @@ def random_states() -> dict[str, Any]:
 
 
 def set_random_states(states: Mapping[str, Any]) -> None:
-    """Go on drawing where :func:`random_states` was."""
+    """Restore the generators to what :func:`random_states` returned."""
     random.setstate(states["python"])
     own = states["numpy"]
     np.random.set_state((own["kind"], own["keys"].numpy(), own["position"], own["has_gauss"], own["gauss"]))
@@ -233,7 +233,7 @@ def set_random_states(states: Mapping[str, Any]) -> None:
 
 
 class Diverged(ArithmeticError):
-    """A training that has nothing left to go on from; the message is one line."""
+    """A training with parameters or outputs that are not finite; the message is one line."""
 
 
 def check_finite(
@@ -243,7 +243,7 @@ def check_finite(
     rate: tuple[str, float],
     checkpoint: Path | None = None,
 ) -> None:
-    """End a training that has diverged.
+    """Raise an error if a network's parameters or outputs are not finite.
 
     Args:
         modules: the networks, by name.

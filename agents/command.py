@@ -27,7 +27,7 @@ _registry = ConstructorRegistry()
 
 @_registry.struct_rule
 def _models(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """Pydantic models; what they refuse is said in one line, where tyro would show pydantic's own words."""
+    """Parse pydantic models and report their errors in one line."""
     if not (isinstance(info.type, type) and issubclass(info.type, BaseModel)):
         return None
     default = info.default if isinstance(info.default, info.type) else info.type()
@@ -47,7 +47,7 @@ def _models(info: StructTypeInfo) -> StructConstructorSpec | None:
 
 
 def read_options(cls: type[Options], script: str, args: Sequence[str] | None = None) -> Options:
-    """What a command line says; settings may stand before, between and after the options.
+    """Parse a command line; settings may stand before, between and after the options.
 
     Args:
         cls: a dataclass for tyro, whose field ``settings`` holds the settings.
@@ -65,7 +65,7 @@ def read_options(cls: type[Options], script: str, args: Sequence[str] | None = N
 
 @contextmanager
 def in_a_line(*kinds: type[Exception]) -> Iterator[None]:
-    """End the script with what errors of some kinds say, where a traceback would tell its user no more."""
+    """End the script with a one-line message for errors of some kinds, instead of a traceback."""
     try:
         yield
     except kinds as error:
@@ -73,7 +73,7 @@ def in_a_line(*kinds: type[Exception]) -> Iterator[None]:
 
 
 def meant_for(path: Path, script: str) -> str:
-    """What to add to the error about a configuration: where it plainly is another script's, which one's.
+    """Return a hint at the script that a refused configuration is for, or an empty string.
 
     Args:
         path: of the file.

@@ -27,7 +27,7 @@ UNTRAINED = ("zero", "random")
 
 
 def read_run(path: Path) -> dict[str, Any]:
-    """What a run has left as its ``results.json``.
+    """Read the ``results.json`` of a run.
 
     Raises:
         OSError: there is no such file.
@@ -44,7 +44,7 @@ def read_run(path: Path) -> dict[str, Any]:
 
 
 def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """One report for several runs.
+    """Summarise several runs in one report.
 
     Args:
         runs: contents of their ``results.json``, by name.
@@ -73,7 +73,7 @@ def summarize(runs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _settings(run: Mapping[str, Any]) -> dict[str, Any]:
-    """All that must be alike."""
+    """Return the settings that all runs must share."""
     config = {key: run["config"][key] for key in run["config"] if key not in FREE}
     return {"script": run["benchmark"], **config}
 
@@ -87,7 +87,7 @@ def _row(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def show(report: Mapping[str, Any], console: Console) -> None:
-    """Print the agents beside each other."""
+    """Print a table of the agents."""
     title = f"{report['config']['env_id']}, trained with {len(report['seeds'])} seeds; mean and 95 % interval over them"
     table = Table(title=title, title_justify="left", caption_justify="left")
     table.caption = "once, at end: task fulfilled in an episode, in its last step"
@@ -120,7 +120,7 @@ class Options:
 
 
 def main(args: list[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     options = tyro.cli(Options, prog="python -m agents.compare", args=args)
     with in_a_line(ValueError, OSError):
         if options.out is not None:

@@ -25,12 +25,12 @@ MOST_RUNS = 1000
 
 
 def first_training_seed(run: int) -> int:
-    """Seed of the first environment's episodes in the training of seed ``run``."""
+    """Return the seed of environment 0's episodes in the training of seed ``run``."""
     return FIRST_TRAINED + MOST_ENVS * run
 
 
 class EvaluationSettings(BaseModel):
-    """How agents are compared: every agent plays the same episodes, which no agent was trained on."""
+    """Settings of an evaluation: every agent plays the same episodes, on which none was trained."""
 
     model_config = FROZEN
 
@@ -62,7 +62,7 @@ def load_resolved(
     source: Mapping[str, Any] | str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
 ) -> Resolved:
-    """A configuration with a section ``env``, of which what it left to the environment's defaults is filled in.
+    """Load a configuration with a section ``env`` and fill in the environment's defaults.
 
     Args:
         cls: of the configuration.
@@ -86,7 +86,7 @@ def load_resolved(
 
 
 def interface(task: Task, observe: Collection[str] | None = None) -> dict[str, Any]:
-    """What a policy is made for: what its actions do, and what it sees.
+    """Describe what a policy is made for: the meaning of its actions and of its observations.
 
     Args:
         task: of the environment.
@@ -105,6 +105,6 @@ def interface(task: Task, observe: Collection[str] | None = None) -> dict[str, A
 
 
 def changed(task: Task, other: Task, observe: Collection[str] | None = None) -> list[str]:
-    """What of :func:`interface` is not the same in another environment, by name: a policy would take it for another."""
+    """Return the entries of :func:`interface` that differ in another environment, by name."""
     then = interface(other, observe)
     return [name for name, now in interface(task, observe).items() if now != then[name]]

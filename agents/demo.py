@@ -58,7 +58,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a demo came to.
+    """Result of a demo.
 
     Attributes:
         evaluations: of zero, random, scripted and trained actions, in this order.
@@ -77,7 +77,7 @@ class Outcome:
 
 
 def run(options: Options, console: Console) -> Outcome:
-    """Everything that ``make demo`` does.
+    """Run all of ``make demo``.
 
     Raises:
         ConfigError: a setting that is unknown, of the wrong type or out of range; or the folder is not the demo's.
@@ -131,7 +131,7 @@ def run(options: Options, console: Console) -> Outcome:
 
 
 def demonstrated(options: Options) -> TrainingConfig:
-    """What is trained.
+    """Return the resolved configuration of the demo.
 
     Raises:
         ConfigError: a setting that is unknown, of the wrong type or out of range, or that makes it no demo of Reach by
@@ -163,7 +163,7 @@ def _timed_play(name: str, agent, config: TrainingConfig, venv) -> tuple[Evaluat
 
 
 def play_references(config: TrainingConfig, venv, facts: EnvFacts) -> list[tuple[Evaluation, float]]:
-    """What the trained policy is compared with, and the time that each took [s]."""
+    """Evaluate the agents that the trained policy is compared with, and return the time that each took [s]."""
     size = len(facts.action_names)
     agents = {
         **baselines(size, config.evaluation.first_seed),
@@ -175,7 +175,7 @@ def play_references(config: TrainingConfig, venv, facts: EnvFacts) -> list[tuple
 def _time_after(
     options: Options, config: TrainingConfig, facts: EnvFacts, references: list[tuple[Evaluation, float]]
 ) -> float:
-    """Time that evaluation and video will take after the training, from what it took before it [s]."""
+    """Estimate the time of the evaluation and video after the training, from the time of the references [s]."""
     episode = max(e.steps for evaluation, _ in references for e in evaluation.episodes)
     one = float(np.median([seconds for _, seconds in references]))  # the first also waits for the workers
     if not options.video:
@@ -186,7 +186,7 @@ def _time_after(
 
 
 def main(args: list[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     options = read_options(Options, "demo", args)
     console = Console(highlight=False, soft_wrap=True)
     with in_a_line(ValueError, Diverged, OSError):

@@ -97,19 +97,19 @@ class Evaluation:
 
     @property
     def returns(self) -> np.ndarray:
-        """Return of every episode, shape ``(episodes,)``."""
+        """Return the return of every episode, shape ``(episodes,)``."""
         return np.array([episode.total for episode in self.episodes])
 
     def estimate(self) -> Estimate:
-        """Mean return and its 95 % interval over episodes."""
+        """Return the mean return and its 95 % interval over episodes."""
         return mean_and_interval(self.returns)
 
     def share(self, what: Callable[[Episode], float]) -> float:
-        """Mean of ``what`` over the episodes."""
+        """Return the mean of ``what`` over the episodes."""
         return float(np.mean([what(episode) for episode in self.episodes]))
 
     def row(self) -> dict[str, Any]:
-        """The figures for a table or a JSON file."""
+        """Return the figures for a table or a JSON file."""
         estimate, distance = self.estimate(), self.share(lambda e: e.distance)
         steps = mean_and_interval([episode.steps for episode in self.episodes])
         row = {
@@ -139,7 +139,7 @@ class Evaluation:
 
 
 def by_push(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
-    """How many episodes lasted, by the greatest impulse of a push in them.
+    """Count the episodes that lasted, by the greatest impulse of a push in them.
 
     A push that fells a body counts with what it has given until then. Classes are :data:`PUSH_CLASS` wide; empty ones
     are left out.
@@ -164,7 +164,7 @@ def _push_row(bounds: tuple[float, float], lasted: Sequence[bool], seeds: int) -
 
 
 def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """One row for trainings of several seeds, with intervals for other seeds and other episodes.
+    """Sum up rows of several seeds in one, with intervals over seeds and episodes.
 
     Returns and lengths have that of :func:`mean_over_seeds`, success that of :func:`share_interval_over_seeds`.
     (Student's intervals are robust to what such distributions are like: Colas, Sigaud & Oudeyer, "How many random
@@ -195,7 +195,7 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _pooled(pushes: Sequence[Mapping[str, Any]], seeds: int) -> list[dict[str, Any]]:
-    """Classes of pushes of several trainings, whose episodes are the same: intervals are of one training's."""
+    """Pool classes of pushes of several trainings in the same episodes; intervals are those of one training."""
     classes: dict[tuple[float, float], list[bool]] = {}
     for push in pushes:
         lasted = round(push["lasted"] * push["episodes"])
@@ -207,7 +207,7 @@ def _pooled(pushes: Sequence[Mapping[str, Any]], seeds: int) -> list[dict[str, A
 def evaluate(
     name: str, agent: Agent, venv: VecEnv, episodes: int, first_seed: int, progress: bool = True
 ) -> Evaluation:
-    """Let an agent play episodes ``first_seed``, ``first_seed + 1``, ... to their ends.
+    """Play episodes ``first_seed``, ``first_seed + 1``, ... to their ends.
 
     Every episode has a seed of its own, so what an agent does that draws nothing does not depend on the number of
     workers. (Random actions come from one stream for all.)
@@ -231,12 +231,12 @@ def evaluate(
 
 
 def episode_bar(name: str, episodes: int, **how: Any) -> tqdm:
-    """A bar of an agent's episodes that have ended, on stderr; ``how`` as tqdm has it."""
+    """Return a progress bar of an agent's finished episodes, on stderr; ``how`` is passed to tqdm."""
     return tqdm(total=episodes, desc=f"evaluate {name}", unit="episode", **how)
 
 
 def _play_round(agent: Agent, venv: VecEnv, first_seed: int) -> list[Episode]:
-    """One episode in every environment, from a reset of all of them to the end of the last."""
+    """Play one episode in every environment, from a reset of all to the end of the last."""
     episodes = [Episode(first_seed + env) for env in range(venv.num_envs)]
     playing = np.ones(venv.num_envs, bool)
     venv.seed(first_seed)
@@ -252,7 +252,7 @@ def _play_round(agent: Agent, venv: VecEnv, first_seed: int) -> list[Episode]:
 
 
 def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evaluation:
-    """Let an agent play one episode in every environment of a batch, to their ends.
+    """Play one episode in every environment of a batch, to their ends.
 
     Args:
         name: the agent's, for tables.
@@ -291,13 +291,13 @@ def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evalua
 
 
 def play_beside_baselines(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> list[Evaluation]:
-    """What zero, random and the agent's actions come to, all in the same episodes; as :func:`play`."""
+    """Play zero actions, random actions and the agent in the same episodes; arguments as for :func:`play`."""
     players = {other: in_every_seat(player) for other, player in baselines(batch.action_size, first_seed).items()}
     return [play(player, act, batch, first_seed) for player, act in {**players, name: agent}.items()]
 
 
 def in_every_seat(agent: Agent) -> Agent:
-    """An agent as :func:`play` takes it, from one for observations ``(n, size)``."""
+    """Turn an agent for observations ``(n, size)`` into one that :func:`play` takes."""
 
     def act(observation: np.ndarray) -> np.ndarray:
         envs, agents = observation.shape[:2]
@@ -307,28 +307,28 @@ def in_every_seat(agent: Agent) -> Agent:
 
 
 def begin_round(agent: Agent, num_envs: int) -> None:
-    """Tell an agent that remembers that ``num_envs`` episodes begin."""
+    """Notify an agent with memory that ``num_envs`` episodes begin."""
     begin = getattr(agent, "begin", None)
     if begin is not None:
         begin(num_envs)
 
 
 def zero_agent(action_size: int) -> Agent:
-    """Does nothing: the commanded pose stays."""
+    """Return an agent of zero actions, which keeps the commanded pose."""
     return lambda observation: np.zeros((len(observation), action_size), np.float32)
 
 
 def random_agent(action_size: int, seed: int) -> Agent:
-    """Uniformly random in the whole action space."""
+    """Return an agent of uniformly random actions in the whole action space."""
     rng = np.random.default_rng(seed)
     return lambda observation: rng.uniform(-1.0, 1.0, (len(observation), action_size)).astype(np.float32)
 
 
 def baselines(action_size: int, seed: int) -> dict[str, Agent]:
-    """What every agent is compared with: zero and random actions."""
+    """Return the agents that every other one is compared with: zero and random actions."""
     return {"zero": zero_agent(action_size), "random": random_agent(action_size, seed)}
 
 
 def separated(better: Evaluation, others: Sequence[Evaluation]) -> bool:
-    """Whether the interval of ``better`` lies wholly above all others'."""
+    """Return whether the interval of ``better`` lies wholly above all others'."""
     return all(better.estimate().low > other.estimate().high for other in others)

@@ -36,7 +36,7 @@ PACKAGES = ("numpy", "scipy", "warp-lang", "gymnasium", "stable-baselines3", "to
 
 
 def write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
-    """Replace a file by what ``write`` writes: whoever is killed in between, the old one or the new one is there.
+    """Replace a file atomically: if the process is killed, either the old or the new content is there.
 
     Args:
         path: of the file. A half of a new one, left by whoever was killed, lies beside it as ``NAME.partial``, and the
@@ -69,13 +69,13 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
 
 
 def write_config(folder: Path, config: BaseModel) -> None:
-    """Leave the resolved configuration in the folder of a run; to be called when nothing more can be refused."""
+    """Write the resolved configuration to the folder of a run; call it after all checks have passed."""
     write_whole(folder / "config.yaml", lambda file: file.write(dump_yaml(config).encode()))
 
 
 @contextmanager
 def made(folder: Path) -> Iterator[None]:
-    """Have a folder; one that was not there before is gone again where nothing has come to lie in it."""
+    """Create a folder for the duration, and remove it again if it was new and is empty at the end."""
     new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -87,7 +87,7 @@ def made(folder: Path) -> Iterator[None]:
 
 
 def hold(folder: Path) -> None:
-    """Keep other processes from training in a folder as long as this one lives.
+    """Lock a folder against training by other processes for as long as this one lives.
 
     Raises:
         ConfigError: another one trains there.
@@ -107,7 +107,7 @@ def hold(folder: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a file that could not be written, before there is anything to write; leaves everything as it is.
+    """Refuse a file that could not be written, before there is content for it; leaves everything as it is.
 
     Raises:
         ConfigError: it is a folder, or nothing can be written there.
@@ -124,7 +124,7 @@ def check_writable(path: Path) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """What a file of figures holds.
+    """Read a JSON file.
 
     Raises:
         OSError: there is no such file.
@@ -137,7 +137,7 @@ def read_json(path: Path) -> Any:
 
 
 def check_figures(path: Path, script: str) -> None:
-    """Refuse to write figures over anything but earlier ones of the same script.
+    """Refuse to overwrite anything but earlier figures of the same script.
 
     Args:
         path: of the JSON file.
@@ -158,7 +158,7 @@ def check_figures(path: Path, script: str) -> None:
 
 
 def claim(folder: Path, script: str, own: tuple[str, ...] = ()) -> None:
-    """Take a folder, which need not exist, for a script that begins anew: earlier results of the same are lost.
+    """Claim a folder, which need not exist, for a script that begins anew and replaces its own earlier results.
 
     Args:
         folder: of the run.
@@ -180,7 +180,7 @@ def claim(folder: Path, script: str, own: tuple[str, ...] = ()) -> None:
 
 
 def describe_run(benchmark: str, device: str = "cpu") -> dict[str, Any]:
-    """Everything but the results: benchmark, commit, device, versions, date."""
+    """Describe a run: benchmark, commit, device, versions, date."""
     commit, dirty = git_commit()
     versions = {name: version for name in PACKAGES if (version := doctor.package_version(name))}
     return {
@@ -194,7 +194,7 @@ def describe_run(benchmark: str, device: str = "cpu") -> dict[str, Any]:
 
 
 def device_info(device: str) -> dict[str, Any]:
-    """The device that is measured, and the CPU beside it.
+    """Describe a device, and the CPU beside it.
 
     Raises:
         ValueError: Warp has no such device.
@@ -208,7 +208,7 @@ def device_info(device: str) -> dict[str, Any]:
 
 
 def git_commit(root: Path = ROOT) -> tuple[str, bool | None]:
-    """Commit of a checkout, and whether its files differ from it; ("unknown", None) outside of one.
+    """Return the commit of a checkout, and whether its files differ from it; ("unknown", None) outside of one.
 
     ``PIAVATAR_COMMIT`` names the commit of a copy whose history stayed behind or is another. Results do not count as
     a difference, or writing one benchmark would taint the next.
@@ -228,7 +228,7 @@ def git_commit(root: Path = ROOT) -> tuple[str, bool | None]:
 
 
 def plain(value: Any, where: str) -> Any:
-    """``value`` as JSON can hold it: NumPy and tuples become numbers and lists.
+    """Convert ``value`` to what JSON can hold: NumPy types and tuples become numbers and lists.
 
     Raises:
         ValueError: a number is not finite (JSON has none such), or the type has no JSON form.
@@ -249,7 +249,7 @@ def plain(value: Any, where: str) -> Any:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write figures as JSON; the folder is made if there is none."""
+    """Write figures as JSON; creates the folder."""
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

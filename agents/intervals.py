@@ -21,17 +21,17 @@ class Estimate(NamedTuple):
 
     @property
     def low(self) -> float:
-        """Lower end of the interval."""
+        """Return the lower end of the interval."""
         return self.mean - self.half_width
 
     @property
     def high(self) -> float:
-        """Upper end of the interval."""
+        """Return the upper end of the interval."""
         return self.mean + self.half_width
 
 
 def mean_and_interval(values: Sequence[float] | np.ndarray) -> Estimate:
-    """Mean and 95 % interval of the mean, by Student's t with n - 1 degrees of freedom.
+    """Return the mean and its 95 % interval, by Student's t with n - 1 degrees of freedom.
 
     Args:
         values: independent measurements (seeds, not steps of one run), shape (n,).
@@ -52,12 +52,12 @@ def mean_and_interval(values: Sequence[float] | np.ndarray) -> Estimate:
 
 
 def share_interval(outcomes: Sequence[bool]) -> list[float]:
-    """Wilson's 95 % interval of the share of episodes with an outcome: not empty where all or none had it."""
+    """Return Wilson's 95 % interval of the share of episodes with an outcome."""
     return wilson(float(np.mean(outcomes)), len(outcomes), NORMAL)
 
 
 def wilson(share: float, size: float, quantile: float) -> list[float]:
-    """The interval of a share whose ends differ from it by ``quantile`` of their own standard errors.
+    """Return the interval of a share whose ends differ from it by ``quantile`` of their own standard errors.
 
     Wilson, "Probable inference, the law of succession, and statistical inference", J. Am. Stat. Assoc. 22, 1927.
 
@@ -75,7 +75,7 @@ def wilson(share: float, size: float, quantile: float) -> list[float]:
 
 
 def mean_over_seeds(means: Sequence[float], halves: Sequence[float], episodes: int) -> Estimate:
-    """The mean of seeds that have played the same episodes, with its 95 % interval for other seeds and episodes.
+    """Return the mean of seeds that played the same episodes, with its 95 % interval over other seeds and episodes.
 
     The scatter of the seeds' means says nothing of the episodes, for these are easy or hard for all seeds alike. So the
     mean's variance is that of the seeds' means over their number, and that of one seed's mean over episodes, as if all
@@ -96,7 +96,7 @@ def mean_over_seeds(means: Sequence[float], halves: Sequence[float], episodes: i
 
 
 def share_interval_over_seeds(shares: Sequence[float], episodes: int) -> list[float]:
-    """The 95 % interval of a share that trainings of several seeds have on average, all in the same episodes.
+    """Return the 95 % interval of a mean share of several seeds that played the same episodes.
 
     It is Wilson's, of as many episodes as would scatter as much as :func:`mean_over_seeds` finds: of those of one seed,
     at most (the effective sample size; Franco, Little, Louis & Slud, "Comparative study of confidence intervals for
@@ -116,7 +116,7 @@ def share_interval_over_seeds(shares: Sequence[float], episodes: int) -> list[fl
 
 
 def _scatter(of_seeds: float, of_episodes: float, seeds: int, episodes: int) -> tuple[float, float]:
-    """The variance of a mean over seeds and episodes, and Student's quantile for it.
+    """Return the variance of a mean over seeds and episodes, and Student's quantile for it.
 
     Of two, whose interval is wider: of seeds and episodes together (degrees of freedom by Satterthwaite, "An
     approximate distribution of estimates of variance components", Biometrics 2, 1946), or of the few seeds alone.

@@ -42,7 +42,7 @@ from piavatar_envs.tasks import load_task
 
 @dataclass(frozen=True)
 class Run:
-    """What a training has left.
+    """A finished training, as read from its folder.
 
     Attributes:
         env_id: registered id.
@@ -61,7 +61,7 @@ class Run:
 
 
 def open_run(folder: Path, device: str = "cpu") -> Run:
-    """A run from its folder.
+    """Open a run by its folder.
 
     Args:
         folder: with config.yaml and policy.pt or policy.zip.
@@ -109,7 +109,7 @@ def _open_sb3(settings: Path, policy: Path, _device: str) -> Run:
 
 @dataclass(frozen=True)
 class Options:
-    """Let what a training has left play again."""
+    """Play the policy of a finished training."""
 
     #: folder of the run
     run: tyro.conf.Positional[Path]
@@ -136,7 +136,7 @@ class Options:
 
 
 def check_options(options: Options) -> None:
-    """Refuse what can be seen to be wrong without the run.
+    """Refuse options that are wrong whatever the run is.
 
     Raises:
         ConfigError: options that do not go together, no episodes, no pictures, or files that cannot be written.
@@ -157,7 +157,7 @@ def check_options(options: Options) -> None:
 
 
 def environment(run: Run, assignments: Sequence[str]) -> Task:
-    """The task of a run's environment, with settings that win over those of the training.
+    """Build the task of a run's environment, with settings that win over those of the training.
 
     Raises:
         ConfigError: a setting is unknown, given twice or out of range, or makes another environment of it than the one
@@ -177,7 +177,7 @@ def environment(run: Run, assignments: Sequence[str]) -> Task:
 
 
 def _changes_alone(trained: Task, assignment: str, observe: Collection[str] | None) -> bool:
-    """Whether a setting by itself makes another environment for a policy, or none."""
+    """Return whether a setting alone changes what the policy was made for."""
     try:
         config = load_config(type(trained.config), trained.config, parse_assignments([assignment]))
         return bool(changed(trained, type(trained)(config), observe))
@@ -186,12 +186,12 @@ def _changes_alone(trained: Task, assignment: str, observe: Collection[str] | No
 
 
 def first_seed(run: Run, options: Options) -> int:
-    """Seed of the first episode."""
+    """Return the seed of the first episode."""
     return run.evaluation.first_seed if options.first_seed is None else options.first_seed
 
 
 def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
-    """Let somebody watch the agent in a web browser until Ctrl-C.
+    """Show the agent in a web browser until Ctrl-C.
 
     Args:
         run: what the training has left.
@@ -216,7 +216,7 @@ def watch_run(run: Run, env: dict[str, Any], options: Options) -> None:
 
 
 def score_run(agent: Agent, batch: EpisodeHost, first: int, options: Options, env: dict[str, Any]) -> None:
-    """Play an episode in every environment of a batch, show the figures, and write them if the command line says so.
+    """Play an episode in every environment of a batch, show the figures, and write them if asked for.
 
     Args:
         agent: what the training has left.
@@ -233,7 +233,7 @@ def score_run(agent: Agent, batch: EpisodeHost, first: int, options: Options, en
 
 
 def film_run(run: Run, agent: Agent, seconds: float, first: int, options: Options, env: dict[str, Any]) -> None:
-    """Film episodes, one after the other; arguments as :func:`score_run`, ``seconds`` is a control step's time."""
+    """Film episodes; arguments as for :func:`score_run`, and ``seconds``, the time of a control step."""
     make = EnvFactory(run.env_id, env, options.device)
     alone = {options.run.name: lambda observation: agent(observation[:, None])[:, 0]}
     film(options.film, make, alone, range(first, first + options.film_episodes), 1.0 / seconds, options.film_every)
@@ -267,7 +267,7 @@ def film(
 
 
 def check_film(path: Path | None, every: int, episodes: int = 1) -> None:
-    """Refuse a video without pictures, or that cannot be written, before there is anything to film.
+    """Refuse a video without pictures, or one that cannot be written.
 
     Raises:
         ConfigError: ``every`` or ``episodes`` is less than 1, or nothing can be written there.
@@ -305,7 +305,7 @@ def _frames(halves: VecEnv, agents: dict[str, Agent], seeds: Sequence[int], ever
 
 
 def main(args: list[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     options = read_options(Options, "play", args)
     quiet_warp()
     scores = options.film is None or options.out is not None or options.episodes is not None

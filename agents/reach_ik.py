@@ -19,7 +19,7 @@ DAMPING = 0.05  # [m]
 
 
 class ReachIK:
-    """Moves the nearer hand to where the target will be after the step.
+    """Scripted agent that moves the nearer hand to the place of the target after the step.
 
     Everything is in the frame of the pelvis, as the observation is.
     """
@@ -27,7 +27,7 @@ class ReachIK:
     def __init__(
         self, layout: ObservationLayout, action_names: Sequence[str], action_step: float, control_dt: float
     ) -> None:
-        """Learn what the action and the observation mean.
+        """Read the layout of the action and of the observation.
 
         Args:
             layout: of the flat observation.
@@ -42,7 +42,7 @@ class ReachIK:
         self.chains = [self._chain(joint_index(f"{side}_wrist")) for side in HANDS]
 
     def _chain(self, wrist: int) -> list[int]:
-        """Acting joints between a hand and the pelvis, as places in ``joints``."""
+        """Return acting joints between a hand and the pelvis, as places in ``joints``."""
         chain, joint = [], wrist
         while joint > 0:
             if joint in self.joints:
@@ -51,7 +51,7 @@ class ReachIK:
         return chain
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions ``(n, action_size)`` for observations ``(n, observation_size)``."""
+        """Return actions ``(n, action_size)`` for observations ``(n, observation_size)``."""
         return np.stack([self._act(self.layout.split(row)) for row in observation])
 
     def _act(self, observed: dict[str, np.ndarray]) -> np.ndarray:
@@ -77,7 +77,7 @@ class ReachIK:
 
 
 def _rotations(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation matrices ``(22, 3, 3)`` of all joints, to the parent and to the pelvis, from the 6D observation."""
+    """Return rotation matrices ``(22, 3, 3)`` to the parent and to the pelvis from the 6D observation."""
     x, y = np.moveaxis(columns.astype(float).reshape(-1, 2, 3), 1, 0)
     local = np.tile(np.eye(3), (NUM_JOINTS, 1, 1))
     local[1:] = np.stack([x, y, np.cross(x, y)], axis=-1)
@@ -88,10 +88,10 @@ def _rotations(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _columns(rotation: np.ndarray, arm: np.ndarray) -> np.ndarray:
-    """Velocity of the end of ``arm`` for unit turns about the three axes of ``rotation``, shape ``(3, 3)``."""
+    """Return the velocity of the end of ``arm`` for unit turns about the axes of ``rotation``, shape ``(3, 3)``."""
     return np.cross(rotation.T, arm).T
 
 
 def _least_squares(jacobian: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """``J^T (J J^T + damping^2)^-1 wanted``."""
+    """Solve damped least squares, ``J^T (J J^T + damping^2)^-1 wanted``."""
     return jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + DAMPING**2 * np.eye(3), wanted)

@@ -24,7 +24,7 @@ _SMOOTH = 20  # episodes in the moving mean of a learning curve, at least; of ma
 
 
 def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
-    """Print the agents beside each other."""
+    """Print a table of the agents."""
     count = len(evaluations[0].episodes)
     table = Table(title=f"{count} fresh episodes each, the same for all", title_justify="left", caption_justify="left")
     table.caption = "once, at end, of time: task fulfilled in the episode, in its last step, share of all steps"
@@ -48,7 +48,7 @@ def show_table(evaluations: Sequence[Evaluation], console: Console) -> None:
 
 
 def show_matches(matches: Sequence[Match], console: Console) -> None:
-    """Print who won against whom."""
+    """Print a table of the matches."""
     table = Table(title=f"{len(matches[0].games)} fresh games each", title_justify="left", caption_justify="left")
     table.caption = "the first sits in every seat equally often; 95 % interval; theirs: the others' return, each"
     table.add_column("game", no_wrap=True)
@@ -100,7 +100,7 @@ def draw_curve(
 
 
 def versions(name: str, device: str) -> dict[str, Any]:
-    """Commit, versions, device and date, as in every benchmark's JSON."""
+    """Return commit, versions, device and date, as in every benchmark's JSON."""
     return describe_run(name, device)
 
 
@@ -119,7 +119,7 @@ def conclude(
     extra: Mapping[str, Any],
     files: str,
 ) -> None:
-    """What scripts end with: leave ``results.json`` in their folder, print it, and say what else is there.
+    """Write ``results.json``, print it, and list the files that the script has left.
 
     Args:
         folder: of the run.
@@ -137,7 +137,7 @@ def conclude(
 
 @dataclass
 class Curve:
-    """Returns of the training episodes, as they ended.
+    """Learning curve: returns of the training episodes, in the order in which they ended.
 
     Attributes:
         steps: control steps taken by then, over all workers and their learning agents.
@@ -152,18 +152,18 @@ class Curve:
     train_steps: int = 0
 
     def csv(self) -> str:
-        """It as CSV, a row an episode."""
+        """Format the curve as CSV, a row per episode."""
         rows = [f"{step},{value:.6g}" for step, value in zip(self.steps, self.returns, strict=True)]
         return "\n".join(["step,return", *rows]) + "\n"
 
     def save(self, path: Path) -> None:
-        """Write it as CSV."""
+        """Write the curve as CSV."""
         write_whole(path, lambda file: file.write(self.csv().encode()))
 
     def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
+        """Return the state for a checkpoint."""
         return {"steps": list(self.steps), "returns": list(self.returns), "seconds": self.seconds}
 
     def load(self, state: dict[str, Any]) -> None:
-        """Go on where :meth:`state` was."""
+        """Restore what :meth:`state` returned."""
         self.steps, self.returns, self.seconds = list(state["steps"]), list(state["returns"]), state["seconds"]

@@ -45,7 +45,7 @@ class Options:
 
 
 def score(batch: EpisodeHost, first_seed: int, count: int) -> dict[str, Any]:
-    """One row for ``count`` streams of random actions.
+    """Evaluate ``count`` streams of random actions as one row.
 
     Args:
         batch: plays an episode in each of its environments.
@@ -57,7 +57,7 @@ def score(batch: EpisodeHost, first_seed: int, count: int) -> dict[str, Any]:
 
 
 def check_streams(count: int) -> None:
-    """Refuse numbers of streams before they have anything to play.
+    """Refuse a number of streams that is out of range.
 
     Raises:
         ConfigError: a count that has no interval, or is larger than that of the seeds that trainings can have.
@@ -67,7 +67,7 @@ def check_streams(count: int) -> None:
 
 
 def main(args: list[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     options = read_options(Options, "score_random", args)
     quiet_warp()
     folder = options.out or Path("runs") / f"random_{options.run.resolve().name}"
@@ -91,7 +91,7 @@ def main(args: list[str] | None = None) -> None:
 
 
 def environment_of(folder: Path) -> tuple[str, Mapping[str, Any]]:
-    """Id and settings of a run's environment.
+    """Return id and settings of a run's environment.
 
     Raises:
         ConfigError: the folder's file is not that of a run.

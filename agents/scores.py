@@ -47,7 +47,7 @@ _PLAYED = "env.control.bone_contact"
 
 
 def scores(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of the table, by environment and then by agent.
+    """Return rows of the table, by environment and then by agent.
 
     Args:
         runs: contents of their ``results.json``, by folder.
@@ -103,7 +103,7 @@ def _learner(run: Mapping[str, Any]) -> str:
 def _rows(
     group: Mapping[str, Mapping[str, Any]], streams: Sequence[Mapping[str, Any]]
 ) -> list[tuple[Mapping[str, Any], Mapping[str, Any]]]:
-    """Of the runs of one script in one environment, each with a run of its settings.
+    """Return rows of the runs of one script in one environment, each with a run of its settings.
 
     Random actions are those of several streams, where there are any of these settings.
     """
@@ -122,14 +122,14 @@ def _rows(
 
 
 def _same_environment(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two runs have one environment."""
+    """Return whether two runs have the same environment."""
     first, second = one["config"], other["config"]
     alike = first["env_id"] == second["env_id"]
     return alike and _known(first["env_id"], first["env"]) == _known(second["env_id"], second["env"])
 
 
 def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """All settings of an environment by dotted name; one that a run does not know yet has its default there.
+    """Return all settings of an environment by dotted name; settings that a run does not have take their defaults.
 
     What follows from other settings where it is null is what follows: runs from before it could be null know that.
     """
@@ -142,21 +142,21 @@ def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _drive(run: Mapping[str, Any]) -> dict[str, Any]:
-    """What drives the avatar that was scored, and what holds its bones; None where its environment does not say."""
+    """Return control and bone settings of the scored avatar; None where its environment has none."""
     known = _known(run["config"]["env_id"], run.get("evaluation", run["config"])["env"])
     keys = {"control": "mode", "firm_bones": "firm_bones", "bone_contact": "bone_contact"}
     return {name: known.get(f"env.control.{key}") for name, key in keys.items()}
 
 
 def _check_alike(group: Mapping[str, Mapping[str, Any]]) -> None:
-    """Refuse seeds that were not all scored on the same bones."""
+    """Refuse seeds that were scored with different bones."""
     bones = {name: _drive(run)["bone_contact"] for name, run in group.items()}
     if len(set(bones.values())) > 1:
         raise ValueError(f"control.bone_contact of what was scored differs: {bones}; score all of them alike")
 
 
 def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """What a training took on average; None where nothing is trained."""
+    """Return the mean time and steps of the trainings; None where nothing is trained."""
     seconds = [run.get("training_s") for run in group.values()]
     steps = [run.get("train_steps") for run in group.values()]
     return {
@@ -166,7 +166,7 @@ def _cost(group: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _read_run(folder: Path) -> dict[str, Any]:
-    """Its ``results.json``; with a later evaluation, that one's row of the policy, and all of it as ``evaluation``."""
+    """Read ``results.json``; a later evaluation replaces the row of the policy and is returned as ``evaluation``."""
     run, path = compare.read_run(folder / RESULTS), folder / "evaluation.json"
     if not all("success_once" in row for row in run["results"]):
         raise ValueError(f"{folder / RESULTS} holds matches of competing agents; give runs of agents with one aim")
@@ -180,7 +180,7 @@ def _read_run(folder: Path) -> dict[str, Any]:
 
 
 def _check_evaluation(evaluation: Mapping[str, Any], run: Mapping[str, Any], folder: Path, path: Path) -> None:
-    """Refuse what is no evaluation of this run's policy in the same episodes; a task is known by its settings."""
+    """Refuse an evaluation of another policy, other settings or other episodes."""
     anew = f"write it anew: python -m agents.play {folder} --out {path}"
     if evaluation.get("date", "") < run.get("date", ""):
         raise ValueError(f"{path} is older than {folder / RESULTS}: the policy may have learned since; {anew}")
@@ -203,7 +203,7 @@ def _check_evaluation(evaluation: Mapping[str, Any], run: Mapping[str, Any], fol
 
 
 def _kept(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What an earlier table says of environments that ``rows`` are not about, with its devices and commits."""
+    """Return the rows of an earlier table about other environments, with its devices and commits."""
     if path is None:
         return {"results": [], "devices": [], "commits": []}
     table = read_json(path)
@@ -215,7 +215,7 @@ def _kept(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any
 
 
 def _check_out(path: Path) -> None:
-    """Refuse a table that is none by its name, that cannot be written, or in whose place something else is."""
+    """Refuse a file for the table that has another suffix, cannot be written, or would replace something else."""
     if path.suffix != ".json":
         raise ValueError(f"out={path} must be a .json file; the same comes beside it as .md")
     check_figures(path, "scores")
@@ -230,7 +230,7 @@ _COLUMNS = ("agent", "control", "bones", "seeds", "episodes", *_RESULTS)
 
 
 def markdown(rows: Sequence[Mapping[str, Any]], about: str) -> str:
-    """The rows as Markdown: a table an environment, and one of pushes where there are any."""
+    """Format the rows as Markdown: a table per environment, and one of pushes where there are any."""
     lines = ["# Scores", "", about, ""]
     for env_id in sorted({row["env_id"] for row in rows}):
         own = [row for row in rows if row["env_id"] == env_id]
@@ -244,7 +244,7 @@ def markdown(rows: Sequence[Mapping[str, Any]], about: str) -> str:
 
 
 def _bones(row: Mapping[str, Any]) -> str:
-    """What holds the bones of a row's avatar; nothing where its environment does not say."""
+    """Describe the bones of a row's avatar; empty where its environment does not say."""
     if row.get("firm_bones") is None:
         return ""
     if not row["firm_bones"]:
@@ -271,7 +271,7 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def _pushes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Share of episodes that lasted, by the greatest impulse of a push."""
+    """Format the share of episodes that lasted, by the greatest impulse of a push."""
     classes = sorted({tuple(push["impulse_n_s"]) for row in rows for push in row["by_push"]})
     lines = [_line(["strongest push [N s]", *(row["agent"] for row in rows)]), _line(["---"] * (1 + len(rows)))]
     for bounds in classes:
@@ -304,7 +304,7 @@ class Options:
 
 
 def main(args: list[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     options = tyro.cli(Options, prog="python -m agents.scores", args=args)
     with in_a_line(ValueError, OSError):
         if options.out is not None:

@@ -98,7 +98,7 @@ class Design:
     hip_share: float = 0.6
 
     def check(self) -> None:
-        """Refuse what is no controller.
+        """Refuse a design with numbers out of range or unknown joints.
 
         Raises:
             ConfigError: a name that is no joint's, or a number out of range.
@@ -123,7 +123,7 @@ DEFAULT = Design()
 
 
 class PIDAgent:
-    """Keeps its balance in a pose, or while it follows a clip.
+    """Agent that balances in a pose, or while it follows a clip.
 
     Attributes:
         bones: the body.
@@ -137,7 +137,7 @@ class PIDAgent:
         design: Design = DEFAULT,
         poses: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
-        """Design the controller.
+        """Design the controller for the body of an environment.
 
         Args:
             env: a batch of the task, of any size; its body, layout and time step are read, not its state.
@@ -168,7 +168,7 @@ class PIDAgent:
         self.begin(0)
 
     def _balance(self) -> Balance:
-        """The strategy of a body that stands in its rest pose."""
+        """Build the balance strategy of a body that stands in its rest pose."""
         bones, design = self.bones, self.design
         height = float(bones.mean(bones.centres[None])[0, 2] - bones.joints[ANKLES, 2].mean())
         beside = float(np.ptp(bones.joints[ANKLES, 0]) + design.foot_width) / 2.0
@@ -180,7 +180,7 @@ class PIDAgent:
         )
 
     def begin(self, n: int) -> None:
-        """``n`` episodes begin: forget the last ones."""
+        """Begin ``n`` episodes and clear the state of earlier ones."""
         design, limit = self.design, np.maximum(-self.lower, self.upper)[1:]
         stiff = np.ones((NUM_JOINTS, 3))
         stiff[ANKLES, 0] = 0.0  # ankles press the ground; the PID keeps feet from turning over
@@ -195,7 +195,7 @@ class PIDAgent:
         self._clip: np.ndarray | None = None
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions ``(n, action_size)`` for observations ``(n, observation_size)``."""
+        """Return actions ``(n, action_size)`` for observations ``(n, observation_size)``."""
         n = len(observation)
         if n != len(self._time):
             self.begin(n)
@@ -221,7 +221,7 @@ class PIDAgent:
         return self.actions(np.einsum("nbij,nbj->nbi", local, torque))
 
     def given(self, local: np.ndarray, asked: np.ndarray) -> np.ndarray:
-        """What muscles give of the torques ``(n, 21, 3)`` that bones, turned by ``local`` from parents, ask for [N m].
+        """Return what muscles give of torques ``(n, 21, 3)`` on bones that ``local`` turns from their parents [N m].
 
         Their limits are along the parents' axes, and seldom the same in both directions: a neck has nearly twice as
         much one way as the other.
@@ -230,19 +230,19 @@ class PIDAgent:
         return np.einsum("nbij,nbi->nbj", local, along)
 
     def actions(self, torque: np.ndarray) -> np.ndarray:
-        """Shares of the greatest torques that give ``torque`` ``(n, 21, 3)``, in the parents' axes [N m]."""
+        """Return ``torque`` ``(n, 21, 3)``, in the parents' axes [N m], as shares of the greatest torques."""
         torque, lower, upper = torque[:, [j - 1 for j in self.acting]], self.lower[self.acting], self.upper[self.acting]
         return np.clip(np.where(torque > 0.0, torque / upper, -torque / lower), -1.0, 1.0).reshape(len(torque), -1)
 
     def posture(self, observation: np.ndarray) -> Posture:
-        """Where the bones are, from the pelvis joint, as is observed ``(n, observation_size)``."""
+        """Reconstruct the bones, from the pelvis joint, from observations ``(n, observation_size)``."""
         n, seen = len(observation), self.layout.split(observation)
         root, local = (_matrices(seen[name].reshape(n, -1, 6)) for name in ("root_orientation", "joint_rotations"))
         places = np.concatenate([np.zeros((n, 1, 3)), seen["bone_positions"].reshape(n, NUM_ACTUATED, 3)], axis=1)
         return self.bones.posture(np.concatenate([root, local], axis=1), _world(root[:, 0], places))
 
     def _target(self, seen: Mapping[str, np.ndarray], vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pose to have now [rad] and the rate that leads on from it [rad/s], ``(n, 21, 3)`` each.
+        """Return the target pose [rad] and its rate [rad/s], ``(n, 21, 3)`` each.
 
         Of ``poses``; without them of the clip that the task shows one step ahead, else the rest pose.
         """
@@ -257,13 +257,13 @@ class PIDAgent:
         return now, difference(now, coming) / self.dt
 
     def _answer(self, now: Posture) -> np.ndarray:
-        """The mass matrix, with what tissue adds to it."""
+        """Return the mass matrix, with the inertia that tissue adds to it."""
         matrix, joints = self.bones.mass_matrix(now), np.arange(NUM_DOF - len(self._resisting), NUM_DOF)
         matrix[:, joints, joints] += self._resisting
         return matrix
 
     def _ground_moments(self, seen: Mapping[str, np.ndarray], now: Posture) -> np.ndarray:
-        """Moments of what the ground is to do to the feet, about all joints [N m], ``(n, 22, 3)``."""
+        """Return moments of the wanted ground force on the feet about all joints [N m], ``(n, 22, 3)``."""
         root, stance = now.rotation[:, 0], self.balance.stance
         feet = now.joints[:, ANKLES]
         left = (feet[:, 0] - feet[:, 1]) * [1.0, 1.0, 0.0]
@@ -294,7 +294,7 @@ class PIDAgent:
         )
 
     def _bearing(self, seen: Mapping[str, np.ndarray], root: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """How much of the weight the legs may push with, ``(n,)``: little while the feet bear little."""
+        """Return the share of the weight that the legs may push with, ``(n,)``: small while the feet bear little."""
         stance = self.balance.stance
         force = _world(root, seen["ground_impulse"][:, None])[:, 0, 2] / (self.dt * stance.mass * GRAVITY)
         self._load += (1.0 - np.exp(-self.dt / LOAD_TIME)) * (np.clip(force, 0.0, 1.0) - self._load)
@@ -307,7 +307,7 @@ def make_pid_agent(
     design: Design = DEFAULT,
     poses: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> PIDAgent:
-    """An agent for a task.
+    """Build an agent for a task.
 
     Args:
         task: id, with or without the namespace.
@@ -324,16 +324,16 @@ def make_pid_agent(
 
 
 def rest_poses(times: np.ndarray) -> np.ndarray:
-    """A clip that stands still in the rest pose."""
+    """Return a clip that stands still in the rest pose."""
     return np.zeros((len(times), NUM_ACTUATED, 3))
 
 
 def _matrices(columns: np.ndarray) -> np.ndarray:
-    """Rotations of their first two columns ``(..., 6)``."""
+    """Return rotation matrices of their first two columns ``(..., 6)``."""
     x, y = columns[..., :3], columns[..., 3:]
     return np.stack([x, y, np.cross(x, y)], axis=-1)
 
 
 def _world(root: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Vectors ``(n, k, 3)`` of the pelvis' axes in the world's."""
+    """Turn vectors ``(n, k, 3)`` from the pelvis' axes to the world's."""
     return np.einsum("nij,nkj->nki", root, vectors)

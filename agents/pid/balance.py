@@ -32,7 +32,7 @@ _SIDES = ("left", "right")
 
 @dataclass(frozen=True)
 class Stance:
-    """How a body stands. Forward and left are positive.
+    """Geometry and mass of a standing body. Forward and left are positive.
 
     Attributes:
         mass: of the body [kg].
@@ -52,7 +52,7 @@ class Stance:
     foot_width: float
 
     def __post_init__(self) -> None:
-        """Refuse lengths and masses that are none.
+        """Refuse lengths and masses that are not positive.
 
         Raises:
             ValueError: a value that is not positive, or feet that bear nowhere.
@@ -65,18 +65,18 @@ class Stance:
 
     @property
     def rate(self) -> float:
-        """``w`` of the pendulum [1/s]."""
+        """Return ``w`` of the pendulum [1/s]."""
         return float(np.sqrt(GRAVITY / self.height))
 
     @property
     def edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest place of the centre of pressure in each plane [m], ``(2,)`` each."""
+        """Return the least and the largest place of the centre of pressure in each plane [m], ``(2,)`` each."""
         return np.array([-self.behind, -self.beside]), np.array([self.ahead, self.beside])
 
 
 @dataclass(frozen=True)
 class Effort:
-    """What a body does to keep its balance; every array is ``(n, 2)``, a column a plane.
+    """Forces and torques that keep the balance; every array is ``(n, 2)``, a column per plane.
 
     Attributes:
         pressure: place of the centre of pressure that the ankles (sideways also the hips) bring about [m].
@@ -107,7 +107,7 @@ class Balance:
         hip_gain: float = 10.0,
         hip_limit: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Choose how to stand.
+        """Configure the feedback.
 
         Args:
             stance: how the body stands.
@@ -132,7 +132,7 @@ class Balance:
             raise ValueError(f"hip_threshold={hip_threshold}, hip_gain={hip_gain}, hip_limit={hip_limit} must be >= 0")
 
     def step(self, offset: np.ndarray, velocity: np.ndarray) -> Effort:
-        """What to do now.
+        """Compute the effort for a state of the centre of mass.
 
         Args:
             offset: of the centre of mass from the midst of the ankles, forward and to the left [m], ``(n, 2)``.
@@ -150,7 +150,7 @@ class Balance:
         return Effort(pressure, weight * pressure, hip, np.minimum(xi - low, high - xi))
 
     def joint_torques(self, effort: Effort) -> np.ndarray:
-        """The effort as torques on the bones of a body that stands in its rest pose [N m], ``(n, 21, 3)``.
+        """Convert the effort to torques on the bones of a body in its rest pose [N m], ``(n, 21, 3)``.
 
         In all joints but the root, in the order of the skeleton, for the ``feedforward`` of a
         :class:`~agents.pid.controller.PosePID` of these joints; the legs get what the trunk gets with the other sign.

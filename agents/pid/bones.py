@@ -20,7 +20,7 @@ NUM_DOF = 3 + 3 * NUM_JOINTS
 
 
 def _beyond() -> np.ndarray:
-    """Whether a bone hangs on a joint, or is what it moves; ``(joint, bone)``."""
+    """Return whether a bone is moved by a joint; ``(joint, bone)``."""
     beyond = np.eye(NUM_JOINTS, dtype=bool)
     for joint in range(NUM_JOINTS - 1, 0, -1):
         beyond[PARENTS[joint]] |= beyond[joint]
@@ -33,7 +33,7 @@ BEYOND = _beyond()
 
 @dataclass(frozen=True)
 class Posture:
-    """Bones of ``n`` bodies, in the world's axes.
+    """Places and rotations of the bones of ``n`` bodies, in the world's axes.
 
     Attributes:
         rotation: from the rest pose, ``(n, 22, 3, 3)``.
@@ -64,7 +64,7 @@ class Bones:
 
     @classmethod
     def of(cls, points: BodyPoints) -> Bones:
-        """Those of the first body of a batch: every bone has of each point what the skinning weights say."""
+        """Lump the first body of a batch into bones by its skinning weights."""
         share = np.zeros((points.num_points, NUM_JOINTS))
         np.add.at(share, (np.arange(points.num_points)[:, None], points.skin_joints), points.skin_weights)
         share *= points.mass[0][:, None]
@@ -76,7 +76,7 @@ class Bones:
         return cls(mass, points.joints[0].astype(float), centres, inertia)
 
     def posture(self, local: np.ndarray, places: np.ndarray | None = None) -> Posture:
-        """Where the bones are.
+        """Compute the posture of local rotations.
 
         Args:
             local: rotations against the parents, of the pelvis against the world, ``(n, 22, 3, 3)``.
@@ -87,11 +87,11 @@ class Bones:
         return Posture(rotation, joints, joints + _turned(rotation, self.centres - self.joints))
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """Mean by mass of what all bones have, ``(n, 22, 3)``: with centres the centre of mass, ``(n, 3)``."""
+        """Return the mass-weighted mean ``(n, 3)`` of a vector per bone, ``(n, 22, 3)``."""
         return np.einsum("b,nbi->ni", self.mass, values) / self.mass.sum()
 
     def mass_matrix(self, now: Posture) -> np.ndarray:
-        """``(n, 69, 69)``, see the module."""
+        """Compute the mass matrix ``(n, 69, 69)``; the module has its definition."""
         n = len(now.joints)
         axes = now.rotation[:, None] * BEYOND.T[None, :, :, None, None]  # (n, bone, joint, 3, axis)
         arms = now.centres[:, :, None] - now.joints[:, None]
@@ -109,14 +109,14 @@ class Bones:
         return matrix
 
     def weight_moments(self, now: Posture, gravity: float) -> np.ndarray:
-        """Moment about every joint of the weight of all beyond it, in the world's axes [N m], ``(n, 22, 3)``."""
+        """Return the moment about every joint of the weight beyond it, in the world's axes [N m], ``(n, 22, 3)``."""
         pull = self.mass[:, None] * np.array([0.0, 0.0, -gravity])
         arms = (now.centres[:, None] - now.joints[:, :, None]) * BEYOND[None, :, :, None]
         return np.cross(arms, pull).sum(2)
 
 
 def force_moments(now: Posture, bone: int, place: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Moment about every joint of a force on a bone, in the world's axes [N m], ``(n, 22, 3)``.
+    """Return the moment about every joint of a force on a bone, in the world's axes [N m], ``(n, 22, 3)``.
 
     Args:
         now: posture of the bodies.
@@ -129,17 +129,17 @@ def force_moments(now: Posture, bone: int, place: np.ndarray, force: np.ndarray)
 
 
 def in_bones(now: Posture, vectors: np.ndarray) -> np.ndarray:
-    """Vectors of the world's axes ``(n, 22, 3)`` about the bones' own."""
+    """Turn vectors ``(n, 22, 3)`` from the world's axes to the bones' own."""
     return np.einsum("nbij,nbi->nbj", now.rotation, vectors)
 
 
 def _turned(rotation: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """``R v``; ``(n, 22, 3, 3)`` and ``(22, 3)``."""
+    """Return ``R v``; ``(n, 22, 3, 3)`` and ``(22, 3)``."""
     return np.einsum("nbij,bj->nbi", rotation, vectors)
 
 
 def answered(matrix: np.ndarray, torque: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
-    """What springs and dampers of joints come to when all joints have answered: ``A (M + A)^-1`` of them goes.
+    """Return the torques of springs and dampers after all joints have responded: ``A (M + A)^-1`` is taken off.
 
     Of springs with stiffness ``K`` and damping ``D`` at the end of a step, ``A = dt D + dt^2 K`` times the acceleration
     that they cause is missing to what they would be if nothing moved (Tan, Liu & Turk, "Stable Proportional-Derivative

@@ -42,7 +42,7 @@ PerJoint = float | np.ndarray
 
 @dataclass(frozen=True)
 class Gains:
-    """Of every degree of freedom; for gains a joint, shape ``(joints, 1)``.
+    """Gains of every degree of freedom; for gains per joint, shape ``(joints, 1)``.
 
     Attributes:
         kp: torque by error [N m/rad].
@@ -75,7 +75,7 @@ class Gains:
                 _check(name, getattr(self, name), strict=True)
 
     def tracking_time(self) -> np.ndarray:
-        """The time in which a limited integral gives way [s]; infinite where there is no integral."""
+        """Return the time constant of anti-windup [s]; infinite where there is no integral."""
         kp, kd, ki = (np.asarray(gain, float) for gain in (self.kp, self.kd, self.ki))
         with np.errstate(divide="ignore", invalid="ignore"):
             chosen = np.where(kd > 0.0, np.sqrt(kd / ki), kp / ki) if self.tracking is None else self.tracking
@@ -91,7 +91,7 @@ def _check(name: str, values: Any, strict: bool) -> None:
 
 
 class PID:
-    """The law of a degree of freedom, for all of them at once.
+    """PID controllers of independent degrees of freedom.
 
     Attributes:
         gains: as given.
@@ -119,7 +119,7 @@ class PID:
         self._give_way = dt / np.broadcast_to(np.maximum(gains.tracking_time(), dt), shape)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forget the integral: of all, or where ``mask`` ``(n,)`` says so, such as where an episode has begun."""
+        """Clear the integral of all, or of the rows of ``mask`` ``(n,)``, such as those whose episode begins."""
         self.integral[slice(None) if mask is None else mask] = 0.0
 
     def step(
@@ -132,7 +132,7 @@ class PID:
         ahead: Ahead | None = None,
         given: Given | None = None,
     ) -> np.ndarray:
-        """Torques for the next ``dt`` [N m].
+        """Compute torques for the next ``dt`` [N m].
 
         Args:
             error: what is missing to the target [rad].
@@ -160,7 +160,7 @@ class PID:
     def _proportional(
         self, error: np.ndarray, closing: np.ndarray, factor: np.ndarray | float, ahead: Ahead | None
     ) -> np.ndarray:
-        """``kp e + kd e'``, now or, where it is known how bodies answer, as they will be after the step."""
+        """Return ``kp e + kd e'``, at the end of the step where the response of the body is known, else now."""
         kp, kd, dt = factor * self._kp, factor * self._kd, self.dt
         if ahead is None and self.gains.inertia is None:
             return kp * error + kd * closing
@@ -169,7 +169,7 @@ class PID:
 
 
 class PosePID:
-    """A PID for joints that are rotations: errors are on SO(3), not differences of rotation vectors.
+    """PID controllers of joints that are rotations: errors are on SO(3), not differences of rotation vectors.
 
     All vectors of a joint (error, rate, torque) have the axes of the bone that it moves, as actions have.
     """
@@ -194,7 +194,7 @@ class PosePID:
         self._fresh = np.ones(len(pid.integral), bool)
 
     def reset(self, mask: np.ndarray | None = None) -> None:
-        """Forget what was: of all, or where ``mask`` ``(n,)`` says so."""
+        """Clear the state of all, or of the rows of ``mask`` ``(n,)``."""
         chosen = slice(None) if mask is None else mask
         self.pid.reset(mask)
         self._rate[chosen], self._fresh[chosen] = 0.0, True
@@ -210,7 +210,7 @@ class PosePID:
         ahead: Ahead | None = None,
         given: Given | None = None,
     ) -> np.ndarray:
-        """Torques of all joints for the next step [N m], ``(n, joints, 3)``.
+        """Compute torques of all joints for the next step [N m], ``(n, joints, 3)``.
 
         Args:
             rotation: local rotation vectors of the joints [rad], ``(n, joints, 3)``.
@@ -229,7 +229,7 @@ class PosePID:
         return self.pid.step(error, rate, closing, feedforward, factor, ahead, given)
 
     def _found_rate(self, rotation: np.ndarray) -> np.ndarray:
-        """Rates from two rotations, through a filter of first order; zero in a first step."""
+        """Estimate rates from two rotations, through a filter of first order; zero in a first step."""
         if self._before is not None:
             moved = difference(self._before, rotation) / self.pid.dt
             share = self.pid.dt / (self.pid.dt + self.smoothing)
@@ -240,7 +240,7 @@ class PosePID:
 
 
 def difference(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The shortest turn from one rotation to another, ``log(R_start^T R_end)``, in the axes of either.
+    """Return the shortest turn from one rotation to another, ``log(R_start^T R_end)``, in the axes of either.
 
     Args:
         start: rotation vectors [rad], ``(..., 3)``.
@@ -254,7 +254,7 @@ def difference(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def turned(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """``R v`` of rotation vectors [rad] and vectors, both ``(..., 3)``."""
+    """Return ``R v`` of rotation vectors [rad] and vectors, both ``(..., 3)``."""
     return _rotations(rotation).apply(_rows(vector)).reshape(np.shape(vector))
 
 
@@ -269,7 +269,7 @@ def _rows(vectors: np.ndarray) -> np.ndarray:
 def follow(
     poses: Callable[[np.ndarray], np.ndarray], time: float | np.ndarray, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a clip asks for at a time: the pose, and the rate that leads to the next one.
+    """Return a clip's pose at a time, and the rate that leads to the next one.
 
     Args:
         poses: from times [s] ``(n,)`` to local rotation vectors [rad] ``(n, joints, 3)``; of a
@@ -286,7 +286,7 @@ def follow(
 
 
 def motion_poses(motion: Any, joints: list[int]) -> Callable[[np.ndarray], np.ndarray]:
-    """Poses of a clip as :func:`follow` takes them.
+    """Return poses of a clip as :func:`follow` takes them.
 
     Args:
         motion: a :class:`~piavatar_envs.avatar.motion.motion.Motion`.

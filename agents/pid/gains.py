@@ -16,7 +16,7 @@ from agents.pid.controller import Gains
 
 @dataclass(frozen=True)
 class Subtrees:
-    """What hangs on every joint: its own bone and all beyond, in one pose.
+    """Mass, centre and inertia beyond every joint, its own bone included, in one pose.
 
     Attributes:
         mass: of the bones [kg], ``(joints,)``.
@@ -30,7 +30,7 @@ class Subtrees:
 
 
 def subtrees(parents: Sequence[int], masses: np.ndarray, centres: np.ndarray, positions: np.ndarray) -> Subtrees:
-    """Sum up what every joint carries.
+    """Sum up mass, centre and inertia beyond every joint.
 
     Args:
         parents: of every joint, before their children; -1 for the root.
@@ -59,7 +59,7 @@ def subtrees(parents: Sequence[int], masses: np.ndarray, centres: np.ndarray, po
 def gains_for(
     load: Subtrees, stiffness: float, damping_ratio: float, limit: np.ndarray, integral_time: float = np.inf
 ) -> Gains:
-    """Gains by what a joint carries, so that all joints behave alike: limbs are not torn, the trunk does not sag.
+    """Scale gains by the inertia beyond each joint, so that all joints respond alike.
 
     ``kp = stiffness m g l``, which leaves ``1 / stiffness`` of a limb that is held out level as its sag [rad], and
     ``kd = 2 damping_ratio sqrt(kp inertia)``, as of a mass on a spring.
@@ -84,7 +84,7 @@ def gains_for(
 def gains_by_strength(
     limit: np.ndarray, stiffness: float, damping_time: float, integral_time: float | np.ndarray = np.inf
 ) -> Gains:
-    """Gains by how strong a joint is, which follows what it has to bear: those of a body that stands on its legs.
+    """Scale gains by the strength of each joint, for a body that stands on its legs.
 
     There what hangs on a joint is not what it carries. How light it is matters to a controller that acts in steps all
     the same, so give it the answer of the whole body, ``ahead`` of :meth:`agents.pid.controller.PID.step`.
@@ -104,7 +104,7 @@ def gains_by_strength(
 
 @dataclass(frozen=True)
 class LoadSchedule:
-    """Factors by the share of the weight that rests on each leg: a leg that carries is stiff, one that swings is soft.
+    """Factors by the share of the weight on each leg: a leg that bears weight is stiff, one that swings is soft.
 
     Attributes:
         joints: number of joints.
@@ -118,7 +118,7 @@ class LoadSchedule:
     unloaded: float
 
     def __call__(self, forces: np.ndarray) -> np.ndarray:
-        """Factors ``(n, joints, 1)`` for forces that the ground exerts on the legs [N], ``(n, legs)`` in their order.
+        """Return factors ``(n, joints, 1)`` for forces of the ground on the legs [N], ``(n, legs)`` in their order.
 
         Where nothing rests on the ground all legs count as unloaded.
         """

@@ -48,7 +48,7 @@ class Options:
 
 
 def main(args: list[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     options = read_options(Options, "pid.score", args)
     quiet_warp()
     episodes, first = options.evaluation.episodes, options.evaluation.first_seed

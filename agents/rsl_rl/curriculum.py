@@ -16,7 +16,7 @@ from piavatar_envs.envs.task import Task
 
 
 class HelpSettings(BaseModel):
-    """A curriculum of ``root_assist``: by the clock (``rollouts``), or by what is achieved (``step``)."""
+    """Schedule of ``root_assist``: by time (``rollouts``), or by success (``step``)."""
 
     model_config = FROZEN
 
@@ -40,7 +40,7 @@ class HelpSettings(BaseModel):
 
 
 class HelpedEnv(AvatarRslEnv):
-    """Environments whose help for the pelvis wanes while an agent learns.
+    """Environments whose root assist declines while an agent learns.
 
     At first environment ``i`` of ``n`` has ``i / (n - 1)`` of the greatest help, so that some have next to none from
     the start, and what is learned with help is tried without; a single one has all of it. By the clock it keeps that
@@ -62,11 +62,11 @@ class HelpedEnv(AvatarRslEnv):
         self.help = settings.first * self._spread
 
     def share(self) -> float:
-        """The greatest help in the current rollout, by the clock."""
+        """Return the greatest assist in the current rollout, by time."""
         return self.settings.first * max(0.0, 1.0 - self.steps // self.rollout_steps / self.settings.rollouts)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance by one control step; help changes before the first of a rollout, or of an episode.
+        """Advance by one control step; the assist changes before the first step of a rollout, or of an episode.
 
         ``extras["log"]`` also holds the mean help.
         """
@@ -85,7 +85,7 @@ class HelpedEnv(AvatarRslEnv):
 
 
 def with_lessons(task: Task, lessons: Mapping[str, Any]) -> EnvConfig:
-    """Settings of the environments to learn in: those of ``task``, but for the lessons.
+    """Return the settings of the training environments: those of ``task``, changed by the curriculum.
 
     Raises:
         ConfigError: a lesson is no setting, or changes what the policy is made for.

@@ -63,7 +63,7 @@ class RslPPOSettings(BaseModel):
 
 
 class RslTraining(BatchTraining):
-    """Everything that a training with rsl_rl depends on."""
+    """Settings of a training with rsl_rl."""
 
     env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
     ppo: RslPPOSettings = Field(default_factory=RslPPOSettings, description="the algorithm")
@@ -76,12 +76,12 @@ class RslTraining(BatchTraining):
 def load_rsl(
     source: Mapping[str, Any] | str | Path | None = None, overrides: Mapping[str, Any] | None = None
 ) -> RslTraining:
-    """A resolved configuration; arguments and errors are those of :func:`agents.batch_training.load_batched`."""
+    """Load a configuration; arguments and errors are those of :func:`agents.batch_training.load_batched`."""
     return load_batched(RslTraining, load_task, source, overrides)
 
 
 def network_settings(ppo: RslPPOSettings) -> dict[str, Any]:
-    """A network as rsl_rl takes it."""
+    """Return the settings of a network as rsl_rl takes them."""
     return {
         "class_name": "MLPModel",
         "hidden_dims": list(ppo.hidden),
@@ -91,13 +91,13 @@ def network_settings(ppo: RslPPOSettings) -> dict[str, Any]:
 
 
 def actor_settings(ppo: RslPPOSettings) -> dict[str, Any]:
-    """The actor: the network's outputs are means of a Gaussian."""
+    """Return the settings of the actor, whose outputs are means of a Gaussian."""
     spread = {"class_name": "GaussianDistribution", "init_std": ppo.action_std, "std_type": "log"}
     return network_settings(ppo) | {"distribution_cfg": spread}
 
 
 def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, action_size: int, device: str) -> Agent:
-    """The agent of an earlier training.
+    """Load the agent of an earlier training.
 
     Args:
         path: of its ``policy.pt``; nothing in it is unpickled.
@@ -122,7 +122,7 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
 
 
 def mean_agent(actor: torch.nn.Module, seen: Sequence[int], device: str) -> Agent:
-    """The policy's mean actions, from observations ``(n, 1, size)`` to ``(n, 1, action_size)``.
+    """Return the agent of a policy's mean actions, from observations ``(n, 1, size)`` to ``(n, 1, action_size)``.
 
     Args:
         actor: rsl_rl's.

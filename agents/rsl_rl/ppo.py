@@ -25,7 +25,7 @@ from piavatar_envs.config import ConfigError
 
 
 class ScaledPPO(PPO):
-    """rsl_rl's PPO, which learns from scaled rewards and noisy observations, and in smaller and smaller updates.
+    """rsl_rl's PPO with scaled rewards, noisy observations, and a target divergence that declines.
 
     What is logged are the environment's own rewards.
 
@@ -39,7 +39,7 @@ class ScaledPPO(PPO):
     def __init__(
         self, *args: Any, reward_scale: float, observation_noise: float, kl_targets: Sequence[float], **settings: Any
     ) -> None:
-        """As rsl_rl's.
+        """Build the algorithm.
 
         Args:
             args: of the base.
@@ -72,11 +72,11 @@ class ScaledPPO(PPO):
     def process_env_step(
         self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, torch.Tensor]
     ) -> None:
-        """Record a step."""
+        """Record a step with its reward scaled."""
         super().process_env_step(obs, self.reward_scale * rewards, dones, extras)
 
     def act(self, obs: TensorDict) -> torch.Tensor:
-        """Draw actions, and record what they are drawn for."""
+        """Draw actions and record them with the observations that they were drawn for."""
         if self.observation_noise > 0.0:
             obs = obs.apply(lambda seen: seen + self.observation_noise * torch.randn_like(seen))
         return super().act(obs)
@@ -119,18 +119,18 @@ _TERMS: Mapping[str, tuple[tuple[float, ...], Sequence[str]]] = {
 
 
 def other_side(name: str) -> str:
-    """The name of what is on the other side; of what is in the middle, its own."""
+    """Return the name of the opposite joint or part; names in the middle stay."""
     side, underscore, rest = name.partition("_")
     return {"left": "right", "right": "left"}.get(side, side) + underscore + rest
 
 
 class Mirror:
-    """Mirrors observations and actions; both as tensors whose last dimension are the components."""
+    """Reflection of observations and actions; both are tensors with the components in the last dimension."""
 
     def __init__(
         self, terms: Iterable[ObservationTerm], joints: Sequence[str], device: str | torch.device, root: bool = False
     ) -> None:
-        """Find where every component comes from.
+        """Build the permutation and the signs of all components.
 
         Args:
             terms: of the observation, in order.
@@ -155,18 +155,18 @@ class Mirror:
         self._done = _joined(acts, device)
 
     def observations(self, seen: torch.Tensor) -> torch.Tensor:
-        """What is seen in the mirrored state."""
+        """Return the observations of the reflected state."""
         source, sign = self._seen
         return seen[..., source] * sign
 
     def actions(self, done: torch.Tensor) -> torch.Tensor:
-        """What is done there: rotation vectors or torques, as shares of ranges that are mirrored, too."""
+        """Return the reflected actions: rotation vectors or torques, as shares of ranges that are reflected too."""
         source, sign = self._done
         return done[..., source] * sign
 
 
 def _changed_over(items: Sequence[str], signs: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Where the components of items come from, and their signs."""
+    """Return source indices and signs of the components of items."""
     first = len(signs) * np.array([items.index(other_side(item)) for item in items])
     return (first[:, None] + np.arange(len(signs))).ravel(), np.tile(signs, len(items))
 

@@ -33,10 +33,10 @@ from piavatar_envs.tasks import load_task
 
 
 class CurveWriter(LogWriter):
-    """Writes what rsl_rl reports for TensorBoard, and keeps the mean return of the latest 100 training episodes."""
+    """Writer of rsl_rl's figures to TensorBoard, and of mean returns of 100 episodes to the curve."""
 
     def __init__(self, log_dir: str, steps_an_iteration: int, first_iteration: int, curve: Curve) -> None:
-        """Write to a folder.
+        """Open the files of a folder.
 
         Args:
             log_dir: for the files; those of the run's earlier parts stay.
@@ -62,7 +62,7 @@ class CurveWriter(LogWriter):
 
 
 class Runner(OnPolicyRunner):
-    """rsl_rl's runner, which keeps up a checkpoint beside the networks that it saves, and goes on from one.
+    """rsl_rl's runner, which also saves a checkpoint and resumes from one.
 
     Attributes:
         curve: of the training.
@@ -70,7 +70,7 @@ class Runner(OnPolicyRunner):
     """
 
     def __init__(self, env: AvatarRslEnv, config: RslTraining, folder: Path, checkpoint: Checkpoint) -> None:
-        """Begin, or go on where the checkpoint is."""
+        """Build networks and environments, and restore the checkpoint if there is one."""
         saved = checkpoint.state
         self.curve, self.iterations, self.checkpoint = Curve(), saved["iterations"] if saved else 0, checkpoint
         if saved:
@@ -91,7 +91,7 @@ class Runner(OnPolicyRunner):
             self._restore(saved)
 
     def train(self, iterations: int) -> None:
-        """Learn until there have been so many iterations.
+        """Learn until the training has had ``iterations``.
 
         Raises:
             ConfigError: there have been more already.
@@ -102,14 +102,14 @@ class Runner(OnPolicyRunner):
             self.learn(left, init_at_random_ep_len=self.iterations == 0)
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Save the networks, and the checkpoint; rsl_rl calls it between iterations."""
+        """Save the networks and the checkpoint; rsl_rl calls it between iterations."""
         super().save(path, infos)
         self.iterations, self.curve = self.current_learning_iteration + 1, self.logger.writer.curve
         self.curve.seconds = time.monotonic() - self._begun
         self.checkpoint.save(self._state())
 
     def _check_finite(self) -> None:
-        """Refuse to go on, or to keep anything, after networks have diverged.
+        """Raise an error if networks have diverged, before anything is saved.
 
         Raises:
             Diverged: they have.
@@ -152,7 +152,7 @@ class Runner(OnPolicyRunner):
 
 
 def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
-    """The configuration as rsl_rl's runner takes it.
+    """Return the configuration as rsl_rl's runner takes it.
 
     Raises:
         ConfigError: steps cannot be mirrored.
@@ -186,7 +186,7 @@ def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
 
 
 def kl_targets(config: RslTraining) -> list[float]:
-    """Divergences that the updates of a training aim at; none where that does not change.
+    """Return the target divergences of the updates; empty where the target is fixed.
 
     Raises:
         ConfigError: there is a last one without a first one.
@@ -200,7 +200,7 @@ def kl_targets(config: RslTraining) -> list[float]:
 
 
 def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
-    """The settings by which rsl_rl appends mirrored steps to every minibatch."""
+    """Return the settings by which rsl_rl appends reflected steps to every minibatch."""
     terms = [env.observation_layout[name] for name in env.groups["policy"]]
     spec = env.host.groups[0].action_spec
     mirror = Mirror(terms, spec.joints, env.device, spec.root)
@@ -216,7 +216,7 @@ def _symmetry(env: AvatarRslEnv) -> dict[str, Any]:
 
 
 def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
-    """The environments to learn in.
+    """Build the training environments.
 
     Raises:
         ConfigError: there is no such term to observe, or nothing to be helped, or a lesson is none.
@@ -262,7 +262,7 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
 
 
 def main(args: list[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     run("rsl_rl.train", RslTraining, load_task, learn, args)
 
 

@@ -24,7 +24,7 @@ MOST_PROCESSES = 256
 
 
 class TrainingConfig(BaseModel):
-    """Everything that a training run depends on."""
+    """Settings of a training with stable-baselines3."""
 
     model_config = FROZEN
 
@@ -59,14 +59,14 @@ class TrainingConfig(BaseModel):
 
     @property
     def is_multi(self) -> bool:
-        """Whether the environment is a world of several agents."""
+        """Return whether the environment has several agents."""
         return _MULTI_ID.fullmatch(self.env_id) is not None
 
 
 def load_training(
     source: Mapping[str, Any] | str | Path | None = None, overrides: Mapping[str, Any] | None = None
 ) -> TrainingConfig:
-    """A resolved configuration: what ``env`` left to the task's defaults is filled in.
+    """Load a configuration and fill in the task's defaults for what ``env`` leaves open.
 
     Args:
         source: a YAML file or a mapping.
@@ -93,7 +93,7 @@ def load_training(
 
 
 def env_config(config: TrainingConfig) -> EnvConfig:
-    """The environment's part of a resolved configuration."""
+    """Return the environment's part of a resolved configuration."""
     return load_config(_env_class(config), config.env)
 
 

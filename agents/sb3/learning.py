@@ -39,10 +39,10 @@ from piavatar_envs.config import ConfigError
 
 
 class Events(TensorBoardOutputFormat):
-    """TensorBoard's files of a run, also of one that was killed and goes on."""
+    """TensorBoard's files of a run, also of one that was killed and resumed."""
 
     def __init__(self, folder: Path, steps: int) -> None:
-        """Write to a folder.
+        """Open the files of a folder.
 
         Args:
             folder: for the files; those of the run's earlier parts stay.
@@ -53,24 +53,24 @@ class Events(TensorBoardOutputFormat):
 
 
 class ScaledMonitor(VecMonitor):
-    """Books the environments' own rewards, and hands on scaled ones."""
+    """Monitor that logs the environments' own rewards and returns scaled ones."""
 
     def __init__(self, venv: VecEnv, reward_scale: float) -> None:
-        """Watch environments."""
+        """Wrap environments."""
         super().__init__(venv)
         self.reward_scale = reward_scale
 
     def step_wait(self) -> VecEnvStepReturn:
-        """The end of a step."""
+        """Finish a step and scale its rewards."""
         observations, rewards, dones, infos = super().step_wait()
         return observations, self.reward_scale * rewards, dones, infos
 
 
 class Progress(BaseCallback):
-    """Books the episodes, shows a bar, and ends the training when its time is over."""
+    """Callback that logs the episodes, shows a bar, and ends the training at its deadline."""
 
     def __init__(self, curve: Curve, total_steps: int, start: float, deadline: float | None) -> None:
-        """Watch a training.
+        """Configure the callback.
 
         Args:
             curve: where to book.
@@ -103,13 +103,13 @@ class Progress(BaseCallback):
         self.close()
 
     def close(self) -> None:
-        """Let go of the bar's line, if there is one; closing twice is fine."""
+        """Close the bar, if there is one; closing twice is allowed."""
         if self.bar is not None:
             self.bar.close()
 
 
 def begin(config: TrainingConfig, venv: VecEnv, facts: EnvFacts, checkpoint: Checkpoint | None = None) -> BaseAlgorithm:
-    """An untrained agent, of the algorithm that the configuration names.
+    """Build an untrained agent of the configured algorithm.
 
     Args:
         config: resolved.
@@ -181,7 +181,7 @@ def learn(
 
 
 def _check_finite(config: TrainingConfig, model: BaseAlgorithm, checkpoint: Checkpoint | None) -> None:
-    """Refuse to go on with networks that have diverged, or to keep them.
+    """Raise an error if the networks have diverged.
 
     Raises:
         Diverged: they have.
@@ -205,7 +205,7 @@ def _check_finite(config: TrainingConfig, model: BaseAlgorithm, checkpoint: Chec
 
 
 def _check_steps(config: TrainingConfig, model: BaseAlgorithm, checkpoint: Checkpoint) -> None:
-    """Refuse to take back what was trained too much."""
+    """Refuse a checkpoint with more steps than the configuration asks for."""
     had = checkpoint.state["steps"]
     rollout = model.n_envs * (model.n_steps if isinstance(model, PPO) else model.train_freq.frequency)
     if had >= config.total_steps + rollout:
@@ -218,7 +218,7 @@ _TRANSITIONS = ("observations", "next_observations", "actions", "rewards", "done
 
 
 def capture(model: BaseAlgorithm, curve: Curve) -> dict[str, Any]:
-    """Everything that the future of a training depends on, between two rollouts."""
+    """Return everything that the rest of a training depends on, between two rollouts."""
     monitor = _monitor(model)
     modules, variables = model._get_torch_save_params()
     return {
@@ -241,7 +241,7 @@ def capture(model: BaseAlgorithm, curve: Curve) -> dict[str, Any]:
 
 
 def restore(model: BaseAlgorithm, curve: Curve, state: dict[str, Any]) -> None:
-    """Go on where :func:`capture` was; the last of all that draws random numbers before the training.
+    """Restore what :func:`capture` returned; call it after everything that draws random numbers.
 
     Args:
         model: built as the one that was captured; self-play's opponents have taken their seats.
@@ -278,7 +278,7 @@ def _monitor(model: BaseAlgorithm) -> VecMonitor:
 
 
 def _replay(model: BaseAlgorithm) -> dict[str, Any] | None:
-    """The filled part of the replay buffer, where there is one."""
+    """Return the filled part of the replay buffer, or nothing for an algorithm without one."""
     if not isinstance(model, OffPolicyAlgorithm):
         return None
     buffer = model.replay_buffer
@@ -295,7 +295,7 @@ def _refill(model: OffPolicyAlgorithm, replay: dict[str, Any]) -> None:
 
 
 def env_state(venv: VecEnv) -> Any:
-    """The state of all environments: of one batch, of the workers, or of worlds and who sits where in them."""
+    """Return the state of all environments: of a batch, of the workers, or of worlds and their seats."""
     if isinstance(venv, SB3VecEnv):
         return venv.vector.get_state()
     if isinstance(venv, AgentVecEnv):
@@ -304,7 +304,7 @@ def env_state(venv: VecEnv) -> Any:
 
 
 def set_env_state(venv: VecEnv, state: Any) -> None:
-    """Put back what :func:`env_state` returned, as a checkpoint holds it.
+    """Restore what :func:`env_state` returned, as a checkpoint holds it.
 
     Raises:
         ValueError: the state is of other environments.
@@ -320,10 +320,10 @@ def set_env_state(venv: VecEnv, state: Any) -> None:
 
 
 class KeepCheckpoint(BaseCallback):
-    """Writes the checkpoint between rollouts, when its time has come, and at the end."""
+    """Callback that writes the checkpoint between rollouts, every so many steps, and at the end."""
 
     def __init__(self, checkpoint: Checkpoint, every: int, curve: Curve, check: Callable[[], None]) -> None:
-        """Watch a training.
+        """Configure the callback.
 
         Args:
             checkpoint: where to write.

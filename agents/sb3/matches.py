@@ -39,7 +39,7 @@ class Match:
     games: tuple[Episode, ...]
 
     def row(self) -> dict[str, Any]:
-        """The figures for a table or a JSON file."""
+        """Return the figures for a table or a JSON file."""
         won, lost, mine, theirs = [], [], [], []
         for seat, game in zip(self.seats, self.games, strict=True):
             success, others = game.agent_success[seat], np.delete(game.agent_success, seat)
@@ -67,7 +67,7 @@ class Match:
 
 
 def seated(agents: Sequence[Agent]) -> Agent:
-    """An agent of a whole world, observations ``(n, agents, size)``, from one for every seat.
+    """Combine an agent for every seat into one of a whole world, observations ``(n, agents, size)``.
 
     Raises:
         ValueError: one that remembers; here an agent may sit in several seats.
@@ -78,7 +78,7 @@ def seated(agents: Sequence[Agent]) -> Agent:
 
 
 def play_together(config: TrainingConfig, model: PPO, worlds: VecEnv) -> list[Evaluation]:
-    """Zero actions, random ones and the trained policy, each in all seats."""
+    """Evaluate zero actions, random actions and the trained policy, each in all seats."""
     agents, size = worlds.action_space.shape
     return [
         evaluate(
@@ -93,7 +93,7 @@ def play_together(config: TrainingConfig, model: PPO, worlds: VecEnv) -> list[Ev
 
 
 def play_matches(config: TrainingConfig, model: PPO, pool: Pool, worlds: VecEnv) -> list[Match]:
-    """Zero actions, random ones and the trained policy against each opponent that the configuration names."""
+    """Play zero actions, random actions and the trained policy against each configured opponent."""
     size = worlds.action_space.shape[1]
     matches = []
     for opponent in config.selfplay.evaluate_against:

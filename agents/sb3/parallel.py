@@ -30,7 +30,7 @@ WAITING = "waiting"
 
 
 class World(gym.Env):
-    """All agents of a world at once: observations ``(agents, size)``, actions ``(agents, size)``.
+    """All agents of a world as one environment: observations ``(agents, size)``, actions ``(agents, size)``.
 
     The reward is the mean of the agents' own, so is ``distance`` where they have one, and ``success`` is that of all.
     What belongs to single agents is in ``info``, in the order of ``names``: ``played`` (whether it took this step),
@@ -39,7 +39,7 @@ class World(gym.Env):
     """
 
     def __init__(self, env: ParallelEnv) -> None:
-        """Show a world.
+        """Wrap a world.
 
         Raises:
             ConfigError: the agents' spaces differ, and one network cannot serve them all.
@@ -58,21 +58,21 @@ class World(gym.Env):
 
     @property
     def config(self) -> EnvConfig:
-        """Settings of the world."""
+        """Return the settings of the world."""
         return self.env.unwrapped.config
 
     @property
     def observation_layout(self) -> ObservationLayout:
-        """What lies where in an agent's observation."""
+        """Return the layout of an agent's observation."""
         return self.env.unwrapped.observation_layout
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """Of every component of an agent's action."""
+        """Return the names of the components of an agent's action."""
         return self.env.unwrapped.action_names
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """Begin an episode: of ``seed``, or the next one of the seed before."""
+        """Begin an episode: of ``seed``, or the next one of the previous seed."""
         observations, _ = self.env.reset(seed=seed, options=options)
         self._observation = np.stack([observations[name] for name in self.names])
         self._successes = np.zeros(len(self.names), bool)
@@ -105,7 +105,7 @@ class World(gym.Env):
         return self._observation.copy(), float(info["rewards"].mean()), terminated, over and not terminated, info
 
     def get_state(self) -> dict[str, Any]:
-        """Everything that the future depends on."""
+        """Return everything that the future depends on."""
         return {"env": self.env.get_state(), "seen": self._observation.copy(), "successes": self._successes.copy()}
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -121,7 +121,7 @@ class World(gym.Env):
         return np.array([values[name] if name in playing else 0 for name in self.names], dtype)
 
     def render(self) -> np.ndarray | None:
-        """A picture of the world."""
+        """Render a picture of the world."""
         return self.env.render()
 
     def close(self) -> None:
@@ -131,7 +131,7 @@ class World(gym.Env):
 
 @dataclass(frozen=True)
 class WorldFactory:
-    """Makes one world, in whichever process calls it.
+    """Factory of one world, in whichever process calls it.
 
     Attributes:
         game: its name, or a module that has ``parallel_env``.
@@ -146,7 +146,7 @@ class WorldFactory:
     render_mode: str | None = None
 
     def __call__(self) -> World:
-        """The world."""
+        """Build the world."""
         quiet_warp()
         game = importlib.import_module(self.game) if "." in self.game else load_game(self.game)
         make: Callable[..., ParallelEnv] = game.parallel_env
@@ -154,7 +154,7 @@ class WorldFactory:
 
 
 class AgentVecEnv(VecEnv):
-    """Every learning agent is a slot; an episode of a slot is its agent's, from the world's reset until it leaves.
+    """Worlds with a slot per learning agent; an episode of a slot lasts from the world's reset until its agent leaves.
 
     In most worlds all agents learn. The last ``num_duels`` worlds have one learner each, in a seat that is drawn for
     every episode; for the other agents act ``opponents``, which need no slot. A world is reset as soon as no learner
@@ -163,7 +163,7 @@ class AgentVecEnv(VecEnv):
     """
 
     def __init__(self, worlds: VecEnv, num_duels: int = 0) -> None:
-        """Fold worlds.
+        """Give every learning agent of the worlds a slot.
 
         Args:
             worlds: of :class:`World` environments.
@@ -191,11 +191,11 @@ class AgentVecEnv(VecEnv):
 
     @property
     def duels(self) -> range:
-        """The worlds with one learner."""
+        """Return the worlds with one learner."""
         return range(self.first_duel, self.worlds.num_envs)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """World ``w`` begins with the episodes of ``seed + w``; seats and opponents are drawn anew, by ``seed`` too."""
+        """Seed world ``w`` with ``seed + w``; seats and opponents are drawn anew, by ``seed`` too."""
         self.rng = np.random.default_rng(seed)
         return self.worlds.seed(seed)
 
@@ -218,7 +218,7 @@ class AgentVecEnv(VecEnv):
         self.worlds.step_async(joint)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """The learners' outcomes."""
+        """Return the learners' outcomes."""
         self._observation, _, over, world_infos = self.worlds.step_wait()
         rewards, dones = np.zeros(self.num_envs, np.float32), np.ones(self.num_envs, bool)
         infos: list[dict[str, Any]] = []
@@ -243,7 +243,7 @@ class AgentVecEnv(VecEnv):
         return self._observation[self.slot_world, self.slot_agent], rewards, dones, infos
 
     def get_state(self) -> dict[str, Any]:
-        """Who sits where and plays against whom, and what was seen last; the worlds have states of their own."""
+        """Return seats, opponents and the latest observations; the worlds have states of their own."""
         return {
             "seen": self._observation.copy(),
             "seats": self.slot_agent.copy(),
@@ -253,7 +253,7 @@ class AgentVecEnv(VecEnv):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_state` returned; the pool of the opponents is as it was then."""
+        """Restore what :meth:`get_state` returned; the pool of the opponents must be as it was."""
         self._observation, self.slot_agent = state["seen"].copy(), state["seats"].copy()
         self.rng.bit_generator.state = state["random"]
         if self.opponents:
@@ -270,11 +270,11 @@ class AgentVecEnv(VecEnv):
         return [int(self.slot_world[slot]) for slot in self._get_indices(indices)]
 
     def close(self) -> None:
-        """End the workers."""
+        """Close the workers."""
         self.worlds.close()
 
     def get_attr(self, attr_name: str, indices: int | Sequence[int] | None = None) -> list[Any]:
-        """An attribute of the slots' worlds."""
+        """Return an attribute of the slots' worlds."""
         return self.worlds.get_attr(attr_name, self._worlds_of(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Sequence[int] | None = None) -> None:
@@ -286,5 +286,5 @@ class AgentVecEnv(VecEnv):
         return self.worlds.env_method(method_name, *args, indices=self._worlds_of(indices), **kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
-        """Whether the slots' worlds are wrapped."""
+        """Return whether the slots' worlds are wrapped."""
         return self.worlds.env_is_wrapped(wrapper_class, self._worlds_of(indices))

@@ -27,12 +27,12 @@ CRITICS = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.", "
 
 
 def policy_agent(model: Any) -> Agent:
-    """The mean action of a trained stable-baselines3 policy."""
+    """Return an agent of the mean actions of a trained stable-baselines3 policy."""
     return lambda observation: model.predict(observation, deterministic=True)[0]
 
 
 def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, action_size: int) -> Agent:
-    """The agent of an earlier training: the mean action of its policy, on the CPU.
+    """Load the agent of an earlier training: the mean action of its policy, on the CPU.
 
     Only parameters are read, into a policy that is built as the configuration says. Nothing is unpickled, as
     stable-baselines3's own ``load`` would.

@@ -52,19 +52,19 @@ class PPOSettings(BaseModel):
 
 
 class SelectTerms(BaseFeaturesExtractor):
-    """Shows the networks some components of the observation, so that the policy takes the environment's as it is."""
+    """Feature extractor that selects components, so that the policy takes the environment's whole observation."""
 
     def __init__(self, observation_space: gym.Space, components: Sequence[int]) -> None:
         super().__init__(observation_space, len(components))
         self.register_buffer("components", torch.as_tensor(list(components), dtype=torch.long))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Shape ``(n, observation_size)`` to ``(n, len(components))``."""
+        """Select from shape ``(n, observation_size)`` to ``(n, len(components))``."""
         return observations[:, self.components]
 
 
 def networks(hidden: Sequence[int], components: Sequence[int]) -> dict[str, Any]:
-    """What the networks of a policy of stable-baselines3 see, and how wide their hidden layers are."""
+    """Return settings of networks: the components that they see, and the widths of their hidden layers."""
     return {
         "net_arch": list(hidden),
         "features_extractor_class": SelectTerms,
@@ -73,7 +73,7 @@ def networks(hidden: Sequence[int], components: Sequence[int]) -> dict[str, Any]
 
 
 def policy_settings(settings: PPOSettings, components: Sequence[int]) -> dict[str, Any]:
-    """The policy as stable-baselines3 takes it."""
+    """Return the policy's settings as stable-baselines3 takes them."""
     return networks(settings.hidden, components) | {
         "activation_fn": torch.nn.Tanh,
         "log_std_init": settings.log_std,
@@ -81,7 +81,7 @@ def policy_settings(settings: PPOSettings, components: Sequence[int]) -> dict[st
 
 
 def build(settings: PPOSettings, venv: VecEnv, components: Sequence[int], seed: int) -> PPO:
-    """An untrained agent on the CPU.
+    """Build an untrained agent on the CPU.
 
     Args:
         settings: hyper-parameters.
@@ -114,19 +114,19 @@ _COLUMNS = ("observations", "actions", "values", "log_probs", "advantages", "ret
 
 
 class PlayedBuffer(RolloutBuffer):
-    """Gives the loss only the steps that were played; :class:`MarkPlayed` says which.
+    """Rollout buffer that yields only the steps that were played, as :class:`MarkPlayed` marks them.
 
     Where all were, the minibatches are those of its base, as long as their size divides the rollout; else they are
     of nearly equal sizes, without a last one of a few steps.
     """
 
     def reset(self) -> None:
-        """Empty it."""
+        """Empty the buffer."""
         super().reset()
         self.played = np.zeros((self.buffer_size, self.n_envs), bool)
 
     def get(self, batch_size: int | None = None) -> Iterator[RolloutBufferSamples]:
-        """Minibatches of at most ``batch_size`` steps, in random order; all in one for None.
+        """Yield minibatches of at most ``batch_size`` steps, in random order; one of all steps for None.
 
         Raises:
             RuntimeError: the buffer is not full, or nobody has marked what was played.
@@ -143,7 +143,7 @@ class PlayedBuffer(RolloutBuffer):
 
 
 class MarkPlayed(BaseCallback):
-    """Tells a :class:`PlayedBuffer` which slots played the step that it is about to be given."""
+    """Callback that marks in a :class:`PlayedBuffer` the slots that played the current step."""
 
     def _on_step(self) -> bool:
         buffer = self.model.rollout_buffer

@@ -40,7 +40,7 @@ class SACSettings(BaseModel):
 
 
 def build(settings: SACSettings, venv: VecEnv, components: Sequence[int], seed: int) -> SAC:
-    """An untrained agent on the CPU.
+    """Build an untrained agent on the CPU.
 
     Args:
         settings: hyper-parameters.

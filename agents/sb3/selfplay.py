@@ -24,7 +24,7 @@ _NAME = re.compile(r"snapshot_(\d+)_steps\.pt")
 
 
 class SelfPlaySettings(BaseModel):
-    """Whom a policy plays against while it learns, and whom at the end."""
+    """Settings of self-play: opponents during training and at the end."""
 
     model_config = FROZEN
 
@@ -43,12 +43,12 @@ class SelfPlaySettings(BaseModel):
     )
 
     def num_duels(self, num_worlds: int) -> int:
-        """How many of the worlds have one learner: at least one, unless the share is zero."""
+        """Return the number of worlds with one learner: at least one, unless the share is zero."""
         return min(num_worlds, max(round(self.duel_share * num_worlds), int(self.duel_share > 0.0)))
 
 
 class Pool:
-    """Snapshots of a policy, each a file with its weights.
+    """Pool of snapshots of a policy, each a file with its weights.
 
     Attributes:
         folder: where the files are.
@@ -56,7 +56,7 @@ class Pool:
     """
 
     def __init__(self, folder: Path, steps: Iterable[int] = ()) -> None:
-        """Keep a pool in ``folder``; snapshots that it holds besides are removed.
+        """Open a pool in ``folder``; other snapshots in it are removed.
 
         Args:
             folder: made if there is none.
@@ -74,12 +74,12 @@ class Pool:
             self._path(found).unlink()
 
     def add(self, policy: BasePolicy, steps: int) -> None:
-        """Keep the policy as it is now."""
+        """Add the policy as it is now."""
         write_whole(self._path(steps), lambda file: torch.save(policy.state_dict(), file))
         self.steps.append(steps)
 
     def load(self, policy: BasePolicy, steps: int) -> None:
-        """Give ``policy`` the weights of a snapshot."""
+        """Load the weights of a snapshot into ``policy``."""
         policy.load_state_dict(load_whole(self._path(steps), "cpu"))
 
     def _path(self, steps: int) -> Path:
@@ -96,7 +96,7 @@ def _snapshots(folder: Path) -> list[int]:
 
 
 class Opponents:
-    """Act in the worlds that have one learner: as one snapshot in each, and as noisily as the learner does.
+    """Opponents in the worlds with one learner: one snapshot in each, acting as noisily as the learner.
 
     Attributes:
         drawn: steps of the snapshot that plays in a world.
@@ -108,25 +108,25 @@ class Opponents:
         self._policies = {world: copy.deepcopy(policy) for world in worlds}
 
     def draw(self, world: int, rng: np.random.Generator) -> None:
-        """Let any snapshot of the pool, each as likely, play the next episode in ``world``."""
+        """Draw the snapshot, uniformly, that plays the next episode in ``world``."""
         steps = self.pool.steps[rng.integers(len(self.pool.steps))]
         if self.drawn.get(world) != steps:
             self.pool.load(self._policies[world], steps)
             self.drawn[world] = steps
 
     def seat(self, drawn: Mapping[int, int]) -> None:
-        """Let the snapshots play on that were drawn for the worlds, by their steps."""
+        """Restore the snapshots that were drawn for the worlds, by their steps."""
         for world, steps in drawn.items():
             self.pool.load(self._policies[world], steps)
         self.drawn = dict(drawn)
 
     def act(self, world: int, observation: np.ndarray) -> np.ndarray:
-        """Actions for observations ``(n, observation_size)``."""
+        """Return actions for observations ``(n, observation_size)``."""
         return self._policies[world].predict(observation)[0]
 
 
 class Snapshots(BaseCallback):
-    """Adds the policy to the pool when its time has come."""
+    """Callback that adds the policy to the pool every so many steps."""
 
     def __init__(self, pool: Pool, every: int) -> None:
         super().__init__()
@@ -143,7 +143,7 @@ class Snapshots(BaseCallback):
 def enter(
     settings: SelfPlaySettings, venv: AgentVecEnv, model: PPO, folder: Path, steps: Iterable[int] = ()
 ) -> Snapshots:
-    """Seat the opponents, before the training begins; returns what keeps their pool growing.
+    """Seat the opponents before the training begins, and return the callback that extends their pool.
 
     Args:
         settings: of self-play.

@@ -63,7 +63,7 @@ def train(
 def train_single(
     config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, checkpoint: Checkpoint | None
 ) -> tuple[Curve, Results]:
-    """One agent: train and evaluate it."""
+    """Train and evaluate one agent."""
     model, curve = train(config, workers, facts, folder, checkpoint)
     episodes, first_seed = config.evaluation.episodes, config.evaluation.first_seed
     players = baselines(len(facts.action_names), first_seed) | {"trained": policy_agent(model)}
@@ -73,7 +73,7 @@ def train_single(
 def train_together(
     config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, checkpoint: Checkpoint | None
 ) -> tuple[Curve, Results]:
-    """Agents with one aim: one policy for all, which all learn."""
+    """Train and evaluate agents with a common aim: one policy for all, which all learn."""
     model, curve = train(config, AgentVecEnv(workers), facts, folder, checkpoint)
     return curve, matches.play_together(config, model, workers)
 
@@ -81,7 +81,7 @@ def train_together(
 def train_selfplay(
     config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, checkpoint: Checkpoint | None
 ) -> tuple[Curve, Results]:
-    """Agents that compete: one policy for all, against itself and its snapshots."""
+    """Train and evaluate agents that compete: one policy for all, against itself and its snapshots."""
     venv = AgentVecEnv(workers, config.selfplay.num_duels(workers.num_envs))
     model = begin(config, venv, facts, checkpoint)
     snapshots = selfplay.enter(config.selfplay, venv, model, folder, pool_of(checkpoint))
@@ -90,7 +90,7 @@ def train_selfplay(
 
 
 def pool_of(checkpoint: Checkpoint | None) -> list[int]:
-    """Steps of the snapshots against which a resumed training plays; none for one that begins."""
+    """Return the steps of the snapshots that a resumed training plays against; empty for a new one."""
     resumed = checkpoint is not None and checkpoint.state is not None
     return checkpoint.state["envs"]["folded"]["pool"] if resumed else []
 
@@ -112,7 +112,7 @@ class Options:
 
 
 def run(config: TrainingConfig, folder: Path, device: str, resume: bool) -> None:
-    """Train, or go on, and evaluate.
+    """Train, or resume a training, and evaluate.
 
     Args:
         config: resolved.
@@ -150,7 +150,7 @@ def run(config: TrainingConfig, folder: Path, device: str, resume: bool) -> None
 
 
 def main(args: list[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     options = read_options(Options, "sb3.train", args)
     quiet_warp()
     try:

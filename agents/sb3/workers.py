@@ -22,7 +22,7 @@ from piavatar_envs.envs.observations import ObservationLayout
 
 @dataclass(frozen=True)
 class EnvFactory:
-    """Makes one environment, in whichever process calls it."""
+    """Factory of one environment, in whichever process calls it."""
 
     env_id: str
     settings: dict[str, Any]
@@ -30,7 +30,7 @@ class EnvFactory:
     render_mode: str | None = None
 
     def __call__(self) -> gym.Env:
-        """The environment."""
+        """Build the environment."""
         import piavatar_envs  # noqa: F401 - registers the ids, also in a fresh process
 
         quiet_warp()
@@ -44,7 +44,7 @@ class EnvFactory:
 
 
 def factory(config: TrainingConfig, device: str = "cpu") -> EnvFactory | WorldFactory:
-    """What makes the environments of a training run: worlds, where there are several agents."""
+    """Return the factory of a training's environments: of worlds, where there are several agents."""
     if config.is_multi:
         return WorldFactory(multi_game(config.env_id).name, dict(config.env), device)
     return EnvFactory(config.env_id, dict(config.env), device)
@@ -52,7 +52,7 @@ def factory(config: TrainingConfig, device: str = "cpu") -> EnvFactory | WorldFa
 
 @dataclass(frozen=True)
 class EnvFacts:
-    """What agents must know of an environment.
+    """Facts about an environment that agents depend on.
 
     Attributes:
         layout: what lies where in the flat observation.
@@ -70,7 +70,7 @@ class EnvFacts:
 
 
 def prepare(make: EnvFactory | WorldFactory) -> EnvFacts:
-    """Compile the kernels, once and before the workers start: side by side they would race each other's files."""
+    """Compile the kernels before the workers start: in parallel they would race for each other's files."""
     env = make()
     try:
         env.reset(seed=0)
@@ -85,7 +85,7 @@ def prepare(make: EnvFactory | WorldFactory) -> EnvFacts:
 
 
 def start(config: TrainingConfig, make: EnvFactory | WorldFactory, device: str = "cpu") -> VecEnv:
-    """The environments of a configuration, as it says: one batch, or processes.
+    """Start the environments of a configuration: one batch, or processes.
 
     Raises:
         ValueError: a batch that does not fit.
@@ -94,7 +94,7 @@ def start(config: TrainingConfig, make: EnvFactory | WorldFactory, device: str =
 
 
 def start_workers(make: EnvFactory | WorldFactory, num_workers: int) -> VecEnv:
-    """``num_workers`` environments; a single one stays in this process."""
+    """Start ``num_workers`` environments; a single one stays in this process."""
     torch.set_num_threads(1)  # the workers have the cores; the networks are small
     if num_workers == 1:
         return DummyVecEnv([make])
@@ -103,7 +103,7 @@ def start_workers(make: EnvFactory | WorldFactory, num_workers: int) -> VecEnv:
 
 
 def start_vector(config: TrainingConfig, device: str = "cpu") -> VecEnv:
-    """The environments of a configuration as one batch, in this process.
+    """Start the environments of a configuration as one batch, in this process.
 
     Raises:
         ValueError: an unknown device, or a batch that does not fit.
@@ -114,7 +114,7 @@ def start_vector(config: TrainingConfig, device: str = "cpu") -> VecEnv:
 
 
 def components(layout: ObservationLayout, observe: tuple[str, ...] | None) -> list[int]:
-    """Places in the flat observation of the named terms; all of it for None.
+    """Return places in the flat observation of the named terms; all of it for None.
 
     Raises:
         ConfigError: there is no such term, or none is named.

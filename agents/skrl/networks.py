@@ -36,7 +36,7 @@ class MAPPOSettings(BaseModel):
 
 
 def layers(seen: int, hidden: Sequence[int], out: int) -> torch.nn.Sequential:
-    """A network with tanh between its layers, whose first answers are near zero."""
+    """Build a network with tanh between its layers, whose first outputs are near zero."""
     widths = [seen, *hidden]
     inner = [module for size, width in pairwise(widths) for module in (torch.nn.Linear(size, width), torch.nn.Tanh())]
     last = torch.nn.Linear(widths[-1], out)
@@ -46,7 +46,7 @@ def layers(seen: int, hidden: Sequence[int], out: int) -> torch.nn.Sequential:
 
 
 class Policy(GaussianMixin, Model):
-    """Normally distributed actions from some components of the agent's observation."""
+    """Policy with normally distributed actions from some components of the agent's observation."""
 
     def __init__(
         self, observation: gym.Space, action: gym.Space, seen: Sequence[int], settings: MAPPOSettings, device: Any
@@ -58,12 +58,12 @@ class Policy(GaussianMixin, Model):
         self.log_std = torch.nn.Parameter(torch.full((self.num_actions,), settings.log_std))
 
     def compute(self, inputs: dict[str, torch.Tensor], role: str = "") -> tuple[torch.Tensor, dict[str, Any]]:
-        """Mean actions and the logarithm of their spread."""
+        """Return mean actions and the logarithm of their standard deviation."""
         return self.net(inputs["observations"][:, self.seen]), {"log_std": self.log_std}
 
 
 class Critic(DeterministicMixin, Model):
-    """The value of a world for one agent, from the same components of all agents' observations."""
+    """Critic of a world for one agent, from the same components of all agents' observations."""
 
     def __init__(self, state: gym.Space, seen: Sequence[int], settings: MAPPOSettings, device: Any) -> None:
         Model.__init__(self, state_space=state, device=device)
@@ -72,19 +72,19 @@ class Critic(DeterministicMixin, Model):
         self.net = layers(len(seen), settings.hidden, 1)
 
     def compute(self, inputs: dict[str, torch.Tensor], role: str = "") -> tuple[torch.Tensor, dict[str, Any]]:
-        """The value."""
+        """Return the value."""
         return self.net(inputs["states"][:, self.seen]), {}
 
 
 class ActedMemory(RandomMemory):
-    """Gives the loss only the steps that the agent took itself, not those for which it was out."""
+    """Memory that samples only the steps that the agent took itself, not those after it left."""
 
     def __init__(self, memory_size: int, num_envs: int, device: Any) -> None:
         super().__init__(memory_size=memory_size, num_envs=num_envs, device=device)
         self.acted = torch.ones(memory_size, num_envs, dtype=torch.bool, device=self.device)
 
     def set_tensor_by_name(self, name: str, tensor: torch.Tensor) -> None:
-        """As its base does, but advantages are normalised over the steps that count."""
+        """Set a tensor; advantages are normalised over the steps that count."""
         if name == "advantages" and self.acted.any():
             counted = tensor[self.acted]
             tensor = (tensor - counted.mean()) / (counted.std(unbiased=False) + 1e-8)
@@ -93,7 +93,7 @@ class ActedMemory(RandomMemory):
     def sample(
         self, names: list[str], *, batch_size: int, mini_batches: int = 1, sequence_length: int = 1
     ) -> list[list[torch.Tensor]]:
-        """Minibatches in random order; none at all where the agent was out all the time."""
+        """Sample minibatches in random order; none if the agent was out all the time."""
         rows = self.acted.flatten().nonzero().flatten().cpu()
         rows = rows[torch.randperm(len(rows))]
         return self.sample_by_index(names, indexes=rows, mini_batches=min(mini_batches, len(rows))) if len(rows) else []

@@ -37,14 +37,14 @@ _OPTIONAL = ("learning_rate_scheduler", "observation_preprocessor", "state_prepr
 
 
 class MAPPOTraining(BatchTraining):
-    """Everything that a training with MAPPO depends on."""
+    """Settings of a training with MAPPO."""
 
     env_id: str = Field("high_five_v0", description="module of piavatar_envs.multi")
     mappo: MAPPOSettings = Field(default_factory=MAPPOSettings, description="the algorithm")
 
 
 def find_world(env_id: str) -> type[Task]:
-    """The task of a world.
+    """Return the task of a world.
 
     Raises:
         ValueError: there is no such world, or PettingZoo is not installed.
@@ -53,7 +53,7 @@ def find_world(env_id: str) -> type[Task]:
 
 
 class Worlds(AvatarSkrlMultiEnv):
-    """Worlds that stand where a checkpoint is when skrl's trainer has reset them, which it does first of all.
+    """Worlds that return to the state of a checkpoint at the first reset, with which skrl's trainer begins.
 
     Attributes:
         saved: the state of the worlds; None for new episodes.
@@ -62,7 +62,7 @@ class Worlds(AvatarSkrlMultiEnv):
     saved: dict[str, np.ndarray] | None = None
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode in every world, or go on."""
+        """Begin an episode in every world, or resume."""
         begun = super().reset(seed, options)
         if self.saved is None:
             return begun
@@ -71,7 +71,7 @@ class Worlds(AvatarSkrlMultiEnv):
 
 
 class WorldMAPPO(MAPPO):
-    """skrl's MAPPO, told by the view who acted and where the episodes really ended, and kept up by a checkpoint.
+    """skrl's MAPPO with masks of the agents that acted, true episode ends, and checkpoints.
 
     Without that it would take the first observation of the next episode for the last one of a truncated episode.
 
@@ -81,7 +81,7 @@ class WorldMAPPO(MAPPO):
     """
 
     def __init__(self, env: Worlds, checkpoint: Checkpoint | None, checkpoint_every: int, **arguments: Any) -> None:
-        """Begin; :meth:`resume` goes on where the checkpoint is.
+        """Build the agents; :meth:`resume` restores a checkpoint.
 
         Args:
             env: the worlds.
@@ -107,7 +107,7 @@ class WorldMAPPO(MAPPO):
         super().record_transition(infos=infos, rewards=rewards, **transition)
 
     def _book(self, rewards: dict[str, torch.Tensor], ended: torch.Tensor) -> None:
-        """Add the mean over agents to the returns of the episodes, and book those that have ended."""
+        """Add the mean over agents to the returns of the episodes, and log those that have ended."""
         self._steps += len(ended)
         self._totals = self._totals + torch.cat(list(rewards.values()), dim=1).mean(dim=1)
         returns = self._totals[ended].tolist()
@@ -116,7 +116,7 @@ class WorldMAPPO(MAPPO):
         self._totals[ended] = 0.0
 
     def post_interaction(self, *, timestep: int, timesteps: int) -> None:
-        """Learn at the end of a rollout, and write the checkpoint when its time has come, and at the end.
+        """Learn at the end of a rollout, and write the checkpoint every so many iterations and at the end.
 
         Raises:
             Diverged: the networks are not finite any more.
@@ -150,12 +150,12 @@ class WorldMAPPO(MAPPO):
         }
 
     def _modules(self) -> Iterable[tuple[str, dict[str, Any]]]:
-        """Networks and optimizers of every agent."""
+        """Return networks and optimizers of every agent."""
         for name, modules in self.checkpoint_modules.items():
             yield name, {part: module for part, module in modules.items() if hasattr(module, "state_dict")}
 
     def resume(self) -> None:
-        """Go on where the checkpoint is, if it is of a training; the last of all that draws random numbers before."""
+        """Restore the checkpoint of a training, if there is one; call it after everything that draws random numbers."""
         saved = self.checkpoint.state if self.checkpoint else None
         if saved is None:
             return
@@ -211,7 +211,7 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
 
 
 def build(config: MAPPOTraining, env: Worlds, folder: Path, checkpoint: Checkpoint | None = None) -> WorldMAPPO:
-    """Untrained agents.
+    """Build untrained agents.
 
     Raises:
         ConfigError: there is no such term to observe.
@@ -262,7 +262,7 @@ def build(config: MAPPOTraining, env: Worlds, folder: Path, checkpoint: Checkpoi
 
 
 def joint_agent(mappo: MAPPO) -> Agent:
-    """All agents' mean actions, from observations ``(n, agents, size)`` to ``(n, agents, action_size)``."""
+    """Return an agent of all mean actions, from observations ``(n, agents, size)`` to ``(n, agents, action_size)``."""
 
     def act(observation: np.ndarray) -> np.ndarray:
         seen = torch.as_tensor(observation, device=mappo.device)
@@ -277,7 +277,7 @@ def joint_agent(mappo: MAPPO) -> Agent:
 
 
 def main(args: list[str] | None = None) -> None:
-    """The command line."""
+    """Run the command line."""
     run("skrl.train", MAPPOTraining, find_world, learn, args)
 
 
