@@ -16,9 +16,9 @@ import tyro
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from agents.checkpoint import Checkpoint, Diverged
-from agents.command import meant_for, read_options
+from agents.command import read_options, script_hint
 from agents.config import MOST_ENVS, MOST_RUNS, EvaluationSettings, first_training_seed, load_resolved
-from agents.evaluate import Agent, play_beside_baselines
+from agents.evaluate import Agent, play_with_baselines
 from agents.files import made
 from agents.report import Curve, conclude, draw_curve, versions
 from piavatar_envs.api.host import EpisodeHost
@@ -160,7 +160,7 @@ def run(
         config = load_batched(cls, find_task, options.config, parse_assignments(options.settings))
         check_device(options.device)
     except ValueError as error:
-        sys.exit(f"error: {error}{meant_for(options.config, name)}")
+        sys.exit(f"error: {error}{script_hint(options.config, name)}")
     folder = options.out or Path("runs") / options.config.stem
     try:
         task = new_task(config, find_task)
@@ -168,18 +168,18 @@ def run(
             checkpoint = Checkpoint(folder, name, config, options.device, options.resume)
             iterations_of(checkpoint, config.iterations)
             learned = learn(config, task, folder, options.device, checkpoint)
-        conclude_batch(name, config, find_task, learned, folder, options.device)
+        evaluate_batch(name, config, find_task, learned, folder, options.device)
     except (ConfigError, Diverged, OSError) as error:
         sys.exit(f"error: {error}")
 
 
-def conclude_batch(
+def evaluate_batch(
     name: str, config: BatchTraining, find_task: FindTask, learned: Learned, folder: Path, device: str
 ) -> None:
     """Evaluate a trained agent and write ``results.json`` and the curve. Arguments are as for :func:`run`."""
     task = new_task(config, find_task)
     batch = EpisodeHost(task, config.evaluation.episodes, device)
-    results = play_beside_baselines("trained", learned.agent, batch, config.evaluation.first_seed)
+    results = play_with_baselines("trained", learned.agent, batch, config.evaluation.first_seed)
     batch.close()
     learned.curve.save(folder / "curve.csv")
     bands = {result.agent: result.estimate() for result in results}

@@ -1,12 +1,12 @@
-"""The checkpoint of a training: one file, written whole or not at all, that says what it belongs to.
+"""The checkpoint of a training: one file, written atomically, that names the run it belongs to.
 
-A run that was killed goes on from it, and on the same CPU (as many threads for torch) comes to the same curve and the
-same networks, bit for bit, as one that was left alone. For that a checkpoint holds everything that the future depends
+A killed run resumes from it, and on the same CPU (with as many threads for torch) gives the same curve and the same
+networks, bit for bit, as one without the interruption. A checkpoint therefore holds everything that the future depends
 on: networks, optimizers, random numbers, environments (0.4 MB each at ``fidelity="coarse"``), remembered steps, what
 the learner saw last, and the curve so far. It is read without running code that it might carry
 (``torch.load(weights_only=True)``).
 
-Trainings whose numbers are not finite any more: they end with a line, before what they would leave is written.
+A training whose parameters or outputs are no longer finite ends in an error before it writes anything.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ import numpy as np
 import torch
 from pydantic import BaseModel
 
-from agents.files import CHECKPOINT, POLICIES, RESULTS, git_commit, hold, write_whole
+from agents.files import CHECKPOINT, POLICIES, RESULTS, git_commit, hold, write_atomically
 from piavatar_envs.config import ConfigError
 from piavatar_envs.doctor import package_version
 
 #: Of the file's content; rises with every change.
-FORMAT = 4
+FORMAT = 5
 #: Settings that what has been learned so far does not depend on.
 FREE = ("total_steps", "iterations", "checkpoint_every", "evaluation", "env.render")
 #: Of these, how long a training is, and the settings that change with how much of it is over: where there is one, what
@@ -89,11 +89,11 @@ class Checkpoint:
     def save(self, state: Mapping[str, Any]) -> None:
         """Replace the saved state by a new one: nested containers of tensors, arrays and plain values."""
         content = {"format": FORMAT, "about": self._about, "state": as_tensors(state)}
-        write_whole(self.path, lambda file: torch.save(content, file))
+        write_atomically(self.path, lambda file: torch.save(content, file))
 
     def _read(self) -> dict[str, Any]:
         try:
-            content = load_whole(self.path, "cpu")
+            content = load_weights(self.path, "cpu")
         except UNREADABLE as error:
             raise ConfigError(f"{self.path} cannot be read ({first_line(error)}); delete it to begin anew") from None
         if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -109,7 +109,7 @@ class Checkpoint:
             ("config", "give the same settings, or begin anew in another folder with --out"),
         ):
             before, now = was[section], self._about[section]
-            unlike = learned_otherwise(before, now) if section == "config" else differences(before, now)
+            unlike = settings_changed(before, now) if section == "config" else differences(before, now)
             for name, old, new in unlike:
                 raise ConfigError(f"{self.path} was written with {name}={old}, now it is {new}; {remedy}")
         for name in ("script", "device"):
@@ -125,14 +125,14 @@ class Checkpoint:
             )
 
 
-#: What may come of reading a file that is damaged, or another's.
+#: Errors of reading a file that is damaged or not a checkpoint.
 UNREADABLE = (
     pickle.UnpicklingError, EOFError, RuntimeError, AttributeError, TypeError, OSError, ValueError, KeyError,
     zipfile.BadZipFile,
 )  # fmt: skip
 
 
-def load_whole(path: Path, device: str) -> Any:
+def load_weights(path: Path, device: str) -> Any:
     """Load a file of ``torch.save`` without running code that it might contain, and verify its checksums.
 
     Raises:
@@ -149,7 +149,7 @@ def first_line(error: Exception) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
-def no_policy(path: Path, seen: int, action_size: int, error: Exception) -> ConfigError:
+def policy_mismatch(path: Path, seen: int, action_size: int, error: Exception) -> ConfigError:
     """Build the error for a file without a policy of ``seen`` inputs and ``action_size`` outputs."""
     size = f"that sees {seen} numbers and gives {action_size}"
     return ConfigError(f"{path} holds no policy of its config.yaml {size}: {first_line(error)}")
@@ -172,7 +172,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple
     return [(name, old.get(name), new.get(name)) for name in sorted(old | new) if old.get(name) != new.get(name)]
 
 
-def learned_otherwise(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+def settings_changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
     """Return :func:`differences` of two trainings that learning so far depends on."""
     falls = any(flattened(now).get(name) is not None for name in FALLING)
     free = [name for name in FREE if not (falls and name in LENGTHS)]

@@ -18,7 +18,7 @@ from piavatar_envs.config import ConfigError, load_config
 
 Options = TypeVar("Options")
 
-#: Which script a configuration is for: by the folder that it is in, and by settings that together no other one's has.
+#: Scripts by the folder of a configuration, and settings that no other script's configuration has.
 _FOLDERS = {"rsl_rl": "rsl_rl.train", "sb3": "sb3.train", "skrl": "skrl.train"}
 _SETTINGS = {"rsl_rl.train": {"iterations", "ppo"}, "sb3.train": {"total_steps"}, "skrl.train": {"mappo"}}
 
@@ -58,13 +58,13 @@ def read_options(cls: type[Options], script: str, args: Sequence[str] | None = N
     with _registry:
         options, unread = tyro.cli(cls, prog=program, args=args, return_unknown_args=True)
         if any(word.startswith("-") for word in unread):
-            return tyro.cli(cls, prog=program, args=args)  # says which options there are not, and exits
-    # tyro takes settings that stand together, and hands back those beyond an option
+            return tyro.cli(cls, prog=program, args=args)  # names the unknown options and exits
+    # tyro parses adjacent settings and returns those that follow an option
     return replace(options, settings=(*options.settings, *unread))
 
 
 @contextmanager
-def in_a_line(*kinds: type[Exception]) -> Iterator[None]:
+def one_line_errors(*kinds: type[Exception]) -> Iterator[None]:
     """End the script with a one-line message for errors of some kinds, instead of a traceback."""
     try:
         yield
@@ -72,7 +72,7 @@ def in_a_line(*kinds: type[Exception]) -> Iterator[None]:
         sys.exit(f"error: {error}")
 
 
-def meant_for(path: Path, script: str) -> str:
+def script_hint(path: Path, script: str) -> str:
     """Return a hint at the script that a refused configuration is for, or an empty string.
 
     Args:
@@ -82,7 +82,7 @@ def meant_for(path: Path, script: str) -> str:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError):
-        return ""  # the error says so
+        return ""  # the error itself names the cause
     names = {str(key).partition(".")[0] for key in content} if isinstance(content, dict) else set()
     others = [other for other, telling in _SETTINGS.items() if telling <= names]
     other = _FOLDERS.get(path.resolve().parent.name, others[0] if len(others) == 1 else script)

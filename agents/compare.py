@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from agents.checkpoint import differences
-from agents.command import in_a_line
+from agents.command import one_line_errors
 from agents.evaluate import over_seeds
 from agents.files import check_figures, plain, read_json, write_json
 
@@ -122,13 +122,13 @@ class Options:
 def main(args: list[str] | None = None) -> None:
     """Run the command line."""
     options = tyro.cli(Options, prog="python -m agents.compare", args=args)
-    with in_a_line(ValueError, OSError):
+    with one_line_errors(ValueError, OSError):
         if options.out is not None:
             check_figures(options.out, "compare")
         files = [path / "results.json" if path.is_dir() else path for path in options.runs]
         report = summarize({str(path): read_run(path) for path in files})
     if options.out is not None:
-        with in_a_line(OSError):
+        with one_line_errors(OSError):
             write_json(options.out, plain(report, "compare"))
     show(report, Console(highlight=False, soft_wrap=True))
 

@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 
 from agents.checkpoint import Diverged
-from agents.command import in_a_line, read_options
+from agents.command import one_line_errors, read_options
 from agents.evaluate import Evaluation, baselines, evaluate, separated
 from agents.files import RESULTS, claim, hold
 from agents.play import film
@@ -32,9 +32,9 @@ from piavatar_envs.sim.world import check_device
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "reach_ppo.yaml"
 FILM_EPISODES = 2
-#: What comes when the training is over.
+#: Files that appear after the training.
 LATER = ("policy.zip", "curve.csv", "curve.png", "before_after.mp4")
-_RESERVE = 1.25  # what comes after the training is allowed to take this much longer than foreseen
+_RESERVE = 1.25  # margin on the estimated time after the training
 _FRAME = 0.1  # rendering and encoding a frame whose halves are drawn in parallel, on slow cores [s]
 
 
@@ -97,10 +97,10 @@ def run(options: Options, console: Console) -> Outcome:
     venv = start_workers(make, config.num_workers)
     try:
         references = play_references(config, venv, facts)
-        # of a demo that is stopped from here on, too, the next one knows that it was one, and takes its place
+        # marks the folder as a demo's, which the next demo may replace, even if this one is stopped
         about = versions("demo", options.device) | {"seed": config.seed, "config": config.model_dump(mode="json")}
         write_results(options.out / RESULTS, about, [evaluation for evaluation, _ in references], {})
-        for name in LATER:  # of an earlier one, which would lie beside this one's figures
+        for name in LATER:  # files of an earlier demo do not belong to this one's figures
             (options.out / name).unlink(missing_ok=True)
         deadline = begun + options.seconds - _RESERVE * _time_after(options, config, facts, references)
         untrained = ppo.build(config.ppo, venv, seen, config.seed)
@@ -189,7 +189,7 @@ def main(args: list[str] | None = None) -> None:
     """Run the command line."""
     options = read_options(Options, "demo", args)
     console = Console(highlight=False, soft_wrap=True)
-    with in_a_line(ValueError, Diverged, OSError):
+    with one_line_errors(ValueError, Diverged, OSError):
         outcome = run(options, console)
     show_table(outcome.evaluations, console)
     verdict = "lies above" if outcome.separated else "does NOT lie above"

@@ -8,7 +8,7 @@ and every episode that was begun counts once. What is counted is the return, the
 An agent is anything that is called with observations ``(n, observation_size)`` and returns actions
 ``(n, action_size)``. One that remembers also has ``begin(n)``, which is called at the start of every round.
 
-One training says little of an algorithm: :func:`over_seeds` sums up several, of different seeds.
+Results of one training vary with its seed: :func:`over_seeds` sums up several seeds.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from piavatar_envs.mpm.types import failure_name
 Agent = Callable[[np.ndarray], np.ndarray]
 #: Width of a class of pushes [N s].
 PUSH_CLASS = 5.0
-#: Metrics of tasks that evaluations sum up.
-TOLD = ("distance", "strongest_push")
-#: Seconds between two signs of life where nobody looks on, as in a log.
+#: Metrics of tasks that evaluations average.
+EVALUATED_METRICS = ("distance", "strongest_push")
+#: Seconds between two updates of the bar in a log.
 _LOG_SECONDS = 30.0
 
 
@@ -262,7 +262,9 @@ def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evalua
     """
     episodes = [Episode(first_seed + env) for env in range(batch.num_envs)]
     batch.reset([episode.seed for episode in episodes])
-    told = {name: batch.task.metric_names.index(name) for name in TOLD if name in batch.task.metric_names}
+    places = {
+        name: batch.task.metric_names.index(name) for name in EVALUATED_METRICS if name in batch.task.metric_names
+    }
     success = np.zeros((batch.num_envs, batch.num_agents), bool)
     playing = np.ones(batch.num_envs, bool)
     begin_round(agent, batch.num_envs)
@@ -278,7 +280,7 @@ def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evalua
             over = batch.read(lambda group: group.terminated).all(axis=1)
             for env in np.flatnonzero(playing):
                 info: dict[str, Any] = {"success": success[env].all(), "failure": failure_name(int(failures[env]))}
-                info |= {name: float(metrics[env, acted[env], place].mean()) for name, place in told.items()}
+                info |= {name: float(metrics[env, acted[env], place].mean()) for name, place in places.items()}
                 if batch.num_agents > 1:
                     info |= {"rewards": rewards[env].astype(np.float64), "successes": success[env].copy()}
                 episodes[env].book(float(rewards[env].mean()), info, bool(over[env]))
@@ -290,13 +292,13 @@ def play(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> Evalua
     return Evaluation(name, episodes)
 
 
-def play_beside_baselines(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> list[Evaluation]:
+def play_with_baselines(name: str, agent: Agent, batch: EpisodeHost, first_seed: int) -> list[Evaluation]:
     """Play zero actions, random actions and the agent in the same episodes; arguments as for :func:`play`."""
-    players = {other: in_every_seat(player) for other, player in baselines(batch.action_size, first_seed).items()}
+    players = {other: for_all_seats(player) for other, player in baselines(batch.action_size, first_seed).items()}
     return [play(player, act, batch, first_seed) for player, act in {**players, name: agent}.items()]
 
 
-def in_every_seat(agent: Agent) -> Agent:
+def for_all_seats(agent: Agent) -> Agent:
     """Turn an agent for observations ``(n, size)`` into one that :func:`play` takes."""
 
     def act(observation: np.ndarray) -> np.ndarray:

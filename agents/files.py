@@ -1,4 +1,4 @@
-"""Where scripts write: files are whole, what is there is not lost, and what cannot be written is refused early."""
+"""Files that scripts read and write: atomic writes, folders of runs, and figures as JSON with their origin."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from piavatar_envs.core.launch_graph import available_cores
 
 try:
     import fcntl
-except ImportError:  # on Windows nobody finds out that two train in one folder
+except ImportError:  # Windows has no such locks, so two trainings in one folder go unnoticed
     fcntl = None
 
-#: What a training goes on from, what it has learned, and the figures that come last.
+#: Files of a training: checkpoint, policies, and the figures that are written last.
 CHECKPOINT, POLICIES, RESULTS = "checkpoint.pt", ("policy.pt", "policy.zip"), "results.json"
 #: Folders that this process holds, and by what; the system lets go of them however the process ends.
 _HELD: dict[Path, int] = {}
@@ -35,11 +35,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("numpy", "scipy", "warp-lang", "gymnasium", "stable-baselines3", "torch", "mujoco")
 
 
-def write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
+def write_atomically(path: Path, write: Callable[[IO[bytes]], None]) -> None:
     """Replace a file atomically: if the process is killed, either the old or the new content is there.
 
     Args:
-        path: of the file. A half of a new one, left by whoever was killed, lies beside it as ``NAME.partial``, and the
+        path: of the file. A killed process can leave half of a new one as ``NAME.partial``, and the
             next write replaces it; where a write fails, as on a full disk, nothing of it is left.
         write: given a file that is open for bytes.
 
@@ -70,7 +70,7 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], None]) -> None:
 
 def write_config(folder: Path, config: BaseModel) -> None:
     """Write the resolved configuration to the folder of a run; call it after all checks have passed."""
-    write_whole(folder / "config.yaml", lambda file: file.write(dump_yaml(config).encode()))
+    write_atomically(folder / "config.yaml", lambda file: file.write(dump_yaml(config).encode()))
 
 
 @contextmanager
@@ -102,7 +102,7 @@ def hold(folder: Path) -> None:
         os.close(held)
         if isinstance(error, BlockingIOError):
             raise ConfigError(f"another training writes to {folder}; end it, or write elsewhere with --out") from None
-        return  # a file system that knows no locks
+        return  # a file system without locks
     _HELD[path] = held
 
 
@@ -118,7 +118,7 @@ def check_writable(path: Path) -> None:
         if path.exists():
             path.open("ab").close()
         nearest = next(folder for folder in path.absolute().parents if folder.exists())
-        tempfile.TemporaryFile(dir=nearest).close()  # tells more than asking for permissions does
+        tempfile.TemporaryFile(dir=nearest).close()  # finds more than a check of permissions does
     except OSError as error:
         raise ConfigError(f"{path} cannot be written ({error.strerror}); write elsewhere") from None
 
@@ -253,4 +253,4 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, lambda file: file.write(text.encode()))
+    write_atomically(path, lambda file: file.write(text.encode()))

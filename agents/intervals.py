@@ -77,7 +77,7 @@ def wilson(share: float, size: float, quantile: float) -> list[float]:
 def mean_over_seeds(means: Sequence[float], halves: Sequence[float], episodes: int) -> Estimate:
     """Return the mean of seeds that played the same episodes, with its 95 % interval over other seeds and episodes.
 
-    The scatter of the seeds' means says nothing of the episodes, for these are easy or hard for all seeds alike. So the
+    The scatter of the seeds' means holds no information on the episodes, which are equally hard for all seeds. So the
     mean's variance is that of the seeds' means over their number, and that of one seed's mean over episodes, as if all
     scatter within a seed came of the episodes: at worst too large.
 
@@ -121,9 +121,9 @@ def _scatter(of_seeds: float, of_episodes: float, seeds: int, episodes: int) -> 
     Of two, whose interval is wider: of seeds and episodes together (degrees of freedom by Satterthwaite, "An
     approximate distribution of estimates of variance components", Biometrics 2, 1946), or of the few seeds alone.
     """
-    alone, together = float(stats.t.ppf(0.975, seeds - 1)), of_seeds + of_episodes
-    if together == 0.0:  # nothing has scattered
+    alone, joint = float(stats.t.ppf(0.975, seeds - 1)), of_seeds + of_episodes
+    if joint == 0.0:  # nothing has scattered
         return 0.0, alone
-    freedom = together**2 / (of_seeds**2 / (seeds - 1) + of_episodes**2 / (episodes - 1))
+    freedom = joint**2 / (of_seeds**2 / (seeds - 1) + of_episodes**2 / (episodes - 1))
     quantile = float(stats.t.ppf(0.975, freedom))
-    return (together, quantile) if quantile**2 * together > alone**2 * of_seeds else (of_seeds, alone)
+    return (joint, quantile) if quantile**2 * joint > alone**2 * of_seeds else (of_seeds, alone)

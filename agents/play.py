@@ -1,7 +1,7 @@
 """Let what a training has left play again: ``python -m agents.play runs/stand_rsl --film stand.gif``.
 
 Takes the folder of a run with one agent, by ``agents.rsl_rl.train`` (policy.pt) or ``agents.sb3.train`` (policy.zip),
-builds the environment of its config.yaml, and plays the episodes of its evaluation. Asked for a film alone it plays no
+builds the environment of its config.yaml, and plays the episodes of its evaluation. With ``--film`` alone it plays no
 others; with ``--live`` it plays in a web browser instead, until Ctrl-C. Nothing in the files is unpickled.
 
 A video of one agent, or of two in the same episodes side by side.
@@ -22,9 +22,9 @@ from rich.console import Console
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
-from agents.command import in_a_line, read_options
+from agents.command import one_line_errors, read_options
 from agents.config import EvaluationSettings, changed
-from agents.evaluate import Agent, begin_round, in_every_seat, play
+from agents.evaluate import Agent, begin_round, for_all_seats, play
 from agents.files import RESULTS, check_figures, check_writable
 from agents.report import show_table, versions, write_results
 from agents.sb3.config import load_training
@@ -103,7 +103,7 @@ def _open_sb3(settings: Path, policy: Path, _device: str) -> Run:
         dict(config.env),
         config.evaluation,
         config.observe,
-        lambda layout, size: in_every_seat(load_agent(policy, config, layout, size)),
+        lambda layout, size: for_all_seats(load_agent(policy, config, layout, size)),
     )
 
 
@@ -115,7 +115,7 @@ class Options:
     run: tyro.conf.Positional[Path]
     #: settings of the environment that win over the run's: fidelity=tiny, or as for the training env.fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
-    #: episodes to score, by default as many as the training's evaluation has, or none where only a film is asked for
+    #: episodes to score, by default as many as the training's evaluation has, or none with --film alone
     episodes: int | None = None
     #: seed of the first episode, by default that of the training's evaluation
     first_seed: int | None = None
@@ -309,7 +309,7 @@ def main(args: list[str] | None = None) -> None:
     options = read_options(Options, "play", args)
     quiet_warp()
     scores = options.film is None or options.out is not None or options.episodes is not None
-    with in_a_line(ValueError, ImportError):
+    with one_line_errors(ValueError, ImportError):
         check_options(options)
         run = open_run(options.run, options.device)
         task = environment(run, options.settings)
@@ -322,7 +322,7 @@ def main(args: list[str] | None = None) -> None:
         check_seeds(first, max(episodes, options.film_episodes), "first_seed")
         batch = EpisodeHost(task, episodes, options.device)
         agent = run.make_agent(batch.layout, batch.action_size)
-    with in_a_line(OSError, ImportError):
+    with one_line_errors(OSError, ImportError):
         if scores:
             score_run(agent, batch, first, options, env)
         batch.close()

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from agents.evaluate import Evaluation
-from agents.files import describe_run, plain, write_json, write_whole
+from agents.files import describe_run, plain, write_atomically, write_json
 from agents.intervals import Estimate
 from agents.sb3.matches import Match
 
@@ -158,7 +158,7 @@ class Curve:
 
     def save(self, path: Path) -> None:
         """Write the curve as CSV."""
-        write_whole(path, lambda file: file.write(self.csv().encode()))
+        write_atomically(path, lambda file: file.write(self.csv().encode()))
 
     def state(self) -> dict[str, Any]:
         """Return the state for a checkpoint."""

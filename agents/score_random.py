@@ -15,9 +15,9 @@ from typing import Any
 
 import tyro
 
-from agents.command import in_a_line, read_options
+from agents.command import one_line_errors, read_options
 from agents.config import MOST_RUNS, EvaluationSettings, first_training_seed
-from agents.evaluate import in_every_seat, over_seeds, play, random_agent
+from agents.evaluate import for_all_seats, over_seeds, play, random_agent
 from agents.files import RESULTS, claim, plain, read_json, write_json
 from agents.report import versions
 from piavatar_envs.api.host import EpisodeHost
@@ -53,7 +53,7 @@ def score(batch: EpisodeHost, first_seed: int, count: int) -> dict[str, Any]:
         count: of streams; the seed of each is the one with which a training of that place would begin.
     """
     streams = [random_agent(batch.action_size, first_training_seed(stream)) for stream in range(count)]
-    return over_seeds([play("random", in_every_seat(stream), batch, first_seed).row() for stream in streams])
+    return over_seeds([play("random", for_all_seats(stream), batch, first_seed).row() for stream in streams])
 
 
 def check_streams(count: int) -> None:
@@ -71,7 +71,7 @@ def main(args: list[str] | None = None) -> None:
     options = read_options(Options, "score_random", args)
     quiet_warp()
     folder = options.out or Path("runs") / f"random_{options.run.resolve().name}"
-    with in_a_line(ValueError, OSError):
+    with one_line_errors(ValueError, OSError):
         check_streams(options.seeds)
         claim(folder, "score_random")
         env_id, env = environment_of(options.run)
@@ -83,7 +83,7 @@ def main(args: list[str] | None = None) -> None:
     row["first_seed"] = options.evaluation.first_seed
     settings = {"env_id": env_id, "env": config.model_dump(mode="json")}
     about = versions("score_random", options.device) | {"seed": 0, "config": settings}
-    with in_a_line(OSError):
+    with one_line_errors(OSError):
         write_json(folder / RESULTS, plain({**about, "results": [row]}, "results"))
     low, high = row["return_interval"]
     print(f"random, {options.seeds} seeds: {row['return_mean']:.1f} ({low:.1f} to {high:.1f})")

@@ -12,8 +12,6 @@ A policy can be scored anew without training it anew: ``python -m agents.play RU
 then takes the place of the training's own; what the training took, and zero and random actions, stay as they were. If
 it was scored on other bones than those that it was trained on, zero and random actions of the training are left out:
 they were not played where the policy was.
-
-Scores as Markdown: what :mod:`agents.scores` has summed up, for people.
 """
 
 from __future__ import annotations
@@ -31,8 +29,17 @@ from rich.markdown import Markdown
 
 from agents import compare
 from agents.checkpoint import flattened
-from agents.command import in_a_line
-from agents.files import RESULTS, check_figures, check_writable, describe_run, plain, read_json, write_json, write_whole
+from agents.command import one_line_errors
+from agents.files import (
+    RESULTS,
+    check_figures,
+    check_writable,
+    describe_run,
+    plain,
+    read_json,
+    write_atomically,
+    write_json,
+)
 from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
 
@@ -42,7 +49,7 @@ STREAMS = "score_random"
 _LEARNERS = {"pid.score": "PID", "rsl_rl.train": "rsl_ppo", "sb3.train": "sb3_ppo", "skrl.train": "skrl_mappo"}
 #: Returns of the same actions in the same episodes, on another device.
 _ALIKE = 1.0e-3
-#: What a policy may be scored on though it was trained on another; the row says which.
+#: Setting of the bones, in which an evaluation may differ from the training; the row has its value.
 _PLAYED = "env.control.bone_contact"
 
 
@@ -131,7 +138,7 @@ def _same_environment(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 def _known(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return all settings of an environment by dotted name; settings that a run does not have take their defaults.
 
-    What follows from other settings where it is null is what follows: runs from before it could be null know that.
+    Settings that follow from others where they are null get that value, which older runs recorded.
     """
     with contextlib.suppress(ValueError):  # a world of several agents, or settings that are no longer there
         config = load_config(load_task(env_id).Config, settings)
@@ -217,7 +224,7 @@ def _kept(path: Path | None, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any
 def _check_out(path: Path) -> None:
     """Refuse a file for the table that has another suffix, cannot be written, or would replace something else."""
     if path.suffix != ".json":
-        raise ValueError(f"out={path} must be a .json file; the same comes beside it as .md")
+        raise ValueError(f"out={path} must be a .json file; the table is written next to it as .md")
     check_figures(path, "scores")
     beside = path.with_suffix(".md")
     check_writable(beside)
@@ -297,7 +304,7 @@ class Options:
 
     #: folders of the runs
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    #: JSON file to write; the table comes beside it, as .md
+    #: JSON file to write; the table is written next to it, as .md
     out: Path | None = None
     #: earlier JSON file, whose rows of other environments stay
     keep: Path | None = None
@@ -306,7 +313,7 @@ class Options:
 def main(args: list[str] | None = None) -> None:
     """Run the command line."""
     options = tyro.cli(Options, prog="python -m agents.scores", args=args)
-    with in_a_line(ValueError, OSError):
+    with one_line_errors(ValueError, OSError):
         if options.out is not None:
             _check_out(options.out)
         runs = {str(path): _read_run(path) for path in options.runs}
@@ -325,9 +332,9 @@ def main(args: list[str] | None = None) -> None:
     text = markdown(rows, about)
     if options.out is not None:
         report = {**describe_run("scores", "cpu"), "devices": devices, "commits": commits, "results": rows}
-        with in_a_line(OSError):
+        with one_line_errors(OSError):
             write_json(options.out, plain(report, "scores"))
-            write_whole(options.out.with_suffix(".md"), lambda file: file.write(text.encode()))
+            write_atomically(options.out.with_suffix(".md"), lambda file: file.write(text.encode()))
     Console(soft_wrap=True).print(Markdown(text))
 
 

@@ -26,7 +26,7 @@ import tyro
 from pydantic import BaseModel
 from rich.progress import track
 
-from agents.checkpoint import LENGTHS, learned_otherwise
+from agents.checkpoint import LENGTHS, settings_changed
 from agents.files import read_json
 from agents.sb3.config import load_training
 from piavatar_envs.config import parse_assignments
@@ -72,7 +72,7 @@ class Job:
             had = load(read_json(path)["config"]).model_dump(mode="json")
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is of no training of {self.config.stem} ({error}); remove it") from None
-        for name, then, now in learned_otherwise(had, asked):
+        for name, then, now in settings_changed(had, asked):
             raise ValueError(
                 f"{path} is of a training with {name}={then}, now it is {now}; give the same settings, or another "
                 "folder with --runs"

@@ -1,6 +1,6 @@
 """An agent for bodies that stand by joint torques (``control="torque"``), such as PIAvatar/Stand-v0: PID and balance.
 
-It sees what any agent sees, the observation, and knows the body as its designer would: masses, lengths and strengths.
+It uses the observation that every agent gets, and masses, lengths and strengths of the body.
 Four parts add up to the torques of a step::
 
     balance      where the centre of pressure has to be (:mod:`agents.pid.balance`): the force of the ground on both
@@ -128,7 +128,7 @@ class PIDAgent:
     Attributes:
         bones: the body.
         balance: the strategy of its ankles and hips.
-        effort: what the balance asked for in the last step.
+        effort: of the balance in the last step.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class PIDAgent:
             return follow(self.poses or rest_poses, self._time, self.dt)
         turns = Rotation.from_rotvec(seen["reference_turns"].reshape(-1, 3))
         coming = (Rotation.from_rotvec(vectors.reshape(-1, 3)) * turns).as_rotvec().reshape(vectors.shape)
-        # what was to come a step ago is the clip now; an episode begins in the clip's own pose
+        # the reference of a step ago is the clip now; an episode begins in the clip's own pose
         coming = np.where(self._followed, coming, 0.0)
         now = np.where(self._followed, vectors, 0.0) if self._clip is None else self._clip
         self._clip = coming

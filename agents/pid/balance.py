@@ -1,6 +1,6 @@
 """Balance of a standing body: the ankle strategy, and beyond a threshold the hip strategy, in both planes.
 
-People who are pushed a little keep stiff and turn about the ankles; pushed harder, or on a short support, they bend at
+A person who is pushed a little stays stiff and turns about the ankles; pushed harder, or on a short support, bends at
 the hips (Horak & Nashner, "Central programming of postural movements", J. Neurophysiology 55, 1986). Forward and
 backward the ankles press toes or heels, sideways the hips load one leg and unload the other (Winter, "Human balance and
 posture control during standing and walking", Gait & Posture 3, 1995).
@@ -82,7 +82,7 @@ class Effort:
         pressure: place of the centre of pressure that the ankles (sideways also the hips) bring about [m].
         ankle: torque of both feet on the ground about the ankles, by that pressure [N m].
         hip: torque that turns the trunk, forward and to the left positive [N m].
-        margin: from ``xi`` to the nearer edge of the feet [m]; negative where the ankles alone cannot help.
+        margin: from ``xi`` to the nearer edge of the feet [m]; negative where the ankles alone cannot recover.
     """
 
     pressure: np.ndarray
@@ -113,7 +113,7 @@ class Balance:
             stance: how the body stands.
             gain: decay of the error of ``xi`` in units of the pendulum's own rate [-].
             goal: where ``xi`` is to rest [m]; by default in the midst of the feet.
-            hip_threshold: share of the way from the goal to an edge of the feet from which on the hips help [-].
+            hip_threshold: share of the way from the goal to an edge of the feet beyond which the hips act too [-].
             hip_gain: of the hips' torque, in units of the body's weight times the way beyond the threshold [-].
             hip_limit: largest torque that turns the trunk, in each plane [N m]; zero for the ankle strategy alone.
 

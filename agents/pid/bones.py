@@ -1,4 +1,4 @@
-"""A body as a tree of rigid bones, as a controller knows it: where they are, what they weigh, and what turns them.
+"""A body as a tree of rigid bones for a controller: positions, masses, and the moments about its joints.
 
 Generalised velocities are those of the pelvis joint in the world [m/s], then of every bone against its parent about the
 bone's own axes [rad/s], the pelvis' against the world first: :data:`NUM_DOF` numbers. With the velocity ``J q'`` of the
@@ -80,7 +80,8 @@ class Bones:
 
         Args:
             local: rotations against the parents, of the pelvis against the world, ``(n, 22, 3, 3)``.
-            places: of the joints [m], ``(n, 22, 3)``; None for those that the bones' lengths say, the pelvis at zero.
+            places: of the joints [m], ``(n, 22, 3)``; None to place them by the bones' lengths, with the pelvis at
+            zero.
         """
         rotation, found = forward_kinematics(local, np.zeros((len(local), 3)), self.joints)
         joints = found if places is None else places

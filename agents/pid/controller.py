@@ -1,6 +1,6 @@
 """An outer-loop PID controller that turns poses into joint torques, for environments with ``control="torque"``.
 
-It knows plain arrays only and needs no simulation. :class:`PID` works on any degrees of freedom ``(n, dof)``,
+It works on plain arrays, without a simulation. :class:`PID` works on any degrees of freedom ``(n, dof)``,
 :class:`PosePID` on joints that are local rotations ``(n, joints, 3)``::
 
     controller = PosePID(PID(gains, dt, (n, joints, 3)))
@@ -17,9 +17,9 @@ elsewhere, such as :mod:`agents.pid.balance`, and a factor ``s`` from a gain sch
 integral is kept as a torque, so that a change of gains does not jump either (section 11.5).
 
 Torques that are held for a control step of 1/30 s allow only weak gains. Where the inertia that a joint moves is given,
-error and rate are those that the end of the step will have (Tan, Liu & Turk, "Stable Proportional-Derivative
-Controllers", 2011), and gains may be as high as one likes. That is right of one joint. Those of a body answer together:
-``ahead`` of :meth:`PID.step` takes the place of the division by inertias (:func:`agents.pid.bones.answered`).
+error and rate are those at the end of the step (Tan, Liu & Turk, "Stable Proportional-Derivative Controllers", 2011),
+and strong gains are stable. That holds for a single joint. For the coupled joints of a body, ``ahead`` of
+:meth:`PID.step` replaces the division by inertias (:func:`agents.pid.bones.answered`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 #: From torques if nothing moved and what springs and dampers add to the inertia to the torques that are given.
 Ahead = Callable[[np.ndarray, np.ndarray], np.ndarray]
-#: What motors give of the torques that they are asked for.
+#: From wanted torques to those that the motors can give.
 Given = Callable[[np.ndarray], np.ndarray]
 
 #: A number for all, or an array that broadcasts against ``(n, joints, 3)`` or ``(n, dof)``.
@@ -142,7 +142,7 @@ class PID:
             factor: on the gains [-], from a schedule.
             ahead: how the body answers springs and dampers within the step; None where every degree of freedom answers
                 alone, by the inertia of the gains, or none does.
-            given: what a motor gives of the torques that it is asked for, where its limits are others than those of the
+            given: maps wanted torques to those that motors can give, where their limits are others than those of the
                 gains; integrals give way to what it leaves.
 
         Raises:

@@ -91,7 +91,7 @@ def gains_by_strength(
 
     Args:
         limit: largest torques [N m], ``(joints, 3)``.
-        stiffness: share of the largest torque of a joint about any axis that an error of 1 rad asks for [1/rad].
+        stiffness: share of the largest torque of a joint about any axis for an error of 1 rad [1/rad].
         damping_time: ``kd / kp`` [s].
         integral_time: ``kp / ki`` [s]; infinite for no integral. For all joints, or ``(joints, 1)``.
 
@@ -110,7 +110,7 @@ class LoadSchedule:
         joints: number of joints.
         legs: places of the joints of each leg.
         unloaded: factor of a leg that carries nothing [-], 1 for no schedule; one that carries its even share, or more,
-            has 1. :class:`agents.pid.agent.Design` says what came of it in a body that stands.
+            has 1.
     """
 
     joints: int

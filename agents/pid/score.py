@@ -11,9 +11,9 @@ from pathlib import Path
 
 import tyro
 
-from agents.command import in_a_line, read_options
+from agents.command import one_line_errors, read_options
 from agents.config import EvaluationSettings
-from agents.evaluate import in_every_seat, play_beside_baselines
+from agents.evaluate import for_all_seats, play_with_baselines
 from agents.files import claim, write_config
 from agents.pid.agent import Design, make_pid_agent
 from agents.play import check_film, film
@@ -54,18 +54,18 @@ def main(args: list[str] | None = None) -> None:
     episodes, first = options.evaluation.episodes, options.evaluation.first_seed
     env_id = listed_name(options.env_id)
     folder = options.out or Path("runs") / f"pid_{env_id.rpartition('/')[2].removesuffix('-v0')}"
-    with in_a_line(ValueError):
+    with one_line_errors(ValueError):
         check_film(options.film, options.film_every)
         claim(folder, "pid.score")
         task_class = load_task(env_id)
         config = load_config(task_class.Config, {"control": "torque"}, parse_assignments(options.settings))
         agent = make_pid_agent(env_id, config.model_dump(mode="json"), options.design)
         batch = EpisodeHost(task_class(config), episodes, options.device)
-    results = play_beside_baselines("PID", in_every_seat(agent), batch, first)
+    results = play_with_baselines("PID", for_all_seats(agent), batch, first)
     batch.close()
     settings = {"env_id": env_id, "env": config.model_dump(mode="json"), "design": asdict(options.design)}
     about = versions("pid.score", options.device) | {"seed": 0, "config": settings}
-    with in_a_line(OSError, ImportError):
+    with one_line_errors(OSError, ImportError):
         folder.mkdir(parents=True, exist_ok=True)
         write_config(folder, config)
         conclude(folder, about, results, {}, "config.yaml, results.json")

@@ -13,10 +13,10 @@ from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 
 from agents.batch_training import BatchTraining, load_batched
-from agents.checkpoint import UNREADABLE, load_whole, no_policy
+from agents.checkpoint import UNREADABLE, load_weights, policy_mismatch
 from agents.config import Widths
 from agents.evaluate import Agent
-from agents.rsl_rl.curriculum import HelpSettings
+from agents.rsl_rl.curriculum import AssistSchedule
 from agents.sb3.workers import components
 from piavatar_envs.config import FROZEN, FrozenDict
 from piavatar_envs.envs.observations import ObservationLayout
@@ -67,8 +67,10 @@ class RslTraining(BatchTraining):
 
     env_id: str = Field("PIAvatar/Reach-v0", description="registered id")
     ppo: RslPPOSettings = Field(default_factory=RslPPOSettings, description="the algorithm")
-    help: HelpSettings | None = Field(None, description="help for the pelvis that wanes; null for what env says")
-    lessons: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
+    assist: AssistSchedule | None = Field(
+        None, description="schedule of root_assist while it learns; null for the environment's own"
+    )
+    curriculum: Annotated[dict[str, Any], AfterValidator(FrozenDict)] = Field(
         default_factory=dict, description="settings of the environment that differ from env while it learns"
     )
 
@@ -115,9 +117,9 @@ def load_agent(path: Path, config: RslTraining, layout: ObservationLayout, actio
     shown = TensorDict({"policy": torch.zeros(1, len(seen))}, [1])
     actor = network(shown, {"actor": ["policy"]}, "actor", action_size, **settings).to(device)
     try:
-        actor.load_state_dict(load_whole(path, device))
+        actor.load_state_dict(load_weights(path, device))
     except UNREADABLE as error:
-        raise no_policy(path, len(seen), action_size, error) from None
+        raise policy_mismatch(path, len(seen), action_size, error) from None
     return mean_agent(actor.eval(), seen, device)
 
 

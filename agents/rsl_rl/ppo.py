@@ -1,10 +1,8 @@
-"""rsl_rl's PPO, with what trainings of the suite ask of it besides.
+"""rsl_rl's PPO with scaled rewards, noisy observations, declining updates, and reflected steps.
 
-Left and right changed over: what a body sees and does, seen in a mirror.
-
-A body is the same on both sides, and so is what it can do: whatever is a good action here is, mirrored, a good action
-in the mirrored state. An algorithm that is told so learns from every step twice (Mittal, Rudin, Klemm, Allshire &
-Hutter, "Symmetry considerations for learning task symmetric robot policies", ICRA 2024).
+A body is the same on both sides, so the reflection of a good action is a good action in the reflected state, and every
+step can be learned from twice (Mittal, Rudin, Klemm, Allshire & Hutter, "Symmetry considerations for learning task
+symmetric robot policies", ICRA 2024).
 
 The mirror is the plane x = 0, in which a body that faces -y looks straight ahead. Vectors change their x; spins and
 rotation vectors keep it and change y and z; a rotation matrix becomes ``S R S`` with ``S = diag(-1, 1, 1)``.
@@ -63,7 +61,7 @@ class ScaledPPO(PPO):
         self.updates += 1
         try:
             losses = super().update()
-        except (RuntimeError, ValueError):  # what torch says of broken networks says nothing to whoever trains
+        except (RuntimeError, ValueError):  # torch's message about broken networks does not name the cause
             self.check()
             raise
         self.check()
@@ -145,11 +143,14 @@ class Mirror:
         for term in terms:
             signs, items = _TERMS.get(term.name, (_SCALAR, ()))
             if len(signs) * len(items) != term.size:
-                raise ConfigError(f"the mirror knows no observation term {term.name!r} of size {term.size}; do without")
+                raise ConfigError(
+                    f"no reflection of observation term {term.name!r} of size {term.size} is known; use "
+                    "ppo.mirrored=false"
+                )
             pairs.append(_changed_over(items, signs))
         lonely = [joint for joint in joints if other_side(joint) not in joints]
         if lonely:
-            raise ConfigError(f"{lonely[0]!r} acts, but {other_side(lonely[0])!r} does not; do without the mirror")
+            raise ConfigError(f"{lonely[0]!r} acts, but {other_side(lonely[0])!r} does not; use ppo.mirrored=false")
         self._seen = _joined(pairs, device)
         acts = [_changed_over(joints, _SPIN)] + ([_changed_over(("root",), _ROOT)] if root else [])
         self._done = _joined(acts, device)

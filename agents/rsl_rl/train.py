@@ -1,8 +1,8 @@
 """PPO by rsl_rl on a batch of environments: ``python -m agents.rsl_rl.train configs/rsl_rl/reach_rsl.yaml``.
 
-Leaves in the folder: the resolved configuration, the networks, TensorBoard's files and rsl_rl's own saved networks, the
-learning curve, and the evaluation. What was killed goes on with ``--resume``, from the latest checkpoint and as if
-nothing had happened.
+Writes to the folder: the resolved configuration, the networks, TensorBoard's files and rsl_rl's own saved networks, the
+learning curve, and the evaluation. A killed training continues with ``--resume`` from the latest checkpoint, with the
+same results as without the interruption.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from torch.utils.tensorboard import SummaryWriter
 
 from agents.batch_training import Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, check_finite, random_states, seed_all, set_random_states
-from agents.files import write_config, write_whole
+from agents.files import write_atomically, write_config
 from agents.report import Curve
-from agents.rsl_rl.curriculum import HelpedEnv, with_lessons
+from agents.rsl_rl.curriculum import AssistedEnv, training_settings
 from agents.rsl_rl.policy import RslTraining, actor_settings, mean_agent, network_settings
 from agents.rsl_rl.ppo import Mirror, ScaledPPO
 from agents.sb3.workers import components
@@ -86,7 +86,7 @@ class Runner(OnPolicyRunner):
         }
         super().__init__(env, settings, log_dir=str(folder / "rsl_rl"), device=str(env.device))
         self.alg.check, self._config = self._check_finite, config
-        self.logger.git_status_repos.clear()  # results.json says which commit; no diffs of what is around
+        self.logger.git_status_repos.clear()  # results.json has the commit; no diffs of other repositories
         if saved:
             self._restore(saved)
 
@@ -123,8 +123,8 @@ class Runner(OnPolicyRunner):
 
     def _state(self) -> dict[str, Any]:
         log = self.logger
-        helped = {"help": self.env.help} if isinstance(self.env, HelpedEnv) else {}
-        return helped | {
+        assist = {"assist": self.env.assist} if isinstance(self.env, AssistedEnv) else {}
+        return assist | {
             "iterations": self.iterations,
             "algorithm": self.alg.save(),
             "envs": self.env.host.get_state(),
@@ -146,9 +146,9 @@ class Runner(OnPolicyRunner):
         log.tot_timesteps, log.tot_time = saved["logged"]
         set_random_states(saved["random"])
         self.alg.updates = self.iterations
-        if isinstance(self.env, HelpedEnv):
+        if isinstance(self.env, AssistedEnv):
             self.env.steps = self.iterations * self.env.rollout_steps
-            self.env.help = saved["help"].to(self.env.device)
+            self.env.assist = saved["assist"].to(self.env.device)
 
 
 def runner_settings(config: RslTraining, env: AvatarRslEnv) -> dict[str, Any]:
@@ -219,20 +219,20 @@ def make_env(config: RslTraining, task: Task, device: str) -> AvatarRslEnv:
     """Build the training environments.
 
     Raises:
-        ConfigError: there is no such term to observe, or nothing to be helped, or a lesson is none.
+        ConfigError: there is no such term to observe, an assist under pose control, or a curriculum that does not fit.
     """
-    settings = with_lessons(task, config.lessons)
-    if config.help is not None and settings.control.mode == "pose":
-        raise ConfigError('help is for bodies under torques, and env.control.mode="pose"; use "pd" or "torque"')
-    if config.help is not None and settings.control.root_assist > 0.0:
+    settings = training_settings(task, config.curriculum)
+    if config.assist is not None and settings.control.mode == "pose":
+        raise ConfigError('assist is for bodies under torques, and env.control.mode="pose"; use "pd" or "torque"')
+    if config.assist is not None and settings.control.root_assist > 0.0:
         raise ConfigError(
-            f"help wanes to nothing, and env.control.root_assist={settings.control.root_assist} stays; give one of them"
+            f"assist declines to 0, and env.control.root_assist={settings.control.root_assist} stays; give one of them"
         )
     groups = None if config.observe is None else {"policy": config.observe}
     about = (config.env_id, config.num_envs, device, settings, groups, config.first_seed)
-    if config.help is None:
+    if config.assist is None:
         return AvatarRslEnv(*about)
-    return HelpedEnv(config.help, config.ppo.rollout_steps, *about)
+    return AssistedEnv(config.assist, config.ppo.rollout_steps, *about)
 
 
 def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint: Checkpoint) -> Learned:
@@ -246,7 +246,7 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
         checkpoint: from which to go on, and which to keep up.
 
     Raises:
-        ConfigError: what is asked for does not fit the environment, or the checkpoint has had more iterations.
+        ConfigError: the configuration does not fit the environment, or the checkpoint has had more iterations.
         Diverged: the networks are not finite any more.
     """
     env = make_env(config, task, device)
@@ -256,7 +256,7 @@ def learn(config: RslTraining, task: Task, folder: Path, device: str, checkpoint
     runner.train(config.iterations)
     runner.curve.train_steps = config.iterations * config.num_envs * config.ppo.rollout_steps
     actor = runner.get_inference_policy(str(env.device))
-    write_whole(folder / "policy.pt", lambda file: torch.save(actor.state_dict(), file))
+    write_atomically(folder / "policy.pt", lambda file: torch.save(actor.state_dict(), file))
     env.close()
     return Learned(mean_agent(actor, components(env.observation_layout, config.observe), str(env.device)), runner.curve)
 

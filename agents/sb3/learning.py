@@ -27,7 +27,7 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 from agents.checkpoint import Checkpoint, as_arrays, check_finite, random_states, set_random_states
-from agents.files import write_config, write_whole
+from agents.files import write_atomically, write_config
 from agents.report import Curve
 from agents.sb3 import ppo, sac
 from agents.sb3.config import TrainingConfig
@@ -83,7 +83,7 @@ class Progress(BaseCallback):
         self.curve, self.total_steps, self.start, self.deadline = curve, total_steps, start, deadline
 
     def _on_training_start(self) -> None:
-        # where nobody watches, a line now and then will do
+        # a log needs a line now and then only
         interval = 0.5 if sys.stderr.isatty() else 30.0
         self.bar = tqdm(
             total=self.total_steps, initial=self.num_timesteps, desc="train", unit="step", mininterval=interval
@@ -118,7 +118,7 @@ def begin(config: TrainingConfig, venv: VecEnv, facts: EnvFacts, checkpoint: Che
         checkpoint: from which :func:`learn` will go on, or None.
 
     Raises:
-        ConfigError: there is no such term to observe, or the checkpoint has had more steps than are asked for.
+        ConfigError: an unknown term to observe, or a checkpoint with more steps than are configured.
     """
     seen = components(facts.layout, config.observe)
     build, settings = (ppo.build, config.ppo) if config.sac is None else (sac.build, config.sac)
@@ -167,7 +167,7 @@ def learn(
         watch.append(KeepCheckpoint(checkpoint, config.checkpoint_every, curve, check))
     try:
         model.learn(config.total_steps - model.num_timesteps, callback=CallbackList(watch), reset_num_timesteps=False)
-    except ValueError:  # what torch says of broken networks says nothing to whoever trains
+    except ValueError:  # torch's message about broken networks does not name the cause
         check()
         raise
     finally:
@@ -175,7 +175,7 @@ def learn(
     check()
     curve.seconds, curve.train_steps = time.monotonic() - start, model.num_timesteps
     model.logger.close()
-    write_whole(folder / "policy.zip", model.save)
+    write_atomically(folder / "policy.zip", model.save)
     curve.save(folder / "curve.csv")
     return curve
 

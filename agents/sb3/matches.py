@@ -1,4 +1,4 @@
-"""How agents of a world are compared: together, where they have one aim, or against each other, seat by seat."""
+"""Evaluation of agents of a world: in cooperation, or in matches, in every seat."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def seated(agents: Sequence[Agent]) -> Agent:
     return lambda observation: np.stack([agent(observation[:, seat]) for seat, agent in enumerate(agents)], axis=1)
 
 
-def play_together(config: TrainingConfig, model: PPO, worlds: VecEnv) -> list[Evaluation]:
+def play_cooperative(config: TrainingConfig, model: PPO, worlds: VecEnv) -> list[Evaluation]:
     """Evaluate zero actions, random actions and the trained policy, each in all seats."""
     agents, size = worlds.action_space.shape
     return [

@@ -34,8 +34,9 @@ class World(gym.Env):
 
     The reward is the mean of the agents' own, so is ``distance`` where they have one, and ``success`` is that of all.
     What belongs to single agents is in ``info``, in the order of ``names``: ``played`` (whether it took this step),
-    ``rewards``, ``terminated``, ``truncated``, ``successes`` (the latest, also of those who left) and ``agent_infos``.
-    An agent that has left keeps its last observation, and its actions are ignored. The world ends with its last agent.
+    ``rewards``, ``terminated``, ``truncated``, ``successes`` (the latest, also of agents that left) and
+    ``agent_infos``. An agent that has left keeps its last observation, and its actions are ignored. The world ends
+    with its last agent.
     """
 
     def __init__(self, env: ParallelEnv) -> None:
@@ -170,7 +171,7 @@ class AgentVecEnv(VecEnv):
             num_duels: how many of them have one learner only.
 
         Raises:
-            ValueError: more duels than worlds, or nobody to fight.
+            ValueError: more duels than worlds, or worlds of one agent.
         """
         agents = worlds.observation_space.shape[0]
         if not 0 <= num_duels <= worlds.num_envs or (num_duels and agents < 2):

@@ -13,7 +13,7 @@ import torch
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.sac.policies import SACPolicy
 
-from agents.checkpoint import no_policy
+from agents.checkpoint import policy_mismatch
 from agents.evaluate import Agent
 from agents.sb3 import ppo
 from agents.sb3.config import TrainingConfig
@@ -54,7 +54,7 @@ def load_agent(path: Path, config: TrainingConfig, layout: ObservationLayout, ac
         if unlike:
             raise KeyError(f"missing or unknown parameters: {', '.join(unlike)}")
     except (KeyError, zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError, TypeError) as error:
-        raise no_policy(path, len(components(layout, config.observe)), action_size, error) from None
+        raise policy_mismatch(path, len(components(layout, config.observe)), action_size, error) from None
     return policy_agent(policy.eval())
 
 

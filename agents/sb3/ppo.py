@@ -3,7 +3,7 @@
 Observations are not normalised by running statistics: they are metres, radians and metres a second of order one
 already, while some (the height of a root that is held up) hardly vary, and dividing by their spread makes them noise.
 
-Rollouts in which not every slot plays every step.
+Of worlds whose agents leave early, a rollout buffer keeps only the steps that were played.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class PlayedBuffer(RolloutBuffer):
         """Yield minibatches of at most ``batch_size`` steps, in random order; one of all steps for None.
 
         Raises:
-            RuntimeError: the buffer is not full, or nobody has marked what was played.
+            RuntimeError: the buffer is not full, or no step is marked as played.
         """
         if not self.full or not self.played.any():
             raise RuntimeError(f"{self.pos} of {self.buffer_size} steps, {self.played.sum()} of them marked as played")

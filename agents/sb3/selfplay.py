@@ -15,8 +15,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 
-from agents.checkpoint import load_whole
-from agents.files import write_whole
+from agents.checkpoint import load_weights
+from agents.files import write_atomically
 from agents.sb3.parallel import AgentVecEnv
 from piavatar_envs.config import FROZEN, ConfigError
 
@@ -75,12 +75,12 @@ class Pool:
 
     def add(self, policy: BasePolicy, steps: int) -> None:
         """Add the policy as it is now."""
-        write_whole(self._path(steps), lambda file: torch.save(policy.state_dict(), file))
+        write_atomically(self._path(steps), lambda file: torch.save(policy.state_dict(), file))
         self.steps.append(steps)
 
     def load(self, policy: BasePolicy, steps: int) -> None:
         """Load the weights of a snapshot into ``policy``."""
-        policy.load_state_dict(load_whole(self._path(steps), "cpu"))
+        policy.load_state_dict(load_weights(self._path(steps), "cpu"))
 
     def _path(self, steps: int) -> Path:
         return self.folder / _file_name(steps)

@@ -1,4 +1,4 @@
-"""Train agents as a configuration says: ``python -m agents.sb3.train configs/reach_ppo.yaml --out runs/reach``.
+"""Train with stable-baselines3: ``python -m agents.sb3.train configs/reach_ppo.yaml --out runs/reach``.
 
 The environment is one agent's, or a world of several: then all its learning agents share one policy, and with a section
 ``selfplay`` they compete, also with snapshots of earlier policies. Leaves in the folder: the resolved configuration,
@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.checkpoint import Checkpoint, Diverged
-from agents.command import meant_for, read_options
+from agents.command import read_options, script_hint
 from agents.evaluate import Evaluation, baselines, evaluate
 from agents.files import made
 from agents.report import Curve, conclude, draw_curve, versions
@@ -70,12 +70,12 @@ def train_single(
     return curve, [evaluate(name, agent, workers, episodes, first_seed) for name, agent in players.items()]
 
 
-def train_together(
+def train_cooperative(
     config: TrainingConfig, workers: VecEnv, facts: EnvFacts, folder: Path, checkpoint: Checkpoint | None
 ) -> tuple[Curve, Results]:
     """Train and evaluate agents with a common aim: one policy for all, which all learn."""
     model, curve = train(config, AgentVecEnv(workers), facts, folder, checkpoint)
-    return curve, matches.play_together(config, model, workers)
+    return curve, matches.play_cooperative(config, model, workers)
 
 
 def train_selfplay(
@@ -126,7 +126,7 @@ def run(config: TrainingConfig, folder: Path, device: str, resume: bool) -> None
         Diverged: the networks are not finite any more.
         OSError: something cannot be written.
     """
-    learns = train_selfplay if config.selfplay else train_together if config.is_multi else train_single
+    learns = train_selfplay if config.selfplay else train_cooperative if config.is_multi else train_single
     with made(folder):
         checkpoint = Checkpoint(folder, "sb3.train", config, device, resume)
         make = factory(config, device)
@@ -157,7 +157,7 @@ def main(args: list[str] | None = None) -> None:
         config = load_training(options.config, parse_assignments(options.settings))
         check_device(options.device)
     except ValueError as error:
-        sys.exit(f"error: {error}{meant_for(options.config, 'sb3.train')}")
+        sys.exit(f"error: {error}{script_hint(options.config, 'sb3.train')}")
     try:
         run(config, options.out or Path("runs") / options.config.stem, options.device, options.resume)
     except (ConfigError, Diverged, OSError) as error:

@@ -25,7 +25,7 @@ from agents.batch_training import BatchTraining, Learned, iterations_of, run
 from agents.checkpoint import Checkpoint, as_arrays, check_finite, random_states, seed_all, set_random_states
 from agents.config import multi_game
 from agents.evaluate import Agent
-from agents.files import write_config, write_whole
+from agents.files import write_atomically, write_config
 from agents.report import Curve
 from agents.sb3.workers import components
 from agents.skrl.networks import ActedMemory, Critic, MAPPOSettings, Policy
@@ -183,7 +183,7 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
         checkpoint: from which to go on, and which to keep up.
 
     Raises:
-        ConfigError: there is no such term to observe, or the checkpoint has had more iterations than are asked for.
+        ConfigError: an unknown term to observe, or a checkpoint with more iterations than are configured.
         Diverged: the networks are not finite any more.
     """
     env = Worlds(type(task), config.num_envs, device, task.config)
@@ -205,7 +205,7 @@ def learn(config: MAPPOTraining, task: Task, folder: Path, device: str, checkpoi
     mappo.resume()
     trainer.train()
     mappo.curve.train_steps = config.iterations * config.num_envs * config.mappo.rollout_steps
-    write_whole(folder / "policy.pt", mappo.save)
+    write_atomically(folder / "policy.pt", mappo.save)
     env.close()
     return Learned(joint_agent(mappo), mappo.curve)
 

@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from agents.batch_training import BatchTraining
-from agents.evaluate import Episode, in_every_seat, play, zero_agent
+from agents.evaluate import Episode, for_all_seats, play, zero_agent
 from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import load_config
 from piavatar_envs.tasks import load_task
@@ -63,13 +63,13 @@ def test_falls_and_pushes_are_told(device):
     task = load_task("PIAvatar/PushRecovery-v0")
     config = load_config(task.Config, {"fidelity": "tiny", "throw_interval": 0.4, "episode_seconds": 3.0})
     batch = EpisodeHost(task(config), 4, device)
-    found = play("zero", in_every_seat(zero_agent(batch.action_size)), batch, first_seed=3)
+    found = play("zero", for_all_seats(zero_agent(batch.action_size)), batch, first_seed=3)
     assert all(episode.terminated and episode.steps < 90 for episode in found.episodes)
     assert sum(row["episodes"] for row in found.row()["by_push"]) == 4
     assert max(episode.push for episode in found.episodes) > config.hit_impulse
     short = load_config(task.Config, {"fidelity": "tiny", "episode_seconds": 0.1})
     still = EpisodeHost(task(short), 2, device)
-    for episode in play("zero", in_every_seat(zero_agent(batch.action_size)), still, first_seed=3).episodes:
+    for episode in play("zero", for_all_seats(zero_agent(batch.action_size)), still, first_seed=3).episodes:
         assert not episode.terminated and episode.steps == 3 and episode.push == 0.0
     batch.close()
     still.close()

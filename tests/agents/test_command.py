@@ -8,7 +8,7 @@ import pytest
 
 from agents import batch_training as batches
 from agents import demo, play
-from agents.command import meant_for, read_options
+from agents.command import read_options, script_hint
 from agents.pid import score as score_pid
 from agents.sb3 import train
 
@@ -59,4 +59,4 @@ def test_files_of_other_scripts_are_known_wherever_they_lie(path, tmp_path):
     copy.write_bytes(path.read_bytes())
     for script in ("rsl_rl.train", "skrl.train", "sb3.train"):
         told = "" if script == owner else f" (this is a file for python -m agents.{owner})"
-        assert meant_for(path, script) == meant_for(copy, script) == told
+        assert script_hint(path, script) == script_hint(copy, script) == told

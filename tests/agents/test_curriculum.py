@@ -11,7 +11,7 @@ for needed in ("rsl_rl", "tensordict", "git"):
 
 from agents.batch_training import load_batched  # noqa: E402
 from agents.rsl_rl import train as rsl_ppo  # noqa: E402
-from agents.rsl_rl.curriculum import HelpedEnv, HelpSettings  # noqa: E402
+from agents.rsl_rl.curriculum import AssistedEnv, AssistSchedule  # noqa: E402
 from agents.rsl_rl.policy import RslTraining  # noqa: E402
 from piavatar_envs.config import load_config, parse_assignments  # noqa: E402
 from piavatar_envs.tasks import load_task  # noqa: E402
@@ -23,8 +23,8 @@ FEW = (
 
 
 def test_it_falls_in_equal_steps_and_some_have_none(device):
-    settings = HelpSettings(first=0.8, rollouts=2)
-    env = HelpedEnv(settings, 3, "Stand-v0", 3, device, {"fidelity": "tiny"})
+    settings = AssistSchedule(first=0.8, rollouts=2)
+    env = AssistedEnv(settings, 3, "Stand-v0", 3, device, {"fidelity": "tiny"})
     still = torch.zeros(3, env.num_actions, device=env.device)
     had = []
     for _ in range(9):
@@ -33,7 +33,7 @@ def test_it_falls_in_equal_steps_and_some_have_none(device):
     expected = [0.8] * 3 + [0.4] * 3 + [0.0] * 3
     np.testing.assert_allclose(had, np.outer(expected, [0.0, 0.5, 1.0]), atol=1e-7)
     env.close()
-    alone = HelpedEnv(settings, 3, "Stand-v0", 1, device, {"fidelity": "tiny"})
+    alone = AssistedEnv(settings, 3, "Stand-v0", 1, device, {"fidelity": "tiny"})
     alone.step(still[:1])
     assert alone.host.groups[0].simulation.controllers[0].assist.numpy().tolist() == pytest.approx([0.8])
     alone.close()
@@ -47,22 +47,22 @@ def test_it_falls_in_equal_steps_and_some_have_none(device):
     ],
 )
 def test_it_falls_after_success_and_rises_after_failure(device, task, expected):
-    """In a tenth of a second nobody falls, and nobody gets up."""
-    settings = HelpSettings(first=0.8, step=0.3)
-    env = HelpedEnv(settings, 4, task, 3, device, {"fidelity": "tiny", "episode_seconds": 0.1})
+    """In a tenth of a second no body falls, and none gets up."""
+    settings = AssistSchedule(first=0.8, step=0.3)
+    env = AssistedEnv(settings, 4, task, 3, device, {"fidelity": "tiny", "episode_seconds": 0.1})
     still = torch.zeros(3, env.num_actions, device=env.device)
     for shares in np.repeat(expected, 3, axis=0):
         _, _, _, extras = env.step(still)
         groups = env.host.groups
         had = np.concatenate([group.simulation.controllers[0].assist.numpy() for group in groups])
         np.testing.assert_allclose(had, shares, atol=1e-6)
-        assert float(extras["log"]["Task/help"]) == pytest.approx(shares.mean(), abs=1e-6)
+        assert float(extras["log"]["Task/root_assist"]) == pytest.approx(shares.mean(), abs=1e-6)
     env.close()
 
 
 @pytest.mark.parametrize("how", ["rollouts: 3", "step: 0.2"])
-def test_a_resumed_training_has_the_help_that_it_would_have_had(device, tmp_path, capsys, how):
-    command = [*FEW, f"help={{first: 0.5, {how}}}", "--device", device, "--out"]
+def test_a_resumed_training_has_the_assist_of_an_uninterrupted_one(device, tmp_path, capsys, how):
+    command = [*FEW, f"assist={{first: 0.5, {how}}}", "--device", device, "--out"]
     rsl_ppo.main([*command[:-3], "iterations=4", *command[-3:], str(tmp_path / "whole")])
     parts = str(tmp_path / "parts")
     rsl_ppo.main([*command[:-3], "iterations=2", *command[-3:], parts])
@@ -76,26 +76,26 @@ def test_a_resumed_training_has_the_help_that_it_would_have_had(device, tmp_path
 
 
 def test_lessons_are_for_learning_only(device, tmp_path, capsys):
-    lessons = "lessons={pose_noise: 0.3, control.root_assist: 0.1}"
-    config = load_batched(RslTraining, load_task, FEW[0], parse_assignments([*FEW[1:], lessons]))
+    setting = "curriculum={pose_noise: 0.3, control.root_assist: 0.1}"
+    config = load_batched(RslTraining, load_task, FEW[0], parse_assignments([*FEW[1:], setting]))
     task = load_task(config.env_id)
     env = rsl_ppo.make_env(config, task(load_config(task.Config, config.env)), device)
     assert env.config.pose_noise == 0.3 and env.config.control.root_assist == 0.1
     assert config.env["pose_noise"] == 0.05 and config.env["control"]["root_assist"] == 0.0
     env.close()
     with pytest.raises(SystemExit, match=r"tail is no setting of StandConfig"):
-        rsl_ppo.main([*FEW, "lessons={tail: 1}", "iterations=1", "--device", device, "--out", str(tmp_path)])
+        rsl_ppo.main([*FEW, "curriculum={tail: 1}", "iterations=1", "--device", device, "--out", str(tmp_path)])
 
 
 @pytest.mark.parametrize(
-    ("lesson", "told"),
+    ("setting", "named"),
     [
         ("control.mode: pd", "control.mode"),
         ("joints: [left_hip]", "its actions"),
         ("observe_parameters: true", "observe_parameters"),
     ],
 )
-def test_lessons_for_another_body_are_refused(device, tmp_path, lesson, told):
+def test_curricula_for_another_body_are_refused(device, tmp_path, setting, named):
     """A policy that sees or does something else would fail, or be evaluated at what it has not learned."""
-    with pytest.raises(SystemExit, match=rf"lessons=.* change .*{told}.*give such settings as env"):
-        rsl_ppo.main([*FEW, f"lessons={{{lesson}}}", "iterations=1", "--device", device, "--out", str(tmp_path)])
+    with pytest.raises(SystemExit, match=rf"curriculum=.* changes .*{named}"):
+        rsl_ppo.main([*FEW, f"curriculum={{{setting}}}", "iterations=1", "--device", device, "--out", str(tmp_path)])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.checkpoint import UNREADABLE, Checkpoint, load_whole
+from agents.checkpoint import UNREADABLE, Checkpoint, load_weights
 from agents.files import hold
 from agents.sb3.config import load_training
 from piavatar_envs.config import ConfigError
@@ -37,20 +37,20 @@ def test_a_run_that_was_kept_is_not_written_over(name, resume, tmp_path):
 def test_damage_anywhere_is_found(tmp_path):
     whole, damaged = tmp_path / "whole.pt", tmp_path / "damaged.pt"
     torch.save({"weight": torch.arange(3000.0)}, whole)
-    torch.testing.assert_close(load_whole(whole, "cpu")["weight"], torch.arange(3000.0))
+    torch.testing.assert_close(load_weights(whole, "cpu")["weight"], torch.arange(3000.0))
     content = whole.read_bytes()
     rng = np.random.default_rng(3)
     for at in [*rng.integers(0, len(content) - 64, 40), content.index(torch.arange(1000.0, 1004.0).numpy().tobytes())]:
         # four bytes of the numbers themselves, or of what describes them
         damaged.write_bytes(content[:at] + bytes(b ^ 0xFF for b in content[at : at + 4]) + content[at + 4 :])
         try:
-            read = load_whole(damaged, "cpu")
+            read = load_weights(damaged, "cpu")
         except UNREADABLE:
             continue
         torch.testing.assert_close(read["weight"], torch.arange(3000.0))  # what nobody reads, such as a date
     for broken in (content[: len(content) // 2], b"", b"no archive"):
         damaged.write_bytes(broken)
         with pytest.raises(UNREADABLE):
-            load_whole(damaged, "cpu")
+            load_weights(damaged, "cpu")
     with pytest.raises(UNREADABLE):
-        load_whole(tmp_path, "cpu")
+        load_weights(tmp_path, "cpu")

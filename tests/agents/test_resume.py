@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from agents.checkpoint import Checkpoint, as_arrays, as_tensors, random_states, set_random_states
-from agents.files import write_whole
+from agents.files import write_atomically
 from agents.sb3 import train
 from agents.sb3.config import load_training
 from agents.sb3.learning import begin, learn
@@ -199,14 +199,14 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_never_run(tiny, tmp_path):
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path):
     path = tmp_path / "file"
-    write_whole(path, lambda file: file.write(b"old"))
+    write_atomically(path, lambda file: file.write(b"old"))
 
     def fail(file):
         file.write(b"ne")
         raise OSError("no space left")
 
     with pytest.raises(OSError, match="no space"):
-        write_whole(path, fail)
+        write_atomically(path, fail)
     assert path.read_bytes() == b"old" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
     class Full(io.BytesIO):
@@ -216,9 +216,9 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(OSError, match=r"file cannot be written \(No space left on device\)"):
-        write_whole(path, lambda _: torch.save({"weight": torch.zeros(9)}, Full()))
+        write_atomically(path, lambda _: torch.save({"weight": torch.zeros(9)}, Full()))
     assert path.read_bytes() == b"old" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
-    write_whole(path, lambda file: file.write(b"new"))
+    write_atomically(path, lambda file: file.write(b"new"))
     assert path.read_bytes() == b"new" and [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 

@@ -25,7 +25,7 @@ from tests.agents.killing import flat, run_killed  # noqa: E402
 CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "rsl_rl").glob("*.yaml"))
 TINY = (
     "env.fidelity=tiny", "env.episode_seconds=0.3", "num_envs=2", "iterations=3", "ppo.rollout_steps=8",
-    "ppo.minibatches=2", "ppo.epochs=2", "evaluation.episodes=2", 'lessons={"episode_seconds": 0.3}',
+    "ppo.minibatches=2", "ppo.epochs=2", "evaluation.episodes=2", 'curriculum={"episode_seconds": 0.3}',
 )  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def test_training_changes_the_policy_repeats_and_depends_on_its_seed(device, tmp
 def test_updates_aim_at_smaller_and_smaller_divergences(tmp_path, monkeypatch, capsys):
     aims, update = [], rsl_algorithm.PPO.update
     monkeypatch.setattr(rsl_algorithm.PPO, "update", lambda self: aims.append(self.desired_kl) or update(self))
-    run = [str(CONFIGS[0]), *TINY, "help=null", "ppo.final_kl=0.01"]
+    run = [str(CONFIGS[0]), *TINY, "assist=null", "ppo.final_kl=0.01"]
     rsl_ppo.main([*run, "ppo.desired_kl=0.02", "--out", str(tmp_path / "falls")])
     assert aims == pytest.approx([0.02, 0.015, 0.01])
     with pytest.raises(SystemExit, match="falls to, and there is none; give both"):

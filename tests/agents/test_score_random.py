@@ -11,7 +11,7 @@ pytest.importorskip("torch", reason="needs the extra train")
 
 from agents import score_random, scores
 from agents.config import first_training_seed
-from agents.evaluate import in_every_seat, over_seeds, play, random_agent
+from agents.evaluate import for_all_seats, over_seeds, play, random_agent
 from agents.pid import score as score_pid
 from piavatar_envs.api.host import EpisodeHost
 from piavatar_envs.config import load_config
@@ -38,7 +38,7 @@ def test_every_seed_is_a_stream_of_its_own_in_the_same_episodes(run, device, tmp
     task = load_task("Stand-v0")
     batch = EpisodeHost(task(load_config(task.Config, env)), 2, device)
     agents = [random_agent(batch.action_size, first_training_seed(seed)) for seed in range(3)]
-    rows = [play("random", in_every_seat(agent), batch, 1_000_000).row() for agent in agents]
+    rows = [play("random", for_all_seats(agent), batch, 1_000_000).row() for agent in agents]
     batch.close()
     means = [seed["return_mean"] for seed in rows]
     assert np.ptp(means) > 0.0

@@ -220,7 +220,7 @@ def test_cooperation_learns_to_meet(games, tmp_path):
     )
     make = factory(config)
     workers = DummyVecEnv([make] * 4)
-    curve, results = train.train_together(config, workers, prepare(make), tmp_path, None)
+    curve, results = train.train_cooperative(config, workers, prepare(make), tmp_path, None)
     assert len(curve.returns) > 100
     rows = {result.agent: result.row() for result in results}
     assert list(rows) == ["zero", "random", "trained"]
