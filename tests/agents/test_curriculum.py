@@ -75,7 +75,7 @@ def test_a_resumed_training_has_the_assist_of_an_uninterrupted_one(device, tmp_p
     assert not all(torch.equal(whole[name], alone[name]) for name in whole)
 
 
-def test_lessons_are_for_learning_only(device, tmp_path, capsys):
+def test_curricula_are_for_training_only(device, tmp_path, capsys):
     setting = "curriculum={pose_noise: 0.3, control.root_assist: 0.1}"
     config = load_batched(RslTraining, load_task, FEW[0], parse_assignments([*FEW[1:], setting]))
     task = load_task(config.env_id)
