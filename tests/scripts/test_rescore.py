@@ -13,7 +13,7 @@ from agents import score_random
 from agents.pid import score as score_pid
 from scripts import rescore
 
-RESULTS = Path(__file__).parents[1] / "benchmarks" / "results"
+RESULTS = Path(__file__).parents[2] / "benchmarks" / "results"
 
 
 def test_every_kept_agent_has_a_job():
