@@ -119,7 +119,7 @@ def hit_by_balls(world: World, control: PoseControlConfig, seeds: int, steps: in
             "ball_kg": ball.mass,
             "ball_m_s": ball.speed,
             "impulse_n_s": ball.impulse,
-            "root_let_go": int(course.let_go[mine].sum()),
+            "root_released": int(course.let_go[mine].sum()),
             "measured_with_real_ball": {"peak_joint_error_deg": peak, "settled_joint_error_deg": settled},
         }
 

@@ -1,6 +1,6 @@
-"""What refusals of settings say: where, which value, which limit and unit, and which setting may have been meant.
+"""Errors of settings as one line: key, value, limit with unit, and the setting that may have been meant.
 
-It knows pydantic models and their errors, and no single setting.
+Its functions work on any pydantic model; :func:`setting_keys` and its neighbours read the structure of one.
 """
 
 from __future__ import annotations
@@ -15,24 +15,22 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-#: Most characters of a value in a message.
+#: Greatest length of a value in a message [characters].
 MOST_SHOWN = 120
-#: What users of Gymnasium may give with settings, and where it belongs.
+#: Arguments of Gymnasium that are no settings, and the call that takes them.
 _ELSEWHERE = {
-    "num_envs": "gym.make_vec(..., num_envs=...) makes several environments",
-    "autoreset_mode": "gym.make_vec(..., autoreset_mode=...) takes it, of several environments",
-    "seed": "reset(seed=...) takes it",
-    "options": "reset(options=...) takes them",
+    "num_envs": "use gym.make_vec(..., num_envs=...)",
+    "autoreset_mode": "use gym.make_vec(..., autoreset_mode=...)",
+    "seed": "use reset(seed=...)",
+    "options": "use reset(options=...)",
 }
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used; the message is one line that names the key, the value and the limit.
-
-    Its arguments are the message, in parts if there are several things wrong.
-    """
+    """A configuration that cannot be used; its arguments are the errors, one line each with key, value and limit."""
 
     def __str__(self) -> str:
+        """Join the errors to one line."""
         return "; ".join(str(part) for part in self.args)
 
 
@@ -71,7 +69,7 @@ def entry_of(annotation: Any) -> type[BaseModel] | None:
 
 
 def shown(value: Any) -> str:
-    """A value as messages show it: on one line, and no longer than they can be read."""
+    """Return a value as messages show it, on one line and at most :data:`MOST_SHOWN` characters long."""
     text = " ".join(repr(value).split())
     return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
 

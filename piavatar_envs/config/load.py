@@ -1,7 +1,7 @@
-"""Reading, merging and printing configurations: the machinery below :mod:`piavatar_envs.config`.
+"""Reading, merging and printing configurations, for any pydantic model.
 
-It knows pydantic models and YAML, and no single setting. Overrides are expanded to nested mappings, merged in order,
-and validated once, strictly, so that a file, a keyword and a command line are refused alike, in one readable line.
+Overrides are expanded to nested mappings, merged in order, and validated once and strictly, so that a file, a keyword
+and a command line are refused alike, in one line.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from piavatar_envs.config.errors import (
 Config = TypeVar("Config", bound=BaseModel)
 
 _NAMES = "the name of a setting is a string"
-#: Of a key ``<<``, which stands for those of another mapping.
+#: Tag of the key ``<<``, which merges another mapping.
 _MERGE = "tag:yaml.org,2002:merge"
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that refuses a key given twice and reads ``1e5`` as a number (YAML 1.1 makes it a string)."""
+    """SafeLoader that refuses a key given twice and reads ``1e5`` as a number, which is a string in YAML 1.1."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        """Construct a mapping whose keys are given once, but for those of merged mappings."""
         keys = [self.construct_object(key, deep=True) for key, _ in node.value if key.tag != _MERGE]
         twice = next((key for i, key in enumerate(keys) if key in keys[:i]), None)
         if twice is not None:
@@ -63,8 +64,8 @@ def load_config(
         overrides: settings that win over ``source``; nested, dotted, or bare where the name is unique.
 
     Raises:
-        ConfigError: what is given is no settings; unknown key, wrong type or value out of range; one line for all that
-            is wrong.
+        ConfigError: the settings are no mapping, or have an unknown key, a wrong type or a value out of range; one line
+            for all errors.
     """
     path = source if isinstance(source, (str, Path)) else None
     base = _expand(cls, _read_settings(cls, Path(path)) if path is not None else _settings("config", source))
@@ -72,7 +73,7 @@ def load_config(
     merged = _merge(_without_replaced_variants(cls, base, above), above)
     merged = _merge(_own_defaults(cls, merged), merged)
     try:
-        # JSON is what YAML, keywords and command lines have in common: a list may be a tuple, a string is no number.
+        # as JSON, files, keywords and command lines are validated alike: a list may be a tuple, a string is no number
         return cls.model_validate_json(json.dumps(_plain(merged)))
     except ValidationError as error:
         given = set(_flat_keys(above))
@@ -80,7 +81,7 @@ def load_config(
 
 
 def replace(config: Config, overrides: Mapping[str, Any] | None = None, /, **settings: Any) -> Config:
-    """A validated copy of ``config`` with settings changed: ``replace(config, {"control.tone": 0}, fidelity="tiny")``.
+    """Return a validated copy with settings changed: ``replace(config, {"control.tone": 0}, fidelity="tiny")``.
 
     Raises:
         ConfigError: as :func:`load_config`.
@@ -90,12 +91,12 @@ def replace(config: Config, overrides: Mapping[str, Any] | None = None, /, **set
 
 
 def dump_yaml(config: BaseModel) -> str:
-    """The whole resolved configuration as YAML; :func:`load_config` reads it back to an equal one."""
+    """Write a resolved configuration as YAML, from which :func:`load_config` returns an equal one."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, default_flow_style=False, allow_unicode=True)
 
 
 def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
-    """Overrides from a command line: ``["control.tone=0.3", "fidelity=tiny"]``, the values read as YAML.
+    """Parse overrides of a command line, ``["control.tone=0.3", "fidelity=tiny"]``, whose values are YAML.
 
     Raises:
         ConfigError: an assignment has no ``=``, its value is not YAML, or a key comes twice.
@@ -115,6 +116,11 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:
+    """Read a YAML file of settings.
+
+    Raises:
+        ConfigError: it cannot be read, is not YAML, or has no mapping.
+    """
     try:
         with path.open(encoding="utf-8") as stream:
             content = yaml.load(stream, _Loader)
@@ -132,7 +138,11 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
 
 
 def _read_settings(cls: type[BaseModel], path: Path) -> Mapping[str, Any]:
-    """What a YAML file holds; that of a training is refused where settings of an environment are asked for."""
+    """Read a YAML file of settings, but refuse that of a training where those of an environment are expected.
+
+    Raises:
+        ConfigError: as :func:`_read_yaml`, or the file is that of a training.
+    """
     content = _read_yaml(path)
     if "env_id" in content and "env_id" not in cls.model_fields:
         raise ConfigError(f"{path} is the file of a training; settings of its environment are those under its key env")
@@ -140,10 +150,10 @@ def _read_settings(cls: type[BaseModel], path: Path) -> Mapping[str, Any]:
 
 
 def _settings(what: str, given: Any) -> Mapping[str, Any] | BaseModel:
-    """Settings as they are given to a call, nothing for None.
+    """Return the settings that are passed to a call, an empty mapping for None.
 
     Raises:
-        ConfigError: they are something else, which would be taken for nothing where it is false.
+        ConfigError: they are neither a mapping nor a configuration.
     """
     if given is None:
         return {}
@@ -208,7 +218,11 @@ def _expand_value(field: FieldInfo | None, value: Any, prefix: str) -> Any:
 
 
 def _qualified(cls: type[BaseModel], key: str) -> str:
-    """The dotted name of a bare key, if exactly one section has a setting of that name."""
+    """Return the dotted name of a bare key, if exactly one section has a setting of that name.
+
+    Raises:
+        ConfigError: several sections have one.
+    """
     if "." in key or key in cls.model_fields:
         return key
     found = [name for name in setting_keys(cls) if name.rpartition(".")[2] == key]
@@ -218,7 +232,7 @@ def _qualified(cls: type[BaseModel], key: str) -> str:
 
 
 def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with ``top`` laid over it, mapping by mapping."""
+    """Merge ``top`` into ``base``, mapping by mapping."""
     merged = dict(base)
     for key, value in top.items():
         both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
@@ -265,6 +279,7 @@ def _own_defaults(cls: type[BaseModel], settings: Mapping[str, Any]) -> dict[str
 
 
 def _flat_keys(nested: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """Return the dotted names of all values."""
     keys: list[str] = []
     for key, value in nested.items():
         keys += _flat_keys(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [f"{prefix}{key}"]
@@ -272,10 +287,10 @@ def _flat_keys(nested: Mapping[str, Any], prefix: str = "") -> list[str]:
 
 
 def _plain(value: Any, key: str = "") -> Any:
-    """JSON form of what Python callers and YAML pass: also NumPy numbers and arrays, paths, and models in a list.
+    """Return the JSON form of a value of a Python caller or of YAML, such as a NumPy array, a path or a model.
 
     Raises:
-        ConfigError: there is none, or a name is no string.
+        ConfigError: it has none, or a name is no string.
     """
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
@@ -298,4 +313,5 @@ def _plain(value: Any, key: str = "") -> Any:
 
 
 def _one_line(error: Exception) -> str:
+    """Return a message without line breaks."""
     return " ".join(str(error).split())

@@ -1,6 +1,7 @@
-"""Sections of a configuration: the continuum, the control, the body's shape, what episodes vary, pictures.
+"""Sections of a configuration, from the continuum to pictures, and :class:`EnvConfig`, which has them all.
 
-What is in a world besides the ground: avatars, soft props and analytic colliders, and how they touch.
+Ranges of values come first, then the sections in the order of :class:`EnvConfig`. Descriptions of fields are written
+for users: they appear on the pages of the environments, with the unit in brackets at their end.
 """
 
 from __future__ import annotations
@@ -14,18 +15,20 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, joint_index
 from piavatar_envs.avatar.body.sources import check_source
 from piavatar_envs.config.load import ConfigError, load_config
+from piavatar_envs.mpm.materials import check_material
 from piavatar_envs.mpm.model import CFL_STABLE
 
-#: Shared by every model. Strict, because a number in quotes is a mistake; ``.inf`` and ``.nan`` are never a setting.
+#: Configuration of every model; strict, because a number in quotes is a mistake, and without infinity and NaN.
 FROZEN = ConfigDict(
     frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
 )
 
 
 class FrozenDict(dict):
-    """A read-only, hashable ``dict``, so that a configuration that holds one is frozen all through."""
+    """A read-only, hashable ``dict`` for values of frozen configurations."""
 
     def _refuse(self, *_args: Any, **_kwargs: Any) -> None:
+        """Refuse every change."""
         raise TypeError("the configuration is frozen; make a changed copy with replace(config, {...})")
 
     __setitem__ = __delitem__ = __ior__ = update = pop = popitem = setdefault = clear = _refuse  # type: ignore[assignment]
@@ -34,40 +37,84 @@ class FrozenDict(dict):
         return hash(frozenset(self.items()))
 
     def __reduce__(self) -> tuple:
-        # dict's own protocol refills an empty copy item by item, which a frozen one refuses.
+        # the protocol of dict fills an empty copy item by item, which a frozen one refuses
         return FrozenDict, (dict(self),)
 
 
-def _check_material(name: str) -> str:
-    """Refuse a material that is not registered."""
-    from piavatar_envs.mpm.materials import check_material
+def _check_joint(name: str) -> str:
+    """Refuse the name of no joint.
 
-    return check_material(name)
-
-
-#: Name of a material of this package or of :func:`piavatar_envs.register_material`.
-MaterialName = Annotated[str, AfterValidator(_check_material)]
-MOST_SUBSTEPS = 10_000
-#: Greatest Young's modulus [Pa] and densities [kg/m^3] of soft matter: a hard plastic, thin smoke, the heaviest metal.
-MOST_MODULUS = 1.0e9
-LEAST_DENSITY, MOST_DENSITY = 0.1, 25_000.0
-#: Greatest distance from the origin of anything in the world, along each axis [m].
-FARTHEST = 1000.0
-#: Of avatars and what they play with, from which other things are a hundred metres away at most [m].
-Place = Annotated[float, Field(ge=-100.0, le=100.0)]
-Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
-ShapeValue = Annotated[float, Field(ge=-1.0, le=1.0)]
+    Raises:
+        ValueError: it is such.
+    """
+    try:
+        joint_index(name)
+    except KeyError as error:
+        raise ValueError(error.args[0]) from None
+    return name
 
 
-Rate = Annotated[float, Field(le=1.0e6)]
+def _check_quaternion(rotation: tuple[float, ...]) -> tuple[float, ...]:
+    """Refuse a quaternion that is too near to zero to be normalised.
+
+    Raises:
+        ValueError: it is.
+    """
+    if math.hypot(*rotation) < 1.0e-3:
+        raise ValueError(f"{list(rotation)} must be a quaternion wxyz, not zero")
+    return rotation
+
+
+def _check_order(bounds: tuple[float, float]) -> tuple[float, float]:
+    """Refuse bounds of which the first is the greater one.
+
+    Raises:
+        ValueError: they are such.
+    """
+    if not bounds[0] <= bounds[1]:
+        raise ValueError("must be in order; give the lower bound first")
+    return bounds
 
 
 def _check_flesh_rate(rates: tuple[float, float]) -> tuple[float, float]:
-    """Refuse rates that are no growing pull from skin to bone; two zeros are none at all."""
+    """Refuse rates that decrease from skin to bone or are not positive; two zeros switch the pull off.
+
+    Raises:
+        ValueError: the rates are such.
+    """
     skin, bone = rates
     if not (0.0 < skin <= bone or skin == bone == 0.0):
         raise ValueError(f"the skin's rate {skin:g} must be positive and at most the bone's {bone:g}, as in (30, 1000)")
     return rates
+
+
+MOST_SUBSTEPS = 10_000
+#: Greatest Young's modulus [Pa] and range of densities [kg/m^3] of soft matter: hard plastic, thin smoke, osmium.
+MOST_MODULUS = 1.0e9
+LEAST_DENSITY, MOST_DENSITY = 0.1, 25_000.0
+#: Greatest distance from the origin along each axis [m].
+FARTHEST = 1000.0
+#: The range of a factor that changes nothing.
+UNCHANGED = (1.0, 1.0)
+
+#: Name of a material of this package or of :func:`piavatar_envs.register_material`.
+MaterialName = Annotated[str, AfterValidator(check_material)]
+JointName = Annotated[str, AfterValidator(_check_joint)]
+#: Coordinate of an avatar or a prop, which leaves room for matter around it [m].
+Place = Annotated[float, Field(ge=-100.0, le=100.0)]
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Component = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+Quaternion = Annotated[tuple[Component, Component, Component, Component], AfterValidator(_check_quaternion)]
+Length = Annotated[float, Field(gt=0.0, le=100.0)]
+Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
+TopSpeed = Annotated[float, Field(ge=0.0, le=1.0e6)]
+Spin = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+ShapeValue = Annotated[float, Field(ge=-1.0, le=1.0)]
+Factor = Annotated[float, Field(ge=1.0e-3, le=1.0e3)]
+FactorRange = Annotated[tuple[Factor, Factor], AfterValidator(_check_order)]
+Rate = Annotated[float, Field(le=1.0e6)]
+RateRange = Annotated[tuple[Rate, Rate], AfterValidator(_check_flesh_rate)]
 
 
 class PhysicsConfig(BaseModel):
@@ -111,7 +158,7 @@ class PhysicsConfig(BaseModel):
 
 
 class PoseControlConfig(BaseModel):
-    """Actions move a commanded pose, which the body follows; a bounded wrench may hold the commanded root."""
+    """Pose control: actions move a commanded pose, which the body follows; a bounded wrench may hold the root."""
 
     model_config = FROZEN
 
@@ -165,7 +212,7 @@ class PoseControlConfig(BaseModel):
 
 
 class TorqueControlConfig(BaseModel):
-    """Joints move under torques: those of springs towards joint targets (pd), or the actions themselves (torque)."""
+    """Torque control: joints move under torques of springs towards joint targets (pd), or of the actions (torque)."""
 
     model_config = FROZEN
 
@@ -180,7 +227,7 @@ class TorqueControlConfig(BaseModel):
     )
     joint_damping: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the damping of the joints' springs [-]")
     strength: float = Field(1.0, ge=0.0, le=1.0e6, description="factor on the greatest torques of the joints [-]")
-    flesh_rate: Annotated[tuple[Rate, Rate], AfterValidator(_check_flesh_rate)] = Field(
+    flesh_rate: RateRange = Field(
         (30.0, 1000.0), description="rates of the pulls that hold flesh to bones, at the skin and at the bone [1/s]"
     )
     firm_bones: bool = Field(
@@ -205,12 +252,12 @@ class TorqueControlConfig(BaseModel):
         return 0.0
 
 
-#: The settings of either kind of control; those of the other kind are refused.
+#: Either kind of control, by its ``mode``; settings of the other kind are refused.
 ControlConfig = Annotated[PoseControlConfig | TorqueControlConfig, Field(discriminator="mode")]
 
 
 class AvatarSourceConfig(BaseModel):
-    """Where the body comes from; see :mod:`piavatar_envs.avatar.body.sources`."""
+    """The source of the body; see :mod:`piavatar_envs.avatar.body.sources`."""
 
     model_config = FROZEN
 
@@ -230,32 +277,16 @@ class ShapeConfig(BaseModel):
         None,
         ge=1,
         le=4096,
-        description="bodies that random shapes are taken from, shaped beforehand, so that a reset can draw on the "
-        "device; null shapes a new one at each reset, on the host, 0.1 s each [-]",
+        description="number of bodies that are shaped beforehand, from which a reset draws on the device; null shapes "
+        "a new body at each reset, on the host, in 0.1 s each [-]",
     )
     parameters: Annotated[dict[str, ShapeValue], AfterValidator(FrozenDict)] = Field(
-        default_factory=dict, description="shape parameters by name, each in [-1, 1], 0 the mean; kept when randomizing"
+        default_factory=dict,
+        description="shape parameters by name, each in [-1, 1], 0 the mean; not randomized",
     )
     scale: float = Field(
         1.0, ge=0.0, le=1.0, description="width of the random shapes: 0 the mean shape, 1 the full range [-]"
     )
-
-
-def _rising(bounds: tuple[float, float]) -> tuple[float, float]:
-    """``bounds``, in order.
-
-    Raises:
-        ValueError: they fall.
-    """
-    if not bounds[0] <= bounds[1]:
-        raise ValueError("bounds must not fall; give the lower one first")
-    return bounds
-
-
-Factor = Annotated[float, Field(ge=1.0e-3, le=1.0e3)]
-FactorRange = Annotated[tuple[Factor, Factor], AfterValidator(_rising)]
-#: The range of a factor that changes nothing.
-UNCHANGED = (1.0, 1.0)
 
 
 class RandomizeConfig(BaseModel):
@@ -277,54 +308,24 @@ class RandomizeConfig(BaseModel):
     )
 
 
-class RenderConfig(BaseModel):
-    """Pictures of the scene; used only with a ``render_mode``."""
-
-    model_config = FROZEN
-
-    width: int = Field(480, ge=16, le=7680, description="width of a frame [pixel]")
-    height: int = Field(480, ge=16, le=4320, description="height of a frame [pixel]")
-    color: Literal["skin", "strain"] = Field("skin", description="colour of the body: its skin, or its deformation")
-    camera_position: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
-        None, description="where the camera is, from the ground below what it follows; null: where the task has it [m]"
-    )
-    camera_target: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
-        None, description="where it looks, from the same point; null: where the task has it [m]"
-    )
-    camera_follows: bool | None = Field(
-        None, description="whether it follows the avatars, or stays about the origin; null: as the task has it"
-    )
-
-
-#: Settings of the section ``physics`` that an avatar may have of its own.
+#: Settings of ``physics`` in which avatars may differ.
 OF_FLESH = ("material", "young_modulus", "soft_young_modulus", "poisson_ratio", "density")
 
 
-def _not_zero(rotation: tuple[float, ...]) -> tuple[float, ...]:
-    """``rotation``, if it is one.
-
-    Raises:
-        ValueError: it is too near to zero to say about which axis it turns.
-    """
-    if math.hypot(*rotation) < 1.0e-3:
-        raise ValueError(f"{list(rotation)} must be a quaternion wxyz, not zero")
-    return rotation
-
-
 def _of_flesh(settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """``settings``, if avatars may differ in them.
+    """Refuse settings of the continuum in which avatars cannot differ.
 
     Raises:
-        ConfigError: one belongs to the whole world.
+        ConfigError: there is one.
     """
-    strange = [name for name in settings if name not in OF_FLESH]
-    if strange:
-        raise ConfigError(f"{strange[0]} cannot differ between avatars; only {', '.join(OF_FLESH)}")
+    shared = [name for name in settings if name not in OF_FLESH]
+    if shared:
+        raise ConfigError(f"{shared[0]} cannot differ between avatars; only {', '.join(OF_FLESH)}")
     return settings
 
 
 class AvatarControl(BaseModel):
-    """The section ``control`` by itself, in which an avatar's own settings of it are validated."""
+    """The section ``control`` by itself, as which an avatar's own settings are validated."""
 
     model_config = FROZEN
 
@@ -332,12 +333,15 @@ class AvatarControl(BaseModel):
 
 
 def _check_control(mode: str, settings: Mapping[str, Any], place: str = "") -> None:
-    """Refuse settings of an avatar that ``mode`` does not have, or out of their range.
+    """Refuse settings of an avatar that ``mode`` does not have, or that are out of range.
 
     Args:
-        mode: what actions are.
-        settings: by name.
-        place: the dotted name of the avatar, with a dot at its end, for the message.
+        mode: the mode of control.
+        settings: values by name.
+        place: dotted name of the avatar in messages, with a dot at its end.
+
+    Raises:
+        ConfigError: there is one.
     """
     try:
         load_config(AvatarControl, {"control": {"mode": mode, **settings}})
@@ -346,7 +350,11 @@ def _check_control(mode: str, settings: Mapping[str, Any], place: str = "") -> N
 
 
 def _of_control(settings: Mapping[str, Any]) -> FrozenDict:
-    """Refuse ``mode``, which is the environment's, and settings that no mode has, or out of their range."""
+    """Refuse ``mode``, in which avatars cannot differ, and settings that no mode has, or that are out of range.
+
+    Raises:
+        ConfigError: there is one.
+    """
     if "mode" in settings:
         raise ConfigError(f"mode={settings['mode']!r} cannot differ between avatars; set control.mode")
     pose = {name: value for name, value in settings.items() if name not in TorqueControlConfig.model_fields}
@@ -360,47 +368,24 @@ def _of_control(settings: Mapping[str, Any]) -> FrozenDict:
 
 
 def _settings_of(section: type[BaseModel]) -> AfterValidator:
-    """Refuses what ``section`` would refuse, long before it is laid over the environment's own."""
+    """Return a validator that refuses settings which ``section`` would refuse."""
 
     def check(settings: Mapping[str, Any]) -> FrozenDict:
+        """Validate the settings as a section."""
         load_config(section, settings)
         return FrozenDict(settings)
 
     return AfterValidator(check)
 
 
-def _joint(name: str) -> str:
-    """``name``, if a joint has it.
-
-    Raises:
-        ValueError: none has.
-    """
-    try:
-        joint_index(name)
-    except KeyError as error:
-        raise ValueError(error.args[0]) from None
-    return name
-
-
-Vector = tuple[Coordinate, Coordinate, Coordinate]
-Part = Annotated[float, Field(ge=-1000.0, le=1000.0)]
-Quaternion = Annotated[tuple[Part, Part, Part, Part], AfterValidator(_not_zero)]
-Length = Annotated[float, Field(gt=0.0, le=100.0)]
-Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
-TopSpeed = Annotated[float, Field(ge=0.0, le=1.0e6)]
-Spin = Annotated[float, Field(ge=-1000.0, le=1000.0)]
-
-
 class RegionConfig(BaseModel):
-    """Flesh of some bones that is of another material: hair, a garment, a stiff boot."""
+    """Flesh of another material about some joints, such as hair, a garment or a stiff boot."""
 
     model_config = FROZEN
 
-    joints: tuple[Annotated[str, AfterValidator(_joint)], ...] = Field(
-        ..., min_length=1, description="joints whose flesh it is, by name"
-    )
+    joints: tuple[JointName, ...] = Field(..., min_length=1, description="names of the joints whose flesh it is")
     beyond: float = Field(
-        0.0, ge=0.0, le=FARTHEST, description="only flesh farther than this from the nearest bone particle [m]"
+        0.0, ge=0.0, le=FARTHEST, description="least distance of the flesh from the nearest bone particle [m]"
     )
     material: MaterialName | None = Field(None, description="elastic energy; null as the rest")
     young_modulus: float | None = Field(
@@ -413,12 +398,12 @@ class RegionConfig(BaseModel):
 
 
 class AvatarConfig(BaseModel):
-    """One avatar: where it starts, and what differs from the environment's own settings."""
+    """One avatar: its initial place, and settings that differ from the environment's."""
 
     model_config = FROZEN
 
-    position: tuple[Place, Place] = Field((0.0, 0.0), description="where it stands, x and y [m]")
-    yaw: float = Field(0.0, ge=-10.0, le=10.0, description="turn about the vertical; at 0 it faces -y [rad]")
+    position: tuple[Place, Place] = Field((0.0, 0.0), description="initial position, x and y [m]")
+    yaw: float = Field(0.0, ge=-10.0, le=10.0, description="initial turn about the vertical; at 0 it faces -y [rad]")
     physics: Annotated[dict[str, Any], AfterValidator(_of_flesh), _settings_of(PhysicsConfig)] = Field(
         default_factory=dict,
         description="material, young_modulus, soft_young_modulus, poisson_ratio or density of its flesh",
@@ -427,7 +412,7 @@ class AvatarConfig(BaseModel):
         default_factory=dict, description="settings of its control, such as tone; all avatars have the same mode"
     )
     avatar: Annotated[dict[str, Any], _settings_of(AvatarSourceConfig)] = Field(
-        default_factory=dict, description="settings of its source, such as source"
+        default_factory=dict, description="settings of the source of its body"
     )
     shape: Annotated[dict[str, Any], _settings_of(ShapeConfig)] = Field(
         default_factory=dict, description="settings of its shape"
@@ -436,88 +421,86 @@ class AvatarConfig(BaseModel):
 
 
 class PropConfig(BaseModel):
-    """A soft thing of its own: it is matter like the flesh, and flies, rolls, dents and rubs."""
+    """A soft prop: matter like the flesh, which can fly, roll, deform and slide."""
 
     model_config = FROZEN
 
-    name: str = Field(..., min_length=1, description="by which it is observed and referred to")
-    shape: Literal["sphere", "box", "capsule", "mesh"] = Field("sphere", description="its solid")
+    name: str = Field(..., min_length=1, description="its name in observations and settings")
+    shape: Literal["sphere", "box", "capsule", "mesh"] = Field("sphere", description="its shape")
     size: tuple[Length, ...] = Field(
         (0.11,), description="sphere: radius; box: half extents; capsule: radius, half length; mesh: scale [m]"
     )
     file: str | None = Field(None, description="watertight mesh, for shape mesh")
-    mass: float | None = Field(None, ge=1.0e-6, le=1.0e4, description="mass; null to take the density [kg]")
+    mass: float | None = Field(None, ge=1.0e-6, le=1.0e4, description="mass; null for that of the density [kg]")
     density: float = Field(
-        1000.0, ge=LEAST_DENSITY, le=MOST_DENSITY, description="density, where no mass is given [kg/m^3]"
+        1000.0, ge=LEAST_DENSITY, le=MOST_DENSITY, description="density, if no mass is given [kg/m^3]"
     )
     material: MaterialName = Field("neo_hookean", description="elastic energy")
     young_modulus: float | None = Field(
         None,
         ge=1.0,
         le=MOST_MODULUS,
-        description="Young's modulus; null for waves as fast as the flesh's, at no more substeps [Pa]",
+        description="Young's modulus; null for waves as fast as the flesh's, which needs no more substeps [Pa]",
     )
     poisson_ratio: float = Field(0.3, ge=0.0, lt=0.5, description="Poisson's ratio [-]")
-    position: Vector = Field((0.0, -1.0, 1.0), description="of its centre of mass at the start [m]")
-    rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="at the start, quaternion wxyz")
-    velocity: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="at the start [m/s]")
-    spin: tuple[Spin, Spin, Spin] = Field((0.0, 0.0, 0.0), description="angular velocity at the start [rad/s]")
+    position: Vector = Field((0.0, -1.0, 1.0), description="initial position of its centre of mass [m]")
+    rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="initial rotation, quaternion wxyz")
+    velocity: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="initial velocity [m/s]")
+    spin: tuple[Spin, Spin, Spin] = Field((0.0, 0.0, 0.0), description="initial angular velocity [rad/s]")
     top_speed: TopSpeed = Field(
         0.0,
-        description="greatest speed that a task, or you, will give any part of it later, as in a throw; substeps are "
-        "short enough for it [m/s]",
+        description="greatest speed that any part of it is given later, as in a throw, for which substeps are short "
+        "enough [m/s]",
     )
     friction: float = Field(0.5, ge=0.0, le=10.0, description="Coulomb coefficient on the ground and colliders [-]")
 
 
 class ColliderConfig(BaseModel):
-    """An analytic solid, at rest or moving as told; nothing moves it."""
+    """An analytic solid, at rest or in prescribed motion."""
 
     model_config = FROZEN
 
-    name: str = Field(..., min_length=1, description="by which it is referred to")
-    kind: Literal["plane", "box", "sphere", "capsule"] = Field("box", description="its solid")
+    name: str = Field(..., min_length=1, description="its name in settings")
+    kind: Literal["plane", "box", "sphere", "capsule"] = Field("box", description="its shape")
     size: tuple[Length, ...] = Field(
         (), description="box: half extents; sphere: radius; capsule: radius, half length [m]"
     )
-    position: Vector = Field((0.0, 0.0, 0.0), description="of its origin [m]")
+    position: Vector = Field((0.0, 0.0, 0.0), description="position of its origin [m]")
     rotation: Quaternion = Field((1.0, 0.0, 0.0, 0.0), description="quaternion wxyz; a plane faces its local +z")
-    velocity: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="of its origin [m/s]")
+    velocity: tuple[Speed, Speed, Speed] = Field((0.0, 0.0, 0.0), description="velocity of its origin [m/s]")
     spin: tuple[Spin, Spin, Spin] = Field((0.0, 0.0, 0.0), description="angular velocity [rad/s]")
-    top_speed: TopSpeed = Field(
-        0.0, description="greatest speed that a task, or you, will give any part of it later [m/s]"
-    )
+    top_speed: TopSpeed = Field(0.0, description="greatest speed that any part of it is given later [m/s]")
     friction: float = Field(0.5, ge=0.0, le=10.0, description="Coulomb coefficient [-]")
 
 
 class PairFriction(BaseModel):
-    """Friction of two things by name: avatars (agent names), props, colliders, or ``ground``."""
+    """Friction between two of the avatars (by agent name), props, colliders and ``ground``."""
 
     model_config = FROZEN
 
-    a: str = Field(..., description="one")
-    b: str = Field(..., description="the other")
+    a: str = Field(..., description="name of the one")
+    b: str = Field(..., description="name of the other")
     friction: float = Field(..., ge=0.0, le=10.0, description="Coulomb coefficient [-]")
 
 
 class SceneConfig(BaseModel):
-    """Avatars, props and colliders. A task adds its own to those given here."""
+    """Avatars, props and colliders, to which a task adds its own."""
 
     model_config = FROZEN
 
-    avatars: tuple[AvatarConfig, ...] = Field((), description="one an agent; where empty, the task places them")
-    props: tuple[PropConfig, ...] = Field((), description="soft props besides the task's")
-    colliders: tuple[ColliderConfig, ...] = Field((), description="analytic solids besides the ground and the task's")
+    avatars: tuple[AvatarConfig, ...] = Field((), description="one per agent; empty for those of the task")
+    props: tuple[PropConfig, ...] = Field((), description="soft props in addition to the task's")
+    colliders: tuple[ColliderConfig, ...] = Field((), description="analytic solids in addition to ground and task's")
     ground: bool = Field(True, description="a floor at z = 0")
     walls: bool = Field(
         True,
-        description="where there are props or several avatars: smooth walls around the domain, to keep them in it",
+        description="smooth walls around the domain, if there are props or several avatars, to keep them in it",
     )
     self_contact: bool = Field(
-        False, description="torso, arms and legs as velocity fields of their own, so that they touch each other"
+        False, description="separate velocity fields for torso, arms and legs, so that they touch each other"
     )
     body_friction: float = Field(0.5, ge=0.0, le=10.0, description="Coulomb coefficient between bodies [-]")
-    pair_friction: tuple[PairFriction, ...] = Field((), description="coefficients that differ")
+    pair_friction: tuple[PairFriction, ...] = Field((), description="coefficients of pairs that differ")
     contact_normals: Literal["shared", "own"] = Field(
         "shared", description="shared (one normal a pair: keeps momentum) or own (the paper's rule, which does not)"
     )
@@ -526,28 +509,45 @@ class SceneConfig(BaseModel):
     )
 
 
+class RenderConfig(BaseModel):
+    """Pictures of the scene; used only with a ``render_mode``."""
+
+    model_config = FROZEN
+
+    width: int = Field(480, ge=16, le=7680, description="width of a frame [pixel]")
+    height: int = Field(480, ge=16, le=4320, description="height of a frame [pixel]")
+    color: Literal["skin", "strain"] = Field("skin", description="colour of the body: its skin, or its deformation")
+    camera_position: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
+        None, description="position of the camera, from the ground below what it follows; null as the task has it [m]"
+    )
+    camera_target: tuple[Coordinate, Coordinate, Coordinate] | None = Field(
+        None, description="the point that it looks at, from the same origin; null as the task has it [m]"
+    )
+    camera_follows: bool | None = Field(
+        None, description="follow the avatars, or stay at the origin; null as the task has it"
+    )
+
+
 class EnvConfig(BaseModel):
-    """What every environment has. A task adds its own settings in one subclass."""
+    """Settings of every environment; a task adds its own in a subclass."""
 
     model_config = FROZEN
 
     physics: PhysicsConfig = Field(default_factory=PhysicsConfig, description="the continuum")
     control: ControlConfig = Field(default_factory=PoseControlConfig, description="how actions move the body")
-    avatar: AvatarSourceConfig = Field(default_factory=AvatarSourceConfig, description="where the body comes from")
+    avatar: AvatarSourceConfig = Field(default_factory=AvatarSourceConfig, description="the source of the body")
     shape: ShapeConfig = Field(default_factory=ShapeConfig, description="the body's shape")
-    randomize: RandomizeConfig = Field(
-        default_factory=RandomizeConfig, description="what every episode draws anew, besides the task and the shape"
-    )
-    scene: SceneConfig = Field(default_factory=SceneConfig, description="what is in the world, and how it touches")
+    randomize: RandomizeConfig = Field(default_factory=RandomizeConfig, description="factors that every episode draws")
+    scene: SceneConfig = Field(default_factory=SceneConfig, description="avatars, props, colliders and their contact")
     render: RenderConfig = Field(default_factory=RenderConfig, description="pictures")
     episode_seconds: float = Field(5.0, gt=0.0, le=3600.0, description="simulated time until truncation [s]")
     joints: tuple[str, ...] | None = Field(
-        None, description="joints that act, the others do what they would do anyway; null for all 21"
+        None, description="joints that act; the others keep their reference pose; null for all 21"
     )
     observe_parameters: bool = Field(
         False,
-        description="observe what the episode has drawn (randomize, random shapes, the task), under pd and torque "
-        "root_assist as it is now, and the episode's clock",
+        description="observe the parameters that the episode has drawn (randomize, random shapes, the task), the "
+        "current root_assist under pd and torque, and the episode's clock",
     )
     obs_mode: Literal["flat", "dict"] = Field(
         "flat", description="observations as one float32 vector (flat) or by name (dict)"

@@ -1,11 +1,10 @@
-"""From actions to the pose that the avatar shall reach: scaled increments on a reference, within joint limits.
+"""Actions: increments of a commanded pose, joint targets or joint torques, by the mode of control.
 
-Actions of avatars whose joints move under torques: joint targets (``control="pd"``) or torques (``"torque"``).
-
-A *target* is absolute. At action 0 a joint is asked for its pose in the rest position (or in the task's reference),
-at 1 and -1 for the ends of its range about that axis, and in between linearly in the rotation vector, so that the
-same action always means the same pose. A *torque* is the share of the greatest that the joint has in that direction.
-Joints that do not act are held in the rest position (the reference).
+Under pose control an action turns a reference pose by scaled increments, within joint limits. Under torque control it
+is a joint target (``control="pd"``) or a torque (``"torque"``). A *target* is absolute: action 0 is the pose of the
+rest position (or of the task's reference), 1 and -1 are the ends of the joint's range about that axis, linear in the
+rotation vector in between, so that an action always means the same pose. A *torque* is a share of the greatest torque
+of the joint in that direction. Joints that do not act are held in the rest position (or the reference).
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _ACTION = wp.constant(FAILURE_ACTION)
 
 @wp.struct
 class ActionMap:
-    """How an action vector moves the goal. Increments are per control step."""
+    """Map from an action vector to the goal, with increments per control step."""
 
     size: int
     offset: wp.array(dtype=int)  # (22,) first action component of a joint, -1 if it does not act
@@ -44,18 +43,18 @@ class ActionMap:
     root_turn: float  # root turn at action 1 [rad]
 
 
-#: How much farther than along one axis an action moves the root along both.
+#: Distance of a root action along both axes, over that along one.
 _DIAGONAL = math.sqrt(2.0)
 
 
 def speed_within(reach: float, most: float, control_dt: float) -> float:
-    """``root_speed`` [m/s], ``most`` or less, by which no step of ``control_dt`` [s] goes beyond ``reach`` [m]."""
+    """Return the root speed [m/s], at most ``most``, that moves at most ``reach`` [m] in ``control_dt`` [s]."""
     return min(most, reach / (_DIAGONAL * control_dt))
 
 
 @dataclass(frozen=True)
 class ActionSpec:
-    """Meaning of an action vector, in order: three rotation increments a joint, then the root's.
+    """Meaning of an action vector: three components per joint, then those of the root.
 
     Attributes:
         joints: names of the acting joints.
@@ -73,7 +72,7 @@ class ActionSpec:
 
     @property
     def greatest_speed(self) -> float:
-        """How fast an action can move the root horizontally [m/s]: along x and y at once."""
+        """Greatest horizontal speed of the root [m/s], along x and y at once."""
         return _DIAGONAL * self.root_speed
 
     @property
@@ -82,7 +81,7 @@ class ActionSpec:
         return 3 * len(self.joints) + 3 * self.root
 
     def under(self, control: str) -> ActionSpec:
-        """The same under ``control``: where torques move the body, nothing moves its root, and its toes are stiff.
+        """Return the specification under a mode of control: torques move neither the root nor the stiff toes.
 
         Raises:
             ConfigError: no joint is left.
@@ -91,16 +90,16 @@ class ActionSpec:
             return self
         joints = tuple(name for name in self.joints if name not in LOCKED_JOINTS)
         if not joints:
-            raise ConfigError(f"joints={list(self.joints)} do not move under control={control!r}; name others")
+            raise ConfigError(f"joints={list(self.joints)} do not move under control.mode={control!r}; name others")
         return replace(self, joints=joints, root=False)
 
     def names(self) -> list[str]:
-        """A name for every component, such as ``left_elbow.x``."""
+        """Return a name for every component, such as ``left_elbow.x``."""
         names = [f"{joint}.{axis}" for joint in self.joints for axis in "xyz"]
         return names + (["root.x", "root.y", "root.yaw"] if self.root else [])
 
     def upload(self, control_dt: float, limits: tuple[np.ndarray, np.ndarray], device: str) -> ActionMap:
-        """Kernel argument for control steps of ``control_dt`` [s] and joint ``limits`` [rad]."""
+        """Upload the action map for control steps of ``control_dt`` [s] and joint ``limits`` [rad]."""
         offset = np.full(NUM_JOINTS, -1, np.int32)
         for index, joint in enumerate(self.joints):
             offset[joint_index(joint)] = 3 * index
@@ -119,15 +118,20 @@ class ActionSpec:
 
 
 def check_actions(action: np.ndarray, shape: tuple[int, ...], names: Sequence[str]) -> np.ndarray:
-    """The action as float32, refused before anything changes.
+    """Return the action as float32.
+
+    Args:
+        action: an array of real numbers.
+        shape: the expected shape.
+        names: of the components, for messages.
 
     Raises:
-        ValueError: what is no array of real numbers, a wrong shape, or a component that is not finite, whose index and
-            name are given.
+        ValueError: the action is no array of real numbers, has another shape, or is not finite; the message names the
+            component.
     """
     try:
         is_complex = np.iscomplexobj(action)
-        with np.errstate(over="ignore"):  # what is too large for float32 is infinite there, and refused
+        with np.errstate(over="ignore"):  # a value too large for float32 becomes infinite and is refused below
             real = action if is_complex else np.asarray(action, dtype=np.float32)
     except (TypeError, ValueError, RuntimeError) as error:
         kind = type(action).__name__
@@ -136,7 +140,7 @@ def check_actions(action: np.ndarray, shape: tuple[int, ...], names: Sequence[st
         raise ValueError("action is of complex numbers; actions must be real, in [-1, 1]: give action.real")
     action = real
     if action.shape != shape:
-        raise ValueError(f"action has shape {action.shape}, expected {shape}")
+        raise ValueError(f"action has shape {action.shape}; use shape {shape}")
     if not np.isfinite(action).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(action))[0])
         where = index[0] if len(index) == 1 else index
@@ -146,7 +150,7 @@ def check_actions(action: np.ndarray, shape: tuple[int, ...], names: Sequence[st
 
 @wp.func
 def bounded(action: wp.array3d(dtype=float), e: int, agent: int, n: int):
-    """An action component clipped to [-1, 1]; zero if it is not finite."""
+    """Return an action component clipped to [-1, 1], or zero if it is not finite."""
     a = action[e, agent, n]
     if not wp.isfinite(a):
         return 0.0
@@ -155,21 +159,21 @@ def bounded(action: wp.array3d(dtype=float), e: int, agent: int, n: int):
 
 @wp.func
 def keep_within(goal: wp.quat, lower: wp.vec3, upper: wp.vec3, allowed: wp.vec3):
-    """``goal`` with its rotation vector between limits that are widened as far as ``allowed`` exceeds them [rad]."""
+    """Clamp the rotation vector of ``goal`` to limits [rad], widened where ``allowed`` exceeds them."""
     v = wp.max(wp.min(allowed, lower), wp.min(quat_log(goal), wp.max(allowed, upper)))
     return quat_exp(short_of_pi(v))
 
 
 @wp.func
 def within_limits(reference: wp.quat, step: wp.vec3, lower: wp.vec3, upper: wp.vec3):
-    """``reference`` turned by ``step`` [rad], kept between the limits of the joint's rotation vector.
+    """Return ``reference`` turned by ``step`` [rad], within the limits of the joint's rotation vector.
 
-    What the reference itself exceeds (a clip may) is allowed, but actions cannot push further.
+    A reference may exceed the limits, as in a clip, but actions cannot increase the excess.
     """
     before = quat_log(reference)
     goal = reference * quat_exp(step)
     if wp.length(before) > MAX_ANGLE + 1.0e-3:
-        # so near to the jump at pi there is no box: an action may only lead away from it
+        # near the jump at pi limits mean nothing, so an action may only lead away from it
         if wp.length(quat_log(goal)) > wp.length(before):
             return reference
         return goal
@@ -180,7 +184,7 @@ def within_limits(reference: wp.quat, step: wp.vec3, lower: wp.vec3, upper: wp.v
 def refuse_nonfinite(
     action: wp.array3d(dtype=float), agent: int, alive: wp.array2d(dtype=wp.bool), failure: wp.array(dtype=int)
 ):
-    """End the environment of an action that is not finite; host-side views have refused it before."""
+    """Flag the failure of an environment whose action is not finite; views of the host have refused it before."""
     e, n = wp.tid()
     if alive[e, agent] and not wp.isfinite(action[e, agent, n]):
         wp.atomic_or(failure, e, _ACTION)
@@ -199,9 +203,9 @@ def apply_actions(
     goal_rotation: wp.array2d(dtype=wp.quat),
     goal_root: wp.array(dtype=wp.vec3),
 ):
-    """Goal of the control step: the reference pose turned by the action, within the limits of the acting joints.
+    """Turn the reference pose by the action, within the limits of the acting joints; over ``(num_envs, bones)``.
 
-    An agent that is out does not act.
+    The action of an agent that is out has no effect.
     """
     e, b = wp.tid()
     goal = reference_rotation[e, b]
@@ -214,7 +218,7 @@ def apply_actions(
         root = reference_root[e]
         n = action_map.root_offset
         if n >= 0 and acts:
-            # steps are in the avatar's heading: forward is -y
+            # in the avatar's frame, forward is -y
             step = wp.vec3(bounded(action, e, agent, n), bounded(action, e, agent, n + 1), 0.0)
             root += action_map.root_step * wp.quat_rotate(turn_about_z(tracked_rotation[e, 0]), step)
             turn = action_map.root_turn * bounded(action, e, agent, n + 2)
@@ -225,13 +229,13 @@ def apply_actions(
 
 @wp.func
 def action_vector(action: wp.array3d(dtype=float), e: int, agent: int, n: int):
-    """Three action components, clipped; zero where they are not finite."""
+    """Return three clipped action components, zero where they are not finite."""
     return wp.vec3(bounded(action, e, agent, n), bounded(action, e, agent, n + 1), bounded(action, e, agent, n + 2))
 
 
 @wp.func
 def share_of(a: wp.vec3, lower: wp.vec3, upper: wp.vec3):
-    """From 0 to ``upper`` where ``a`` goes from 0 to 1, to ``lower`` where it goes to -1, axis by axis."""
+    """Map ``a`` linearly to ``lower`` at -1, 0 at 0 and ``upper`` at 1, axis by axis."""
     return wp.cw_mul(wp.max(a, wp.vec3(0.0)), upper) - wp.cw_mul(wp.min(a, wp.vec3(0.0)), lower)
 
 
@@ -247,9 +251,9 @@ def follow_reference(
     goal_rotation: wp.array2d(dtype=wp.quat),
     goal_root: wp.array(dtype=wp.vec3),
 ):
-    """The goal before actions: the reference, its joints in the rest pose if ``about_rest``.
+    """Set the goal before actions to the reference, with its joints in the rest pose if ``about_rest``.
 
-    The reference has been commanded: it is what the next one is counted from.
+    The command becomes the reference as well, since the next one is relative to it. Over ``(num_envs, bones)``.
     """
     e, b = wp.tid()
     if failure[e] != 0:
@@ -273,9 +277,10 @@ def apply_targets(
     # in and out
     goal_rotation: wp.array2d(dtype=wp.quat),
 ):
-    """Move the goal of every acting joint towards the ends of its range. An agent that is out does not act.
+    """Move the goal of every acting joint towards the ends of its range; over ``(num_envs, bones)``.
 
-    What the goal itself exceeds (a clip may) is allowed, but actions cannot push further.
+    A goal may exceed the range, as in a clip, but actions cannot increase the excess. The action of an agent that is
+    out has no effect.
     """
     e, b = wp.tid()
     n = action_map.offset[b]
@@ -298,7 +303,7 @@ def apply_torques(
     # out
     torque: wp.array2d(dtype=wp.vec3),
 ):
-    """Torque of every acting joint, of the reference adult [N m]. An agent that is out is limp."""
+    """Set the torque of every acting joint for the reference adult [N m]; zero for an agent that is out."""
     e, b = wp.tid()
     n = action_map.offset[b]
     if n < 0:

@@ -116,7 +116,7 @@ class BatchEnv(EpisodeArrays):
 
         clocks, flags = [self.step_count, self.head_start], [self.terminated, self.truncated, self.success, self.alive]
         graph.launch(begin_episode, (n, self.num_agents), [self.mask], [*clocks, *flags, self.begins])
-        sim.record_draws(graph, self.mask, self.seed, self.episode)
+        sim.record_randomization(graph, self.mask, self.seed, self.episode)
         for words in self.task.cleared_words():
             graph.launch(clear_words, words.shape, [self.mask], [words])
         self.task.record_reset(self, graph)

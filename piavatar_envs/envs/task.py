@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 #: Keys of every environment's ``info`` and of its views; no metric can have these names.
 NAMES_OF_INFO = (
-    "success", "failure", "root_force", "root_torque", "root_let_go", "reward_terms", "cost", "cost_terms",
+    "success", "failure", "root_force", "root_torque", "root_released", "reward_terms", "cost", "cost_terms",
     "final_info", "final_obs", "final_state", "episode", "is_success", "terminal_observation", "TimeLimit.truncated",
     "acted", "alive", "time_outs", "log",
 )  # fmt: skip
@@ -322,7 +322,7 @@ class Task:
         """Append: for environments of ``env.mask``, write the avatars' first commanded poses and draw the task.
 
         Props and colliders start where the scene says, unless this writes other places into
-        ``env.simulation.props.spawn`` (and ``.density``) or ``env.simulation.collider_spawn``. The setting
+        ``env.simulation.props.initial`` (and ``.density``) or ``env.simulation.initial_colliders``. The setting
         ``top_speed`` in the scene bounds their speed, then and later; the time step is short enough for it.
 
         Raises:

@@ -517,7 +517,7 @@ class Shapes:
         names = self._names
         return {p.name: (p, self._parameters[avatar][:, names.index(name)]) for name, p in self._ranges.items()}
 
-    def record_draws(self, graph: LaunchGraph, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
+    def record_reset(self, graph: LaunchGraph, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
         """Record the launches by which the masked environments draw bodies from pools."""
         for flesh in self.flesh:
             if flesh.pool:

@@ -159,7 +159,7 @@ class PropSet:
         names: of the props.
         points: their particles (NumPy).
         state: their tracked rigid motion, updated by :meth:`record_tracking`.
-        spawn: their motion after a reset: the scene's, until the reset of a task overwrites it.
+        initial: their motion after a reset: the scene's, until the reset of a task overwrites it.
         density: their density after a reset [kg/m^3], likewise.
         mass: mass of each at its density in the scene [kg].
         volume: volume of each [m^3].
@@ -194,8 +194,8 @@ class PropSet:
         density = np.array([[m.density for m in self.matter] or [1.0]], np.float32)
         self.density = wp.array(np.repeat(density, n, 0), dtype=float, device=device)
         self.state = PropState.allocate(n, max(1, len(configs)), device)
-        self.spawn = PropState.allocate(n, max(1, len(configs)), device)
-        self.spawn.assign(configs)
+        self.initial = PropState.allocate(n, max(1, len(configs)), device)
+        self.initial.assign(configs)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -225,15 +225,15 @@ class PropSet:
             self.record_place(graph, state, mask, index)
 
     def record_place(self, graph: LaunchGraph, state: State, mask: wp.array, index: int) -> None:
-        """Record the launch that sets prop ``index`` of the masked environments in the motion of ``spawn``, unstrained.
+        """Record the launch that sets prop ``index`` of the masked environments in its initial motion, unstrained.
 
         Within an episode, before the physics of a step, this throws a prop or removes it from play.
         """
-        prop, spawn = self.props[index], self.spawn
+        prop, start = self.props[index], self.initial
         graph.launch(
             place_prop,
             (self.model.num_envs, prop.count),
-            [mask, prop, index, spawn.position, spawn.rotation, spawn.velocity, spawn.spin],
+            [mask, prop, index, start.position, start.rotation, start.velocity, start.spin],
             [state.x, state.u, state.C, state.F, state.kinematic],
         )
 

@@ -57,7 +57,7 @@ class Simulation:
         props: the soft props.
         randomization: factors on mass, stiffness and friction, and the constants that they scale.
         shapes: bodies of random shape.
-        collider_spawn: poses and velocities of the colliders after a reset.
+        initial_colliders: poses and velocities of the colliders after a reset.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class Simulation:
             sound_speed=wave,
         )
         fields = self.model.contact.num_fields
-        self.collider_spawn = make_boundaries(subjects.colliders, fields, self.num_envs, self.device)
+        self.initial_colliders = make_boundaries(subjects.colliders, fields, self.num_envs, self.device)
 
     def _build_avatars(self) -> None:
         """Allocate the avatars and their controllers."""
@@ -203,9 +203,9 @@ class Simulation:
         first = self.subjects.first[count:-1]
         self.props = PropSet(self.scene.props, self._solids, self._prop_matter, first, columns, self.model)
 
-    def record_draws(self, graph: LaunchGraph, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
+    def record_randomization(self, graph: LaunchGraph, mask: wp.array, seed: wp.array, episode: wp.array) -> None:
         """Record the launches by which the masked environments draw bodies, then factors on their constants."""
-        self.shapes.record_draws(graph, mask, seed, episode)
+        self.shapes.record_reset(graph, mask, seed, episode)
         self.randomization.record_reset(graph, mask, seed, episode)
 
     def record_reset(self, graph: LaunchGraph, mask: wp.array) -> None:
@@ -217,7 +217,7 @@ class Simulation:
         graph.launch(clear_masked_sensors, self.num_envs, [mask], [self.sensors])
         if self.model.moving_boundaries:
             boundaries = self.model.boundaries
-            graph.launch(place_colliders, boundaries.position.shape, [mask, self.collider_spawn], [boundaries])
+            graph.launch(place_colliders, boundaries.position.shape, [mask, self.initial_colliders], [boundaries])
         graph.parallel_for_each(self.avatars, lambda avatar, own: avatar.record_tracking(own, self.state))
         self.props.record_tracking(graph, self.state)
 

@@ -367,7 +367,7 @@ earns all the reward, and every ball hits it. The root can be steered up to `roo
         avatar, props = env.simulation.avatar, env.simulation.props
         inputs = [self.rule, avatar.body, avatar.state.command_root]
         graph.launch(keep_place, env.num_envs, inputs, [self.reference_root])
-        clocks, now, spawn = [env.seed, env.episode, env.step_count, env.failure], props.state, props.spawn
+        clocks, now, spawn = [env.seed, env.episode, env.step_count, env.failure], props.state, props.initial
         graph.launch(
             throw_balls,
             self.placed.shape,

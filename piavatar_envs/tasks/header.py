@@ -181,7 +181,7 @@ at most 1, half of it for the goal."""
         self.fall = fill(Fall(), config.physics, speed=config.ball_speed, low=low, high=high)
 
     def record_ball(self, env, graph) -> None:
-        spawn, density = env.simulation.props.spawn, env.simulation.props.density
+        spawn, density = env.simulation.props.initial, env.simulation.props.density
         inputs = [env.mask, env.seed, env.episode, self.ball, self.fall]
         graph.launch(throw_ball, env.num_envs, inputs, [spawn.position, spawn.rotation, spawn.velocity, density])
 

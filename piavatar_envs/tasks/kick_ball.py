@@ -114,7 +114,7 @@ at most 1, half of it for the goal."""
         return (self.config.ball_radius,)
 
     def record_ball(self, env, graph) -> None:
-        spawn, density = env.simulation.props.spawn, env.simulation.props.density
+        spawn, density = env.simulation.props.initial, env.simulation.props.density
         inputs = [env.mask, env.seed, env.episode, self.ball]
         graph.launch(draw_ball, env.num_envs, inputs, [spawn.position, spawn.rotation, density])
 

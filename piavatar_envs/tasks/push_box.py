@@ -338,7 +338,7 @@ each action the command is clamped to within 0.1 m and 0.3 rad of the body."""
 
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
-        spawn, density = env.simulation.props.spawn, env.simulation.props.density
+        spawn, density = env.simulation.props.initial, env.simulation.props.density
         outputs = [spawn.position, spawn.rotation, density, self.target, self.way]
         graph.launch(draw_push, env.num_envs, [env.mask, env.seed, env.episode, self.push], outputs)
 

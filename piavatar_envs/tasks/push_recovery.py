@@ -247,7 +247,7 @@ greatest impulse of the episode so far: sorted by it, episodes show which pushes
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         props, tracked = env.simulation.props, env.simulation.avatar.tracked
-        now, spawn = props.state, props.spawn
+        now, spawn = props.state, props.initial
         clocks = [env.seed, env.episode, env.step_count, env.failure]
         graph.launch(
             throw_push,

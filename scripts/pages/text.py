@@ -35,7 +35,7 @@ INFO_DOCS = {
     "failure": "reason for which the simulation has failed; `None` while it has not",
     "root_force": "force of the root wrench on the body, its mean over the step, in the world [N]",
     "root_torque": "its torque about the body's centre of mass [N m]",
-    "root_let_go": "whether the root wrench has let go; it does not take hold again in the episode",
+    "root_released": "whether the root wrench has been released, which lasts until the end of the episode",
     "reward_terms": "the terms of the reward by name",
     "cost": "sum of the cost terms",
     "cost_terms": "the cost terms by name",

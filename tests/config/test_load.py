@@ -1,4 +1,4 @@
-"""Configurations: what is refused and how, what is merged, and that nothing is lost on the way."""
+"""Configurations: errors name key, value and limit; sources merge in order; round trips lose nothing."""
 
 from __future__ import annotations
 
@@ -39,45 +39,35 @@ def refusal(source=None, overrides=None, cls=Task) -> str:
     return message
 
 
-def test_defaults_are_those_of_the_design():
-    config = load_config(EnvConfig)
-    assert config.physics.young_modulus == 1e5 and config.physics.control_dt == pytest.approx(1 / 30)
-    assert config.physics.num_substeps is None and config.physics.decoupling == "split"
-    assert config.control.max_root_force == 2.0 and config.control.release_tilt == pytest.approx(np.pi / 4)
-    assert config == EnvConfig()
-
-
 @pytest.mark.parametrize(
-    ("overrides", "told"),
+    ("overrides", "key", "limit"),
     [
-        ({"control.tone": 1.5}, "control.tone=1.5 must be <= 1"),
-        ({"control": {"tone": -0.1}}, "control.tone=-0.1 must be >= 0"),
-        ({"physics.control_dt": 0}, "physics.control_dt=0 must be >= 0.0001 [s]"),
-        ({"physics.poisson_ratio": 0.5}, "physics.poisson_ratio=0.5 must be < 0.5"),
-        ({"fidelity": "ultra"}, "physics.fidelity='ultra' must be one of 'tiny', 'coarse', 'medium' or 'fine'"),
-        ({"young_modulus": "soft"}, "physics.young_modulus='soft' must be a number [Pa]"),
-        ({"young_modulus": "100000"}, "physics.young_modulus='100000' must be a number [Pa]"),
-        ({"tone": True}, "control.tone=True must be a number"),
-        ({"num_substeps": 1.5}, "physics.num_substeps=1.5 must be a whole number"),
-        ({"free_motion": 1}, "control.free_motion=1 must be true or false"),
-        ({"tone": float("nan")}, "control.tone=nan must be a finite number"),
-        ({"density": float("inf")}, "physics.density=inf must be a finite number [kg/m^3]"),
-        ({"shape.parameters.age": 2}, "shape.parameters.age=2 must be <= 1"),
-        ({"physics": 3}, "physics=3 must be a section, with its settings below it"),
-        ({"target_radius": 2.0}, "target_radius=2.0 must be <= 1 [m]"),
-        ({"width": 8}, "render.width=8 must be >= 16 [pixel]"),
-        ({"control.ton": 1}, "control.ton is no setting of Task; did you mean control.tone?"),
-        (
-            {"control.young_modulus": 1},
-            "control.young_modulus is no setting of Task; did you mean physics.young_modulus?",
-        ),
-        ({"physcs": {"fidelity": "tiny"}}, "physcs is no setting of Task; did you mean physics?"),
-        ({"target_radius.x": 1}, "target_radius={'x': 1} must be a number [m]"),
-        ({"control": {"tone": 0.1}, "tone": 0.2}, "control.tone is given twice, last as {'tone': 0.2}; give it once"),
+        ({"control.tone": 1.5}, "control.tone=1.5", "<= 1"),
+        ({"control": {"tone": -0.1}}, "control.tone=-0.1", ">= 0"),
+        ({"physics.control_dt": 0}, "physics.control_dt=0", ">= 0.0001 [s]"),
+        ({"physics.poisson_ratio": 0.5}, "physics.poisson_ratio=0.5", "< 0.5"),
+        ({"fidelity": "ultra"}, "physics.fidelity='ultra'", "one of 'tiny', 'coarse', 'medium' or 'fine'"),
+        ({"young_modulus": "soft"}, "physics.young_modulus='soft'", "a number [Pa]"),
+        ({"young_modulus": "100000"}, "physics.young_modulus='100000'", "a number [Pa]"),
+        ({"tone": True}, "control.tone=True", "a number"),
+        ({"num_substeps": 1.5}, "physics.num_substeps=1.5", "a whole number"),
+        ({"free_motion": 1}, "control.free_motion=1", "true or false"),
+        ({"tone": float("nan")}, "control.tone=nan", "a finite number"),
+        ({"density": float("inf")}, "physics.density=inf", "a finite number [kg/m^3]"),
+        ({"shape.parameters.age": 2}, "shape.parameters.age=2", "<= 1"),
+        ({"physics": 3}, "physics=3", "a section, with its settings below it"),
+        ({"target_radius": 2.0}, "target_radius=2.0", "<= 1 [m]"),
+        ({"width": 8}, "render.width=8", ">= 16 [pixel]"),
+        ({"control.ton": 1}, "control.ton ", "control.tone?"),
+        ({"control.young_modulus": 1}, "control.young_modulus ", "physics.young_modulus?"),
+        ({"physcs": {"fidelity": "tiny"}}, "physcs ", "physics?"),
+        ({"target_radius.x": 1}, "target_radius={'x': 1}", "a number [m]"),
+        ({"control": {"tone": 0.1}, "tone": 0.2}, "control.tone", "given twice"),
     ],
 )
-def test_a_refusal_names_key_value_and_limit(overrides, told):
-    assert refusal(None, overrides) == told
+def test_a_refusal_names_key_value_and_limit(overrides, key, limit):
+    message = refusal(None, overrides)
+    assert message.startswith(key) and limit in message
 
 
 def test_an_unlike_key_is_answered_with_what_there_is():

@@ -63,8 +63,8 @@ def test_refusals_within_lists_say_which_entry(scene, told):
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"num_envs": 4}, "num_envs is no setting of EnvConfig; gym.make_vec(..., num_envs=...) makes several"),
-        ({"seed": 3}, "seed is no setting of EnvConfig; reset(seed=...) takes it"),
+        ({"num_envs": 4}, "num_envs is no setting of EnvConfig; use gym.make_vec(..., num_envs=...)"),
+        ({"seed": 3}, "seed is no setting of EnvConfig; use reset(seed=...)"),
         ({"scene": {"seed": 3}}, "scene.seed is no setting of EnvConfig; there are scene."),
     ],
 )

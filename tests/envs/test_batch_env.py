@@ -131,7 +131,7 @@ def test_letting_go_of_the_root_terminates_and_does_not_truncate(make_env, env_i
     velocity.assign(velocity.numpy() + np.float32([0.0, 4.0, 0.0]))
     for _ in range(2):  # and it is latched
         _, _, terminated, truncated, info = env.step(np.zeros(env.action_space.shape))
-        assert terminated is True and truncated is False and info["root_let_go"] and info["failure"] is None
+        assert terminated is True and truncated is False and info["root_released"] and info["failure"] is None
     assert not info["root_force"].any() and not info["root_torque"].any()
     env.reset(seed=0)
     assert env.step(np.zeros(env.action_space.shape))[2] is False

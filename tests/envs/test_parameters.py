@@ -106,7 +106,7 @@ def test_the_gate_stands_where_it_is_told(make_batch, task):
     batch = make_batch(f"PIAvatar/{task}-v0", 3, observe_parameters=True)
     batch.reset(seeds=[1, 2, 3])
     told, course = by_name(batch), batch.task.course
-    start = batch.simulation.props.spawn.position.numpy()[:, 0]
+    start = batch.simulation.props.initial.position.numpy()[:, 0]
     side = told["target_side"]
     way = told["target_distance"][:, None] * np.stack([side, -np.sqrt(1.0 - side**2)], axis=1)
     assert course.center.numpy()[:, :2] == pytest.approx(start[:, :2] + way, abs=1e-4)

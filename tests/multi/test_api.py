@@ -254,7 +254,7 @@ def test_what_a_step_tells(make_game, play, game_name):
             assert tuple(terms) == task.reward_names and np.isfinite(list(terms.values())).all()
             assert rewards[name] == pytest.approx(sum(terms.values()), abs=1e-5)
             assert all(np.isfinite(info[metric]) for metric in task.metric_names)
-            assert type(info["success"]) is bool and info["failure"] is None and type(info["root_let_go"]) is bool
+            assert type(info["success"]) is bool and info["failure"] is None and type(info["root_released"]) is bool
             assert info["root_force"].shape == info["root_torque"].shape == (3,)
             assert ("cost" in info) == bool(task.cost_names)
 

@@ -18,6 +18,6 @@ def test_a_run_repeats_and_agents_that_fall_stay_in(make_game, play, game_name, 
         for a, b in zip(first[:2], second[:2], strict=True):
             assert all(np.array_equal(a[name], b[name]) for name in a)
     infos = [info for row in runs[0] for info in row[4].values()]
-    assert all(info["failure"] is None and not info["root_let_go"] for info in infos)
+    assert all(info["failure"] is None and not info["root_released"] for info in infos)
     assert not any(np.any(info["root_force"]) for info in infos)
     assert all("root" not in name for name in world.action_names)

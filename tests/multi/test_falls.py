@@ -61,7 +61,7 @@ def test_who_falls_loses_and_who_stands_wins(make_game, module, shape):
     lost = {SUMO: "out", BOXING: "down"}[module]
     assert infos["agent_0"]["reward_terms"][lost] < -4.0 and infos["agent_1"]["reward_terms"]["win"] > 4.0
     assert rewards["agent_0"] < -4.0 and rewards["agent_1"] > 4.0
-    assert not any(info["root_let_go"] for info in infos.values())
+    assert not any(info["root_released"] for info in infos.values())
 
 
 @pytest.mark.parametrize("module", [SUMO, BOXING])
@@ -95,7 +95,7 @@ def test_where_all_have_one_aim_a_fall_is_the_end_for_all(make_game, module):
         if any(down):
             break
     assert any(down) and not world.agents
-    assert not any(info["success"] or info["root_let_go"] or info["failure"] for info in infos.values())
+    assert not any(info["success"] or info["root_released"] or info["failure"] for info in infos.values())
 
 
 @pytest.mark.parametrize("module", [SUMO, BOXING, HIGH_FIVE, PASS_BALL])

@@ -276,7 +276,7 @@ def test_when_one_falls_it_is_over_for_both(make_game, play):
     world.set_state(state)
     [(_, rewards, terminations, _, infos)] = play(world, 1)
     assert all(terminations.values()) and not world.agents
-    assert [infos[name]["root_let_go"] for name in infos] == [False, True]
+    assert [infos[name]["root_released"] for name in infos] == [False, True]
     assert not any(info["success"] for info in infos.values()) and max(rewards.values()) < 1.0
 
 

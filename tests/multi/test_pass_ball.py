@@ -239,7 +239,7 @@ def test_a_ball_that_nobody_can_play_ends_it_for_all(make_game, play, where, vel
     put_ball(world, where, velocity)
     [(_, _, terminations, _, infos)] = play(world, 1)
     assert set(terminations.values()) == {over} and (not world.agents) == over
-    assert all(info["failure"] is None and not info["root_let_go"] for info in infos.values())
+    assert all(info["failure"] is None and not info["root_released"] for info in infos.values())
 
 
 def test_roots_stay_near_their_places(make_game, play):
@@ -284,7 +284,7 @@ def test_when_one_falls_it_is_over_for_all(make_game, play):
     state["avatar_2.state.let_go"][:] = 1
     world.set_state(state)
     [(_, _, terminations, _, infos)] = play(world, 1)
-    assert all(terminations.values()) and [info["root_let_go"] for info in infos.values()] == [False, False, True]
+    assert all(terminations.values()) and [info["root_released"] for info in infos.values()] == [False, False, True]
 
 
 @pytest.mark.parametrize("settings", [{"ball_mass": (0.0, 1.0)}, {"serve_speed": (2.0, 1.0)}])

@@ -79,7 +79,7 @@ def test_walking_out_of_the_ring_loses_and_the_last_one_in_wins(make_game, play)
     assert infos["agent_0"]["reward_terms"]["out"] == -world.config.out_cost
     assert infos["agent_1"]["reward_terms"]["win"] == world.config.win_reward
     assert infos["agent_0"]["reward_terms"]["win"] == infos["agent_1"]["reward_terms"]["out"] == 0.0
-    assert not infos["agent_0"]["root_let_go"]
+    assert not infos["agent_0"]["root_released"]
 
 
 def test_who_is_down_is_out(make_game, play):
@@ -87,7 +87,7 @@ def test_who_is_down_is_out(make_game, play):
     world.reset(seed=0)
     knock_down(world, 1)
     [(_, rewards, terminations, _, infos)] = play(world, 1)
-    assert infos["agent_1"]["root_let_go"] and infos["agent_0"]["success"] and not infos["agent_1"]["success"]
+    assert infos["agent_1"]["root_released"] and infos["agent_0"]["success"] and not infos["agent_1"]["success"]
     assert rewards["agent_0"] > 9.0 and rewards["agent_1"] < -9.0 and all(terminations.values())
 
 
@@ -211,7 +211,7 @@ def test_a_push_moves_who_does_not_push_back(make_game, device):
         assert infos["agent_0"]["push_impulse"] == pytest.approx(pushed[-1], rel=0.02, abs=0.05), "equal and opposite"
         drive = world.batch.simulation.avatars[0].state
         lead.append(np.linalg.norm((drive.command_root.numpy()[0] - pelvises(world)[0])[:2]))
-    assert infos["agent_0"]["success"] and not infos["agent_1"]["root_let_go"]
+    assert infos["agent_0"]["success"] and not infos["agent_1"]["root_released"]
     assert max(pushed) > 10.0
     # a step of the root beyond the limit of its lead, and what contact took back in this step
     step = world.config.root_speed * world.config.physics.control_dt

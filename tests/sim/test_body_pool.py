@@ -134,7 +134,7 @@ def test_avatars_draw_apart_from_bodies_that_are_shaped_once(device):
         wp.array(np.arange(n, dtype=np.int32), dtype=int, device=device),
         wp.zeros(n, dtype=int, device=device),
     )
-    simulation.record_draws(graph, mask, seed, episode)
+    simulation.record_randomization(graph, mask, seed, episode)
     graph.run()
     pools = [flesh.pool for flesh in simulation.flesh]
     assert pools[0].bodies is pools[1].bodies

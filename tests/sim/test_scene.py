@@ -142,7 +142,7 @@ def test_episodes_draw_the_places_that_are_looked_at(make_batch, task):
     drawn = []
     for episode in range(8):
         batch.reset(seeds=range(32) if episode == 0 else None)
-        drawn.append(batch.simulation.props.spawn.position.numpy()[:, batch.simulation.props.index(name)])
+        drawn.append(batch.simulation.props.initial.position.numpy()[:, batch.simulation.props.index(name)])
     drawn, places = np.concatenate(drawn), np.array(places)
     low, high = places.min(0), places.max(0)
     assert (drawn >= low - 1e-6).all() and (drawn <= high + 1e-6).all()

@@ -54,7 +54,7 @@ def test_masses_are_uniform_in_their_logarithm_and_observed(make_batch):
         batch.step()
         assert batch.metrics.numpy()[:, 0, 2] == pytest.approx(mass, rel=1e-5)
         masses.append(mass)
-        places.append(batch.simulation.props.spawn.position.numpy()[:, batch.task.index])
+        places.append(batch.simulation.props.initial.position.numpy()[:, batch.task.index])
     low, high = np.log(batch.config.ball_mass)
     share = (np.log(np.concatenate(masses)) - low) / (high - low)
     # Kolmogorov-Smirnov: the 0.1 % quantile of the distance is 1.95 / sqrt(n)

@@ -47,7 +47,7 @@ def tracked(env, index: int) -> tuple[np.ndarray, np.ndarray]:
 
 def spawn(env, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Where and how fast a ball was placed last."""
-    spawn = env.batch.simulation.props.spawn
+    spawn = env.batch.simulation.props.initial
     return spawn.position.numpy()[0, index].astype(float), spawn.velocity.numpy()[0, index].astype(float)
 
 
@@ -159,8 +159,8 @@ def test_placing_a_prop_touches_its_particles_in_the_masked_environments_only(ma
     simulation, index = batch.simulation, 1
     props, rng = simulation.props, np.random.default_rng(0)
     for name, values in (("position", rng.normal(size=(3, 2, 3))), ("velocity", rng.normal(size=(3, 2, 3)) * 5.0)):
-        getattr(props.spawn, name).assign(values.astype(np.float32))
-    props.spawn.spin.assign(rng.normal(size=(3, 2, 3)).astype(np.float32))
+        getattr(props.initial, name).assign(values.astype(np.float32))
+    props.initial.spin.assign(rng.normal(size=(3, 2, 3)).astype(np.float32))
     graph, before = LaunchGraph(batch.device), simulation.state.numpy()
     before = {name: value.copy() for name, value in before.items()}
     mask = np.array([True, False, True])
@@ -178,7 +178,7 @@ def test_placing_a_prop_touches_its_particles_in_the_masked_environments_only(ma
     for e in np.flatnonzero(mask):
         x, u, C, F = (after[name][e, own].astype(float) for name in ("x", "u", "C", "F"))
         center, velocity, spin = (
-            getattr(props.spawn, name).numpy()[e, index].astype(float) for name in ("position", "velocity", "spin")
+            getattr(props.initial, name).numpy()[e, index].astype(float) for name in ("position", "velocity", "spin")
         )
         m = mass[e]
         assert m @ x / m.sum() == pytest.approx(center, abs=1e-5)

@@ -186,7 +186,7 @@ def test_straying_too_far_terminates(make_env):
     rows = [env.step(action) for _ in range(6)]
     errors, ended = [row[4]["mpjpe"] for row in rows], [row[2] for row in rows]
     assert ended == [error > 0.06 for error in errors] and ended[-1] and not ended[0]
-    assert rows[-1][4]["failure"] is None and not rows[-1][4]["root_let_go"]
+    assert rows[-1][4]["failure"] is None and not rows[-1][4]["root_released"]
 
 
 def test_episodes_begin_anywhere_in_a_clip_that_loops(make_env):

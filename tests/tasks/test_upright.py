@@ -139,7 +139,7 @@ def test_pushes_come_at_random_moments_from_everywhere_and_are_weighed(make_env)
         for step in range(5 * interval):
             before = env.batch.task.push.numpy()[0].copy()
             observation, *_, info = env.step(still(env))
-            spawn = env.batch.simulation.props.spawn
+            spawn = env.batch.simulation.props.initial
             thrown = bool(env.batch.task.placed.numpy()[0]) and spawn.velocity.numpy()[0, 0].any()
             if thrown:
                 at, way = spawn.position.numpy()[0, 0], spawn.velocity.numpy()[0, 0]
@@ -167,7 +167,7 @@ def test_pushes_come_at_random_moments_from_everywhere_and_are_weighed(make_env)
                 turn = Rotation.from_quat(tracked.rotation.numpy()[0, 0].astype(float))
                 off = props.position.numpy()[0, 0] - tracked.position.numpy()[0, 0]
                 assert turn.apply(ball[0]) == pytest.approx(off, abs=1e-4)
-            if info["root_let_go"]:
+            if info["root_released"]:
                 break
         hits += strongest > env.config.hit_impulse
         throws = 0
@@ -184,7 +184,7 @@ def test_a_push_is_at_most_what_the_ball_carries(make_env, mass):
     for seed in range(3):
         env.reset(seed=seed)
         infos = [env.step(still(env))[4] for _ in range(18)]
-        spawn = env.batch.simulation.props.spawn.velocity.numpy()[0, 0]
+        spawn = env.batch.simulation.props.initial.velocity.numpy()[0, 0]
         found.append(infos[-1]["strongest_push"] / (mass * np.linalg.norm(spawn)))
     assert np.median(found) > 0.2 and max(found) < 2.5
 

@@ -416,7 +416,7 @@ class GateTask(Task):
         return getattr(env.simulation.props.state, name)[:, self.index]
 
     def record_ball(self, env, graph) -> None:
-        """Append, at a reset: draw the ball's place, velocity and mass into ``props.spawn`` and ``props.density``."""
+        """Append, at a reset: draw the ball's place, velocity and mass into ``props.initial`` and ``props.density``."""
         raise NotImplementedError
 
     def record_gap(self, env, graph) -> None:
@@ -426,7 +426,7 @@ class GateTask(Task):
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
         self.record_ball(env, graph)
-        start = env.simulation.props.spawn.position[:, self.index]
+        start = env.simulation.props.initial.position[:, self.index]
         graph.launch(draw_gate, env.num_envs, [env.mask, env.seed, env.episode, self.gate, start], [self.course])
 
     def record_outcome(self, env, graph) -> None:

@@ -268,5 +268,5 @@ def record_balls(env: EpisodeArrays, graph: LaunchGraph, throws: Throws) -> None
         draw_balls,
         (env.num_envs, throws.num_balls),
         [env.mask, env.seed, env.episode, throws],
-        [props.spawn.position, props.spawn.velocity, props.spawn.spin, props.density],
+        [props.initial.position, props.initial.velocity, props.initial.spin, props.density],
     )

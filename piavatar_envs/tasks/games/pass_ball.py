@@ -395,7 +395,7 @@ actions."""
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
         record_shift(env, graph, self.config.place_noise)
-        spawn, density = env.simulation.props.spawn, env.simulation.props.density
+        spawn, density = env.simulation.props.initial, env.simulation.props.density
         inputs = [env.mask, env.seed, env.episode, self.serve, self.places]
         outputs = [spawn.position, spawn.velocity, spawn.spin, density, self.play]
         graph.launch(serve_ball, env.num_envs, inputs, outputs)
