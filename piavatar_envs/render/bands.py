@@ -30,7 +30,7 @@ class Band:
 
 
 def bands_of(body: Body) -> list[Band]:
-    """The body in bands of equal width in its scalars; those that no triangle belongs to are left out.
+    """Split the body into bands of equal width in its scalars; bands without triangles are left out.
 
     A triangle belongs where the mean of its corners does; beyond the range, and NaN, to the last band.
     """

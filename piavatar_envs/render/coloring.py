@@ -16,7 +16,7 @@ _STRAIN_ANCHORS = np.array(
 
 
 def strain_magnitude(deformation_gradient: ArrayLike) -> np.ndarray:
-    """Largest departure of a principal stretch from one: ``max_i |s_i - 1|``, zero for any rotation.
+    """Return the largest departure of a principal stretch from one: ``max_i |s_i - 1|``, zero for any rotation.
 
     The principal stretches ``s_i`` are the singular values of ``F``; where ``det F < 0`` (inverted) the smallest is
     counted as negative. An ``F`` that is not finite gives infinity.
@@ -38,7 +38,7 @@ def strain_magnitude(deformation_gradient: ArrayLike) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def strain_table() -> np.ndarray:
-    """The strain colour map, shape ``(256, 3)`` sRGB in [0, 1]; read-only."""
+    """Return the strain colour map, shape ``(256, 3)`` sRGB in [0, 1]; read-only."""
     at = np.linspace(0.0, len(_STRAIN_ANCHORS) - 1.0, _TABLE_SIZE)
     lightness, chroma, hue = (
         np.interp(at, np.arange(len(_STRAIN_ANCHORS)), _STRAIN_ANCHORS[:, column]) for column in range(3)
@@ -50,7 +50,7 @@ def strain_table() -> np.ndarray:
 
 
 def color_by(values: ArrayLike, maximum: float) -> np.ndarray:
-    """Colours of scalars on the fixed range ``[0, maximum]``; values outside, and NaN, take the nearest end's.
+    """Map scalars in ``[0, maximum]`` to colours; values outside, and NaN, take the colour of the nearest end.
 
     Args:
         values: scalars, shape ``(N,)``.
@@ -75,13 +75,13 @@ def srgb_to_linear(color: ArrayLike) -> np.ndarray:
 
 
 def linear_to_srgb(light: ArrayLike) -> np.ndarray:
-    """Values in [0, 1] (sRGB) of light intensities; clips what is out of range (IEC 61966-2-1)."""
+    """Convert light intensities to sRGB in [0, 1], clipped (IEC 61966-2-1)."""
     light = np.clip(np.asarray(light, dtype=np.float64), 0.0, 1.0)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
 
 
 def to_bytes(light: np.ndarray) -> np.ndarray:
-    """Bytes (sRGB) of light intensities, through a table: quick enough for every vertex of every frame."""
+    """Convert light intensities to bytes (sRGB) by a table, quick enough for every vertex of every frame."""
     table = _byte_table()
     return table[np.clip(light * np.float32(len(table) - 1), 0.0, len(table) - 1).astype(np.int32)]
 
@@ -92,7 +92,7 @@ def _byte_table() -> np.ndarray:
 
 
 def oklab_to_srgb(lab: ArrayLike) -> np.ndarray:
-    """Values in [0, 1] (sRGB) of Oklab colours, shape ``(..., 3)`` (B. Ottosson, "A perceptual color space", 2020)."""
+    """Convert Oklab colours to sRGB in [0, 1], ``(..., 3)`` (B. Ottosson, "A perceptual color space", 2020)."""
     lab = np.asarray(lab, dtype=np.float64)
     to_lms = np.array(
         [

@@ -16,7 +16,7 @@ _EGL_OPENGL_API = 0x30A2
 
 @lru_cache(maxsize=1)
 def opengl_available() -> bool:
-    """Whether VTK can open an off-screen window. It must be known before: without OpenGL, VTK kills the process.
+    """Return whether VTK can open an off-screen window, because without OpenGL it kills the process.
 
     Elsewhere than on Linux the system brings OpenGL; a user who set ``VTK_DEFAULT_OPENGL_WINDOW`` is trusted.
     """
@@ -30,7 +30,7 @@ def opengl_available() -> bool:
 
 @contextlib.contextmanager
 def off_screen_window() -> Iterator[None]:
-    """Within it VTK opens an EGL window at once on Linux, instead of warning that there is no X server first."""
+    """Let VTK open an EGL window at once on Linux, without its warning that there is no X server."""
     if not sys.platform.startswith("linux") or _WINDOW_VARIABLE in os.environ:
         yield
         return
@@ -42,7 +42,7 @@ def off_screen_window() -> Iterator[None]:
 
 
 def _egl_starts(egl: ctypes.CDLL) -> bool:
-    """Whether EGL starts on its first device, or else its default display, as VTK will ask it to."""
+    """Return whether EGL starts on its first device, or else on its default display, in VTK's order."""
     pointer, integer = ctypes.c_void_p, ctypes.c_int
     egl.eglGetProcAddress.restype, egl.eglGetProcAddress.argtypes = pointer, [ctypes.c_char_p]
     egl.eglGetDisplay.restype, egl.eglGetDisplay.argtypes = pointer, [pointer]

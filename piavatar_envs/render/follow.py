@@ -16,7 +16,7 @@ class Follower:
     """
 
     def __init__(self, camera: Camera) -> None:
-        """It has followed nothing yet."""
+        """Start without a point to follow."""
         self.camera = camera
         self.center: np.ndarray | None = None
         self._wanted = np.zeros(2)  # what it followed last [m]

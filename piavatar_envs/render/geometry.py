@@ -49,13 +49,13 @@ class Topology:
         return sparse.csr_array(sparse.diags_array(1.0 / edges.sum(axis=1)) @ edges, dtype=np.float32)
 
     def smooth(self, values: np.ndarray, passes: int) -> np.ndarray:
-        """Quantities of the vertices averaged with their neighbours ``passes`` times, shape ``(V, n)``."""
+        """Average quantities of the vertices with their neighbours ``passes`` times, shape ``(V, n)``."""
         for _ in range(passes):
             values = self._neighbours @ values
         return values
 
     def triangles(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Centres [m] and area vectors [m^2] (outward normal times area) of the triangles.
+        """Return centres [m] and area vectors [m^2] (outward normal times area) of the triangles.
 
         Args:
             vertices: positions [m], shape ``(3, V)``.
@@ -73,7 +73,7 @@ class Topology:
         return a + (u + v) * np.float32(1.0 / 3.0), area
 
     def vertex_areas(self, triangle_areas: np.ndarray) -> np.ndarray:
-        """Area vectors of the vertices, a third of each of their triangles' [m^2]: their smooth normals times area.
+        """Return area vectors of the vertices [m^2], a third of each of their triangles': smooth normals times area.
 
         Args:
             triangle_areas: area vectors of the triangles [m^2], shape ``(3, T)``.
@@ -85,22 +85,22 @@ class Topology:
 
 
 def topology_key(faces: Sequence[np.ndarray], counts: Sequence[int]) -> tuple:
-    """Equal for meshes that share a :class:`Topology`: the very same face arrays with as many vertices."""
+    """Return a key that is equal for meshes of one :class:`Topology`: the same face arrays and numbers of vertices."""
     return tuple((id(part), int(count)) for part, count in zip(faces, counts, strict=True))
 
 
 def drawable(vertices: np.ndarray) -> np.ndarray:
-    """Vertices that a graphics library can take, float32: a simulation that blew up is still worth a picture."""
+    """Return vertices as float32 that a graphics library accepts, also of a failed simulation."""
     vertices = np.asarray(vertices, dtype=np.float32)
     return np.clip(np.nan_to_num(vertices, nan=0.0, posinf=_FAR, neginf=-_FAR), -_FAR, _FAR)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors of length one, along the first axis; a zero vector stays zero."""
+    """Return vectors of length one, along the first axis; a zero vector stays zero."""
     return vectors / np.maximum(length(vectors), np.float32(1e-20))
 
 
 def length(vectors: np.ndarray) -> np.ndarray:
-    """Lengths of vectors along the first axis, shape ``(3, N)`` to ``(N,)``."""
+    """Return lengths of vectors along the first axis, shape ``(3, N)`` to ``(N,)``."""
     x, y, z = vectors
     return np.sqrt(x * x + y * y + z * z)

@@ -21,7 +21,7 @@ LINE_PIXELS = 1
 
 
 def tile() -> np.ndarray:
-    """The repeating tile, ``2 SQUARE`` wide, shape ``(256, 256, 3)`` uint8, indexed ``[y, x]``."""
+    """Return the repeating tile, ``2 SQUARE`` wide, shape ``(256, 256, 3)`` uint8, indexed ``[y, x]``."""
     half = TILE_PIXELS // 2
     cell = np.arange(TILE_PIXELS) // half
     dark = (cell[:, None] + cell[None, :]) % 2 == 1
@@ -33,6 +33,6 @@ def tile() -> np.ndarray:
 
 
 def fade(distance: np.ndarray) -> np.ndarray:
-    """Opacity of the ground at a horizontal distance [m] from what the camera follows, in [0, 1]."""
+    """Return the ground's opacity in [0, 1] at a horizontal distance [m] from the camera's centre."""
     share = np.clip((FADE_END - np.asarray(distance)) / (FADE_END - FADE_START), 0.0, 1.0)
     return share * share * (3.0 - 2.0 * share)

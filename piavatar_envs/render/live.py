@@ -94,7 +94,7 @@ class LiveView:
         print(f"live view: {self.url}", flush=True)
 
     def _set_up(self, camera: Camera) -> None:
-        """Camera, light and ground, by the numbers of the pictures."""
+        """Set up camera, light and ground as in the pictures."""
         scene, first = self.server.scene, self.server.initial_camera
         first.position, first.look_at, first.fov = camera.position, camera.target, math.radians(camera.field_of_view)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -163,7 +163,7 @@ class LiveView:
 
 
 def _meshes(scene: Scene) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, Color]]]:
-    """Name, vertices, triangles and colour of everything in a scene; the same thing has the same name every time."""
+    """Yield name, vertices, triangles and colour of everything in a scene; names persist between scenes."""
     for index, body in enumerate(scene.bodies):
         name = f"{_WORLD}/body_{index}"
         if body.scalars is None:

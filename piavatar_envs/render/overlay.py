@@ -32,7 +32,7 @@ def draw_scale(frame: np.ndarray, maximum: float, title: str) -> None:
 
 
 def label(frame: np.ndarray, text: str) -> np.ndarray:
-    """A copy of the picture with ``text`` on a light plate in its upper left corner, shape ``(H, W, 3)`` uint8."""
+    """Return a copy of the picture, ``(H, W, 3)`` uint8, with ``text`` on a light plate in its upper left corner."""
     from PIL import Image, ImageDraw
 
     image = Image.fromarray(np.ascontiguousarray(frame))
@@ -46,7 +46,7 @@ def label(frame: np.ndarray, text: str) -> np.ndarray:
 
 
 def side_by_side(left: np.ndarray, right: np.ndarray, gap: int = 4) -> np.ndarray:
-    """Two pictures of one height beside each other.
+    """Join two pictures of one height side by side.
 
     Args:
         left: shape ``(H, W1, 3)`` uint8.
@@ -66,7 +66,7 @@ def side_by_side(left: np.ndarray, right: np.ndarray, gap: int = 4) -> np.ndarra
 
 @lru_cache(maxsize=8)
 def _scale_image(frame_height: int, maximum: float, title: str) -> tuple[np.ndarray, np.ndarray]:
-    """The scale's colours ``(h, w, 3)`` and opacity ``(h, w, 1)``, both float."""
+    """Return the scale's colours ``(h, w, 3)`` and opacity ``(h, w, 1)``, both float."""
     from PIL import Image, ImageDraw
 
     size = max(10, frame_height // 36)

@@ -95,7 +95,7 @@ def rasterise(
 
 @wp.func
 def ground_point(view: View, x: float, y: float) -> wp.vec3:
-    """Ground coordinates seen at a sample [m] and their inverse depth [1/m]; 0 above the horizon."""
+    """Return ground coordinates seen at a sample [m] and their inverse depth [1/m]; 0 above the horizon."""
     ray = (
         view.forward
         + ((x - 0.5 * float(view.width)) * view.right + (0.5 * float(view.height) - y) * view.up) / view.focal
@@ -107,19 +107,19 @@ def ground_point(view: View, x: float, y: float) -> wp.vec3:
 
 @wp.func
 def triangle_wave(x: float) -> float:
-    """Integral of the square wave of period 2: what a box filter needs."""
+    """Return the integral of the square wave of period 2, for a box filter."""
     return 2.0 * wp.abs(0.5 * x - wp.floor(0.5 * x) - 0.5)
 
 
 @wp.func
 def lines_integral(x: float) -> float:
-    """Integral of the lines at whole numbers."""
+    """Return the integral of the lines at whole numbers."""
     return wp.floor(x) * _LINE_SHARE + wp.min(x - wp.floor(x), _LINE_SHARE)
 
 
 @wp.func
 def checker(look: GroundLook, at: wp.vec2, footprint: wp.vec2) -> wp.vec3:
-    """The ground's colour averaged over a pixel, ``at`` and ``footprint`` in squares."""
+    """Return the ground's colour averaged over a pixel, ``at`` and ``footprint`` in squares."""
     low = at - 0.5 * footprint
     high = at + 0.5 * footprint
     sx = (triangle_wave(low[0]) - triangle_wave(high[0])) / footprint[0]
@@ -132,7 +132,7 @@ def checker(look: GroundLook, at: wp.vec2, footprint: wp.vec2) -> wp.vec3:
 
 @wp.func
 def shadow_at(look: GroundLook, opacity: wp.array2d[float], x: float, y: float) -> float:
-    """Opacity of the shadow at a point of the ground [m], between texels."""
+    """Return the opacity of the shadow at a point of the ground [m], between texels."""
     size = opacity.shape[0]
     scale = float(size) / look.shadow_size
     u = (x - look.shadow_origin[0]) * scale - 0.5

@@ -111,7 +111,7 @@ class Renderer:
         self.close()
 
     def _gather(self, bodies: Sequence[Body], markers: Sequence[Marker]) -> tuple[Topology, np.ndarray, np.ndarray]:
-        """Everything shown as one mesh: its triangles, vertices ``(V, 3)`` [m] and own colours ``(V, 3)``."""
+        """Join all bodies and markers to one mesh: triangles, vertices ``(V, 3)`` [m] and own colours ``(V, 3)``."""
         if not bodies and not markers:
             raise ValueError("nothing to show: give at least one body or marker")
         meshes = [(body.vertices, body.faces) for body in bodies] + [marker.mesh() for marker in markers]

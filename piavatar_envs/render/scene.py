@@ -53,7 +53,7 @@ class Sphere:
     color: Color = TARGET
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """World vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
+        """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
         vertices, faces = _UNIT_SPHERE
         return np.asarray(self.position, dtype=np.float64) + self.radius * vertices, faces
 
@@ -68,7 +68,7 @@ class Arrow:
     radius: float = 0.018
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """World vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
+        """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
         vector = np.asarray(self.vector, dtype=np.float64)
         length = float(np.linalg.norm(vector))
         axis = vector / length if length > 1e-9 else np.array([0.0, 0.0, 1.0])
@@ -94,7 +94,7 @@ class Box:
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """World vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
+        """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
         vertices, faces = _UNIT_BOX
         local = vertices * np.asarray(self.half_size, dtype=np.float64)
         return np.asarray(self.position, dtype=np.float64) + local @ np.asarray(self.rotation).T, faces
@@ -111,7 +111,7 @@ class Capsule:
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """World vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
+        """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
         vertices, faces = _UNIT_SPHERE
         local = self.radius * vertices
         local[:, 2] += np.where(vertices[:, 2] >= 0.0, self.half_length, -self.half_length)
@@ -134,7 +134,7 @@ class Ring:
     lowest: float = 0.0
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """World vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
+        """Return world vertices ``(V, 3)`` [m] and triangles ``(T, 3)``."""
         position, normal = np.asarray(self.position, dtype=np.float64), np.asarray(self.normal, dtype=np.float64)
         up = np.array([0.0, 0.0, 1.0]) if abs(normal[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
         up -= (up @ normal) * normal
@@ -209,7 +209,7 @@ class Camera:
 
 
 def _revolve(profile: np.ndarray) -> np.ndarray:
-    """Vertices of the rings ``(radius, height)`` about the z axis, shape ``(rings * segments, 3)``."""
+    """Return vertices of the rings ``(radius, height)`` about the z axis, shape ``(rings * segments, 3)``."""
     angle = np.linspace(0.0, 2.0 * np.pi, _ARROW_SEGMENTS, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     rings = np.concatenate(
@@ -220,7 +220,7 @@ def _revolve(profile: np.ndarray) -> np.ndarray:
 
 
 def _ring_faces(num_rings: int, num_segments: int) -> np.ndarray:
-    """Outward triangles between consecutive rings that rise along z."""
+    """Return outward triangles between consecutive rings that rise along z."""
     ring, segment = np.meshgrid(np.arange(num_rings - 1), np.arange(num_segments), indexing="ij")
     following = (segment + 1) % num_segments
     a, b = ring * num_segments + segment, ring * num_segments + following
@@ -241,7 +241,7 @@ def _unit_sphere() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unit_box() -> tuple[np.ndarray, np.ndarray]:
-    """Six gridded sides that share no vertices, so that edges are sharp and shadows are filled."""
+    """Return six gridded sides that share no vertices, so that edges are sharp and shadows are filled."""
     line = np.linspace(-1.0, 1.0, _BOX_CELLS + 1)
     u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
     i, j = (grid.ravel() for grid in np.meshgrid(np.arange(_BOX_CELLS), np.arange(_BOX_CELLS), indexing="ij"))

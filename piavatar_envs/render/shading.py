@@ -88,7 +88,7 @@ def shade(
 
 
 def _lit_share(positions: np.ndarray, casters: Casters) -> np.ndarray:
-    """Share of the key light that reaches each vertex, shape ``(V,)``: a shadow map seen from the light."""
+    """Return the share of the key light that reaches each vertex, shape ``(V,)``: a shadow map seen from the light."""
     side = unit(np.cross(KEY, [0.0, 0.0, 1.0])).astype(np.float32)
     frame = np.stack([side, np.cross(KEY, side), KEY])
     points = frame @ casters.points
@@ -112,7 +112,7 @@ def _lit_share(positions: np.ndarray, casters: Casters) -> np.ndarray:
 
 
 def _occlusion(positions: np.ndarray, normals: np.ndarray, casters: Casters) -> np.ndarray:
-    """Share of the sky hidden by near surfaces, shape ``(V,)``: surface found in blurred voxels along the normal."""
+    """Return the share of the sky hidden by near surfaces, ``(V,)``: surface in blurred voxels along the normal."""
     low = casters.points.min(axis=1) - np.float32(3.0 * _VOXEL)
     extent = casters.points.max(axis=1) - low
     voxel = np.float32(max(_VOXEL, float(extent.max()) / (_VOXEL_LIMIT - 4)))

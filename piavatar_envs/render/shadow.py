@@ -35,7 +35,7 @@ class GroundShadow:
 
 
 def ground_shadow(casters: Casters) -> GroundShadow:
-    """Shadow of all surfaces on z = 0."""
+    """Cast the shadow of all surfaces on z = 0."""
     height = np.maximum(casters.points[2], 0.0)
     cast = casters.points[:2] - height * (KEY[:2] / KEY[2])[:, None]
     low, high = cast.min(axis=1), cast.max(axis=1)
@@ -58,7 +58,7 @@ def ground_shadow(casters: Casters) -> GroundShadow:
 
 
 def _splat(points: np.ndarray, weights: np.ndarray, origin: np.ndarray, texel: float, level: int) -> np.ndarray:
-    """Weights of points ``(2, N)`` summed on the patch, blurred by about ``2**level`` texels, ``(192, 192)``."""
+    """Sum weights of points ``(2, N)`` on the patch, blurred by about ``2**level`` texels, ``(192, 192)``."""
     size = _SIZE >> level
     x, y = np.floor((points - origin[:, None]) / (texel * 2**level)).astype(np.int32)
     inside = (x >= 0) & (x < size) & (y >= 0) & (y < size)

@@ -89,7 +89,7 @@ class Skin:
         return self._interpolation.shape[1]
 
     def deform(self, rotations: np.ndarray, positions: np.ndarray, particle_positions: np.ndarray) -> np.ndarray:
-        """Skin vertices of one simulated state.
+        """Compute the skin vertices of one simulated state.
 
         Args:
             rotations: world rotations of the bones, identity in the rest pose, shape ``(22, 3, 3)``.
@@ -110,11 +110,11 @@ class Skin:
         return (self._vertex_skinning @ transforms + self._interpolation @ displacement).astype(np.float32)
 
     def interpolate(self, per_particle: np.ndarray) -> np.ndarray:
-        """Carry a quantity of the particles to the skin, shape ``(P, ...)`` to ``(V, ...)``."""
+        """Interpolate a quantity of the particles on the skin, shape ``(P, ...)`` to ``(V, ...)``."""
         return self._interpolation @ np.asarray(per_particle, dtype=np.float64)
 
     def _transforms(self, rotations: np.ndarray, positions: np.ndarray) -> np.ndarray:
-        """Rest-to-world transforms stacked for the skinning matrices, shape ``(88, 3)``."""
+        """Return rest-to-world transforms stacked for the skinning matrices, shape ``(88, 3)``."""
         rotations = np.asarray(rotations, dtype=np.float64)
         translations = np.asarray(positions, dtype=np.float64) - np.einsum("bij,bj->bi", rotations, self._rest_joints)
         stacked = np.concatenate([rotations.transpose(0, 2, 1), translations[:, None, :]], axis=1)
@@ -122,7 +122,7 @@ class Skin:
 
 
 def _skinning_matrix(points: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> sparse.csr_array:
-    """Linear blend skinning as one sparse product: rows ``w_b (x, y, z, 1)``, shape ``(N, 88)``."""
+    """Build linear blend skinning as one sparse matrix: rows ``w_b (x, y, z, 1)``, shape ``(N, 88)``."""
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     joints = np.asarray(joints, dtype=np.int64)
     values = np.asarray(weights, dtype=np.float64)[:, :, None] * homogeneous[:, None, :]
@@ -134,7 +134,7 @@ def _skinning_matrix(points: np.ndarray, joints: np.ndarray, weights: np.ndarray
 
 
 def _joint_weights(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Skinning weights as one dense row a point, shape ``(N, 22)``."""
+    """Return skinning weights as one dense row a point, shape ``(N, 22)``."""
     dense = np.zeros((len(joints), NUM_JOINTS))
     np.add.at(dense, (np.arange(len(joints))[:, None], np.asarray(joints, dtype=np.int64)), weights)
     return dense
@@ -143,7 +143,7 @@ def _joint_weights(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
 def _interpolation_matrix(
     vertices: np.ndarray, vertex_weights: np.ndarray, particles: np.ndarray, particle_weights: np.ndarray
 ) -> sparse.csr_array:
-    """Weights of the nearest particles that move with each vertex's own bones, shape ``(V, P)``, rows sum to one.
+    """Weigh the nearest particles that move with each vertex's own bones, ``(V, P)``, rows sum to one.
 
     The nearest particle to the inside of one thigh may lie in the other: distance alone would glue them together.
     ``overlap = sum_b w_vertex,b w_particle,b`` is zero between them.
@@ -177,7 +177,7 @@ def _interpolation_matrix(
 def _select(
     distance: np.ndarray, index: np.ndarray, overlap: np.ndarray, compatible: np.ndarray, num_neighbours: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest compatible candidates of each row and their weights, both ``(rows, num_neighbours)``."""
+    """Return nearest compatible candidates of each row and their weights, both ``(rows, num_neighbours)``."""
     # A vertex that shares no bone with any candidate takes the nearest particles.
     compatible = np.where(compatible.any(axis=1, keepdims=True), compatible, True)
     overlap = np.where(compatible, np.maximum(overlap, 1e-6), 0.0)

@@ -29,7 +29,7 @@ class SoftwareBackend:
     def draw(
         self, topology: Topology, vertices: np.ndarray, colors: np.ndarray, shadow: GroundShadow, shot: Shot
     ) -> np.ndarray:
-        """One picture; see :class:`piavatar_envs.render.backend.Backend`."""
+        """Draw one picture; see :class:`piavatar_envs.render.backend.Backend`."""
         if topology is not self._topology:
             self._corners = wp.array(topology.faces, dtype=wp.vec3i, device="cpu")
             self._topology = topology

@@ -26,7 +26,7 @@ class SolidSurface:
         self._weight = weight / weight.sum(axis=1, keepdims=True)
 
     def deform(self, rotation: np.ndarray, position: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """World vertices [m], shape ``(V, 3)``.
+        """Return world vertices [m], shape ``(V, 3)``.
 
         Args:
             rotation: rest frame to world, shape ``(3, 3)``.

@@ -125,6 +125,6 @@ def _checked(frame: np.ndarray, shape: tuple[int, ...] | None, count: int) -> np
 
 
 def _even(frame: np.ndarray) -> np.ndarray:
-    """The frame with its last row or column doubled where a side is odd."""
+    """Return the frame with its last row or column doubled where a side is odd."""
     height, width = frame.shape[:2]
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge") if height % 2 or width % 2 else frame

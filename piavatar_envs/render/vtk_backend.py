@@ -18,7 +18,7 @@ _RINGS, _SEGMENTS = 14, 48
 
 
 def import_pyvista() -> ModuleType:
-    """The pyvista module.
+    """Return the pyvista module.
 
     Raises:
         ImportError: it is not installed; names the extra that has it.
@@ -55,7 +55,7 @@ class VtkBackend:
     def draw(
         self, topology: Topology, vertices: np.ndarray, colors: np.ndarray, shadow: GroundShadow, shot: Shot
     ) -> np.ndarray:
-        """One picture; see :class:`piavatar_envs.render.backend.Backend`."""
+        """Draw one picture; see :class:`piavatar_envs.render.backend.Backend`."""
         from PIL import Image  # comes with pyvista
 
         self._set_mesh(topology, vertices, colors)
@@ -92,7 +92,7 @@ class VtkBackend:
         self._mesh.Modified()
 
     def _add_ground(self) -> None:
-        """A disc that follows the camera's centre; its texture stays fixed to the world."""
+        """Add a disc that follows the camera's centre; its texture stays fixed to the world."""
         radius = np.concatenate([[0.0], np.linspace(ground.FADE_START, ground.FADE_END, _RINGS - 1)])
         angle = np.linspace(0.0, 2.0 * np.pi, _SEGMENTS, endpoint=False)
         disc = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
