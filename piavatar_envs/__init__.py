@@ -16,13 +16,18 @@ if TYPE_CHECKING:
     from piavatar_envs.api.conformance import check_task
     from piavatar_envs.avatar.body.sources import register_source
     from piavatar_envs.avatar.motion import register_motion
-    from piavatar_envs.envs.task import Task
+    from piavatar_envs.envs.observations import ObservationTerm
+    from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
     from piavatar_envs.mpm.materials import register_material
     from piavatar_envs.tasks.games import register_game
 
 #: Public names with heavy imports, and the modules that define them.
 _LAZY = {
+    "Metric": "piavatar_envs.envs.task",
+    "ObservationTerm": "piavatar_envs.envs.observations",
     "Task": "piavatar_envs.envs.task",
+    "TaskArray": "piavatar_envs.envs.task",
+    "Term": "piavatar_envs.envs.task",
     "check_task": "piavatar_envs.api.conformance",
     "register_game": "piavatar_envs.tasks.games",
     "register_material": "piavatar_envs.mpm.materials",
@@ -31,7 +36,11 @@ _LAZY = {
 }
 
 __all__ = [
+    "Metric",
+    "ObservationTerm",
     "Task",
+    "TaskArray",
+    "Term",
     "check_task",
     "register_game",
     "register_material",
