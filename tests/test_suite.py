@@ -1,4 +1,4 @@
-"""What every registered environment promises: the API checkers, determinism, observations, rewards."""
+"""Contract of every registered environment: the API checkers, determinism, observations, rewards."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ALMOST_CONSTANT = {
 
 
 def rollout(env, steps: int, seed: int | None = None, actions: int = 0, episodes: int = 1) -> list[tuple]:
-    """What the environment returned at every reset and step under random actions."""
+    """Answers of the environment to every reset and step under random actions."""
     rng, log = np.random.default_rng(actions), []
     for episode in range(episodes):
         observation, info = env.reset(seed=seed if episode == 0 else None)

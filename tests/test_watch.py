@@ -1,4 +1,4 @@
-"""``watch``: it plays for ever, does what the panel asks for, and ends quietly."""
+"""``watch``: endless play, the controls of the panel, and a quiet end."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_it_plays_one_episode_after_the_other(open_show):
     show, env, time, begun = open_show("PIAvatar/Reach-v0", episode_seconds=0.2)
     for turn in range(1, 16):
         show.turn()
-        if turn in (6, 12):  # the last step of an episode is told, however short it was
+        if turn in (6, 12):  # the last step of an episode is shown, however short it was
             assert "| step | 6 |" in table(show) and "| time | 0.20 s |" in table(show)
     assert len(begun) == 3 and steps_done(env) == 3
     assert time.now - 100.0 == pytest.approx(0.5)
@@ -85,7 +85,7 @@ def test_the_panel_sets_the_speed(open_show):
     assert time.now - 100.0 == pytest.approx(2.25 / 30.0)
 
 
-def test_who_pauses_sees_the_last_step(open_show):
+def test_a_pause_shows_the_last_step(open_show):
     """At high speed a screen is not sent every step; the last one is, when it stands still."""
     show, _, _, _ = open_show("PIAvatar/Reach-v0")
     show.panel.speed = 4.0
@@ -107,7 +107,7 @@ def test_the_panel_changes_the_colour_also_while_it_stands_still(open_show):
     assert steps_done(env) == 0
 
 
-def test_the_panel_tells_of_the_reward(open_show):
+def test_the_panel_shows_the_reward(open_show):
     show, *_ = open_show("PIAvatar/Reach-v0")
     show.panel.request_step()
     show.turn()

@@ -1,4 +1,4 @@
-"""Vectors of environments for the tests of this folder, and how two answers are compared."""
+"""Vectors of environments for the tests of this folder, and the comparison of two answers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def make_vec(device: str):
-    """A maker of vectors, ``make_vec(env_id, num_envs, **settings)``, tiny unless told otherwise.
+    """A maker of vectors, ``make_vec(env_id, num_envs, **settings)``, tiny by default.
 
     The same settings give the same object, because building takes longer than a test: begin with a seeded reset.
     """
@@ -53,7 +53,7 @@ def arrays_in_fixture():
 
 @pytest.fixture(scope="session")
 def same(equal):
-    """Whether two answers are alike all through: names, kinds, types, shapes, and numbers as ``equal`` says."""
+    """Assert that two answers are alike: names, types, shapes, and numbers by ``equal``."""
 
     def compare(a, b, where: str = "") -> None:
         assert type(a) is type(b), f"{where}: {type(a)} is not {type(b)}"

@@ -64,7 +64,7 @@ def pelvis_heights(env, agent: int = 0) -> np.ndarray:
 
 
 def let_be(env) -> None:
-    """Steps without torques, behind the view: whoever nothing helps sinks down."""
+    """Steps without torques, behind the view: a body without assistance sinks down."""
     for group in batches(env):
         group.action.zero_()
         for _ in range(STEPS):

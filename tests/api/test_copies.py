@@ -1,4 +1,4 @@
-"""copy.deepcopy and pickle: a copy goes on as the view it was made of, over the end of the episode and beyond."""
+"""Copies by copy.deepcopy and pickle go on as the view they were made of, over the ends of episodes."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_the_copy_is_another_world(make_env, equal):
 
 
 def test_a_failed_run_is_copied(make_env, same):
-    """What is not finite there is what it is, and no reason to refuse the copy."""
+    """Numbers that are not finite are no reason to refuse the copy of a failed run."""
     env = make_env("PIAvatar/KickBall-v0", **SHORT)
     env.reset(seed=0)
     state = env.get_state()
@@ -107,8 +107,8 @@ def test_a_failed_run_is_copied(make_env, same):
     assert_copies_go_on(env, same)
 
 
-def test_what_was_never_reset_stays_so(device, same):
-    """But for a seed it is different every time; help that was given before holds."""
+def test_a_copy_of_a_view_without_reset_needs_one(device, same):
+    """Without a seed it is different every time; root assistance set before is copied."""
     env = AvatarEnv("PushRecovery-v0", device=device, fidelity="tiny", **SHORT)
     env.assist_root(0.7)
     vector = AvatarVectorEnv("KickBall-v0", 2, device=device, fidelity="tiny")
@@ -121,7 +121,7 @@ def test_what_was_never_reset_stays_so(device, same):
     assert np.abs(starts[0] - starts[1]).max() > 1e-4
 
 
-def test_what_the_view_keeps_is_copied(device):
+def test_attributes_of_the_view_are_copied(device):
     env = gymnasium.make("PIAvatar/Reach-v0", device=device, fidelity="tiny")
     env.reset(seed=3)
     env.action_space.seed(5)
@@ -135,7 +135,7 @@ def test_what_the_view_keeps_is_copied(device):
         assert other.spec == env.spec and other.get_wrapper_attr("_has_reset")
 
 
-def test_ones_own_task_and_view(device, same):
+def test_users_tasks_and_views_are_copied(device, same):
     env = OwnEnv(device)
     env.reset(seed=0)
     env.step(actions_of(env, 1, seed=0)[0])
@@ -167,7 +167,7 @@ def play_vector(vector) -> list:
 @pytest.mark.parametrize("steps", [2, 6])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_vectors_go_on(make_vec, same, mode, steps):
-    """Also where some are about to be reset, and clocks run out apart."""
+    """Also where resets are pending and clocks run out at different times."""
     vector = make_vec("PIAvatar/KickBall-v0", 3, autoreset_mode=mode, **SHORT)
     vector.reset(seed=[5, 9, 2])
     actions = actions_of(vector, steps, seed=0)
@@ -231,7 +231,7 @@ def plain(answer):
 
 
 def play_learners(view, steps: int = 9, seed: int = 1) -> list:
-    """What a view for learners returns on the way over the ends of its episodes."""
+    """Answers of a view for learners, over the ends of its episodes."""
     import torch
 
     episodes, rng = view.host, np.random.default_rng(seed)
@@ -264,7 +264,7 @@ def test_views_for_learners_go_on(device, make, arrays_in, equal):
 
 
 def test_a_copy_for_rsl_rl_begins_no_episode(device, monkeypatch):
-    """A view of one's own may not be able to reset before the copy has what it keeps."""
+    """A user's view may be unable to reset before the copy has its attributes."""
     view = rsl_view(device)
     monkeypatch.setattr(type(view), "reset", None)
     other = copy.deepcopy(view)
@@ -273,7 +273,7 @@ def test_a_copy_for_rsl_rl_begins_no_episode(device, monkeypatch):
         made.close()
 
 
-def test_a_copy_of_what_was_closed_is_open(device):
+def test_a_copy_of_a_closed_view_is_open(device):
     vector = AvatarVectorEnv("Reach-v0", 2, device=device, fidelity="tiny", num_threads=2)
     vector.reset(seed=0)
     vector.close()
@@ -285,7 +285,7 @@ def test_a_copy_of_what_was_closed_is_open(device):
     assert other.closed
 
 
-def test_nobody_watches_a_copy_before_its_reset(device):
+def test_a_copy_opens_no_live_view_before_its_reset(device):
     pytest.importorskip("viser")
     env = AvatarEnv("Reach-v0", render_mode="human", device=device, fidelity="tiny")
     env.reset(seed=0)

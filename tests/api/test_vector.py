@@ -19,7 +19,7 @@ def actions_of(vector, steps: int, seed: int = 0) -> np.ndarray:
 
 
 def run(vector, actions) -> list:
-    """Answers of a run in which the caller does what DISABLED asks for."""
+    """Answers of a run with the resets that DISABLED leaves to the caller."""
     answers = []
     for action in actions:
         answers.append(vector.step(action))
@@ -61,7 +61,7 @@ def test_it_is_gymnasiums_vector_of_single_environments(make_vec, make_env, env_
 
 
 def test_bodies_and_worlds_that_differ_are_those_of_single_environments(make_vec, make_env, same):
-    """What every episode draws anew depends on seed and episode, and neither on the batch nor on its threads."""
+    """Random numbers of an episode depend on seed and episode, and neither on the batch nor on its threads."""
     settings = {
         "shape.randomize": True,
         "randomize.mass_factor": (0.8, 1.25),
@@ -176,7 +176,7 @@ def test_what_is_no_seed_is_refused(make_vec, seed):
 
 
 def test_a_refused_reset_leaves_its_mask(make_vec):
-    """Who tries again with the same options resets the same environments, not all of them."""
+    """A second call with the same options resets the same environments, not all of them."""
     vector = make_vec("PIAvatar/Reach-v0", 2)
     vector.reset(seed=5)
     options = {"reset_mask": np.array([False, True])}

@@ -1,4 +1,4 @@
-"""What a vector takes and refuses, whose the arrays are that it returns, and that neither threads nor torch matter."""
+"""Vectors: accepted and refused arguments, ownership of returned arrays, independence of threads and array kinds."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def _tensor(vector, action: np.ndarray):
 
 @pytest.mark.parametrize(("mode", "obs_mode"), [("NextStep", "dict"), ("SameStep", "flat"), ("Disabled", "flat")])
 def test_tensors_say_what_arrays_say(make_vec, env_id, equal, mode, obs_mode):
-    """The same numbers and names; a tensor knows failures by their bits, and ends as a whole batch with a mask."""
+    """The same numbers and names; a tensor has failures as bits, and ends as a whole batch with a mask."""
     torch = pytest.importorskip("torch")
     settings = {**SHORT, "autoreset_mode": mode, "obs_mode": obs_mode}
     numpy, tensor = (make_vec(env_id, 3, array_api=name, **settings) for name in ("numpy", "torch"))
@@ -358,7 +358,7 @@ def test_a_restored_vector_needs_no_reset(device, same):
 
 
 def test_threads_never_capture_at_once(device):
-    """Warp records one graph at a time: what was restored captures in turns, though nobody begins an episode yet."""
+    """Warp records one graph at a time: what was restored captures in turns, though no episode begins yet."""
     settings = {"device": device, "fidelity": "tiny", "num_threads": 2}
     vector, fresh = (AvatarVectorEnv("KickBall-v0", 3, **settings) for _ in range(2))
     vector.reset(seed=1)

@@ -164,7 +164,7 @@ def test_closing_frees_the_port(capsys, monkeypatch):
 
 
 def test_no_page_of_the_browser_can_publish_it(view, monkeypatch):
-    """The library would open a tunnel to the internet for whoever sends the message of its button."""
+    """The library would open a tunnel to the internet for any page that sends the message of its button."""
     from viser import _messages
 
     handlers = view.server._websock_server._incoming_handlers[_messages.ShareUrlRequest]

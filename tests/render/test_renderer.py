@@ -100,7 +100,7 @@ def test_the_camera_follows(body):
 
 
 def test_the_camera_glides_by_time_not_by_pictures(body):
-    """Behind somebody who walks it is where it is, in one picture or in six; and where no time goes by it stays."""
+    """Its place behind a walking body does not depend on the number of pictures; without time it stays."""
 
     def left_of(times: list[float]) -> int:
         with Renderer(SIZE, SIZE, camera=Camera(follow=0.2), backend="software") as renderer:
