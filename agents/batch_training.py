@@ -1,4 +1,4 @@
-"""What trainings on one batch have in common, whichever library learns: configuration, command line, evaluation.
+"""Trainings on one batch, for any library: configuration, command line, evaluation.
 
 A batch advances all its environments in the same kernel launches and hands out tensors on their device. The learning
 itself is in ``agents/skrl/train.py`` and ``agents/rsl_rl/train.py``.

@@ -1,7 +1,4 @@
-"""What a training leaves for people: table, learning curve, JSON.
-
-The learning curve of a training, whichever library learns.
-"""
+"""Reports of a training: tables, the learning curve, and JSON."""
 
 from __future__ import annotations
 

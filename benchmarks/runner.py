@@ -35,7 +35,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class Options:
-    """What every benchmark understands; a benchmark adds its own in a subclass."""
+    """Options of every benchmark; a benchmark adds its own in a subclass."""
 
     #: JSON file to write; without it the results go to the terminal
     out: Path | None = None
@@ -44,7 +44,7 @@ class Options:
 
 
 def progress(items: Iterable[Item], description: str, total: int | None = None) -> Iterable[Item]:
-    """``items`` with a progress bar on stderr; silent where stderr is not a terminal."""
+    """Wrap ``items`` in a progress bar on stderr; silent where stderr is not a terminal."""
     return tqdm(items, desc=description, total=total, disable=None, dynamic_ncols=True)
 
 
@@ -54,7 +54,7 @@ def main(
     options: type[Options] = Options,
     args: Sequence[str] | None = None,
 ) -> dict[str, Any]:
-    """Parse the command line, run all cases, write the JSON; returns what was written.
+    """Parse the command line, run all cases, write the JSON, and return what was written.
 
     Args:
         benchmark: its name in the JSON.

@@ -31,7 +31,7 @@ TABLE = "torque_baselines.json"
 
 @dataclass(frozen=True)
 class Job:
-    """The command that scores one agent.
+    """Command that scores one agent.
 
     Attributes:
         source: folder of the agent among the results.
@@ -99,7 +99,7 @@ def find_jobs(results: Path, out: Path, device: str, bone_contact: bool | None =
 
 
 def scored_on(folder: Path) -> bool | None:
-    """Return ``control.bone_contact`` of a policy's last evaluation; None if it does not say."""
+    """Return ``control.bone_contact`` of a policy's last evaluation; None if it has none."""
     path = folder / "evaluation.json"
     env = read_json(path).get("env", {}) if path.is_file() else {}
     return env.get("control", {}).get("bone_contact")

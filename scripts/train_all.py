@@ -48,14 +48,14 @@ WAIT = 0.2
 
 @dataclass(frozen=True)
 class Job:
-    """A training: its configuration, seed and folder."""
+    """Training with its configuration, seed and folder."""
 
     config: Path
     seed: int
     folder: Path
 
     def is_over(self, settings: tuple[str, ...]) -> bool:
-        """Whether it has had all that is asked for: its scores are the last that it writes.
+        """Return whether the training is complete: its scores are the last file that it writes.
 
         Args:
             settings: that win over the file's.
@@ -81,13 +81,13 @@ class Job:
         return not longer and had["evaluation"] == asked["evaluation"]
 
     def command(self, device: str, settings: tuple[str, ...]) -> list[str]:
-        """What trains it, or goes on with it."""
+        """Return the command that trains, or resumes the training."""
         script = SCRIPTS[self.config.parent.name]
         where = ["--device", device, "--out", str(self.folder), "--resume"]
         return [sys.executable, "-m", script, str(self.config), f"seed={self.seed}", *settings, *where]
 
     def run(self, gpu: str | None, settings: tuple[str, ...], time_is_up: Callable[[], bool]) -> str:
-        """Train on a GPU, or without one on the CPU, until it is over or ``time_is_up``; returns what went wrong."""
+        """Train on a GPU or the CPU until the training or the time is over, and return the error, if any."""
         if self.is_over(settings) or time_is_up():
             return ""
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -106,7 +106,7 @@ class Job:
 
 
 def end(process: subprocess.Popen) -> None:
-    """Kill a training and the processes that it has; its checkpoints are whole whenever that happens."""
+    """Kill a training and its processes; its checkpoints are written atomically, so none is damaged."""
     if hasattr(os, "killpg"):
         with contextlib.suppress(ProcessLookupError):  # it has ended by itself
             os.killpg(process.pid, signal.SIGKILL)
@@ -179,7 +179,7 @@ def main(
 
 
 def find(names: tuple[str, ...]) -> list[Path]:
-    """Files of configurations by their names, each once, all if there are none.
+    """Return files of configurations by their names, each once, or all if there are no names.
 
     Raises:
         ValueError: there is none of a name.
@@ -192,7 +192,7 @@ def find(names: tuple[str, ...]) -> list[Path]:
 
 
 def as_by_ctrl_c(*_: object) -> None:
-    """Where the terminal is gone, or the system asks for an end, trainings must not go on by themselves."""
+    """Raise KeyboardInterrupt, so that trainings end with the terminal or at the system's request."""
     raise KeyboardInterrupt
 
 

@@ -1,4 +1,4 @@
-"""What every training with stable-baselines3 does: begin or go on, watch, book the episodes, leave policies.
+"""Learning with stable-baselines3: begin or resume, log episodes, write checkpoints and policies.
 
 What a training with stable-baselines3 depends on, taken out of a model and put back.
 """

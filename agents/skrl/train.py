@@ -150,7 +150,7 @@ class WorldMAPPO(MAPPO):
         }
 
     def _modules(self) -> Iterable[tuple[str, dict[str, Any]]]:
-        """Return networks and optimizers of every agent."""
+        """Yield networks and optimizers of every agent."""
         for name, modules in self.checkpoint_modules.items():
             yield name, {part: module for part, module in modules.items() if hasattr(module, "state_dict")}
 

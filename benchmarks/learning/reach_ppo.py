@@ -1,4 +1,4 @@
-"""What PPO learns of Reach in the steps that ``make demo`` has, over several seeds, beside agents that do not learn.
+"""PPO on Reach with the steps of ``make demo``, over several seeds, beside agents that do not learn.
 
 ``python -m benchmarks.learning.reach_ppo --seeds 3 --out benchmarks/results/reach_demo.json``. Every seed trains its
 own policy; the episodes that are evaluated are the same for all seeds and agents. The last row is the mean over the
@@ -41,7 +41,7 @@ class Options(runner.Options):
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """A row for every agent that does not learn, for every seed's policy, and for their mean."""
+    """Yield a row for every agent that does not learn, for every seed's policy, and for their mean."""
     config = load_training(CONFIG, parse_assignments(options.settings))
     make = factory(config, options.device)
     facts = prepare(make)
@@ -69,7 +69,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 
 def _row(trained: Evaluation, references: Sequence[Evaluation], curve: Curve, config: TrainingConfig) -> dict[str, Any]:
-    """One policy: how well it does, and how it was learned."""
+    """Return the row of one policy: its evaluation, and the cost of its training."""
     parts = [part for part in np.array_split(np.arange(len(curve.steps)), _BINS) if part.size]
     return {
         **trained.row(),
@@ -84,7 +84,7 @@ def _row(trained: Evaluation, references: Sequence[Evaluation], curve: Curve, co
 
 
 def _over_seeds(returns: Sequence[float]) -> dict[str, Any]:
-    """The mean of the policies' mean returns, and its interval over seeds."""
+    """Return the mean of the policies' mean returns, and its interval over seeds."""
     estimate = mean_and_interval(returns)
     return {
         "case": "PPO over seeds",

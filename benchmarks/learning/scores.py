@@ -52,12 +52,12 @@ class Options(runner.Options):
 
 
 def every_environment() -> list[str]:
-    """Registered ids, then modules of several agents."""
+    """Return the registered ids, then the modules of several agents."""
     return [*task_modules(), *listed_games()]
 
 
 def training_config(env_id: str, options: Options) -> TrainingConfig:
-    """What is trained, from the environment's own file or the generic settings."""
+    """Return the training configuration of an environment, from its own file or the generic settings."""
     own = ROOT / "configs" / f"{env_id.rpartition('/')[2].lower().replace('-', '_')}_scores.yaml"
     source: Any = own if own.is_file() else {"env_id": env_id, **GENERIC}
     changes = {
@@ -70,13 +70,13 @@ def training_config(env_id: str, options: Options) -> TrainingConfig:
 
 
 def row(env_id: str, evaluation: Evaluation, trained_for: int | None = None) -> dict[str, Any]:
-    """One row of the results."""
+    """Return one row of the results."""
     figures = {key: value for key, value in evaluation.row().items() if key != "case"}
     return {"case": env_id, "agent": evaluation.agent, "trained_for_steps": trained_for, **figures}
 
 
 def score(env_id: str, options: Options) -> Iterator[dict[str, Any]]:
-    """Rows of one environment."""
+    """Yield the rows of one environment."""
     config = training_config(env_id, options)
     make = factory(config, options.device)
     facts = prepare(make)
@@ -100,12 +100,12 @@ def score(env_id: str, options: Options) -> Iterator[dict[str, Any]]:
 
 
 def _in_every_seat(agent: Agent, agents: int) -> Agent:
-    """The same agent for all of a world; itself where there is one."""
+    """Return the agent for all seats of a world, or the agent itself for a single one."""
     return seated([agent] * agents) if agents else agent
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Rows of all environments."""
+    """Yield the rows of all environments."""
     for env_id in options.ids or every_environment():
         yield from score(env_id, options)
 

@@ -25,14 +25,14 @@ HEAD = View(eye=(1.25, -1.7, 1.7), target=(0.0, -0.1, 1.38), moments=(0.2,))
 
 
 def ball(mass: float, position: tuple, velocity: tuple = (0.0, 0.0, 0.0), young: float | None = None) -> PropConfig:
-    """A ball of 22 cm."""
+    """Return a ball of 22 cm."""
     return PropConfig(
         name="ball", size=(BALL_RADIUS,), mass=mass, position=position, velocity=velocity, young_modulus=young
     )
 
 
 def low_kick() -> Script:
-    """A kick with the right foot along the ground, from the moment when the weight is on the left leg."""
+    """Return a kick with the right foot along the ground, once the weight is on the left leg."""
     guard = {
         "left_arm": Arm((0.55, -0.35, -0.75), (0.05, -0.8, 0.35)),
         "right_arm": Arm((0.55, -0.35, -0.75), (0.05, -0.8, 0.35)),
@@ -52,7 +52,7 @@ def low_kick() -> Script:
 
 
 def kicks(masses: tuple[float, ...] = (0.5, 1.5, 8.0)) -> list[Act]:
-    """The same kick without a ball, and at balls of some masses lying on the ground."""
+    """Return acts of the same kick without a ball, and at balls of several masses lying on the ground."""
     act = Act(
         "kick, no ball",
         seconds=1.2,
@@ -70,7 +70,7 @@ def kicks(masses: tuple[float, ...] = (0.5, 1.5, 8.0)) -> list[Act]:
 
 
 def throws(moduli: tuple[float, ...] = (1e3, 1e4, 1e5, 1e6, 1e7)) -> list[Act]:
-    """A ball of 1.5 kg thrown at the chest at 4 m/s, from soft to stiff."""
+    """Return acts of a ball of 1.5 kg thrown at the chest at 4 m/s, from soft to stiff."""
     start = (0.0, CHEST[1] - BALL_RADIUS - 0.25, CHEST[2])
     view = View(eye=(2.0, -1.35, 1.45), target=(0.0, -0.3, 1.15), moments=(0.1, 0.1667))
     return [
@@ -86,7 +86,7 @@ def throws(moduli: tuple[float, ...] = (1e3, 1e4, 1e5, 1e6, 1e7)) -> list[Act]:
 
 
 def head_hits(tones: tuple[float, ...] = (1.0, 0.3, 0.0)) -> list[Act]:
-    """A ball of 4 kg thrown at the face at 6 m/s; the avatar tensed, at ease, limp."""
+    """Return acts of a ball of 4 kg thrown at the face at 6 m/s, with the avatar tensed, at ease and limp."""
     thrown = ball(4.0, (0.0, FACE[1] - BALL_RADIUS - 0.2, FACE[2] + 0.02), (0.0, 6.0, 0.0))
     return [
         Act(
@@ -102,7 +102,7 @@ def head_hits(tones: tuple[float, ...] = (1.0, 0.3, 0.0)) -> list[Act]:
 
 
 def crowd(mesh: Path) -> Act:
-    """A ball, a box, a capsule and the solid of a mesh file at one avatar, all at once."""
+    """Return an act of a ball, a box, a capsule and the solid of a mesh file that hit one avatar at once."""
     props = (
         PropConfig(name="ball", size=(0.12,), mass=2.0, position=(0.25, -0.75, 1.15), velocity=(-0.6, 4.0, 1.0)),
         PropConfig(
@@ -128,7 +128,7 @@ def crowd(mesh: Path) -> Act:
 
 
 def belly_dents() -> list[Act]:
-    """A heavy ball pushed into the belly of a limp avatar, with and without shape preservation."""
+    """Return acts of a heavy ball pushed into a limp avatar's belly, with and without shape preservation."""
     thrown = ball(5.0, (0.0, BELLY[1] - BALL_RADIUS - 0.1, BELLY[2]), (0.0, 3.0, 0.0))
     found = []
     for alpha, kind in ((0.0, "physical"), (0.3, "physical"), (1.0, "physical"), (0.3, "kinematic")):
@@ -147,7 +147,7 @@ def belly_dents() -> list[Act]:
 
 
 def crossed_legs() -> list[Act]:
-    """Legs crossed and opened again off the ground, with and without velocity fields for the limbs.
+    """Return acts of legs crossed and opened off the ground, with and without velocity fields for the limbs.
 
     Once the left leg passes in front of the right one, as far as commanded poses go; once both want the same place.
     """
@@ -172,7 +172,7 @@ def crossed_legs() -> list[Act]:
 
 
 def pillows(moduli: tuple[float, ...] = (1e3, 2e3, 5e3, 1e5)) -> list[Act]:
-    """A pillow of 0.6 kg thrown at the head at 5 m/s; the last is as stiff as flesh."""
+    """Return acts of a pillow of 0.6 kg thrown at the head at 5 m/s; the last is as stiff as flesh."""
     found = []
     for young in moduli:
         pillow = PropConfig(
@@ -193,7 +193,7 @@ def pillows(moduli: tuple[float, ...] = (1e3, 2e3, 5e3, 1e5)) -> list[Act]:
 
 
 def cans(mesh: Path) -> list[Act]:
-    """A can of 0.35 kg against head, belly and ankle at one speed, on flesh and on a region of another material."""
+    """Return acts of a can of 0.35 kg against head, belly and ankle, on flesh and on a region of another material."""
     top, down = load_asset().mean_body().vertices[:, 2].max(), (0.0, 0.0, -CAN_SPEED)
     hair = RegionConfig(joints=("head",), beyond=0.05, material="fixed_corotated", young_modulus=7e2)
     garment = RegionConfig(
@@ -234,7 +234,7 @@ def _modulus(regions: tuple[RegionConfig, ...]) -> float | None:
 
 
 def jumps() -> list[Act]:
-    """A jump of a person with a belly: flesh that keeps to its bones, and soft flesh that is late."""
+    """Return acts of a jump: with flesh that keeps to its bones, and with soft flesh that lags."""
     if JUMP_CLIP in list_motions():
         motion = load_motion(JUMP_CLIP)
         script, seconds, clip = played(motion.translated([*-motion.root_position[0, :2], 0.0])), 1.75, JUMP_CLIP

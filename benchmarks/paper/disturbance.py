@@ -46,7 +46,7 @@ class Ball:
 
     @property
     def impulse(self) -> float:
-        """Impulse on the chest [N s]."""
+        """Return the impulse on the chest [N s]."""
         return (1.0 + RESTITUTION) * self.mass * self.speed / (1.0 + self.mass / CHEST_MASS)
 
 
@@ -60,7 +60,7 @@ BALLS = (
 
 @dataclass
 class Course:
-    """What a struck body did: one entry a control step, shape ``(CONTROL_STEPS, num_envs)``."""
+    """Motion of a struck body: one entry per control step, shape ``(CONTROL_STEPS, num_envs)``."""
 
     joint_error: np.ndarray  # worst joint [rad]
     last_errors: np.ndarray  # of every joint at the end [rad], shape (num_envs, 21)
@@ -73,7 +73,7 @@ class Course:
 
 
 def plan(seeds: int, quick: bool, world: World) -> Iterator[Callable[[], Iterator[dict[str, Any]]]]:
-    """Every case, as a function that yields its rows."""
+    """Yield every case, as a function that yields its rows."""
     steps = 4 if quick else CONTROL_STEPS
     free = replace(world, num_substeps=None)
     standing = replace(free, gravity=9.81, ground=True)
@@ -86,7 +86,7 @@ def plan(seeds: int, quick: bool, world: World) -> Iterator[Callable[[], Iterato
 
 
 def struck_free(world: World, control: PoseControlConfig, seeds: int, steps: int) -> Iterator[dict[str, Any]]:
-    """A body adrift without gravity, struck on the chest or on a forearm: a row for each."""
+    """Yield rows of a body adrift without gravity, struck on the chest or on a forearm."""
     rng = np.random.default_rng(3)
     bones = np.repeat([joint_index(name) for name in STRIKES], seeds)
     size = np.repeat(list(STRIKES.values()), seeds)
@@ -102,7 +102,7 @@ def struck_free(world: World, control: PoseControlConfig, seeds: int, steps: int
 
 
 def hit_by_balls(world: World, control: PoseControlConfig, seeds: int, steps: int) -> Iterator[dict[str, Any]]:
-    """A standing body, its root held by the wrench, and what balls would give its chest from the front."""
+    """Yield rows of a standing body, its root held by the wrench, under the impulses of balls on its chest."""
     rng = np.random.default_rng(4)
     shapes = np.tile(random_shapes(load_asset(), rng, seeds), (len(BALLS), 1))
     size = np.repeat([ball.impulse for ball in BALLS], seeds)
@@ -125,7 +125,7 @@ def hit_by_balls(world: World, control: PoseControlConfig, seeds: int, steps: in
 
 
 def follow(rig: Rig, poses: np.ndarray, bones: np.ndarray, impulses: np.ndarray, steps: int) -> Course:
-    """Strike every body once, then hold the pose and watch."""
+    """Strike every body once, then hold the pose and record."""
     rig.reset(poses)
     rig.step(poses)
     ledger = [_totals(rig)]
@@ -151,7 +151,7 @@ def follow(rig: Rig, poses: np.ndarray, bones: np.ndarray, impulses: np.ndarray,
 def _row(
     case: str, world: World, control: PoseControlConfig, course: Course, mine: slice, seeds: int
 ) -> dict[str, Any]:
-    """What every struck body has: mean over seeds and standard deviation."""
+    """Return mean and standard deviation over seeds of all figures of struck bodies."""
     alive = np.arange(len(course.alive))[mine][course.alive[mine]]
     error, shape = np.degrees(course.joint_error[:, alive]), 1e3 * course.shape_error[:, alive]
     strain = course.strain[:, alive]
@@ -188,7 +188,7 @@ def _row(
 
 
 def _conservation(course: Course, mine: slice) -> dict[str, float]:
-    """Momentum and energy of bodies that nothing holds: the worst of them, relative to what the strike brought."""
+    """Return the worst errors of momentum and energy of free bodies, relative to what the strike brought."""
     linear, angular, rises = [0.0], [0.0], [0.0]
     for env in np.arange(len(course.alive))[mine][course.alive[mine]]:
         before, struck, *later = (totals_of[env] for totals_of in course.ledger)
@@ -206,7 +206,7 @@ def _conservation(course: Course, mine: slice) -> dict[str, float]:
 
 
 def _recovery_time(error: np.ndarray) -> float | None:
-    """Seconds from the strike until the worst joint stays within :data:`RECOVERED_DEG`; None if it does not."""
+    """Return the time from the strike until the worst joint stays within :data:`RECOVERED_DEG` [s], or None."""
     outside = np.flatnonzero(error >= RECOVERED_DEG)
     if len(outside) == 0:
         return 0.0
@@ -214,7 +214,7 @@ def _recovery_time(error: np.ndarray) -> float | None:
 
 
 def _totals(rig: Rig) -> list[Totals]:
-    """Of every body; of none in a world that adds momentum of its own."""
+    """Return the totals of every body; of none in a world that adds momentum of its own."""
     if rig.world.gravity or rig.world.ground:
         return []
     return [totals(rig.model, rig.state, env) for env in range(rig.num_envs)]

@@ -1,4 +1,4 @@
-"""What is read off the courses of the supplement's acts: a row of numbers for each."""
+"""Measures of the supplement's acts: a row of numbers from the course of each."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ JIGGLING = 0.6  # softness of the flesh that is watched
 
 
 def settled(course: Course, values: np.ndarray) -> float:
-    """Mean over the last moments."""
+    """Return the mean over the last moments."""
     return float(values[course.time > course.time[-1] - LAST_SECONDS].mean())
 
 
 def pose_error(course: Course) -> Row:
-    """Worst joint, at its peak and in the end, and which it is."""
+    """Return the worst joint's error, at its peak and in the end, and the joint's name."""
     worst = course.joint_errors.max(1)
     peak = int(worst.argmax())
     return {
@@ -35,7 +35,7 @@ def pose_error(course: Course) -> Row:
 
 
 def contact(course: Course, subject: int = 1) -> Row:
-    """Impulse that a subject gave the avatar: its sum, and the most in a control step; depth in each other."""
+    """Return the impulse of a subject on the avatar, in sum and at most in a control step, and the depth of contact."""
     impulse = np.linalg.norm(course.impulse[:, :, subject].sum(1), axis=1)
     return {
         "impulse_n_s": float(np.linalg.norm(course.impulse[:, :, subject].sum((0, 1)))),
@@ -45,7 +45,7 @@ def contact(course: Course, subject: int = 1) -> Row:
 
 
 def kick(course: Course) -> Row:
-    """How much the ball bends the leg that kicks it, and how fast it leaves."""
+    """Measure the bend of the kicking leg and the speed of the ball."""
     error = course.errors_of("right_hip", "right_knee", "right_ankle", "right_foot")
     row = pose_error(course) | {"peak_leg_error_deg": float(error.max()), "mean_error_deg": course.joint_errors.mean()}
     if course.stage.simulation.props.names:
@@ -54,7 +54,7 @@ def kick(course: Course) -> Row:
 
 
 def throw(course: Course) -> Row:
-    """How much a thrown ball is dented; a ball has one length along the throw, the shortest counts."""
+    """Measure the dent of a thrown ball; of its lengths the one along the throw, the shortest, counts."""
     prop = course.stage.simulation.props.props[0]
     along = np.ptp(course.x[:, prop.first : prop.first + prop.count, 1], axis=1)
     return contact(course) | {
@@ -65,7 +65,7 @@ def throw(course: Course) -> Row:
 
 
 def head_hit(course: Course) -> Row:
-    """How far neck and head are bent, at the worst and in the end."""
+    """Measure the bend of neck and head, at the worst and in the end."""
     head = course.errors_of("neck", "head")
     bent = course.errors_of("left_hip", "left_knee", "right_hip", "right_knee", "spine1", "spine2", "spine3")
     return (
@@ -80,7 +80,7 @@ def head_hit(course: Course) -> Row:
 
 
 def crowd(course: Course) -> Row:
-    """Whether everything touched, and what it did."""
+    """Measure the contacts of all props with the avatar."""
     simulation = course.stage.simulation
     row = pose_error(course)
     for subject, name in enumerate(simulation.props.names, start=1):
@@ -92,13 +92,13 @@ def crowd(course: Course) -> Row:
 
 
 def near(course: Course, place: Sequence[float], reach: float = NEAR) -> np.ndarray:
-    """The avatar's particles around a place of the standing body, shape ``(P,)`` bool."""
+    """Return a mask ``(P,)`` of the avatar's particles around a place of the standing body."""
     rest = course.stage.simulation.flesh[0].points.rest[0]
     return np.linalg.norm(rest - np.asarray(place), axis=1) < reach
 
 
 def belly(course: Course) -> Row:
-    """The dent of the belly, at its deepest and later."""
+    """Measure the dent of the belly, at its deepest and later."""
     dent = 1e3 * course.displacements(near(course, acts.BELLY))
     deepest = int(dent.mean(1).argmax())
 
@@ -115,7 +115,7 @@ def belly(course: Course) -> Row:
 
 
 def legs(course: Course) -> Row:
-    """How much of the legs is in one another, and whether they come back."""
+    """Measure the overlap of the legs, and their pose afterwards."""
     part, names = course.stage.simulation.flesh[0].part, list(BODY_PARTS)
     volume = course.stage.simulation.model.particles.volume.numpy()[0, : len(part)]
     left, right = (part == names.index(f"{side}_leg") for side in ("left", "right"))
@@ -132,7 +132,7 @@ def legs(course: Course) -> Row:
 
 
 def overlap_volume(course: Course, x: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
-    """Volume [m^3] that two sets of the avatar's particles both fill, with particles at ``x`` [m].
+    """Return the volume [m^3] that two sets of the avatar's particles both fill, with particles at ``x`` [m].
 
     Volumes are spread by quadratic B-splines, as the solver spreads masses, over nodes half a grid spacing apart: about
     one for each particle, so that surfaces that only touch are blurred by little.
@@ -156,7 +156,7 @@ def overlap_volume(course: Course, x: np.ndarray, first: np.ndarray, second: np.
 
 
 def pillow(course: Course) -> Row:
-    """What a pillow does to the head, and the head to the pillow."""
+    """Measure the effects of a pillow and the head on each other."""
     return contact(course) | {
         "peak_head_deg": float(course.errors_of("neck", "head").max()),
         "peak_pillow_dent_mm": 1e3 * float(course.dent.max()),
@@ -164,7 +164,7 @@ def pillow(course: Course) -> Row:
 
 
 def can(course: Course) -> Row:
-    """Response of a place of the body to a can."""
+    """Measure the response of a place of the body to a can."""
     simulation = course.stage.simulation
     way = course.speed[0, 0] / np.linalg.norm(course.speed[0, 0])
     hit = int(np.linalg.norm(course.impulse[:, :, 1].sum(1), axis=1).argmax())
@@ -179,7 +179,7 @@ def can(course: Course) -> Row:
 
 
 def jump(course: Course) -> Row:
-    """Motion of the belly's soft flesh relative to its bones, from the landing on."""
+    """Measure the motion of the belly's soft flesh relative to its bones, from the landing on."""
     flesh = course.stage.simulation.flesh[0]
     points, sampled = flesh.points, flesh.sampled
     rest, low, high = points.rest[0], *(course.stage.simulation.asset.joints[[0, 6], 2])

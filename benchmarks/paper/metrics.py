@@ -18,7 +18,7 @@ from agents.intervals import mean_and_interval
 
 
 def distance_metrics(distances: Sequence[np.ndarray]) -> dict[str, float]:
-    """Mean, root mean square and accuracy of distances [m], every particle of every body alike."""
+    """Return mean, root mean square and accuracy of distances [m] over all particles of all bodies."""
     if not distances:
         return {"mean_distance_m": math.nan, "rmse_m": math.nan, "acc_at_1cm": math.nan}
     d = np.concatenate(distances)
@@ -30,7 +30,7 @@ def distance_metrics(distances: Sequence[np.ndarray]) -> dict[str, float]:
 
 
 def pose_metrics(errors: Sequence[dict[str, np.ndarray]]) -> dict[str, float]:
-    """Mean Kabsch errors in degrees and metres."""
+    """Return mean Kabsch errors in degrees and metres."""
 
     def mean(name: str) -> float:
         values = np.concatenate([error[name].ravel() for error in errors])
@@ -45,7 +45,7 @@ def pose_metrics(errors: Sequence[dict[str, np.ndarray]]) -> dict[str, float]:
 
 
 def spread(samples: Sequence[dict[str, float]]) -> dict[str, float | None]:
-    """Of every metric its mean over seeds, the standard deviation and half of the 95 % interval of the mean.
+    """Return of every metric its mean over seeds, the standard deviation and half of the mean's 95 % interval.
 
     A value that does not exist (every body of a seed has failed) is left out; None where nothing is left.
     """
@@ -73,7 +73,7 @@ TABLE_2_RELATIVE_ROTATION = (0.10, 0.32)
 
 
 def table_1(decoupling: str, substeps: int) -> dict[str, Any]:
-    """What the paper has for a row of Table 1; None where it has nothing."""
+    """Return the paper's row of Table 1; None where it has no figure."""
     if decoupling == "none":
         return {"mean_distance_m": TABLE_1_UNDECOUPLED, "acc_at_1cm": None}
     return {
@@ -83,7 +83,7 @@ def table_1(decoupling: str, substeps: int) -> dict[str, Any]:
 
 
 def table_2() -> dict[str, Any]:
-    """The paper's ranges for Table 2."""
+    """Return the paper's ranges for Table 2."""
     return {
         "root_rotation_deg": list(TABLE_2_ROOT_ROTATION),
         "relative_rotation_deg": list(TABLE_2_RELATIVE_ROTATION),

@@ -16,7 +16,7 @@ ROOT_SHIFT = 0.05  # standard deviation of each component of the root's displace
 
 
 def random_pose(rng: np.random.Generator, joint_range: float = JOINT_RANGE) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation vectors of the joints ``(22, 3)`` [rad], uniform in their ranges, and the root's shift ``(3,)`` [m]."""
+    """Draw rotation vectors ``(22, 3)`` [rad], uniform in the joints' ranges, and the root's shift ``(3,)`` [m]."""
     lower, upper = joint_limits()
     rotation = joint_range * rng.uniform(lower, upper)
     rotation[0] = ROOT_TURN * rng.standard_normal(3)
@@ -26,14 +26,14 @@ def random_pose(rng: np.random.Generator, joint_range: float = JOINT_RANGE) -> t
 def random_poses(
     rng: np.random.Generator, count: int, joint_range: float = JOINT_RANGE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` independent poses: rotation vectors ``(count, 22, 3)`` [rad] and root shifts ``(count, 3)`` [m]."""
+    """Draw ``count`` independent poses: rotation vectors ``(count, 22, 3)`` [rad], root shifts ``(count, 3)`` [m]."""
     poses = [random_pose(rng, joint_range) for _ in range(count)]
     rotations = np.array([rotation for rotation, _ in poses]).reshape(count, NUM_JOINTS, 3)
     return rotations, np.array([shift for _, shift in poses]).reshape(count, 3)
 
 
 def passing_through(rotations: np.ndarray, shifts: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same poses, reached from the rest pose along arcs in ``steps`` steps each.
+    """Interpolate poses along arcs from the rest pose on, ``steps`` steps each.
 
     Args:
         rotations: poses as rotation vectors [rad], shape ``(count, 22, 3)``.
@@ -56,13 +56,13 @@ def passing_through(rotations: np.ndarray, shifts: np.ndarray, steps: int) -> tu
 
 
 def random_shapes(asset: AvatarAsset, rng: np.random.Generator, count: int) -> np.ndarray:
-    """Shape parameters of ``count`` random people, the sexes alternating, shape ``(count, S)``."""
+    """Draw shape parameters of ``count`` bodies, the sexes alternating, shape ``(count, S)``."""
     shapes = asset.sample_parameters(rng, count)
     shapes[:, asset.shape_names.index("sex")] = np.where(np.arange(count) % 2 == 0, -1.0, 1.0)
     return shapes
 
 
 def random_directions(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Random unit vectors, shape ``(count, 3)``."""
+    """Draw random unit vectors, shape ``(count, 3)``."""
     vectors = rng.standard_normal((count, 3))
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -28,12 +28,12 @@ Script = Callable[[float], Pose]
 
 
 def standing(_time: float) -> Pose:
-    """The rest pose, upright."""
+    """Return the rest pose, upright."""
     return np.zeros((NUM_JOINTS, 3)), load_asset().joints[0].astype(float)
 
 
 def keyed(*keys: tuple[float, dict[str, Sequence[float]]]) -> Script:
-    """Poses at times: joints by name with their rotation vectors [rad], and ``root``, a shift of the pelvis [m].
+    """Interpolate poses at times: joints by name with rotation vectors [rad], and ``root``, a shift of the pelvis [m].
 
     Between them every joint moves straight and evenly eased; before the first and after the last the body holds.
     """
@@ -59,7 +59,7 @@ def keyed(*keys: tuple[float, dict[str, Sequence[float]]]) -> Script:
 
 
 def played(motion: Motion, start: float = 0.0) -> Script:
-    """A clip from its time ``start`` [s] on."""
+    """Return a script that follows a clip from its time ``start`` [s] on."""
 
     def script(time: float) -> Pose:
         rotation, root = motion.sample(start + time)
@@ -70,7 +70,7 @@ def played(motion: Motion, start: float = 0.0) -> Script:
 
 @dataclass(frozen=True)
 class View:
-    """Where a picture is taken from, and when.
+    """Camera and moments of a picture.
 
     Attributes:
         eye, target: the camera and what it looks at [m].
@@ -86,7 +86,7 @@ class View:
 
 @dataclass(frozen=True)
 class Act:
-    """What is on stage, what the avatar does, and how long one watches.
+    """Props, colliders, script and duration of a scene.
 
     Attributes:
         name: of the act.
@@ -112,14 +112,14 @@ class Act:
 
 @dataclass
 class _Backdrop:
-    """What a picture asks a task for."""
+    """Stand-in for the task that a renderer needs."""
 
     camera_position: tuple[float, float, float]
     camera_target: tuple[float, float, float]
     camera_follows: bool = False
 
     def markers(self, _stage: Stage, _env: int) -> tuple:
-        """Nothing but matter is drawn."""
+        """Return no markers, as only matter is drawn."""
         return ()
 
 
@@ -147,13 +147,13 @@ class Stage:
         self._reset.run()
 
     def step(self) -> None:
-        """One control step of the script."""
+        """Take one control step of the script."""
         self.steps_done += 1
         self._command("goal", self.act.script(self.steps_done * self.dt))
         self._step.run()
 
     def gaps(self) -> np.ndarray:
-        """How far the avatar's joints are from where their parents have them [m], shape ``(21,)``."""
+        """Return the distance of joints from their places on the parents' bones [m], shape ``(21,)``."""
         avatar = self.simulation.avatar
         return joint_gaps(avatar.tracked, avatar.body.rest_joint.numpy().astype(float))[0]
 
@@ -166,7 +166,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Course:
-    """What happened: an entry at the start and one after each control step; ``T`` of them.
+    """Record of an act: an entry at the start and one after each control step; ``T`` of them.
 
     Attributes:
         stage: the world at the end.
@@ -197,26 +197,26 @@ class Course:
 
     @property
     def failed(self) -> bool:
-        """Whether the simulation failed."""
+        """Return whether the simulation failed."""
         return bool(self.stage.simulation.state.failure.numpy()[0])
 
     @property
     def let_go(self) -> bool:
-        """Whether the avatar has been knocked over."""
+        """Return whether the avatar was knocked over."""
         return bool(self.stage.simulation.avatar.state.let_go.numpy()[0])
 
     @cached_property
     def joint_errors(self) -> np.ndarray:
-        """Angle between tracked and commanded rotation of every joint [deg], shape ``(T, 21)``."""
+        """Return angles between tracked and commanded rotations of all joints [deg], shape ``(T, 21)``."""
         tracked, goal = (Rotation.from_quat(q[:, 1:].reshape(-1, 4).astype(float)) for q in (self.local, self.goal))
         return np.degrees((tracked.inv() * goal).magnitude()).reshape(len(self.time), NUM_JOINTS - 1)
 
     def errors_of(self, *names: str) -> np.ndarray:
-        """Sum of the angles of some joints [deg], shape ``(T,)``."""
+        """Return the sum of the angles of some joints [deg], shape ``(T,)``."""
         return self.joint_errors[:, [JOINT_NAMES.index(name) - 1 for name in names]].sum(1)
 
     def displacements(self, chosen: np.ndarray) -> np.ndarray:
-        """Distance of ``chosen`` flesh of the avatar from its skinned place on the tracked bones [m], ``(T, n)``."""
+        """Return the distance of ``chosen`` flesh from its skinned place on the tracked bones [m], ``(T, n)``."""
         points = self.stage.simulation.flesh[0].points
         found = []
         for x, turn, at in zip(self.x, self.bones, self.joints, strict=True):
@@ -258,7 +258,7 @@ def perform(act: Act, fidelity: str = "coarse", device: str = "cpu", steps: int 
 
 
 def _look(stage: Stage) -> dict[str, np.ndarray]:
-    """Copies of what a course records."""
+    """Copy everything that a course records."""
     simulation = stage.simulation
     avatar, props, sensors = simulation.avatar, simulation.props.state, simulation.sensors
     arrays = {

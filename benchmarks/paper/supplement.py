@@ -27,7 +27,7 @@ QUICK_STEPS = 2
 
 @dataclass(frozen=True)
 class Options(runner.Options):
-    """What the supplement is played with."""
+    """Options of the supplement."""
 
     #: resolution of bodies and grid
     fidelity: Literal["tiny", "coarse", "medium", "fine"] = "coarse"
@@ -36,12 +36,12 @@ class Options(runner.Options):
 
 
 def cases(options: Options) -> Iterator[Row]:
-    """All rows."""
+    """Yield all rows."""
     yield from rows(options.fidelity, options.device, options.quick)
 
 
 def rows(fidelity: str = "coarse", device: str = "cpu", quick: bool = False) -> Iterator[Row]:
-    """All rows, study by study; a study's rows come when it is done, because its expectation needs them all."""
+    """Yield all rows, study by study; a study's rows come at its end, because its expectation needs them all."""
     fidelity = "tiny" if quick else fidelity
 
     def play(act: Act) -> Course:
@@ -57,7 +57,7 @@ def rows(fidelity: str = "coarse", device: str = "cpu", quick: bool = False) -> 
 
 
 def studies(folder: Path) -> dict[str, tuple[list[Act], Callable[[Course], Row], Callable[[list[Row]], Verdict]]]:
-    """Of every study its acts, its measure, and its judge; mesh files are written into ``folder``."""
+    """Return acts, measure and judge of every study; mesh files are written into ``folder``."""
     torus, can = write_meshes(folder)
     return {
         "ball mass": (acts.kicks(), measures.kick, judge_kicks),
@@ -73,7 +73,7 @@ def studies(folder: Path) -> dict[str, tuple[list[Act], Callable[[Course], Row],
 
 
 def write_meshes(folder: Path) -> tuple[Path, Path]:
-    """Files of a torus of 43 cm and of a can of 12 cm."""
+    """Write mesh files of a torus of 43 cm and of a can of 12 cm."""
     import trimesh
 
     torus, can = folder / "torus.obj", folder / "can.obj"
@@ -101,53 +101,53 @@ def _row(act: Act, measure: Callable[[Course], Row], play: Play, fidelity: str) 
 
 
 def _rounded(value: Any) -> Any:
-    """Four digits: nobody needs more of these."""
+    """Round to four digits."""
     return float(f"{value:.4g}") if isinstance(value, (float, np.floating)) else value
 
 
 def rises(found: Sequence[Row], name: str) -> bool:
-    """Whether a value rises from row to row."""
+    """Return whether a value rises from row to row."""
     values = [row.get(name) for row in found]
     return None not in values and bool((np.diff(values) > 0.0).all())
 
 
 def falls(found: Sequence[Row], name: str) -> bool:
-    """Whether a value falls from row to row."""
+    """Return whether a value falls from row to row."""
     return rises([{name: None if row.get(name) is None else -row[name]} for row in found], name)
 
 
 def judge_kicks(found: list[Row]) -> Verdict:
-    """Heavier and heavier balls, after the kick without one."""
+    """Judge heavier and heavier balls, after the kick without one."""
     struck = [row for row in found if row["ball_kg"] is not None]
     expected = rises(found, "peak_leg_error_deg") and falls(struck, "ball_speed_m_s")
     return "a heavier ball bends the leg more and leaves more slowly", expected
 
 
 def judge_throws(found: list[Row]) -> Verdict:
-    """Stiffer and stiffer balls."""
+    """Judge stiffer and stiffer balls."""
     return "a stiffer ball is dented less", falls(found, "peak_ball_dent_mm")
 
 
 def judge_head_hits(found: list[Row]) -> Verdict:
-    """Less and less tone."""
+    """Judge less and less tone."""
     names = "peak_head_deg", "settled_head_deg", "settled_trunk_and_legs_deg"
     return "less resistance: more recoil, and joints that stay bent (collapse)", all(rises(found, n) for n in names)
 
 
 def judge_crowd(found: list[Row]) -> Verdict:
-    """One act."""
+    """Judge the act with several objects."""
     expected = all(row.get("objects_that_touched") == 4 and not row["let_go"] for row in found)
     return "all four objects touch the avatar, which keeps standing", expected
 
 
 def judge_bellies(found: list[Row]) -> Verdict:
-    """Rows with the physical pull, weak to strong; the kinematic one stands beside them."""
+    """Judge rows with the physical pull, weak to strong, beside the kinematic one."""
     pulled = [row for row in found if row["shape_preservation"] == "physical"]
     return "the more shape preservation, the less of the dent is left", falls(pulled, "mean_dent_after_1_s_mm")
 
 
 def judge_legs(found: list[Row]) -> Verdict:
-    """Each pose's two rows: with limb fields first, then without."""
+    """Judge each pose's two rows: with limb fields first, then without."""
     agrees = []
     for own, one in zip(found[::2], found[1::2], strict=False):
         overlaps = own.get("peak_overlap_cm3"), one.get("peak_overlap_cm3")
@@ -157,13 +157,13 @@ def judge_legs(found: list[Row]) -> Verdict:
 
 
 def judge_pillows(found: list[Row]) -> Verdict:
-    """Stiffer and stiffer pillows."""
+    """Judge stiffer and stiffer pillows."""
     expected = falls(found, "peak_pillow_dent_mm") and rises(found, "peak_impulse_n_s")
     return "a softer pillow gives way more and hits less hard", expected
 
 
 def judge_cans(found: list[Row]) -> Verdict:
-    """Each site's two rows: flesh first, then the region."""
+    """Judge each site's two rows: flesh first, then the region."""
     agrees = []
     for flesh, region in zip(found[::2], found[1::2], strict=False):
         stiffer_last = [flesh, region] if region["young_modulus_pa"] > flesh["young_modulus_pa"] else [region, flesh]
@@ -172,7 +172,7 @@ def judge_cans(found: list[Row]) -> Verdict:
 
 
 def judge_jumps(found: list[Row]) -> Verdict:
-    """Softer and softer flesh; the first row has none that could jiggle."""
+    """Judge softer and softer flesh; in the first row it cannot jiggle."""
     expected = rises(found, "peak_rms_mm") and all(r["rms_0.3_s_later_mm"] < 0.5 * r["peak_rms_mm"] for r in found[1:])
     return "softer and later flesh jiggles more at the landing, and is back to half within 0.3 s", expected
 

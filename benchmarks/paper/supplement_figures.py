@@ -18,12 +18,12 @@ from benchmarks.paper.supplement import write_meshes
 FOLDER = Path(__file__).resolve().parent / "results" / "figures"
 PANEL = 300  # [px]
 FILM, FILM_RATE = 300, 15  # [px] and pictures a second
-STEP = 4  # between the brightnesses of a PNG, of 256: half the size, and nobody sees it
+STEP = 4  # between the brightnesses of a PNG, of 256: half the size, without a visible difference
 
 
 @dataclass(frozen=True)
 class Options:
-    """What to draw, and how."""
+    """Options of the figures."""
 
     #: where to write
     folder: Path = FOLDER
@@ -38,7 +38,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Figure:
-    """A row of pictures for each act; the acts of a film stand side by side.
+    """Figure with a row of pictures for each act; the acts of a film are placed side by side.
 
     Attributes:
         acts: what is played.
@@ -53,7 +53,7 @@ class Figure:
 
 
 def figures(folder: Path) -> dict[str, Figure]:
-    """All figures by file name; mesh files are written into ``folder``."""
+    """Return all figures by file name; mesh files are written into ``folder``."""
     torus, can = write_meshes(folder)
     kicks, throws, hits = acts.kicks(), acts.throws(), acts.head_hits()
     dents, legs, pillows, cans, jumps = (
@@ -77,7 +77,7 @@ def figures(folder: Path) -> dict[str, Figure]:
 
 
 def draw(figure: Figure, path: Path, fidelity: str, device: str) -> None:
-    """One PNG: acts below each other, moments beside each other; more than four acts in two columns."""
+    """Draw a PNG: acts in rows, moments in columns; more than four acts in two columns."""
     from PIL import Image
 
     from piavatar_envs.render import label
@@ -94,7 +94,7 @@ def draw(figure: Figure, path: Path, fidelity: str, device: str) -> None:
 
 
 def film(figure: Figure, path: Path, fidelity: str, device: str) -> None:
-    """One GIF: acts side by side."""
+    """Write a GIF: acts side by side."""
     from piavatar_envs.render import label, write_video
 
     moments = tuple(np.arange(0.0, figure.film, 1.0 / FILM_RATE))
@@ -109,12 +109,12 @@ def film(figure: Figure, path: Path, fidelity: str, device: str) -> None:
 
 
 def _steps(act: Act, seconds: float) -> int:
-    """Control steps until a moment."""
+    """Return the control steps until a moment."""
     return max(1, round(30.0 * min(seconds, act.seconds)))
 
 
 def main(options: Options) -> list[Path]:
-    """Draw; returns the files.
+    """Draw the figures and return their files.
 
     Raises:
         ValueError: there is no figure of such a name.

@@ -1,4 +1,4 @@
-"""How exactly a soft body follows commanded poses: the paper's Tables 1 and 2, struck and unstruck.
+"""Distance of a soft body from commanded poses: the paper's Tables 1 and 2, struck and unstruck.
 
 ``python -m benchmarks.paper.tracking --out benchmarks/results/tracking.json``; ``benchmarks/README.md`` has the
 protocol.
@@ -57,14 +57,14 @@ class Options(runner.Options):
 
 
 def shortened(options: Options) -> Options:
-    """The same options, cut to a smoke run if that is asked for."""
+    """Return the options, shortened to a smoke run if asked for."""
     if not options.quick:
         return options
     return replace(options, seeds=2, sequences=1, poses=3, struck_poses=3, medium_seeds=0)
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """All rows of the benchmark."""
+    """Yield all rows of the benchmark."""
     chosen = shortened(options)
     world = World(fidelity="tiny" if options.quick else "coarse", device=options.device)
     bar = runner.progress(list(plan(chosen, world)), "tracking")
@@ -80,7 +80,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 
 def plan(options: Options, world: World) -> Iterator[Any]:
-    """Every measurement, as a function that yields its rows."""
+    """Yield every measurement, as a function that yields its rows."""
     medium = replace(world, fidelity="medium")
     runs = [(replace(world, decoupling=v), BARE, options.seeds) for v in VARIANTS]
     runs += [
@@ -119,7 +119,7 @@ def plan(options: Options, world: World) -> Iterator[Any]:
 def table_1(
     options: Options, world: World, control: PoseControlConfig, seeds: int, strike: float = 0.0
 ) -> Iterator[dict[str, Any]]:
-    """Rows of Table 1: distance to the commanded shape after one, two, three and four poses.
+    """Yield rows of Table 1: distance to the commanded shape after one, two, three and four poses.
 
     With ``strike`` [N s], a forearm is struck before the second pose, in a random direction.
     """
@@ -148,7 +148,7 @@ def table_1(
 def run_sequences(
     world: World, control: PoseControlConfig, sequences: int, seed: int, strike: float = 0.0
 ) -> list[dict[str, float]]:
-    """One repetition of Table 1: metrics after each of the four poses, over all bodies of the repetition."""
+    """Run one repetition of Table 1 and return metrics after each of the four poses, over all bodies."""
     rng = np.random.default_rng([seed, 1])
     shapes = random_shapes(load_asset(), rng, sequences)
     rotations, shifts = random_poses(rng, sequences * FRAMES)
@@ -189,7 +189,7 @@ def table_2(
     steps_per_pose: int = 1,
     strike: float = 0.0,
 ) -> Iterator[dict[str, Any]]:
-    """A row of Table 2: mean Kabsch errors over a long sequence of random poses, a body a seed.
+    """Yield a row of Table 2: mean Kabsch errors over a long sequence of random poses, a body per seed.
 
     Poses are reached in one control step, or along arcs in ``steps_per_pose``. A body that fails is put, unstrained,
     into the pose it should have, and counted. With ``strike`` [N s], a forearm is struck before every tenth step.
@@ -239,7 +239,7 @@ def table_2(
 
 
 def bone_particles(options: Options, world: World) -> Iterator[dict[str, Any]]:
-    """What ten times as many bone particles cost and bring: the last frame of Table 1's protocol, and the runtime."""
+    """Yield error and cost with ten times as many bone particles, in the last frame of Table 1's protocol."""
     samples = [run_sequences(world, BARE, options.sequences, seed)[-1] for seed in range(options.seeds)]
     rig = Rig(world, BARE, np.zeros((1, len(load_asset().shape_names))))
     trackers = np.bincount(rig.points.bone[~rig.flesh])
@@ -260,7 +260,7 @@ def bone_particles(options: Options, world: World) -> Iterator[dict[str, Any]]:
 
 
 def time_tracking(rig: Rig, repeats: int = 20) -> float:
-    """Median time of one Kabsch tracking of all bones of one body [s]."""
+    """Return the median time of one Kabsch tracking of all bones of one body [s]."""
     graph = LaunchGraph(rig.model.device)
     rig.avatar.record_tracking(graph, rig.state)
     runs = []
@@ -273,7 +273,7 @@ def time_tracking(rig: Rig, repeats: int = 20) -> float:
 
 
 def label(what: str, world: World, control: PoseControlConfig, strike: float) -> str:
-    """The case of a row, for people."""
+    """Return the name of a row."""
     return f"{what}: {world.decoupling}, {control.command}, {world.fidelity}" + (", struck" if strike else "")
 
 

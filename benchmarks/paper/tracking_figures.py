@@ -33,7 +33,7 @@ def draw_all(rows: Sequence[dict[str, Any]], folder: Path, world: World) -> None
 
 
 def draw_distance(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Mean distance over the four poses of Table 1, with the standard deviation over seeds."""
+    """Draw the mean distance over the four poses of Table 1, with the standard deviation over seeds."""
     figure, axes = _figure(5.2)
     for decoupling, color in COLORS.items():
         for (drive, fidelity), style in STYLES.items():
@@ -60,7 +60,7 @@ def draw_distance(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def draw_recovery(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Error of the worst joint after a strike, by tone."""
+    """Draw the error of the worst joint after a strike, by tone."""
     found = [row for row in rows if row.get("study") == "recovery" and row["alpha"] == 0.3]
     names = list(dict.fromkeys(row["case"].split(", tone")[0] for row in found))
     if not names:
@@ -91,7 +91,7 @@ def draw_recovery(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def draw_strain(path: Path, world: World) -> None:
-    """The three variants after the same four poses, coloured by strain, as the paper's deformation-gradient figure."""
+    """Draw the three variants after the same four poses, coloured by strain, as in the paper's figure."""
     from PIL import Image
     from scipy.spatial.transform import Rotation
 

@@ -1,4 +1,4 @@
-"""Bodies under springs that soft balls hit, and that kick them: how far joints give way, who gets which momentum.
+"""Bodies under springs that soft balls hit, and that kick them: deflection of joints, and exchange of momentum.
 
 Nothing weighs anything and there is no floor: the body floats, so what a ball loses is what the body gets. A kick is
 measured twice, floating and with a pelvis that the assisting springs hold.
@@ -43,7 +43,7 @@ LEAD = 0.06  # from where the toes are fastest to the ball's surface [m]: they h
 
 
 def afloat(name: str, *props: PropConfig, **settings: Any) -> Act:
-    """A body under springs in empty space; ``settings`` are those of an act."""
+    """Build a body under springs in empty space; ``settings`` are those of an act."""
     scene = SceneConfig(ground=False, walls=False, props=props)
     control = {"mode": "pd", **settings.pop("control", {})}
     physics = {"gravity": 0.0, **settings.pop("physics", {})}
@@ -51,14 +51,14 @@ def afloat(name: str, *props: PropConfig, **settings: Any) -> Act:
 
 
 def subject_totals(stage: Stage, subject: int) -> Totals:
-    """Momentum and energy of the body (0) or of the ball (1)."""
+    """Return momentum and energy of the body (0) or of the ball (1)."""
     simulation = stage.simulation
     first = simulation.subjects.first
     return totals(simulation.model, simulation.state, 0, slice(first[subject], first[subject + 1]))
 
 
 def joint_errors(stage: Stage) -> np.ndarray:
-    """Angle of every joint from the pose that its spring pulls to [deg], shape ``(21,)``."""
+    """Return the angle of every joint from the pose of its spring [deg], shape ``(21,)``."""
     avatar, above = stage.simulation.avatar, list(PARENTS[1:])
     world = Rotation.from_quat(stage.simulation.controllers[0].state.rotation.numpy()[0].astype(float))
     goal = Rotation.from_quat(avatar.state.goal_rotation.numpy()[0].astype(float))
@@ -66,7 +66,7 @@ def joint_errors(stage: Stage) -> np.ndarray:
 
 
 def set_stiffness(stage: Stage, stiffness: float) -> None:
-    """Give all joints one stiffness [N m/rad], and the damping that is critical for what each carries."""
+    """Set one stiffness of all joints [N m/rad], and the damping that is critical for each."""
     controller = stage.simulation.controllers[0]
     size = float(controller.joints.strength.factor.numpy()[0])  # gains are the reference adult's
     values = np.stack([np.full(NUM_JOINTS - 1, stiffness), critical_damping(controller.joints, stiffness)]) / size
@@ -75,7 +75,7 @@ def set_stiffness(stage: Stage, stiffness: float) -> None:
 
 
 def hit(options: Options, mass: float, stiffness: float, hold: str = "") -> dict[str, Any]:
-    """A ball at the chest of a floating body, whose bones are held as a key of :data:`HOLDS` says."""
+    """Throw a ball at the chest of a floating body, whose bones are held as a key of :data:`HOLDS` says."""
     start = (0.0, CHEST[1] - BALL_RADIUS - DISTANCE, CHEST[2])
     prop = ball(mass, start, (0.0, SPEED, 0.0))
     control = {"strength": BOUNDLESS, **HOLDS[hold]}
@@ -108,7 +108,7 @@ def hit(options: Options, mass: float, stiffness: float, hold: str = "") -> dict
 
 @dataclass(frozen=True)
 class Kick:
-    """What a swinging leg did: one entry a control step, ``T`` of them.
+    """Motion of a swinging leg: one entry per control step, ``T`` of them.
 
     Attributes:
         stage: the world at the end.
@@ -142,7 +142,7 @@ def swing(options: Options, held: bool, hold: str, *props: PropConfig) -> Kick:
 
 
 def kick(options: Options, mass: float, held: bool, hold: str, alone: Kick) -> dict[str, Any]:
-    """A ball where the toes would be fastest; ``alone`` is the same swing without one."""
+    """Kick a ball where the toes would be fastest; ``alone`` is the same swing without one."""
     step = np.diff(alone.toes, axis=0)
     fastest = int(np.linalg.norm(step, axis=1).argmax())
     place = alone.toes[fastest] + (BALL_RADIUS + LEAD) * step[fastest] / np.linalg.norm(step[fastest])
@@ -170,7 +170,7 @@ def kick(options: Options, mass: float, held: bool, hold: str, alone: Kick) -> d
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Balls of every mass at joints of every stiffness; kicks, floating and held; with firm bones and slipping ones."""
+    """Yield rows of balls of every mass at joints of every stiffness, and of kicks, floating and held."""
     for hold in HOLDS:
         for mass in BALLS:
             for stiffness in STIFFNESSES:

@@ -27,13 +27,13 @@ BLOCK = (0.2, 0.2, 0.1)
 
 
 def grid_spacing(resolution: str) -> float:
-    """Grid spacing of a fidelity [m]."""
+    """Return the grid spacing of a fidelity [m]."""
     return float(np.ptp(load_asset().mean_body().vertices[:, 2])) / GRID_PER_HEIGHT[resolution]
 
 
 @dataclass(frozen=True)
 class Thing:
-    """A soft body of a collision: its particles [m], their volumes [m^3], how it moves and what it is made of."""
+    """Soft body of a collision: particles [m], their volumes [m^3], motion and material."""
 
     x: np.ndarray
     volume: np.ndarray
@@ -43,7 +43,7 @@ class Thing:
 
 
 def ball(center: Sequence[float], resolution: str, radius: float = 0.11, mass: float | None = None, **how) -> Thing:
-    """A ball; of a given mass [kg] its waves are as fast as the flesh's."""
+    """Return a ball; with a given mass [kg] its wave speed is that of flesh."""
     points = geometry.sphere(radius, spacing_for(grid_spacing(resolution)))
     density = 1000.0 if mass is None else mass / float(points.volume.sum())
     how = {"density": density, "young_modulus": 100.0 * density, **how}
@@ -51,7 +51,7 @@ def ball(center: Sequence[float], resolution: str, radius: float = 0.11, mass: f
 
 
 def block(center: Sequence[float], resolution: str, half: Sequence[float] = BLOCK, **how) -> Thing:
-    """A box."""
+    """Return a box."""
     points = geometry.box(half, spacing_for(grid_spacing(resolution)))
     return Thing(points.rest + np.asarray(center), points.volume, **how)
 
@@ -62,7 +62,7 @@ def _flesh(resolution: str):
 
 
 def body(resolution: str, shift: Sequence[float] = (0.0, 0.0, 0.0), yaw: float = 0.0, **how) -> Thing:
-    """The avatar's flesh in its rest pose, without a drive."""
+    """Return the avatar's flesh in its rest pose, without control."""
     particles = _flesh(resolution)
     c, s = np.cos(yaw), np.sin(yaw)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -71,7 +71,7 @@ def body(resolution: str, shift: Sequence[float] = (0.0, 0.0, 0.0), yaw: float =
 
 @dataclass
 class Collision:
-    """Things in one world. ``things`` are subjects 0, 1, ...; build with :func:`collide`."""
+    """Several things in one world. ``things`` are subjects 0, 1, ...; build with :func:`collide`."""
 
     things: Sequence[Thing]
     model: object
@@ -87,38 +87,38 @@ class Collision:
             self.graphs["damped" if damped else "free"].run()
 
     def totals(self, thing: int | None = None, about: Sequence[float] = (0.0, 0.0, 0.0)) -> Totals:
-        """Momentum and energy of one thing or all."""
+        """Return momentum and energy of one thing or all."""
         select = slice(None) if thing is None else self.owner == thing
         return totals(self.model, self.state, 0, select, about)
 
     def positions(self, thing: int) -> np.ndarray:
-        """Particles [m]."""
+        """Return particles [m]."""
         return self.state.x.numpy()[0][self.owner == thing].astype(float)
 
     def velocity(self, thing: int) -> np.ndarray:
-        """Mean velocity [m/s]."""
+        """Return the mean velocity [m/s]."""
         t = self.totals(thing)
         return t.momentum / t.mass
 
     def nearest(self, a: int = 0, b: int = 1) -> float:
-        """Smallest distance of a particle of one thing from one of the other [m]."""
+        """Return the smallest distance between particles of two things [m]."""
         return float(cKDTree(self.positions(a)).query(self.positions(b))[0].min())
 
     def gap(self, a: int = 0, b: int = 1) -> float:
-        """Gap between surfaces [m]: the smallest distance of particles less their spacing; negative if they overlap."""
+        """Return the gap between surfaces [m]: the smallest distance less the spacing; negative if they overlap."""
         return self.nearest(a, b) - spacing_for(self.dx)
 
     def penetration(self) -> float:
-        """Of the sensor: the deepest particle inside another thing [m]."""
+        """Return the sensor's depth of the deepest particle inside another thing [m]."""
         return float(self.scratch.sensors.penetration.numpy().max())
 
     def touched(self) -> bool:
-        """Whether impulses were exchanged in the last control step."""
+        """Return whether impulses were exchanged in the last control step."""
         return bool(np.abs(self.scratch.sensors.part_impulse.numpy()).max() > 0.0)
 
     @property
     def failed(self) -> bool:
-        """Whether the simulation gave up."""
+        """Return whether the simulation failed."""
         return bool(self.state.failure.numpy()[0])
 
 
@@ -134,7 +134,7 @@ def collide(
     device: str = "cpu",
     fastest: float = 0.0,
 ) -> Collision:
-    """A world of ``things`` with a margin of ``room`` [m] around them.
+    """Build a world of ``things`` with a margin of ``room`` [m] around them.
 
     Substeps come from the waves and from ``fastest`` [m/s], so that nothing crosses more than half a grid spacing.
     """

@@ -26,7 +26,7 @@ AFTER = 0.2  # how long after contact a release is looked at [s]
 
 @dataclass(frozen=True)
 class Options(runner.Options):
-    """Contact."""
+    """Options of the contact benchmark."""
 
     #: resolutions, as the environments' fidelity
     resolutions: tuple[str, ...] = ("coarse", "medium")
@@ -37,7 +37,7 @@ class Options(runner.Options):
 
 
 def conservation(world: Collision, steps: int) -> dict[str, Any]:
-    """Run, and say how well momentum and energy were kept."""
+    """Run a collision and return its errors of momentum and energy."""
     about = np.average([t.x.mean(0) for t in world.things], axis=0)
     start = world.totals(about=about)
     scale = sum(
@@ -65,7 +65,7 @@ def conservation(world: Collision, steps: int) -> dict[str, Any]:
 
 
 def free_hits(resolution: str, normals: str, options: Options) -> Iterator[dict[str, Any]]:
-    """Free-floating hits, all off centre: a ball on a body, and a body on a body."""
+    """Yield rows of free, off-centre hits: a ball on a body, and a body on a body."""
     steps = 3 if options.quick else 24
     thrown = ball((0.05, -0.5, 1.25), resolution, mass=1.5, velocity=(0.3, 6.0, 0.5))
     hits = {
@@ -81,7 +81,7 @@ def free_hits(resolution: str, normals: str, options: Options) -> Iterator[dict[
 
 
 def rapid(resolution: str, normals: str, options: Options) -> Iterator[dict[str, Any]]:
-    """A ball of 0.45 kg at 5 to 20 m/s on a body: released or stuck, how far, and what momentum was lost."""
+    """Yield rows of a ball of 0.45 kg at 5 to 20 m/s on a body: release, rebound and lost momentum."""
     speeds = (20.0,) if options.quick else (5.0, 10.0, 15.0, 20.0)
     for speed in speeds:
         thrown = ball((0.0, -0.35, 1.25), resolution, mass=0.45, velocity=(0.0, speed, 0.0))
@@ -91,7 +91,7 @@ def rapid(resolution: str, normals: str, options: Options) -> Iterator[dict[str,
 
 
 def release(world: Collision) -> dict[str, Any]:
-    """Whether the second thing has left the first."""
+    """Return whether the second thing has left the first."""
     relative = world.velocity(1) - world.velocity(0)
     return {
         "release_speed_m_per_s": float(np.linalg.norm(relative)),
@@ -102,7 +102,7 @@ def release(world: Collision) -> dict[str, Any]:
 
 
 def gaps(resolution: str, normals: str, options: Options) -> Iterator[dict[str, Any]]:
-    """A ball of 1.5 kg at 3 m/s on a body: gap and depth at closest approach and after; a block at rest on another."""
+    """Yield rows of a ball of 1.5 kg at 3 m/s on a body (gap and depth), and of a block at rest on another."""
     thrown = ball((0.0, -0.4, 1.25), resolution, mass=1.5, velocity=(0.0, 3.0, 0.0))
     world = collide([body(resolution), thrown], resolution, normals, fastest=3.0, device=options.device)
     closest, depth, contact_ends = np.inf, 0.0, 0
@@ -130,7 +130,7 @@ def _depth_row(depth: float, world: Collision) -> dict[str, float]:
 
 
 def inclines(resolution: str, normals: str, options: Options) -> Iterator[dict[str, Any]]:
-    """A block on an incline, analytic or of soft matter: gravity tilts, the ground stays level."""
+    """Yield rows of a block on an incline, analytic or of soft matter: gravity tilts, the ground stays level."""
     tilted = GRAVITY * np.array([np.sin(INCLINE), 0.0, -np.cos(INCLINE)])
     for friction in (0.2,) if options.quick else (0.0, 0.2, 0.5):
         expected = GRAVITY * max(0.0, np.sin(INCLINE) - friction * np.cos(INCLINE))
@@ -156,7 +156,7 @@ def inclines(resolution: str, normals: str, options: Options) -> Iterator[dict[s
 
 
 def _on_incline(resolution: str, normals: str, friction: float, analytic: bool, tilted: np.ndarray, options: Options):
-    """The world, and which thing slides."""
+    """Build the world, and return which thing slides."""
     if analytic:
         floor, things = [Collider.plane((0.0, 0.0, 1.0), 0.0, friction)], [block((0.0, 0.0, BLOCK[2]), resolution)]
     else:
@@ -169,7 +169,7 @@ def _on_incline(resolution: str, normals: str, friction: float, analytic: bool, 
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """All rows."""
+    """Yield all rows."""
     resolutions = ("tiny",) if options.quick else options.resolutions
     for resolution in runner.progress(resolutions, "resolutions"):
         for experiment in (free_hits, rapid, gaps, inclines):

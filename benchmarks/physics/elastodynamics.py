@@ -23,7 +23,7 @@ from benchmarks.physics.textbook import BarImpact, HertzImpact, bar_frequency, b
 
 @dataclass(frozen=True)
 class Options(runner.Options):
-    """Elastodynamics."""
+    """Options of the benchmark of elastic bodies."""
 
     #: cells of the bar and of the cantilever
     cells: tuple[int, ...] = (2, 3, 4, 6, 8)
@@ -36,7 +36,7 @@ class Options(runner.Options):
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """All rows, then the picture."""
+    """Yield all rows, then draw the picture."""
     device, rows = options.device, []
     cells = options.cells[:1] if options.quick else options.cells
     radius_cells = options.radius_cells[:1] if options.quick else options.radius_cells
@@ -58,7 +58,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 
 def _period(times: np.ndarray, signal: np.ndarray) -> float:
-    """Mean period of an oscillation about zero, from its interpolated zero crossings.
+    """Return the mean period of an oscillation about zero, from its interpolated zero crossings.
 
     Raises:
         ValueError: there are fewer than four.
@@ -73,7 +73,7 @@ def _period(times: np.ndarray, signal: np.ndarray) -> float:
 def bar(
     cells: int, material: str = "neo_hookean", poisson_ratio: float = 0.0, finer: int = 1, device: str = "cpu"
 ) -> dict[str, Any]:
-    """First longitudinal frequency of a free bar, six sides long.
+    """Measure the first longitudinal frequency of a free bar, six sides long.
 
     Args:
         cells: along a side.
@@ -107,7 +107,7 @@ def bar(
 
 
 def cantilever(cells: int, device: str = "cpu") -> dict[str, Any]:
-    """Tip deflection of a cantilever under a little weight, five sides long: 4 % of its length.
+    """Measure the tip deflection of a cantilever under a small weight, five sides long: 4 % of its length.
 
     It is one half of a free beam that is pushed up in the middle as much as it weighs: symmetry is a perfect clamp.
     """
@@ -132,7 +132,7 @@ def cantilever(cells: int, device: str = "cpu") -> dict[str, Any]:
 
 
 def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Errors over the resolution, and the forces of a bar and of a ball that bounce."""
+    """Draw errors over the resolution, and forces of a bar and of a ball that bounce."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -147,7 +147,7 @@ def draw(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def _draw_errors(rows: Sequence[dict[str, Any]], axes: Any) -> None:
-    """Of impacts the largest over the places of the grid."""
+    """Draw errors; of impacts the largest over the places of the grid."""
     for name, label, color in (
         ("bar", "frequency of a bar", "#1b7f79"),
         ("cantilever", "sag of a cantilever", "#d1495b"),
@@ -170,7 +170,7 @@ def _draw_errors(rows: Sequence[dict[str, Any]], axes: Any) -> None:
 
 
 def _draw_forces(rows: Sequence[dict[str, Any]], theory: BarImpact | HertzImpact, axes: Any) -> None:
-    """Of an impact, against time."""
+    """Draw the force of an impact over time."""
     from matplotlib import colormaps
 
     for row, shade in zip(rows, np.linspace(0.85, 0.0, len(rows)), strict=True):

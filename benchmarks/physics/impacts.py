@@ -24,7 +24,7 @@ SHIFTS = (0.0, 0.25, 0.5, 0.75)
 def bar_impact(
     cells: int, mirrored: bool = False, shifts: Sequence[float] = SHIFTS, device: str = "cpu"
 ) -> dict[str, Any]:
-    """A bar at a hundredth of its waves' speed meets a smooth wall, or another bar, end on.
+    """Bounce a bar at a hundredth of its wave speed off a smooth wall, or off another bar, end on.
 
     Args:
         cells: along a side; the bar is six sides long.
@@ -42,7 +42,7 @@ def bar_impact(
 def ball_impact(
     cells: int, mirrored: bool = False, shifts: Sequence[float] = SHIFTS, device: str = "cpu"
 ) -> dict[str, Any]:
-    """A ball at a hundredth of its waves' speed meets a smooth plane, or another ball.
+    """Bounce a ball at a hundredth of its wave speed off a smooth plane, or off another ball.
 
     It has three particles to a cell along every axis: the steps of a coarser lattice are as deep as the contact.
 
@@ -70,7 +70,7 @@ def _met(
     shifts: Sequence[float],
     device: str,
 ) -> dict[str, Any]:
-    """Means over places of the grid; see :class:`Bounce`."""
+    """Return means over places of the grid; see :class:`Bounce`."""
     found = [bounce(theory, points, dx, poisson_ratio, mirrored, shift, device) for shift in shifts]
     errors = np.array([bounced.errors for bounced in found])
     return {
@@ -87,7 +87,7 @@ def _met(
 
 @dataclass(frozen=True)
 class Bounce:
-    """A body that has come back.
+    """Record of a body that has bounced.
 
     Attributes:
         theory: what it should have done.
@@ -103,22 +103,22 @@ class Bounce:
 
     @property
     def force(self) -> np.ndarray:
-        """What acted between two looks [N]."""
+        """Return the force between two samples [N]."""
         return np.diff(self.upward) * self.theory.speed * self.theory.mass / self.dt
 
     def time_at(self, upward: float) -> float:
-        """When it had a velocity [s]."""
+        """Return the time at which the body had a velocity [s]."""
         return float(np.interp(upward, self.upward, self.dt * np.arange(len(self.upward))))
 
     @property
     def errors(self) -> tuple[float, float]:
-        """Relative errors of the time in which it turns, and of the force when it does."""
+        """Return relative errors of the time of reversal, and of the force then."""
         turned = self.time_at(0.5) - self.time_at(-0.5)
         return turned / self.theory.reversal_time - 1.0, float(self.course[len(WATCHED) // 2]) - 1.0
 
     @property
     def course(self) -> np.ndarray:
-        """Forces at the times ``WATCHED`` before and after it turns, in units of the greatest by theory."""
+        """Return forces at the times ``WATCHED`` around the reversal, in units of the greatest by theory."""
         times = (np.arange(len(self.force)) + 0.5) * self.dt - self.time_at(0.0)
         return np.interp(WATCHED * self.theory.duration, times, self.force / self.theory.force)
 
@@ -132,7 +132,7 @@ def bounce(
     shift: float,
     device: str,
 ) -> Bounce:
-    """One impact, along z.
+    """Simulate one impact along z.
 
     Args:
         theory: of it.

@@ -56,7 +56,7 @@ class Limbs:
         firm_bones: bool = True,
         bone_contact: bool = True,
     ) -> None:
-        """Build it in a pose of rotation vectors ``(22, 3)``; ``rate`` holds flesh to bones, if not zero.
+        """Build it in a pose of rotation vectors ``(22, 3)``; ``rate`` attaches flesh to bones, if not zero.
 
         With ``firm_bones`` particles of bones are put into their places after every control step, with
         ``bone_contact`` bones stop at the floor, as in environments.
@@ -88,7 +88,7 @@ class Limbs:
         graph.run()
 
     def record(self, joints: bool = True) -> LaunchGraph:
-        """A control step, with ``joints`` or the Material Point Method alone."""
+        """Record a control step, with ``joints`` or of the Material Point Method alone."""
         rig, graph = self.rig, LaunchGraph(self.rig.model.device)
         record_begin(graph, rig.model, rig.state, rig.scratch)
         for step in range(rig.model.num_substeps):
@@ -101,7 +101,7 @@ class Limbs:
         return graph
 
     def set_springs(self, stiffness: np.ndarray | float, damping: np.ndarray | float, held: bool = False) -> None:
-        """Springs and dampers of all joints but the pelvis, of one or ``(21,)``; the pelvis' hold it, or are none."""
+        """Set springs and dampers of all joints but the pelvis, a number or ``(21,)``; the pelvis is held or free."""
         values = np.zeros((2, 1, 1 + NUM_JOINTS), np.float32)
         values[0, 0, 2:], values[1, 0, 2:] = stiffness, damping
         values[:, 0, :2] = np.array(HOLD)[:, None] * held
@@ -109,16 +109,16 @@ class Limbs:
         self.body.springs.damping.assign(values[1])
 
     def aim(self, rotations: np.ndarray) -> None:
-        """Let the springs pull to a pose, rotation vectors ``(22, 3)``."""
+        """Set the rest pose of the springs, rotation vectors ``(22, 3)``."""
         self.body.target.rotation.assign(Rotation.from_rotvec(rotations).as_quat()[None].astype(np.float32))
 
     def arm(self, side: str) -> np.ndarray:
-        """From shoulder to wrist [m]."""
+        """Return the vector from shoulder to wrist [m]."""
         position = self.body.state.position.numpy()[0]
         return (position[joint_index(f"{side}_wrist")] - position[joint_index(f"{side}_shoulder")]).astype(float)
 
     def gaps(self) -> np.ndarray:
-        """How far joints are from where their parents have them, as the particles are now [m], shape ``(21,)``."""
+        """Return the distance of joints from their places on the parents' bones [m], shape ``(21,)``."""
         graph = LaunchGraph(self.rig.model.device)
         self.rig.avatar.record_tracking(graph, self.rig.state)
         graph.run()
@@ -126,14 +126,14 @@ class Limbs:
 
 
 def widest(gaps: Sequence[np.ndarray]) -> dict[str, Any]:
-    """What a row says of the gaps ``(T, 21)`` [m] of a course: the largest, and of which joint."""
+    """Return the largest of the gaps ``(T, 21)`` [m] of a course, and its joint."""
     found = np.array(gaps)
     joint = int(found.max(0).argmax())
     return {"largest_gap_mm": float(1e3 * found.max()), "widest_joint": JOINT_NAMES[1 + joint]}
 
 
 def critical_damping(body: ArticulatedBody, stiffness: np.ndarray | float) -> np.ndarray:
-    """Of all joints but the pelvis, by the inertia of what each carries [N m s/rad], shape ``(21,)``."""
+    """Return critical damping of all joints but the pelvis, by the inertia beyond each [N m s/rad], ``(21,)``."""
     diagonal = np.diagonal(body.mass.read()[0])
     inertia = diagonal[6:].reshape(-1, 3).mean(1).astype(float)
     return 2.0 * np.sqrt(stiffness * inertia)

@@ -69,11 +69,11 @@ class Matter:
         return self
 
     def get(self, name: str, env: int = 0) -> np.ndarray:
-        """A state array of an environment, in double precision."""
+        """Return a state array of an environment, in double precision."""
         return self.state.numpy()[name][env].astype(float)
 
     def totals(self, env: int = 0, **kwargs) -> Totals:
-        """Mass, momentum and energy of an environment; see :func:`piavatar_envs.mpm.diagnostics.totals`."""
+        """Return mass, momentum and energy of an environment; see :func:`piavatar_envs.mpm.diagnostics.totals`."""
         return totals(self.model, self.state, env, **kwargs)
 
     def of(self, field: int) -> np.ndarray:
@@ -82,7 +82,7 @@ class Matter:
 
     @property
     def accumulators_are_clear(self) -> bool:
-        """Whether no node holds anything that a later substep would add to."""
+        """Return whether no node holds anything that a later substep would add to."""
         sums = self.scratch.accumulators
         arrays = [sums.fixed, sums.offset, sums.offset_fixed, sums.candidates]
         if self.model.path != "block":  # where sums are written, not added
@@ -91,7 +91,7 @@ class Matter:
 
     @property
     def failures(self) -> list[int]:
-        """Bits ``FAILURE_*`` of every environment."""
+        """Return bits ``FAILURE_*`` of every environment."""
         return self.state.failure.numpy().tolist()
 
 

@@ -33,7 +33,7 @@ LOWER, UPPER = (-1.6, -1.6, -0.7), (1.6, 1.6, 2.6)  # room enough for bodies tha
 
 @dataclass(frozen=True)
 class World:
-    """Everything about a batch but its bodies and its control.
+    """Settings of a batch except for its bodies and its control.
 
     Attributes:
         fidelity: resolution, as in the environments.
@@ -136,7 +136,7 @@ class Rig:
         self._reset.run()
 
     def step(self, rotations: np.ndarray | None = None, shifts: np.ndarray | None = None) -> None:
-        """One control step towards a pose: rotation vectors ``(num_envs, 22, 3)`` [rad], root shifts ``(num_envs, 3)``.
+        """Take a control step towards a pose: rotation vectors ``(num_envs, 22, 3)`` [rad], shifts ``(num_envs, 3)``.
 
         Without a pose, towards the one before.
         """
@@ -155,18 +155,18 @@ class Rig:
 
     @property
     def alive(self) -> np.ndarray:
-        """Bodies whose simulation has not failed, shape ``(num_envs,)`` bool."""
+        """Return a mask ``(num_envs,)`` of bodies whose simulation has not failed."""
         return self.state.failure.numpy() == 0
 
     def distances(self) -> np.ndarray:
-        """Distance of every flesh particle to the skinned commanded pose [m], shape ``(num_envs, flesh)``."""
+        """Return the distance of flesh to the skinned commanded pose [m], shape ``(num_envs, flesh)``."""
         drive = self.avatar.state
         local = Rotation.from_quat(drive.goal_rotation.numpy().reshape(-1, 4)).as_matrix()
         local, root = local.reshape(self.num_envs, NUM_JOINTS, 3, 3), drive.goal_root.numpy()
         return self._distances_to(local, root)
 
     def shape_errors(self) -> np.ndarray:
-        """Distance of every flesh particle to the skinned *tracked* pose [m], shape ``(num_envs, flesh)``."""
+        """Return the distance of flesh to the skinned *tracked* pose [m], shape ``(num_envs, flesh)``."""
         tracked = self.avatar.tracked
         local = Rotation.from_quat(tracked.local.numpy().reshape(-1, 4)).as_matrix()
         return self._distances_to(local.reshape(self.num_envs, NUM_JOINTS, 3, 3), tracked.position.numpy()[:, 0])
@@ -188,7 +188,7 @@ class Rig:
         return found
 
     def pose_errors(self) -> dict[str, np.ndarray]:
-        """Tracked against commanded pose, by Kabsch.
+        """Return errors of the tracked pose against the commanded one, by Kabsch.
 
         ``root_rotation`` [rad] and ``root_translation`` [m] of shape ``(num_envs,)``; ``relative_rotation`` [rad] and
         ``relative_translation`` [m] of every joint in its parent's frame, shape ``(num_envs, 21)``.
@@ -208,7 +208,7 @@ class Rig:
         }
 
     def strain(self) -> np.ndarray:
-        """Mean distance of the deformation gradient to the nearest rotation, shape ``(num_envs,)``.
+        """Return the mean distance of the deformation gradient to the nearest rotation, shape ``(num_envs,)``.
 
         ``|F - R|`` rather than ``|F - I|``: a free body that is struck turns, and a turn is no strain.
         """
@@ -218,7 +218,7 @@ class Rig:
 
 
 def joint_gaps(tracked: Tracked, joints: np.ndarray) -> np.ndarray:
-    """How far joints are from where their parents have them [m], shape ``(num_envs, 21)``.
+    """Return the distance of joints from their places on the parents' bones [m], shape ``(num_envs, 21)``.
 
     Args:
         tracked: bones as the particles have them.
@@ -234,17 +234,17 @@ def joint_gaps(tracked: Tracked, joints: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _morphed(parameters: tuple[float, ...], spacing: float, bone_rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rest positions [m] and volumes [m^3] of the particles of a shape; the variants all use the same bodies."""
+    """Return rest positions [m] and volumes [m^3] of a shape's particles; all variants use the same bodies."""
     asset = load_asset()
     return morph(asset, sample_particles(asset, spacing, bone_rings=bone_rings), asset.shape(parameters))
 
 
 @wp.kernel
 def clear_impulse(impulse: wp.array(dtype=wp.vec3)):
-    """An impulse acts once."""
+    """Clear the impulse, so that it acts once."""
     impulse[wp.tid()] = wp.vec3(0.0)
 
 
 def _quaternions(rotations: np.ndarray) -> np.ndarray:
-    """Warp's ``xyzw`` quaternions ``(..., 4)`` of rotation vectors ``(..., 3)``."""
+    """Return Warp's ``xyzw`` quaternions ``(..., 4)`` of rotation vectors ``(..., 3)``."""
     return Rotation.from_rotvec(rotations.reshape(-1, 3)).as_quat().astype(np.float32).reshape(*rotations.shape[:-1], 4)

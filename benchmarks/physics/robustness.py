@@ -21,7 +21,7 @@ from piavatar_envs.tasks import task_modules
 
 @dataclass(frozen=True)
 class Options(runner.Options):
-    """What to run; the defaults are 20 seeds, 10,000 steps in all."""
+    """Options of the robustness run; the defaults are 20 seeds, 10,000 steps in all."""
 
     #: environment steps in all, spread evenly over environments and seeds
     steps: int = 10_000
@@ -32,7 +32,7 @@ class Options(runner.Options):
 
 
 def numbers(value: object) -> Iterator[float]:
-    """Every number in what a step returned."""
+    """Yield every number in the results of a step."""
     if isinstance(value, dict):
         for entry in value.values():
             yield from numbers(entry)
@@ -41,7 +41,7 @@ def numbers(value: object) -> Iterator[float]:
 
 
 def run_seed(env: gymnasium.Env, seed: int, steps: int) -> dict:
-    """One seed's steps under actions that are uniform in [-1, 1] in even episodes, at the corners in odd ones."""
+    """Run one seed's steps under actions that are uniform in even episodes, and at the corners in odd ones."""
     rng = np.random.default_rng([seed, 1])
     ends: Counter[str] = Counter()
     failures: Counter[str] = Counter()
@@ -77,7 +77,7 @@ def run_seed(env: gymnasium.Env, seed: int, steps: int) -> dict:
 
 
 def cases(options: Options) -> Iterator[dict]:
-    """One row an environment and seed, and one that sums them up."""
+    """Yield a row per environment and seed, and one that sums them up."""
     jobs = [(env_id, seed) for env_id in task_modules() for seed in range(options.seeds)]
     each, rest = divmod(options.steps, len(jobs))
     envs: dict[str, gymnasium.Env] = {}

@@ -62,7 +62,7 @@ class Trial:
     control_dt: float = 1.0 / 30.0
 
     def stage(self, options: Options, pose: np.ndarray) -> Stage:
-        """The body, at rest in the rest pose; from the first step on it is asked for ``pose`` (22, 3) [rad]."""
+        """Build the body at rest in the rest pose; its springs pull to ``pose`` (22, 3) [rad]."""
         rest = standing(0.0)
         physics = {"control_dt": self.control_dt, "young_modulus": self.young, "num_substeps": self.substeps}
         control = {"joint_stiffness": self.stiffness, "joint_damping": self.damping, "strength": self.strength}
@@ -78,7 +78,7 @@ class Trial:
         return Stage(act, options.fidelity, options.device)
 
     def fault(self, options: Options, seed: int) -> str | None:
-        """Why it is not stable, as the module has it: a failure by name, ``"energy"``, ``"hum"``; None where it is."""
+        """Return the reason for instability: a failure by name, ``"energy"`` or ``"hum"``; None if stable."""
         pose = random_pose(np.random.default_rng(seed), self.reach)[0] * (np.arange(NUM_JOINTS) > 0)[:, None]
         stage = self.stage(options, pose * (not self.grounded))
         simulation, controller = stage.simulation, stage.simulation.controllers[0]
@@ -103,7 +103,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Edge:
-    """Between what is stable and what is not.
+    """Boundary between stable and unstable values.
 
     Attributes:
         stable: the largest value found stable.
@@ -117,7 +117,7 @@ class Edge:
 
 
 def halve(fault: Callable[[float], str | None], low: float, high: float, halvings: int) -> Edge:
-    """The edge between ``low`` and ``high``, on a logarithmic scale; ``fault(value)`` is None where it is stable.
+    """Find the boundary between ``low`` and ``high`` by bisection on a logarithmic scale.
 
     Raises:
         RuntimeError: ``low`` is not stable.
@@ -137,20 +137,20 @@ def halve(fault: Callable[[float], str | None], low: float, high: float, halving
 
 
 def first_fault(trials: Iterable[Trial], options: Options) -> str | None:
-    """The first fault of trials, each with as many poses as the options have; None without any."""
+    """Return the first fault of trials, each with as many poses as the options have; None without any."""
     pairs = [(trial, seed) for trial in trials for seed in range(1 if trial.grounded else options.poses)]
     return next(filter(None, (trial.fault(options, seed) for trial, seed in pairs)), None)
 
 
 @contextmanager
 def unrefused() -> Iterator[None]:
-    """Time steps are built that :func:`~piavatar_envs.mpm.model.check_num_substeps` or torques would refuse."""
+    """Disable :func:`~piavatar_envs.mpm.model.check_num_substeps`, so that unstable time steps can be built."""
     with mock.patch.object(build, "CFL_STABLE", np.inf), mock.patch.object(simulation, "LONGEST_SUBSTEP", np.inf):
         yield
 
 
 def longest_step(options: Options, name: str, grounded: bool, young: float) -> dict[str, Any]:
-    """The longest stable substep under the environments' own gains."""
+    """Find the longest stable substep under the environments' own gains."""
     first = Trial(grounded, young=young).stage(options, np.zeros((NUM_JOINTS, 3))).simulation
     speed, dx = first.model.sound_speed, first.dx
 
@@ -177,7 +177,7 @@ def longest_step(options: Options, name: str, grounded: bool, young: float) -> d
 
 
 def largest_gains(options: Options, kind: str, limited: bool) -> dict[str, Any]:
-    """The largest stable factor on stiffness, damping or both, with the limits of muscles or without."""
+    """Find the largest stable factor on stiffness, damping or both, with the limits of muscles or without."""
     on_stiffness, on_damping = KINDS[kind]
     strength, reach = (1.0, JOINT_RANGE) if limited else (BOUNDLESS, NUDGE)
 
@@ -203,7 +203,7 @@ def largest_gains(options: Options, kind: str, limited: bool) -> dict[str, Any]:
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Time steps in flight, on the floor and in soft flesh; gains of every kind."""
+    """Yield rows of time steps in flight, on the floor and in soft flesh, and of gains of every kind."""
     for name, grounded, young in (("floating", False, 1e5), ("standing", True, 1e5), ("soft_floating", False, SOFT)):
         yield longest_step(options, name, grounded, young)
     for limited in (True, False):

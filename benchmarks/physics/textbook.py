@@ -1,4 +1,4 @@
-"""What elastic bodies do by textbook: bars, beams, and balls that meet."""
+"""Textbook solutions for elastic bodies: bars, beams, and impacts of balls."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 
 def bar_frequency(length: float, side: float, young_modulus: float, poisson_ratio: float, density: float) -> float:
-    """First longitudinal frequency of a free square bar [Hz].
+    """Return the first longitudinal frequency of a free square bar [Hz].
 
     ``c / (2 L)`` with ``c = sqrt(E / rho)``, Rayleigh's correction for the inertia of the sides' Poisson motion
     included: ``1 - (nu pi r / L)^2 / 2`` with the polar radius of gyration ``r^2 = side^2 / 6`` (Graff, "Wave Motion in
@@ -23,7 +23,7 @@ def bar_frequency(length: float, side: float, young_modulus: float, poisson_rati
 def beam_deflection(
     x: np.ndarray, acceleration: np.ndarray, side: float, young_modulus: float, density: float
 ) -> np.ndarray:
-    """Sag [m] of one half of a free square beam against its middle, at the places ``x`` [m] from there.
+    """Return the sag [m] of one half of a free square beam against its middle, at ``x`` [m] from there.
 
     From Timoshenko's equations, ``V' = q``, ``M' = V``, ``y' = integral of M / EI - V / (k G A)`` with ``k = 5/6`` and
     no Poisson effect (Timoshenko & Gere, "Mechanics of Materials", 1972, ch. 6 and 12).
@@ -66,32 +66,32 @@ class BarImpact:
 
     @property
     def wave_speed(self) -> float:
-        """``c`` [m/s]."""
+        """Return ``c`` [m/s]."""
         return float(np.sqrt(self.young_modulus / self.density))
 
     @property
     def mass(self) -> float:
-        """[kg]."""
+        """Return the mass [kg]."""
         return self.density * self.area * self.length
 
     @property
     def force(self) -> float:
-        """While they touch [N]."""
+        """Return the force during contact [N]."""
         return self.density * self.wave_speed * self.speed * self.area
 
     @property
     def duration(self) -> float:
-        """How long they touch [s]."""
+        """Return the duration of contact [s]."""
         return 2.0 * self.length / self.wave_speed
 
     @property
     def history(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times from the first touch on [s], and what the wall gives then [N]."""
+        """Return times from the first contact on [s], and the force of the wall [N]."""
         return np.array([0.0, 0.0, 1.0, 1.0]) * self.duration, np.array([0.0, 1.0, 1.0, 0.0]) * self.force
 
     @property
     def reversal_time(self) -> float:
-        """As that of :class:`HertzImpact` [s]."""
+        """Return the time of reversal, as for :class:`HertzImpact` [s]."""
         return 0.5 * self.duration
 
 
@@ -119,32 +119,32 @@ class HertzImpact:
 
     @property
     def stiffness(self) -> float:
-        """``k`` [N/m^1.5]."""
+        """Return ``k`` [N/m^1.5]."""
         return 4.0 / 3.0 * self.young_modulus / (1.0 - self.poisson_ratio**2) * np.sqrt(self.radius)
 
     @property
     def depth(self) -> float:
-        """Greatest depth [m], where ``2/5 k d^(5/2)`` is the kinetic energy."""
+        """Return the greatest depth [m], where ``2/5 k d^(5/2)`` is the kinetic energy."""
         return (1.25 * self.mass * self.speed**2 / self.stiffness) ** 0.4
 
     @property
     def contact_radius(self) -> float:
-        """Of the disc of contact at the greatest depth [m]."""
+        """Return the radius of the disc of contact at the greatest depth [m]."""
         return np.sqrt(self.radius * self.depth)
 
     @property
     def force(self) -> float:
-        """Greatest force [N]."""
+        """Return the greatest force [N]."""
         return self.stiffness * self.depth**1.5
 
     @property
     def duration(self) -> float:
-        """How long they touch [s]: ``2 d/v`` times the integral of ``(1 - s^(5/2))^(-1/2)`` from 0 to 1, 1.4716."""
+        """Return the duration of contact [s]: ``2 d/v`` times 1.4716, the integral of ``(1 - s^(5/2))^(-1/2)``."""
         return 2.9432 * self.depth / self.speed
 
     @cached_property
     def history(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times from the first touch on [s], and what the plane gives then [N]."""
+        """Return times from the first contact on [s], and the force of the plane [N]."""
         times = np.linspace(0.0, self.duration, 1001)
         moved = solve_ivp(
             lambda _t, y: [y[1], -self.stiffness / self.mass * max(y[0], 0.0) ** 1.5],
@@ -158,7 +158,7 @@ class HertzImpact:
 
     @property
     def reversal_time(self) -> float:
-        """Time in which its velocity goes from half of what it was to half of that backwards [s]."""
+        """Return the time from half of the initial velocity to half of it backwards [s]."""
         times, force = self.history
         velocity = np.concatenate([[0.0], np.cumsum(0.5 * (force[1:] + force[:-1]) * np.diff(times))]) / self.mass
         return float(np.diff(np.interp([0.5 * self.speed, 1.5 * self.speed], velocity, times))[0])

@@ -55,7 +55,7 @@ MODULES = (attachment, joint_motion, joint_stages, mass_pairs)
 
 
 def flail(options: Options, rate: float, hold: str) -> dict[str, Any]:
-    """A body in empty space is given one random pose after the other; ``hold`` is a key of :data:`HOLDS`."""
+    """Drive a body in empty space to one random pose after the other; ``hold`` is a key of :data:`HOLDS`."""
     limbs, poses = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), rate, **HOLDS[hold]), flailing(options)
     limbs.set_springs(*FLAILING)
 
@@ -68,7 +68,7 @@ def flail(options: Options, rate: float, hold: str) -> dict[str, Any]:
 
 
 def flail_under_pd(options: Options, flesh: str, hold: str) -> dict[str, Any]:
-    """The same under ``control="pd"`` of the environments: muscles with their limits, tissue, locked feet."""
+    """Repeat :func:`flail` under ``control="pd"`` of the environments: muscle limits, tissue, locked feet."""
     poses, (rest, root) = flailing(options), standing(0.0)
     interval = FLAIL_EVERY * PhysicsConfig().control_dt
 
@@ -83,7 +83,7 @@ def flail_under_pd(options: Options, flesh: str, hold: str) -> dict[str, Any]:
 
 
 def flailing(options: Options) -> list[np.ndarray]:
-    """Random poses, rotation vectors ``(22, 3)`` [rad], enough for a case."""
+    """Return random poses for a case, rotation vectors ``(22, 3)`` [rad]."""
     rng, joints = np.random.default_rng(0), (np.arange(NUM_JOINTS) > 0)[:, None]
     return [random_pose(rng)[0] * joints for _ in range(1 + options.steps // FLAIL_EVERY)]
 
@@ -91,7 +91,7 @@ def flailing(options: Options) -> list[np.ndarray]:
 def drift(
     options: Options, model: Model, state: State, step: Callable[[int], None], gaps: Callable[[], np.ndarray]
 ) -> dict[str, Any]:
-    """How far the momenta of a body at rest go astray, and its bones apart, while ``step(index)`` moves it."""
+    """Measure drift of momenta and gaps between bones, while ``step(index)`` moves a body from rest."""
     start, scale, found, apart = totals(model, state), 0.0, np.zeros(2), []
     for index in range(options.steps):
         step(index)
@@ -110,7 +110,7 @@ def drift(
 
 
 def stretch_arms(options: Options, stiffness: float, hold: str) -> dict[str, Any]:
-    """A body whose pelvis is held stretches its arms to the sides, under gravity and against springs alone.
+    """Stretch the arms of a body with a held pelvis to the sides, under gravity and against springs alone.
 
     Only the springs of the arms have the ``stiffness`` [N m/rad]; those of trunk and legs have :data:`TRUNK`.
     """
@@ -138,7 +138,7 @@ def stretch_arms(options: Options, stiffness: float, hold: str) -> dict[str, Any
 
 
 def press(options: Options, damping: float, hold: str) -> dict[str, Any]:
-    """Ankles press the toes of a held, weightless body on the floor: what of their springs' torque arrives."""
+    """Press the toes of a held, weightless body on the floor, and measure the share of the springs' torque."""
     ankles = [*map(joint_index, ANKLES)]
     limbs = Limbs(options, 0.0, np.zeros((NUM_JOINTS, 3)), RATE, ground=True, **HOLDS[hold])
     limbs.set_springs(3000.0, 100.0, held=True)
@@ -167,7 +167,7 @@ def press(options: Options, damping: float, hold: str) -> dict[str, Any]:
 
 
 def stand(options: Options, assist: float, hold: str) -> dict[str, Any]:
-    """Ten seconds of zero actions under ``control="pd"``, in the default environment of that resolution."""
+    """Run ten seconds of zero actions under ``control="pd"``, in the default environment of the resolution."""
     task = load_task("PIAvatar/Reach-v0")
     settings = {"control": "pd", "root_assist": assist, "fidelity": options.fidelity, "pose_noise": 0.0} | HOLDS[hold]
     env = BatchEnv(task(load_config(task.Config, None, settings)), 1, options.device)
@@ -196,7 +196,7 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def cost(options: Options, hold: str) -> dict[str, Any]:
-    """What the joints cost beside the Material Point Method alone: whole control steps, and launch by launch.
+    """Measure the cost of joints on top of the Material Point Method: whole control steps, and by kernel.
 
     Steps are replayed as they are in environments, with joints and without in turn, and the fastest of each
     counts: what interrupts a thread is not its cost. Nothing weighs anything: the body stays where it is in either.
@@ -219,7 +219,7 @@ def cost(options: Options, hold: str) -> dict[str, Any]:
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """Free float, arms by stiffness, pressing toes by damping, standing, balls, kicks, wear, floor, stability, cost."""
+    """Yield all rows: floating, arms, toes, standing, balls, kicks, wear, floor, stability, cost."""
     for hold in HOLDS:
         for rate in (0.0, RATE):
             yield flail(options, rate, hold)

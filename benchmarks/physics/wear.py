@@ -33,7 +33,7 @@ PLACES = {"upright": ("PIAvatar/Reach-v0", {"joints": None, "root_assist": 1.0})
 
 
 def make(options: Options, task: str, **settings: Any) -> BatchEnv:
-    """One environment under torques, reset."""
+    """Build one environment under torques, and reset it."""
     found = load_task(task)
     settings = {"fidelity": options.fidelity, "control": "torque", "pose_noise": 0.0, **settings}
     env = BatchEnv(found(load_config(found.Config, None, settings)), 1, options.device)
@@ -42,7 +42,7 @@ def make(options: Options, task: str, **settings: Any) -> BatchEnv:
 
 
 def homes(env: BatchEnv) -> np.ndarray:
-    """Where its bones have each particle of the avatar, shape ``(P, 3)`` [m]."""
+    """Return the place of each particle of the avatar on its bones, shape ``(P, 3)`` [m]."""
     simulation = env.simulation
     pose, points = simulation.controllers[0].state, simulation.flesh[0].points
     world = Rotation.from_quat(pose.rotation.numpy()[0].astype(float)).as_matrix()
@@ -52,18 +52,18 @@ def homes(env: BatchEnv) -> np.ndarray:
 
 
 def ways(env: BatchEnv) -> np.ndarray:
-    """How far each particle of the avatar is from where its bones have it, shape ``(P,)`` [m]."""
+    """Return the distance of each particle of the avatar from its place on the bones, shape ``(P,)`` [m]."""
     home = homes(env)
     return np.linalg.norm(env.simulation.state.x.numpy()[0, : len(home)] - home, axis=1)
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square in millimetres of lengths in metres."""
+    """Return the root mean square in millimetres of lengths in metres."""
     return float(1e3 * np.sqrt((values**2).mean()))
 
 
 def thrash(options: Options, place: str, hold: str) -> dict[str, Any]:
-    """Random torques of all that the muscles have, new ones in every control step."""
+    """Apply random torques up to the muscles' limits, new ones in every control step."""
     task, settings = PLACES[place]
     env, rng = make(options, task, **settings, **HOLDS[hold]), np.random.default_rng(0)
     bone = env.simulation.flesh[0].sampled.bone
@@ -85,14 +85,14 @@ def thrash(options: Options, place: str, hold: str) -> dict[str, Any]:
 
 
 def widths(env: BatchEnv) -> np.ndarray:
-    """Width of every bone's particles across the bone, a root mean square however it lies [m], shape ``(22,)``."""
+    """Return the root-mean-square width of every bone's particles across the bone [m], shape ``(22,)``."""
     x, bone = env.simulation.state.x.numpy()[0].astype(float), env.simulation.flesh[0].sampled.bone
     spread = [np.linalg.svd(x[bone == b] - x[bone == b].mean(0), compute_uv=False) for b in range(NUM_JOINTS)]
     return np.array([np.hypot(*values[1:]) for values in spread])
 
 
 def set_spinning(env: BatchEnv, rate: float) -> None:
-    """Give the whole body a spin about the vertical through its centre of mass [rad/s]."""
+    """Set a spin of the whole body about the vertical through its centre of mass [rad/s]."""
     state, model = env.simulation.state, env.simulation.model
     x, mass = state.x.numpy()[0].astype(float), model.particles.mass.numpy()[0].astype(float)
     state.u.assign(np.cross((0.0, 0.0, rate), x - mass @ x / mass.sum())[None].astype(np.float32))
@@ -102,13 +102,13 @@ def set_spinning(env: BatchEnv, rate: float) -> None:
 
 
 def straight_growth(env: BatchEnv, rate: float, steps: int) -> float:
-    """What limbs that spin would grow by on straight ways, as a share."""
+    """Return the relative growth of spinning limbs whose particles move straight on."""
     physics = env.simulation.model
     return float(np.expm1(0.5 * rate**2 * physics.step.dt * steps * physics.control_dt))
 
 
 def spin(options: Options, hold: str) -> dict[str, Any]:
-    """A body in empty space that holds its pose by springs spins as a whole."""
+    """Spin a body in empty space that holds its pose by springs."""
     empty = {"gravity": 0.0, "scene": {"ground": False, "walls": False}, "root_assist": 0.0, "control": "pd"}
     env = make(options, "PIAvatar/Reach-v0", **empty, **HOLDS[hold])
     before, steps = widths(env), round(SPIN_SECONDS / env.config.physics.control_dt)
@@ -127,7 +127,7 @@ def spin(options: Options, hold: str) -> dict[str, Any]:
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """A spinning body, then bodies that thrash; with firm bones and slipping ones."""
+    """Yield rows of a spinning body and of bodies that thrash, with firm bones and slipping ones."""
     for hold in HOLDS:
         yield spin(options, hold)
         for place in PLACES:
@@ -142,17 +142,17 @@ SETTLING = 0.25  # first share of the time, in which soft soles give way until t
 
 
 def standing(env: BatchEnv) -> Act:
-    """A PID agent keeps its balance; nothing helps it."""
+    """Return a PID agent that keeps its balance unassisted."""
     return PIDAgent(env)
 
 
 def limp(env: BatchEnv) -> Act:
-    """A body without torques."""
+    """Return zero torques."""
     return lambda _observation: np.zeros((1, env.action_spec.size))
 
 
 def thrashing(env: BatchEnv) -> Act:
-    """Random torques of all that muscles have, new ones in every control step."""
+    """Return random torques up to the muscles' limits, new ones in every control step."""
     rng = np.random.default_rng(0)
     return lambda _observation: rng.uniform(-1.0, 1.0, (1, env.action_spec.size))
 
@@ -166,7 +166,7 @@ WAYS = {
 
 
 def on_floor(options: Options, way: str, hold: str) -> dict[str, Any]:
-    """A body on the floor moves as a key of :data:`WAYS` says; ``hold`` is a key of :data:`HOLDS`."""
+    """Move a body on the floor as a key of :data:`WAYS` says; ``hold`` is a key of :data:`HOLDS`."""
     task, begin = WAYS[way]
     env = make(options, task, **HOLDS[hold])
     act, avatar = begin(env), env.simulation.avatar
@@ -194,7 +194,7 @@ def on_floor(options: Options, way: str, hold: str) -> dict[str, Any]:
 
 
 def floor_cases(options: Options) -> Iterator[dict[str, Any]]:
-    """A body that stands, one that falls and one that lies; with bones that are firm and stop, and without either."""
+    """Yield rows of bodies that stand, fall and lie, with firm bones that stop at the floor and without."""
     for hold in HOLDS:
         for way in WAYS:
             yield on_floor(options, way, hold)

@@ -1,4 +1,4 @@
-"""What a step costs on one CPU core: the suite's tasks beside Gymnasium's ``Humanoid-v5`` in the same run.
+"""Cost of a step on one CPU core: the suite's tasks beside Gymnasium's ``Humanoid-v5`` in the same run.
 
 ``python -m benchmarks.speed.cpu --out benchmarks/results/cpu.json``. Every measurement runs in a process of its own,
 pinned to one core, so that peak memory is that of one environment; the cases take turns, so that a slower minute of the
@@ -46,7 +46,7 @@ class Options(runner.Options):
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """A row for every environment, and one for the time of each of Reach's stages.
+    """Yield a row for every environment, and one for the time of each of Reach's stages.
 
     Raises:
         ValueError: the device is not the CPU.
@@ -69,7 +69,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 
 def summarize(name: str, results: list[dict[str, Any]], core: int | None) -> dict[str, Any]:
-    """One row out of the rounds of a case: medians, and the quarters and ends of the sample."""
+    """Sum up the rounds of a case in a row: medians, quartiles and ends of the sample."""
     rates = np.concatenate([result["env_steps_per_s"] for result in results])
     cpu_rates = np.concatenate([result["env_steps_per_cpu_s"] for result in results])
     particles, substeps = results[0]["particles"], results[0]["substeps"]
@@ -101,7 +101,7 @@ def summarize(name: str, results: list[dict[str, Any]], core: int | None) -> dic
 
 
 def measure(name: str, steps: int, repeats: int, core: int | None) -> dict[str, Any]:
-    """Environment steps a second under full-scale random actions, through ``gym.make``; in a process of its own."""
+    """Measure environment steps a second under full-scale random actions, through ``gym.make``."""
     pin(core)
     prepare(name)
     imports = peak_memory_mb()
@@ -131,7 +131,7 @@ def measure(name: str, steps: int, repeats: int, core: int | None) -> dict[str, 
 
 
 def stages(name: str, steps: int, core: int | None) -> list[dict[str, Any]]:
-    """Rows of the time of each kernel in one step of an environment; in a process of its own."""
+    """Return rows of the time of each kernel in one step of an environment."""
     pin(core)
     prepare(name)
     env = gym.make(name)
@@ -172,7 +172,7 @@ def stages(name: str, steps: int, core: int | None) -> list[dict[str, Any]]:
 
 
 def prepare(name: str) -> None:
-    """Import what an environment needs, so that its memory can be told from theirs."""
+    """Import the libraries of an environment, so that their memory is counted apart."""
     if name.startswith("PIAvatar/"):
         import warp as wp
 
@@ -184,14 +184,14 @@ def prepare(name: str) -> None:
 
 
 def step(env: Any, action: np.ndarray) -> None:
-    """One step; an episode that ends begins anew, as it would in training."""
+    """Take one step; an episode that ends begins anew."""
     _, _, terminated, truncated, _ = env.step(action)
     if terminated or truncated:
         env.reset()
 
 
 def size(env: Any) -> dict[str, Any]:
-    """Particles, substeps and Courant number of one of the suite's environments; None for others."""
+    """Return particles, substeps and Courant number of one of the suite's environments; None for others."""
     batch = getattr(env.unwrapped, "batch", None)
     if batch is None:
         return {"particles": None, "substeps": None, "cfl": None}
@@ -210,7 +210,7 @@ def pin(core: int | None) -> None:
 
 
 def peak_memory_mb() -> float | None:
-    """Largest resident memory of this process so far [MB]; None where the system does not tell."""
+    """Return the largest resident memory of this process so far [MB]; None where it is unknown."""
     try:
         status = Path("/proc/self/status").read_text()
     except OSError:
@@ -234,7 +234,7 @@ def _last_core() -> int | None:
 
 
 def _in_own_process(function: Any, *arguments: Any) -> Any:
-    """Call in a fresh process with one thread for every library."""
+    """Call a function in a fresh process with one thread for every library."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:

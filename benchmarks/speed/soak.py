@@ -49,7 +49,7 @@ class Options(runner.Options):
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """A row for each window, and the verdict.
+    """Yield a row for each window, and the verdict.
 
     Raises:
         ValueError: the file to go on with is of another run.
@@ -66,7 +66,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 
 def resumed(options: Options) -> list[dict[str, Any]]:
-    """Windows of a run that was stopped, from the file it wrote; none if there is no such file.
+    """Return the windows of a run that was stopped, from its file; none if there is no such file.
 
     Raises:
         ValueError: it is of another commit, another device or other options.
@@ -88,7 +88,7 @@ def resumed(options: Options) -> list[dict[str, Any]]:
 
 
 def run(options: Options, done: int, process: int) -> Iterator[dict[str, Any]]:
-    """Step on from ``done`` steps, in the ``process``-th process of this run; a row for each window."""
+    """Step on from ``done`` steps, in the ``process``-th process of this run, and yield a row for each window."""
     batch = BatchEnv(make_task(options.world, options.fidelity), options.num_envs, options.device, seed=done)
     batch.reset()
     stepper = Stepper(batch)
@@ -116,7 +116,7 @@ def run(options: Options, done: int, process: int) -> Iterator[dict[str, Any]]:
 
 
 def verdict(samples: Sequence[dict[str, Any]], steps: int) -> dict[str, Any]:
-    """What has grown over ``steps`` steps, with 95 % intervals: memory [MB], the time of a step as a share of it."""
+    """Return growth over ``steps`` steps, with 95 % intervals: of memory [MB], and of the step's time as a share."""
     kept = [row for process in {row["process"] for row in samples} for row in _settled(samples, process)]
     row: dict[str, Any] = {"case": "verdict", "steps": steps, "windows": len(samples), "windows_used": len(kept)}
     decisions = {}
@@ -137,7 +137,7 @@ def verdict(samples: Sequence[dict[str, Any]], steps: int) -> dict[str, Any]:
 
 
 def slope(steps: Sequence[float], values: Sequence[float], process: Sequence[int]) -> Estimate | None:
-    """Growth a step by least squares, with a level for each process; None where there are too few samples."""
+    """Return growth per step by least squares, with a level for each process; None with too few samples."""
     x, y, groups = np.asarray(steps, float), np.asarray(values, float), np.asarray(process)
     for group in np.unique(groups):
         own = groups == group
@@ -153,13 +153,13 @@ def slope(steps: Sequence[float], values: Sequence[float], process: Sequence[int
 
 
 def _settled(samples: Sequence[dict[str, Any]], process: int) -> list[dict[str, Any]]:
-    """Windows of a process without its first tenth."""
+    """Return the windows of a process without its first tenth."""
     own = [row for row in samples if row["process"] == process]
     return own[int(np.ceil(WARM_UP_SHARE * len(own))) :]
 
 
 def _decide(growth: Sequence[float] | None, limit: float) -> str:
-    """``flat`` if the growth is surely below the limit, ``grows`` if surely above it."""
+    """Return ``flat`` if the growth is surely below the limit, ``grows`` if surely above it, else ``undecided``."""
     if growth is None:
         return "undecided"
     _, low, high = growth

@@ -22,7 +22,7 @@ HASH = re.compile(r"_[0-9a-f]{8}$")
 
 @dataclass(frozen=True)
 class KernelTime:
-    """What a kernel took in one run of a graph.
+    """Time of a kernel in one run of a graph.
 
     Attributes:
         ms: time on the device in all of its launches [ms].
@@ -34,7 +34,7 @@ class KernelTime:
 
 
 def wall_times(device: str, action: Callable[[], object], repeats: int) -> np.ndarray:
-    """Seconds of each of ``repeats`` calls, the device idle before and after; shape ``(repeats,)``."""
+    """Return seconds of each of ``repeats`` calls, the device idle before and after; shape ``(repeats,)``."""
     seconds = np.empty(repeats)
     for index in range(repeats):
         wp.synchronize_device(device)
@@ -46,7 +46,7 @@ def wall_times(device: str, action: Callable[[], object], repeats: int) -> np.nd
 
 
 def kernel_times(graph: LaunchGraph, repeats: int = 1) -> dict[str, KernelTime]:
-    """Time of each kernel in one run, launched one by one; the state advances by ``repeats`` runs.
+    """Measure each kernel in one run, launched one by one; the state advances by ``repeats`` runs.
 
     On a GPU the times come from events around each launch. What events around a kernel that does nothing measure is
     taken off, so launches and the gaps between kernels are not in these times. On a CPU they are times of the calls,
@@ -72,7 +72,7 @@ def kernel_times(graph: LaunchGraph, repeats: int = 1) -> dict[str, KernelTime]:
 
 
 def _launch_times(graph: LaunchGraph) -> dict[str, list[float]]:
-    """Milliseconds of every launch of a run on a GPU, one after the other, by kernel; no condition is asked for."""
+    """Return milliseconds of every launch of a run on a GPU, in sequence, by kernel, whatever the conditions are."""
     launches = graph.launches
     wp.timing_begin(wp.TIMING_ALL)
     with wp.ScopedDevice(graph.device):
@@ -86,28 +86,28 @@ def _launch_times(graph: LaunchGraph) -> dict[str, list[float]]:
 
 
 def array_bytes(device: str) -> int:
-    """Bytes in use: on a GPU those of Warp's memory pool, on a CPU those of the Warp arrays that are alive."""
+    """Return bytes in use: on a GPU those of Warp's memory pool, on a CPU those of the Warp arrays that are alive."""
     target = wp.get_device(device)
     if not target.is_cuda:
         own = (item for item in gc.get_objects() if type(item) is wp.array)  # not fixed arrays in kernels
         return sum(array.capacity for array in own if array.device == target and array.deleter is not None)
-    wp.synchronize_device(target)  # the pool knows of what is freed when the device has come to it
+    wp.synchronize_device(target)  # the pool counts freed memory only once the device has reached the call
     if target.is_mempool_enabled:
         return int(wp.get_mempool_used_mem_current(target))
     return target.total_memory - target.free_memory
 
 
 def device_bytes(device: str) -> int | None:
-    """Bytes of a GPU that are not free, whoever has them, as ``nvidia-smi`` counts; None on a CPU."""
+    """Return the bytes of a GPU that are not free, as ``nvidia-smi`` counts; None on a CPU."""
     target = wp.get_device(device)
     return target.total_memory - target.free_memory if target.is_cuda else None
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process now.
+    """Return the resident memory of this process.
 
     Raises:
-        RuntimeError: the system does not tell.
+        RuntimeError: the system has no /proc.
     """
     try:
         status = Path("/proc/self/status").read_text(encoding="utf-8")
@@ -119,4 +119,4 @@ def resident_bytes() -> int:
 
 @wp.kernel
 def do_nothing():
-    """The price of a launch."""
+    """Do nothing, to measure the overhead of a launch."""

@@ -58,7 +58,7 @@ class Options(runner.Options):
 
 
 def cases(options: Options) -> Iterator[dict[str, Any]]:
-    """A row for each world and number of environments; on a CPU one more about threads."""
+    """Yield a row for each world and number of environments; on a CPU one more about threads."""
     on_gpu = wp.get_device(options.device).is_cuda
     batches = options.num_envs or (BATCHES_ON_GPU if on_gpu else BATCHES_ON_CPU)
     for world in runner.progress(options.worlds, "vector"):
@@ -72,7 +72,7 @@ def cases(options: Options) -> Iterator[dict[str, Any]]:
 
 
 def make_task(world: str, fidelity: str, settings: Sequence[str] = ()) -> Task:
-    """The task of a world at a resolution, with settings such as ``control.bone_contact=false``.
+    """Build the task of a world at a resolution, with settings such as ``control.bone_contact=false``.
 
     Raises:
         ValueError: there is no such world or setting.
@@ -85,7 +85,7 @@ def make_task(world: str, fidelity: str, settings: Sequence[str] = ()) -> Task:
 
 
 class Stepper:
-    """A batch under random actions, everything on the device.
+    """Batch under random actions, everything on the device.
 
     Attributes:
         batch: what is stepped.
@@ -103,20 +103,20 @@ class Stepper:
             graph.launch(advance_clock, 1, [], [self._clock])
 
     def step(self) -> None:
-        """New episodes where one has ended, random actions, one control step."""
+        """Begin new episodes where one has ended, and take a control step under random actions."""
         self.batch.find_ended()
         self._note.run()
         self.batch.reset_masked()
         self.batch.step()
 
     def step_only(self) -> None:
-        """Random actions and one control step; nothing begins anew."""
+        """Take one control step under random actions, without resets."""
         self._act.run()
         self.batch.step()
 
 
 class Trainer:
-    """A batch as a trainer steps it: its own actions in, copies out, SAME_STEP."""
+    """Batch as a trainer steps it: its own actions in, copies out, SAME_STEP."""
 
     def __init__(self, batched: EpisodeHost) -> None:
         self.batched = batched
@@ -131,12 +131,12 @@ class Trainer:
             self._draw = lambda: rng.uniform(-1.0, 1.0, shape).astype(np.float32)
 
     def step(self) -> None:
-        """One step, everything that a learner stores copied, new episodes where one has ended."""
+        """Take one step, copy everything that a learner stores, and begin new episodes where one has ended."""
         self.batched.step_and_reset(self._draw())
 
 
 def rates(step: Callable[[], None], num_envs: int, options: Options) -> np.ndarray:
-    """Environment steps a second of each repeat; shape ``(repeats,)``."""
+    """Measure environment steps a second in each repeat; shape ``(repeats,)``."""
     device = options.device
     timing.wall_times(device, step, WARM_UP)  # captures the graphs, compiles what there is
     once = float(np.median(timing.wall_times(device, step, WARM_UP)))
@@ -150,7 +150,7 @@ def rates(step: Callable[[], None], num_envs: int, options: Options) -> np.ndarr
 
 
 def torch_can_use(device: str) -> bool:
-    """Whether torch is there and knows the device; tensors on a CPU have nothing to show that NumPy has not."""
+    """Return whether torch can use the device; on a CPU NumPy serves as well."""
     if not wp.get_device(device).is_cuda or importlib.util.find_spec("torch") is None:
         return False
     import torch
@@ -159,7 +159,7 @@ def torch_can_use(device: str) -> bool:
 
 
 def measure(world: str, num_envs: int, options: Options) -> dict[str, Any]:
-    """Speeds and memory of one batch, or why there is none."""
+    """Measure speeds and memory of one batch, or return the reason for its refusal."""
     gc.collect()  # what the batch before has left
     before = timing.array_bytes(options.device)
     api = "torch" if torch_can_use(options.device) else "numpy"
@@ -196,7 +196,7 @@ def measure(world: str, num_envs: int, options: Options) -> dict[str, Any]:
 
 
 def scaling(world: str, num_envs: int, options: Options) -> dict[str, Any]:
-    """How much faster two threads are than one, in turns, so that a slower minute of the machine hits both."""
+    """Measure the speed-up of two threads over one, in turns, so that a slower minute of the machine hits both."""
     trainers = {
         threads: Trainer(EpisodeHost(make_task(world, options.fidelity), num_envs, options.device, "numpy", threads))
         for threads in (1, 2)
@@ -223,7 +223,7 @@ def scaling(world: str, num_envs: int, options: Options) -> dict[str, Any]:
 
 @wp.kernel
 def draw_actions(clock: wp.array(dtype=int), action: wp.array3d(dtype=float)):
-    """Actions uniform in [-1, 1], different at every reading of the clock."""
+    """Draw actions uniform in [-1, 1], different at every reading of the clock."""
     e, agent, n = wp.tid()
     seed = int(wp.rand_init(clock[0], e))
     state = wp.rand_init(seed, agent * action.shape[2] + n)
@@ -232,7 +232,7 @@ def draw_actions(clock: wp.array(dtype=int), action: wp.array3d(dtype=float)):
 
 @wp.kernel
 def advance_clock(clock: wp.array(dtype=int)):
-    """The next reading."""
+    """Advance the clock."""
     clock[0] = clock[0] + 1
 
 

@@ -1,4 +1,4 @@
-"""What trainings on one batch share: evaluations are those of single environments, configurations are refused alike."""
+"""Trainings on one batch: evaluations equal those of single environments."""
 
 from __future__ import annotations
 

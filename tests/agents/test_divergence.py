@@ -37,7 +37,7 @@ TRAININGS = {
 
 
 def ended_with(name: str, folder: Path, device: str, *settings: str) -> str:
-    """What a training says in the end; it must fail."""
+    """Run a training that must fail, and return its message."""
     needed, script, config, own, *_ = TRAININGS[name]
     pytest.importorskip(needed, reason="needs its extra")
     main = importlib.import_module(f"agents.{script}").main

@@ -1,4 +1,4 @@
-"""What a training's folder holds is not lost to another one, and what is damaged there is not taken for sound."""
+"""Folders of trainings: no other training overwrites them, and damage is detected."""
 
 from __future__ import annotations
 

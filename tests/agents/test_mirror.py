@@ -38,7 +38,7 @@ def test_twice_is_as_before_and_once_is_not(name, device):
 
 
 def test_a_symmetric_clip_is_its_own_mirror_image(device):
-    """What is left to follow of a squat, from a body that stays behind."""
+    """Return the remaining reference of a squat for a body that lags behind."""
     settings = {"motion": "squat", "random_start": False, "impulse": 0.0, "root_action": False, "fail_distance": 2.0}
     episodes = batch("TrackMotion-v0", 1, device, **settings, control="torque")
     mirror = mirror_of(episodes)

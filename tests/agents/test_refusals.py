@@ -148,7 +148,7 @@ def test_policies_play_only_what_they_were_trained_for(settings, words, ended, d
 
 
 def test_a_policy_that_does_not_see_a_prop_plays_beside_it(ended):
-    """What it does see keeps its meaning."""
+    """The observed components keep their meaning."""
     run = play.open_run(ended)
     ball = ('scene.props=[{"name": "ball", "position": [0, -2, 0.2]}]',)
     with pytest.raises(ValueError, match="changes its observations"):

@@ -1,4 +1,4 @@
-"""What is killed goes on as if nothing had happened: the same curve and the same networks, bit for bit."""
+"""Killed trainings resume with the same curve and the same networks, bit for bit."""
 
 from __future__ import annotations
 

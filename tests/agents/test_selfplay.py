@@ -46,7 +46,7 @@ def keep(config: TrainingConfig, folder) -> Checkpoint:
 
 
 def play(config: TrainingConfig, folder, checkpoint: Checkpoint | None = None, watcher: BaseCallback | None = None):
-    """What ``train.train_selfplay`` does before it evaluates, with all worlds in this process."""
+    """Train as ``train.train_selfplay`` does, with all worlds in this process."""
     make = factory(config)
     folder.mkdir(parents=True, exist_ok=True)
     venv = AgentVecEnv(DummyVecEnv([make] * config.num_workers), config.selfplay.num_duels(config.num_workers))

@@ -1,4 +1,4 @@
-"""What the toy worlds have in common: the PettingZoo Parallel API in pure NumPy, seeded as the suite's own."""
+"""Base of the toy worlds: the PettingZoo Parallel API in pure NumPy, seeded as the suite's own."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Game(ParallelEnv):
         """Draw the episode."""
 
     def observe(self, name: str) -> list[float]:
-        """What an agent sees."""
+        """Return an agent's observation."""
         raise NotImplementedError
 
     def play(self, actions: dict[str, float]) -> tuple[dict, dict, dict, dict]:
