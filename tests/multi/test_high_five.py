@@ -282,5 +282,5 @@ def test_when_one_falls_it_is_over_for_both(make_game, play):
 
 @pytest.mark.parametrize("impulse", [(0.0, 1.0), (2.0, 1.0)])
 def test_an_impulse_that_cannot_be_is_refused(impulse):
-    with pytest.raises(ConfigError, match="must be positive and not fall; give the lower bound first"):
+    with pytest.raises(ConfigError, match=r"impulse.*must be positive"):
         high_five_v0.TASK(load_config(high_five_v0.TASK.Config, None, {"impulse": impulse}))

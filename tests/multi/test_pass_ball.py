@@ -289,5 +289,5 @@ def test_when_one_falls_it_is_over_for_all(make_game, play):
 
 @pytest.mark.parametrize("settings", [{"ball_mass": (0.0, 1.0)}, {"serve_speed": (2.0, 1.0)}])
 def test_ranges_that_cannot_be_are_refused(settings):
-    with pytest.raises(ConfigError, match=r"must be (positive and not fall; give the lower bound first|>= 0.001)"):
+    with pytest.raises(ConfigError, match=r"must be (positive|>= 0.001)"):
         pass_ball_v0.TASK(load_config(pass_ball_v0.TASK.Config, None, settings))
