@@ -1,4 +1,4 @@
-"""Boxing: what a blow is worth, whose it is, and who has won."""
+"""Boxing: points of a blow, the agent that scores them, and the winner."""
 
 from __future__ import annotations
 
@@ -22,16 +22,15 @@ class Scorer:
     """The kernel that counts points, over made-up impulses of one environment of ``agents``."""
 
     def __init__(self, device: str, agents: int = 2) -> None:
-        from piavatar_envs.tasks.games.boxing import Scale, Tally, count_points
+        from piavatar_envs.tasks.games.boxing import Rules, count_points
 
-        self.device, self.agents, self.kernel = device, agents, count_points
-        self.scale, self.tally = Scale(), Tally()
-        self.scale.least, self.scale.points = LEAST, wp.vec2(*POINTS)
+        self.device, self.agents, self.kernel, self.rules = device, agents, count_points, Rules()
+        self.rules.blow_impulse, self.rules.points = LEAST, wp.vec2(*POINTS)
         pairs = 1, agents, agents
-        self.tally.impulse = wp.full(pairs, wp.vec2(np.nan, np.nan), dtype=wp.vec2, device=device)
-        self.tally.points = wp.full(pairs, np.nan, dtype=float, device=device)
-        self.tally.peak = wp.zeros(pairs, dtype=wp.vec2, device=device)
-        self.tally.score = wp.zeros(pairs[:2], dtype=float, device=device)
+        self.impulse = wp.full(pairs, wp.vec2(np.nan, np.nan), dtype=wp.vec2, device=device)
+        self.points = wp.full(pairs, np.nan, dtype=float, device=device)
+        self.peak = wp.zeros(pairs, dtype=wp.vec2, device=device)
+        self.score = wp.zeros(pairs[:2], dtype=float, device=device)
         self.alive = np.ones((1, agents), bool)
         self.failure = 0
 
@@ -44,10 +43,9 @@ class Scorer:
         sensors.part_impulse = wp.array(part_impulse, dtype=wp.vec3, device=self.device)
         alive = wp.array(self.alive, dtype=wp.bool, device=self.device)
         failure = wp.array([self.failure], dtype=int, device=self.device)
-        tally = self.tally
-        outputs = [tally.peak, tally.score, tally.impulse, tally.points]
-        wp.launch(self.kernel, (1, self.agents), [self.scale, alive, failure, sensors, *outputs], device=self.device)
-        return tally.points.numpy()[0]
+        outputs = [self.peak, self.score, self.impulse, self.points]
+        wp.launch(self.kernel, (1, self.agents), [self.rules, alive, failure, sensors, *outputs], device=self.device)
+        return self.points.numpy()[0]
 
     def blow(self, strength: float, target: str = "head", arm: str = "right_arm", felt: float | None = None) -> float:
         """Points for agent 0 of one step in which it strikes agent 1."""
@@ -63,7 +61,7 @@ def expected(strength: float, full: float) -> float:
 
 @pytest.mark.parametrize("strength", [0.5, 1.5, 2.0, 2.9, 3.0, 30.0])
 @pytest.mark.parametrize(("target", "full"), [("head", POINTS[0]), ("torso", POINTS[1]), ("left_leg", 0.0)])
-def test_a_blow_is_worth_what_it_strikes_and_how_hard(games, device, strength, target, full):
+def test_points_depend_on_target_and_strength(games, device, strength, target, full):
     for arm in ("left_arm", "right_arm"):
         assert Scorer(device).blow(strength, target, arm) == pytest.approx(expected(strength, full), abs=1e-6)
 
@@ -82,7 +80,7 @@ def test_a_contact_counts_once_by_its_strongest_step(games, device):
     # 2.0 to 2.8 are one contact (it never falls below 0.75); 2.3 and 3.5 are new ones
     first = [value[0], value[1] - value[0], 0.0, 0.0, 0.0, value[5] - value[1]]
     assert gained == pytest.approx([*first, 0.0, value[7], 0.0, 1.0], abs=1e-6)
-    assert scorer.tally.score.numpy()[0] == pytest.approx([sum(gained), 0.0], abs=1e-6)
+    assert scorer.score.numpy()[0] == pytest.approx([sum(gained), 0.0], abs=1e-6)
 
 
 def test_leaning_scores_once(games, device):
@@ -90,7 +88,7 @@ def test_leaning_scores_once(games, device):
     assert sum(scorer.blow(2.5) for _ in range(30)) == pytest.approx(expected(2.5, 1.0), abs=1e-6)
 
 
-def test_a_blow_belongs_to_who_struck_it(games, device):
+def test_points_belong_to_the_striking_agent(games, device):
     scorer = Scorer(device, agents=3)
     points = scorer.count({
         (2, "head", 0): (3.0, 0.0, 0.0), (0, "left_arm", 2): (-3.0, 0.0, 0.0),
@@ -102,11 +100,11 @@ def test_a_blow_belongs_to_who_struck_it(games, device):
     assert points == pytest.approx(wanted, abs=1e-6)
 
 
-def test_nobody_scores_who_is_out_or_on_who_is_out(games, device):
+def test_an_agent_that_is_out_neither_scores_nor_is_scored_on(games, device):
     for out in (0, 1):
         scorer = Scorer(device)
         scorer.alive[0, out] = False
-        assert scorer.blow(9.0) == 0.0 and not scorer.tally.score.numpy().any()
+        assert scorer.blow(9.0) == 0.0 and not scorer.score.numpy().any()
     scorer = Scorer(device)
     scorer.failure = 1
     assert scorer.blow(9.0) == 0.0
@@ -162,7 +160,7 @@ def test_a_bout_is_taken_up_again_in_mid_blow(make_game, same):
     world, other = (make_game(BOXING, twin=n, **SOFT) for n in (0, 1))
     world.reset(seed=0)
     impulses = [row[4]["agent_0"]["given_impulse"] for row in strike(world)]
-    # a moment in touch, and still in touch a step later: another blow, to who forgets the first
+    # a moment in touch, and still in touch a step later: another blow, if the first were forgotten
     full = 2.0 * SOFT["blow_impulse"]
     moment = next(k for k, two in enumerate(pairwise(impulses)) if min(two) > full)
     world.reset(seed=0)
@@ -196,7 +194,7 @@ def test_a_knock_down_ends_the_bout(make_game, play):
     world = make_game(BOXING)
     world.reset(seed=0)
     state = world.get_state()
-    state["task.score"][0] = (3.0, 0.0)  # points do not help who is down
+    state["task.score"][0] = (3.0, 0.0)  # points do not help an agent that is down
     state["avatar_0.state.let_go"][:] = 1
     world.set_state(state)
     [(_, _, terminations, _, infos)] = play(world, 1)
@@ -233,7 +231,7 @@ def test_among_three_the_bout_goes_on(make_game, play):
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_the_ropes_hold(make_game, play, count):
-    """Walking backwards for as long as it takes: nobody leaves the ring, nobody falls, nothing fails."""
+    """Walking backwards for as long as it takes: no agent leaves the ring or falls, nothing fails."""
     world = make_game(BOXING, num_agents=count, ring_size=2.2)
     world.reset(seed=0)
     rows = play(world, 40, **{"root.y": 1.0})

@@ -1,4 +1,4 @@
-"""HighFive: what counts as a slap, that its numbers are those of the bodies, and that two who swing succeed."""
+"""HighFive: conditions of a slap, metrics that agree with the bodies, and success of two that swing."""
 
 from __future__ import annotations
 
@@ -199,7 +199,14 @@ def test_what_counts(device, why, success, ended):
     elif why == "the other arms":
         parts = np.roll(parts, -1, axis=1)
     rule, hands, sensors = slap.SlapRule(), slap.Hands(), Sensors()
-    rule.window, rule.reach, rule.height, rule.upright, rule.margin, rule.slap_bonus = 3.0, 0.15, 1.3, 0.5, 0.5, 7.0
+    rule.impulse_window, rule.reach, rule.least_height, rule.upright, rule.margin, rule.slap_bonus = (
+        3.0,
+        0.15,
+        1.3,
+        0.5,
+        0.5,
+        7.0,
+    )
     hands.middle, hands.direction = (wp.array(a, dtype=wp.vec3, device=device) for a in (middle, direction))
     sensors.part_impulse = wp.array(parts, dtype=wp.vec3, device=device)
     side, least = wp.array([1], dtype=int, device=device), wp.array([2.0], dtype=float, device=device)

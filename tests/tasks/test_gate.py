@@ -102,7 +102,14 @@ def test_a_flight_passes_as_near_as_its_parabola(device):
 
 def gate_struct(**values) -> Gate:
     gate = Gate()
-    settings = {"radius": 0.4, "height": 0.3, "near": 1.0, "far": 2.0, "spread": 0.5, "ball_radius": BALL_RADIUS}
+    settings = {
+        "target_radius": 0.4,
+        "target_height": 0.3,
+        "near": 1.0,
+        "far": 2.0,
+        "target_angle": 0.5,
+        "ball_radius": BALL_RADIUS,
+    }
     for name, value in {**settings, "ball_volume": 0.005, "gravity": GRAVITY, "control_cost": 0.1, **values}.items():
         setattr(gate, name, value)
     return gate
@@ -152,14 +159,14 @@ class Shot:
         t = np.clip(way @ flat / max(flat @ flat, 1e-6), 0.0, 1.0)
         height = max(x[2] + v[2] * t - 0.5 * GRAVITY * t**2, min(BALL_RADIUS, x[2]))
         miss = np.linalg.norm([*(way - t * flat)[:2], self.center[2] - height])
-        promise = 1.0 - np.clip((miss - 0.5 * gate.radius) / (self.length - 0.5 * gate.radius), 0.0, 1.0)
+        promise = 1.0 - np.clip((miss - 0.5 * gate.target_radius) / (self.length - 0.5 * gate.target_radius), 0.0, 1.0)
         best = self.best or (near, promise)
         earned = [0.1 * max(near - best[0], 0.0), 0.4 * max(promise - best[1], 0.0), 0.0]
         self.best = (max(near, best[0]), max(promise, best[1]))
         s = [(p - self.center) @ self.forward for p in (self.last, x)]
         if s[0] < 0.0 <= s[1]:
             cross = self.last + s[0] / (s[0] - s[1]) * (x - self.last)
-            inside = np.linalg.norm(cross - self.center) <= gate.radius
+            inside = np.linalg.norm(cross - self.center) <= gate.target_radius
             earned[2] = 0.5 if inside and not self.through else 0.0
             self.through = self.through or inside
         self.last = x

@@ -133,7 +133,7 @@ def test_standing_must_last(make_env):
     stand = make_env("PIAvatar/Stand-v0", root_assist=1.0, pose_noise=0.0)
     stand.reset(seed=0)
     lying, standing = env.get_state(), stand.get_state()
-    env.set_state({name: standing[name] if name.startswith(("particles", "joints", "tracked", "drive")) else value
+    env.set_state({name: standing[name] if name.startswith(("particles", "avatar", "controller")) else value
                    for name, value in lying.items()})  # fmt: skip
     held = 0
     for _ in range(25):
