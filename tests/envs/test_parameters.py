@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.envs.parameters import ASSIST, PARAMETERS
 from piavatar_envs.sim.randomize import Parameter
 from tests.sim.randomized import VARIED, by_name, check_term, factors_of
@@ -86,7 +87,7 @@ def test_the_way_of_the_target_is_known_from_what_is_told(make_batch):
     batch = make_batch(REACH, 3, observe_parameters=True, **VARIED)
     batch.reset(seeds=[1, 2, 3])
     config, body = batch.config, batch.simulation.avatar.body
-    center = np.broadcast_to(body.rest_joint.numpy()[:, batch.task.target.center], (3, 3))
+    center = np.broadcast_to(body.rest_joint.numpy()[:, joint_index("spine3")], (3, 3))
     for _ in range(3):
         batch.step()
         told = by_name(batch)

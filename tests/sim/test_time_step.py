@@ -105,7 +105,7 @@ def test_they_do_not_end_episodes(make_env, task, settings):
 
 def test_a_fast_serve_does_not_end_the_game(device):
     pytest.importorskip("pettingzoo", reason="needs the extra multi")
-    from piavatar_envs.tasks.games.pass_ball import parallel_env
+    from piavatar_envs.multi.pass_ball_v0 import parallel_env
 
     game = parallel_env(device=device, fidelity="tiny", serve_speed=(30.0, 30.0))
     game.reset(seed=0)
