@@ -1,4 +1,4 @@
-"""What is in a world: avatars with settings of their own, props, colliders, friction by name, and what is refused."""
+"""Worlds: avatars with settings of their own, props, colliders, friction by name, and impossible scenes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_avatars_have_settings_of_their_own(device):
     simulation = world(device, avatars=avatars)
     a, b = (controller.parameters for controller in simulation.controllers)
     assert b.tone_rate / a.tone_rate == pytest.approx(0.25)
-    assert b.max_force / a.max_force == pytest.approx(0.5 / 2.0)
+    assert b.max_root_force / a.max_root_force == pytest.approx(0.5 / 2.0)
     assert b.shape_rate / a.shape_rate == pytest.approx(0.1 / 0.3)
     own = slice(simulation.subjects.first[1], simulation.subjects.first[2])
     particles = simulation.model.particles
