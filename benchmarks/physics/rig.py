@@ -78,7 +78,7 @@ class Rig:
             skin_joints=particles.skin_joints,
             skin_weights=particles.skin_weights,
             bone=particles.bone,
-            inert=np.zeros((1, len(particles)), np.float32),
+            velocity_lag=np.zeros((1, len(particles)), np.float32),
         )
         self.flesh = particles.bone < 0
         self.model = build_model(

@@ -1,19 +1,13 @@
-"""Sums over chunks of particles where quarters of a warp share them: one, two, or all four, by a chunk's length.
+"""Sums over the particles of bones: moments that rigid motions are fitted to, and momenta of what controllers change.
 
-A warp that sums one chunk has as much to do with what its lanes have in the end as with the particles, and chunks of
-bones are short. So all lanes have about as many particles, and what they have in the end is added up for up to four
-chunks at once. On a CPU a thread has a chunk.
+They run over fixed lists of particles in chunks, without atomics: the result does not depend on the schedule. A warp
+that summed a single chunk would spend as long on adding up its lanes as on the particles, so up to four chunks share a
+warp, in quarters of it: a chunk has one, two or all four, by its length. On a CPU a thread has a chunk.
 
-Sums over the particles of bones: moments that rigid motions are fitted to, momenta of what the drive changes.
-
-They run over fixed lists of particles in chunks (no atomics): the result does not depend on the schedule. ``threads``
-threads share a chunk, or the chunks of a bone.
-
-Sums over bones in the pass over particles that finds what is to be summed.
-
-A body's particles are in parts that follow each other in memory. On a GPU a CUDA block has a part: what its threads
-find of the particles meets in shared memory, from where its warps sum the chunks of bones that are in the part. On a
-CPU a body is one part, and its particles meet in an array that all bodies use after each other.
+The torque controller sums in the same pass over particles that computes the summands. A body's particles are then
+partitioned in memory order: on a GPU a CUDA block has a partition, whose particles its threads store in shared memory,
+from where its warps sum the chunks of that partition. On a CPU a body is one partition, and the particles are stored in
+an array that all bodies use one after the other.
 """
 
 from __future__ import annotations
@@ -34,17 +28,17 @@ LANES, QUARTERS, MOST = 8, 4, 6
 
 
 def share_chunks(chunk: np.ndarray, begin: np.ndarray, end: np.ndarray, bone: np.ndarray, device: str) -> np.ndarray:
-    """Who shares chunks of these numbers, with entries from ``begin`` on before ``end``: records of four, int32.
+    """Distribute chunks, with entries from ``begin`` on before ``end``, over quarters of warps.
 
-    That is, of quarters that follow each other, in whole warps: the chunk whose sum a quarter stores, or -1; the
-    ``bone`` of its chunk, and 256 times the lanes that share it; its first entry, and the end of all. On a CPU there is
-    one for each chunk.
+    Returns:
+        Records ``(quarters, 4)`` int32, in whole warps: the chunk whose sum a quarter stores, or -1; the ``bone`` of
+        its chunk plus 256 times the lanes that share it; its first entry; the end of all. On a CPU one for each chunk.
     """
     length = end - begin
     if not wp.get_device(device).is_cuda:
         return np.stack([chunk, bone + 256, begin, end], axis=1).astype(np.int32)
     count = np.select([length <= LANES * MOST, length <= 2 * LANES * MOST], [1, 2], QUARTERS)
-    order = np.lexsort((-length, -count))  # those that share a warp begin with a whole one, a half one, or anywhere
+    order = np.lexsort((-length, -count))  # longest shares first, so that none straddles two warps
     own = np.repeat(order, count[order])
     rank = np.concatenate([np.arange(n) for n in count[order]])
     stored = np.where(rank == 0, chunk[own], -1)
@@ -54,13 +48,13 @@ def share_chunks(chunk: np.ndarray, begin: np.ndarray, end: np.ndarray, bone: np
 
 
 def warps_of(quarters: wp.array, threads: int) -> int:
-    """Warps that share the chunks, of so many ``threads``; on a CPU there is one a chunk."""
+    """Return the number of warps of ``threads`` that share the chunks; on a CPU one a chunk."""
     return quarters.shape[0] // max(1, threads // LANES)
 
 
 @wp.func
 def quarters_at_once(threads: int):
-    """Quarters of a warp; 1 of a thread that is alone."""
+    """Return the quarters of a warp; 1 for a single thread."""
     return wp.max(1, threads // LANES)
 
 
@@ -73,13 +67,13 @@ return quarters.data[first];
 #endif
 """)
 def share_of(quarters: wp.array(dtype=wp.vec4i), first: int, lane: int) -> wp.vec4i:
-    """The share of a ``lane`` of the warp whose quarters are ``first`` and the next, with its own first entry."""
+    """Return the share of a ``lane`` of the warp whose quarters begin at ``first``, with its own first entry."""
     ...
 
 
 @wp.func
 def own_share(quarters: wp.array(dtype=wp.vec4i), i: int, j: int, k: int, threads: int):
-    """Environment and share of a thread in a launch over ``(num_envs, warps_of(quarters), threads)``."""
+    """Return environment and share of a thread in a launch over ``(num_envs, warps_of(quarters), threads)``."""
     together = quarters_at_once(threads)
     at = place_in_chunks(i, j, k, quarters.shape[0] // together)
     return at[0], share_of(quarters, together * at[1], at[2])
@@ -87,7 +81,7 @@ def own_share(quarters: wp.array(dtype=wp.vec4i), i: int, j: int, k: int, thread
 
 # Each step halves the numbers that a lane goes on with, as well as the lanes that go on with the same.
 def _store(words: int, store: str) -> str:
-    """A snippet that adds up the ``part`` of so many words of all lanes that share a chunk, and stores it."""
+    """Return a snippet that adds up so many words of all lanes that share a chunk, and stores them."""
     size = 1 << (words - 1).bit_length()
     return f"""
 #if defined(__CUDA_ARCH__)
@@ -142,9 +136,9 @@ def store_both(
     value: vec16,
     other: vec12,
 ):
-    """``into[e, c]`` = the sum of ``value`` over the lanes that share chunk ``c``, ``other_into[e, c]`` of ``other``.
+    """Store the sums of ``value`` and ``other`` over the lanes that share chunk ``c`` in ``[e, c]`` of both arrays.
 
-    All threads of a warp come here.
+    All threads of a warp must call this.
     """
     ...
 
@@ -155,27 +149,27 @@ _ALONE = "into.data[into.shape[1] * e + share[0]] = value;\n#endif\n"
 
 @wp.func_native(_store(12, _TWO) + _ALONE)
 def store_one(into: wp.array2d(dtype=vec12), e: int, share: wp.vec4i, value: vec12):
-    """:func:`store_both` of twelve numbers."""
+    """Store the sum of twelve numbers like :func:`store_both`."""
     ...
 
 
 @wp.func_native(_store(16, _TWO) + _ALONE)
 def store_moments(into: wp.array2d(dtype=vec16), e: int, share: wp.vec4i, value: vec16):
-    """:func:`store_both` of sixteen numbers."""
+    """Store the sum of sixteen numbers like :func:`store_both`."""
     ...
 
 
-#: Groups of threads that share the chunks of a body, where it seldom has any.
+#: Groups of threads that share the chunks of a body in a sum that is seldom needed.
 GROUPS = wp.constant(8)
 
 
-#: Entries of a chunk that a thread asks for at once, in sums that wait for memory.
+#: Entries of a chunk that a thread loads at once, in sums that wait for memory.
 AT_ONCE = wp.constant(2)
 
 
 @wp.func
 def entry_of(body: Body, n: int, last: int):
-    """Particle of entry ``n`` and the bone's weight in it, 0 beyond the ``last`` entry of the chunk."""
+    """Return the particle of entry ``n`` and the bone's weight in it, 0 beyond the ``last`` entry of the chunk."""
     at = wp.min(n, last)
     weight = float_at(body.entry_weight, at)
     return int_at(body.entry, at), wp.where(n > last, 0.0, weight)
@@ -183,7 +177,7 @@ def entry_of(body: Body, n: int, last: int):
 
 @wp.func
 def moments_of(w: float, d: wp.vec3, v: wp.vec3):
-    """What a share of mass ``w`` at ``d`` with velocity ``v`` has of the sums in :data:`vec16`."""
+    """Return the moments of a mass ``w`` at ``d`` with velocity ``v``: m, m d, m v, m d d^T, m d x v."""
     p = w * v
     wd = w * d
     l = wp.cross(wd, v)
@@ -208,7 +202,7 @@ def chunk_moments(
     # out
     moments: wp.array2d(dtype=vec16),
 ):
-    """Moments of one chunk of a bone's particles about the bone's reference point (small numbers, small round-off).
+    """Sum the moments of one chunk of a bone's particles about the bone's reference point, for small round-off.
 
     The ``share`` of a thread is as :mod:`piavatar_envs.avatar.segment_sums` has it.
     """
@@ -239,7 +233,7 @@ def sum_moments(
     # out
     moments: wp.array2d(dtype=vec16),
 ):
-    """:func:`chunk_moments` of every chunk, over ``(num_envs, warps of the quarters, threads)``."""
+    """Run :func:`chunk_moments` for every chunk, over ``(num_envs, warps of the quarters, threads)``."""
     i, j, k = wp.tid()
     e, share = own_share(body.quarters, i, j, k, threads)
     if failure[e] == 0:
@@ -259,7 +253,7 @@ def chunk_corrections(
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """Momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk."""
+    """Sum momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk."""
     origin = center[e, share[1] & 255]
     r = row(e, particles.mass.shape[0])
     p1 = wp.vec3()
@@ -297,7 +291,7 @@ def sum_corrections(
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """:func:`chunk_corrections` of every chunk, over ``(num_envs, warps of the quarters, threads)``."""
+    """Run :func:`chunk_corrections` for every chunk, over ``(num_envs, warps of the quarters, threads)``."""
     i, j, k = wp.tid()
     e, share = own_share(body.quarters, i, j, k, threads)
     if failure[e] == 0:
@@ -315,7 +309,7 @@ def add_chunks(
     # out
     bone_corrections: wp.array2d(dtype=vec12),
 ):
-    """Sum of the chunks of bone ``b``."""
+    """Add up the chunks of bone ``b``."""
     s = vec12()
     for c in range(body.chunk_start[b] + thread, body.chunk_start[b + 1], threads):
         s += corrections[e, c]
@@ -336,7 +330,7 @@ def chunk_motion(
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """Momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in one chunk."""
+    """Sum momentum of the kinematic velocity and its moment ``sum m d vk^T`` about the bone's centre in one chunk."""
     origin = center[e, share[1] & 255]
     r = row(e, particles.mass.shape[0])
     P = wp.vec3()
@@ -364,13 +358,171 @@ def sum_motion(
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """:func:`chunk_motion` of bodies that nothing supports.
-
-    Launched over ``(num_envs, GROUPS, threads)``: most bodies have nothing to do here, and end few threads.
-    """
+    """Run :func:`chunk_motion` for bodies that nothing supports, over ``(num_envs, GROUPS, threads)``."""
     e, group, thread = wp.tid()
     if failure[e] != 0 or (control.free_motion == 0 and let_go[e] == 0):
         return
     quarters = quarters_at_once(threads)
     for n in range(group, body.quarters.shape[0] // quarters, GROUPS):
         chunk_motion(body, particles, x, vk, center, e, share_of(body.quarters, quarters * n, thread), corrections)
+
+
+#: Threads of a CUDA block that has a partition.
+PARTITION_THREADS = 256
+#: Particles of a partition on a GPU: more have fewer chunks, but fill more shared memory. It must not depend on the
+#: number of environments, because sums depend on it.
+PARTITION_SIZE = 3 * PARTITION_THREADS
+#: Words of a particle's record: three times four, so that lanes whose particles follow each other read from different
+#: banks. Masses follow all records.
+WORDS = wp.constant(12)
+#: Words of a particle in all.
+ALL_WORDS = int(WORDS) + 1
+
+
+@wp.struct
+class Partitions:
+    """The particles of a body in partitions: partition ``i`` has those from ``i * size`` on."""
+
+    size: int
+    start: wp.array(dtype=int)  # (partitions + 1,) chunks of partition i are those of quarters[start[i] : start[i + 1]]
+    quarters: wp.array(dtype=wp.vec4i)  # of warps, see piavatar_envs.avatar.segment_sums
+    entry: wp.array(dtype=wp.vec2i)  # as the body's: which particle of its partition, bits of the weight
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+const unsigned partitions = gridDim.x / (unsigned)num_envs, row = blockIdx.x / partitions;
+return wp::vec_t<3, wp::int32>((int)row, (int)(blockIdx.x - row * partitions), (int)threadIdx.x);
+#else
+return wp::vec_t<3, wp::int32>(e, part, thread);
+#endif
+""")
+def place_in_partitions(e: int, part: int, thread: int, num_envs: int) -> wp.vec3i:
+    """Return environment, partition and thread in a launch over ``(num_envs, partitions, PARTITION_THREADS)``.
+
+    The partitions of a body follow each other, because they read the same bones.
+    """
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+__shared__ float __align__(16) particles[{ALL_WORDS * PARTITION_SIZE}];
+return reinterpret_cast<wp::uint64>(particles);
+#else
+return reinterpret_cast<wp::uint64>(scratch.data);
+#endif
+""")
+def particle_arena(scratch: wp.array(dtype=float)) -> wp.uint64:
+    """Return the arena of a partition's particles: a CUDA block's shared memory, on a CPU ``scratch``."""
+    ...
+
+
+@wp.func_native(f"""
+float* const to = reinterpret_cast<float*>(arena) + {int(WORDS)} * n;
+reinterpret_cast<float*>(arena)[{int(WORDS)} * size + n] = m;
+#if defined(__CUDA_ARCH__)
+reinterpret_cast<float4*>(to)[0] = make_float4(x[0], x[1], x[2], way[0]);
+reinterpret_cast<float4*>(to)[1] = make_float4(first[0], first[1], first[2], way[1]);
+reinterpret_cast<float4*>(to)[2] = make_float4(second[0], second[1], second[2], way[2]);
+#else
+for (int c = 0; c < 3; ++c) to[c] = x[c], to[4 + c] = first[c], to[8 + c] = second[c], to[3 + 4 * c] = way[c];
+#endif
+""")
+def store_point(
+    arena: wp.uint64, size: int, n: int, m: float, x: wp.vec3, first: wp.vec3, second: wp.vec3, way: wp.vec3
+):
+    """Store mass, position and three vectors of particle ``n`` of a partition of ``size`` particles."""
+    ...
+
+
+@wp.func_native(f"""
+const float* const from = reinterpret_cast<const float*>(arena) + {int(WORDS)} * n;
+wp::vec_t<12, wp::float32> value;
+#if defined(__CUDA_ARCH__)
+#pragma unroll
+for (int c = 0; c < 3; ++c) {{
+    const float4 four = reinterpret_cast<const float4*>(from)[c];
+    value[4 * c] = four.x, value[4 * c + 1] = four.y, value[4 * c + 2] = four.z, value[4 * c + 3] = four.w;
+}}
+#else
+for (int c = 0; c < 12; ++c) value[c] = from[c];
+#endif
+return value;
+""")
+def load_point(arena: wp.uint64, n: int) -> vec12:
+    """Return position, first and second vector of particle ``n``, each with a component of the way."""
+    ...
+
+
+@wp.func_native(f"return reinterpret_cast<const float*>(arena)[{int(WORDS)} * size + n];")
+def load_mass(arena: wp.uint64, size: int, n: int) -> float:
+    """Return the mass of particle ``n``."""
+    ...
+
+
+@wp.func_native(f"""
+const float* const from = reinterpret_cast<const float*>(arena) + 8;
+float* const to = reinterpret_cast<float*>(&wp::index(into, e, first));
+for (int n = thread; n < 3 * count; n += threads) to[n] = from[{int(WORDS)} * (n / 3) + n % 3];
+""")
+def store_second_vectors(
+    arena: wp.uint64, count: int, thread: int, threads: int, e: int, first: int, into: wp.array2d(dtype=wp.vec3)
+):
+    """Write the second vectors of ``count`` particles to ``into[e, first:]``, in memory order."""
+    ...
+
+
+@wp.func_native("return entries.data[n];")
+def entry_at(entries: wp.array(dtype=wp.vec2i), n: int) -> wp.vec2i:
+    """Return ``entries[n]``."""
+    ...
+
+
+@wp.func_native("float weight;\nmemcpy(&weight, &entry[1], sizeof(weight));\nreturn weight;")
+def weight_of(entry: wp.vec2i) -> float:
+    """Return the weight of an entry of a partition."""
+    ...
+
+
+@wp.func
+def sum_chunk(
+    partitions: Partitions,
+    arena: wp.uint64,
+    share: wp.vec4i,
+    origin: wp.vec3,
+    e: int,
+    # out
+    moments: wp.array2d(dtype=vec16),
+    other_moments: wp.array2d(dtype=vec12),
+):
+    """Sum the moments about ``origin`` of the chunk of a ``share``, with the first vector as velocity.
+
+    Of the second vector, and of the way, sum momentum and angular momentum.
+    """
+    total = vec16()
+    P = wp.vec3()
+    L = wp.vec3()
+    way_P = wp.vec3()
+    way_L = wp.vec3()
+    n = share[2]
+    while n < share[3]:
+        entry = entry_at(partitions.entry, n)
+        s = load_point(arena, entry[0])
+        w = weight_of(entry) * load_mass(arena, partitions.size, entry[0])
+        d = wp.vec3(s[0], s[1], s[2]) - origin
+        total += moments_of(w, d, wp.vec3(s[4], s[5], s[6]))
+        momentum = w * wp.vec3(s[8], s[9], s[10])
+        P += momentum
+        L += wp.cross(d, momentum)
+        momentum = w * wp.vec3(s[3], s[7], s[11])
+        way_P += momentum
+        way_L += wp.cross(d, momentum)
+        n += share[1] >> 8
+    # fmt: off
+    other = vec12(
+        P[0], P[1], P[2], L[0], L[1], L[2],
+        way_P[0], way_P[1], way_P[2], way_L[0], way_L[1], way_L[2],
+    )
+    # fmt: on
+    store_both(moments, other_moments, e, share, total, other)

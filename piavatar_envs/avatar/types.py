@@ -44,7 +44,7 @@ class Body:
     rest: wp.array2d(dtype=wp.vec3)  # (rows, count) rest positions [m]
     skin: wp.array(dtype=wp.vec4)  # (count,) bones that move a particle, see piavatar_envs.avatar.skinning
     alone: int  # the first so many particles are moved by one bone each
-    inert: wp.array2d(dtype=float)  # (rows, count) share of a change of commanded motion that a particle misses
+    velocity_lag: wp.array2d(dtype=float)  # (rows, count) share of a change of commanded motion that a particle misses
     rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
     bone_mass: wp.array2d(dtype=float)  # (rows, bones) skinning-weighted mass [kg]

@@ -22,7 +22,7 @@ from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
 from piavatar_envs.avatar.body.muscles import attachment_rates, firmness, make_muscles
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, body_part_of_joint, joint_index
-from piavatar_envs.avatar.body.soft_tissue import bone_distance, inert_share, softness
+from piavatar_envs.avatar.body.soft_tissue import bone_distance, softness, velocity_lag
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.controller import TorqueControl
 from piavatar_envs.avatar.types import COMMANDS, DAMPING, ROOT_RATE, TONE_RATE, PoseControl
@@ -51,7 +51,7 @@ STANDARD_GRAVITY = 9.81
 #: First number of the seeds of a pool's shapes.
 POOL_SEED = 20_260
 #: Arrays of :class:`~piavatar_envs.avatar.types.Body` that depend on the shape.
-_OF_BODY = ("rest", "rest_joint", "rest_center", "bone_mass", "inert")
+_OF_BODY = ("rest", "rest_joint", "rest_center", "bone_mass", "velocity_lag")
 
 
 class Flesh:
@@ -119,7 +119,7 @@ class Flesh:
             self._stale = False
             index = self.pool.index.numpy()
             self._shape_parameters[:] = self.pool.bodies.parameters[index]
-            for name in ("rest", "mass", "joints", "inert"):
+            for name in ("rest", "mass", "joints", "velocity_lag"):
                 getattr(self._points, name)[:] = self.pool.bodies.tables[name][index]
 
     def shaped(self, parameters: np.ndarray) -> tuple[BodyPoints, np.ndarray]:
@@ -133,7 +133,7 @@ class Flesh:
             skin_joints=sampled.skin_joints,
             skin_weights=sampled.skin_weights,
             bone=sampled.bone,
-            inert=inert_share(self.control.soft_tissue, self._softness(rest))[None],
+            velocity_lag=velocity_lag(self.control.soft_tissue, self._softness(rest))[None],
         )
         return points, volume[None]
 
@@ -299,7 +299,7 @@ def shape_ranges(flesh: Sequence[Flesh]) -> dict[str, Parameter]:
 
 def _repeat(points: BodyPoints, rows: int) -> BodyPoints:
     """Return the same points with a writable row for each environment."""
-    repeated = {name: np.repeat(getattr(points, name), rows, 0) for name in ("rest", "mass", "joints", "inert")}
+    repeated = {name: np.repeat(getattr(points, name), rows, 0) for name in ("rest", "mass", "joints", "velocity_lag")}
     return BodyPoints(**repeated, skin_joints=points.skin_joints, skin_weights=points.skin_weights, bone=points.bone)
 
 
@@ -325,7 +325,7 @@ class Bodies:
             parameters = flesh.draw_parameters(np.random.default_rng([POOL_SEED, number]))
             points, volume = flesh.shaped(parameters)
             bone_mass, center = bone_masses(points)
-            rows = {name: getattr(points, name) for name in ("rest", "mass", "joints", "inert")}
+            rows = {name: getattr(points, name) for name in ("rest", "mass", "joints", "velocity_lag")}
             rows |= {"volume": volume, "bone_mass": bone_mass, "rest_center": center}
             rows |= {"body_mass": points.mass.sum(1, keepdims=True), "shape": parameters[None]}
             for name, value in rows.items():
@@ -460,7 +460,7 @@ class Shapes:
             (body.rest[env], points.rest),
             (body.rest_joint[env], points.joints),
             (body.rest_center[env], center),
-            (body.inert[env], points.inert),
+            (body.velocity_lag[env], points.velocity_lag),
             (body.bone_mass[env], mass),
             (particles.mass[env][own], points.mass),
             (particles.volume[env][own], volume),
@@ -506,7 +506,7 @@ class Shapes:
                 rest=body.rest,
                 joints=body.rest_joint,
                 rest_center=body.rest_center,
-                inert=body.inert,
+                velocity_lag=body.velocity_lag,
                 volume=particles.volume[:, own],
                 **self.randomization.nominal_mass(index),
                 **shape,

@@ -279,9 +279,9 @@ def build_rig(
     x = state.x.numpy()
     x[:, :others] = [0.7 * room, 0.7 * room, 0.5] + np.linspace(0.0, 0.2, others)[:, None] * [0.0, 0.0, 1.0]
     state.x.assign(x)
-    inert = np.zeros((1, volume.shape[1]), np.float32)
+    velocity_lag = np.zeros((1, volume.shape[1]), np.float32)
     mass = volume * np.float32(DENSITY)
-    points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, inert)
+    points = BodyPoints(rest, mass, joints, particles.skin_joints, particles.skin_weights, particles.bone, velocity_lag)
     avatar = Avatar(points, others, model)
     controller = PoseController(avatar, pose_control(PoseControlConfig(**{"free_motion": False} | settings), model))
     mask = wp.zeros(num_envs, dtype=wp.bool, device=device)

@@ -8,7 +8,7 @@ import warp as wp
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar import part_sums
+from piavatar_envs.avatar.body import device as body_device
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
 from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
 from piavatar_envs.avatar.torque_control.dynamics import UNBOUNDED
@@ -302,7 +302,7 @@ def test_a_body_in_many_parts_moves_as_in_one(joints, monkeypatch, attachment):
         return made
 
     whole = moved()
-    monkeypatch.setattr(part_sums, "part_size", lambda device, count: 100)
+    monkeypatch.setattr(body_device, "partition_size", lambda device, count: 100)
     divided = moved()
     assert divided.body.body.chunk_bone.shape[0] > whole.body.body.chunk_bone.shape[0]
     assert divided.rig.points.num_points > 200

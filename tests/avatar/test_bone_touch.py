@@ -21,8 +21,8 @@ from piavatar_envs.avatar.torque_control.bone_contact import (
 )
 from piavatar_envs.avatar.torque_control.dynamics import spread_motion
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
-from piavatar_envs.avatar.torque_control.tree_cholesky import fetch_factor
-from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, room_of_warp
+from piavatar_envs.avatar.torque_control.tree_cholesky import load_factor
+from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, warp_arena
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.cuda_intrinsics import warp_threads
 from piavatar_envs.mpm.colliders import Collider
@@ -42,8 +42,8 @@ def push_bone(
 ):
     """``K`` of a bone, and an impulse on it, by factor ``first + e``; over ``(num_envs, threads)``."""
     e, thread = wp.tid()
-    room = room_of_warp()
-    fetch_factor(w.factors, first + e, room)
+    room = warp_arena()
+    load_factor(w.factors, first + e, room)
     found = answer_at(body, first + e, e, b, x[e], thread, threads, room, w)
     if thread == 0:
         K[e] = found

@@ -11,14 +11,14 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import (
     Pattern,
     factor_size,
     factorize,
-    fetch_factor,
     find_pattern,
-    keep_factor,
+    load_factor,
     lower_entries,
     pack,
     solve,
+    store_factor,
 )
-from piavatar_envs.avatar.torque_control.workspace import room_of_warp
+from piavatar_envs.avatar.torque_control.workspace import warp_arena
 from piavatar_envs.core.cuda_intrinsics import warp_threads
 
 
@@ -34,14 +34,14 @@ def factorize_and_solve(
 ):
     """Two diagonals of every matrix, over ``(num_envs, threads)``; all is solved after both factors have been found."""
     e, thread = wp.tid()
-    n, room = matrix.shape[0], room_of_warp()
+    n, room = matrix.shape[0], warp_arena()
     for which in range(2):
         system = which * n + e
         factorize(pattern, matrix, diagonal, e, system, room, system, factor)
-        keep_factor(room, system, factor)
+        store_factor(room, system, factor)
     for which in range(2):
         system = which * n + e
-        fetch_factor(factor, system, room)
+        load_factor(factor, system, room)
         solve(pattern, factor, system, right, system, system, thread, threads, room, x)
 
 

@@ -160,15 +160,15 @@ def test_the_papers_decoupling_is_worse_but_no_decoupling_is_worst(make_rig, wil
     assert means["split"] < 1e-4 < 1e-3 < means["paper"] < 0.8 * means["none"]
 
 
-@pytest.mark.parametrize("inert", [0.0, 0.4, 1.0])
-def test_inert_flesh_misses_its_share_of_commanded_momentum(make_rig, inert):
-    """A root commanded to move at v gives the body the momentum ``(1 - inert) M v``; inert flesh stays behind."""
+@pytest.mark.parametrize("velocity_lag", [0.0, 0.4, 1.0])
+def test_flesh_with_a_velocity_lag_misses_its_share_of_commanded_momentum(make_rig, velocity_lag):
+    """A root commanded to move at v gives the body the momentum ``(1 - lag) M v``."""
     rig = make_rig(root="free", tone=0.0, alpha=0.0)
-    rig.avatar.body.inert.fill_(inert)
+    rig.avatar.body.velocity_lag.fill_(velocity_lag)
     velocity = np.array([0.3, -0.2, 0.0])
     rig.command(root=rig.points.joints[0, 0] + velocity * rig.model.control_dt)
     rig.step()
-    expected = (1.0 - inert) * rig.mass.sum() * velocity
+    expected = (1.0 - velocity_lag) * rig.mass.sum() * velocity
     np.testing.assert_allclose(rig.totals().momentum, expected, atol=1e-4 * rig.mass.sum())
 
 

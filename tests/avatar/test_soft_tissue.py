@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index, skin
-from piavatar_envs.avatar.body.soft_tissue import inert_share, softness
+from piavatar_envs.avatar.body.soft_tissue import softness, velocity_lag
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
@@ -30,7 +30,7 @@ def test_softness_is_at_the_bones_zero_and_in_belly_and_thighs_high():
 @pytest.mark.parametrize("amount", [-0.1, 1.1, np.nan])
 def test_an_amount_out_of_range_is_refused(amount):
     with pytest.raises(ValueError, match=r"outside \[0, 1\]"):
-        inert_share(amount, np.ones(3))
+        velocity_lag(amount, np.ones(3))
 
 
 def lag(device: str, amount: float) -> np.ndarray:

@@ -21,7 +21,12 @@ def constants_of(simulation, env: int, avatar: int = 0) -> dict[str, np.ndarray]
     drive, particles = simulation.avatars[avatar], simulation.model.particles
     body = drive.body
     own = slice(body.first, body.first + body.count)
-    found = {"rest": body.rest, "joints": body.rest_joint, "center": body.rest_center, "inert": body.inert}
+    found = {
+        "rest": body.rest,
+        "joints": body.rest_joint,
+        "center": body.rest_center,
+        "velocity_lag": body.velocity_lag,
+    }
     found |= {"bone_mass": body.bone_mass, "mass": particles.mass[:, own], "volume": particles.volume[:, own]}
     return {name: array.numpy()[env] for name, array in found.items()} | {"total": drive.body_mass.numpy()[env]}
 
@@ -30,7 +35,7 @@ def expected_of(flesh, parameters: np.ndarray) -> dict[str, np.ndarray]:
     """The same, shaped anew on the host."""
     points, volume = flesh.shaped(parameters)
     mass, center = bone_masses(points)
-    found = {"rest": points.rest, "joints": points.joints, "center": center, "inert": points.inert}
+    found = {"rest": points.rest, "joints": points.joints, "center": center, "velocity_lag": points.velocity_lag}
     found |= {"bone_mass": mass, "mass": points.mass, "volume": volume}
     return {name: array[0].astype(np.float32) for name, array in found.items()} | {"total": points.mass.sum()}
 

@@ -1,4 +1,4 @@
-"""From a body in NumPy to the arrays that its drive reads."""
+"""Constants of a body on the device, from a body in NumPy."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS
-from piavatar_envs.avatar.segment_sums import share_chunks
+from piavatar_envs.avatar.segment_sums import PARTITION_SIZE, Partitions, share_chunks
 from piavatar_envs.avatar.skinning import in_order, pack
 from piavatar_envs.avatar.types import Body
 
 #: Entries of one chunk of a bone's particle list, which a warp sums on a GPU: few enough that one body keeps many warps
-#: busy, so many that adding up the threads' sums costs little.
+#: busy, enough that adding up the threads' sums costs little.
 CHUNK = 256
 #: In large bodies chunks are longer, so that there are about so many: what they sum to is added up in turn.
 MOST_CHUNKS = 2048
@@ -32,7 +32,7 @@ class BodyPoints:
         skin_joints: bones that move a point, shape ``(num_points, 4)`` int.
         skin_weights: their weights, descending, rows sum to one, shape ``(num_points, 4)``.
         bone: joint that a point tracks, -1 for flesh, shape ``(num_points,)``.
-        inert: share of a change of commanded motion that a point misses (it jiggles), shape ``(rows, num_points)``.
+        velocity_lag: share of a change of commanded motion that a point misses, shape ``(rows, num_points)``.
     """
 
     rest: np.ndarray
@@ -41,7 +41,7 @@ class BodyPoints:
     skin_joints: np.ndarray
     skin_weights: np.ndarray
     bone: np.ndarray
-    inert: np.ndarray
+    velocity_lag: np.ndarray
 
     @property
     def num_points(self) -> int:
@@ -50,9 +50,9 @@ class BodyPoints:
 
 
 def bone_lists(points: BodyPoints, part: int) -> dict[str, np.ndarray]:
-    """Chunked lists of the particles that each bone moves: chunk ``c`` holds ``entry_start[c] : entry_start[c + 1]``.
+    """List the particles that each bone moves in chunks: chunk ``c`` holds ``entry_start[c] : entry_start[c + 1]``.
 
-    The particles of a chunk are in one of the parts that the body has, of ``part`` particles each.
+    The particles of a chunk are in one partition of the body, of ``part`` particles each.
     """
     skin_joints, skin_weights = in_order(points.skin_joints, points.skin_weights)
     chunk_start, chunk_bone, entry_start, entries, weights = [0], [], [0], [], []
@@ -78,7 +78,7 @@ def bone_lists(points: BodyPoints, part: int) -> dict[str, np.ndarray]:
 
 
 def _joint_depths() -> list[int]:
-    """Joints between each joint and the root."""
+    """Count the joints between each joint and the root."""
     depths: list[int] = []
     for parent in PARENTS:
         depths.append(0 if parent < 0 else depths[parent] + 1)
@@ -86,7 +86,7 @@ def _joint_depths() -> list[int]:
 
 
 def bone_masses(points: BodyPoints) -> tuple[np.ndarray, np.ndarray]:
-    """Skinning-weighted mass [kg] ``(rows, 22)`` and centre of mass [m] ``(rows, 22, 3)`` of every bone at rest."""
+    """Return skinning-weighted mass [kg] ``(rows, 22)`` and centre of mass [m] ``(rows, 22, 3)`` of bones at rest."""
     dense = np.zeros((points.num_points, NUM_JOINTS))
     for slot in range(4):
         np.add.at(dense, (np.arange(points.num_points), points.skin_joints[:, slot]), points.skin_weights[:, slot])
@@ -97,7 +97,7 @@ def bone_masses(points: BodyPoints) -> tuple[np.ndarray, np.ndarray]:
 
 
 def build_body(points: BodyPoints, first: int, device: str) -> Body:
-    """Device arrays of a body whose particles start at ``first``.
+    """Upload a body whose particles start at ``first``.
 
     Raises:
         ValueError: a bone has too few tracking particles, or weights do not sum to one.
@@ -124,7 +124,7 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
     body.skin = upload(pack(joints, weights), wp.vec4)
     several = weights[:, 1] > 0.0
     body.alone = int(several.argmax()) if several.any() else points.num_points
-    body.inert = upload(points.inert, float)
+    body.velocity_lag = upload(points.velocity_lag, float)
     body.rest_joint = upload(points.joints, wp.vec3)
     body.rest_center = upload(center, wp.vec3)
     body.bone_mass = upload(bone_mass, float)
@@ -140,9 +140,34 @@ def build_body(points: BodyPoints, first: int, device: str) -> Body:
 
 
 def set_lists(body: Body, lists: dict[str, np.ndarray], device: str) -> None:
-    """Upload what :func:`bone_lists` has found."""
+    """Upload the lists of :func:`bone_lists`."""
     borders, bone = lists["entry_start"], lists["chunk_bone"]
     quarters = share_chunks(np.arange(len(bone)), borders[:-1], borders[1:], bone, device)
     body.quarters = wp.array(quarters, dtype=wp.vec4i, device=device)
     for name in ("chunk_start", "chunk_bone", "entry", "entry_weight"):
         setattr(body, name, wp.array(lists[name], dtype=float if name == "entry_weight" else int, device=device))
+
+
+def partition_size(device: str, count: int) -> int:
+    """Return the particles of a partition of a body of ``count``; on a CPU all."""
+    return PARTITION_SIZE if wp.get_device(device).is_cuda else count
+
+
+def partition_body(points: BodyPoints, body: Body, device: str) -> tuple[Body, Partitions]:
+    """Return the body with chunks that are each in one partition, and these partitions."""
+    size = partition_size(device, points.num_points)
+    divided, parts = Body(), Partitions()
+    for name in Body.vars:
+        setattr(divided, name, getattr(body, name))
+    lists = bone_lists(points, size)
+    set_lists(divided, lists, device)
+    begin, end, bone = lists["entry_start"][:-1], lists["entry_start"][1:], lists["chunk_bone"]
+    part = lists["entry"][begin] // size
+    found = [np.flatnonzero(part == i) for i in range(-(-points.num_points // size))]
+    quarters = [share_chunks(own, begin[own], end[own], bone[own], device) for own in found]
+    parts.size = size
+    parts.start = wp.array(np.cumsum([0, *map(len, quarters)]).astype(np.int32), dtype=int, device=device)
+    parts.quarters = wp.array(np.concatenate(quarters), dtype=wp.vec4i, device=device)
+    entry = np.stack([lists["entry"] % size, lists["entry_weight"].view(np.int32)], axis=1)
+    parts.entry = wp.array(entry.astype(np.int32), dtype=wp.vec2i, device=device)
+    return divided, parts

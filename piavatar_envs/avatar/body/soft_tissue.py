@@ -46,7 +46,7 @@ def softness(rest: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_w
     return (ramp * share * (bone < 0)).astype(np.float32)
 
 
-def inert_share(amount: float, soft: np.ndarray) -> np.ndarray:
+def velocity_lag(amount: float, soft: np.ndarray) -> np.ndarray:
     """Share of a change of commanded motion that particles miss, for an ``amount`` in [0, 1]; shape of ``soft``.
 
     Raises:

@@ -271,7 +271,7 @@ def command_particle(
     velocity. ``at`` is the particle's position and ``before`` its velocity; the bones' blended velocity is that at
     ``center``, the pelvis'.
     """
-    inert = number_at(body.inert, row(e, body.inert.shape[0]), p)
+    velocity_lag = number_at(body.velocity_lag, row(e, body.velocity_lag.shape[0]), p)
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     s = blend_records(record, e, body.skin, p, rest)
     displacement = at - blended_vector(s, AT_PLACE)
@@ -282,10 +282,10 @@ def command_particle(
     relative = before - blended_velocity(s, at - center)
     pulled = implicit_velocity(control.shape_rate, control.dt, -displacement, relative) - relative
     way = blended_vector(s, AT_LEAN)
-    if inert > 0.0:
+    if velocity_lag > 0.0:
         # a body that nothing supports could not take the reaction
         if control.free_motion == 0 and not let_go:
-            u[e, body.first + p] = before - inert * (k - motion[e, p])
+            u[e, body.first + p] = before - velocity_lag * (k - motion[e, p])
         motion[e, p] = k
     pulled += pull_gain(control.tone_rate, control.dt) * way
     store_pair(kinematic.vk, kinematic.spin, e, body.first + p, k, -0.5 * axial(turn), True, True)

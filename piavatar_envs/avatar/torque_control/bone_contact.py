@@ -26,10 +26,10 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.skinning import motion_at
-from piavatar_envs.avatar.torque_control.dynamics import part_of, set_part, spread_motion
+from piavatar_envs.avatar.torque_control.dynamics import set_triple, spread_motion, triple_of
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, NUM_DOF
 from piavatar_envs.avatar.torque_control.tree_cholesky import begin_solution, end_solution
-from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, place_of_part, row_in_room, see_columns
+from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, place_of_triple, row_in_arena, view_columns
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import vec8, vector_at
 from piavatar_envs.core.cuda_intrinsics import max_of_threads, or_of_threads, sum_threads6, sync_threads
@@ -189,7 +189,7 @@ def find_fastest(
 
 
 #: The pelvis' place, then all joints.
-PARTS = wp.constant(1 + int(BONES))
+TRIPLES = wp.constant(1 + int(BONES))
 #: Impulses in a substep, at most.
 MOST_STOPS = 8
 _MOST_STOPS = wp.constant(MOST_STOPS)
@@ -208,7 +208,7 @@ def carries(body: Body, a: int, b: int):
 
 @wp.func
 def answer_at(
-    body: Body, factor: int, e: int, b: int, x: wp.vec3, thread: int, threads: int, room: wp.uint64, w: TorqueWorkspace
+    body: Body, factor: int, e: int, b: int, x: wp.vec3, thread: int, threads: int, arena: wp.uint64, w: TorqueWorkspace
 ) -> wp.mat33:
     """``K`` of bone ``b`` at ``x`` [1/kg], ``Y^T Y`` with ``Y = L^-T J^T``, which stays in the columns.
 
@@ -216,9 +216,9 @@ def answer_at(
     """
     n = w.velocity.shape[0]
     wanted = w.pattern.reach[1 + b]
-    columns = see_columns(w.touch, room)
+    columns = view_columns(w.touch, arena)
     sync_threads(threads)
-    for k in range(thread, PARTS, threads):
+    for k in range(thread, TRIPLES, threads):
         arm = wp.vec3()
         if k > 0:
             arm = carries(body, k - 1, b) * (x - w.pose.position[e, wp.max(k - 1, 0)])
@@ -227,15 +227,15 @@ def answer_at(
             along[axis] = 1.0
             if k > 0:  # else the pelvis' place
                 along = wp.cross(arm, along)
-            set_part(columns, row_in_room(axis * n + e, axis), place_of_part(k), along)
-    begin_solution(w.pattern, w.factors, factor, wanted, e, n, threads, room, w.touch)
+            set_triple(columns, row_in_arena(axis * n + e, axis), place_of_triple(k), along)
+    begin_solution(w.pattern, w.factors, factor, wanted, e, n, threads, arena, w.touch)
     sync_threads(threads)
     s = vec8()
-    for k in range(thread, PARTS, threads):
+    for k in range(thread, TRIPLES, threads):
         if (wanted >> k) & 1 == 1:
             y = wp.mat33()
             for axis in range(3):
-                y[axis] = part_of(columns, row_in_room(axis * n + e, axis), place_of_part(k))
+                y[axis] = triple_of(columns, row_in_arena(axis * n + e, axis), place_of_triple(k))
             s += vec8(
                 wp.dot(y[0], y[0]), wp.dot(y[1], y[1]), wp.dot(y[2], y[2]),
                 wp.dot(y[1], y[2]), wp.dot(y[0], y[2]), wp.dot(y[0], y[1]), 0.0, 0.0,
@@ -246,24 +246,24 @@ def answer_at(
 
 @wp.func
 def push(
-    p: wp.vec3, b: int, own: int, factor: int, e: int, thread: int, threads: int, room: wp.uint64, w: TorqueWorkspace
+    p: wp.vec3, b: int, own: int, factor: int, e: int, thread: int, threads: int, arena: wp.uint64, w: TorqueWorkspace
 ):
     """Give bone ``b`` an impulse at the point that the columns are of: by ``M^-1 J^T p = L^-1 Y p``."""
     n = w.velocity.shape[0]
     wanted = w.pattern.reach[1 + b]
-    columns = see_columns(w.touch, room)
-    for k in range(thread, PARTS, threads):
+    columns = view_columns(w.touch, arena)
+    for k in range(thread, TRIPLES, threads):
         y = wp.vec3()
         if (wanted >> k) & 1 == 1:
             for axis in range(3):
-                y += p[axis] * part_of(columns, row_in_room(axis * n + e, axis), place_of_part(k))
-        set_part(columns, row_in_room(e, 0), place_of_part(k), y)
-    end_solution(w.pattern, w.factors, factor, e, threads, room, w.touch)
+                y += p[axis] * triple_of(columns, row_in_arena(axis * n + e, axis), place_of_triple(k))
+        set_triple(columns, row_in_arena(e, 0), place_of_triple(k), y)
+    end_solution(w.pattern, w.factors, factor, e, threads, arena, w.touch)
     sync_threads(threads)
-    for k in range(thread, PARTS, threads):
-        change = part_of(columns, row_in_room(e, 0), place_of_part(k))
-        set_part(w.whole, e, 3 * k, part_of(w.whole, e, 3 * k) + change)
-        set_part(w.shares, own, 3 * k, part_of(w.shares, own, 3 * k) + change)
+    for k in range(thread, TRIPLES, threads):
+        change = triple_of(columns, row_in_arena(e, 0), place_of_triple(k))
+        set_triple(w.whole, e, 3 * k, triple_of(w.whole, e, 3 * k) + change)
+        set_triple(w.shares, own, 3 * k, triple_of(w.shares, own, 3 * k) + change)
 
 
 @wp.func
@@ -300,7 +300,7 @@ def stop_point(
     e: int,
     thread: int,
     threads: int,
-    room: wp.uint64,
+    arena: wp.uint64,
     w: TorqueWorkspace,
 ) -> vec8:
     """Stop a point as :func:`find_fastest` names it; the impulse, and its moment about the pelvis joint."""
@@ -309,11 +309,11 @@ def stop_point(
     b = which // boundaries.count % BONES
     tracker = body.tracker_start[b] + which // (boundaries.count * BONES)
     touch = touch_of(body, boundaries, w, e, b, tracker, k)
-    K = answer_at(body, factor, e, b, touch.place, thread, threads, room, w)
+    K = answer_at(body, factor, e, b, touch.place, thread, threads, arena, w)
     field = ground.field[body.first + body.tracker[tracker]]
     friction = boundaries.friction[row(e, boundaries.friction.shape[0]), field * boundaries.count + k]
     p = stopping_impulse(K, touch.velocity, touch.normal, least_speed(touch.distance, dt), friction)
-    push(p, b, own, factor, e, thread, threads, room, w)
+    push(p, b, own, factor, e, thread, threads, arena, w)
     moment = wp.cross(touch.place - w.pose.position[e, 0], p)
     return vec8(p[0], p[1], p[2], moment[0], moment[1], moment[2], 0.0, 0.0)
 
@@ -328,7 +328,7 @@ def stop_bones(
     e: int,
     thread: int,
     threads: int,
-    room: wp.uint64,
+    arena: wp.uint64,
     w: TorqueWorkspace,
 ) -> vec8:
     """Let no bone go through a boundary: changes share ``own``, which the joints are about to add to their velocity.
@@ -348,14 +348,14 @@ def stop_bones(
         fastest = find_fastest(body, ground, dt, e, thread, threads, w)
         if fastest[0] <= TOLERANCE:
             break
-        given += stop_point(body, ground, dt, int(fastest[1]), own, factor, e, thread, threads, room, w)
+        given += stop_point(body, ground, dt, int(fastest[1]), own, factor, e, thread, threads, arena, w)
         stops += 1
     sync_threads(threads)
     return given
 
 
 @wp.func
-def tell_sensors(body: Body, ground: Ground, given: vec8, e: int, pelvis: wp.vec3):
+def add_to_sensors(body: Body, ground: Ground, given: vec8, e: int, pelvis: wp.vec3):
     """Add what boundaries gave the bones to what they gave the body."""
     p = wp.vec3(given[0], given[1], given[2])
     if wp.length_sq(p) > 0.0:

@@ -66,7 +66,7 @@ import numpy as np
 import warp as wp
 
 from piavatar_envs.avatar.avatar import Avatar
-from piavatar_envs.avatar.body.device import BodyPoints
+from piavatar_envs.avatar.body.device import BodyPoints, partition_body
 from piavatar_envs.avatar.body.muscles import (
     FASTEST,
     LOCKED_JOINTS,
@@ -76,9 +76,8 @@ from piavatar_envs.avatar.body.muscles import (
     spring_rows,
 )
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
-from piavatar_envs.avatar.part_sums import ALL_WORDS, PART_BLOCK, divide
 from piavatar_envs.avatar.rotation import quat_log
-from piavatar_envs.avatar.segment_sums import sum_moments, warps_of
+from piavatar_envs.avatar.segment_sums import ALL_WORDS, PARTITION_THREADS, sum_moments, warps_of
 from piavatar_envs.avatar.torque_control.bone_contact import Ground
 from piavatar_envs.avatar.torque_control.dynamics import (
     UNBOUNDED,
@@ -86,11 +85,11 @@ from piavatar_envs.avatar.torque_control.dynamics import (
     Target,
     make_strength,
     make_tissue,
-    set_part,
+    set_triple,
     take_over,
 )
 from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, put_in_place
-from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, JointMass, grid_inertia
+from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, MassMatrix, grid_inertia
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
 from piavatar_envs.avatar.types import ROOT_RATE, Body, JointState, Pose, allocate
@@ -158,7 +157,7 @@ class ArticulatedBody:
                 raise ValueError(f"{name} must be finite and not negative, its least is {value.min():g}")
         if firm is not None and firm.shape != (points.num_points,):
             raise ValueError(f"firm has shape {firm.shape}, expected ({points.num_points},): one a particle")
-        self.body, self._parts = divide(points, body, device)
+        self.body, self._partitions = partition_body(points, body, device)
         self.model, self.threads = model, warp_threads(device)
         self._points = (n, particle_threads(device, body.count, particle_rounds(device, n * body.count)))
         self.springs = make_struct(Springs, stiffness=self._upload(stiffness), damping=self._upload(damping))
@@ -173,7 +172,7 @@ class ArticulatedBody:
         self.target = allocate(Target, n, device, **given)
         self.target.rotation.fill_(wp.quat_identity())
         self.solid = solid
-        self.mass = JointMass(points, body, model)
+        self.mass = MassMatrix(points, body, model)
         self._inertia = grid_inertia(points, model.grid.dx)
         words = ALL_WORDS * points.num_points if self.threads == 1 else 0
         self._scratch = wp.zeros(words, dtype=float, device=device)
@@ -298,11 +297,11 @@ class ArticulatedBody:
 
     def _record_pull(self, graph: LaunchGraph, state: State) -> None:
         """Append the pass over particles that pulls them to the bones, and sums what joints are to take over."""
-        block = PART_BLOCK if self.threads > 1 else 1
-        dim = (self.model.num_envs, self._parts.start.shape[0] - 1, block)
-        inputs = [self.body, self._parts, self.model.step.dt, self.model.particles.mass]
+        block = PARTITION_THREADS if self.threads > 1 else 1
+        dim = (self.model.num_envs, self._partitions.start.shape[0] - 1, block)
+        inputs = [self.body, self._partitions, self.model.step.dt, self.model.particles.mass]
         inputs += [state.x, self.attachment, state.failure, self._scratch]
-        graph.launch(attach_flesh, dim, inputs, [state.u, state.vk, self._workspace], block_dim=PART_BLOCK)
+        graph.launch(attach_flesh, dim, inputs, [state.u, state.vk, self._workspace], block_dim=PARTITION_THREADS)
 
     def record_end(self, graph: LaunchGraph, state: State) -> None:
         """Append what ends a control step: firm particles are put into their places on the bones as they are now.
@@ -432,11 +431,11 @@ def set_joints_in_motion(
         return
     spin = spin_between(pose.rotation[e, b], after.rotation[e, b], time)
     if b == 0:
-        set_part(velocity, e, 0, (after.position[e, 0] - pose.position[e, 0]) / time)
+        set_triple(velocity, e, 0, (after.position[e, 0] - pose.position[e, 0]) / time)
     else:
         a = body.parent[b]
         spin -= spin_between(pose.rotation[e, a], after.rotation[e, a], time)
-    set_part(velocity, e, 3 + 3 * b, spin)
+    set_triple(velocity, e, 3 + 3 * b, spin)
 
 
 @wp.kernel

@@ -51,13 +51,13 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
-def part_of(q: wp.array2d(dtype=float), e: int, first: int):
+def triple_of(q: wp.array2d(dtype=float), e: int, first: int):
     """Three components of a generalised vector."""
     return wp.vec3(q[e, first], q[e, first + 1], q[e, first + 2])
 
 
 @wp.func
-def set_part(q: wp.array2d(dtype=float), e: int, first: int, v: wp.vec3):
+def set_triple(q: wp.array2d(dtype=float), e: int, first: int, v: wp.vec3):
     """Write three components of a generalised vector."""
     for i in range(3):
         q[e, first + i] = v[i]
@@ -66,10 +66,10 @@ def set_part(q: wp.array2d(dtype=float), e: int, first: int, v: wp.vec3):
 @wp.func
 def joint_alone(position: wp.array2d(dtype=wp.vec3), q: wp.array2d(dtype=float), row: int, e: int, b: int):
     """Rigid motion that joint ``b`` alone gives to what it carries; the pelvis' place moves with the first one."""
-    w = part_of(q, row, 3 + 3 * b)
+    w = triple_of(q, row, 3 + 3 * b)
     v = wp.vec3()
     if b == 0:
-        v = part_of(q, row, 0)
+        v = triple_of(q, row, 0)
     else:
         v = wp.cross(w, position[e, 0] - position[e, b])
     return vec8(v[0], v[1], v[2], w[0], w[1], w[2], 0.0, 0.0)
@@ -424,7 +424,7 @@ for (int v = 0; v < VECTORS; ++v)
     }
 #endif
 """)
-def pass_down_together(
+def pass_down_in_warp(
     parent: wp.array(dtype=int),
     depths: wp.array(dtype=int),
     children: wp.array(dtype=int),
@@ -462,7 +462,7 @@ def pass_down(
     """
     sync_threads(threads)
     if threads > 1:
-        pass_down_together(
+        pass_down_in_warp(
             body.parent, body.depth, body.children, body.levels, position, e, own, step, linear, angular, momentum
         )  # fmt: skip
     else:
@@ -472,8 +472,8 @@ def pass_down(
                 b = BONES - 1 - back  # children come after their parents
                 take_child(position, e, row, body.parent[b], b, linear, angular)
             for b in range(BONES):
-                set_part(momentum, row, 3 + 3 * b, angular[row, b])
-            set_part(momentum, row, 0, linear[row, 0])
+                set_triple(momentum, row, 3 + 3 * b, angular[row, b])
+            set_triple(momentum, row, 0, linear[row, 0])
 
 
 @wp.func
@@ -686,7 +686,7 @@ def implicit_diagonal(
             stiff = tissue.stop[b]
         stop[e, b] = stiff
         value += implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) + tissue.lock[b]
-    set_part(diagonal, into, 3 * n, wp.vec3(value))
+    set_triple(diagonal, into, 3 * n, wp.vec3(value))
 
 
 @wp.func
@@ -712,7 +712,7 @@ def joint_impulse(
     """
     r = row(e, springs.stiffness.shape[0])
     K = springs.stiffness[r, n]
-    v = part_of(q, e, 3 * n) + part_of(outside, e, 3 * n)
+    v = triple_of(q, e, 3 * n) + triple_of(outside, e, 3 * n)
     active = wp.vec3()
     passive = wp.vec3()
     if n == 0:
@@ -729,8 +729,8 @@ def joint_impulse(
             passive -= implicit_inertia(dt, stiff, resistance(tissue, stiff, b)) * v
         active = dt * wp.quat_rotate(frame, push)
     active -= implicit_inertia(dt, K, springs.damping[r, n]) * v
-    set_part(muscle, e, 3 * n, active)
-    set_part(impulse, e, 3 * n, active + passive)
+    set_triple(muscle, e, 3 * n, active)
+    set_triple(impulse, e, 3 * n, active + passive)
 
 
 @wp.func
@@ -762,16 +762,16 @@ def limit_torque(
     if again and (left[e, 3 * n] != rest or A == 0.0):
         return limited
     if n > 1:
-        before = part_of(muscle, e, 3 * n)
+        before = triple_of(muscle, e, 3 * n)
         frame = above(body, pose.rotation, e, n - 1)
         limit = dt * strength.factor[row(e, strength.factor.shape[0])]
-        own = wp.quat_rotate_inv(frame, before - A * part_of(change, row_of_change, 3 * n))
+        own = wp.quat_rotate_inv(frame, before - A * triple_of(change, row_of_change, 3 * n))
         cut = wp.max(limit * strength.lower[n - 1], wp.min(own, limit * strength.upper[n - 1]))
         if wp.length_sq(cut - own) > 0.0:
             rest -= A
             limited = 1.0
-            set_part(impulse, e, 3 * n, part_of(impulse, e, 3 * n) - before + wp.quat_rotate(frame, cut))
-    set_part(left, e, 3 * n, wp.vec3(rest))
+            set_triple(impulse, e, 3 * n, triple_of(impulse, e, 3 * n) - before + wp.quat_rotate(frame, cut))
+    set_triple(left, e, 3 * n, wp.vec3(rest))
     return limited
 
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.critical_damping import implicit_velocity
-from piavatar_envs.avatar.part_sums import (
-    PART_BLOCK,
-    Parts,
-    bring_particle,
-    place_in_parts,
-    room_of_particles,
-    store_second,
+from piavatar_envs.avatar.segment_sums import (
+    PARTITION_THREADS,
+    Partitions,
+    particle_arena,
+    place_in_partitions,
+    quarters_at_once,
+    share_of,
+    store_point,
+    store_second_vectors,
     sum_chunk,
 )
-from piavatar_envs.avatar.segment_sums import quarters_at_once, share_of
 from piavatar_envs.avatar.skinning import blend_back, blend_images, skinned_place
 from piavatar_envs.avatar.torque_control.dynamics import blended_motion, motion_apart
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
@@ -37,24 +38,24 @@ def pulled_rest(body: Body, e: int, p: int, w: TorqueWorkspace):
 
 
 @wp.func
-def sum_part(parts: Parts, room: wp.uint64, pelvis: wp.vec3, e: int, part: int, w: TorqueWorkspace):
-    """Sums of the chunks of the part in the room, where places are seen from the ``pelvis``."""
+def sum_partition(partitions: Partitions, arena: wp.uint64, pelvis: wp.vec3, e: int, part: int, w: TorqueWorkspace):
+    """Sums of the chunks of the part in the arena, where places are seen from the ``pelvis``."""
     warp = warp_of_block()
     lane = lane_of_warp()
     quarters = quarters_at_once(lane[1])
-    n = int_at(parts.start, part) + quarters * warp[0]
-    end = int_at(parts.start, part + 1)
+    n = int_at(partitions.start, part) + quarters * warp[0]
+    end = int_at(partitions.start, part + 1)
     while n < end:
-        share = share_of(parts.quarters, n, lane[0])
+        share = share_of(partitions.quarters, n, lane[0])
         origin = vector_at(w.pose.position, e, share[1] & 255) - pelvis
-        sum_chunk(parts, room, share, origin, e, w.moments, w.other_moments)
+        sum_chunk(partitions, arena, share, origin, e, w.moments, w.other_moments)
         n += quarters * warp[1]
 
 
-@wp.kernel(launch_bounds=(PART_BLOCK, 4))
+@wp.kernel(launch_bounds=(PARTITION_THREADS, 4))
 def attach_flesh(
     body: Body,
-    parts: Parts,
+    partitions: Partitions,
     dt: float,
     mass: wp.array2d(dtype=float),
     x: wp.array2d(dtype=wp.vec3),
@@ -74,18 +75,18 @@ def attach_flesh(
     the pull has taken of the velocity, of what it leaves, and of the way to the particles' places, the bones get the
     moments.
 
-    Over ``(num_envs, parts, PART_BLOCK)``, a CUDA block a part; on a CPU one thread has the only one.
+    Over ``(num_envs, partitions, PARTITION_THREADS)``, a CUDA block a part; on a CPU one thread has the only one.
     """
     i, j, k = wp.tid()
-    at = place_in_parts(i, j, k, x.shape[0])
+    at = place_in_partitions(i, j, k, x.shape[0])
     e = at[0]
     if failure[e] != 0:
         return
     thread = at[2]
     threads = threads_of_block()
-    room = room_of_particles(scratch)
-    first = at[1] * parts.size
-    last = wp.min(first + parts.size, body.count)
+    arena = particle_arena(scratch)
+    first = at[1] * partitions.size
+    last = wp.min(first + partitions.size, body.count)
     r = row(e, mass.shape[0])
     p = first + thread
     pelvis = vector_at(w.pose.position, e, 0)
@@ -106,11 +107,11 @@ def attach_flesh(
         before = v - blended_motion(now, arm) - apart
         way = wp.vec3(now[6], now[7], now[8]) - arm
         after = implicit_velocity(own_rate, dt, way, before)
-        bring_particle(room, parts.size, p - first, m, arm, before - after, after, way)
+        store_point(arena, partitions.size, p - first, m, arm, before - after, after, way)
         p += threads
     sync_block()
-    store_second(room, last - first, thread, threads, e, body.first + first, u)
-    sum_part(parts, room, pelvis, e, at[1], w)
+    store_second_vectors(arena, last - first, thread, threads, e, body.first + first, u)
+    sum_partition(partitions, arena, pelvis, e, at[1], w)
 
 
 @wp.func

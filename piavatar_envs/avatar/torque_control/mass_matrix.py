@@ -43,7 +43,7 @@ from piavatar_envs.avatar.torque_control.tree_cholesky import (
     factor_size,
     find_pattern,
     lower_entries,
-    set_in_rooms,
+    set_in_arenas,
 )
 from piavatar_envs.avatar.tracking import symmetric
 from piavatar_envs.avatar.types import Body
@@ -100,7 +100,7 @@ return reinterpret_cast<wp::uint64>(words + at);
 return reinterpret_cast<wp::uint64>(scratch.data);
 #endif
 """)
-def room_of_records(scratch: wp.array(dtype=vec16), at: int) -> wp.uint64:
+def record_arena(scratch: wp.array(dtype=vec16), at: int) -> wp.uint64:
     """Where an environment's records are: from word ``at`` of a CUDA block's shared memory; on a CPU in ``scratch``."""
     ...
 
@@ -154,9 +154,9 @@ class Pairs:
 
     # (bones * bones,) pair of two bones; -1 where they have no particle in common, and for a bone with itself
     of: wp.array(dtype=int)
-    # bone c has particles in common with others beside[beside_start[c] : beside_start[c + 1]]
-    beside_start: wp.array(dtype=int)
-    beside: wp.array(dtype=int)
+    # bone c has particles in common with others neighbors[neighbor_start[c] : neighbor_start[c + 1]]
+    neighbor_start: wp.array(dtype=int)
+    neighbors: wp.array(dtype=int)
     first: wp.array(dtype=int)  # (pairs,) one of the bones of a pair, about whose joint its moments are
     second: wp.array(dtype=int)  # (pairs,) the other one
     quarters: wp.array(dtype=wp.vec4i)  # of warps that share chunks, see piavatar_envs.avatar.segment_sums
@@ -192,8 +192,8 @@ def build_pairs(points: BodyPoints, device: str) -> Pairs:
     pairs = Pairs()
     lists = {
         "of": of.ravel(),
-        "beside_start": np.cumsum([0, *(of >= 0).sum(1)]),
-        "beside": np.nonzero(of >= 0)[1],
+        "neighbor_start": np.cumsum([0, *(of >= 0).sum(1)]),
+        "neighbors": np.nonzero(of >= 0)[1],
         "first": [a for a, _ in sorted(particles)],
         "second": [b for _, b in sorted(particles)],
         "chunk_start": chunk_start,
@@ -316,8 +316,8 @@ def place_bone(
         s += add_rows16(moments, e, n, n + 1)
     second = symmetric(wp.vec3(s[7], s[8], s[9]), wp.vec3(s[10], s[11], s[12]))
     own = two_sided(s[0], wp.vec3(s[1], s[2], s[3]), second)
-    for n in range(pairs.beside_start[c] + thread, pairs.beside_start[c + 1], threads):
-        d = pairs.beside[n]
+    for n in range(pairs.neighbor_start[c] + thread, pairs.neighbor_start[c + 1], threads):
+        d = pairs.neighbors[n]
         own -= moved(read_pair(records, c, d), wp.vec3(), position[e, d] - position[e, c])
     own = sum_threads16(own, threads)
     if thread == 0:
@@ -358,7 +358,7 @@ def compose_alone(body: Body, position: wp.array2d(dtype=wp.vec3), records: wp.u
 
 
 @wp.func
-def compose_together(
+def compose_in_warp(
     body: Body,
     position: wp.array2d(dtype=wp.vec3),
     records: wp.uint64,
@@ -401,11 +401,11 @@ def fill_blocks(s: vec16, pattern: Pattern, c: int, d: int, at: wp.uint64):
     """The block of two joints of the mass matrix; those of the pelvis' velocity with the first joint's."""
     both = second_moment(s)
     own = (1 + c) * (1 + BONES)
-    set_in_rooms(at, pattern.block[own + 1 + d], wp.trace(both) * I3 - both)
+    set_in_arenas(at, pattern.block[own + 1 + d], wp.trace(both) * I3 - both)
     if d == 0:
-        set_in_rooms(at, pattern.block[own], wp.skew(wp.vec3(s[1], s[2], s[3])))  # of v_0 . (w x a), transposed
+        set_in_arenas(at, pattern.block[own], wp.skew(wp.vec3(s[1], s[2], s[3])))  # of v_0 . (w x a), transposed
         if c == 0:
-            set_in_rooms(at, 0, s[0] * I3)
+            set_in_arenas(at, 0, s[0] * I3)
 
 
 @wp.func
@@ -462,8 +462,8 @@ def compose_mass(
     if threads == 1:
         compose_alone(body, position, records, e)
     else:
-        compose_together(body, position, records, e, True, thread, threads)
-        compose_together(body, position, records, e, False, thread, threads)
+        compose_in_warp(body, position, records, e, True, thread, threads)
+        compose_in_warp(body, position, records, e, False, thread, threads)
     fill_mass(pattern, records, thread, threads, at)
 
 
@@ -500,7 +500,7 @@ def grid_inertia(points: BodyPoints, dx: float) -> np.ndarray:
     return known * 0.5 * dx**2 * mass
 
 
-class JointMass:
+class MassMatrix:
     """``M = J^T m J`` of one avatar; see :mod:`piavatar_envs.avatar.torque_control.mass_matrix`.
 
     Attributes:

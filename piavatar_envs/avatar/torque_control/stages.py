@@ -13,7 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.rotation import rigid_matrix
-from piavatar_envs.avatar.torque_control.bone_contact import PARTS, Ground, measure_bones, stop_bones, tell_sensors
+from piavatar_envs.avatar.torque_control.bone_contact import TRIPLES, Ground, add_to_sensors, measure_bones, stop_bones
 from piavatar_envs.avatar.torque_control.dynamics import (
     Springs,
     Strength,
@@ -28,31 +28,31 @@ from piavatar_envs.avatar.torque_control.dynamics import (
     joint_impulse,
     limit_torque,
     move_joints,
-    part_of,
     pass_down,
     spread_motion,
+    triple_of,
 )
-from piavatar_envs.avatar.torque_control.mass_matrix import BONES, PLACES, Pairs, compose_mass, room_of_records
+from piavatar_envs.avatar.torque_control.mass_matrix import BONES, PLACES, Pairs, compose_mass, record_arena
 from piavatar_envs.avatar.torque_control.tree_cholesky import (
-    ROOM,
+    ARENA_WORDS,
     factorize,
-    factorize_in_room,
-    fetch_factor,
-    keep_factor,
+    factorize_in_arena,
+    load_factor,
     place_of_factor,
     solve,
     solve_three_in_place,
-    store_room,
+    store_arena,
+    store_factor,
 )
 from piavatar_envs.avatar.torque_control.workspace import (
     TorqueWorkspace,
-    bring_places,
-    enter_room,
-    keep_motion,
-    leave_room,
-    room_of_warp,
-    row_in_room,
-    see_vectors,
+    load_positions,
+    load_workspace,
+    row_in_arena,
+    store_motion,
+    store_workspace,
+    view_vectors,
+    warp_arena,
 )
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import vec8
@@ -64,7 +64,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 WARP = wp.constant(32)
 #: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
 MASS_BLOCK = wp.constant(128)
-_ROOM = wp.constant(ROOM)
+_ARENA_WORDS = wp.constant(ARENA_WORDS)
 #: How often joints are solved for anew, at most, with more muscles at their limits: who gives less changes the others.
 MOST_CUTS = wp.constant(4)
 #: Share of what the pose is off the particles that one fit takes away. Those of a fast, light joint (a head, a hand)
@@ -99,15 +99,15 @@ def begin(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
 
 @wp.func
 def find_shares(
-    body: Body, own: int, step: int, rows: int, e: int, thread: int, threads: int, room: wp.uint64, w: TorqueWorkspace
+    body: Body, own: int, step: int, rows: int, e: int, thread: int, threads: int, arena: wp.uint64, w: TorqueWorkspace
 ):
     """The shares ``dq = M^-1 J^T m v`` that the joints can take of so many velocities, from the bones' momenta.
 
     Of the first they are in row ``own``, of others ``step`` rows apart.
     """
     pass_down(body, w.pose.position, e, rows, own, step, threads, w.linear, w.angular, w.shares)
-    fetch_factor(w.factors, e, room)
-    solve_three_in_place(w.pattern, w.factors, e, own, step, threads, room, w.shares)
+    load_factor(w.factors, e, arena)
+    solve_three_in_place(w.pattern, w.factors, e, own, step, threads, arena, w.shares)
 
 
 @wp.func
@@ -125,7 +125,7 @@ def move_on(body: Body, dt: float, move: int, off: int, e: int, thread: int, thr
         time = -_FIT_SHARE
         spread_motion(body, w.pose.position, w.shares, off, e, thread, threads, w.moving)
     if move == 1:
-        keep_motion(w.moving, e, 6, thread, threads, w.steps)
+        store_motion(w.moving, e, 6, thread, threads, w.steps)
     move_joints(body, time, w.moving, e, thread, threads, w.pose.rotation, w.pose.position)
 
 
@@ -154,7 +154,7 @@ def limit_joints(
 ) -> float:
     """Let muscles give no more than they have by share ``own``, and tell all threads how many would, or ``again``."""
     limited = float(0.0)
-    for k in range(thread, PARTS, threads):
+    for k in range(thread, TRIPLES, threads):
         rest = w.diagonals[driven, 3 * k]
         limited += limit_torque(
             body, dt, w.pose, springs, strength, w.muscle, rest, w.shares, own, again, e, k, w.impulse, w.left
@@ -177,7 +177,7 @@ def turn_joints(
     e: int,
     thread: int,
     threads: int,
-    room: wp.uint64,
+    arena: wp.uint64,
     w: TorqueWorkspace,
 ):
     """Springs, torques, tissue and what bones meet change the velocity of the joints, by share ``own``.
@@ -185,30 +185,30 @@ def turn_joints(
     ``driven`` is the factor of the mass matrix with all that is implicit.
     """
     sync_threads(threads)
-    for k in range(thread, PARTS, threads):
+    for k in range(thread, TRIPLES, threads):
         joint_impulse(
             body, dt, w.pose, target, springs, tissue, w.stop, w.velocity, w.outside, e, k, w.muscle, w.impulse
         )
-    fetch_factor(w.factors, driven, room)
+    load_factor(w.factors, driven, arena)
     factor = int(driven)
     met = vec8()
     cuts = int(0)
     while factor >= 0:  # once more where muscles reach their limits, by the same piece of the graph
-        solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, room, w.shares)
-        met = stop_bones(body, ground, dt, own, factor, e, thread, threads, room, w)
+        solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, arena, w.shares)
+        met = stop_bones(body, ground, dt, own, factor, e, thread, threads, arena, w)
         if cuts == MOST_CUTS:
             break
         if limit_joints(body, dt, springs, strength, driven, own, cuts > 0, e, thread, threads, w) == 0.0:
             break
         cuts += 1
         factor = w.factors.shape[0] - 1
-        factorize(w.pattern, w.matrix, w.left, e, e, room, factor, w.factors)
+        factorize(w.pattern, w.matrix, w.left, e, e, arena, factor, w.factors)
     find_given(w.left, w.shares, own, e, thread, threads, w.impulse)
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
-    support = part_of(w.impulse, e, 0) + wp.vec3(met[0], met[1], met[2])
-    moment = part_of(w.impulse, e, 3) + wp.vec3(met[3], met[4], met[5])
+    support = triple_of(w.impulse, e, 0) + wp.vec3(met[0], met[1], met[2])
+    moment = triple_of(w.impulse, e, 3) + wp.vec3(met[3], met[4], met[5])
     if thread == 0:
-        tell_sensors(body, ground, met, e, w.pose.position[e, 0])
+        add_to_sensors(body, ground, met, e, w.pose.position[e, 0])
     balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, own, thread, threads, w.shares)
 
 
@@ -235,25 +235,25 @@ def build_mass(
     if failure[e] != 0:
         return
     n = failure.shape[0]
-    for k in range(thread, PARTS, threads):
+    for k in range(thread, TRIPLES, threads):
         implicit_diagonal(body, dt, w.pose, springs, tissue, e, k, n + e, w.stop, w.diagonals)
-    records = room_of_records(w.records, 0)
-    bring_places(w.pose.position, e, thread, threads, records, PLACES)
-    position = see_vectors(w.pose.position, records, PLACES, 0)
+    records = record_arena(w.records, 0)
+    load_positions(w.pose.position, e, thread, threads, records, PLACES)
+    position = view_vectors(w.pose.position, records, PLACES, 0)
     mass = place_of_factor(w.matrix, e, records)
     compose_mass(body, pairs, w.pair_sums, w.moments, position, w.pattern, records, e, thread, threads, mass)
-    store_room(mass, e, thread, threads, w.matrix)
+    store_arena(mass, e, thread, threads, w.matrix)
     sync_block()
     lanes = wp.min(threads, WARP)
     warp = thread // lanes
     for which in range(warp, 2, threads // lanes):
         system = which * n + e
-        room = room_of_records(w.records, which * _ROOM)
+        arena = record_arena(w.records, which * _ARENA_WORDS)
         if threads == 1:
-            factorize(w.pattern, w.matrix, w.diagonals, e, system, room, system, w.factors)
+            factorize(w.pattern, w.matrix, w.diagonals, e, system, arena, system, w.factors)
         else:
-            factorize_in_room(w.pattern, w.diagonals, system, room)
-        keep_factor(room, system, w.factors)
+            factorize_in_arena(w.pattern, w.diagonals, system, arena)
+        store_factor(arena, system, w.factors)
 
 
 @wp.kernel
@@ -305,27 +305,27 @@ def act(
     threads = at[2]
     if failure[e] != 0:
         return
-    room = room_of_warp()
+    arena = warp_arena()
     n = failure.shape[0]
-    own = row_in_room(e, 0)
-    taken = row_in_room(n + e, 1)
-    off = row_in_room(2 * n + e, 2)
-    near = enter_room(w, e)
+    own = row_in_arena(e, 0)
+    taken = row_in_arena(n + e, 1)
+    off = row_in_arena(2 * n + e, 2)
+    near = load_workspace(w, e)
     gather_sums(
         body.chunk_bone, w.moments, w.other_moments, e, own, taken, off, near.bones, near.linear, near.angular
     )  # fmt: skip
-    find_shares(body, own, taken - own, moves, e, thread, threads, room, near)
+    find_shares(body, own, taken - own, moves, e, thread, threads, arena, near)
     pull_bones(body, own, e, thread, threads, near)
     add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)
-    turn_joints(body, dt, target, springs, tissue, strength, ground, n + e, own, e, thread, threads, room, near)
+    turn_joints(body, dt, target, springs, tissue, strength, ground, n + e, own, e, thread, threads, arena, near)
     go_on(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
     spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.moving)
-    keep_motion(near.moving, e, 0, thread, threads, w.steps)
+    store_motion(near.moving, e, 0, thread, threads, w.steps)
     if thread == 0:
         w.pelvis[e] = near.pose.position[e, 0]
-        support.force[e] = support.force[e] + per_time * part_of(w.impulse, e, 0)
-        support.torque[e] = support.torque[e] + per_time * part_of(w.impulse, e, 3)
+        support.force[e] = support.force[e] + per_time * triple_of(w.impulse, e, 0)
+        support.torque[e] = support.torque[e] + per_time * triple_of(w.impulse, e, 3)
     for move in range(moves):
         move_on(body, dt, move, off, e, thread, threads, near)
     begin(body, e, thread, threads, near)
-    leave_room(w, e, near)
+    store_workspace(w, e, near)

@@ -1,8 +1,8 @@
-"""Cholesky factors of small sparse matrices, one an environment, and what is solved with them.
+"""Cholesky factors of small sparse matrices, one an environment, and solutions with them.
 
-On a GPU a factor is in the room of a warp, in shared memory: each row needs the one before, and would wait for global
-memory every time. A room has :data:`ROOM` words, a factor's and from :data:`SPARE` on those of vectors that are solved
-for. On a CPU a factor is where it is kept, and vectors are where they are wanted.
+On a GPU a factor is in the arena of a warp, in shared memory: each row needs the one before, and would wait for global
+memory every time. An arena has :data:`ARENA_WORDS` words: a factor's, and from :data:`SPARE` on those of vectors to
+solve for. On a CPU factor and vectors are where they are kept.
 
 The matrix is ``L^T L`` with a lower triangle ``L``: rows are eliminated from the last one up. Where rows are joints
 in an order that has children after their parents, limbs go before what they hang on, and of two limbs neither fills
@@ -11,8 +11,7 @@ of two joints, are not zero is found once, on the host.
 
 Matrices and factors are kept as these blocks alone, one after the other, row by row, in a row the diagonal's last; of a
 matrix that one is whole. In a factor it is its inverse, ``L_kk^-1``, lower, which is all that solutions ask for. On a
-GPU a warp works on a factor in a ``room`` in shared memory, on a CPU one thread does where factors are kept: the same
-graph, :mod:`piavatar_envs.avatar.torque_control.tree_cholesky`.
+GPU a warp works on a factor in an arena in shared memory; on a CPU one thread works where factors are kept.
 """
 
 from __future__ import annotations
@@ -25,15 +24,14 @@ from piavatar_envs.core.cuda_intrinsics import lane_of_warp, sync_threads
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
-#: Rows of the largest matrix that there is room for: as many as an avatar has. 16 warps have room in a multiprocessor,
-#: so that those of 2,048 environments are all at work at once.
+#: Rows of the largest matrix that fits an arena: as many as an avatar has. 16 arenas fit a multiprocessor.
 MOST_ROWS = 69
 _JOINTS = MOST_ROWS // 3
 #: Words of shared memory of a warp: all blocks that a factor may have, and three vectors, four words a joint.
 SPARE = 9 * _JOINTS * (_JOINTS + 1) // 2
-ROOM = SPARE + 3 * 4 * _JOINTS
-_ROOM = """
-float* const room = reinterpret_cast<float*>(at);
+ARENA_WORDS = SPARE + 3 * 4 * _JOINTS
+_ARENA = """
+float* const arena = reinterpret_cast<float*>(at);
 #if defined(__CUDA_ARCH__)
 const int lane = threadIdx.x & 31;
 constexpr int LANES = 32;
@@ -53,7 +51,7 @@ const auto over_root = [](float x) { return 1.0f / sqrtf(x); };
 # Of a row all lanes find the inverse of the diagonal's block, a lane a column of the others. Then a lane has two of its
 # blocks, whose product is to be taken from a third.
 @wp.func_native(
-    _ROOM
+    _ARENA
     + """
 #if defined(__CUDA_ARCH__)
 using Step = int4;
@@ -62,7 +60,7 @@ struct Step { int x, y, z, w; };
 #endif
 struct Block { float number[9]; };
 const Step* const all_steps = reinterpret_cast<const Step*>(steps.data);
-const auto at_byte = [&](int n) { return reinterpret_cast<float*>(reinterpret_cast<char*>(room) + n); };
+const auto at_byte = [&](int n) { return reinterpret_cast<float*>(reinterpret_cast<char*>(arena) + n); };
 const int column = 9 * (lane / 3) + lane % 3;
 const auto block_at = [](const float* from) {
     Block block;
@@ -124,19 +122,19 @@ for (int round = 0; round < steps.shape[0] - 2; ++round) {
 """
 )
 def eliminate(steps: wp.array(dtype=wp.vec4i), pair: wp.array(dtype=int), at: wp.uint64):
-    """The factor of the matrix in a room, in its place."""
+    """The factor of the matrix in an arena, in its place."""
     ...
 
 
 @wp.func_native(
-    _ROOM
+    _ARENA
     + """
-for (int i = lane; i < diagonal.shape[1]; i += LANES) room[entry.data[i]] += wp::index(diagonal, e, i);
+for (int i = lane; i < diagonal.shape[1]; i += LANES) arena[entry.data[i]] += wp::index(diagonal, e, i);
 meet();
 """
 )
 def add_diagonal(entry: wp.array(dtype=int), diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
-    """Add row ``e`` to the diagonal of the matrix in a room, whose entries are there."""
+    """Add row ``e`` to the diagonal of the matrix in an arena, whose entries are there."""
     ...
 
 
@@ -146,12 +144,12 @@ if (block < 0) return;
 for (int n = 0; n < 9; ++n) {{
     to[n] = value.data[n / 3][n % 3];
 #if defined(__CUDA_ARCH__)
-    to[n + {ROOM}] = to[n];
+    to[n + {ARENA_WORDS}] = to[n];
 #endif
 }}
 """)
-def set_in_rooms(at: wp.uint64, block: int, value: wp.mat33):
-    """Write a block, if there is one of that number, to the matrix in a room, and on a GPU to that in the next room."""
+def set_in_arenas(at: wp.uint64, block: int, value: wp.mat33):
+    """Write a block, if it has a number, to the matrix in an arena, and on a GPU to that in the next arena."""
     ...
 
 
@@ -161,8 +159,8 @@ float4* const to = reinterpret_cast<float4*>(&wp::index(rows, n, 0));
 for (int k = thread; k < rows.shape[1] / 4; k += threads) to[k] = reinterpret_cast<const float4*>(at)[k];
 #endif
 """)
-def store_room(at: wp.uint64, n: int, thread: int, threads: int, rows: wp.array2d(dtype=float)):
-    """Write what is in a room to row ``n``; on a CPU it is there."""
+def store_arena(at: wp.uint64, n: int, thread: int, threads: int, rows: wp.array2d(dtype=float)):
+    """Write what is in an arena to row ``n``; on a CPU it is there."""
     ...
 
 
@@ -178,31 +176,31 @@ float* const to = reinterpret_cast<float*>(at);
 if (to != &wp::index(rows, n, 0)) memcpy(to, &wp::index(rows, n, 0), sizeof(float) * rows.shape[1]);
 #endif
 """)
-def load_room(rows: wp.array2d(dtype=float), n: int, at: wp.uint64):
-    """Read row ``n`` into a room."""
+def load_arena(rows: wp.array2d(dtype=float), n: int, at: wp.uint64):
+    """Read row ``n`` into an arena."""
     ...
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-return room;
+return arena;
 #else
 return reinterpret_cast<wp::uint64>(&wp::index(factor, f, 0));
 #endif
 """)
-def place_of_factor(factor: wp.array2d(dtype=float), f: int, room: wp.uint64) -> wp.uint64:
-    """Where factor ``f`` is worked on: in the room of a warp, or on a CPU in the array itself."""
+def place_of_factor(factor: wp.array2d(dtype=float), f: int, arena: wp.uint64) -> wp.uint64:
+    """Where factor ``f`` is worked on: in the arena of a warp, or on a CPU in the array itself."""
     ...
 
 
 # All lanes find the part of a joint, and each takes from one number of another joint what that has of it: on the way
 # down, in the columns of its row, and on the way up, in the rows of its column. What is not in ``wanted`` is passed by.
-_PARTS = (
-    _ROOM
+_TRIPLES = (
+    _ARENA
     + f"""
 constexpr int VECTORS = COUNT, STRIDE = {4 * _JOINTS};
 #if defined(__CUDA_ARCH__)
-float* const spare = room + {SPARE};
+float* const spare = arena + {SPARE};
 const auto part = [&](int v, int n) {{
     return reinterpret_cast<float*>(reinterpret_cast<char*>(spare + STRIDE * v) + n);
 }};
@@ -212,7 +210,7 @@ const auto part = [&](int v, int n) {{ return &wp::index(x, first + v * step, 3 
 """
 )
 _SWEEPS = """
-const auto at_byte = [&](int n) { return reinterpret_cast<const float*>(reinterpret_cast<const char*>(room) + n); };
+const auto at_byte = [&](int n) { return reinterpret_cast<const float*>(reinterpret_cast<const char*>(arena) + n); };
 float y[VECTORS][3];
 const auto take = [&](int word, float m0, float m1, float m2) {
 #pragma unroll
@@ -297,7 +295,7 @@ for (int v = 0; v < VECTORS; ++v)
 meet();
 #endif
 """
-_SOLVE = _ALL + _PARTS + _BRING + _SWEEPS + _DOWN + _UP + _KEEP
+_SOLVE = _ALL + _TRIPLES + _BRING + _SWEEPS + _DOWN + _UP + _KEEP
 
 
 @wp.func_native(_SOLVE.replace("COUNT", "1"))
@@ -305,7 +303,7 @@ def solve_one(
     heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
     x: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """Row ``first`` of what is solved with the factor in a room; it has the right-hand side at first."""
+    """Row ``first`` of what is solved with the factor in an arena; it has the right-hand side at first."""
     ...
 
 
@@ -318,19 +316,19 @@ def solve_three(
     ...
 
 
-@wp.func_native((_PARTS + _SWEEPS + _DOWN).replace("COUNT", "3"))
+@wp.func_native((_TRIPLES + _SWEEPS + _DOWN).replace("COUNT", "3"))
 def descend_three(
     heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
     wanted: int, x: wp.array2d(dtype=float),
 ):  # fmt: skip
     """``L^-T`` times three vectors that have nothing but in joints whose bits are ``wanted``, as have the answers.
 
-    Of a warp they are in its room, of a thread that is alone in rows of ``x`` as in :func:`solve_three`.
+    Of a warp they are in its arena, of a thread that is alone in rows of ``x`` as in :func:`solve_three`.
     """
     ...
 
 
-@wp.func_native((_ALL + "constexpr int step = 0;" + _PARTS + _SWEEPS + _UP).replace("COUNT", "1"))
+@wp.func_native((_ALL + "constexpr int step = 0;" + _TRIPLES + _SWEEPS + _UP).replace("COUNT", "1"))
 def ascend_one(
     heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int,
     x: wp.array2d(dtype=float),
@@ -466,7 +464,7 @@ def factorize(
     diagonal: wp.array2d(dtype=float),
     source: int,
     e: int,
-    room: wp.uint64,
+    arena: wp.uint64,
     f: int,
     # out
     factor: wp.array2d(dtype=float),
@@ -474,32 +472,32 @@ def factorize(
     """``L`` of ``L^T L = matrix + diag(diagonal)``, of matrix ``source`` and row ``e`` of the ``diagonal``.
 
     ``matrix`` is ``(num_envs, factor_size)``. A thread that is alone writes factor ``f`` of as many numbers; a warp has
-    it in its room, from where :func:`keep_factor` writes it.
+    it in its arena, from where :func:`store_factor` writes it.
     """
-    at = place_of_factor(factor, f, room)
-    load_room(matrix, source, at)
-    factorize_in_room(pattern, diagonal, e, at)
+    at = place_of_factor(factor, f, arena)
+    load_arena(matrix, source, at)
+    factorize_in_arena(pattern, diagonal, e, at)
 
 
 @wp.func
-def factorize_in_room(pattern: Pattern, diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
+def factorize_in_arena(pattern: Pattern, diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
     """:func:`factorize` of the matrix that is there."""
     add_diagonal(pattern.entry, diagonal, e, at)
     eliminate(pattern.step, pattern.pair, at)
 
 
 @wp.func
-def keep_factor(room: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
+def store_factor(arena: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
     """Write factor ``f``, which :func:`factorize` has just found, where it has not done so itself."""
     lane = lane_of_warp()
-    store_room(room, f, lane[0], lane[1], factor)
-    sync_threads(lane[1])  # the room is free
+    store_arena(arena, f, lane[0], lane[1], factor)
+    sync_threads(lane[1])  # the arena is free
 
 
 @wp.func
-def fetch_factor(factor: wp.array2d(dtype=float), f: int, room: wp.uint64):
+def load_factor(factor: wp.array2d(dtype=float), f: int, arena: wp.uint64):
     """Let a warp solve with factor ``f`` from here on."""
-    load_room(factor, f, place_of_factor(factor, f, room))
+    load_arena(factor, f, place_of_factor(factor, f, arena))
 
 
 @wp.func
@@ -512,16 +510,16 @@ def solve(
     row: int,
     thread: int,
     threads: int,
-    room: wp.uint64,
+    arena: wp.uint64,
     # out
     x: wp.array2d(dtype=float),
 ):
-    """``x[row]`` with ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its room."""
+    """``x[row]`` with ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its arena."""
     sync_threads(threads)
     for i in range(thread, x.shape[1], threads):
         x[row, i] = right[e, i]
     sync_threads(threads)
-    solve_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), row, 0, x)
+    solve_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, arena), row, 0, x)
 
 
 @wp.func
@@ -532,13 +530,13 @@ def solve_three_in_place(
     first: int,
     step: int,
     threads: int,
-    room: wp.uint64,
+    arena: wp.uint64,
     # in and out
     x: wp.array2d(dtype=float),
 ):
     """:func:`solve` of three right-hand sides in ``x``, the ``first`` and others ``step`` rows apart."""
     sync_threads(threads)
-    solve_three(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), first, step, x)
+    solve_three(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, arena), first, step, x)
 
 
 @wp.func
@@ -550,18 +548,18 @@ def begin_solution(
     first: int,
     step: int,
     threads: int,
-    room: wp.uint64,
+    arena: wp.uint64,
     # in and out
     x: wp.array2d(dtype=float),
 ):
     """``Y = L^-T B`` of three right-hand sides ``B`` in ``x``, with which ``B^T M^-1 B = Y^T Y``.
 
     Both have something in joints whose bits are ``wanted`` alone, which is what ``Pattern.reach`` tells; elsewhere
-    nothing is read or written. A warp has them in its room, see
-    :func:`piavatar_envs.avatar.torque_control.workspace.see_columns`.
+    nothing is read or written. A warp has them in its arena, see
+    :func:`piavatar_envs.avatar.torque_control.workspace.view_columns`.
     """
     sync_threads(threads)
-    at = place_of_factor(factor, f, room)
+    at = place_of_factor(factor, f, arena)
     descend_three(pattern.head, pattern.word, pattern.turn, at, first, step, wanted, x)
 
 
@@ -572,10 +570,10 @@ def end_solution(
     f: int,
     first: int,
     threads: int,
-    room: wp.uint64,
+    arena: wp.uint64,
     # in and out
     x: wp.array2d(dtype=float),
 ):
     """``L^-1`` times the first of the columns of :func:`begin_solution`."""
     sync_threads(threads)
-    ascend_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, room), first, x)
+    ascend_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, arena), first, x)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
-from piavatar_envs.avatar.torque_control.tree_cholesky import MOST_ROWS, ROOM, SPARE, Pattern
+from piavatar_envs.avatar.torque_control.tree_cholesky import ARENA_WORDS, MOST_ROWS, SPARE, Pattern
 from piavatar_envs.avatar.types import Pose
 from piavatar_envs.core.arrays import vec8, vec12, vec16
 
@@ -64,24 +64,24 @@ class TorqueWorkspace:
 _ROWS, _VECTORS = wp.constant(MOST_ROWS), wp.constant(3 * NUM_JOINTS)
 _LINEAR = wp.constant(0)
 _ANGULAR = wp.constant(int(_LINEAR) + 3 * int(_VECTORS))
-_SHARES = wp.constant(ROOM)
+_SHARES = wp.constant(ARENA_WORDS)
 _MOVING = wp.constant(int(_SHARES) + 3 * MOST_ROWS)
 _ROTATION = wp.constant(int(_MOVING) + 8 * NUM_JOINTS)
 _POSITION = wp.constant(int(_ROTATION) + 4 * NUM_JOINTS)
 _WORDS = -(-(int(_POSITION) + 3 * NUM_JOINTS) // 4) * 4
-# Of vectors that are solved for: where they are in a room, and words of one.
-_SPARE, _COLUMN = wp.constant(SPARE), wp.constant((ROOM - SPARE) // 3)
+# Of vectors that are solved for: where they are in an arena, and words of one.
+_SPARE, _COLUMN = wp.constant(SPARE), wp.constant((ARENA_WORDS - SPARE) // 3)
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-__shared__ float __align__(16) room[{_WORDS}];
-return reinterpret_cast<wp::uint64>(room);
+__shared__ float __align__(16) arena[{_WORDS}];
+return reinterpret_cast<wp::uint64>(arena);
 #else
 return 0;
 #endif
 """)
-def room_of_warp() -> wp.uint64:
+def warp_arena() -> wp.uint64:
     """Room of a warp that has a CUDA block of its own; a factor's is at its beginning."""
     ...
 
@@ -93,14 +93,14 @@ return there;
 return row;
 #endif
 """)
-def row_in_room(row: int, there: int) -> int:
-    """Row ``there`` of what has several in a warp's room; on a CPU ``row``."""
+def row_in_arena(row: int, there: int) -> int:
+    """Row ``there`` of what has several in a warp's arena; on a CPU ``row``."""
     ...
 
 
-_SEE = """
+_VIEW = """
 #if defined(__CUDA_ARCH__)
-rows.data = reinterpret_cast<decltype(rows.data)>(reinterpret_cast<float*>(room) + at);
+rows.data = reinterpret_cast<decltype(rows.data)>(reinterpret_cast<float*>(arena) + at);
 rows.strides[0] = 4 * words;
 rows.strides[1] = sizeof(*rows.data);  // known when it is compiled
 #endif
@@ -108,34 +108,34 @@ return rows;
 """
 
 
-@wp.func_native(_SEE)
-def see_numbers(rows: wp.array2d(dtype=float), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=float):
-    """The array with its first row at word ``at`` of the room, and another one every so many ``words``."""
+@wp.func_native(_VIEW)
+def view_numbers(rows: wp.array2d(dtype=float), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=float):
+    """The array with its first row at word ``at`` of the arena, and another one every so many ``words``."""
     ...
 
 
-@wp.func_native(_SEE)
-def see_vectors(rows: wp.array2d(dtype=wp.vec3), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.vec3):
-    """:func:`see_numbers` of vectors."""
+@wp.func_native(_VIEW)
+def view_vectors(rows: wp.array2d(dtype=wp.vec3), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.vec3):
+    """:func:`view_numbers` of vectors."""
     ...
 
 
-@wp.func_native(_SEE)
-def see_turns(rows: wp.array2d(dtype=wp.quat), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.quat):
-    """:func:`see_numbers` of rotations."""
+@wp.func_native(_VIEW)
+def view_rotations(rows: wp.array2d(dtype=wp.quat), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.quat):
+    """:func:`view_numbers` of rotations."""
     ...
 
 
-@wp.func_native(_SEE)
-def see_motions(rows: wp.array2d(dtype=vec8), room: wp.uint64, at: int, words: int) -> wp.array2d(dtype=vec8):
-    """:func:`see_numbers` of rigid motions."""
+@wp.func_native(_VIEW)
+def view_motions(rows: wp.array2d(dtype=vec8), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=vec8):
+    """:func:`view_numbers` of rigid motions."""
     ...
 
 
 @wp.func
-def see_columns(rows: wp.array2d(dtype=float), room: wp.uint64):
-    """Three vectors that are solved for, in the room of a warp; on a CPU ``rows``. See :func:`place_of_part`."""
-    return see_numbers(rows, room, _SPARE, _COLUMN)
+def view_columns(rows: wp.array2d(dtype=float), arena: wp.uint64):
+    """Three vectors that are solved for, in the arena of a warp; on a CPU ``rows``. See :func:`place_of_triple`."""
+    return view_numbers(rows, arena, _SPARE, _COLUMN)
 
 
 @wp.func_native("""
@@ -145,26 +145,26 @@ return 4 * k;
 return 3 * k;
 #endif
 """)
-def place_of_part(k: int) -> int:
-    """Where in a column of :func:`see_columns` the part of joint ``k`` begins; the pelvis' place comes first."""
+def place_of_triple(k: int) -> int:
+    """Where in a column of :func:`view_columns` the part of joint ``k`` begins; the pelvis' place comes first."""
     ...
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-float* const to = reinterpret_cast<float*>(room) + at;
+float* const to = reinterpret_cast<float*>(arena) + at;
 const float* const from = reinterpret_cast<const float*>(&wp::index(position, e, 0));
 for (int n = thread; n < {3 * NUM_JOINTS}; n += threads) to[n] = from[n];
 #endif
 """)
-def bring_places(position: wp.array2d(dtype=wp.vec3), e: int, thread: int, threads: int, room: wp.uint64, at: int):
-    """Write where the joints of an environment are to the room, from word ``at`` on."""
+def load_positions(position: wp.array2d(dtype=wp.vec3), e: int, thread: int, threads: int, arena: wp.uint64, at: int):
+    """Write where the joints of an environment are to the arena, from word ``at`` on."""
     ...
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-float* const to = reinterpret_cast<float*>(room);
+float* const to = reinterpret_cast<float*>(arena);
 const float* const rotation = reinterpret_cast<const float*>(&wp::index(w.pose.rotation, e, 0));
 const float* const position = reinterpret_cast<const float*>(&wp::index(w.pose.position, e, 0));
 for (int n = threadIdx.x & 31; n < {4 * NUM_JOINTS}; n += 32) to[{_ROTATION} + n] = rotation[n];
@@ -172,26 +172,26 @@ for (int n = threadIdx.x & 31; n < {3 * NUM_JOINTS}; n += 32) to[{_POSITION} + n
 __syncwarp();
 #endif
 """)
-def bring_pose(w: TorqueWorkspace, e: int, room: wp.uint64):
-    """Write the pose of an environment to the room."""
+def load_pose(w: TorqueWorkspace, e: int, arena: wp.uint64):
+    """Write the pose of an environment to the arena."""
     ...
 
 
 @wp.func
-def enter_room(w: TorqueWorkspace, e: int):
-    """The bench with pose, motion, momenta and shares of an environment in the room of its warp.
+def load_workspace(w: TorqueWorkspace, e: int):
+    """The bench with pose, motion, momenta and shares of an environment in the arena of its warp.
 
-    What has several rows has them as :func:`row_in_room` says; all else has one there, whatever the environment. On a
+    What has several rows has them as :func:`row_in_arena` says; all else has one there, whatever the environment. On a
     CPU it is the bench itself.
     """
-    room = room_of_warp()
-    bring_pose(w, e, room)
-    w.linear = see_vectors(w.linear, room, _LINEAR, _VECTORS)
-    w.angular = see_vectors(w.angular, room, _ANGULAR, _VECTORS)
-    w.shares = see_numbers(w.shares, room, _SHARES, _ROWS)
-    w.moving = see_motions(w.moving, room, _MOVING, 0)
-    w.pose.rotation = see_turns(w.pose.rotation, room, _ROTATION, 0)
-    w.pose.position = see_vectors(w.pose.position, room, _POSITION, 0)
+    arena = warp_arena()
+    load_pose(w, e, arena)
+    w.linear = view_vectors(w.linear, arena, _LINEAR, _VECTORS)
+    w.angular = view_vectors(w.angular, arena, _ANGULAR, _VECTORS)
+    w.shares = view_numbers(w.shares, arena, _SHARES, _ROWS)
+    w.moving = view_motions(w.moving, arena, _MOVING, 0)
+    w.pose.rotation = view_rotations(w.pose.rotation, arena, _ROTATION, 0)
+    w.pose.position = view_vectors(w.pose.position, arena, _POSITION, 0)
     return w
 
 
@@ -200,7 +200,7 @@ const float* const from = reinterpret_cast<const float*>(&wp::index(motion, e, 0
 float* const to = reinterpret_cast<float*>(&wp::index(steps, e, 0)) + first;
 for (int n = thread; n < {6 * NUM_JOINTS}; n += threads) to[12 * (n / 6) + n % 6] = from[8 * (n / 6) + n % 6];
 """)
-def keep_motion(
+def store_motion(
     motion: wp.array2d(dtype=vec8), e: int, first: int, thread: int, threads: int, steps: wp.array2d(dtype=vec12)
 ):
     """Write the motion of all bones to their records, from number ``first`` on."""
@@ -219,6 +219,6 @@ keep(near.pose.rotation, w.pose.rotation, {4 * NUM_JOINTS});
 keep(near.pose.position, w.pose.position, {3 * NUM_JOINTS});
 #endif
 """)
-def leave_room(w: TorqueWorkspace, e: int, near: TorqueWorkspace):
-    """Write motion and pose from the room, as all threads have left them."""
+def store_workspace(w: TorqueWorkspace, e: int, near: TorqueWorkspace):
+    """Write motion and pose from the arena, as all threads have left them."""
     ...
