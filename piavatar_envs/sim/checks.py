@@ -10,22 +10,18 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
-from piavatar_envs.config import AvatarConfig, ColliderConfig, ConfigError, PropConfig
+from piavatar_envs.config import AvatarConfig, ColliderConfig, ConfigError, PropConfig, SceneConfig
 from piavatar_envs.mpm.colliders import COLLIDER_KINDS
 from piavatar_envs.sim.bodies import Flesh
 from piavatar_envs.sim.prop_geometry import PropPoints, primitive_distance
 from piavatar_envs.sim.props import turn_of
 from piavatar_envs.sim.scene import GROUND, Domain
-
-if TYPE_CHECKING:
-    from piavatar_envs.sim.world import Simulation
 
 #: How far a prop may reach out of the domain at the start [grid spacings]: the grid has room, and walls push it back.
 OVERLAP = 0.5
@@ -149,21 +145,34 @@ def check_beside_solids(
                 _refuse(thing.name, deep.max(), solid.name, dx, move)
 
 
-def check_beside_standing(simulation: Simulation) -> None:
+def check_beside_standing(
+    given: SceneConfig,
+    scene: SceneConfig,
+    points: Sequence[PropPoints],
+    flesh: Sequence[Flesh],
+    names: Sequence[str],
+    dx: float,
+) -> None:
     """Refuse configured props and colliders that would begin in an avatar in the rest pose.
+
+    Args:
+        given: the configured scene, whose props and colliders are checked.
+        scene: the scene with the avatars and props of the task.
+        points: particles of the props of ``scene``.
+        flesh: of the avatars.
+        names: of the avatars.
+        dx: grid spacing [m].
 
     Raises:
         ConfigError: there are such props or colliders.
     """
-    dx, given = simulation.dx, simulation.config.scene
-    points = dict(zip((prop.name for prop in simulation.scene.props), simulation.props.points, strict=True))
+    points = dict(zip((prop.name for prop in scene.props), points, strict=True))
     things = [_collider(collider, dx) for collider in given.colliders]
     things += [_prop(prop, points[prop.name]) for prop in given.props]
     if not things:
         return
-    names = simulation.subjects.names
-    for name, avatar, flesh in zip(names, simulation.scene.avatars, simulation.flesh, strict=False):
-        body = _Body.standing(avatar, flesh, dx)
+    for name, avatar, own in zip(names, scene.avatars, flesh, strict=False):
+        body = _Body.standing(avatar, own, dx)
         for thing in things:
             deep = max(body.depth_in(thing), body.depth_at(thing.inner).max(initial=0.0))
             if deep > dx or (thing.bounded and body.depth_at(thing.middle) > 0.0):

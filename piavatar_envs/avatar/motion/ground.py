@@ -1,8 +1,8 @@
-"""How far above the ground a clip's skin is."""
+"""Height of a clip's skin above the ground."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -12,15 +12,25 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 
 if TYPE_CHECKING:
     from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody
-    from piavatar_envs.avatar.motion.motion import Motion
 
 _CHUNK = 128  # frames skinned at once, bounds the memory of long clips
 
 
+class Clip(Protocol):
+    """Poses in frames, such as a :class:`~piavatar_envs.avatar.motion.motion.Motion`."""
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+
+    def joint_frames(self, rest_joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return world rotations ``(num_frames, 22, 3, 3)`` and joint positions [m] ``(num_frames, 22, 3)``."""
+
+
 def lowest_heights(
-    motion: Motion, asset: AvatarAsset, body: ShapedBody | None = None, ignored: tuple[int, ...] = ()
+    motion: Clip, asset: AvatarAsset, body: ShapedBody | None = None, ignored: tuple[int, ...] = ()
 ) -> np.ndarray:
-    """Height of the lowest skin point in each frame [m].
+    """Return the height of the lowest skin point in each frame [m].
 
     Args:
         motion: the clip.

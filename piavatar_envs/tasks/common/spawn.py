@@ -31,7 +31,8 @@ def record_standing(env: EpisodeArrays, graph: LaunchGraph, noise: float) -> Non
     Raises:
         ConfigError: something of the scene would begin inside of an avatar.
     """
-    check_beside_standing(env.simulation)
+    sim = env.simulation
+    check_beside_standing(sim.config.scene, sim.scene, sim.props.points, sim.flesh, sim.subjects.names, sim.dx)
     for index, (avatar, config) in enumerate(zip(env.simulation.avatars, env.task.scene.avatars, strict=True)):
         limits = env.action_map.lower, env.action_map.upper
         place = wp.vec3(*config.position, config.yaw)
