@@ -137,7 +137,10 @@ class PhysicsConfig(BaseModel):
         le=CFL_STABLE,
         description="largest c dt / dx a substep may have, c the P-wave speed; beyond 0.84 it is not stable [-]",
     )
-    material: MaterialName = Field("neo_hookean", description="elastic energy of the flesh")
+    material: MaterialName = Field(
+        "neo_hookean",
+        description="elastic energy of the flesh: neo_hookean, fixed_corotated, or a name given to register_material",
+    )
     young_modulus: float = Field(1.0e5, ge=1.0, le=MOST_MODULUS, description="Young's modulus of the flesh [Pa]")
     soft_young_modulus: float | None = Field(
         None,

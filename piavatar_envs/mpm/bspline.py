@@ -1,4 +1,4 @@
-"""Quadratic B-spline, and the layout of nodes in blocks: the only module that knows either.
+"""Quadratic B-spline, and the layout of nodes in blocks: the only module that depends on either.
 
 A particle touches the 3 x 3 x 3 nodes ``base + (0..2)``, its stencil. With ``f = (x - x_base) / dx`` in [0.5, 1.5) the
 weights along one axis are those of Jiang et al., "The Material Point Method for Simulating Continuum Materials"
