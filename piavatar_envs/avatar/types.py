@@ -14,7 +14,8 @@ from typing import Any
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
-from piavatar_envs.core.arrays import make_struct, vec8, vec12, vec16
+from piavatar_envs.core.arrays import vec8, vec12, vec16
+from piavatar_envs.core.structs import make_struct
 
 wp.set_module_options({"enable_backward": False})
 

@@ -268,11 +268,3 @@ def components_of(matrices: np.ndarray) -> np.ndarray:
     """Convert matrices to components in single precision: the inverse of :func:`matrices_of`."""
     values = np.asarray(matrices, np.float32)
     return np.ascontiguousarray(np.moveaxis(values.reshape(*values.shape[:-2], 9), -1, -2))
-
-
-def make_struct(struct: wp.Struct, **arrays: wp.array):
-    """Return an instance of ``struct`` with these arrays as its members."""
-    instance = struct()
-    for name, array in arrays.items():
-        setattr(instance, name, array)
-    return instance

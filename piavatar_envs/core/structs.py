@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
+import warp as wp
+
 Struct = TypeVar("Struct")
 
 
@@ -33,3 +35,11 @@ def fill(struct: Struct, *sources: Any, **values: Any) -> Struct:
             value = getattr(holder, name)
         setattr(struct, name, value)
     return struct
+
+
+def make_struct(struct: wp.Struct, **arrays: wp.array):
+    """Return an instance of ``struct`` with these arrays as its members."""
+    instance = struct()
+    for name, array in arrays.items():
+        setattr(instance, name, array)
+    return instance

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import warp as wp
 
-from piavatar_envs.core.arrays import allocate_matrices, components_of, make_struct, vec4l, whole_lines
+from piavatar_envs.core.arrays import allocate_matrices, components_of, vec4l, whole_lines
+from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.bspline import BLOCK, BLOCK_NODES
 from piavatar_envs.mpm.contact_sensors import senses_in_g2p
 from piavatar_envs.mpm.cuda.block_grid import MOST_PARTICLES, plan_arena

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from piavatar_envs.core.arrays import make_struct
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.colliders import move_colliders
 from piavatar_envs.mpm.contact import solve_contact
 from piavatar_envs.mpm.contact_normals import find_volume_gradients

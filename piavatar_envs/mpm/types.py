@@ -16,7 +16,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 import warp as wp
 
-from piavatar_envs.core.arrays import make_struct, matrices_of, vec4l
+from piavatar_envs.core.arrays import matrices_of, vec4l
+from piavatar_envs.core.structs import make_struct
 
 wp.set_module_options({"enable_backward": False})
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from piavatar_envs.core.arrays import make_struct, vec4l, vec8
+from piavatar_envs.core.arrays import vec4l, vec8
+from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.grid_arrays import (
     clear_offset,
     finish_take,

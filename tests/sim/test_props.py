@@ -7,7 +7,8 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.core.arrays import make_struct, matrices_of
+from piavatar_envs.core.arrays import matrices_of
+from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.types import Kinematic, Particles
 from piavatar_envs.sim import prop_geometry as geometry
 from piavatar_envs.sim.props import Prop, PropMatter, PropState, place_prop, scale_density, track_prop

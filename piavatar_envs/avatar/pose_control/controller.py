@@ -26,9 +26,9 @@ from piavatar_envs.avatar.pose_control.kernels import (
 )
 from piavatar_envs.avatar.segment_sums import GROUPS, sum_corrections, sum_moments, sum_motion, warps_of
 from piavatar_envs.avatar.types import COMMANDS, Command, PoseControl, PoseWorkspace, RootState, allocate
-from piavatar_envs.core.arrays import make_struct
 from piavatar_envs.core.cuda_intrinsics import BLOCK, chunk_threads, particle_rounds, particle_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.types import DECOUPLING, Scratch, State
 
 

@@ -93,9 +93,9 @@ from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, MassMatrix,
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
 from piavatar_envs.avatar.types import ROOT_RATE, Body, JointState, Pose, allocate
-from piavatar_envs.core.arrays import make_struct
 from piavatar_envs.core.cuda_intrinsics import BLOCK, particle_rounds, particle_threads, warp_threads
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.types import Model, Scratch, State, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})

@@ -36,7 +36,7 @@ from piavatar_envs.avatar.skinning import blend_steps, motion_at
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, I3, NUM_DOF
 from piavatar_envs.avatar.tracking import point_inertia, spin_of, symmetric
 from piavatar_envs.avatar.types import Body, Pose
-from piavatar_envs.core.arrays import make_struct, store_triple, vec8, vec12, vec16, vector_at, vector_from
+from piavatar_envs.core.arrays import store_triple, vec8, vec12, vec16, vector_at, vector_from
 from piavatar_envs.core.cuda_intrinsics import (
     BLOCK,
     first_particle,
@@ -45,6 +45,7 @@ from piavatar_envs.core.cuda_intrinsics import (
     sync_threads,
     threads_of_environment,
 )
+from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.types import Kinematic, row
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
