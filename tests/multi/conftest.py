@@ -34,7 +34,7 @@ def games(device):
 
 @pytest.fixture(scope="session")
 def make_game(device, games):
-    """A maker of parallel environments of games, ``make_game(game_name, **settings)``, tiny unless told otherwise.
+    """A maker of parallel environments of games, ``make_game(game_name, **settings)``, tiny by default.
 
     The same settings give the same object, because building takes longer than a test: begin with a reset. ``twin=1``
     gives another one of the same settings.

@@ -1,4 +1,4 @@
-"""What every world promises: PettingZoo's own tests, determinism, agents that leave, refusals, no shared memory."""
+"""Contracts of every game: PettingZoo's own tests, determinism, agents that leave, refusals, no shared memory."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from piavatar_envs.tasks.games import game_modules
 #: PettingZoo's complaints that are wanted: these observations have no honest limits.
 UNBOUNDED = r"Agent's (minimum|maximum) observation space value is -?infinity.*"
 
-#: Terms that need a touch, somebody to leave or a pass to change; they are tested where that happens.
+#: Terms that need a touch, an agent that leaves or a pass to change; they are tested where that happens.
 RARE = ("contact_impulse", "others_in", "turn")
 
 
@@ -144,7 +144,7 @@ def test_observations_are_finite_and_none_is_constant(make_game, play, game_name
 
 @pytest.mark.parametrize("kind", ["uniform", "corners", "held corners"])
 def test_no_failure_under_full_actions(make_game, game_name, kind):
-    """And nothing that is not finite; who is out does not act, and a new episode begins when all are."""
+    """And nothing that is not finite; an agent that is out does not act; a new episode begins when all are out."""
     world, rng = make_game(game_name), np.random.default_rng(0)
     world.reset(seed=0)
     size, actions = world.action_space(world.possible_agents[0]).shape, {}
@@ -173,7 +173,7 @@ def test_state_is_what_all_see(make_game, play, game_name):
 
 
 def test_a_copy_goes_on_as_the_original(make_game, play, same, game_name):
-    """By both ways, over the end of the episode; also where an agent has left, and where nobody plays any more."""
+    """By both ways, over the end of the episode; also where an agent has left, and where all agents have left."""
     world = make_game(game_name, max_cycles=6)
     assert copy.deepcopy(world).agents == world.agents
     for steps in (2, 4, 6):

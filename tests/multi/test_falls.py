@@ -1,4 +1,4 @@
-"""Falls under torques: who is down by the heights of head and pelvis, what postures that means, and what follows."""
+"""Falls under torques: limits of head and pelvis, the postures below them, and the consequences."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def test_a_ball_that_is_kicked_on_arrives_and_all_is_booked(circle):
 
 
 def test_the_serve_rolls_to_one_of_them(circle):
-    """Without slip, from the middle, at a speed and with a mass in their ranges; everybody is served to at times."""
+    """Without slip, from the middle, at a speed and with a mass in their ranges; every agent is served at times."""
     config, first, masses, speeds = circle.config, set(), [], []
     places = np.array([avatar.position for avatar in circle.task.scene.avatars])
     for start in range(0, 24, 4):
@@ -225,8 +225,8 @@ def test_whose_turn_it_is(device, story, steps):
 @pytest.mark.parametrize(
     ("where", "velocity", "over"),
     [
-        ((0.0, 0.0, 0.11), (0.0, 0.0, 0.0), True),  # at rest in the middle, where nobody reaches it
-        ((0.0, 0.0, 0.11), (0.5, 0.0, 0.0), False),  # it may still roll to somebody
+        ((0.0, 0.0, 0.11), (0.0, 0.0, 0.0), True),  # at rest in the middle, where no agent reaches it
+        ((0.0, 0.0, 0.11), (0.5, 0.0, 0.0), False),  # it may still roll to an agent
         ((0.0, 0.5, 0.11), (0.0, 0.0, 0.0), False),  # at rest before the first of them
         ((0.5, 1.4, 0.11), (0.5, 0.5, 0.0), True),  # out
         ((0.5, 1.2, 0.11), (0.5, 0.5, 0.0), False),  # not yet
@@ -271,7 +271,7 @@ def test_any_number_stands_around_the_circle(make_game, play, agents):
     for at_agent, avatar in zip(at, world.batch.simulation.avatars, strict=True):
         facing = Rotation.from_quat(avatar.tracked.rotation.numpy()[0, 0]).apply([0.0, -1.0, 0.0])
         assert facing @ (-at_agent * [1, 1, 0]) / np.linalg.norm(at_agent[:2]) > 0.99
-    # the next one is to the right of who faces the middle
+    # the next one is to the right of an agent that faces the middle
     if agents > 2:
         assert np.cross(-at[0] * [1, 1, 0], at[1] - at[0])[2] < 0.0
     assert len(play(world, 3)) == 3

@@ -1,4 +1,4 @@
-"""Random mass, stiffness and friction in every world: avatars draw apart, and each agent is told of all of them."""
+"""Random mass, stiffness and friction in every game: avatars draw apart, and each agent observes all draws."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DRAWN = {"high_five_v0": {"hand": "random", "impulse": (1.0, 2.0)}}
 
 @pytest.fixture(scope="session")
 def make_crowd(games, device):
-    """A maker of batches of a world, ``make_crowd(game_name, num_envs)``, with everything random and told."""
+    """A maker of batches of a game, ``make_crowd(game_name, num_envs)``, with everything random and observed."""
     made = {}
 
     def make(game_name: str, num_envs: int, **settings) -> BatchEnv:

@@ -1,4 +1,4 @@
-"""Sumo: who is out and who has won, what that is worth, and that fair means fair."""
+"""Sumo: agents that are out, the winner, their rewards, and fairness."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_nobody_wins_by_a_failure(make_game, play):
     [(_, rewards, terminations, _, infos)] = play(world, 1)
     assert all(terminations.values()) and infos["agent_0"]["failure"] == "cfl"
     assert not any(info["success"] for info in infos.values())
-    assert max(np.abs(list(rewards.values()))) < 0.1, "nobody is to blame"
+    assert max(np.abs(list(rewards.values()))) < 0.1, "no agent is at fault"
 
 
 def test_the_clock_makes_it_a_draw(make_game, play):
@@ -150,7 +150,7 @@ def test_the_world_goes_on_without_those_who_are_out(make_game, play, same):
     # the others see that it is out, counted on from themselves
     for name, expected in (("agent_0", [0, 1, 1]), ("agent_2", [1, 1, 0]), ("agent_3", [1, 0, 1])):
         assert world.observation_layout.split(rows[-1][0][name])["others_in"].tolist() == expected
-    # who is out comes back from a state, too
+    # a state restores the agents that are out
     state = world.get_state()
     expected = play(world, 3)
     world.reset(seed=1)

@@ -1,4 +1,4 @@
-"""Dodge: what it costs to be hit is what the sensors feel; the reward is for standing in one's place."""
+"""Dodge: costs of hits agree with the sensors; the reward is for standing still in the place."""
 
 from __future__ import annotations
 

@@ -159,7 +159,7 @@ def test_a_foot_in_the_air_bears_nothing(make_env):
 
 @pytest.mark.parametrize("control", ["pd", "torque"])
 def test_every_environment_has_a_clock_of_its_own(control, device):
-    """Goals of held arms by each one's own clock, which a partial reset sets back."""
+    """Goals of held arms follow the clock of each environment, which a partial reset sets back."""
     legs = ["left_hip", "right_hip", "left_knee", "right_knee"]
     settings = {"control": control, "fidelity": "tiny", "joints": legs, "root_assist": 1.0, "gait.worth": 0.2}
     task = load_task(WALK)
@@ -207,7 +207,7 @@ def test_a_stride_of_hardly_any_steps_is_refused(stride, dt):
 
 @pytest.mark.parametrize(("speed", "stride", "refused"), [(1.2, 2.0, False), (1.3, 2.0, True), (5.0, 0.4, False)])
 def test_steps_that_no_leg_makes_are_refused(speed, stride, refused):
-    """Of up to 1.2 m; without a gait nobody asks for any."""
+    """Of up to 1.2 m; without a gait there is no limit."""
     task = load_task(WALK)
     settings = {"target_speed": speed, "gait.stride_seconds": stride}
     if refused:
@@ -220,7 +220,7 @@ def test_steps_that_no_leg_makes_are_refused(speed, stride, refused):
 
 
 def test_the_mirror_is_half_a_stride_on(make_env):
-    """The same moment of the other side: who is paid for the left foot's load is, mirrored, for the right one's."""
+    """The reward of the left foot's load is, mirrored, that of the right one's at the same moment."""
     env = make_env(WALK, **{"gait.worth": 0.3})
     terms = [env.observation_layout["gait_phase"], env.observation_layout["foot_impulses"]]
     mirror = Mirror(terms, ("left_hip", "right_hip"), "cpu")

@@ -59,7 +59,7 @@ def test_bodies_lie_on_the_ground_on_either_side(make_env):
 
 
 def test_some_begin_on_the_way_up(make_env):
-    """On the ground, higher than who lies there, and told apart by the side from which they come."""
+    """On the ground, higher than lying bodies, and different for each side from which they come."""
     env, seen = make_env(GET_UP, halfway=1.0, pose_noise=0.0, observe_parameters=True), {}
     rest = env.batch.simulation.flesh[0].points
     for seed in range(24):

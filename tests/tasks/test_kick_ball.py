@@ -73,7 +73,7 @@ def test_a_ball_at_rest_waits_for_the_kick(make_batch):
     for _ in range(30):
         batch.step()
         assert not batch.success.numpy().any() and not batch.terms.numpy()[:, 0, 2].any()
-        assert not batch.metrics.numpy()[:, 0, 3].any(), "nobody touches it"
+        assert not batch.metrics.numpy()[:, 0, 3].any(), "no body touches it"
     for e in range(2):
         position, velocity = ball(batch, e)
         assert np.hypot(*(position - start[e])[:2]) < 0.03 and np.linalg.norm(velocity) < 0.05

@@ -37,7 +37,7 @@ piavatar_envs.register_task("{namespace}/Near-v0", "{module}:NearTask")
 
 @pytest.fixture
 def module(tmp_path, monkeypatch):
-    """A module of somebody else's with a task; nothing of it is left afterwards."""
+    """A module of another author with a task; nothing of it is left afterwards."""
     monkeypatch.syspath_prepend(tmp_path)
     name = "somebodys_tasks"
     (tmp_path / f"{name}.py").write_text(MODULE.format(module=name, namespace="Somebody"))

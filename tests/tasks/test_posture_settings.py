@@ -32,7 +32,7 @@ OTHERS = {
     ],
 )
 def test_settings_that_would_do_nothing_are_refused(config, name, line):
-    """A walker is not asked to keep still, and who gets up has fallen already."""
+    """Walk has no margins of stillness, and GetUp no fall."""
     with pytest.raises(ConfigError, match=line):
         load_config(config, None, {name: 0.5})
 

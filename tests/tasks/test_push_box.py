@@ -1,4 +1,4 @@
-"""PushBox: what is drawn and told agrees with the particles, the box obeys momentum and friction, and can be pushed."""
+"""PushBox: draws and observations agree with the particles; the box obeys momentum and friction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Throws come when, from where and as fast as told; a ball flies freely, is caught, and keeps its mass."""
+"""Throws: their times, origins and speeds; a ball flies freely, is caught, and keeps its mass."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_balls_are_thrown_in_turn_at_the_times_that_are_told(make_env):
 
 @pytest.mark.parametrize(("place", "yaw"), [((0.0, 0.0), 0.0), ((0.5, -0.3), 2.0)])
 def test_throws_begin_before_the_avatar_and_lead_to_chest_or_head(make_env, place, yaw):
-    """A free flight from each start, at the speed told, comes within the spread of the line from chest to head."""
+    """A free flight from each start, at the speed set, comes within the spread of the line from chest to head."""
     avatar = {"position": list(place), "yaw": yaw}
     env = make_env(DODGE, throw_interval=0.2, pose_noise=0.2, **{"scene.avatars": [avatar]})
     config, rows = env.config, []

@@ -123,7 +123,7 @@ def test_reward_metrics_and_falls_are_what_the_joints_say(make_env, task):
         turn = Rotation.from_quat(env.batch.simulation.avatar.tracked.rotation.numpy()[0, 0].astype(float))
         assert seen(env, observation, "gravity_direction") == pytest.approx(turn.inv().apply([0, 0, -1.0]), abs=1e-5)
         outcomes.add((bool(info["success"]), terminated))
-    # who only asks for the rest pose falls, and has stood before
+    # with the rest pose as a constant target a body falls, and has stood before
     assert outcomes >= {(task == STAND, False), (False, True)}
 
 
