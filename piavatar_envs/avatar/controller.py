@@ -19,7 +19,7 @@ class Controller(Protocol):
 
     @property
     def moves_particles(self) -> bool:
-        """Whether :meth:`record_end` moves particles: it must then wait for the sensors of the control step."""
+        """Return whether :meth:`record_end` moves particles: it must then wait for the sensors of the control step."""
         ...
 
     def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:

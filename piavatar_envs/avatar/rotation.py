@@ -37,7 +37,7 @@ def quat_log(q: wp.quat):
 
 @wp.func
 def finite_turn(w: wp.vec3, dt: float):
-    """``(R - I) / dt`` of the rotation ``R = exp(dt w)``, without cancellation [1/s]."""
+    """Return ``(R - I) / dt`` of the rotation ``R = exp(dt w)``, without cancellation [1/s]."""
     half = 0.5 * dt * wp.length(w)
     s = 1.0 - half * half / 6.0
     if half > 1.0e-2:
@@ -70,7 +70,7 @@ def torque_of_vector(v: wp.vec3, pull: wp.vec3):
 
 @wp.func
 def turn_about_z(q: wp.quat):
-    """The part of ``q`` that turns about the vertical (its twist); the identity where that is undefined."""
+    """Return the part of ``q`` that turns about the vertical (its twist); the identity where that is undefined."""
     n = wp.sqrt(q[2] * q[2] + q[3] * q[3])
     if n < 1.0e-4:
         return wp.quat(0.0, 0.0, 0.0, 1.0)

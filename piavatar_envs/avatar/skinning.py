@@ -52,14 +52,14 @@ def in_order(joints: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def pack(joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """What :func:`in_order` returns in records of four numbers, ``(N, 4)`` float32: three weights, a byte a bone."""
+    """Pack bones and weights of :func:`in_order` into ``(N, 4)`` float32: three weights, then a byte a bone."""
     bones = (joints.astype(np.uint32) << (8 * np.arange(4, dtype=np.uint32))).sum(axis=1, dtype=np.uint32)
     return np.column_stack([weights[:, 1:], bones.view(np.float32)])
 
 
 @wp.func_native(READ + "return wp::vec_t<4, wp::int32>(joint(0), joint(1), joint(2), joint(3));")
 def bones_of(skin: wp.array(dtype=wp.vec4), p: int) -> wp.vec4i:
-    """The bones that move particle ``p``."""
+    """Return the bones that move particle ``p``."""
     ...
 
 
@@ -131,25 +131,25 @@ def blend_records(
     p: int,
     rest: wp.vec3,
 ) -> vec24:
-    """What particle ``p`` blends of its bones' places and velocities at ``rest``, and of the rest of their records."""
+    """Blend the records of particle ``p``'s bones, with places and velocities applied at ``rest``."""
     ...
 
 
 @wp.func
 def blended_vector(s: vec24, first: int):
-    """The vector that begins at ``first`` of what a particle has blended."""
+    """Return the vector at ``first`` of a blended record."""
     return wp.vec3(s[first], s[first + 1], s[first + 2])
 
 
 @wp.func
 def blended_turn(s: vec24):
-    """The blended rate ``(dR - I) / dt`` of a substep's rotation [1/s]."""
+    """Return the blended rate ``(dR - I) / dt`` of a substep's rotation [1/s]."""
     return wp.mat33(s[9], s[10], s[11], s[12], s[13], s[14], s[15], s[16], s[17])
 
 
 @wp.func
 def blended_velocity(s: vec24, arm: wp.vec3):
-    """Velocity of the bones' blended rigid motion, ``arm`` from the pelvis' centre [m/s]."""
+    """Return the velocity of the bones' blended rigid motion, ``arm`` from the pelvis' centre [m/s]."""
     return blended_vector(s, AT_VELOCITY) + wp.cross(blended_vector(s, AT_SPIN), arm)
 
 
@@ -163,12 +163,12 @@ wp::index(record, e, b) = value;
 #endif
 """)
 def store_record(record: wp.array2d(dtype=vec44), e: int, b: int, value: vec44):
-    """``record[e, b] = value``, 16 bytes at a time."""
+    """Store ``record[e, b] = value``, 16 bytes at a time."""
     ...
 
 
 def _blend(length: int, numbers: int) -> str:
-    """A snippet that blends the first ``numbers`` of bones' records of a ``length``, on a GPU four at a time."""
+    """Return a snippet that blends the first ``numbers`` of bones' records of a ``length``, on a GPU four at a time."""
     return f"""{READ}
 wp::vec_t<{length}, wp::float32> sum;
 #pragma unroll
@@ -195,18 +195,18 @@ return sum;
 
 @wp.func_native(_blend(8, 6))
 def blend_changes(record: wp.array2d(dtype=vec8), e: int, skin: wp.array(dtype=wp.vec4), p: int) -> vec8:
-    """``sum_n weight_n record[e, joint_n]`` of particle ``p``: a rigid motion of each bone."""
+    """Return ``sum_n weight_n record[e, joint_n]`` of particle ``p``: a rigid motion of each bone."""
     ...
 
 
 @wp.func_native(_blend(12, 12))
 def blend_steps(record: wp.array2d(dtype=vec12), e: int, skin: wp.array(dtype=wp.vec4), p: int) -> vec12:
-    """:func:`blend_changes` of twelve numbers: two rigid motions of each bone."""
+    """Run :func:`blend_changes` for twelve numbers: two rigid motions of each bone."""
     ...
 
 
 def _blend_rows(add: str) -> str:
-    """A snippet that adds to a vector what there is of ``row`` ``i`` of a bone's place, which counts by ``w``."""
+    """Return a snippet that adds row ``i`` of a bone's place to a vector, weighted by ``w``."""
     return f"""{READ}
 wp::vec3 sum;
 #pragma unroll
@@ -237,7 +237,7 @@ def blend_places(
     p: int,
     rest: wp.vec3,
 ) -> wp.vec3:
-    """``sum_n weight_n place[e, joint_n] (rest, 1)`` of particle ``p``: linear blend skinning."""
+    """Return ``sum_n weight_n place[e, joint_n] (rest, 1)`` of particle ``p``: linear blend skinning."""
     ...
 
 
@@ -249,7 +249,7 @@ def blend_back(
     p: int,
     way: wp.vec3,
 ) -> wp.vec3:
-    """``sum_n weight_n R_n^T way``, ``R_n`` the turns of ``place[e, joint_n]``: a way in the frame of the rest pose."""
+    """Return ``sum_n weight_n R_n^T way``, ``R_n`` the turns of ``place[e, joint_n]``: a way in the rest frame."""
     ...
 
 
@@ -300,7 +300,7 @@ def blend_images(
     p: int,
     rest: wp.vec3,
 ) -> vec12:
-    """Of a motion :func:`blend_changes`; :func:`blend_places`; and what the bones' spins do there.
+    """Blend the bones' motions, their places of a particle, and the velocity of their spins there.
 
     Each bone's spin turns its own place of the particle about what places are seen from.
     """
@@ -309,12 +309,12 @@ def blend_images(
 
 @wp.func
 def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int):
-    """Where linear blend skinning has a particle [m]; ``place`` takes bones from rest to where they are."""
+    """Return the skinned position of a particle [m]; ``place`` takes bones from rest to the world."""
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     return blend_places(place, e, body.skin, p, rest)
 
 
 @wp.func
 def motion_at(change: vec8, arm: wp.vec3):
-    """Velocity under a bone's change, or under a blend of them, ``arm`` from where the pelvis' velocity is [m/s]."""
+    """Return the velocity of a change of rigid motion at ``arm`` from the pelvis' centre [m/s]."""
     return wp.vec3(change[0], change[1], change[2]) + wp.cross(wp.vec3(change[3], change[4], change[5]), arm)

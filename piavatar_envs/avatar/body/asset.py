@@ -56,7 +56,7 @@ class AvatarAsset:
     shape_joints: np.ndarray
 
     def shape(self, parameters: Sequence[float] | np.ndarray) -> ShapedBody:
-        """The body of the given shape parameters, shape ``(S,)``, standing on z = 0 with the pelvis over x = y = 0.
+        """Return the body of shape parameters ``(S,)``, standing on z = 0 with the pelvis over x = y = 0.
 
         Raises:
             ValueError: a wrong number of parameters, or one that is not finite or outside [-1, 1].
@@ -68,7 +68,7 @@ class AvatarAsset:
         return ShapedBody((vertices - origin).astype(np.float32), (joints - origin).astype(np.float32))
 
     def mean_body(self) -> ShapedBody:
-        """The shape of all parameters zero."""
+        """Return the shape of all parameters zero."""
         return self.shape(np.zeros(len(self.shape_names)))
 
     def height(self, parameters: Sequence[float] | np.ndarray) -> float:
@@ -138,7 +138,7 @@ def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def top_weights(weights: np.ndarray, count: int = NUM_SKIN_JOINTS) -> tuple[np.ndarray, np.ndarray]:
-    """The ``count`` largest weights of every row, descending and normalised.
+    """Return the ``count`` largest weights of every row, descending and normalised.
 
     Args:
         weights: non-negative weights of every joint, shape ``(N, J)``.
@@ -154,7 +154,7 @@ def top_weights(weights: np.ndarray, count: int = NUM_SKIN_JOINTS) -> tuple[np.n
 
 
 def dense_weights(skin_joints: np.ndarray, skin_weights: np.ndarray, num_joints: int = NUM_JOINTS) -> np.ndarray:
-    """The inverse of :func:`top_weights`: shape ``(N, num_joints)`` float64."""
+    """Return the inverse of :func:`top_weights`: shape ``(N, num_joints)`` float64."""
     dense = np.zeros((len(skin_joints), num_joints))
     np.add.at(dense, (np.arange(len(skin_joints))[:, None], skin_joints), skin_weights)
     return dense

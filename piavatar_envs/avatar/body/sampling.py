@@ -339,7 +339,7 @@ def _flesh_lattice(asset: AvatarAsset, skin: ClosedSurface, spacing: float, seed
 
 
 def _bone_ends(asset: AvatarAsset, skin: ClosedSurface) -> np.ndarray:
-    """Where every bone points from its joint [m], shape ``(22, 3)``: the next joint, or the middle of its flesh."""
+    """Return the far end of every bone [m], shape ``(22, 3)``: the next joint, or the middle of its flesh."""
     ends = np.empty((NUM_JOINTS, 3))
     for joint, name in enumerate(JOINT_NAMES):
         children = [child for child in range(NUM_JOINTS) if PARENTS[child] == joint]
@@ -455,7 +455,7 @@ def limb_group_of_joint() -> np.ndarray:
 
 
 def limb_groups(skin_joints: np.ndarray, skin_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The group of every particle, and where two groups grow together.
+    """Return the group of every particle, and where two groups grow together.
 
     Args:
         skin_joints: joints that move each particle, shape ``(P, K)`` int.

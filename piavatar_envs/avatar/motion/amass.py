@@ -87,7 +87,7 @@ def _directions(zero_joints: np.ndarray) -> dict[str, np.ndarray | None]:
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """``poses`` (N, 66) axis-angle [rad], ``trans`` (N, 3) [m] and the rate [1/s]; only these keys are read."""
+    """Return ``poses`` (N, 66) axis-angle [rad], ``trans`` (N, 3) [m] and the rate [1/s]; only these keys are read."""
     if path.suffix.lower() != ".npz":
         raise ValueError(f"{path}: AMASS motions are .npz files, nothing else is read (a pickle would run code)")
     if not path.is_file():

@@ -40,7 +40,7 @@ _QUATERNION_STARTS = (4, 8, 12, 16, 21, 25, 30, 35, 39)
 
 
 def clip_folder() -> Path | None:
-    """The folder of the clips in an installed ``pybullet``, or ``None``. Imports nothing."""
+    """Return the folder of the clips in an installed ``pybullet``, or ``None``. Imports nothing."""
     spec = importlib.util.find_spec("pybullet_data")
     if spec is None or not spec.submodule_search_locations:
         return None
@@ -144,7 +144,7 @@ def mend_jumps(rotations: np.ndarray, fps: float) -> np.ndarray:
 
 
 def _read(path: Path) -> tuple[bool, float, np.ndarray]:
-    """Whether it loops, its rate and its frames ``(num_frames, 44)`` at that constant rate."""
+    """Return whether it loops, its rate and its frames ``(num_frames, 44)`` at that constant rate."""
     try:
         content = json.loads(path.read_text())
         loop = {"wrap": True, "none": False}[content["Loop"]]

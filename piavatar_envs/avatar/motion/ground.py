@@ -56,7 +56,7 @@ def lowest_heights(
 
 
 def ground_level(heights: np.ndarray, fps: float, window: float, loop: bool) -> np.ndarray:
-    """A smooth floor under a clip that drifts up and down: the lowest height within a window, then averaged.
+    """Return a smooth floor under a clip that drifts up and down: the lowest height within a window, then averaged.
 
     The average reaches no farther than the minimum does, so the level is never above ``heights``, and a flight shorter
     than the window stays a flight.

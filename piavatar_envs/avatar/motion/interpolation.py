@@ -43,7 +43,7 @@ def hemisphere_consistent(quaternions: np.ndarray) -> np.ndarray:
 
 
 def turned(heading: float | np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """``quaternion`` after a turn by ``heading`` [rad] about the vertical: the product cos + k sin, written out."""
+    """Return ``quaternion`` after a turn by ``heading`` [rad] about the vertical."""
     c, s = np.cos(0.5 * np.asarray(heading)), np.sin(0.5 * np.asarray(heading))
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
     return np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=-1)

@@ -101,7 +101,7 @@ class Motion:
         return float(np.remainder(2.0 * np.arctan2(z, w) + np.pi, 2.0 * np.pi) - np.pi)
 
     def sample(self, time: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The pose at a time, on the arc between the two nearest frames.
+        """Return the pose at a time, on the arc between the two nearest frames.
 
         Args:
             time: [s], a number or an array of shape ``(...)``. Past its ends a clip that does not loop holds its
@@ -138,13 +138,13 @@ class Motion:
         return forward_kinematics(matrices.reshape(-1, NUM_JOINTS, 3, 3), self.root_position, rest)
 
     def joint_speeds(self) -> np.ndarray:
-        """How fast each joint turns between frames [rad/s], shape ``(num_frames - 1, 22)``."""
+        """Return how fast each joint turns between frames [rad/s], shape ``(num_frames - 1, 22)``."""
         parts = (self.local_rotations[:-1].reshape(-1, 4), self.local_rotations[1:].reshape(-1, 4))
         first, second = (Rotation.from_quat(part, scalar_first=True) for part in parts)
         return (first.inv() * second).magnitude().reshape(-1, NUM_JOINTS) * self.fps
 
     def resample(self, fps: float) -> Motion:
-        """The same clip at another rate.
+        """Return the same clip at another rate.
 
         A loop keeps a whole number of frames a round: its period changes by half a new frame at most. A clip that
         does not loop holds its last pose for less than one new frame.
@@ -164,7 +164,7 @@ class Motion:
         return replace(self, fps=fps, local_rotations=rotations, root_position=root)
 
     def closed(self, blend_time: float = 0.4, heading: float | None = None) -> Motion:
-        """The clip as a loop: both ends are bent to meet half-way.
+        """Return the clip as a loop: both ends are bent to meet half-way.
 
         Args:
             blend_time: how long before the end and after the start poses are changed [s], at most half the clip.
@@ -185,17 +185,17 @@ class Motion:
         return replace(self, local_rotations=quaternions, root_position=root, loop=True)
 
     def mirrored(self) -> Motion:
-        """The clip seen in a mirror: left and right change places, world x changes sign."""
+        """Return the clip seen in a mirror: left and right change places, world x changes sign."""
         rotations = self.local_rotations[:, _SWAPPED] * _MIRROR
         root = self.root_position * np.array([-1.0, 1.0, 1.0])
         return replace(self, name=f"{self.name}:mirrored", local_rotations=rotations, root_position=root)
 
     def translated(self, offset: np.ndarray) -> Motion:
-        """The clip moved by ``offset`` [m], shape ``(3,)``."""
+        """Return the clip moved by ``offset`` [m], shape ``(3,)``."""
         return replace(self, root_position=self.root_position + np.asarray(offset, dtype=np.float64))
 
     def on_ground(self, asset: AvatarAsset, body: ShapedBody | None = None, window: float | None = None) -> Motion:
-        """The clip raised or lowered so that the skin touches z = 0 and never goes below it.
+        """Return the clip raised or lowered so that the skin touches z = 0 and never goes below it.
 
         Args:
             asset: the avatar whose skin is meant.

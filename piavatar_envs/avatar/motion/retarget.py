@@ -27,7 +27,7 @@ LIMB_ENDS: dict[str, str] = {
 
 
 def shortest_rotation(start: np.ndarray, end: np.ndarray) -> Rotation:
-    """The rotation without twist that takes the direction ``start`` to ``end``, both shape ``(3,)``.
+    """Return the rotation without twist that takes the direction ``start`` to ``end``, both shape ``(3,)``.
 
     Raises:
         ValueError: the directions are opposite, so that the axis is undefined.

@@ -52,7 +52,7 @@ _FAR = wp.constant(1.0e3)  # no point of a bone is as far from its joint [m]
 
 @wp.struct
 class Ground:
-    """What bones may meet, and who is told."""
+    """Boundaries that bones may meet, and sensors."""
 
     solid: int  # whether bones stop at all
     boundaries: Boundaries
@@ -73,7 +73,7 @@ class Touch:
 
 @wp.func
 def at_rest(body: Body, e: int, b: int, tracker: int):
-    """From a joint to a point of its bone in the rest pose [m]; the point by its place in the list of trackers."""
+    """Return the offset from a joint to a point of its bone in the rest pose [m]; the point by its tracker index."""
     joint = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
     return vector_at(body.rest, row(e, body.rest.shape[0]), body.tracker[tracker]) - joint
 
@@ -94,13 +94,13 @@ def measure_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorksp
 
 @wp.func
 def motion_of_bone(w: TorqueWorkspace, e: int, b: int, x: wp.vec3):
-    """Velocity of a bone's matter at ``x`` [m/s]."""
+    """Return the velocity of a bone's matter at ``x`` [m/s]."""
     return motion_at(w.moving[e, b], x - w.pose.position[e, 0])
 
 
 @wp.func
 def touch_of(body: Body, boundaries: Boundaries, w: TorqueWorkspace, e: int, b: int, tracker: int, k: int) -> Touch:
-    """A point of bone ``b``, by its place in the list of trackers, and boundary ``k``."""
+    """Return the contact of a point of bone ``b``, by its tracker index, with boundary ``k``."""
     touch = Touch()
     touch.place = w.pose.position[e, b] + wp.quat_rotate(w.pose.rotation[e, b], at_rest(body, e, b, tracker))
     d = signed_distance(boundaries, e, k, touch.place)
@@ -121,14 +121,14 @@ def least_speed(distance: float, dt: float):
 
 @wp.func
 def reach_along(half: wp.vec3, turn: wp.quat, n: wp.vec3):
-    """The greatest component along ``n`` of what is in a box of half extents ``half`` about the origin, turned."""
+    """Return the greatest component along ``n`` within a turned box of half extents ``half`` about the origin."""
     own = wp.quat_rotate_inv(turn, n)
     return wp.dot(half, wp.abs(own))
 
 
 @wp.func
 def may_lack(boundaries: Boundaries, dt: float, w: TorqueWorkspace, e: int, b: int, k: int):
-    """Whether any point of a bone may be too fast for a boundary, by the box that holds them.
+    """Return whether any point of a bone may be too fast for a boundary, by the box that holds them.
 
     A boundary that is no plane has other normals elsewhere: there it is by the ball around the box, and by speeds.
     """
@@ -163,7 +163,7 @@ def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: T
 def find_fastest(
     body: Body, ground: Ground, dt: float, e: int, thread: int, threads: int, w: TorqueWorkspace
 ) -> wp.vec2:
-    """By how much the point is too fast that is so by most [m/s], and which: point, bone and boundary in a number.
+    """Find the point that is too fast by most: by how much [m/s], and point, bone and boundary as one number.
 
     Few bones come near a boundary: the threads share the points of one after the other. The number is exact in single
     precision, below 2^24.
@@ -199,7 +199,7 @@ _JAMMED = wp.constant(0.1)
 
 @wp.func
 def carries(body: Body, a: int, b: int):
-    """1 if joint ``a`` moves bone ``b``, else 0."""
+    """Return 1 if joint ``a`` moves bone ``b``, else 0."""
     above = int(b)
     while above > a:  # children come after their parents
         above = body.parent[above]
@@ -210,7 +210,7 @@ def carries(body: Body, a: int, b: int):
 def answer_at(
     body: Body, factor: int, e: int, b: int, x: wp.vec3, thread: int, threads: int, arena: wp.uint64, w: TorqueWorkspace
 ) -> wp.mat33:
-    """``K`` of bone ``b`` at ``x`` [1/kg], ``Y^T Y`` with ``Y = L^-T J^T``, which stays in the columns.
+    """Compute ``K`` of bone ``b`` at ``x`` [1/kg], ``Y^T Y`` with ``Y = L^-T J^T``, which stays in the columns.
 
     ``J^T`` has something in joints that carry the bone, and ``Y`` hardly anywhere else: ``L`` is a tree's.
     """
@@ -268,7 +268,7 @@ def push(
 
 @wp.func
 def stopping_impulse(K: wp.mat33, v: wp.vec3, normal: wp.vec3, least: float, friction: float):
-    """Impulse [N s] after which a point at ``v`` goes at ``least`` along the normal, by Coulomb's law."""
+    """Return the impulse [N s] after which a point at ``v`` has ``least`` along the normal, by Coulomb's law."""
     stick = wp.inverse(K) * (least * normal - v)
     push = wp.dot(stick, normal)
     if wp.length(stick - push * normal) <= friction * push:

@@ -11,9 +11,9 @@ lets torques act on them:
 ``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each;
 ``p`` are impulses on points of bones that come to a boundary, see
 :mod:`piavatar_envs.avatar.torque_control.bone_contact`. Light joints take over less than all: to the first ``M = J^T m
-J`` some inertia is added, of which torques know nothing, see
+J`` some inertia is added, which torques are not divided by, see
 :func:`piavatar_envs.avatar.torque_control.mass_matrix.grid_inertia`. ``c`` is what all else, contact, weight and
-flesh, did to the joints in the last substep, and is expected to do again. The springs know of it, see
+flesh, did to the joints in the last substep, and is expected to do again. The springs take it into account, see
 :mod:`piavatar_envs.avatar.torque_control.dynamics`, and so does the split: the joints go on with the velocity that
 will be left of their push, and the rest of the push, ``-J c``, waits in ``u`` for what is to stop it. A free limb has
 ``c = 0``; of one that stands on the ground nothing moves. (All of ``d`` put into ``qdot``, the push of a foot and the
@@ -49,9 +49,7 @@ Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`
 centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
 of more than some 5 ms ago makes fast limbs unstable.
 
-A drive whose joints move under torques: joint targets or torques in, forces of muscles out, nothing held by magic.
-
-The other way to drive an avatar; see :mod:`piavatar_envs.avatar.pose_control.controller`. Gravity, the ground and
+The controller takes joint targets or torques and returns forces of muscles. Gravity, the ground and
 other bodies act on the whole body, and only torques between its bones act back. An assisting spring may help the
 pelvis, as a curriculum: at ``assist`` 1 it nearly holds the pelvis alone, at 0 there is none.
 """
@@ -267,7 +265,7 @@ class ArticulatedBody:
         Args:
             graph: records.
             state: of the particles.
-            scratch: of the world, whose sensors are told what bones meet.
+            scratch: of the world, whose sensors record what bones meet.
             step: which substep of its control step it is. The first one finds joints wherever they are; all others go
                 on from the one before.
         """
@@ -284,7 +282,7 @@ class ArticulatedBody:
         graph.launch(take_over, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
 
     def _ground(self, scratch: Scratch) -> Ground:
-        """What bones meet."""
+        """Return the boundaries that bones meet, and the sensors."""
         model = self.model
         return make_struct(
             Ground,
@@ -393,7 +391,7 @@ def reset_joints(
     velocity: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
 ):
-    """Joints of the masked environments into a pose, at rest; launched over ``(num_envs, 1 + bones)``."""
+    """Put the joints of the masked environments into a pose, at rest; over ``(num_envs, 1 + bones)``."""
     e, n = wp.tid()
     if not mask[e]:
         return
@@ -422,7 +420,7 @@ def set_joints_in_motion(
     # out
     velocity: wp.array2d(dtype=float),
 ):
-    """Joints of the masked environments on their way to the pose ``after`` a ``time`` [s] later; over ``(E, bones)``.
+    """Set the velocity of the masked joints that reaches the pose ``after`` in a ``time`` [s]; over ``(E, bones)``.
 
     Joints that only found it in their particles would take it for what the world does to them in every substep.
     """
@@ -497,12 +495,12 @@ class TorqueController:
 
     @property
     def state(self) -> JointState:
-        """The joints' state: all that a checkpoint holds besides :attr:`assist`."""
+        """Return the joints' state: all that a checkpoint holds besides :attr:`assist`."""
         return self.joints.state
 
     @property
     def moves_particles(self) -> bool:
-        """Whether the end of a control step puts firm particles into their places."""
+        """Return whether the end of a control step puts firm particles into their places."""
         return self.joints.firm.size > 0
 
     def release(self, joints: list[int]) -> None:

@@ -81,13 +81,13 @@ _ADD = "value[k] += up < 0 ? 0.0f : more;"
 
 @wp.func_native(over_ancestors(6, _ADD))
 def add_ancestors6(value: vec8, parent: int, levels: int) -> vec8:
-    """Sum of what the lanes of a warp have, of a bone each, over all from the root to a lane's own; six numbers."""
+    """Add up six numbers of the lanes of a warp, one bone each, over all ancestors of a lane's bone and itself."""
     ...
 
 
 @wp.func_native(over_ancestors(3, _ADD))
 def add_ancestors3(value: wp.vec3, parent: int, levels: int) -> wp.vec3:
-    """:func:`add_ancestors6` of a vector."""
+    """Do the same as :func:`add_ancestors6` for a vector."""
     ...
 
 
@@ -124,7 +124,7 @@ def spread_motion(
 
 @wp.func
 def motion_apart(b: vec12):
-    """What bones move a particle by besides the blend of their motions at its place [m/s].
+    """Return the velocity that bones give a particle besides the blend of their motions at its place [m/s].
 
     Of :func:`piavatar_envs.avatar.skinning.blend_images`. Linear blend skinning has a particle where its bones have it
     in the mean. In a bent joint they have it at places that are centimetres apart, and each turns its own: the mean of
@@ -136,7 +136,7 @@ def motion_apart(b: vec12):
 
 @wp.func
 def blended_motion(b: vec12, arm: wp.vec3):
-    """The blend of the bones' first motions, ``arm`` from where their velocity is [m/s].
+    """Return the blend of the bones' first motions, ``arm`` from where their velocity is [m/s].
 
     Of :func:`piavatar_envs.avatar.skinning.blend_images`, or of :func:`piavatar_envs.avatar.skinning.blend_steps`.
     """
@@ -158,7 +158,7 @@ def take_over(
     """Write ``J qdot`` of the middle of the substep, and leave the physical velocity what it is not of the whole one.
 
     Particle and bones are half a step on there. Moved by ``J qdot`` of its beginning, a straight way, what turns by
-    ``theta`` in a substep would be ``theta^2 / 2`` further from its axis, of which no stress knows: limbs would swell
+    ``theta`` in a substep would be ``theta^2 / 2`` further from its axis, without any stress: limbs would swell
     within seconds. The whole velocity is the physical one and what that lacks, the first of the bones' motions in
     ``steps``, about where the ``pelvis`` joint begins [m]; the second is that of the joints, about where it is
     half-way. To that comes what ``vk`` has kept where bones are not alone, see
@@ -207,7 +207,7 @@ def next_position(
     e: int,
     b: int,
 ):
-    """Where a joint will be from its parent's, which has turned already [m]; the pelvis', in the world."""
+    """Return a joint's next position from its parent's, which has turned already [m]; the pelvis', in the world."""
     if b == 0:
         s = field[e, 0]
         return position[e, 0] + dt * wp.vec3(s[0], s[1], s[2])
@@ -259,7 +259,7 @@ def add_change(
     q: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
 ):
-    """What the particles did to the joints: it was not the joints' own doing."""
+    """Add the change of the velocity that the particles caused, which is not due to the joints themselves."""
     sync_threads(threads)
     for i in range(thread, NUM_DOF, threads):
         q[e, i] = q[e, i] + change[row, i]
@@ -279,7 +279,7 @@ def go_on(
     q: wp.array2d(dtype=float),
     taken: wp.array2d(dtype=float),
 ):
-    """The velocity that joints will have if all else does again what it did; what particles lack without it.
+    """Predict the velocity of joints if all else acts as before, and what particles lack without it.
 
     The joints' own ``change`` is in row ``own``; what was ``taken`` of the particles before is in ``row``, where what
     they lack of their whole velocity comes.
@@ -351,7 +351,7 @@ def gather_sums(
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
 ):
-    """Moments of the ``bones`` about their joints from those of their chunks, and their momenta of three velocities.
+    """Sum moments of the ``bones`` about their joints over their chunks, and their momenta of three velocities.
 
     These are in row ``own`` of the velocity that the moments are of, in ``taken`` and in ``off`` of the other two.
     """
@@ -438,7 +438,7 @@ def pass_down_in_warp(
     angular: wp.array2d(dtype=wp.vec3),
     momentum: wp.array2d(dtype=float),
 ):
-    """:func:`pass_down` of three velocities by a warp."""
+    """Run :func:`pass_down` for three velocities in a warp."""
     ...
 
 
@@ -457,7 +457,7 @@ def pass_down(
     # out
     momentum: wp.array2d(dtype=float),
 ):
-    """``J^T m u`` from the momenta of the bones about their joints: each joint has what all beyond it have.
+    """Compute ``J^T m u`` from the momenta of the bones about their joints: each joint sums all bones beyond it.
 
     Of so many velocities, a warp of three, the first in row ``own``, others ``step`` rows apart.
     """
@@ -552,7 +552,7 @@ STOP_TIME = wp.constant(0.03)
 class Springs:
     """Springs and dampers: of the pelvis' place, then of all joints, ``(1 or num_envs, 1 + bones)``.
 
-    Those of the pelvis, ``[:, :2]``, act from outside: a body that nobody holds has none. Those of the others are
+    Those of the pelvis, ``[:, :2]``, act from outside: an unsupported body has none. Those of the others are
     muscles, which have their limits.
     """
 
@@ -603,7 +603,7 @@ def make_strength(lower: np.ndarray, upper: np.ndarray, rows: int, device: str) 
 def make_tissue(
     damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int], device: str
 ) -> Tissue:
-    """What resists passively.
+    """Upload the passive resistance of the joints.
 
     Args:
         damping: of all joints, shape ``(22,)`` [N m s/rad].
@@ -624,7 +624,7 @@ def make_tissue(
 
 @wp.func
 def implicit_inertia(dt: float, stiffness: float, damping: float):
-    """``A = dt D + dt^2 K``: what a spring and a damper, implicit in time, add to the mass."""
+    """Return ``A = dt D + dt^2 K``: the inertia of a spring and a damper, implicit in time."""
     return dt * damping + dt * dt * stiffness
 
 
@@ -676,7 +676,7 @@ def implicit_diagonal(
     stop: wp.array2d(dtype=float),
     diagonal: wp.array2d(dtype=float),
 ):
-    """Whether a joint is beyond its range, and ``A`` of muscles and tissue; ``n`` is 0 for the pelvis' place."""
+    """Compute ``A`` of muscles and tissue, with the stop if a joint is beyond its range; ``n`` 0: the pelvis."""
     r = row(e, springs.stiffness.shape[0])
     value = implicit_inertia(dt, springs.stiffness[r, n], springs.damping[r, n])
     if n > 1:
@@ -707,7 +707,7 @@ def joint_impulse(
     muscle: wp.array2d(dtype=float),
     impulse: wp.array2d(dtype=float),
 ):
-    """Impulse of a joint if the joints themselves changed nothing, of muscles and of all.
+    """Compute the impulse of a joint at an unchanged velocity of the joints, of muscles and of all.
 
     A torque of the pelvis, which would come from outside, is not asked for.
     """
@@ -752,7 +752,7 @@ def limit_torque(
     impulse: wp.array2d(dtype=float),
     left: wp.array2d(dtype=float),
 ) -> float:
-    """Where a muscle would give more than it has, let it give that, whatever moves: then the answer is 1, else 0.
+    """Limit a muscle's impulse to its strength; return 1 if it was limited, else 0.
 
     ``left`` is ``A``, of which all is ``rest``, without the spring that was cut. Who asks ``again`` leaves those as
     they are that have been.
@@ -787,6 +787,6 @@ def find_given(
     # in and out
     impulse: wp.array2d(dtype=float),
 ):
-    """The impulses that joints and pelvis really get, implicit as they are."""
+    """Compute the impulses that joints and pelvis get, implicit in time."""
     for i in range(thread, NUM_DOF, threads):
         impulse[e, i] = impulse[e, i] - left[e, i] * change[row_of_change, i]

@@ -30,7 +30,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 @wp.func
 def pulled_rest(body: Body, e: int, p: int, w: TorqueWorkspace):
-    """What of the rest pose a particle is pulled to [m]: its own place; a firm one beyond, by what it was put back."""
+    """Return the rest position that a particle is pulled to [m]; for a firm one with its slip added."""
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     if p < w.slip.shape[1]:
         rest += vector_at(w.slip, e, p)
@@ -39,7 +39,7 @@ def pulled_rest(body: Body, e: int, p: int, w: TorqueWorkspace):
 
 @wp.func
 def sum_partition(partitions: Partitions, arena: wp.uint64, pelvis: wp.vec3, e: int, part: int, w: TorqueWorkspace):
-    """Sums of the chunks of the part in the arena, where places are seen from the ``pelvis``."""
+    """Sum the chunks of a partition in the arena, with positions relative to the ``pelvis``."""
     warp = warp_of_block()
     lane = lane_of_warp()
     quarters = quarters_at_once(lane[1])
@@ -97,7 +97,7 @@ def attach_flesh(
         n = body.first + p
         arm = vector_at(x, e, n) - pelvis
         v = vector_at(u, e, n) + vector_at(vk, e, n)
-        m = number_at(mass, r, n)  # asked for before anything is stored, which it would wait for
+        m = number_at(mass, r, n)  # loaded before any store, which it would wait for
         own_rate = number_at(rate, row(e, rate.shape[0]), p)
         now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, e, p, w))
         apart = wp.vec3()
@@ -116,7 +116,7 @@ def attach_flesh(
 
 @wp.func
 def keep_outside(boundaries: Boundaries, e: int, x: wp.vec3):
-    """The place ``x`` [m], or the nearest one on the surface that it lies beyond, in the order of the boundaries."""
+    """Return ``x`` [m], or the nearest point on the surface that it lies beyond, in the order of the boundaries."""
     for b in range(boundaries.count):
         d = signed_distance(boundaries, e, b, x)
         x = x - wp.min(d[3], 0.0) * wp.vec3(d[0], d[1], d[2])
@@ -156,6 +156,6 @@ def put_in_place(
     spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, vector_at(u, e, q) + vector_at(vk, e, q))
     affine = matrix_at(C, e, q) - wp.skew(spin)
     slipped = vector_at(slip, e, p) + blend_back(place, e, body.skin, p, way)
-    set_vector(x, e, q, at)  # not before all has been asked for
+    set_vector(x, e, q, at)  # after all loads
     set_vector(slip, e, p, slipped)
     store_matrix(C, e, q, affine)

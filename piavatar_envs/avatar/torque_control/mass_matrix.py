@@ -57,7 +57,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 @wp.func
 def two_sided(m: float, first: wp.vec3, second: wp.mat33):
-    """Moments of two joints as one record: ``sum m``, ``sum m a`` and, by rows, ``sum m b a^T``."""
+    """Return the moments of two joints as one record: ``sum m``, ``sum m a`` and, by rows, ``sum m b a^T``."""
     # fmt: off
     return vec16(
         m, first[0], first[1], first[2],
@@ -71,13 +71,13 @@ def two_sided(m: float, first: wp.vec3, second: wp.mat33):
 
 @wp.func
 def second_moment(s: vec16):
-    """``sum m b a^T`` of a record."""
+    """Return ``sum m b a^T`` of a record."""
     return wp.mat33(s[4], s[5], s[6], s[7], s[8], s[9], s[10], s[11], s[12])
 
 
 @wp.func
 def moved(s: vec16, alpha: wp.vec3, beta: wp.vec3):
-    """The record with ``a + alpha`` and ``b + beta``: of a joint with itself, of any two where ``alpha`` is zero."""
+    """Return the record with ``a + alpha`` and ``b + beta``: for one joint, or any two where ``alpha`` is zero."""
     m = s[0]
     first = wp.vec3(s[1], s[2], s[3])
     both = second_moment(s) + wp.outer(first, alpha) + wp.outer(beta, first) + m * wp.outer(beta, alpha)
@@ -101,7 +101,7 @@ return reinterpret_cast<wp::uint64>(scratch.data);
 #endif
 """)
 def record_arena(scratch: wp.array(dtype=vec16), at: int) -> wp.uint64:
-    """Where an environment's records are: from word ``at`` of a CUDA block's shared memory; on a CPU in ``scratch``."""
+    """Return the arena of an environment's records: a CUDA block's shared memory from word ``at``, or ``scratch``."""
     ...
 
 
@@ -117,7 +117,7 @@ return reinterpret_cast<const wp::vec_t<16, wp::float32>*>(records)[{NUM_JOINTS}
 #endif
 """)
 def read_pair(records: wp.uint64, c: int, d: int) -> vec16:
-    """The record of bones ``c`` and ``d``."""
+    """Return the record of bones ``c`` and ``d``."""
     ...
 
 
@@ -137,14 +137,14 @@ def write_pair(records: wp.uint64, c: int, d: int, value: vec16):
 
 @wp.func
 def lift(s: vec16, step: wp.vec3, away: wp.vec3):
-    """The record with ``a + step``; ``away`` is ``b - a``."""
+    """Return the record with ``a + step``; ``away`` is ``b - a``."""
     first = wp.vec3(s[1], s[2], s[3])
     return two_sided(s[0], first + s[0] * step, second_moment(s) + wp.outer(first + s[0] * away, step))
 
 
 @wp.func
 def transposed(s: vec16, away: wp.vec3):
-    """The record with ``a`` and ``b`` exchanged; ``away`` is ``b - a``."""
+    """Return the record with ``a`` and ``b`` exchanged; ``away`` is ``b - a``."""
     return two_sided(s[0], wp.vec3(s[1], s[2], s[3]) + s[0] * away, wp.transpose(second_moment(s)))
 
 
@@ -260,7 +260,7 @@ I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 
 
 def filled_entries(pairs: Pairs) -> np.ndarray:
-    """Where the mass matrix need not be zero, shape ``(69, 69)`` bool: where two joints carry what moves with both."""
+    """Return which entries of the mass matrix may differ from zero, ``(69, 69)`` bool: joints with common matter."""
     shared = (pairs.of.numpy().reshape(NUM_JOINTS, NUM_JOINTS) >= 0) | np.eye(NUM_JOINTS, dtype=bool)
     for columns in (False, True):
         for bone in range(NUM_JOINTS - 1, 0, -1):  # children come after their parents
@@ -282,7 +282,7 @@ def place_pair(
     # out
     records: wp.uint64,
 ):
-    """Moments of what two bones both move, about their joints, for either as the first."""
+    """Store the moments of what two bones both move, about their joints, with either as the first."""
     c = pairs.first[pair]  # about whose joint the sums are
     d = pairs.second[pair]
     s = add_rows12(sums, e, pairs.chunk_start[pair], pairs.chunk_start[pair + 1])
@@ -307,7 +307,7 @@ def place_bone(
     # in and out
     records: wp.uint64,
 ):
-    """Moments of what a bone moves alone, about its joint: of all that it moves, less what it moves with others.
+    """Store the moments of what a bone alone moves, about its joint: of everything less what it shares.
 
     So many ``threads`` that follow each other share the bone.
     """
@@ -326,14 +326,14 @@ def place_bone(
 
 @wp.func
 def take_row(position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, a: int, b: int, other: int):
-    """What bone ``b``, with all beyond, has in common with an ``other``, as bone ``a`` has it, which it hangs on."""
+    """Read the shared moments of bone ``b``, with all beyond, and an ``other``, moved to its parent ``a``."""
     step = position[e, b] - position[e, a]
     return lift(read_pair(records, b, other), step, position[e, b] - position[e, other])
 
 
 @wp.func
 def take_column(position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, a: int, b: int, other: int):
-    """Likewise for the second bone of a pair, where the first is the ``other``."""
+    """Do the same for the second bone of a pair, where the first is the ``other``."""
     step = position[e, b] - position[e, a]
     away = position[e, other] - position[e, b]
     lifted = lift(transposed(read_pair(records, other, b), away), step, -away)
@@ -367,7 +367,7 @@ def compose_in_warp(
     thread: int,
     threads: int,
 ):
-    """:func:`compose_alone` of one side: the threads of a CUDA block share a level's bones and all others."""
+    """Run :func:`compose_alone` for one side: threads of a CUDA block share a level's bones and all others."""
     for back in range(body.levels - 1):
         level = body.levels - 2 - back
         first = body.level_start[level]
@@ -392,13 +392,13 @@ def compose_in_warp(
 
 @wp.func_native("return (int)((sqrtf(8.0f * (float)n + 1.0f) - 1.0f) * 0.5f);")
 def row_of_pair(n: int) -> int:
-    """Row of entry ``n`` of a lower triangle whose rows follow each other."""
+    """Return the row of an entry of a lower triangle stored row by row."""
     ...
 
 
 @wp.func
 def fill_blocks(s: vec16, pattern: Pattern, c: int, d: int, at: wp.uint64):
-    """The block of two joints of the mass matrix; those of the pelvis' velocity with the first joint's."""
+    """Write the block of two joints of the mass matrix; those of the pelvis' velocity with the first joint's."""
     both = second_moment(s)
     own = (1 + c) * (1 + BONES)
     set_in_arenas(at, pattern.block[own + 1 + d], wp.trace(both) * I3 - both)
@@ -410,7 +410,7 @@ def fill_blocks(s: vec16, pattern: Pattern, c: int, d: int, at: wp.uint64):
 
 @wp.func
 def fill_mass(pattern: Pattern, records: wp.uint64, thread: int, threads: int, at: wp.uint64):
-    """The mass matrix ``at`` its place from its records, which are there, too, on a GPU, and where it goes twice."""
+    """Write the mass matrix to ``at`` from its records, on a GPU in the same arena."""
     if threads == 1:
         for c in range(BONES):
             for d in range(c + 1):
@@ -444,7 +444,7 @@ def compose_mass(
     threads: int,
     at: wp.uint64,
 ):
-    """The mass matrix, ``at`` its place, from the moments of pairs and of bones, by blocks of the ``pattern``.
+    """Compose the mass matrix at ``at`` from the moments of pairs and of bones, by blocks of the ``pattern``.
 
     Moments of every two bones become those of all that two joints carry: first for one side of the pairs, then for the
     other. The threads of a CUDA block share the bones.
@@ -523,7 +523,7 @@ class MassMatrix:
         self.refresh = min(MOST_USES, max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6)))
 
     def is_due(self, step: int) -> bool:
-        """Whether substep ``step`` of a control step has a matrix of its own."""
+        """Return whether substep ``step`` of a control step has a matrix of its own."""
         return step % self.refresh == 0
 
     def make_factors(self, systems: int) -> wp.array:
@@ -531,7 +531,7 @@ class MassMatrix:
         return wp.zeros((systems, factor_size(self.pattern)), dtype=float, device=self.model.device)
 
     def read(self) -> np.ndarray:
-        """The mass matrices of all environments, ``(num_envs, 69, 69)``."""
+        """Return the mass matrices of all environments, ``(num_envs, 69, 69)``."""
         rows, columns, numbers = lower_entries(self.pattern)
         matrix = np.zeros((self.model.num_envs, NUM_DOF, NUM_DOF))
         matrix[:, rows, columns] = matrix[:, columns, rows] = self.matrix.numpy()[:, numbers]

@@ -3,8 +3,8 @@
 On a GPU an environment has a CUDA block, so that nothing is launched for what one warp does in a few microseconds: four
 warps build the mass matrix, two a factor each; one does all else. On a CPU it is one thread.
 
-There are three of what particles ask of the joints, for flesh that is pulled, for what the joints take over, and for
-how far flesh is from its places, and two factors of the mass matrix, with locked joints alone and with all that is
+There are three right-hand sides: of flesh that is pulled, of what the joints take over, and of how far flesh is from
+its places; and two factors of the mass matrix, with locked joints alone and with all that is
 implicit. Those of a kind are in one array: the first of all environments, then the second, then the third.
 """
 
@@ -65,7 +65,7 @@ WARP = wp.constant(32)
 #: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
 MASS_BLOCK = wp.constant(128)
 _ARENA_WORDS = wp.constant(ARENA_WORDS)
-#: How often joints are solved for anew, at most, with more muscles at their limits: who gives less changes the others.
+#: How often joints are solved for anew, at most, with more muscles at their limits: a limited muscle changes the others.
 MOST_CUTS = wp.constant(4)
 #: Share of what the pose is off the particles that one fit takes away. Those of a fast, light joint (a head, a hand)
 #: are not where it has them for other reasons, too: to follow them at once throws it about.
@@ -92,7 +92,7 @@ def place_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspac
 
 @wp.func
 def begin(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
-    """Motion and places of the bones, as passes over particles read them."""
+    """Compute motion and places of the bones for the passes over particles."""
     spread_motion(body, w.pose.position, w.velocity, e, e, thread, threads, w.moving)
     place_bones(body, e, thread, threads, w)
 
@@ -101,7 +101,7 @@ def begin(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
 def find_shares(
     body: Body, own: int, step: int, rows: int, e: int, thread: int, threads: int, arena: wp.uint64, w: TorqueWorkspace
 ):
-    """The shares ``dq = M^-1 J^T m v`` that the joints can take of so many velocities, from the bones' momenta.
+    """Solve for the shares ``dq = M^-1 J^T m v`` of several velocities, from the bones' momenta.
 
     Of the first they are in row ``own``, of others ``step`` rows apart.
     """
@@ -131,7 +131,7 @@ def move_on(body: Body, dt: float, move: int, off: int, e: int, thread: int, thr
 
 @wp.func
 def pull_bones(body: Body, own: int, e: int, thread: int, threads: int, w: TorqueWorkspace):
-    """The joints get what the pull of the flesh has taken from the particles, with exactly its momentum."""
+    """Give the joints the momentum that the pull of the flesh has taken from the particles."""
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     none = wp.vec3(0.0)
     balance(w.pose.position, w.bones, 1.0, none, none, w.moving, e, own, thread, threads, w.shares)
@@ -152,7 +152,7 @@ def limit_joints(
     threads: int,
     w: TorqueWorkspace,
 ) -> float:
-    """Let muscles give no more than they have by share ``own``, and tell all threads how many would, or ``again``."""
+    """Let muscles give no more than they have by share ``own``, and return to all threads how many would, or ``again``."""
     limited = float(0.0)
     for k in range(thread, TRIPLES, threads):
         rest = w.diagonals[driven, 3 * k]
@@ -223,7 +223,7 @@ def build_mass(
     # in and out
     w: TorqueWorkspace,
 ):
-    """The mass matrix where the bones' moments are, and its factors.
+    """Build the mass matrix from the bones' moments, and its factors.
 
     Over ``(num_envs, MASS_BLOCK)``; a CUDA block has one.
     """
@@ -263,7 +263,7 @@ def begin_substep(
     # in and out
     w: TorqueWorkspace,
 ):
-    """:func:`begin` where something else has moved the joints, or made them another body's.
+    """Run :func:`begin` where something else has moved the joints, or they are another body's.
 
     Over ``(num_envs, WARP)``, a CUDA block each.
     """

@@ -122,7 +122,7 @@ for (int round = 0; round < steps.shape[0] - 2; ++round) {
 """
 )
 def eliminate(steps: wp.array(dtype=wp.vec4i), pair: wp.array(dtype=int), at: wp.uint64):
-    """The factor of the matrix in an arena, in its place."""
+    """Factorize the matrix in an arena, in place."""
     ...
 
 
@@ -189,7 +189,7 @@ return reinterpret_cast<wp::uint64>(&wp::index(factor, f, 0));
 #endif
 """)
 def place_of_factor(factor: wp.array2d(dtype=float), f: int, arena: wp.uint64) -> wp.uint64:
-    """Where factor ``f`` is worked on: in the arena of a warp, or on a CPU in the array itself."""
+    """Return the address of factor ``f``: in the arena of a warp, or on a CPU in the array itself."""
     ...
 
 
@@ -303,7 +303,7 @@ def solve_one(
     heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
     x: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """Row ``first`` of what is solved with the factor in an arena; it has the right-hand side at first."""
+    """Solve for row ``first`` with the factor in an arena, in place."""
     ...
 
 
@@ -312,7 +312,7 @@ def solve_three(
     heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
     x: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """:func:`solve_one` of three rows, a ``step`` from one to the next."""
+    """Solve like :func:`solve_one` for three rows, a ``step`` apart."""
     ...
 
 
@@ -321,7 +321,7 @@ def descend_three(
     heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
     wanted: int, x: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """``L^-T`` times three vectors that have nothing but in joints whose bits are ``wanted``, as have the answers.
+    """Multiply three vectors by ``L^-T``; only joints whose bits are ``wanted`` have entries.
 
     Of a warp they are in its arena, of a thread that is alone in rows of ``x`` as in :func:`solve_three`.
     """
@@ -333,7 +333,7 @@ def ascend_one(
     heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int,
     x: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """``L^-1`` times the first of the vectors of :func:`descend_three`, in its place."""
+    """Multiply the first of the vectors of :func:`descend_three` by ``L^-1``, in place."""
     ...
 
 
@@ -367,12 +367,12 @@ LANES, NUMBER, BLOCK = 32, 4, 36
 
 
 def in_rounds(words: np.ndarray) -> np.ndarray:
-    """The same in whole rounds, one at least."""
+    """Pad to whole rounds, at least one."""
     return np.pad(words, (0, max(LANES, -(-len(words) // LANES) * LANES) - len(words)), constant_values=-1)
 
 
 def find_pattern(filled: np.ndarray, device: str) -> Pattern:
-    """Where ``L`` has entries, by elimination, from where the matrix has: ``filled``, shape ``(N, N)`` bool.
+    """Find the entries of ``L`` by elimination, from those of the matrix, ``filled``, shape ``(N, N)`` bool.
 
     Raises:
         ValueError: it is not made of filled and empty blocks of 3 x 3, or has too many rows.
@@ -429,7 +429,7 @@ def plan_solution(block: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
 
 
 def plan_reach(block: np.ndarray) -> np.ndarray:
-    """``reach`` of :class:`Pattern`, from the ``block`` of every two joints."""
+    """Return ``reach`` of :class:`Pattern`, from the ``block`` of every two joints."""
     reach = 1 << np.arange(len(block))
     for k, own in enumerate(block):
         reach[k] |= np.bitwise_or.reduce(reach[:k][own[:k] >= 0], initial=0)
@@ -442,7 +442,7 @@ def factor_size(pattern: Pattern) -> int:
 
 
 def lower_entries(pattern: Pattern) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows and columns of the entries of the lower triangle that are kept, and which numbers they are."""
+    """Return rows and columns of the stored entries of the lower triangle, and their numbers."""
     row, column = np.nonzero(np.tril(pattern.block.numpy().reshape(2 * [pattern.entry.shape[0] // 3]) >= 0))
     axis = np.arange(9)
     i, j = (3 * row[:, None] + axis // 3).ravel(), (3 * column[:, None] + axis % 3).ravel()
@@ -469,7 +469,7 @@ def factorize(
     # out
     factor: wp.array2d(dtype=float),
 ):
-    """``L`` of ``L^T L = matrix + diag(diagonal)``, of matrix ``source`` and row ``e`` of the ``diagonal``.
+    """Compute ``L`` of ``L^T L = matrix + diag(diagonal)``, of matrix ``source`` and row ``e`` of the ``diagonal``.
 
     ``matrix`` is ``(num_envs, factor_size)``. A thread that is alone writes factor ``f`` of as many numbers; a warp has
     it in its arena, from where :func:`store_factor` writes it.
@@ -481,7 +481,7 @@ def factorize(
 
 @wp.func
 def factorize_in_arena(pattern: Pattern, diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
-    """:func:`factorize` of the matrix that is there."""
+    """Run :func:`factorize` for the matrix in the arena."""
     add_diagonal(pattern.entry, diagonal, e, at)
     eliminate(pattern.step, pattern.pair, at)
 
@@ -514,7 +514,7 @@ def solve(
     # out
     x: wp.array2d(dtype=float),
 ):
-    """``x[row]`` with ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its arena."""
+    """Solve for ``x[row]`` in ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its arena."""
     sync_threads(threads)
     for i in range(thread, x.shape[1], threads):
         x[row, i] = right[e, i]
@@ -534,7 +534,7 @@ def solve_three_in_place(
     # in and out
     x: wp.array2d(dtype=float),
 ):
-    """:func:`solve` of three right-hand sides in ``x``, the ``first`` and others ``step`` rows apart."""
+    """Run :func:`solve` for three right-hand sides in ``x``, from ``first`` on, ``step`` rows apart."""
     sync_threads(threads)
     solve_three(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, arena), first, step, x)
 
@@ -552,7 +552,7 @@ def begin_solution(
     # in and out
     x: wp.array2d(dtype=float),
 ):
-    """``Y = L^-T B`` of three right-hand sides ``B`` in ``x``, with which ``B^T M^-1 B = Y^T Y``.
+    """Compute ``Y = L^-T B`` of three right-hand sides ``B`` in ``x``, with which ``B^T M^-1 B = Y^T Y``.
 
     Both have something in joints whose bits are ``wanted`` alone, which is what ``Pattern.reach`` tells; elsewhere
     nothing is read or written. A warp has them in its arena, see
@@ -574,6 +574,6 @@ def end_solution(
     # in and out
     x: wp.array2d(dtype=float),
 ):
-    """``L^-1`` times the first of the columns of :func:`begin_solution`."""
+    """Multiply the first of the columns of :func:`begin_solution` by ``L^-1``."""
     sync_threads(threads)
     ascend_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, arena), first, x)

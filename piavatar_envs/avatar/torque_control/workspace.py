@@ -94,7 +94,7 @@ return row;
 #endif
 """)
 def row_in_arena(row: int, there: int) -> int:
-    """Row ``there`` of what has several in a warp's arena; on a CPU ``row``."""
+    """Return row ``there``, where an array has several rows in a warp's arena; on a CPU ``row``."""
     ...
 
 
@@ -110,25 +110,25 @@ return rows;
 
 @wp.func_native(_VIEW)
 def view_numbers(rows: wp.array2d(dtype=float), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=float):
-    """The array with its first row at word ``at`` of the arena, and another one every so many ``words``."""
+    """Return the array with its first row at word ``at`` of the arena, and rows every so many ``words``."""
     ...
 
 
 @wp.func_native(_VIEW)
 def view_vectors(rows: wp.array2d(dtype=wp.vec3), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.vec3):
-    """:func:`view_numbers` of vectors."""
+    """Do the same as :func:`view_numbers` for vectors."""
     ...
 
 
 @wp.func_native(_VIEW)
 def view_rotations(rows: wp.array2d(dtype=wp.quat), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.quat):
-    """:func:`view_numbers` of rotations."""
+    """Do the same as :func:`view_numbers` for rotations."""
     ...
 
 
 @wp.func_native(_VIEW)
 def view_motions(rows: wp.array2d(dtype=vec8), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=vec8):
-    """:func:`view_numbers` of rigid motions."""
+    """Do the same as :func:`view_numbers` for rigid motions."""
     ...
 
 
@@ -146,7 +146,7 @@ return 3 * k;
 #endif
 """)
 def place_of_triple(k: int) -> int:
-    """Where in a column of :func:`view_columns` the part of joint ``k`` begins; the pelvis' place comes first."""
+    """Return where joint ``k`` begins in a column of :func:`view_columns`; the pelvis' position comes first."""
     ...
 
 
@@ -179,7 +179,7 @@ def load_pose(w: TorqueWorkspace, e: int, arena: wp.uint64):
 
 @wp.func
 def load_workspace(w: TorqueWorkspace, e: int):
-    """The bench with pose, motion, momenta and shares of an environment in the arena of its warp.
+    """Return the workspace with pose, motion, momenta and shares of an environment in the arena of its warp.
 
     What has several rows has them as :func:`row_in_arena` says; all else has one there, whatever the environment. On a
     CPU it is the bench itself.

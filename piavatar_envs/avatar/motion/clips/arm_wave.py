@@ -12,7 +12,7 @@ _OUT, _IN = Arm(_UPPER, (0.62, -0.25, 0.85)), Arm(_UPPER, (-0.30, -0.30, 0.95))
 
 
 def build(rest_joints: np.ndarray) -> Motion:
-    """The clip for a body with these joints [m], shape ``(22, 3)``; leaning a little away from the arm."""
+    """Return the clip for a body with these joints [m], shape ``(22, 3)``; leaning a little away from the arm."""
     lean = {"spine2": (0.0, -4.0, 0.0), "head": (0.0, 4.0, 8.0)}
     keys = [Key(0.0), Key(0.8, turns=lean, left_arm=_IN)]
     keys += [Key(0.8 + 0.4 * i, turns=lean, left_arm=_OUT if i % 2 else _IN) for i in range(1, 6)]

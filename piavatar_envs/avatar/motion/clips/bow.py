@@ -11,7 +11,7 @@ _HANGING = Arm((0.45, -0.70, -0.60), (0.15, -0.95, -0.35))
 
 
 def build(rest_joints: np.ndarray) -> Motion:
-    """The clip for a body with these joints [m], shape ``(22, 3)``."""
+    """Return the clip for a body with these joints [m], shape ``(22, 3)``."""
     turns = {
         "pelvis": (38.0, 0.0, 0.0),
         "spine1": (8.0, 0.0, 0.0),

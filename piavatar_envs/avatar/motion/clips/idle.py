@@ -9,7 +9,7 @@ from piavatar_envs.avatar.motion.motion import Motion
 
 
 def build(rest_joints: np.ndarray) -> Motion:
-    """The clip for a body with these joints [m], shape ``(22, 3)``."""
+    """Return the clip for a body with these joints [m], shape ``(22, 3)``."""
     inhaled = {"spine3": (-2.0, 0.0, 0.0), "left_collar": (0.0, -2.5, 0.0), "right_collar": (0.0, 2.5, 0.0)}
     keys = [
         Key(0.0),

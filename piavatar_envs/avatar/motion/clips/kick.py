@@ -13,7 +13,7 @@ _BACK = Arm((0.70, 0.45, -0.55), (0.50, -0.15, -0.85))
 
 
 def build(rest_joints: np.ndarray) -> Motion:
-    """The clip for a body with these joints [m], shape ``(22, 3)``."""
+    """Return the clip for a body with these joints [m], shape ``(22, 3)``."""
     guard = {"left_arm": _GUARD, "right_arm": _GUARD}
     shift = {"pelvis": (0.16, 0.0, -0.05), "turns": {"spine2": (0.0, -5.0, 0.0)}, **guard}
     wind_up = {

@@ -11,7 +11,7 @@ _FORWARD = Arm((0.25, -0.78, 0.45), (0.05, -0.85, 0.48))
 
 
 def build(rest_joints: np.ndarray) -> Motion:
-    """The clip for a body with these joints [m], shape ``(22, 3)``."""
+    """Return the clip for a body with these joints [m], shape ``(22, 3)``."""
     down = {
         "pelvis": (32.0, 0.0, 0.0),
         "spine1": (6.0, 0.0, 0.0),

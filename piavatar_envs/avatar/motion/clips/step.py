@@ -14,7 +14,7 @@ _SHIFT = 0.13  # how far the pelvis moves over the foot that stands, in leg leng
 
 
 def build(rest_joints: np.ndarray) -> Motion:
-    """The clip for a body with these joints [m], shape ``(22, 3)``."""
+    """Return the clip for a body with these joints [m], shape ``(22, 3)``."""
     on_right = {"pelvis": (-_SHIFT, -0.01, -0.035), "turns": {"pelvis": (2.0, 0.0, 0.0), "spine2": (2.0, 5.0, 0.0)}}
     on_left = {"pelvis": (_SHIFT, -0.01, -0.035), "turns": {"pelvis": (2.0, 0.0, 0.0), "spine2": (2.0, -5.0, 0.0)}}
     left_up = {**on_right, "left_foot": _UP, "right_arm": _AHEAD, "left_arm": _BEHIND}
