@@ -36,7 +36,7 @@ demo: install
 
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 # What is for a GPU runs on a CPU, too (tests/gpu_on_cpu): of that some minutes' worth. All of tests/mpm takes fifteen.
-OF_A_GPU := tests/core/test_launch_graph.py $(addprefix tests/mpm/test_,p2g_paths.py contact_nodes.py) tests/envs/test_peaks.py $(addprefix tests/avatar/test_,lanes.py drive_envs.py cholesky.py articulated.py bone_contact.py bone_touch.py)
+OF_A_GPU := tests/core/test_launch_graph.py $(addprefix tests/mpm/test_,p2g_paths.py contact_nodes.py) tests/envs/test_peaks.py $(addprefix tests/avatar/test_,segment_sums.py pose_control_batch.py tree_cholesky.py torque_control.py bone_contact.py bone_impulses.py)
 
 # The kernels are compiled once, before the two workers start and would both compile them.
 test: install

@@ -12,7 +12,7 @@ from benchmarks.physics.rig import joint_gaps
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.torque_control.bone_contact import LAYER
 from piavatar_envs.mpm.colliders import Collider
-from tests.avatar.jointed import Joints
+from tests.avatar.articulated import Joints
 
 UP = np.array([0.0, 0.0, 1.0])
 FACING = Collider.plane((0.0, 0.0, -1.0), -1.9, 0.8)  # a ceiling

@@ -65,7 +65,7 @@ WARP = wp.constant(32)
 #: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
 MASS_BLOCK = wp.constant(128)
 _ARENA_WORDS = wp.constant(ARENA_WORDS)
-#: How often joints are solved for anew, at most, with more muscles at their limits: a limited muscle changes the others.
+#: Most solutions in a substep, each with more muscles at their limits: a limited muscle changes the others.
 MOST_CUTS = wp.constant(4)
 #: Share of what the pose is off the particles that one fit takes away. Those of a fast, light joint (a head, a hand)
 #: are not where it has them for other reasons, too: to follow them at once throws it about.
@@ -152,7 +152,7 @@ def limit_joints(
     threads: int,
     w: TorqueWorkspace,
 ) -> float:
-    """Let muscles give no more than they have by share ``own``, and return to all threads how many would, or ``again``."""
+    """Limit the muscles by share ``own``; return to all threads how many were limited, or ``again``."""
     limited = float(0.0)
     for k in range(thread, TRIPLES, threads):
         rest = w.diagonals[driven, 3 * k]

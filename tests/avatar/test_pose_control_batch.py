@@ -1,4 +1,4 @@
-"""The drive in a batch: masked resets, failures, determinism; no environment knows of another."""
+"""The pose controller in a batch: masked resets, failures, determinism; environments are independent."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from piavatar_envs.avatar.body.soft_tissue import bone_distance
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
 from piavatar_envs.avatar.torque_control.dynamics import UNBOUNDED, stopping_torque
-from tests.avatar.jointed import Joints
+from tests.avatar.articulated import Joints
 
 ANKLES = [joint_index("left_ankle"), joint_index("right_ankle")]
 TOES = [joint_index("left_foot"), joint_index("right_foot")]

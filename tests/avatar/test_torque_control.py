@@ -16,7 +16,7 @@ from piavatar_envs.avatar.torque_control.mass_matrix import LONGEST_REFRESH, MOS
 from piavatar_envs.avatar.torque_control.stages import FIT_SHARE
 from piavatar_envs.core import cuda_intrinsics as lanes
 from piavatar_envs.core.launch_graph import LaunchGraph
-from tests.avatar.jointed import GAINS, Joints, carried_by, momentum_of
+from tests.avatar.articulated import GAINS, Joints, carried_by, momentum_of
 
 TOES = [joint_index("left_foot"), joint_index("right_foot")]
 

@@ -26,7 +26,7 @@ from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, warp_
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.cuda_intrinsics import warp_threads
 from piavatar_envs.mpm.colliders import Collider
-from tests.avatar.jointed import Joints, carried_by
+from tests.avatar.articulated import Joints, carried_by
 
 
 @wp.kernel(enable_backward=False)
