@@ -25,7 +25,7 @@ from piavatar_envs.config import SceneConfig
 from piavatar_envs.mpm import model as build
 from piavatar_envs.mpm.diagnostics import totals
 from piavatar_envs.mpm.types import failure_name
-from piavatar_envs.sim import world as simulation
+from piavatar_envs.sim import time_step
 
 SECONDS, CALM = 1.0, 1.0  # how long a body is watched [s], and what it may have left [J]
 GRAVITY = 9.81
@@ -145,7 +145,7 @@ def first_fault(trials: Iterable[Trial], options: Options) -> str | None:
 @contextmanager
 def unrefused() -> Iterator[None]:
     """Disable :func:`~piavatar_envs.mpm.model.check_num_substeps`, so that unstable time steps can be built."""
-    with mock.patch.object(build, "CFL_STABLE", np.inf), mock.patch.object(simulation, "LONGEST_SUBSTEP", np.inf):
+    with mock.patch.object(build, "CFL_STABLE", np.inf), mock.patch.object(time_step, "LONGEST_SUBSTEP", np.inf):
         yield
 
 
