@@ -27,7 +27,7 @@ from benchmarks import runner
 ENVIRONMENTS: dict[str, int] = {"PIAvatar/Reach-v0": 60, "PIAvatar/TrackMotion-v0": 60, "Humanoid-v5": 3000}
 EXPECTED_STEPS, EXPECTED_MICROSECONDS = 50.0, 0.35  # of Reach, on one core
 WARM_UP = 5
-CONTINUUM = ("particles_to_grid", "update_grid", "grid_to_particles")  # kernels of an MPM substep
+CONTINUUM = ("p2g", "update_grid", "grid_to_particles")  # kernels of an MPM substep
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -151,7 +151,7 @@ def stages(name: str, steps: int, core: int | None) -> list[dict[str, Any]]:
     material = sum(
         value
         for kernel, value in ordered.items()
-        if kernel in ("particles_to_grid", "update_grid", "grid_to_particles")
+        if kernel in ("p2g", "update_grid", "grid_to_particles")
     )
     work = known["particles"] * known["substeps"]
     total = sum(ordered.values())
