@@ -30,7 +30,7 @@ from agents.sb3.workers import EnvFacts, components, factory, prepare, start_wor
 from piavatar_envs.config import ConfigError, parse_assignments
 from piavatar_envs.sim.world import check_device
 
-CONFIG = Path(__file__).resolve().parents[1] / "configs" / "reach_ppo.yaml"
+CONFIG = Path(__file__).resolve().parents[1] / "configs" / "sb3" / "reach_ppo.yaml"
 FILM_EPISODES = 2
 #: Files that appear after the training.
 LATER = ("policy.zip", "curve.csv", "curve.png", "before_after.mp4")
@@ -42,7 +42,7 @@ _FRAME = 0.1  # rendering and encoding a frame whose halves are drawn in paralle
 class Options:
     """Train PPO on Reach on the CPU, and show what it has learned."""
 
-    #: settings that win over configs/reach_ppo.yaml: total_steps=1000 env.fidelity=tiny
+    #: settings that win over configs/sb3/reach_ppo.yaml: total_steps=1000 env.fidelity=tiny
     settings: tyro.conf.Positional[tuple[str, ...]] = ()
     #: folder to write to
     out: Path = Path("runs/demo")

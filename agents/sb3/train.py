@@ -1,4 +1,4 @@
-"""Train with stable-baselines3: ``python -m agents.sb3.train configs/reach_ppo.yaml --out runs/reach``.
+"""Train with stable-baselines3: ``python -m agents.sb3.train configs/sb3/reach_ppo.yaml --out runs/reach``.
 
 The environment is one agent's, or a world of several: then all its learning agents share one policy, and with a section
 ``selfplay`` they compete, also with snapshots of earlier policies. Leaves in the folder: the resolved configuration,

@@ -27,7 +27,8 @@ class ObservationTerm:
         name: key in ``obs_mode="dict"``.
         size: number of components.
         unit: physical unit, ``"-"`` if it has none.
-        frame: ``"world"``, ``"root"`` (origin at the pelvis, turned with it), ``"parent"`` bone, or ``"-"``.
+        frame: ``"world"``, ``"root"`` (origin at the pelvis, turned with it), ``"parent"`` bone,
+            the ``"bone"`` itself, or ``"-"``.
         description: one line.
         parameters: the drawn parameters that its components hold, each normalised to [-1, 1]; empty for other terms.
     """

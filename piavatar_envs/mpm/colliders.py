@@ -1,7 +1,7 @@
 """Analytic colliders, fixed or moving, with Coulomb friction.
 
-A collider acts on a node only if the mass-weighted position of the particles there is within ``CONTACT_GATE`` of the
-surface: without this gate a foot is held while it is still a grid cell away, and sticks when it leaves.
+A collider acts on a node only if the mass-weighted position of the particles there is within ``COLLIDER_CONTACT_GATE``
+of the surface: without this gate a foot is held while it is still a grid cell away, and sticks when it leaves.
 
 Kinds, each in a local frame:
 
@@ -37,14 +37,14 @@ CAPSULE = wp.constant(3)
 COLLIDER_KINDS: dict[str, int] = {"plane": 0, "sphere": 1, "box": 2, "capsule": 3}
 
 #: Gap at which contact begins [grid spacings].
-CONTACT_GATE = wp.constant(0.5)
+COLLIDER_CONTACT_GATE = wp.constant(0.5)
 #: Particles closer than this [grid spacings] are contact candidates: the gate and two stencils, so that near a level
 #: surface all particles are that have a node in contact.
 NEAR_PARTICLE = wp.constant(3.5)
 #: Blocks whose middle is closer [grid spacings] may be the base of such a particle: NEAR_PARTICLE and half a diagonal.
 NEAR_BLOCK = wp.constant(7.0)
-#: Slabs of nodes closer than this [grid spacings] may hold matter within the gate: CONTACT_GATE, half a stencil's and
-#: half a slab's diagonal.
+#: Slabs of nodes closer than this [grid spacings] may hold matter within the gate: COLLIDER_CONTACT_GATE, half a
+#: stencil's and half a slab's diagonal.
 GATED_SLAB = wp.constant(5.3)
 
 #: Shorter directions [m] are round-off and replaced by another.

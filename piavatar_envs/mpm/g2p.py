@@ -21,7 +21,7 @@ import warp as wp
 
 from piavatar_envs.core.arrays import matrix_at, store_matrix, store_pair
 from piavatar_envs.mpm.bspline import Stencil, base_node, grid_position, in_same_subblock, stencil_at, stencil_inside
-from piavatar_envs.mpm.colliders import CONTACT_GATE, nearest_boundary, remove_approach
+from piavatar_envs.mpm.colliders import COLLIDER_CONTACT_GATE, nearest_boundary, remove_approach
 from piavatar_envs.mpm.grid_arrays import TO_KINEMATIC, first_of_halves, read_half_from
 from piavatar_envs.mpm.p2g import _LINES, Lines, lines_of
 from piavatar_envs.mpm.sparse_grid import (
@@ -150,7 +150,7 @@ def needs_kinematic(grid: Grid, step: Step, distance: float):
     if step.decoupling == PAPER:
         return True
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    return split and distance < CONTACT_GATE * grid.dx
+    return split and distance < COLLIDER_CONTACT_GATE * grid.dx
 
 
 @wp.func
@@ -174,7 +174,7 @@ def carried_velocity(
     if not needed:
         return vk
     seen = wp.vec3(kinematic.mean[1], kinematic.mean[2], kinematic.mean[3])
-    return seen + remove_approach(boundaries, e, x, vk - seen, CONTACT_GATE * grid.dx)
+    return seen + remove_approach(boundaries, e, x, vk - seen, COLLIDER_CONTACT_GATE * grid.dx)
 
 
 @wp.func

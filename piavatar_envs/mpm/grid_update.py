@@ -10,7 +10,13 @@ import warp as wp
 from piavatar_envs.core.arrays import vec4l, vec8
 from piavatar_envs.core.cuda_intrinsics import any_lane, environment_of, lane_of_thread, lanes_of_warp, sync_warp
 from piavatar_envs.mpm.bspline import BLOCK_NODES, block_corner, node_of_block, node_position
-from piavatar_envs.mpm.colliders import CONTACT_GATE, GATED_SLAB, NEAR_BLOCK, boundary_contact, nearest_boundary
+from piavatar_envs.mpm.colliders import (
+    COLLIDER_CONTACT_GATE,
+    GATED_SLAB,
+    NEAR_BLOCK,
+    boundary_contact,
+    nearest_boundary,
+)
 from piavatar_envs.mpm.contact_sensors import add_impulse, boundary_entry, moment_entry
 from piavatar_envs.mpm.grid_arrays import (
     MASS_MIN,
@@ -83,7 +89,7 @@ def collide_with_boundaries(
     offset = offset_at(grid, accumulators, e, f, r)
     matter = at - wp.vec3(offset[0], offset[1], offset[2]) / total[0]
     v = wp.vec3(total[1], total[2], total[3])
-    dv = boundary_contact(boundaries, e, f, matter, v, CONTACT_GATE * grid.dx) - v
+    dv = boundary_contact(boundaries, e, f, matter, v, COLLIDER_CONTACT_GATE * grid.dx) - v
     if wp.length_sq(dv) > 0.0:
         subject = contact.subject[f]
         add_impulse(sensors, e, boundary_entry(sensors, subject), total[0] * dv)

@@ -35,7 +35,7 @@ CFL_STABLE = 0.84
 #: Most velocity fields: one bit of an int32 each, without the sign.
 MAX_FIELDS = 31
 #: Gap between the surfaces of two bodies below which they are in contact [grid spacings].
-CONTACT_GATE = 0.15
+BODY_CONTACT_GATE = 0.15
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Fields:
     subject: Sequence[int] = (0,)
     friction: np.ndarray | float = 0.0
     density: np.ndarray | float = 1000.0
-    gate: float = CONTACT_GATE
+    gate: float = BODY_CONTACT_GATE
     normals: str = "shared"
     num_sensors: int = 0
 

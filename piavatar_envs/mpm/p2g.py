@@ -1,4 +1,6 @@
-"""Particle-to-grid transfer (P2G); the way back is in :mod:`piavatar_envs.mpm.g2p`.
+"""Particle-to-grid transfer (P2G) of the plain path; the way back is in :mod:`piavatar_envs.mpm.g2p`.
+
+The plain path runs on CPUs, and on GPUs below compute capability 7.0.
 
 APIC (Jiang et al., "The Affine Particle-In-Cell Method", 2015) with the MLS form of the stress force (Hu et al., "A
 Moving Least Squares Material Point Method", 2018, eq. 16). Physical and kinematic momentum share one pass.

@@ -4,9 +4,10 @@ The split-velocity scheme of PIAvatar (Han et al., arXiv 2606.21162) with APIC t
 quadratic B-splines: particles carry a physical velocity ``u`` and a kinematic velocity ``vk``; contact acts on the
 nodes' total velocity.
 
-``model.path`` names the path of P2G and G2P. ``"plain"`` runs on any device. ``"tiled"`` sums tiles of particles of
-large bodies in shared memory before they reach the grid. ``"block"`` keeps the grid of an environment in the shared
-memory of CUDA blocks, so that P2G, the grid update and, with a single velocity field, G2P are one launch.
+``model.path`` names the path of P2G and G2P. ``"plain"`` runs on CPUs, and on GPUs below compute capability 7.0.
+``"tiled"`` sums tiles of particles of large bodies in shared memory before they reach the grid. ``"block"`` keeps the
+grid of an environment in the shared memory of CUDA blocks, so that P2G, the grid update and, with a single velocity
+field, G2P are one launch.
 """
 
 from __future__ import annotations

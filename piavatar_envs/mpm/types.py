@@ -38,7 +38,7 @@ FAILURE_NAMES: dict[int, str] = {
 
 #: How prescribed motion is kept out of the deformation gradient (:mod:`piavatar_envs.mpm.g2p`).
 DECOUPLING: dict[str, int] = {"split": 0, "paper": 1, "none": 2, "no_stress": 3}
-#: How particles reach the nodes (docs of :mod:`piavatar_envs.mpm.p2g`, ``tiles`` and ``shared_substep``).
+#: How particles reach the nodes: :mod:`piavatar_envs.mpm.p2g`, ``cuda.tiled_p2g``, ``cuda.block_substep``.
 PATHS = ("plain", "tiled", "block")
 #: Bits of ``Blocks.candidate``: the particle is a contact candidate; another field is active near it.
 CANDIDATE, NEAR_FIELD = wp.constant(1), wp.constant(2)

@@ -1,6 +1,9 @@
 """Boxing: hit the other's head and trunk with the arms, and keep your own out of the way.
 
-The rules are in :mod:`piavatar_envs.tasks.games.boxing`.
+The rules are in :mod:`piavatar_envs.tasks.games.boxing`, which is enough for
+``piavatar_envs.multi.parallel_env("boxing_v0")``. This module adds only the form that PettingZoo's own games have,
+``boxing_v0.parallel_env()``.
+
 """
 
 from __future__ import annotations

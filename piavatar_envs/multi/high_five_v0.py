@@ -1,6 +1,9 @@
 """HighFive: two avatars face each other and slap one hand each.
 
-The rules are in :mod:`piavatar_envs.tasks.games.high_five`.
+The rules are in :mod:`piavatar_envs.tasks.games.high_five`, which is enough for
+``piavatar_envs.multi.parallel_env("high_five_v0")``. This module adds only the form that PettingZoo's own games have,
+``high_five_v0.parallel_env()``.
+
 """
 
 from __future__ import annotations

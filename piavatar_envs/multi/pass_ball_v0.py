@@ -1,6 +1,9 @@
 """PassBall: a circle of avatars keeps a ball going round.
 
-The rules are in :mod:`piavatar_envs.tasks.games.pass_ball`.
+The rules are in :mod:`piavatar_envs.tasks.games.pass_ball`, which is enough for
+``piavatar_envs.multi.parallel_env("pass_ball_v0")``. This module adds only the form that PettingZoo's own games have,
+``pass_ball_v0.parallel_env()``.
+
 """
 
 from __future__ import annotations

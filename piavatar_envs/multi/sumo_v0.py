@@ -1,6 +1,9 @@
 """Sumo: push the others out of the ring, or over, and stay in it.
 
-The rules are in :mod:`piavatar_envs.tasks.games.sumo`.
+The rules are in :mod:`piavatar_envs.tasks.games.sumo`, which is enough for
+``piavatar_envs.multi.parallel_env("sumo_v0")``. This module adds only the form that PettingZoo's own games have,
+``sumo_v0.parallel_env()``.
+
 """
 
 from __future__ import annotations

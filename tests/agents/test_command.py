@@ -48,8 +48,8 @@ def test_options_that_there_are_not_are_refused(script, first, line, capsys):
 
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-#: What scripts call files that are theirs; those that lie in no library's folder are agents.sb3.train's.
-OWNERS = {"rsl_rl": "rsl_rl.train", "skrl": "skrl.train", "sb3": "sb3.train", "configs": "sb3.train"}
+#: The script that a folder of configurations belongs to.
+OWNERS = {"rsl_rl": "rsl_rl.train", "skrl": "skrl.train", "sb3": "sb3.train"}
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.yaml")), ids=lambda path: path.stem)

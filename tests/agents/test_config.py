@@ -11,7 +11,7 @@ from agents.sb3.config import env_config, load_training
 from agents.sb3.workers import components, factory
 from piavatar_envs.config import ConfigError, dump_yaml
 
-CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs").glob("*.yaml"))
+CONFIGS = sorted((Path(__file__).resolve().parents[2] / "configs" / "sb3").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)

@@ -23,7 +23,7 @@ MAPPO = ("mappo.rollout_steps=8", "mappo.minibatches=2", "mappo.epochs=2")
 #: Name -> what it needs, script, configuration, its settings, the learning rate's, steps of a rollout.
 TRAININGS = {
     "rsl": ("rsl_rl", "rsl_rl.train", "rsl_rl/reach_rsl", (*BATCH, *RSL), "ppo", 16),
-    "ppo": ("stable_baselines3", "sb3.train", "reach_ppo", (*WORKER, *PPO), "ppo", 16),
+    "ppo": ("stable_baselines3", "sb3.train", "sb3/reach_ppo", (*WORKER, *PPO), "ppo", 16),
     "sac": (
         "stable_baselines3",
         "sb3.train",

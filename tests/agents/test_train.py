@@ -20,7 +20,8 @@ from agents.sb3.policy import policy_agent
 from agents.sb3.workers import factory, prepare, start_vector, start_workers
 from piavatar_envs.config import dump_yaml
 
-PUBLISHED = sorted((Path(__file__).resolve().parents[2] / "configs" / "sb3").glob("*.yaml"))
+SB3 = Path(__file__).resolve().parents[2] / "configs" / "sb3"
+PUBLISHED = sorted(path for path in SB3.glob("*.yaml") if "vector: true" in path.read_text(encoding="utf-8"))
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.physics.matter import Matter, ball, build_matter, lattice
-from piavatar_envs.mpm.model import CONTACT_GATE, Fields, MaterialPoints
+from piavatar_envs.mpm.model import BODY_CONTACT_GATE, Fields, MaterialPoints
 
 FLOOR = [((0.0, 0.0, 1.0), -0.11, 0.5)]
 
@@ -42,7 +42,7 @@ def meet(simulate) -> Callable[..., Matter]:
     def build(
         bodies: Sequence[dict],
         friction: np.ndarray | float = 0.0,
-        gate: float = CONTACT_GATE,
+        gate: float = BODY_CONTACT_GATE,
         normals: str = "shared",
         spacing: float = 0.025,
         stiffness: float = 100.0,
