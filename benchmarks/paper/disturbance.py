@@ -68,7 +68,7 @@ class Course:
     strain: np.ndarray
     impulse: np.ndarray  # what the strike was to bring [N s], shape (num_envs, 3)
     ledger: list[list[Totals]]  # of every body: before the strike, after it, then after each control step
-    let_go: np.ndarray  # shape (num_envs,)
+    released: np.ndarray  # shape (num_envs,)
     alive: np.ndarray  # shape (num_envs,)
 
 
@@ -119,7 +119,7 @@ def hit_by_balls(world: World, control: PoseControlConfig, seeds: int, steps: in
             "ball_kg": ball.mass,
             "ball_m_s": ball.speed,
             "impulse_n_s": ball.impulse,
-            "root_released": int(course.let_go[mine].sum()),
+            "root_released": int(course.released[mine].sum()),
             "measured_with_real_ball": {"peak_joint_error_deg": peak, "settled_joint_error_deg": settled},
         }
 
@@ -143,7 +143,7 @@ def follow(rig: Rig, poses: np.ndarray, bones: np.ndarray, impulses: np.ndarray,
         last_errors=rig.pose_errors()["relative_rotation"],
         impulse=impulses,
         ledger=ledger,
-        let_go=rig.avatar.state.let_go.numpy(),
+        released=rig.avatar.state.released.numpy(),
         alive=rig.alive,
     )
 

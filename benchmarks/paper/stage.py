@@ -201,9 +201,9 @@ class Course:
         return bool(self.stage.simulation.state.failure.numpy()[0])
 
     @property
-    def let_go(self) -> bool:
+    def released(self) -> bool:
         """Return whether the avatar was knocked over."""
-        return bool(self.stage.simulation.avatar.state.let_go.numpy()[0])
+        return bool(self.stage.simulation.avatar.state.released.numpy()[0])
 
     @cached_property
     def joint_errors(self) -> np.ndarray:

@@ -93,7 +93,7 @@ def _row(act: Act, measure: Callable[[Course], Row], play: Play, fidelity: str) 
         "particles": course.x.shape[1],
         "tone": simulation.flesh[0].control.tone,
         "failed": course.failed,
-        "let_go": course.let_go,
+        "released": course.released,
         **act.tags,
     }
     measured = {} if course.failed else measure(course)
@@ -136,7 +136,7 @@ def judge_head_hits(found: list[Row]) -> Verdict:
 
 def judge_crowd(found: list[Row]) -> Verdict:
     """Judge the act with several objects."""
-    expected = all(row.get("objects_that_touched") == 4 and not row["let_go"] for row in found)
+    expected = all(row.get("objects_that_touched") == 4 and not row["released"] for row in found)
     return "all four objects touch the avatar, which keeps standing", expected
 
 

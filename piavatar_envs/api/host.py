@@ -299,7 +299,7 @@ class EpisodeHost:
             # a failed environment may hold numbers that are not finite, which must not leave the suite
             "root_force": self.api.finite(drive("wrench_force")),
             "root_torque": self.api.finite(drive("wrench_torque")),
-            "root_released": drive("let_go") != 0,
+            "root_released": drive("released") != 0,
         }
 
     def outcome(self, agent: int) -> dict[str, Any]:

@@ -92,7 +92,7 @@ class Avatar:
             reset_commands,
             (n, NUM_JOINTS),
             [mask, s.command_rotation, s.command_root],
-            [s.goal_rotation, s.goal_root, s.let_go, s.wrench_force, s.wrench_torque],
+            [s.goal_rotation, s.goal_root, s.released, s.wrench_force, s.wrench_torque],
         )
         self.record_still_pose(graph, (s.command_rotation, s.command_root), self.placed)
         graph.launch(
@@ -138,7 +138,7 @@ def reset_commands(
     # out
     goal_rotation: wp.array2d(dtype=wp.quat),
     goal_root: wp.array(dtype=wp.vec3),
-    let_go: wp.array(dtype=int),
+    released: wp.array(dtype=int),
     wrench_force: wp.array(dtype=wp.vec3),
     wrench_torque: wp.array(dtype=wp.vec3),
 ):
@@ -149,7 +149,7 @@ def reset_commands(
     goal_rotation[e, b] = command_rotation[e, b]
     if b == 0:
         goal_root[e] = command_root[e]
-        let_go[e] = 0
+        released[e] = 0
         wrench_force[e] = wp.vec3(0.0)
         wrench_torque[e] = wp.vec3(0.0)
 

@@ -352,7 +352,7 @@ def sum_motion(
     x: wp.array2d(dtype=wp.vec3),
     vk: wp.array2d(dtype=wp.vec3),
     center: wp.array2d(dtype=wp.vec3),
-    let_go: wp.array(dtype=int),
+    released: wp.array(dtype=int),
     failure: wp.array(dtype=int),
     threads: int,
     # out
@@ -360,7 +360,7 @@ def sum_motion(
 ):
     """Run :func:`chunk_motion` for bodies that nothing supports, over ``(num_envs, GROUPS, threads)``."""
     e, group, thread = wp.tid()
-    if failure[e] != 0 or (control.free_motion == 0 and let_go[e] == 0):
+    if failure[e] != 0 or (control.free_motion == 0 and released[e] == 0):
         return
     quarters = quarters_at_once(threads)
     for n in range(group, body.quarters.shape[0] // quarters, GROUPS):

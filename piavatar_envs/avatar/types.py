@@ -80,7 +80,7 @@ class PoseControl:
     kinematic_shape_rate: float  # the paper's shape preservation inside vk; breaks momentum
     tone_rate: float  # pull towards the commanded pose, TONE_RATE tone
     damping: float  # decay of motion between bones [1/s]
-    free_motion: int  # 1: commanded motion carries no net momentum (0: not until the root wrench has let go)
+    free_motion: int  # 1: commanded motion carries no net momentum (0: not until the root wrench is released)
     gravity: wp.vec3
     # root wrench
     root_rate: float  # 0: none
@@ -166,7 +166,7 @@ class Wrench:
 class RootState:
     """What the root wrench leaves behind, see :class:`AvatarState`; ``(num_envs,)``."""
 
-    let_go: wp.array(dtype=int)
+    released: wp.array(dtype=int)
     wrench_force: wp.array(dtype=wp.vec3)
     wrench_torque: wp.array(dtype=wp.vec3)
 
@@ -210,7 +210,7 @@ class AvatarState:
     command_root: wp.array(dtype=wp.vec3)  # (num_envs,) commanded pelvis position [m]
     goal_rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) local rotations at the end of this control step
     goal_root: wp.array(dtype=wp.vec3)  # (num_envs,) pelvis position to reach [m]
-    let_go: wp.array(dtype=int)  # (num_envs,) 1 once the root is no longer held
+    released: wp.array(dtype=int)  # (num_envs,) 1 once the root is no longer held
     # (num_envs, count) kinematic velocity of flesh with a velocity lag in the last substep, before a rigid part came
     # off; only pose control writes it
     motion: wp.array2d(dtype=wp.vec3)

@@ -189,14 +189,14 @@ class BatchEnv(EpisodeArrays):
             graph.launch(refuse_nonfinite, (n, self.action_spec.size), [self.action, agent, self.alive], [self.failure])
             self._record_actions(graph, agent, avatar, reference)
             if self.num_agents > 1:
-                graph.launch(retire, n, [agent, self.alive], [avatar.state.let_go])
+                graph.launch(retire, n, [agent, self.alive], [avatar.state.released])
         sim.record_control_step(graph)
         self.task.record_outcome(self, graph)
         for agent, avatar in enumerate(sim.avatars):
             graph.launch(
                 end_agent,
                 n,
-                [agent, self.num_agents, self.failure, avatar.state.let_go, self.terms, self.cost_terms],
+                [agent, self.num_agents, self.failure, avatar.state.released, self.terms, self.cost_terms],
                 [self.reward, self.cost, self.terminated, self.alive],
             )
         ends = [self.max_steps, self.terminated, self.head_start]

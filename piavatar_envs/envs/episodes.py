@@ -168,11 +168,11 @@ def begin_episode(
 
 
 @wp.kernel
-def retire(agent: int, alive: wp.array2d(dtype=wp.bool), let_go: wp.array(dtype=int)):
+def retire(agent: int, alive: wp.array2d(dtype=wp.bool), released: wp.array(dtype=int)):
     """Release the root of an agent that is out."""
     e = wp.tid()
     if not alive[e, agent]:
-        let_go[e] = 1
+        released[e] = 1
 
 
 @wp.kernel
@@ -180,7 +180,7 @@ def end_agent(
     agent: int,
     num_agents: int,
     failure: wp.array(dtype=int),
-    let_go: wp.array(dtype=int),
+    released: wp.array(dtype=int),
     terms: wp.array3d(dtype=float),
     cost_terms: wp.array3d(dtype=float),
     # out
@@ -205,7 +205,7 @@ def end_agent(
             cost_terms[e, agent, n] = 0.0
         total += cost_terms[e, agent, n]
     cost[e, agent] = total
-    terminated[e, agent] = failure[e] != 0 or let_go[e] != 0 or terminated[e, agent] or out
+    terminated[e, agent] = failure[e] != 0 or released[e] != 0 or terminated[e, agent] or out
     alive[e, agent] = not terminated[e, agent]
 
 

@@ -105,7 +105,7 @@ class Task:
     Class attributes for the task's page in ``docs/envs`` (Markdown; ``python -m scripts.env_pages`` writes it):
         summary: a paragraph: the situation, and what a good agent does.
         success_doc: the condition of ``info["success"]``.
-        termination_doc: conditions that terminate an episode, besides a root that lets go and a failure; may be empty.
+        termination_doc: conditions that terminate an episode, besides a released root and a failure; may be empty.
         history: versions and what each changed, the newest first.
         picture_seconds: moment of the picture [s].
         picture_actions: how the avatars act until then: ``"zero"``, ``"random"`` or constant actions by component name.

@@ -36,8 +36,8 @@ def test_every_episode_is_the_one_a_single_env_would_play(make_env, device):
         calls.append(observation)
         actions = rowing(observation)
         if len(calls) == 4:
-            let_go = batch.groups[0].simulation.avatars[0].state.let_go
-            let_go.assign([1] + [0] * (len(let_go) - 1))  # the first one falls
+            released = batch.groups[0].simulation.avatars[0].state.released
+            released.assign([1] + [0] * (len(released) - 1))  # the first one falls
         return actions
 
     found = play("rowing", agent, batch, first_seed=50)

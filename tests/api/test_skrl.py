@@ -64,7 +64,7 @@ def knock_down(env, *where: tuple[int, int]) -> None:
     """The roots of these agents, given as (world, agent), let go."""
     state = env.get_state()
     for world, agent in where:
-        state[f"avatar_{agent}.state.let_go"][world] = 1
+        state[f"avatar_{agent}.state.released"][world] = 1
     env.set_state(state)
 
 

@@ -21,13 +21,13 @@ def displacement(rig, env: int = 0) -> np.ndarray:
 
 def push(rig, force, steps: int = 15, after: int = 30) -> dict[str, np.ndarray]:
     """Push the upper chest for ``steps`` control steps, then watch; what happened at every step."""
-    log = {"tilt": [], "let_go": [], "force": [], "torque": [], "shift": []}
+    log = {"tilt": [], "released": [], "force": [], "torque": [], "shift": []}
     for k in range(steps + after):
         if k < steps:
             rig.push(force)
         rig.step()
         log["tilt"].append(tilt(rig))
-        log["let_go"].append(int(rig.avatar.state.let_go.numpy()[0]))
+        log["released"].append(int(rig.avatar.state.released.numpy()[0]))
         log["force"].append(np.linalg.norm(rig.avatar.state.wrench_force.numpy()[0]))
         log["torque"].append(np.linalg.norm(rig.avatar.state.wrench_torque.numpy()[0]))
         log["shift"].append(displacement(rig))
@@ -57,7 +57,7 @@ def test_a_push_within_the_limits_is_survived(make_rig):
     rig = make_rig(gravity=G, floor=True, room=1.6)
     log = push(rig, (0.0, 1000.0, 0.0))
     assert 5.0 < log["tilt"].max() < 45.0
-    assert not log["let_go"].any()
+    assert not log["released"].any()
     assert log["tilt"][-1] < 2.0
     assert np.linalg.norm(log["shift"][-1]) < 0.02
     # the limits of the wrench, in units of the weight and of a metre
@@ -69,16 +69,16 @@ def test_a_push_within_the_limits_is_survived(make_rig):
 def test_a_push_beyond_the_limits_knocks_down_for_good(make_rig):
     rig = make_rig(gravity=G, floor=True, room=2.0)
     log = push(rig, (0.0, 1500.0, 0.0), steps=15, after=10)
-    assert log["let_go"].any()
-    first = log["let_go"].argmax()
-    assert log["let_go"][first:].all()  # latched
+    assert log["released"].any()
+    first = log["released"].argmax()
+    assert log["released"][first:].all()  # latched
     assert np.all(log["force"][first + 1 :] == 0.0) and np.all(log["torque"][first + 1 :] == 0.0)
     assert log["torque"].max() == pytest.approx(0.7 * rig.mass.sum() * G, rel=1e-3)  # it did what it could
     assert log["tilt"][-1] > 45.0
     rig.reset()
-    assert rig.avatar.state.let_go.numpy()[0] == 0
+    assert rig.avatar.state.released.numpy()[0] == 0
     rig.step(10)
-    assert rig.avatar.state.let_go.numpy()[0] == 0 and tilt(rig) < 0.1
+    assert rig.avatar.state.released.numpy()[0] == 0 and tilt(rig) < 0.1
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_it_lets_go_at_each_limit(make_rig, error, limit, share):
     rig.avatar.state.command_root.assign(root.astype(np.float32)[None])
     rig.command(rotvec, root)
     rig.step()
-    assert rig.avatar.state.let_go.numpy()[0] == (share > 1.0)
+    assert rig.avatar.state.released.numpy()[0] == (share > 1.0)
 
 
 def test_turning_in_place_is_not_a_tilt(make_rig):
@@ -108,14 +108,14 @@ def test_turning_in_place_is_not_a_tilt(make_rig):
     rig.avatar.state.command_rotation.assign(rig.quaternions(yaw))
     rig.command(yaw)
     rig.step()
-    assert rig.avatar.state.let_go.numpy()[0] == 0
+    assert rig.avatar.state.released.numpy()[0] == 0
 
 
 @pytest.mark.parametrize("commanded", [False, True])
 def test_a_body_let_go_falls_freely(make_rig, commanded):
     """Not even by moving its limbs, or by a commanded root, can it push itself off the air."""
     rig = make_rig(gravity=G, room=1.8)
-    rig.avatar.state.let_go.fill_(1)
+    rig.avatar.state.released.fill_(1)
     swing = np.zeros((22, 3))
     for k in range(6):
         if commanded:

@@ -66,7 +66,7 @@ def test_an_undisturbed_course_is_what_the_script_commands(device: str):
     assert len(course.time) == 7 and course.time[-1] == pytest.approx(0.2)
     elbow = Rotation.from_quat(course.local[-1, joint_index("left_elbow")]).as_rotvec()
     np.testing.assert_allclose(elbow, [0.0, 0.0, -0.6], atol=0.01)
-    assert course.joint_errors.max() < 0.5 and not course.failed and not course.let_go
+    assert course.joint_errors.max() < 0.5 and not course.failed and not course.released
     everything = np.ones(len(course.stage.simulation.flesh[0].part), bool)
     assert course.displacements(everything)[-1].max() < 2e-3
 

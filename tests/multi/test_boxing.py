@@ -195,7 +195,7 @@ def test_a_knock_down_ends_the_bout(make_game, play):
     world.reset(seed=0)
     state = world.get_state()
     state["task.score"][0] = (3.0, 0.0)  # points do not help an agent that is down
-    state["avatar_0.state.let_go"][:] = 1
+    state["avatar_0.state.released"][:] = 1
     world.set_state(state)
     [(_, _, terminations, _, infos)] = play(world, 1)
     assert all(terminations.values()) and not world.agents
@@ -211,7 +211,7 @@ def test_points_do_not_help_who_is_down_at_the_gong(make_game, play):
     state = world.get_state()
     state["task.score"][0] = (3.0, 0.0)
     for agent in (0, 1):
-        state[f"avatar_{agent}.state.let_go"][:] = 1
+        state[f"avatar_{agent}.state.released"][:] = 1
     world.set_state(state)
     [(_, _, terminations, truncations, infos)] = play(world, 1)
     assert all(terminations.values()) and not any(truncations.values())
@@ -222,7 +222,7 @@ def test_among_three_the_bout_goes_on(make_game, play):
     world = make_game(BOXING, num_agents=3)
     world.reset(seed=0)
     state = world.get_state()
-    state["avatar_0.state.let_go"][:] = 1
+    state["avatar_0.state.released"][:] = 1
     world.set_state(state)
     [(_, _, terminations, _, infos)] = play(world, 1)
     assert list(terminations.values()) == [True, False, False] and world.agents == ["agent_1", "agent_2"]

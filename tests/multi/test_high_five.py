@@ -279,7 +279,7 @@ def test_when_one_falls_it_is_over_for_both(make_game, play):
     world = make_game(FIVE)
     world.reset(seed=0)
     state = world.get_state()
-    state["avatar_1.state.let_go"][:] = 1
+    state["avatar_1.state.released"][:] = 1
     world.set_state(state)
     [(_, rewards, terminations, _, infos)] = play(world, 1)
     assert all(terminations.values()) and not world.agents

@@ -281,7 +281,7 @@ def test_when_one_falls_it_is_over_for_all(make_game, play):
     world = make_game(PASS)
     world.reset(seed=0)
     state = world.get_state()
-    state["avatar_2.state.let_go"][:] = 1
+    state["avatar_2.state.released"][:] = 1
     world.set_state(state)
     [(_, _, terminations, _, infos)] = play(world, 1)
     assert all(terminations.values()) and [info["root_released"] for info in infos.values()] == [False, False, True]

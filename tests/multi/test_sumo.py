@@ -26,7 +26,7 @@ def knock_down(world, *agents: int) -> None:
     """The roots of these agents let go."""
     state = world.get_state()
     for agent in agents:
-        state[f"avatar_{agent}.state.let_go"][:] = 1
+        state[f"avatar_{agent}.state.released"][:] = 1
     world.set_state(state)
 
 
@@ -104,7 +104,7 @@ def test_nobody_wins_by_a_failure(make_game, play):
     world = make_game(SUMO, **STILL)
     world.reset(seed=0)
     state = world.get_state()
-    state["avatar_1.state.let_go"][:] = 1
+    state["avatar_1.state.released"][:] = 1
     state["particles.u"][0, 0] = 1e6
     world.set_state(state)
     [(_, rewards, terminations, _, infos)] = play(world, 1)
@@ -283,7 +283,7 @@ def test_the_walls_keep_who_is_thrown_out(make_game, play, walls):
     world = make_game(SUMO, num_agents=4, scene={"walls": walls})
     world.reset(seed=0)
     state = world.get_state()
-    state["avatar_1.state.let_go"][:] = 1
+    state["avatar_1.state.released"][:] = 1
     state["particles.u"][0, particles_of(world, 1)] = (-6.0, 0.0, 1.0)
     world.set_state(state)
     reached = []

@@ -12,7 +12,7 @@ from piavatar_envs.tasks.common.root_command import clamp_root
 LEAD, TURN = 0.2, 0.4
 
 
-def clamped(device, rotation, position, command_rotation, command_root, let_go=None):
+def clamped(device, rotation, position, command_rotation, command_root, released=None):
     """The commands after the kernel, quaternions ``xyzw``."""
     n = len(position)
     bones = [np.asarray(a, np.float32)[:, None] for a in (rotation, position, command_rotation)]
@@ -20,7 +20,7 @@ def clamped(device, rotation, position, command_rotation, command_root, let_go=N
         wp.array(a, dtype=t, device=device) for a, t in zip(bones, (wp.quat, wp.vec3, wp.quat), strict=True)
     )
     root = wp.array(np.asarray(command_root, np.float32), dtype=wp.vec3, device=device)
-    down = wp.array(np.zeros(n) if let_go is None else let_go, dtype=int, device=device)
+    down = wp.array(np.zeros(n) if released is None else released, dtype=int, device=device)
     wp.launch(clamp_root, n, [LEAD, TURN, rotations, positions, down, commands, root], device=device)
     return commands.numpy()[:, 0].astype(float), root.numpy().astype(float)
 

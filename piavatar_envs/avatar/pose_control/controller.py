@@ -56,7 +56,7 @@ class PoseController:
         else:
             self._start = tracked.local, tracked.position[:, 0]
         self._root = make_struct(
-            RootState, let_go=state.let_go, wrench_force=state.wrench_force, wrench_torque=state.wrench_torque
+            RootState, released=state.released, wrench_force=state.wrench_force, wrench_torque=state.wrench_torque
         )
         command = make_struct(
             Command,
@@ -118,7 +118,7 @@ class PoseController:
         """Append the same as :func:`command_body`, in a launch for each pass over particles."""
         avatar, model, w, root = self.avatar, self.avatar.model, self._workspaces[step % 2], self._root
         n, threads, body, particles = model.num_envs, avatar.threads, avatar.body, model.particles
-        parameters, let_go, failure = self.parameters, avatar.state.let_go, state.failure
+        parameters, released, failure = self.parameters, avatar.state.released, state.failure
         chunks = (n, warps_of(body.quarters, threads), threads)
         rounds = particle_rounds(model.device, n * avatar.num_points)
         points = (n, particle_threads(model.device, avatar.num_points, rounds))
@@ -132,11 +132,11 @@ class PoseController:
         inputs = [body, parameters, avatar.body_mass, step, self._chunk_threads, failure]
         graph.launch(prepare_body, (n, block), inputs, [w, root], block_dim=block)
 
-        inputs = [body, parameters, state.x, w.record, w.bones, let_go, failure]
+        inputs = [body, parameters, state.x, w.record, w.bones, released, failure]
         outputs = [state.u, avatar.state.motion, state.kinematic, w.pull, w.lean]
         graph.launch(command_particles, points, inputs, outputs, block_dim=BLOCK)
-        if parameters.free_motion or parameters.root_rate > 0.0:  # a root that lets go leaves an unsupported body
-            inputs = [body, parameters, particles, state.x, state.vk, w.bones.center, let_go, failure, threads]
+        if parameters.free_motion or parameters.root_rate > 0.0:  # a released root leaves an unsupported body
+            inputs = [body, parameters, particles, state.x, state.vk, w.bones.center, released, failure, threads]
             graph.launch(sum_motion, (n, int(GROUPS), threads), inputs, [w.corrections], block_dim=BLOCK)
             graph.launch(remove_motions, (n, threads), [body, parameters, failure, threads], [w, root], block_dim=BLOCK)
 
@@ -146,7 +146,7 @@ class PoseController:
             graph.launch(add_to_bones, bones, [body, failure, threads], [w], block_dim=threads)
         inputs = [body, parameters, self._chunk_threads, failure, threads]
         graph.launch(correct_body, (n, threads), inputs, [w], block_dim=threads)
-        inputs = [body, parameters, state.x, w.pull, w.bones, w.change, w.removed, let_go, failure]
+        inputs = [body, parameters, state.x, w.pull, w.bones, w.change, w.removed, released, failure]
         graph.launch(apply_corrections, points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
 
     def _record_injection(self, graph: LaunchGraph, state: State) -> None:

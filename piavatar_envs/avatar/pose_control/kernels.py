@@ -108,14 +108,14 @@ def command_body(
     fit_motion(body, control, step, 1, w, e, 0, 1)
     write_records(body, control, step, w, e, 0, 1)
     hold_body(control, step, body_mass[row(e, body_mass.shape[0])], w, root, e)
-    free = is_free(control, root.let_go[e])
-    let_go = root.let_go[e] != 0
+    free = is_free(control, root.released[e])
+    released = root.released[e] != 0
     center = w.bones.center[e, 0]
     for p in range(body.count):
         at = vector_at(x, e, body.first + p)
         before = vector_at(u, e, body.first + p)
         command_particle(
-            body, control, at, before, w.record, center, let_go, e, p, u, motion, kinematic, w.pull, w.lean
+            body, control, at, before, w.record, center, released, e, p, u, motion, kinematic, w.pull, w.lean
         )
     if free:
         for c in range(chunks):
@@ -253,7 +253,7 @@ def command_particle(
     before: wp.vec3,
     record: wp.array2d(dtype=vec44),
     center: wp.vec3,
-    let_go: bool,
+    released: bool,
     e: int,
     p: int,
     # in and out
@@ -284,7 +284,7 @@ def command_particle(
     way = blended_vector(s, AT_LEAN)
     if velocity_lag > 0.0:
         # a body that nothing supports could not take the reaction
-        if control.free_motion == 0 and not let_go:
+        if control.free_motion == 0 and not released:
             u[e, body.first + p] = before - velocity_lag * (k - motion[e, p])
         motion[e, p] = k
     pulled += pull_gain(control.tone_rate, control.dt) * way
@@ -299,7 +299,7 @@ def command_particles(
     x: wp.array2d(dtype=wp.vec3),
     record: wp.array2d(dtype=vec44),
     bones: RigidFits,
-    let_go: wp.array(dtype=int),
+    released: wp.array(dtype=int),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
@@ -319,7 +319,7 @@ def command_particles(
     p = own[1]
     last = body.count - 1
     center = bones.center[e, 0]
-    gone = let_go[e] != 0
+    gone = released[e] != 0
     n = wp.min(p, last)
     following = vector_at(x, e, body.first + n)
     following_u = vector_at(u, e, body.first + n)
@@ -338,7 +338,7 @@ def remove_motion(
     body: Body, control: PoseControl, w: PoseWorkspace, root: RootState, e: int, thread: int, threads: int
 ):
     """Compute the rigid part of commanded motion that comes off: nothing, where something supports the body."""
-    if is_free(control, root.let_go[e]):
+    if is_free(control, root.released[e]):
         free_motion(body, control, w.corrections, w.bones, w.whole, e, thread, threads, w.removed, w.wrench)
     elif thread == 0:  # a former value would enter the carry
         w.removed.velocity[e] = wp.vec3(0.0)
@@ -496,7 +496,7 @@ def apply_corrections(
     bones: RigidFits,
     change: wp.array2d(dtype=vec8),
     removed: RemovedMotion,
-    let_go: wp.array(dtype=int),
+    released: wp.array(dtype=int),
     failure: wp.array(dtype=int),
     # in and out
     u: wp.array2d(dtype=wp.vec3),
@@ -509,7 +509,7 @@ def apply_corrections(
     e = own[0]
     if failure[e] != 0:
         return
-    free = is_free(control, let_go[e])
+    free = is_free(control, released[e])
     p = own[1]
     last = body.count - 1
     center = bones.center[e, 0]

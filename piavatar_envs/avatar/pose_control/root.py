@@ -2,7 +2,7 @@
 
 A pose-controlled avatar does not balance itself; a six-degree-of-freedom wrench holds the commanded root instead. It is
 a rigid acceleration field over the whole body (no sag), with gravity fed forward and an implicit critically damped PD
-``a = (w^2 (e - dt V) - 2 w V) / (1 + 2 w dt + w^2 dt^2)``. It is bounded, and it lets go for good (until reset) once
+``a = (w^2 (e - dt V) - 2 w V) / (1 + 2 w dt + w^2 dt^2)``. It is bounded, and it is released for good (until reset) once
 the body has been knocked too far: pushes are survived or not.
 
 Commanded motion of a body that nothing supports must carry neither momentum nor angular momentum.
@@ -36,9 +36,9 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 @wp.func
-def is_free(control: PoseControl, let_go: int):
+def is_free(control: PoseControl, released: int):
     """Return whether nothing supports a body, so that commanded motion must carry no momentum."""
-    return control.free_motion != 0 or let_go != 0
+    return control.free_motion != 0 or released != 0
 
 
 @wp.func
@@ -86,8 +86,8 @@ def hold_root(
         or horizontal > control.release_distance
         or wp.abs(error[2]) > control.release_height
     ):
-        root.let_go[e] = 1
-    if root.let_go[e] != 0:
+        root.released[e] = 1
+    if root.released[e] != 0:
         return
     I = whole.inertia[e]
     a = critical_pull(control.root_rate, control.dt, error, whole.velocity[e]) - control.gravity

@@ -349,7 +349,7 @@ def set_springs(
     body_mass: wp.array(dtype=float),
     per_size: float,
     assist: wp.array(dtype=float),
-    let_go: wp.array(dtype=int),
+    released: wp.array(dtype=int),
     torque: wp.array2d(dtype=wp.vec3),
     # out
     factor: wp.array(dtype=float),
@@ -358,7 +358,7 @@ def set_springs(
     """Strength and springs of every body, by its weight times its height; over ``(num_envs, 1 + bones)``.
 
     A muscle that shortens at its greatest speed has no force left: what a torque loses to speed is a damper. The pelvis
-    is assisted where it has not been let go.
+    is assisted where it has not been released.
     """
     e, n = wp.tid()
     m = body_mass[row(e, body_mass.shape[0])]
@@ -370,7 +370,7 @@ def set_springs(
         factor[e] = size
     if n < 2:
         K = wp.where(n == 0, m * _ASSIST_RATE * _ASSIST_RATE, _ASSIST_TORQUE)
-        K *= wp.where(let_go[e] != 0, 0.0, assist[e])
+        K *= wp.where(released[e] != 0, 0.0, assist[e])
         D = 2.0 * K / _ASSIST_RATE
     else:
         share = wp.abs(torque[e, n - 1])
@@ -530,7 +530,7 @@ class TorqueController:
         """Append what begins a control step: strength and springs of the bodies as they are."""
         avatar, joints = self.avatar, self.joints
         avatar.record_clear_support(graph)
-        inputs = [avatar.body, self.gains, avatar.body_mass, self._per_size, self.assist, avatar.state.let_go]
+        inputs = [avatar.body, self.gains, avatar.body_mass, self._per_size, self.assist, avatar.state.released]
         graph.launch(
             set_springs,
             (avatar.model.num_envs, 1 + NUM_JOINTS),

@@ -108,7 +108,7 @@ class Referee:
 
     Attributes:
         pelvis: tracked pelvis joints [m], ``(num_envs, num_agents)``.
-        out: whether the root has let go, the avatar has fallen, or its pelvis is too far from the origin, ``(num_envs,
+        out: whether the root is released, the avatar has fallen, or its pelvis is too far from the origin, ``(num_envs,
             num_agents)``.
     """
 
@@ -131,7 +131,7 @@ class Referee:
             graph.launch(
                 find_out,
                 env.num_envs,
-                [agent, self.radius, self.least, avatar.body, avatar.tracked.position, avatar.state.let_go],
+                [agent, self.radius, self.least, avatar.body, avatar.tracked.position, avatar.state.released],
                 [self.pelvis, self.out],
             )
 
@@ -210,7 +210,7 @@ def find_out(
     least: wp.vec2,
     body: Body,
     position: wp.array2d(dtype=wp.vec3),
-    let_go: wp.array(dtype=int),
+    released: wp.array(dtype=int),
     # out
     pelvis: wp.array2d(dtype=wp.vec3),
     out: wp.array2d(dtype=wp.bool),
@@ -218,7 +218,7 @@ def find_out(
     """Write an agent's pelvis, and whether it is down (lower than ``least``) or beyond ``radius`` [m]."""
     e = wp.tid()
     pelvis[e, agent] = position[e, 0]
-    down = let_go[e] != 0 or is_down(heights_of(body, e, position), least)
+    down = released[e] != 0 or is_down(heights_of(body, e, position), least)
     out[e, agent] = down or from_centre(position[e, 0]) > radius
 
 

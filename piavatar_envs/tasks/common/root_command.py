@@ -1,7 +1,7 @@
 """Root command clamp: the commanded root keeps within a distance and a turn of the tracked pelvis.
 
 Root actions move the command, and the root wrench pulls the body after it, the harder the farther the command is ahead.
-Without the clamp the command of a blocked body would run away from it until the root lets go. With it the command
+Without the clamp the command of a blocked body would run away from it until the root is released. With it the command
 waits, and the greatest lead bounds how hard the body pushes.
 """
 
@@ -43,7 +43,7 @@ def record_root_clamp(
         graph.launch(
             clamp_root,
             env.num_envs,
-            [lead, turn, tracked.rotation, tracked.position, state.let_go],
+            [lead, turn, tracked.rotation, tracked.position, state.released],
             [state.command_rotation, state.command_root],
         )
         references.append((state.command_rotation, state.command_root))
@@ -65,14 +65,14 @@ def clamp_root(
     turn: float,
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
-    let_go: wp.array(dtype=int),
+    released: wp.array(dtype=int),
     # in and out
     command_rotation: wp.array2d(dtype=wp.quat),
     command_root: wp.array(dtype=wp.vec3),
 ):
     """Clamp the command's horizontal place and its heading; its height and tilt stay."""
     e = wp.tid()
-    if let_go[e] != 0:
+    if released[e] != 0:
         return
     command_root[e] = clamp_to_circle(command_root[e], position[e, 0], lead)
     q = command_rotation[e, 0]
