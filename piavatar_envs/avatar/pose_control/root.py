@@ -2,7 +2,7 @@
 
 A pose-controlled avatar does not balance itself; a six-degree-of-freedom wrench holds the commanded root instead. It is
 a rigid acceleration field over the whole body (no sag), with gravity fed forward and an implicit critically damped PD
-``a = (w^2 (e - dt V) - 2 w V) / (1 + 2 w dt + w^2 dt^2)``. It is bounded, and it is released for good (until reset) once
+``a = (w^2 (e - dt V) - 2 w V) / (1 + 2 w dt + w^2 dt^2)``. It is bounded, and is released until the next reset once
 the body has been knocked too far: pushes are survived or not.
 
 Commanded motion of a body that nothing supports must carry neither momentum nor angular momentum.

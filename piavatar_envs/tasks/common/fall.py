@@ -46,7 +46,7 @@ UNDER_TORQUES_DOC = f'under `control="pd"` or `"torque"` an avatar falls: {FALLE
 
 
 def least_heights(config: EnvConfig, fall: FallConfig) -> wp.vec2:
-    """Return the least shares of head and pelvis; minus infinity where a wrench holds the root, which then lets go."""
+    """Return the least shares of head and pelvis; minus infinity where a wrench holds the root until it is released."""
     if config.control.mode == "pose":
         return wp.vec2(-math.inf, -math.inf)
     return fall.least
