@@ -1,57 +1,69 @@
-"""Articulated momentum projection: joints that move under torques, in a body of flesh that moves with them.
+"""Torque control: joints that move under torques, in a body of flesh that moves with them.
 
-The velocity of a particle is ``v = u + J qdot``: what the joints cannot do, and what they do, with the skinning
-Jacobian ``J`` at the particles. Every substep gives the joints what they can take over of the physical velocity, and
-lets torques act on them:
+The velocity of a particle is split into two parts, ``v = u + J qdot``, with the skinning Jacobian ``J`` at the
+particles. ``J qdot`` is the part the joints can produce, ``u`` the remainder, which the MPM substep advances as the
+physical velocity. Moving velocity from one part to the other changes the velocity of no particle. Torques act on the
+joints; gravity, the ground and other bodies act on the particles, and reach the joints by the projection (step 3).
 
-    M dq = J^T m u,   qdot <- qdot + dq,   u <- u - J dq,   c <- c + dq
-    (M + A) d = dt (K e + tau) + J_b^T p - A (qdot + c),   A = dt D + dt^2 K
-    qdot <- qdot + d + c,   u <- u - J c,   vk = J qdot
+A substep, see :meth:`ArticulatedBody.record_substep`:
 
-``K e`` is a spring towards a target pose and ``D`` a damper, both implicit in time, ``tau`` a torque, a joint each;
-``p`` are impulses on points of bones that come to a boundary, see
-:mod:`piavatar_envs.avatar.torque_control.bone_contact`. Light joints take over less than all: to the first ``M = J^T m
-J`` some inertia is added, which torques are not divided by, see
-:func:`piavatar_envs.avatar.torque_control.mass_matrix.grid_inertia`. ``c`` is what all else, contact, weight and
-flesh, did to the joints in the last substep, and is expected to do again. The springs take it into account, see
-:mod:`piavatar_envs.avatar.torque_control.dynamics`, and so does the split: the joints go on with the velocity that
-will be left of their push, and the rest of the push, ``-J c``, waits in ``u`` for what is to stop it. A free limb has
-``c = 0``; of one that stands on the ground nothing moves. (All of ``d`` put into ``qdot``, the push of a foot and the
-answer of the ground are two large opposite velocities, of which one strains the foot: it is torn to pieces. All of it
-put into ``u``, the grid blurs it, and light limbs shake.) If what is expected does not come, ``-J c`` is taken over in
-the next substep: nothing is lost.
+1. *Pull of the flesh* (:func:`~piavatar_envs.avatar.torque_control.flesh_coupling.attach_flesh`). The change of
+   ``J qdot`` with the pose is added to ``u``: these are the centrifugal forces. Flesh may be pulled to the bones,
+   implicitly and critically damped, ``u' = (u + dt w^2 s) / (1 + dt w)^2``, with the displacement ``s`` from the
+   particle to its skinned place. The joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, corrected by a
+   rigid motion to exactly its momentum.
+2. *Mass matrix* ``M = J^T m J``, if due; see :mod:`piavatar_envs.avatar.torque_control.mass_matrix`.
+3. *Projection.* The joints take over what they can of the physical velocity::
 
-Muscles have limits. The pelvis may be held by springs from outside.
+       M dq = J^T m u,   qdot <- qdot + dq,   u <- u - J dq,   c <- c + dq
 
-The first line moves velocity from one share to the other and changes no particle's, whatever the mass matrix. Torques
-between bones must change neither momentum nor angular momentum. With the mass matrix of this moment they would not; it
-may be a few substeps old, so what rigid motion ``J d`` has too much comes off, found from the bones' moments as they
-are. At the end of a substep that had a new one the pose is fitted to the particles, too (``dq = M^-1 J^T m (x - LBS)``,
-with what they were off their places at its beginning).
+   For light joints inertia is added for the projection only; the torque solve omits it
+   (:func:`~piavatar_envs.avatar.torque_control.mass_matrix.grid_inertia`).
+4. *Torques*, springs, tissue and bone contact, implicit in time
+   (:mod:`~piavatar_envs.avatar.torque_control.dynamics`, :mod:`~piavatar_envs.avatar.torque_control.bone_contact`)::
 
-Flesh may be held to the bones by a pull, implicit and critically damped, ``u' = (u + dt w^2 d)/(1 + dt w)^2`` with
-``d`` from the particle to its skinned place; the joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, with
-exactly its momentum. The grid blurs what a pull gives a single particle, and under load a particle slips from its place
-for the pull to carry it: by millimetres where cells have centimetres. After every control step firm particles, those of
-bones, may be put into their places, if these are not beyond a boundary. No velocity changes, and no momentum; what a
-way ``d`` has of angular momentum, ``m d x v``, the affine velocity of the particle takes back. The centre of mass moves
-by the mean of these ways: hundredths of a millimetre, in all directions. The pull, and the fit of the pose, go on as if
-the particle were where it was: it remembers the way. Else the load would begin to slip anew, and feet that press on the
-ground would not come to rest.
+       (M + A) d = dt (K e + tau) + J_b^T p - A (qdot + c),   A = dt D + dt^2 K
 
-The last ``J`` is that of the middle of the substep, particles and pose half a step on, by the velocity they begin with
-(the explicit midpoint rule): limbs that turn keep their width. To it comes what skinning does besides: where bones have
-a particle at different places, each turns its own (:func:`piavatar_envs.avatar.torque_control.dynamics.motion_apart`).
-So ``vk`` takes particles from their skinned places to their skinned places, however joints turn and bend. The velocity
-of a particle stays what it was; what ``vk`` is less is more in ``u``.
+   Torques between bones must change neither momentum nor angular momentum. Because ``M`` may be a few substeps old, the
+   rigid motion that ``J d`` has in excess is subtracted, computed from the current moments of the bones.
+5. *Advance.* The joints move on with the predicted velocity, and particles get the rest::
 
-Whenever ``J`` has changed, and it does with every move, the change of ``J qdot`` goes to ``u``: these are the
-centrifugal forces. They are explicit in time, so light limbs that nothing damps gain a little energy, and a mass matrix
-of more than some 5 ms ago makes fast limbs unstable.
+       qdot <- qdot + d + c,   u <- u - J c,   vk = J qdot
 
-The controller takes joint targets or torques and returns forces of muscles. Gravity, the ground and
-other bodies act on the whole body, and only torques between its bones act back. An assisting spring may help the
-pelvis, as a curriculum: at ``assist`` 1 it nearly holds the pelvis alone, at 0 there is none.
+   The predicted reaction ``-J c`` is added to ``u``, so that contact can cancel it. For a free limb ``c = 0``; a limb
+   blocked by the ground does not move. If the predicted change does not occur, the next projection takes ``-J c`` back.
+   ``vk`` uses ``J`` at the middle of the substep (explicit midpoint rule), so that turning limbs keep their width, and
+   includes the velocity that skinning adds where bones place a particle differently
+   (:func:`~piavatar_envs.avatar.torque_control.dynamics.motion_apart`).
+6. *Fit*, after a new mass matrix: the pose is moved by a share of ``M^-1 J^T m (x - LBS)``, with the particles'
+   displacements from their skinned places ``LBS`` at the beginning of the substep.
+
+After a control step, :func:`~piavatar_envs.avatar.torque_control.flesh_coupling.put_in_place` moves firm particles,
+those of bones, to their skinned places, unless these are beyond a boundary. It changes no velocity; the angular
+momentum ``m s x v`` of displacement ``s`` is compensated in the affine velocity ``C``. ``slip`` stores the displacement,
+so that the pull stays the same and feet come to rest.
+
+Symbols:
+
+===========  ===========================================================================================
+``qdot``     generalised velocity of the joints, see :mod:`~piavatar_envs.avatar.torque_control.mass_matrix`
+``M``        mass matrix of the joints
+``K e``      torque of springs ``K`` with the error ``e`` between target and pose
+``D``        damping
+``A``        implicit inertia of springs and dampers
+``tau``      torques of the joints
+``p, J_b``   impulses on points of bones that touch a boundary, and the Jacobian of these points
+``d``        velocity change by step 4
+``c``        velocity change from contact, gravity and flesh in the previous substep, the prediction for this one
+===========  ===========================================================================================
+
+Limits:
+
+- Muscles have a greatest torque. There is no external support except ``root_assist``, springs on the pelvis that serve
+  as a curriculum: at 1 they nearly hold the pelvis alone, at 0 there are none.
+- Centrifugal forces are explicit in time, so light limbs that nothing damps gain a little energy, and fast limbs become
+  unstable with a mass matrix older than :data:`~piavatar_envs.avatar.torque_control.mass_matrix.LONGEST_REFRESH`.
+- Moving firm particles shifts the centre of mass by the mean of their displacements.
 """
 
 from __future__ import annotations
@@ -100,20 +112,20 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
 class ArticulatedBody:
-    """Joints of one avatar in every environment, and what moves them.
+    """Joints of one avatar in every environment, with the springs, torques and contacts that move them.
 
     Attributes:
-        state: pose of the bones, generalised velocity and torques; what a checkpoint holds.
-        target: where the springs pull to, and the torques.
+        state: pose of the bones, generalised velocity and torques; stored in checkpoints.
+        target: target pose of the springs, and the torques.
         springs: of the pelvis and of all joints.
-        strength: limits of what springs and torques of the joints do; none until :meth:`set_strength`.
-        tissue: what resists in the joints; nothing until :meth:`set_tissue`.
+        strength: limits of the torques of the joints, springs included; none until :meth:`set_strength`.
+        tissue: passive resistance of the joints; none until :meth:`set_tissue`.
         attachment: rates of the pulls that hold flesh to bones, ``(1 or num_envs, num_points)`` [1/s].
-        firm: particles that are put into their places on the bones, by index in the body.
+        firm: particles that are moved to their skinned places, by index in the body.
         solid: whether bones stop at boundaries.
         mass: the mass matrix.
-        impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` is what held the pelvis.
-        support: force and torque of what holds the pelvis: every substep adds its share of a control step's mean.
+        impulse: of muscles and tissue in the last substep, ``(num_envs, 69)``; ``[:, :6]`` of the pelvis springs.
+        support: force and torque of the pelvis springs: every substep adds its share of a control step's mean.
     """
 
     def __init__(
@@ -130,20 +142,19 @@ class ArticulatedBody:
         """Allocate.
 
         Args:
-            points: the body as its drive was built from it.
+            points: the body on the host.
             body: the same on the device.
             model: of the world.
             stiffness: of the springs, as :class:`Springs` has it, shape ``(1 or num_envs, 23)``.
             damping: likewise.
             attachment: rates of the pulls that hold flesh to bones, shape ``(1 or num_envs, num_points)`` [1/s];
                 without them, or where they are 0, flesh is held by its own stiffness only.
-            firm: which particles are put into their places on the bones after every control step, shape
+            firm: flags of the particles that are moved to their skinned places after every control step, shape
                 ``(num_points,)`` bool; none if not given.
             solid: whether bones stop at boundaries, see :mod:`piavatar_envs.avatar.torque_control.bone_contact`.
 
         Raises:
-            ValueError: a stiffness, damping or rate is negative or not finite, or the shape of one, or of ``firm``, is
-                another one.
+            ValueError: a stiffness, damping or rate is negative or not finite, or a shape is wrong.
         """
         n, device = model.num_envs, model.device
         rates = np.zeros((1, points.num_points)) if attachment is None else attachment
@@ -182,7 +193,7 @@ class ArticulatedBody:
         self.set_tissue(without[:, 0], without[:, 0], -everywhere, everywhere, [])
 
     def _allocate(self) -> TorqueWorkspace:
-        """Return the arrays of a substep."""
+        """Return the zeroed arrays of a substep."""
         n, s, mass, device = self.model.num_envs, self.state, self.mass, self.model.device
 
         def rows(count: int, columns: int, dtype: type = float) -> wp.array:
@@ -219,24 +230,24 @@ class ArticulatedBody:
         return wp.array(np.ascontiguousarray(value, np.float32), dtype=dtype, device=self.model.device)
 
     def set_strength(self, lower: np.ndarray, upper: np.ndarray, rows: int) -> None:
-        """Limit the torques of the joints; see :func:`make_strength`. To be called before anything is recorded."""
+        """Limit the torques of the joints, see :func:`make_strength`; call it before anything is recorded."""
         self.strength = make_strength(lower, upper, rows, self.model.device)
 
     def set_tissue(
         self, damping: np.ndarray, stop: np.ndarray, lower: np.ndarray, upper: np.ndarray, locked: Sequence[int]
     ) -> None:
-        """Let joints resist; see :func:`make_tissue`. To be called before anything is recorded."""
+        """Set the passive resistance, see :func:`make_tissue`; call it before anything is recorded."""
         self.tissue = make_tissue(damping, stop, lower, upper, locked, self.model.device)
         besides = np.r_[np.zeros(3), np.repeat(self._inertia + self.tissue.lock.numpy(), 3)]
         own = self._workspace.diagonals[: self.model.num_envs]
         own.assign(np.broadcast_to(besides.astype(np.float32), own.shape))
 
     def record_pose(self, graph: LaunchGraph, state: State) -> None:
-        """Append: places and motion of the bones as the joints are now, if something else than a substep moved them."""
+        """Append the computation of the bones' places and motion, for joints that were not moved by a substep."""
         self._record_stage(graph, begin_substep, [self.body], state)
 
     def record_mass(self, graph: LaunchGraph, state: State) -> None:
-        """Append: build the mass matrix where particles and joints are, if no substep does."""
+        """Append the sums of the bones' moments and the mass matrix, outside of a substep."""
         w = self._workspace
         graph.launch(
             sum_moments,
@@ -248,26 +259,26 @@ class ArticulatedBody:
         self._record_mass(graph, state)
 
     def _record_mass(self, graph: LaunchGraph, state: State) -> None:
-        """Append: build the mass matrix from the bones' moments, and what follows from it."""
+        """Append the mass matrix from the bones' moments, and its factors."""
         self.mass.record_sums(graph, state, self.state.position)
         threads = int(MASS_BLOCK) if self.threads > 1 else 1
         inputs = [self.body, self.mass.pairs, self.model.step.dt, self.springs, self.tissue, state.failure]
         graph.launch(build_mass, (self.model.num_envs, threads), inputs, [self._workspace], block_dim=threads)
 
     def _record_stage(self, graph: LaunchGraph, stage: wp.Kernel, inputs: list, state: State, *more: Any) -> None:
-        """Append what a warp does for an environment."""
+        """Append ``stage`` with one warp an environment."""
         inputs, outputs = [*inputs, state.failure], [*more, self._workspace]
         graph.launch(stage, (self.model.num_envs, self.threads), inputs, outputs, block_dim=self.threads)
 
     def record_substep(self, graph: LaunchGraph, state: State, scratch: Scratch, step: int) -> None:
-        """Append what the joints do before an MPM substep: take over, act, and move the pose on.
+        """Append the stages that precede an MPM substep: pull, mass matrix, projection, torques, and the new pose.
 
         Args:
-            graph: records.
+            graph: receives the launches.
             state: of the particles.
-            scratch: of the world, whose sensors record what bones meet.
-            step: which substep of its control step it is. The first one finds joints wherever they are; all others go
-                on from the one before.
+            scratch: of the world, whose sensors record the impulses on bones.
+            step: index of the substep in its control step. The first one recomputes places and motion of the bones; all
+                others use those that the substep before has left.
         """
         model, w, fit = self.model, self._workspace, self.mass.is_due(step)
         if step == 0:
@@ -282,7 +293,7 @@ class ArticulatedBody:
         graph.launch(take_over, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
 
     def _ground(self, scratch: Scratch) -> Ground:
-        """Return the boundaries that bones meet, and the sensors."""
+        """Return the boundaries and sensors that bone contact uses."""
         model = self.model
         return make_struct(
             Ground,
@@ -294,7 +305,7 @@ class ArticulatedBody:
         )
 
     def _record_pull(self, graph: LaunchGraph, state: State) -> None:
-        """Append the pass over particles that pulls them to the bones, and sums what joints are to take over."""
+        """Append the pass that pulls particles to the bones, and sums the momenta that are projected on the joints."""
         block = PARTITION_THREADS if self.threads > 1 else 1
         dim = (self.model.num_envs, self._partitions.start.shape[0] - 1, block)
         inputs = [self.body, self._partitions, self.model.step.dt, self.model.particles.mass]
@@ -302,9 +313,9 @@ class ArticulatedBody:
         graph.launch(attach_flesh, dim, inputs, [state.u, state.vk, self._workspace], block_dim=PARTITION_THREADS)
 
     def record_end(self, graph: LaunchGraph, state: State) -> None:
-        """Append what ends a control step: firm particles are put into their places on the bones as they are now.
+        """Append the end of a control step: firm particles are moved to their skinned places.
 
-        Blocks of the grid are not marked where they come to: the next control step marks all anew.
+        Grid blocks are not activated for the new positions; the next control step activates all.
         """
         if self.firm.size == 0:
             return
@@ -316,7 +327,7 @@ class ArticulatedBody:
 
 #: Longest substep with joints under torques [s].
 LONGEST_SUBSTEP = 0.004
-#: Of the assisting spring that turns the pelvis upright [N m/rad].
+#: Stiffness of the assisting spring that turns the pelvis upright [N m/rad].
 ASSIST_TORQUE = 1500.0
 _FASTEST = wp.constant(FASTEST)
 _ASSIST_TORQUE, _ASSIST_RATE = wp.constant(ASSIST_TORQUE), wp.constant(ROOT_RATE)
@@ -328,10 +339,10 @@ class TorqueControl:
     """Parameters of a torque controller, named like the settings of ``control`` that they follow from.
 
     Attributes:
-        muscles: of the reference adult; those of the body follow from its weight times its height.
-        root_assist: of the pelvis at first, 0 to 1.
+        muscles: those of the reference adult; the body's are scaled by its mass times its height.
+        root_assist: initial assistance of the pelvis, 0 to 1.
         flesh_rate: rates of the pulls that hold flesh to bones, shape ``(P,)`` [1/s].
-        firm_bones: particles that are put into their places on the bones after every control step, ``(P,)`` bool.
+        firm_bones: particles that are moved to their skinned places after every control step, ``(P,)`` bool.
         bone_contact: whether bones stop at boundaries.
     """
 
@@ -355,10 +366,10 @@ def set_springs(
     factor: wp.array(dtype=float),
     springs: Springs,
 ):
-    """Strength and springs of every body, by its weight times its height; over ``(num_envs, 1 + bones)``.
+    """Set strength and springs of every body by its mass times its height; over ``(num_envs, 1 + bones)``.
 
-    A muscle that shortens at its greatest speed has no force left: what a torque loses to speed is a damper. The pelvis
-    is assisted where it has not been released.
+    A muscle that shortens at its greatest speed has no force left, so each torque adds a damper. The pelvis is assisted
+    unless it has been released.
     """
     e, n = wp.tid()
     m = body_mass[row(e, body_mass.shape[0])]
@@ -406,7 +417,7 @@ def reset_joints(
 
 @wp.func
 def spin_between(before: wp.quat, after: wp.quat, time: float):
-    """Constant angular velocity by which a rotation becomes another one in a ``time`` [rad/s]."""
+    """Return the constant angular velocity that turns ``before`` into ``after`` within ``time`` [rad/s]."""
     return quat_log(after * wp.quat_inverse(before)) / time
 
 
@@ -420,9 +431,9 @@ def set_joints_in_motion(
     # out
     velocity: wp.array2d(dtype=float),
 ):
-    """Set the velocity of the masked joints that reaches the pose ``after`` in a ``time`` [s]; over ``(E, bones)``.
+    """Set the joint velocity that reaches the pose ``after`` within ``time`` [s], if masked; over ``(E, bones)``.
 
-    Joints that only found it in their particles would take it for what the world does to them in every substep.
+    Otherwise the projection would count this velocity as an external change ``c``.
     """
     e, b = wp.tid()
     if not mask[e]:
@@ -445,24 +456,24 @@ def clear_slip(mask: wp.array(dtype=wp.bool), slip: wp.array2d(dtype=wp.vec3)):
 
 
 class TorqueController:
-    """Lets torques act between the bones of one avatar in every environment.
+    """Controller that applies torques between the bones of one avatar in every environment.
 
     Attributes:
         avatar: the avatar.
         joints: its articulated body.
-        assist: of the pelvis, ``(num_envs,)``, 0 to 1; what is written here holds until it is written again.
+        assist: assistance of the pelvis, ``(num_envs,)``, 0 to 1; may be written at any time.
         gains: springs and dampers of the reference adult's joints, ``(1, 23)``.
-        first: the pose that bodies are on their way to when an episode begins, and reach after a control step: local
-            rotations and root, as commands; None where they begin at rest. To be set before a reset is recorded.
+        first: the pose that bodies reach one control step after an episode begins: local rotations and root, as
+            commands; None for a start at rest. Set it before a reset is recorded.
     """
 
     def __init__(self, avatar: Avatar, points: BodyPoints, parameters: TorqueControl) -> None:
         """Allocate.
 
         Args:
-            avatar: the avatar, whose goals the springs pull to.
+            avatar: the avatar; its goals are the targets of the springs.
             points: the body that it was built from.
-            parameters: of the joints.
+            parameters: muscles, assistance and coupling of the flesh.
         """
         n, model, muscles = avatar.model.num_envs, avatar.model, parameters.muscles
         self.avatar = avatar
@@ -486,7 +497,7 @@ class TorqueController:
         stiffness, damping = (wp.array(values, dtype=float, device=model.device) for values in gains)
         self.gains = make_struct(Springs, stiffness=stiffness, damping=damping)
         self.assist = wp.full(n, parameters.root_assist, dtype=float, device=model.device)
-        # the height that goes with the joints' span in the first body
+        # height over the span from foot to head joint, in the first body
         joints, rest = points.joints[0], points.rest[0]
         span = float(joints[joint_index("head"), 2] - joints[joint_index("left_foot"), 2])
         self._per_size = float(np.ptp(rest[:, 2])) / span / (REFERENCE_MASS * REFERENCE_HEIGHT)
@@ -495,25 +506,25 @@ class TorqueController:
 
     @property
     def state(self) -> JointState:
-        """Return the joints' state: all that a checkpoint holds besides :attr:`assist`."""
+        """Return the joints' state, which checkpoints store together with :attr:`assist`."""
         return self.joints.state
 
     @property
     def moves_particles(self) -> bool:
-        """Return whether the end of a control step puts firm particles into their places."""
+        """Return whether the end of a control step moves firm particles."""
         return self.joints.firm.size > 0
 
     def release(self, joints: list[int]) -> None:
-        """Take the springs from joints, by index, that torques alone shall move."""
+        """Remove the springs of ``joints``, by index, so that torques alone move them."""
         for array in (self.gains.stiffness, self.gains.damping):
             values = array.numpy()
             values[0, [1 + joint for joint in joints]] = 0.0
             array.assign(values)
 
     def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
-        """Append: put the joints of the masked environments into the pose in which the avatar has been placed.
+        """Append the reset of the masked environments: joints take the pose in which the avatar has been placed.
 
-        They are at rest, or on their way to :attr:`first`.
+        They start at rest, or with the velocity that reaches :attr:`first`.
         """
         avatar, s = self.avatar, self.state
         n, placed = avatar.model.num_envs, avatar.placed
@@ -527,7 +538,7 @@ class TorqueController:
             graph.launch(set_joints_in_motion, (n, NUM_JOINTS), inputs, [s.velocity])
 
     def record_begin(self, graph: LaunchGraph) -> None:
-        """Append what begins a control step: strength and springs of the bodies as they are."""
+        """Append the start of a control step: strength and springs for the current bodies."""
         avatar, joints = self.avatar, self.joints
         avatar.record_clear_support(graph)
         inputs = [avatar.body, self.gains, avatar.body_mass, self._per_size, self.assist, avatar.state.released]
@@ -539,11 +550,11 @@ class TorqueController:
         )
 
     def record_before_substep(self, graph: LaunchGraph, state: State, scratch: Scratch, step: int) -> None:
-        """Append what the joints do before MPM substep ``step`` of a control step."""
+        """Append the stages that precede MPM substep ``step`` of a control step."""
         self.joints.record_substep(graph, state, scratch, step)
 
     def record_end(self, graph: LaunchGraph, state: State) -> None:
-        """Append what ends a control step: firm particles are put into their places."""
+        """Append the end of a control step: firm particles are moved to their skinned places."""
         self.joints.record_end(graph, state)
 
     def arrays(self) -> dict[str, wp.array]:
@@ -552,10 +563,10 @@ class TorqueController:
 
 
 def checked_assist(share: float | np.ndarray, num_envs: int) -> np.ndarray:
-    """Help for the pelvis in every environment, ``(num_envs,)`` float32, from one share or as many.
+    """Return the assistance in every environment, ``(num_envs,)`` float32, from one share or one for each.
 
     Raises:
-        ValueError: it is out of range, or of another shape.
+        ValueError: a share is outside of [0, 1], or the shape is wrong.
     """
     shares = np.asarray(share, np.float32)
     if shares.shape not in ((), (num_envs,)) or not ((shares >= 0.0) & (shares <= 1.0)).all():

@@ -1,27 +1,22 @@
-"""What velocities of the joints do to bones and particles: the skinning Jacobian ``J``, applied and never stored.
+"""Joint dynamics: motion of bones and particles, momentum of particles at the joints, and torques implicit in time.
 
-A generalised velocity is that of the pelvis and, for every joint, the angular velocity against its parent in the
-world's axes; see :mod:`piavatar_envs.avatar.torque_control.mass_matrix`. Each bone then has a rigid motion, and a
-particle the blend of those of its bones: at the particle, not at its skinned place, or angular momentum would not be
-kept.
+The symbols are those of :mod:`piavatar_envs.avatar.torque_control.controller`; a generalised velocity is as
+:mod:`piavatar_envs.avatar.torque_control.mass_matrix` defines it. The skinning Jacobian ``J`` is applied and never
+stored: a generalised velocity gives each bone a rigid motion, and a particle the blend of its bones' motions. The blend
+is evaluated at the particle, not at its skinned place; otherwise angular momentum would not be conserved.
 
-What momentum the joints have to do with: that of the particles as they see it, and that which they must not make.
-
-What turns the joints in a substep: springs, muscles with their limits, tissue that resists; implicit in time.
-
-The impulse of a spring ``K`` and a damper ``D`` over a substep depends on the velocity at its end. The joints know what
-they themselves will change, ``d``; what else will (contact, weight, flesh) is not known yet when they act. It is taken
-to be what it was in the last substep, ``c``, and the impulse is
+The impulse of a spring ``K`` and a damper ``D`` over a substep depends on the velocity at its end. The change ``d`` by
+the joints themselves is solved for; the change by contact, weight and flesh is predicted to be that of the last
+substep, ``c``. The impulse is
 
     dt K e - A (v + d),   v = qdot + c,   A = dt D + dt^2 K.
 
-Without this a limb that is blocked transmits ``M / (M + A)`` of its torque only: its damper resists a motion that
-contact will take away, and a light foot under a strong damper could not push. With it the torque of a blocked limb goes
-to ``K e`` as ``(A / (M + A))^n`` goes to zero, and that of a free one is unchanged.
+Without ``c`` a blocked limb would transmit only ``M / (M + A)`` of its torque, because its damper would resist a motion
+that contact is going to stop. With it the torque of a blocked limb approaches ``K e`` as ``(A / (M + A))^n`` over ``n``
+substeps, and that of a free limb is unchanged.
 
-Muscles have limits. Where the solution asks more of a joint than it has, the joint gives what it has, no longer a
-spring then, and all are solved for once more, so that the others know. (Cutting the impulses alone lets light limbs
-blow up.)
+Where the solution exceeds the strength of a joint, the joint applies its greatest torque instead of a spring, and the
+system is solved again, so that all other joints respond to it.
 """
 
 from __future__ import annotations
@@ -53,20 +48,20 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 @wp.func
 def triple_of(q: wp.array2d(dtype=float), e: int, first: int):
-    """Three components of a generalised vector."""
+    """Return three components of a generalised vector, from index ``first`` on."""
     return wp.vec3(q[e, first], q[e, first + 1], q[e, first + 2])
 
 
 @wp.func
 def set_triple(q: wp.array2d(dtype=float), e: int, first: int, v: wp.vec3):
-    """Write three components of a generalised vector."""
+    """Write three components of a generalised vector, from index ``first`` on."""
     for i in range(3):
         q[e, first + i] = v[i]
 
 
 @wp.func
 def joint_alone(position: wp.array2d(dtype=wp.vec3), q: wp.array2d(dtype=float), row: int, e: int, b: int):
-    """Rigid motion that joint ``b`` alone gives to what it carries; the pelvis' place moves with the first one."""
+    """Return the rigid motion that joint ``b`` alone adds to all bones beyond it; joint 0 also moves the pelvis."""
     w = triple_of(q, row, 3 + 3 * b)
     v = wp.vec3()
     if b == 0:
@@ -81,13 +76,13 @@ _ADD = "value[k] += up < 0 ? 0.0f : more;"
 
 @wp.func_native(over_ancestors(6, _ADD))
 def add_ancestors6(value: vec8, parent: int, levels: int) -> vec8:
-    """Add up six numbers of the lanes of a warp, one bone each, over all ancestors of a lane's bone and itself."""
+    """Sum a per-bone value from the root to each lane's bone: six numbers, one bone a lane."""
     ...
 
 
 @wp.func_native(over_ancestors(3, _ADD))
 def add_ancestors3(value: wp.vec3, parent: int, levels: int) -> wp.vec3:
-    """Do the same as :func:`add_ancestors6` for a vector."""
+    """Run :func:`add_ancestors6` for a vector of three numbers."""
     ...
 
 
@@ -103,9 +98,10 @@ def spread_motion(
     # out
     field: wp.array2d(dtype=vec8),
 ):
-    """Rigid motion of every bone under generalised velocity ``q[row]``: velocity where the pelvis joint is, and spin.
+    """Compute the rigid motion of every bone under generalised velocity ``q[row]``.
 
-    A thread that is alone goes through the bones in their order, parents first. Each lane of a warp has a bone.
+    ``field`` gets velocity at the pelvis joint [m/s] and spin [rad/s]. A single thread processes the bones in their
+    order, parents first; in a warp each lane has a bone.
     """
     sync_threads(threads)
     if threads == 1:
@@ -124,21 +120,22 @@ def spread_motion(
 
 @wp.func
 def motion_apart(b: vec12):
-    """Return the velocity that bones give a particle besides the blend of their motions at its place [m/s].
+    """Return the velocity from bones that place the particle differently, missing in the blended motion [m/s].
 
-    Of :func:`piavatar_envs.avatar.skinning.blend_images`. Linear blend skinning has a particle where its bones have it
-    in the mean. In a bent joint they have it at places that are centimetres apart, and each turns its own: the mean of
-    that is not what their mean motion does to the mean place. Without it particles would leave their places with every
-    turn. Rigid motion has nothing of it.
+    ``b`` is a record of :func:`piavatar_envs.avatar.skinning.blend_images`. Linear blend skinning places a particle at
+    the mean of its bones' images. In a bent joint these lie apart, and each bone turns its own image, so that the mean
+    of their velocities differs from the mean motion at the mean place. Without this term particles would drift from
+    their skinned places with every turn. It is zero for a rigid motion.
     """
     return wp.vec3(b[9], b[10], b[11]) - wp.cross(wp.vec3(b[3], b[4], b[5]), wp.vec3(b[6], b[7], b[8]))
 
 
 @wp.func
 def blended_motion(b: vec12, arm: wp.vec3):
-    """Return the blend of the bones' first motions, ``arm`` from where their velocity is [m/s].
+    """Return the velocity of the bones' blended first motions at ``arm`` from their reference point [m/s].
 
-    Of :func:`piavatar_envs.avatar.skinning.blend_images`, or of :func:`piavatar_envs.avatar.skinning.blend_steps`.
+    ``b`` is a record of :func:`piavatar_envs.avatar.skinning.blend_images` or
+    :func:`piavatar_envs.avatar.skinning.blend_steps`.
     """
     return wp.vec3(b[0], b[1], b[2]) + wp.cross(wp.vec3(b[3], b[4], b[5]), arm)
 
@@ -155,14 +152,14 @@ def take_over(
     u: wp.array2d(dtype=wp.vec3),
     driven: Kinematic,
 ):
-    """Write ``J qdot`` of the middle of the substep, and leave the physical velocity what it is not of the whole one.
+    """Write ``vk = J qdot`` at the midpoint, and set ``u`` to the rest of the total velocity.
 
-    Particle and bones are half a step on there. Moved by ``J qdot`` of its beginning, a straight way, what turns by
-    ``theta`` in a substep would be ``theta^2 / 2`` further from its axis, without any stress: limbs would swell
-    within seconds. The whole velocity is the physical one and what that lacks, the first of the bones' motions in
-    ``steps``, about where the ``pelvis`` joint begins [m]; the second is that of the joints, about where it is
-    half-way. To that comes what ``vk`` has kept where bones are not alone, see
-    :func:`piavatar_envs.avatar.torque_control.flesh_coupling.attach_flesh`.
+    Moved straight by ``J qdot`` of the substep's beginning, a particle that turns by ``theta`` would end a factor of
+    ``1 + theta^2 / 2`` from the axis, and limbs would swell without stress. The total velocity is ``u`` plus the first
+    of the bones' motions in ``steps``, about the ``pelvis`` joint at the beginning [m]; the second of these is the
+    motion of the joints, about the pelvis joint at the midpoint. ``vk`` also keeps
+    :func:`motion_apart`, stored there by :func:`piavatar_envs.avatar.torque_control.flesh_coupling.attach_flesh` for
+    particles of several bones.
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -207,7 +204,7 @@ def next_position(
     e: int,
     b: int,
 ):
-    """Return a joint's next position from its parent's, which has turned already [m]; the pelvis', in the world."""
+    """Return a joint's new offset from its parent, which must have turned already [m]; the pelvis' new position."""
     if b == 0:
         s = field[e, 0]
         return position[e, 0] + dt * wp.vec3(s[0], s[1], s[2])
@@ -227,7 +224,10 @@ def move_joints(
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """Turn every bone by its spin over ``dt``, and the pelvis on; joints stay together. Threads as above."""
+    """Integrate bone rotations and the pelvis position over ``dt``; the other joints follow at fixed offsets.
+
+    Threads share the bones as in :func:`spread_motion`.
+    """
     sync_threads(threads)
     r = row(e, body.rest_joint.shape[0])
     for b in range(thread, BONES, threads):
@@ -259,7 +259,7 @@ def add_change(
     q: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
 ):
-    """Add the change of the velocity that the particles caused, which is not due to the joints themselves."""
+    """Add the velocity change caused by particles to ``q`` and to ``outside``."""
     sync_threads(threads)
     for i in range(thread, NUM_DOF, threads):
         q[e, i] = q[e, i] + change[row, i]
@@ -279,10 +279,10 @@ def go_on(
     q: wp.array2d(dtype=float),
     taken: wp.array2d(dtype=float),
 ):
-    """Predict the velocity of joints if all else acts as before, and what particles lack without it.
+    """Predict the joint velocity with ``outside`` repeated, and write the remainder that particles take.
 
-    The joints' own ``change`` is in row ``own``; what was ``taken`` of the particles before is in ``row``, where what
-    they lack of their whole velocity comes.
+    Row ``own`` of ``change`` is the change by the joints themselves. Row ``row`` of ``taken`` holds the projected
+    velocity, and gets what the total velocity exceeds ``u`` by, as a generalised velocity.
     """
     sync_threads(threads)
     for i in range(thread, NUM_DOF, threads):
@@ -291,7 +291,7 @@ def go_on(
         taken[row, i] = after - taken[row, i] - outside[e, i]
 
 
-# A lane of a warp has one of the 28 numbers, so that all of a chunk's are asked for at once, of a few chunks ahead.
+# A lane of a warp sums one of the 28 numbers, so that those of a chunk are loaded at once, several chunks ahead.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 const int lane = threadIdx.x & 31;
@@ -351,9 +351,10 @@ def gather_sums(
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
 ):
-    """Sum moments of the ``bones`` about their joints over their chunks, and their momenta of three velocities.
+    """Sum the moments of the ``bones`` about their joints over their chunks, and their momenta of three velocities.
 
-    These are in row ``own`` of the velocity that the moments are of, in ``taken`` and in ``off`` of the other two.
+    Row ``own`` of ``linear`` and ``angular`` gets the momenta of ``moments``, rows ``taken`` and ``off`` those of
+    ``other_moments``.
     """
     ...
 
@@ -369,13 +370,13 @@ def take_child(
     linear: wp.array2d(dtype=wp.vec3),
     angular: wp.array2d(dtype=wp.vec3),
 ):
-    """Add the momenta of bone ``b`` and all beyond to those of ``a``, which it hangs on."""
+    """Add the momenta of bone ``b`` and all beyond to those of its parent ``a``."""
     arm = position[e, b] - position[e, a]
     angular[row, a] = angular[row, a] + angular[row, b] + wp.cross(arm, linear[row, b])
     linear[row, a] = linear[row, a] + linear[row, b]
 
 
-# Each lane of a warp has a bone. Level by level, bones take what their children have for them, a child at a time.
+# Each lane of a warp has a bone. Level by level, bones add the sums of their children, a child at a time.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
 constexpr unsigned ALL = 0xffffffffu;
@@ -459,7 +460,8 @@ def pass_down(
 ):
     """Compute ``J^T m u`` from the momenta of the bones about their joints: each joint sums all bones beyond it.
 
-    Of so many velocities, a warp of three, the first in row ``own``, others ``step`` rows apart.
+    A warp does so for three velocities, a single thread for ``velocities`` of them: the first in row ``own``, the others
+    ``step`` rows apart.
     """
     sync_threads(threads)
     if threads > 1:
@@ -492,11 +494,11 @@ def balance(
     # in and out
     change: wp.array2d(dtype=float),
 ):
-    """Give ``change[row]`` of the joints' velocities, that moves bones as ``field``, the momentum that it must have.
+    """Correct ``change[row]`` by a rigid motion so that the body's momentum is ``support``.
 
-    That is ``support``, an impulse, and its ``moment`` about the pelvis joint, and with ``reaction`` 1 what the bones'
-    sums say. A rigid motion of the body makes up the difference. The blend of the bones' motions has the momenta of the
-    bones' own sums, because weights add up to one.
+    Its angular momentum about the pelvis joint becomes ``moment``. With ``reaction`` 1 the momenta of the bones' sums
+    are added to both. ``field`` are the rigid motions of the bones by ``change[row]``. Their blend has the momenta of
+    the bones' own sums, because weights add up to one.
     """
     m = float(0.0)
     first = wp.vec3()
@@ -540,20 +542,20 @@ def balance(
         change[row, 3 + i] = change[row, 3 + i] - W[i]
 
 
-#: What limits nothing.
+#: A bound that is never reached.
 UNBOUNDED = 1.0e30
-#: Inertia of a joint that does not move: much more than any body has [kg m^2].
+#: Inertia of a locked joint, far above that of any body [kg m^2].
 LOCK = 1.0e6
-#: Damping of a joint at the end of its range, over the stiffness of that end [s].
+#: Damping over stiffness of the stop at the end of a joint's range [s].
 STOP_TIME = wp.constant(0.03)
 
 
 @wp.struct
 class Springs:
-    """Springs and dampers: of the pelvis' place, then of all joints, ``(1 or num_envs, 1 + bones)``.
+    """Springs and dampers: of the pelvis' position, then of all joints, ``(1 or num_envs, 1 + bones)``.
 
-    Those of the pelvis, ``[:, :2]``, act from outside: an unsupported body has none. Those of the others are
-    muscles, which have their limits.
+    Those of the pelvis, ``[:, :2]``, are external support: an unsupported body has none. The others are muscles, limited
+    by :class:`Strength`.
     """
 
     stiffness: wp.array2d(dtype=float)  # [N/m], then [N m/rad]
@@ -562,7 +564,7 @@ class Springs:
 
 @wp.struct
 class Target:
-    """Where springs pull to, and torques besides; ``(num_envs, bones)`` and ``(num_envs,)``."""
+    """Target pose of the springs, and additional torques; ``(num_envs, bones)`` and ``(num_envs,)``."""
 
     rotation: wp.array2d(dtype=wp.quat)  # local; of the pelvis in the world
     root: wp.array(dtype=wp.vec3)  # of the pelvis joint [m]
@@ -581,17 +583,17 @@ class Strength:
 
 @wp.struct
 class Tissue:
-    """What resists passively: a little always, much where a joint leaves its range; ``(bones,)``."""
+    """Passive resistance of the joints: slight damping, and stiff stops at the ends of their ranges; ``(bones,)``."""
 
     damping: wp.array(dtype=float)  # [N m s/rad]
     stop: wp.array(dtype=float)  # stiffness beyond the range [N m/rad]
     lower: wp.array(dtype=wp.vec3)  # range of the rotation vector relative to the rest pose [rad]
     upper: wp.array(dtype=wp.vec3)
-    lock: wp.array(dtype=float)  # inertia of what does not move at all, else 0 [kg m^2]
+    lock: wp.array(dtype=float)  # inertia of locked joints, else 0 [kg m^2]
 
 
 def make_strength(lower: np.ndarray, upper: np.ndarray, rows: int, device: str) -> Strength:
-    """Limits of the torques, each ``(22, 3)`` [N m], and a factor of 1 on them in ``rows`` rows."""
+    """Upload limits of the torques, each ``(22, 3)`` [N m], with a factor of 1 on them in ``rows`` rows."""
     return make_struct(
         Strength,
         lower=wp.array(lower.astype(np.float32), dtype=wp.vec3, device=device),
@@ -610,7 +612,7 @@ def make_tissue(
         stop: stiffness beyond their ranges, shape ``(22,)`` [N m/rad].
         lower: of the ranges of the rotation vectors, shape ``(22, 3)`` [rad].
         upper: likewise.
-        locked: joints that do not move: what they carry belongs to their parents.
+        locked: joints that do not move: the bones beyond them are rigid extensions of their parents.
         device: Warp device.
     """
     lock = np.zeros(len(damping))
@@ -630,13 +632,13 @@ def implicit_inertia(dt: float, stiffness: float, damping: float):
 
 @wp.func
 def resistance(tissue: Tissue, stop: float, b: int):
-    """Damping of tissue, with that of the end of the range where the joint is beyond it [N m s/rad]."""
+    """Return the damping of tissue, with that of the ``stop`` where the joint is beyond its range [N m s/rad]."""
     return tissue.damping[b] + STOP_TIME * stop
 
 
 @wp.func
 def above(body: Body, rotation: wp.array2d(dtype=wp.quat), e: int, b: int):
-    """Rotation of what a bone hangs on; the pelvis hangs on the world."""
+    """Return the rotation of a bone's parent; the pelvis has the world as its parent."""
     if b == 0:
         return wp.quat(0.0, 0.0, 0.0, 1.0)
     return rotation[e, body.parent[b]]
@@ -644,10 +646,10 @@ def above(body: Body, rotation: wp.array2d(dtype=wp.quat), e: int, b: int):
 
 @wp.func
 def beyond(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
-    """Rotation vector back into the range [rad]; zero within it.
+    """Return the change of the rotation vector that leads back into the range [rad]; zero within it.
 
-    A corner of the box may be further than half a turn from its middle, where rotation vectors jump and a stop would
-    push on: the range ends before.
+    The range ends before half a turn, even at the corners of the box: there rotation vectors jump, and a stop would
+    push outwards.
     """
     v = quat_log(local)
     return short_of_pi(wp.max(lower, wp.min(v, upper))) - v
@@ -655,9 +657,9 @@ def beyond(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
 
 @wp.func
 def stopping_torque(local: wp.quat, lower: wp.vec3, upper: wp.vec3):
-    """Torque of the end of the range, over its stiffness, in the frame of what the joint hangs on [rad].
+    """Return the torque of the stop over its stiffness, in the frame of the parent [rad].
 
-    What it takes from a joint, it gives back: it is the gradient of half the square of :func:`beyond`.
+    It is conservative: the gradient of half the square of :func:`beyond`.
     """
     return torque_of_vector(quat_log(local), beyond(local, lower, upper))
 
@@ -676,7 +678,7 @@ def implicit_diagonal(
     stop: wp.array2d(dtype=float),
     diagonal: wp.array2d(dtype=float),
 ):
-    """Compute ``A`` of muscles and tissue, with the stop if a joint is beyond its range; ``n`` 0: the pelvis."""
+    """Write ``A``, and the stop stiffness (0 within the range); ``n`` 0 is the pelvis' position, joints follow."""
     r = row(e, springs.stiffness.shape[0])
     value = implicit_inertia(dt, springs.stiffness[r, n], springs.damping[r, n])
     if n > 1:
@@ -707,9 +709,9 @@ def joint_impulse(
     muscle: wp.array2d(dtype=float),
     impulse: wp.array2d(dtype=float),
 ):
-    """Compute the impulse of a joint at an unchanged velocity of the joints, of muscles and of all.
+    """Write the impulses of a joint at ``d = 0``: of muscles alone, and with tissue.
 
-    A torque of the pelvis, which would come from outside, is not asked for.
+    Actions apply no torque to the pelvis.
     """
     r = row(e, springs.stiffness.shape[0])
     K = springs.stiffness[r, n]
@@ -754,8 +756,8 @@ def limit_torque(
 ) -> float:
     """Limit a muscle's impulse to its strength; return 1 if it was limited, else 0.
 
-    ``left`` is ``A``, of which all is ``rest``, without the spring that was cut. Who asks ``again`` leaves those as
-    they are that have been.
+    ``left`` gets the implicit diagonal ``rest``, reduced by the ``A`` of a spring that was limited. With ``again``,
+    joints already limited are skipped.
     """
     limited = float(0.0)
     r = row(e, springs.stiffness.shape[0])
@@ -787,6 +789,6 @@ def find_given(
     # in and out
     impulse: wp.array2d(dtype=float),
 ):
-    """Compute the impulses that joints and pelvis get, implicit in time."""
+    """Compute the impulses of joints and pelvis at the end of the substep: subtract ``left`` times the change."""
     for i in range(thread, NUM_DOF, threads):
         impulse[e, i] = impulse[e, i] - left[e, i] * change[row_of_change, i]

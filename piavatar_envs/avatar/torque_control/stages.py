@@ -1,11 +1,13 @@
-"""What the joints of an environment do between two passes over its particles, in a launch each.
+"""Stages of the torque controller between two passes over particles, one launch each.
 
-On a GPU an environment has a CUDA block, so that nothing is launched for what one warp does in a few microseconds: four
-warps build the mass matrix, two a factor each; one does all else. On a CPU it is one thread.
+On a GPU an environment has a CUDA block: four warps build the mass matrix, then two of them factorize it, one matrix
+each; one warp runs all other stages, because a launch for a few microseconds of work costs more than the work. On a CPU
+one thread runs a stage.
 
-There are three right-hand sides: of flesh that is pulled, of what the joints take over, and of how far flesh is from
-its places; and two factors of the mass matrix, with locked joints alone and with all that is
-implicit. Those of a kind are in one array: the first of all environments, then the second, then the third.
+There are three right-hand sides: momentum of the pull, momentum of the remaining physical velocity, and displacements
+of particles from their places. There are two factors of the mass matrix: one with locked joints and the added inertia of
+the projection, one with locked joints and everything implicit. Those of a kind are in one array: the first of all
+environments, then the second, then the third.
 """
 
 from __future__ import annotations
@@ -62,28 +64,28 @@ from piavatar_envs.mpm.types import row
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 WARP = wp.constant(32)
-#: Threads that build a mass matrix. Two warps have a factor each; before that all compose.
+#: Threads that build a mass matrix: all compose it, then two warps compute a factor each.
 MASS_BLOCK = wp.constant(128)
 _ARENA_WORDS = wp.constant(ARENA_WORDS)
-#: Most solutions in a substep, each with more muscles at their limits: a limited muscle changes the others.
+#: Most repeated solutions in a substep: a muscle at its limit changes the load of the others.
 MOST_CUTS = wp.constant(4)
-#: Share of what the pose is off the particles that one fit takes away. Those of a fast, light joint (a head, a hand)
-#: are not where it has them for other reasons, too: to follow them at once throws it about.
+#: Share of the deviation between pose and particles that one fit removes. Particles of fast, light joints (head, hands)
+#: also deviate for other reasons, so that following them at once would destabilise these joints.
 FIT_SHARE = 0.2
 _FIT_SHARE = wp.constant(FIT_SHARE)
 
 
 @wp.struct
 class Support:
-    """What the springs of the pelvis do to the body, summed over substeps; ``(num_envs,)``."""
+    """Force and torque of the pelvis springs on the body, summed over substeps; ``(num_envs,)``."""
 
-    force: wp.array(dtype=wp.vec3)  # [N], if the sum is over a control step that has begun with zero
+    force: wp.array(dtype=wp.vec3)  # [N], once a control step that began with zero is complete
     torque: wp.array(dtype=wp.vec3)  # [N m]
 
 
 @wp.func
 def place_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
-    """Matrices that take the bones from rest to where they are, seen from the pelvis joint."""
+    """Write the matrices that take the bones from rest to their current places, relative to the pelvis joint."""
     r = row(e, body.rest_joint.shape[0])
     pelvis = w.pose.position[e, 0]
     for b in range(thread, BONES, threads):
@@ -103,7 +105,7 @@ def find_shares(
 ):
     """Solve for the shares ``dq = M^-1 J^T m v`` of several velocities, from the bones' momenta.
 
-    Of the first they are in row ``own``, of others ``step`` rows apart.
+    The share of the first velocity is in row ``own``, the others follow ``step`` rows apart.
     """
     pass_down(body, w.pose.position, e, rows, own, step, threads, w.linear, w.angular, w.shares)
     load_factor(w.factors, e, arena)
@@ -112,11 +114,11 @@ def find_shares(
 
 @wp.func
 def move_on(body: Body, dt: float, move: int, off: int, e: int, thread: int, threads: int, w: TorqueWorkspace):
-    """Move the pose on by half a substep, first and second of the moves; by the third, fit it to the particles.
+    """Advance the pose by half a substep (moves 0 and 1), or fit it to the particles (move 2).
 
-    That is by a share of ``dq = M^-1 J^T m way``, the way from particles to their places. It is in row ``off``, of the
-    beginning of the substep: on the way from there to here particles have gone on with the joints. One piece of graph
-    for all moves is a third of what must be fetched, instruction by instruction.
+    The fit is a share of ``dq = M^-1 J^T m way``, with the displacements ``way`` from particles to their places, in row
+    ``off``. They are those of the beginning of the substep; since then particles have moved with the joints. All moves
+    share one piece of code, to fetch fewer instructions.
     """
     time = 0.5 * dt
     if move < 2:
@@ -131,7 +133,7 @@ def move_on(body: Body, dt: float, move: int, off: int, e: int, thread: int, thr
 
 @wp.func
 def pull_bones(body: Body, own: int, e: int, thread: int, threads: int, w: TorqueWorkspace):
-    """Give the joints the momentum that the pull of the flesh has taken from the particles."""
+    """Add the reaction of the flesh's pull to the joints, with exactly the momentum that particles have lost."""
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
     none = wp.vec3(0.0)
     balance(w.pose.position, w.bones, 1.0, none, none, w.moving, e, own, thread, threads, w.shares)
@@ -152,7 +154,10 @@ def limit_joints(
     threads: int,
     w: TorqueWorkspace,
 ) -> float:
-    """Limit the muscles by share ``own``; return to all threads how many were limited, or ``again``."""
+    """Limit the impulses of the muscles at share ``own``; return to all threads the number of newly limited ones.
+
+    With ``again``, joints already limited are skipped.
+    """
     limited = float(0.0)
     for k in range(thread, TRIPLES, threads):
         rest = w.diagonals[driven, 3 * k]
@@ -180,9 +185,9 @@ def turn_joints(
     arena: wp.uint64,
     w: TorqueWorkspace,
 ):
-    """Springs, torques, tissue and what bones meet change the velocity of the joints, by share ``own``.
+    """Solve for the velocity change by springs, torques, tissue and bone contact, and write it to share ``own``.
 
-    ``driven`` is the factor of the mass matrix with all that is implicit.
+    ``driven`` is the factor of the mass matrix with everything implicit.
     """
     sync_threads(threads)
     for k in range(thread, TRIPLES, threads):
@@ -193,7 +198,7 @@ def turn_joints(
     factor = int(driven)
     met = vec8()
     cuts = int(0)
-    while factor >= 0:  # once more where muscles reach their limits, by the same piece of the graph
+    while factor >= 0:  # repeated while muscles reach their limits
         solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, arena, w.shares)
         met = stop_bones(body, ground, dt, own, factor, e, thread, threads, arena, w)
         if cuts == MOST_CUTS:
@@ -225,7 +230,7 @@ def build_mass(
 ):
     """Build the mass matrix from the bones' moments, and its factors.
 
-    Over ``(num_envs, MASS_BLOCK)``; a CUDA block has one.
+    Over ``(num_envs, MASS_BLOCK)``, a CUDA block for each environment.
     """
     i, _ = wp.tid()
     at = place_in_block(i, MASS_BLOCK)
@@ -263,9 +268,9 @@ def begin_substep(
     # in and out
     w: TorqueWorkspace,
 ):
-    """Run :func:`begin` where something else has moved the joints, or they are another body's.
+    """Run :func:`begin` for joints that were not moved by a substep, or whose body has changed.
 
-    Over ``(num_envs, WARP)``, a CUDA block each.
+    Over ``(num_envs, WARP)``, a CUDA block for each environment.
     """
     i, _ = wp.tid()
     at = place_in_block(i, WARP)
@@ -293,10 +298,11 @@ def act(
     support: Support,
     w: TorqueWorkspace,
 ):
-    """Take over what joints can of two velocities, that of the pull first; let them turn; move the pose on.
+    """Project two velocities on the joints (reaction of the pull, then ``u``), apply torques, and advance the pose.
 
-    Of three ``moves`` the last fits the pose; else there are two. The next substep begins with bones where they are
-    then. ``per_time`` is the share of an impulse in the support [1/s]. Launched as :func:`begin_substep`.
+    With three ``moves`` the last one fits the pose; otherwise there are two. Places and motion of the bones are written
+    for the next substep. ``per_time`` is the share of an impulse in the support [1/s]. Launched as
+    :func:`begin_substep`.
     """
     i, _ = wp.tid()
     at = place_in_block(i, WARP)
