@@ -1,24 +1,18 @@
-"""Points of bones and boundaries: how fast a point may come, and which one is too fast by most.
+"""Bone contact: boundaries stop bones by impulses in joint space, where contact on the grid cannot.
 
-Points are the particles that track a bone. They come no closer to a boundary than a thin layer of flesh that cannot be
-squeezed further: one may approach it in a substep by what there is left. What is done about those that are too fast is
-in :mod:`piavatar_envs.avatar.torque_control.bone_contact`.
+Contact on the grid stops the matter near a surface. Of a limb that falls on the floor this is a little soft flesh,
+which its bones would pass through. Therefore points of bones, the particles that track them, have contact of their own:
+a thin layer of flesh between bone and boundary is incompressible, and a point may approach the boundary in a substep by
+the remaining distance to this layer.
 
-Bones stop at boundaries: contact in joint space, for what the grid cannot stop.
-
-Contact on the grid stops the matter that is near a surface. Of a limb that falls on the floor that is a little soft
-flesh, and its bones go on through it. So bones have contact of their own. Points of theirs, the particles that track
-them, come no closer to a boundary than a thin layer of flesh that cannot be squeezed further: a bone may approach it in
-a substep by what there is left, and no more.
-
-An impulse ``p`` at a point of a bone changes the joints' velocities by ``M^-1 J^T p``, ``J`` the Jacobian of the point,
-and the point's own by ``K p``, ``K = J M^-1 J^T``. It is the least that stops the point, by Coulomb's law: it sticks if
-the impulse is in the friction cone, else friction is against the slip that there would be without, as strong as the
-cone allows but no stronger than what halts it. ``M`` is that of all that is implicit, springs and dampers included: so
-these answer to a bone that is stopped as they do to any load. Of all points the one that is too fast by most is
-stopped, then the next, until none is left or there have been :data:`MOST_STOPS` (Gauss and Southwell's order; for
-contact of articulated bodies in such coordinates see Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 11). No
-point is pulled, and where nothing has come below a boundary at rest no energy is made.
+An impulse ``p`` at a point changes the joints' velocities by ``M^-1 J^T p``, with the Jacobian ``J`` of the point, and
+the point's own velocity by ``K p``, ``K = J M^-1 J^T``. ``M`` includes everything implicit, so springs and dampers
+respond to a stopped bone as to any load. The impulse is the least that stops the point under Coulomb's law: the point
+sticks if that impulse is in the friction cone; otherwise friction opposes the slip of the frictionless solution, as
+strong as the cone allows but no stronger than what halts the slip. The point that violates its bound most is stopped
+first, then the next, until none is left or :data:`MOST_STOPS` is reached (the Gauss-Southwell order; for contact of
+articulated bodies in joint space see Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 11). Impulses never
+pull, and add no energy unless a point has come below a boundary at rest.
 """
 
 from __future__ import annotations
@@ -40,35 +34,35 @@ from piavatar_envs.mpm.types import Boundaries, Sensors, row
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
-#: Flesh that is left between a bone and a boundary [m].
+#: Thickness of the incompressible layer between a bone and a boundary [m].
 LAYER = 0.001
 _LAYER = wp.constant(LAYER)
-#: A point that has come closer goes back by a share of that in a substep, no faster than at a speed [m/s].
+#: A point within the layer moves out by this share of its depth in a substep, at no more than this speed [m/s].
 _BACK_SHARE, _BACK_SPEED = wp.constant(0.2), wp.constant(0.5)
-#: Speeds below are none [m/s].
+#: Violations below this speed are ignored [m/s].
 TOLERANCE = wp.constant(1.0e-3)
-_FAR = wp.constant(1.0e3)  # no point of a bone is as far from its joint [m]
+_FAR = wp.constant(1.0e3)  # farther than any point of a bone from its joint [m]
 
 
 @wp.struct
 class Ground:
-    """Boundaries that bones may meet, and sensors."""
+    """Boundaries and sensors of bone contact."""
 
     solid: int  # whether bones stop at all
     boundaries: Boundaries
-    field: wp.array(dtype=int)  # (num_particles,) velocity field, whose friction it is
-    subject: wp.array(dtype=int)  # (fields,) of a field
+    field: wp.array(dtype=int)  # (num_particles,) velocity field, which selects the friction
+    subject: wp.array(dtype=int)  # (fields,) sensor subject of a field
     sensors: Sensors
 
 
 @wp.struct
 class Touch:
-    """A point of a bone and a boundary."""
+    """Contact of a point of a bone with a boundary."""
 
     place: wp.vec3  # [m]
     normal: wp.vec3
     distance: float  # [m]
-    velocity: wp.vec3  # against the boundary's matter [m/s]
+    velocity: wp.vec3  # relative to the boundary's surface [m/s]
 
 
 @wp.func
@@ -80,7 +74,7 @@ def at_rest(body: Body, e: int, b: int, tracker: int):
 
 @wp.func
 def measure_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorkspace):
-    """Find boxes that hold the points of bones, of the body as it is: another one may have been drawn."""
+    """Compute the bounding boxes of the bones' points, for the current body."""
     for b in range(thread, BONES, threads):
         low = wp.vec3(_FAR)
         high = wp.vec3(-_FAR)
@@ -89,12 +83,12 @@ def measure_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorksp
             low = wp.min(low, point)
             high = wp.max(high, point)
         w.middle[e, b] = 0.5 * (low + high)
-        w.half[e, b] = 0.5 * (high - low)  # below zero where there are no points
+        w.half[e, b] = 0.5 * (high - low)  # negative for a bone without points
 
 
 @wp.func
 def motion_of_bone(w: TorqueWorkspace, e: int, b: int, x: wp.vec3):
-    """Return the velocity of a bone's matter at ``x`` [m/s]."""
+    """Return the velocity of a bone at ``x`` [m/s]."""
     return motion_at(w.moving[e, b], x - w.pose.position[e, 0])
 
 
@@ -112,7 +106,7 @@ def touch_of(body: Body, boundaries: Boundaries, w: TorqueWorkspace, e: int, b: 
 
 @wp.func
 def least_speed(distance: float, dt: float):
-    """With which a point may go, away from a boundary [m/s]: it may come to the layer, or goes back to it."""
+    """Return the least allowed normal velocity [m/s]: a point may reach the layer, or must move out of it."""
     way = _LAYER - distance
     if way < 0.0:
         return way / dt
@@ -121,16 +115,16 @@ def least_speed(distance: float, dt: float):
 
 @wp.func
 def reach_along(half: wp.vec3, turn: wp.quat, n: wp.vec3):
-    """Return the greatest component along ``n`` within a turned box of half extents ``half`` about the origin."""
+    """Return the greatest component along ``n`` in a box of half extents ``half``, rotated about the origin."""
     own = wp.quat_rotate_inv(turn, n)
     return wp.dot(half, wp.abs(own))
 
 
 @wp.func
 def may_lack(boundaries: Boundaries, dt: float, w: TorqueWorkspace, e: int, b: int, k: int):
-    """Return whether any point of a bone may be too fast for a boundary, by the box that holds them.
+    """Return whether any point of a bone may violate its bound at a boundary, from the bone's bounding box.
 
-    A boundary that is no plane has other normals elsewhere: there it is by the ball around the box, and by speeds.
+    For a boundary that is not a plane, whose normals vary, the test uses the sphere around the box, and speeds.
     """
     half = w.half[e, b]
     turn = w.pose.rotation[e, b]
@@ -150,7 +144,7 @@ def may_lack(boundaries: Boundaries, dt: float, w: TorqueWorkspace, e: int, b: i
 
 @wp.func
 def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: TorqueWorkspace):
-    """Bits of the bones of which points may be too fast."""
+    """Return the bits of the bones with points that may violate their bounds."""
     near = int(0)
     for b in range(thread, BONES, threads):
         for k in range(ground.boundaries.count):
@@ -163,10 +157,10 @@ def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: T
 def find_fastest(
     body: Body, ground: Ground, dt: float, e: int, thread: int, threads: int, w: TorqueWorkspace
 ) -> wp.vec2:
-    """Find the point that is too fast by most: by how much [m/s], and point, bone and boundary as one number.
+    """Return the greatest violation [m/s], and point, bone and boundary of it as one number.
 
-    Few bones come near a boundary: the threads share the points of one after the other. The number is exact in single
-    precision, below 2^24.
+    Few bones are near a boundary, so the threads share the points of one bone after the other. The number is below
+    2^24, hence exact in single precision.
     """
     most = float(0.0)
     which = int(0)
@@ -188,12 +182,12 @@ def find_fastest(
     return max_of_threads(most, which, threads)
 
 
-#: The pelvis' place, then all joints.
+#: Triples of a generalised velocity: the pelvis' position, then all joints.
 TRIPLES = wp.constant(1 + int(BONES))
-#: Impulses in a substep, at most.
+#: Most impulses in a substep.
 MOST_STOPS = 8
 _MOST_STOPS = wp.constant(MOST_STOPS)
-#: Share of the straight answer along the normal below which friction would jam a point: then it has none.
+#: If friction reduces the normal response to less than this share, the point would jam: then it has no friction.
 _JAMMED = wp.constant(0.1)
 
 
@@ -210,9 +204,9 @@ def carries(body: Body, a: int, b: int):
 def answer_at(
     body: Body, factor: int, e: int, b: int, x: wp.vec3, thread: int, threads: int, arena: wp.uint64, w: TorqueWorkspace
 ) -> wp.mat33:
-    """Compute ``K`` of bone ``b`` at ``x`` [1/kg], ``Y^T Y`` with ``Y = L^-T J^T``, which stays in the columns.
+    """Compute ``K = Y^T Y`` of bone ``b`` at ``x`` [1/kg], with ``Y = L^-T J^T``, which stays in the columns.
 
-    ``J^T`` has something in joints that carry the bone, and ``Y`` hardly anywhere else: ``L`` is a tree's.
+    ``J^T`` has entries for the joints that carry the bone; because ``L`` follows the tree, ``Y`` has few others.
     """
     n = w.velocity.shape[0]
     wanted = w.pattern.reach[1 + b]
@@ -225,7 +219,7 @@ def answer_at(
         for axis in range(3):
             along = wp.vec3()
             along[axis] = 1.0
-            if k > 0:  # else the pelvis' place
+            if k > 0:  # the pelvis' position has unit columns
                 along = wp.cross(arm, along)
             set_triple(columns, row_in_arena(axis * n + e, axis), place_of_triple(k), along)
     begin_solution(w.pattern, w.factors, factor, wanted, e, n, threads, arena, w.touch)
@@ -248,7 +242,7 @@ def answer_at(
 def push(
     p: wp.vec3, b: int, own: int, factor: int, e: int, thread: int, threads: int, arena: wp.uint64, w: TorqueWorkspace
 ):
-    """Give bone ``b`` an impulse at the point that the columns are of: by ``M^-1 J^T p = L^-1 Y p``."""
+    """Apply impulse ``p`` to bone ``b`` at the point of the columns ``Y``: ``M^-1 J^T p = L^-1 Y p``."""
     n = w.velocity.shape[0]
     wanted = w.pattern.reach[1 + b]
     columns = view_columns(w.touch, arena)
@@ -268,18 +262,18 @@ def push(
 
 @wp.func
 def stopping_impulse(K: wp.mat33, v: wp.vec3, normal: wp.vec3, least: float, friction: float):
-    """Return the impulse [N s] after which a point at ``v`` has ``least`` along the normal, by Coulomb's law."""
+    """Return the impulse [N s] that gives a point of velocity ``v`` the normal velocity ``least``, by Coulomb's law."""
     stick = wp.inverse(K) * (least * normal - v)
     push = wp.dot(stick, normal)
     if wp.length(stick - push * normal) <= friction * push:
         return stick
     lacking = wp.max(least - wp.dot(v, normal), 0.0)
     straight = wp.dot(normal, K * normal)
-    slip = v + lacking / straight * (K * normal)  # without friction, which is against it
+    slip = v + lacking / straight * (K * normal)  # the frictionless slip, which friction opposes
     along = wp.normalize(slip - wp.dot(slip, normal) * normal)
     share = friction
     halting = wp.dot(along, v) * wp.dot(normal, K * along) + lacking * wp.dot(along, K * along)
-    if halting > 0.0:  # more than halts the slip would turn it
+    if halting > 0.0:  # more friction than halts the slip would reverse it
         share = wp.min(friction, straight * wp.dot(along, slip) / halting)
     direction = normal - share * along
     answer = wp.dot(normal, K * direction)
@@ -303,7 +297,7 @@ def stop_point(
     arena: wp.uint64,
     w: TorqueWorkspace,
 ) -> vec8:
-    """Stop a point as :func:`find_fastest` names it; the impulse, and its moment about the pelvis joint."""
+    """Stop the point that :func:`find_fastest` returned; return the impulse and its moment about the pelvis joint."""
     boundaries = ground.boundaries
     k = which % boundaries.count
     b = which // boundaries.count % BONES
@@ -331,10 +325,10 @@ def stop_bones(
     arena: wp.uint64,
     w: TorqueWorkspace,
 ) -> vec8:
-    """Let no bone go through a boundary: changes share ``own``, which the joints are about to add to their velocity.
+    """Stop bones at boundaries: correct share ``own``, the velocity change that the joints are about to make.
 
-    ``factor`` is the matrix's that it was solved with. The answer is the impulse [N s] and its moment about the pelvis
-    joint [N m s].
+    ``factor`` is the factor that the share was solved with. Returns the sum of the impulses [N s] and their moment
+    about the pelvis joint [N m s].
     """
     given = vec8()
     if ground.solid == 0:
@@ -356,7 +350,7 @@ def stop_bones(
 
 @wp.func
 def add_to_sensors(body: Body, ground: Ground, given: vec8, e: int, pelvis: wp.vec3):
-    """Add what boundaries gave the bones to what they gave the body."""
+    """Add the impulses on bones to the sensors of the body's boundary contact."""
     p = wp.vec3(given[0], given[1], given[2])
     if wp.length_sq(p) > 0.0:
         subject = ground.subject[ground.field[body.first]]

@@ -40,8 +40,8 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
 
 After a control step, :func:`~piavatar_envs.avatar.torque_control.flesh_coupling.put_in_place` moves firm particles,
 those of bones, to their skinned places, unless these are beyond a boundary. It changes no velocity; the angular
-momentum ``m s x v`` of displacement ``s`` is compensated in the affine velocity ``C``. ``slip`` stores the displacement,
-so that the pull stays the same and feet come to rest.
+momentum ``m s x v`` of displacement ``s`` is compensated in the affine velocity ``C``. ``slip`` stores the
+displacement, so that the pull stays the same and feet come to rest.
 
 Symbols:
 

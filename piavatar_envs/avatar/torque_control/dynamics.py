@@ -154,12 +154,12 @@ def take_over(
 ):
     """Write ``vk = J qdot`` at the midpoint, and set ``u`` to the rest of the total velocity.
 
-    Moved straight by ``J qdot`` of the substep's beginning, a particle that turns by ``theta`` would end a factor of
-    ``1 + theta^2 / 2`` from the axis, and limbs would swell without stress. The total velocity is ``u`` plus the first
-    of the bones' motions in ``steps``, about the ``pelvis`` joint at the beginning [m]; the second of these is the
-    motion of the joints, about the pelvis joint at the midpoint. ``vk`` also keeps
-    :func:`motion_apart`, stored there by :func:`piavatar_envs.avatar.torque_control.flesh_coupling.attach_flesh` for
-    particles of several bones.
+    Moved straight by ``J qdot`` of the substep's beginning, a particle that turns by ``theta`` would end
+    ``1 + theta^2 / 2`` times as far from its axis, and limbs would swell without stress. The total velocity is ``u``
+    plus the first of the bones' motions in ``steps``, about the ``pelvis`` joint at the beginning [m]; the second of
+    these is the motion of the joints, about the pelvis joint at the midpoint. ``vk`` also keeps :func:`motion_apart`,
+    stored there by :func:`piavatar_envs.avatar.torque_control.flesh_coupling.attach_flesh` for particles of several
+    bones.
     """
     i, _ = wp.tid()
     threads = threads_of_environment(x.shape[0])
@@ -460,8 +460,8 @@ def pass_down(
 ):
     """Compute ``J^T m u`` from the momenta of the bones about their joints: each joint sums all bones beyond it.
 
-    A warp does so for three velocities, a single thread for ``velocities`` of them: the first in row ``own``, the others
-    ``step`` rows apart.
+    A warp does so for three velocities, a single thread for ``velocities`` of them: the first in row ``own``, the
+    others ``step`` rows apart.
     """
     sync_threads(threads)
     if threads > 1:
@@ -554,8 +554,8 @@ STOP_TIME = wp.constant(0.03)
 class Springs:
     """Springs and dampers: of the pelvis' position, then of all joints, ``(1 or num_envs, 1 + bones)``.
 
-    Those of the pelvis, ``[:, :2]``, are external support: an unsupported body has none. The others are muscles, limited
-    by :class:`Strength`.
+    Those of the pelvis, ``[:, :2]``, are external support: an unsupported body has none. The others are muscles,
+    limited by :class:`Strength`.
     """
 
     stiffness: wp.array2d(dtype=float)  # [N/m], then [N m/rad]

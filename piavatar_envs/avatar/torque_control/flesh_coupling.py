@@ -1,4 +1,4 @@
-"""What holds flesh to bones that move under torques; see :mod:`piavatar_envs.avatar.torque_control.controller`."""
+"""Coupling of flesh and bones under torques: implicit pulls, and placement of firm particles."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 @wp.func
 def pulled_rest(body: Body, e: int, p: int, w: TorqueWorkspace):
-    """Return the rest position that a particle is pulled to [m]; for a firm one with its slip added."""
+    """Return the rest position that a particle is pulled to [m], with the slip of a firm particle."""
     rest = vector_at(body.rest, row(e, body.rest.shape[0]), p)
     if p < w.slip.shape[1]:
         rest += vector_at(w.slip, e, p)
@@ -39,7 +39,7 @@ def pulled_rest(body: Body, e: int, p: int, w: TorqueWorkspace):
 
 @wp.func
 def sum_partition(partitions: Partitions, arena: wp.uint64, pelvis: wp.vec3, e: int, part: int, w: TorqueWorkspace):
-    """Sum the chunks of a partition in the arena, with positions relative to the ``pelvis``."""
+    """Sum the chunks of a partition from its arena, with positions relative to the ``pelvis``."""
     warp = warp_of_block()
     lane = lane_of_warp()
     quarters = quarters_at_once(lane[1])
@@ -67,15 +67,15 @@ def attach_flesh(
     vk: wp.array2d(dtype=wp.vec3),
     w: TorqueWorkspace,
 ):
-    """Hand back, and pull every particle to its place on the bones, implicit in time and critically damped.
+    """Update ``u`` to the new ``J``, pull every particle to its skinned place, and sum moments of the bones.
 
-    What a new pose has changed of ``J qdot`` goes to the physical velocity; what the bones move a particle by besides,
-    :func:`piavatar_envs.avatar.torque_control.dynamics.motion_apart`, stays in ``vk``, as it is now, but where a bone
-    is alone, which has none of it. ``rate`` is the pull's [1/s]; one of 0 leaves a velocity exactly as it is. Of what
-    the pull has taken of the velocity, of what it leaves, and of the way to the particles' places, the bones get the
-    moments.
+    The change of ``J qdot`` with the pose is added to ``u``. ``vk`` keeps
+    :func:`piavatar_envs.avatar.torque_control.dynamics.motion_apart` of particles that several bones move. The pull is
+    implicit in time and critically damped, with ``rate`` [1/s]; a rate of 0 leaves a velocity exactly as it is. The
+    moments are those of the velocity that the pull removes, of the remaining velocity, and of the displacements to the
+    skinned places.
 
-    Over ``(num_envs, partitions, PARTITION_THREADS)``, a CUDA block a part; on a CPU one thread has the only one.
+    Over ``(num_envs, partitions, PARTITION_THREADS)``, a CUDA block a partition; on a CPU one thread has the only one.
     """
     i, j, k = wp.tid()
     at = place_in_partitions(i, j, k, x.shape[0])
@@ -97,7 +97,7 @@ def attach_flesh(
         n = body.first + p
         arm = vector_at(x, e, n) - pelvis
         v = vector_at(u, e, n) + vector_at(vk, e, n)
-        m = number_at(mass, r, n)  # loaded before any store, which it would wait for
+        m = number_at(mass, r, n)  # loaded before any store, to avoid waiting for it
         own_rate = number_at(rate, row(e, rate.shape[0]), p)
         now = blend_images(w.place, w.moving, e, body.skin, p, pulled_rest(body, e, p, w))
         apart = wp.vec3()
@@ -116,7 +116,7 @@ def attach_flesh(
 
 @wp.func
 def keep_outside(boundaries: Boundaries, e: int, x: wp.vec3):
-    """Return ``x`` [m], or the nearest point on the surface that it lies beyond, in the order of the boundaries."""
+    """Return ``x`` [m], projected on the surface of each boundary that it lies beyond, in their order."""
     for b in range(boundaries.count):
         d = signed_distance(boundaries, e, b, x)
         x = x - wp.min(d[3], 0.0) * wp.vec3(d[0], d[1], d[2])
@@ -139,11 +139,11 @@ def put_in_place(
     C: wp.array3d(dtype=float),
     slip: wp.array2d(dtype=wp.vec3),
 ):
-    """Put the ``firm`` particles where their bones have them, though not beyond boundaries; over ``E * firm ones``.
+    """Move the ``firm`` particles to their skinned places, but not beyond boundaries; over ``num_envs * firm.size``.
 
-    No particle's velocity ``v`` changes. What a way of ``d`` gives of angular momentum, ``m d x v``, the affine
-    velocity takes back: the grid gets ``m (dx^2/4) eps C`` of it (Jiang et al. 2015, quadratic weights). The ``slip``
-    remembers the way, in the frame of the rest pose.
+    No particle's velocity ``v`` changes. The angular momentum ``m s x v`` of displacement ``s`` is compensated in the
+    affine velocity ``C``, of which the grid receives ``m (dx^2/4) eps C`` (Jiang et al. 2015, quadratic weights).
+    ``slip`` stores the displacement, in the frame of the rest pose.
     """
     own = environment_of(wp.tid(), firm.shape[0])
     e = own[0]
@@ -156,6 +156,6 @@ def put_in_place(
     spin = (2.0 / (grid.dx * grid.dx)) * wp.cross(way, vector_at(u, e, q) + vector_at(vk, e, q))
     affine = matrix_at(C, e, q) - wp.skew(spin)
     slipped = vector_at(slip, e, p) + blend_back(place, e, body.skin, p, way)
-    set_vector(x, e, q, at)  # after all loads
+    set_vector(x, e, q, at)  # stores after all loads
     set_vector(slip, e, p, slipped)
     store_matrix(C, e, q, affine)

@@ -5,8 +5,8 @@ each; one warp runs all other stages, because a launch for a few microseconds of
 one thread runs a stage.
 
 There are three right-hand sides: momentum of the pull, momentum of the remaining physical velocity, and displacements
-of particles from their places. There are two factors of the mass matrix: one with locked joints and the added inertia of
-the projection, one with locked joints and everything implicit. Those of a kind are in one array: the first of all
+of particles from their places. There are two factors of the mass matrix: one with locked joints and the added inertia
+of the projection, one with locked joints and everything implicit. Those of a kind are in one array: the first of all
 environments, then the second, then the third.
 """
 

@@ -1,6 +1,7 @@
-"""What the joints of an environment work on. A warp has in shared memory what goes from bone to bone.
+"""Workspace of the torque controller: its arrays, and their views in shared memory.
 
-In global memory each bone would wait some hundred cycles for the one before.
+On a GPU the arrays that pass values from bone to bone are in the shared memory of a warp (its *arena*), to hide the
+latency of global memory between dependent steps. On a CPU they stay in the workspace.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class TorqueWorkspace:
-    """What the joints work on in a substep; rows are environments', where there are several of a kind times as many."""
+    """Arrays of the torque controller in a substep; arrays of several kinds have the rows of one after the other."""
 
     pose: Pose
     velocity: wp.array2d(dtype=float)  # (num_envs, 69) as in JointState
@@ -27,39 +28,39 @@ class TorqueWorkspace:
     records: wp.array(dtype=vec16)
     pattern: Pattern
     matrix: wp.array2d(dtype=float)  # (num_envs, entries)
-    diagonals: wp.array2d(dtype=float)  # (2 num_envs, 69) what factors have besides
-    # (2 num_envs + 1, entries); the last one, where muscles reach their limits, is a CPU's
+    diagonals: wp.array2d(dtype=float)  # (2 num_envs, 69) added to the mass matrix before factorization
+    # (2 num_envs + 1, entries); the last one, for muscles at their limits, is used on a CPU only
     factors: wp.array2d(dtype=float)
     stop: wp.array2d(dtype=float)  # (num_envs, bones) stiffness beyond the range [N m/rad]
-    # what particles have
+    # sums over particles
     moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)
-    # (num_envs, chunks) momenta of what the pull leaves, and of the ways to the particles' places, as velocities
+    # (num_envs, chunks) momenta of the velocity after the pull, and of the displacements to the skinned places
     other_moments: wp.array2d(dtype=vec12)
     bones: wp.array2d(dtype=vec16)  # (num_envs, bones)
     linear: wp.array2d(dtype=wp.vec3)  # (3 num_envs, bones)
     angular: wp.array2d(dtype=wp.vec3)
-    # (3 num_envs, 69) momenta, then changes of the velocity: the joints' own, what is taken over; and of the pose
+    # (3 num_envs, 69) momenta, then velocity changes by the joints and by the projection, and the fit of the pose
     shares: wp.array2d(dtype=float)
-    # (3 num_envs, 69) moments of an impulse on a bone along each axis, and how far they are solved for; a CPU's
+    # (3 num_envs, 69) columns J^T, then Y, of the point of a bone, an axis each; used on a CPU only
     touch: wp.array2d(dtype=float)
-    whole: wp.array2d(dtype=float)  # (num_envs, 69) velocity of all that acts
-    # (num_envs, bones) boxes that hold the points of bones, in the rest pose: from joints to middles, half extents [m]
+    whole: wp.array2d(dtype=float)  # (num_envs, 69) predicted velocity of the joints, with the impulses of bone contact
+    # (num_envs, bones) bounding boxes of bones' points, in the rest pose: middle from the joint, half extents [m]
     middle: wp.array2d(dtype=wp.vec3)
     half: wp.array2d(dtype=wp.vec3)
-    # what the joints do
+    # torques
     muscle: wp.array2d(dtype=float)  # (num_envs, 69) impulses
     impulse: wp.array2d(dtype=float)
     left: wp.array2d(dtype=float)  # (num_envs, 69) diagonal without muscles that have reached their limits
-    # what particles get
-    place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to where bones are, from the pelvis joint
-    moving: wp.array2d(dtype=vec8)  # (num_envs, bones) motion of the joints
-    # (num_envs, bones) what the physical velocity lacks of the whole one, and the joints' motion half-way
+    # motion for the particles
+    place: wp.array2d(dtype=wp.mat44)  # (num_envs, bones) from rest to current places, relative to the pelvis
+    moving: wp.array2d(dtype=vec8)  # (num_envs, bones) rigid motions by the joints
+    # (num_envs, bones) rigid motions: total velocity less physical one, and J qdot at the midpoint
     steps: wp.array2d(dtype=vec12)
     slip: wp.array2d(dtype=wp.vec3)  # as in JointState
-    pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) where its joint begins the substep [m]
+    pelvis: wp.array(dtype=wp.vec3)  # (num_envs,) position of its joint at the start of the substep [m]
 
 
-# Words of shared memory of a warp: the factor's, which have the bones' momenta until it comes; three shares, the bones'
+# Words of a warp's arena: the factor, whose place first holds the bones' momenta; three shares, the bones'
 # motion, and the pose.
 _ROWS, _VECTORS = wp.constant(MOST_ROWS), wp.constant(3 * NUM_JOINTS)
 _LINEAR = wp.constant(0)
@@ -69,7 +70,7 @@ _MOVING = wp.constant(int(_SHARES) + 3 * MOST_ROWS)
 _ROTATION = wp.constant(int(_MOVING) + 8 * NUM_JOINTS)
 _POSITION = wp.constant(int(_ROTATION) + 4 * NUM_JOINTS)
 _WORDS = -(-(int(_POSITION) + 3 * NUM_JOINTS) // 4) * 4
-# Of vectors that are solved for: where they are in an arena, and words of one.
+# First word of the right-hand sides in an arena, and words of each.
 _SPARE, _COLUMN = wp.constant(SPARE), wp.constant((ARENA_WORDS - SPARE) // 3)
 
 
@@ -82,7 +83,7 @@ return 0;
 #endif
 """)
 def warp_arena() -> wp.uint64:
-    """Room of a warp that has a CUDA block of its own; a factor's is at its beginning."""
+    """Return the arena of a warp that is a CUDA block of its own; it begins with the factor."""
     ...
 
 
@@ -94,7 +95,7 @@ return row;
 #endif
 """)
 def row_in_arena(row: int, there: int) -> int:
-    """Return row ``there``, where an array has several rows in a warp's arena; on a CPU ``row``."""
+    """Return the row of an array in a warp's arena: ``there`` on a GPU, ``row`` on a CPU."""
     ...
 
 
@@ -110,31 +111,31 @@ return rows;
 
 @wp.func_native(_VIEW)
 def view_numbers(rows: wp.array2d(dtype=float), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=float):
-    """Return the array with its first row at word ``at`` of the arena, and rows every so many ``words``."""
+    """Return a view whose first row is at word ``at`` of the arena, with ``words`` from row to row."""
     ...
 
 
 @wp.func_native(_VIEW)
 def view_vectors(rows: wp.array2d(dtype=wp.vec3), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.vec3):
-    """Do the same as :func:`view_numbers` for vectors."""
+    """Run :func:`view_numbers` for vectors."""
     ...
 
 
 @wp.func_native(_VIEW)
 def view_rotations(rows: wp.array2d(dtype=wp.quat), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=wp.quat):
-    """Do the same as :func:`view_numbers` for rotations."""
+    """Run :func:`view_numbers` for rotations."""
     ...
 
 
 @wp.func_native(_VIEW)
 def view_motions(rows: wp.array2d(dtype=vec8), arena: wp.uint64, at: int, words: int) -> wp.array2d(dtype=vec8):
-    """Do the same as :func:`view_numbers` for rigid motions."""
+    """Run :func:`view_numbers` for rigid motions."""
     ...
 
 
 @wp.func
 def view_columns(rows: wp.array2d(dtype=float), arena: wp.uint64):
-    """Three vectors that are solved for, in the arena of a warp; on a CPU ``rows``. See :func:`place_of_triple`."""
+    """Return the three right-hand sides in the arena of a warp; on a CPU ``rows``. See :func:`place_of_triple`."""
     return view_numbers(rows, arena, _SPARE, _COLUMN)
 
 
@@ -146,7 +147,7 @@ return 3 * k;
 #endif
 """)
 def place_of_triple(k: int) -> int:
-    """Return where joint ``k`` begins in a column of :func:`view_columns`; the pelvis' position comes first."""
+    """Return the first index of triple ``k`` in a column of :func:`view_columns`; 0 is the pelvis' position."""
     ...
 
 
@@ -158,7 +159,7 @@ for (int n = thread; n < {3 * NUM_JOINTS}; n += threads) to[n] = from[n];
 #endif
 """)
 def load_positions(position: wp.array2d(dtype=wp.vec3), e: int, thread: int, threads: int, arena: wp.uint64, at: int):
-    """Write where the joints of an environment are to the arena, from word ``at`` on."""
+    """Copy the joint positions of an environment to the arena, from word ``at`` on."""
     ...
 
 
@@ -173,7 +174,7 @@ __syncwarp();
 #endif
 """)
 def load_pose(w: TorqueWorkspace, e: int, arena: wp.uint64):
-    """Write the pose of an environment to the arena."""
+    """Copy the pose of an environment to the arena."""
     ...
 
 
@@ -181,8 +182,8 @@ def load_pose(w: TorqueWorkspace, e: int, arena: wp.uint64):
 def load_workspace(w: TorqueWorkspace, e: int):
     """Return the workspace with pose, motion, momenta and shares of an environment in the arena of its warp.
 
-    What has several rows has them as :func:`row_in_arena` says; all else has one there, whatever the environment. On a
-    CPU it is the bench itself.
+    Arrays with several rows have them as :func:`row_in_arena` numbers them; all others have one row, which any
+    environment index reads. On a CPU it returns the workspace itself.
     """
     arena = warp_arena()
     load_pose(w, e, arena)
@@ -203,7 +204,7 @@ for (int n = thread; n < {6 * NUM_JOINTS}; n += threads) to[12 * (n / 6) + n % 6
 def store_motion(
     motion: wp.array2d(dtype=vec8), e: int, first: int, thread: int, threads: int, steps: wp.array2d(dtype=vec12)
 ):
-    """Write the motion of all bones to their records, from number ``first`` on."""
+    """Copy the motion of all bones to their records in ``steps``, from component ``first`` on."""
     ...
 
 
@@ -220,5 +221,5 @@ keep(near.pose.position, w.pose.position, {3 * NUM_JOINTS});
 #endif
 """)
 def store_workspace(w: TorqueWorkspace, e: int, near: TorqueWorkspace):
-    """Write motion and pose from the arena, as all threads have left them."""
+    """Copy motion and pose from the arena back to the workspace."""
     ...
