@@ -1,32 +1,22 @@
-"""Moments of what two bones both move as records: how they move from joint to joint, and where an environment has them.
+"""Mass matrix of a skinned body's joints, ``M = J^T m J`` with the skinning Jacobian ``J`` at the particles.
 
-See :mod:`piavatar_envs.avatar.torque_control.mass_matrix`.
-
-What every two bones of an avatar move both: lists of particles, and their moments.
-
-What a bone has alone needs no lists: weights of a particle add up to one, so that it is what is left of all that the
-bone moves. See :mod:`piavatar_envs.avatar.torque_control.mass_matrix`.
-
-Mass matrix of a skinned body's joints, ``M = J^T m J`` with the skinning Jacobian ``J`` at the particles.
-
-A joint ``c`` turns all that it carries about its place ``p_c``. With ``W_pc``, the sum of a particle's weights of the
-bones beyond the joint, a velocity of the joints moves it by
+A joint ``c`` turns all bones beyond it about its position ``p_c``. With ``W_pc``, the sum of a particle's weights of
+these bones, the velocity of the joints moves a particle by
 
     v_p = v_0 + sum_c W_pc  w_c x (x_p - p_c),
 
-``v_0`` the velocity of the pelvis and ``w_0`` its spin, ``w_c`` the angular velocity of a joint against its parent, in
-the world's axes. The generalised velocity is ``(v_0, w_0, ..., w_21)``, 69 numbers. The block of two joints is
+where ``v_0`` is the velocity of the pelvis, ``w_0`` its spin, and ``w_c`` the angular velocity of a joint relative to
+its parent, in the world's axes. The generalised velocity is ``(v_0, w_0, ..., w_21)``, 69 numbers. The block of two
+joints is
 
     M_cd = sum_p m W_pc W_pd ((a . b) I - b a^T),   a = x_p - p_c,  b = x_p - p_d.
 
-Nothing of the size of ``J`` is stored. A particle has four bones at most, so few pairs of bones have particles in
-common; their moments are summed over fixed lists (no atomics), then from bone to bone up the tree, once for each of the
-two joints (the composite bodies of Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6, but for bodies that
-share matter). Moments are always about the joints at hand: about a common point, a hand's inertia would be the small
-difference of large numbers. Of what a bone moves alone nothing is summed: its moments are those of all that it moves,
-which are there for other reasons, less those of its pairs.
-
-The mass matrix of an avatar's joints in every environment, and what is solved with it: arrays, and sums of pairs.
+``J`` is never stored. A particle has at most four bones, so few pairs of bones share particles. The moments of each
+pair are summed over fixed lists (no atomics), then from bone to bone up the tree, once for each of the two joints (the
+composite bodies of Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6, but for bodies that share matter).
+Moments are always about the joints at hand: about a common point, a hand's inertia would be the small difference of
+large numbers. The moments of the matter that a bone moves alone need no lists, because the weights of a particle add up
+to one: they are those of all matter that the bone moves, which other stages need too, less those of its pairs.
 """
 
 from __future__ import annotations
@@ -84,11 +74,11 @@ def moved(s: vec16, alpha: wp.vec3, beta: wp.vec3):
     return two_sided(m, first + m * alpha, both)
 
 
-# Records of the pairs of bones lie in shared memory on a GPU, word by word, rows an odd number of words apart: threads
-# read from different banks, whether theirs are the pairs of one bone or those of all with one.
+# On a GPU the records of pairs are in shared memory, word by word, with rows an odd number of words apart, so that
+# threads read from different banks along rows and along columns.
 _ROW, _WORDS = NUM_JOINTS + 1 - NUM_JOINTS % 2, 13
 _WORD = _ROW * NUM_JOINTS
-#: Where the joints' places are, behind all records.
+#: First word of the joint positions, which follow all records.
 PLACES = wp.constant(_WORDS * _WORD)
 
 
@@ -131,7 +121,7 @@ reinterpret_cast<wp::vec_t<16, wp::float32>*>(records)[{NUM_JOINTS} * c + d] = v
 #endif
 """)
 def write_pair(records: wp.uint64, c: int, d: int, value: vec16):
-    """Write what :func:`read_pair` reads."""
+    """Write the record of bones ``c`` and ``d``."""
     ...
 
 
@@ -150,14 +140,14 @@ def transposed(s: vec16, away: wp.vec3):
 
 @wp.struct
 class Pairs:
-    """Particles that two bones move: lists in chunks, as those of :class:`piavatar_envs.avatar.types.Body`."""
+    """Pairs of bones that share particles: lists in chunks, as those of :class:`piavatar_envs.avatar.types.Body`."""
 
     # (bones * bones,) pair of two bones; -1 where they have no particle in common, and for a bone with itself
     of: wp.array(dtype=int)
     # bone c has particles in common with others neighbors[neighbor_start[c] : neighbor_start[c + 1]]
     neighbor_start: wp.array(dtype=int)
     neighbors: wp.array(dtype=int)
-    first: wp.array(dtype=int)  # (pairs,) one of the bones of a pair, about whose joint its moments are
+    first: wp.array(dtype=int)  # (pairs,) first bone of a pair; its joint is the reference of the moments
     second: wp.array(dtype=int)  # (pairs,) the other one
     quarters: wp.array(dtype=wp.vec4i)  # of warps that share chunks, see piavatar_envs.avatar.segment_sums
     chunk_start: wp.array(dtype=int)  # (pairs + 1,) pair q owns chunks chunk_start[q] : chunk_start[q + 1]
@@ -166,7 +156,7 @@ class Pairs:
 
 
 def build_pairs(points: BodyPoints, device: str) -> Pairs:
-    """Lists of all pairs of two bones that have particles in common."""
+    """Build the lists of all pairs of bones that share particles."""
     weights = points.skin_weights / points.skin_weights.sum(1, keepdims=True)
     particles: dict[tuple[int, int], list[np.ndarray]] = {}
     products: dict[tuple[int, int], list[np.ndarray]] = {}
@@ -219,9 +209,9 @@ def sum_pairs(
     # out
     sums: wp.array2d(dtype=vec12),
 ):
-    """Mass, first and second moment of chunks about a joint; over ``(num_envs, warps of the quarters, threads)``.
+    """Sum mass, first and second moment of chunks about a joint; over ``(num_envs, warps of the quarters, threads)``.
 
-    ``position`` are those of the joints [m].
+    ``position`` holds the joint positions [m].
     """
     i, j, k = wp.tid()
     e, share = own_share(pairs.quarters, i, j, k, threads)
@@ -254,13 +244,13 @@ NUM_DOF = 3 + 3 * NUM_JOINTS
 BONES = wp.constant(NUM_JOINTS)
 #: Pairs of bones whose blocks are in the lower triangle.
 LOWER = wp.constant(NUM_JOINTS * (NUM_JOINTS + 1) // 2)
-#: Lanes that share what a bone moves.
+#: Lanes that share the sums of a bone.
 LANES = wp.constant(4)
 I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 
 
 def filled_entries(pairs: Pairs) -> np.ndarray:
-    """Return which entries of the mass matrix may differ from zero, ``(69, 69)`` bool: joints with common matter."""
+    """Return the mask of the entries that may be nonzero, ``(69, 69)`` bool: those of joints with common matter."""
     shared = (pairs.of.numpy().reshape(NUM_JOINTS, NUM_JOINTS) >= 0) | np.eye(NUM_JOINTS, dtype=bool)
     for columns in (False, True):
         for bone in range(NUM_JOINTS - 1, 0, -1):  # children come after their parents
@@ -282,8 +272,8 @@ def place_pair(
     # out
     records: wp.uint64,
 ):
-    """Store the moments of what two bones both move, about their joints, with either as the first."""
-    c = pairs.first[pair]  # about whose joint the sums are
+    """Store the moments of the matter that both bones of a pair move, about their joints, in either order."""
+    c = pairs.first[pair]  # the sums are about its joint
     d = pairs.second[pair]
     s = add_rows12(sums, e, pairs.chunk_start[pair], pairs.chunk_start[pair + 1])
     second = symmetric(wp.vec3(s[4], s[5], s[6]), wp.vec3(s[7], s[8], s[9]))
@@ -307,9 +297,9 @@ def place_bone(
     # in and out
     records: wp.uint64,
 ):
-    """Store the moments of what a bone alone moves, about its joint: of everything less what it shares.
+    """Store the moments of the matter that a bone moves alone, about its joint: all that it moves less its pairs.
 
-    So many ``threads`` that follow each other share the bone.
+    ``threads`` consecutive threads share the bone.
     """
     s = vec16()
     for n in range(body.chunk_start[c] + thread, body.chunk_start[c + 1], threads):
@@ -326,14 +316,14 @@ def place_bone(
 
 @wp.func
 def take_row(position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, a: int, b: int, other: int):
-    """Read the shared moments of bone ``b``, with all beyond, and an ``other``, moved to its parent ``a``."""
+    """Return the moments shared by bone ``b``, with all beyond, and ``other``, moved to the parent ``a`` of ``b``."""
     step = position[e, b] - position[e, a]
     return lift(read_pair(records, b, other), step, position[e, b] - position[e, other])
 
 
 @wp.func
 def take_column(position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int, a: int, b: int, other: int):
-    """Do the same for the second bone of a pair, where the first is the ``other``."""
+    """Return the same as :func:`take_row` with ``other`` as the first bone of the pair."""
     step = position[e, b] - position[e, a]
     away = position[e, other] - position[e, b]
     lifted = lift(transposed(read_pair(records, other, b), away), step, -away)
@@ -342,7 +332,7 @@ def take_column(position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int,
 
 @wp.func
 def compose_alone(body: Body, position: wp.array2d(dtype=wp.vec3), records: wp.uint64, e: int):
-    """Add what every bone has in common with another to what its parent has, for both sides; a thread, bone by bone."""
+    """Add the shared moments of every bone to those of its parent, for both bones of all pairs, on a single thread."""
     for other in range(BONES):
         for back in range(BONES - 1):
             b = BONES - 1 - back  # children come after their parents
@@ -367,7 +357,7 @@ def compose_in_warp(
     thread: int,
     threads: int,
 ):
-    """Run :func:`compose_alone` for one side: threads of a CUDA block share a level's bones and all others."""
+    """Run :func:`compose_alone` for one bone of the pairs; threads of a CUDA block share the pairs of a level."""
     for back in range(body.levels - 1):
         level = body.levels - 2 - back
         first = body.level_start[level]
@@ -398,7 +388,7 @@ def row_of_pair(n: int) -> int:
 
 @wp.func
 def fill_blocks(s: vec16, pattern: Pattern, c: int, d: int, at: wp.uint64):
-    """Write the block of two joints of the mass matrix; those of the pelvis' velocity with the first joint's."""
+    """Write the block of joints ``c`` and ``d`` of the mass matrix; with ``d`` 0 also those of the pelvis' velocity."""
     both = second_moment(s)
     own = (1 + c) * (1 + BONES)
     set_in_arenas(at, pattern.block[own + 1 + d], wp.trace(both) * I3 - both)
@@ -410,7 +400,7 @@ def fill_blocks(s: vec16, pattern: Pattern, c: int, d: int, at: wp.uint64):
 
 @wp.func
 def fill_mass(pattern: Pattern, records: wp.uint64, thread: int, threads: int, at: wp.uint64):
-    """Write the mass matrix to ``at`` from its records, on a GPU in the same arena."""
+    """Write the mass matrix to ``at`` from its records; on a GPU it replaces them in the same arena."""
     if threads == 1:
         for c in range(BONES):
             for d in range(c + 1):
@@ -446,8 +436,8 @@ def compose_mass(
 ):
     """Compose the mass matrix at ``at`` from the moments of pairs and of bones, by blocks of the ``pattern``.
 
-    Moments of every two bones become those of all that two joints carry: first for one side of the pairs, then for the
-    other. The threads of a CUDA block share the bones.
+    The moments of two bones become those of all matter that two joints carry: first for one bone of the pairs, then for
+    the other. The threads of a CUDA block share the bones.
     """
     for n in range(thread, BONES * BONES, threads):
         write_pair(records, n // BONES, n % BONES, vec16())
@@ -467,31 +457,28 @@ def compose_mass(
     fill_mass(pattern, records, thread, threads, at)
 
 
-#: Age that a mass matrix may reach [s]: a little older, and fast limbs are unstable.
+#: Greatest age of a mass matrix [s]; fast limbs become unstable with an older one.
 LONGEST_REFRESH = 0.005
-#: Substeps that a mass matrix may be used in. What the joints take over by an old one is wrong by more than itself in
-#: directions in which a turned limb is much heavier than it was, and that grows from substep to substep. Moments of its
-#: pairs must be as new: with those of the control step's beginning, turned with the bones, 71 of 192 ``tiny`` bodies
-#: that lay on the floor failed within 200 control steps of random torques; with new ones none.
+#: Most substeps that use the same mass matrix. In directions in which a turned limb has become much heavier, the
+#: projection by an old matrix overshoots, and the error grows from substep to substep. The moments of its pairs must be
+#: as new as the matrix: reusing older ones, turned with the bones, makes bodies on the floor unstable.
 MOST_USES = 2
-#: What joints whose limbs are thinner than a cell know of the inertia that flesh has on the grid. Without it 20 of 48
-#: ``tiny`` bodies that lie on the floor fail within 200 control steps of random torques, with it 1 of 96. Ankles have
-#: less: at 0.5 two of five walkers fell in every fifth episode, at 0.25 in 2 of 100 at most. Without, feet jerk.
+#: Share of the grid's additional inertia of flesh that is added for joints whose limbs are thinner than a cell.
+#: Without it small bodies on the floor become unstable; ankles get less, because walking needs fast feet.
 GRID_SHARES = {"elbow": 0.5, "wrist": 0.5, "ankle": 0.25}
 
 
 def grid_inertia(points: BodyPoints, dx: float) -> np.ndarray:
-    """Inertia besides that of its limb with which a light joint takes over what particles do, ``(22,)`` [kg m^2].
+    """Return the inertia that is added to light joints for the projection, ``(22,)`` [kg m^2].
 
-    Between particles and nodes matter is spread: with quadratic weights by ``dx^2/4`` along each axis, as mean square
-    (``D_p`` of Jiang et al. 2015), so that flesh of mass ``m`` turns on the grid with ``m dx^2/2`` besides its own
-    inertia. Joints that know nothing of it take over more from a hand than the grid lets it have, and the two throw it
-    about until it fails. A share of it is enough. What is not taken over stays with the particles: no momentum is
-    lost. The mass is that of the bones' own flesh in the shape that the body is built with.
+    Between particles and nodes matter is spread: with quadratic weights by a mean square of ``dx^2/4`` along each axis
+    (``D_p`` of Jiang et al. 2015), so that flesh of mass ``m`` turns on the grid with ``m dx^2/2`` in addition to its
+    own inertia. Without this inertia a light joint takes over more velocity from a hand than the grid allows, and the
+    exchange becomes unstable; a share of it is enough. Velocity that is not taken over stays with the particles, so no
+    momentum is lost. The mass is that of the bones' flesh in the shape that the body is built with.
 
-    Torques are to know nothing of it, or what reaches the ground of them would be less by this inertia than what a
-    joint gives. Heavier joints neither: they take over from flesh that is pulled to bones, too, and something of that
-    would be missing (a knee that bears 22 N m would give 1 more).
+    The torque solve omits it: otherwise less of a torque would reach the ground. Heavier joints have none, because the
+    reaction of the flesh's pull is projected too, and would be incomplete.
     """
     joints, weights = in_order(points.skin_joints, points.skin_weights)
     shares = weights * points.mass[0][:, None]
@@ -501,15 +488,15 @@ def grid_inertia(points: BodyPoints, dx: float) -> np.ndarray:
 
 
 class MassMatrix:
-    """``M = J^T m J`` of one avatar; see :mod:`piavatar_envs.avatar.torque_control.mass_matrix`.
+    """Mass matrix ``M = J^T m J`` of one avatar in every environment, with the sums that it is built from.
 
     Attributes:
-        pairs: of bones that have particles in common.
+        pairs: pairs of bones that share particles.
         sums: their moments, ``(num_envs, chunks)``.
-        pattern: where its factors have entries.
+        pattern: positions of the entries of its factors.
         matrix: the mass matrix, ``(num_envs, factor_size)``; see :meth:`read`.
-        records: on a CPU, where the matrix is composed, one body after the other.
-        refresh: substeps that a matrix is used in.
+        records: scratch memory of the composition on a CPU, one body after the other.
+        refresh: number of substeps that use a matrix.
     """
 
     def __init__(self, points: BodyPoints, body: Body, model: Model) -> None:
@@ -523,11 +510,11 @@ class MassMatrix:
         self.refresh = min(MOST_USES, max(1, int(LONGEST_REFRESH / model.step.dt + 1e-6)))
 
     def is_due(self, step: int) -> bool:
-        """Return whether substep ``step`` of a control step has a matrix of its own."""
+        """Return whether the matrix is rebuilt in substep ``step`` of a control step."""
         return step % self.refresh == 0
 
     def make_factors(self, systems: int) -> wp.array:
-        """Room for so many Cholesky factors, or matrices."""
+        """Allocate ``systems`` Cholesky factors, or matrices."""
         return wp.zeros((systems, factor_size(self.pattern)), dtype=float, device=self.model.device)
 
     def read(self) -> np.ndarray:
@@ -538,7 +525,7 @@ class MassMatrix:
         return matrix
 
     def record_sums(self, graph: LaunchGraph, state: State, position: wp.array) -> None:
-        """Append: moments of all pairs for joints at ``position`` [m]."""
+        """Append the moments of all pairs for joints at ``position`` [m]."""
         graph.launch(
             sum_pairs,
             (self.sums.shape[0], warps_of(self.pairs.quarters, self.threads), self.threads),

@@ -1,17 +1,16 @@
-"""Cholesky factors of small sparse matrices, one an environment, and solutions with them.
+"""Cholesky factors of small sparse matrices of kinematic trees, one per environment, and solutions with them.
 
-On a GPU a factor is in the arena of a warp, in shared memory: each row needs the one before, and would wait for global
-memory every time. An arena has :data:`ARENA_WORDS` words: a factor's, and from :data:`SPARE` on those of vectors to
-solve for. On a CPU factor and vectors are where they are kept.
+The matrix is ``L^T L`` with a lower triangle ``L``: rows are eliminated from the last one up. Where children come after
+their parents, limbs are eliminated before the bones that they hang on, so that separate limbs cause no fill-in in each
+other's rows (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6.5). The nonzero blocks of 3 x 3, the axes of
+two joints, are found once, on the host.
 
-The matrix is ``L^T L`` with a lower triangle ``L``: rows are eliminated from the last one up. Where rows are joints
-in an order that has children after their parents, limbs go before what they hang on, and of two limbs neither fills
-the rows of the other (Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 6.5). Which blocks of 3 x 3, the axes
-of two joints, are not zero is found once, on the host.
+Matrices and factors store only these blocks, row by row, the diagonal block last in its row. In a matrix the diagonal
+block is complete; in a factor it is the inverse ``L_kk^-1`` (lower), the only form that solutions use.
 
-Matrices and factors are kept as these blocks alone, one after the other, row by row, in a row the diagonal's last; of a
-matrix that one is whole. In a factor it is its inverse, ``L_kk^-1``, lower, which is all that solutions ask for. On a
-GPU a warp works on a factor in an arena in shared memory; on a CPU one thread works where factors are kept.
+On a GPU a warp has a factor in shared memory, its *arena*, because each row depends on the one before and would wait
+for global memory. An arena has :data:`ARENA_WORDS` words: those of a factor, and from :data:`SPARE` on the right-hand
+sides. On a CPU a single thread works on factors and vectors in place.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ from piavatar_envs.core.cuda_intrinsics import lane_of_warp, sync_threads
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
-#: Rows of the largest matrix that fits an arena: as many as an avatar has. 16 arenas fit a multiprocessor.
+#: Rows of the largest matrix that fits an arena: those of an avatar.
 MOST_ROWS = 69
 _JOINTS = MOST_ROWS // 3
-#: Words of shared memory of a warp: all blocks that a factor may have, and three vectors, four words a joint.
+#: Words of a warp's arena: all blocks that a factor may have, and three vectors with four words a joint.
 SPARE = 9 * _JOINTS * (_JOINTS + 1) // 2
 ARENA_WORDS = SPARE + 3 * 4 * _JOINTS
 _ARENA = """
@@ -45,11 +44,10 @@ const auto over_root = [](float x) { return 1.0f / sqrtf(x); };
 """
 
 
-# A warp that is alone takes four cycles for an instruction, and hundreds for what it does not find in the first-level
-# cache, of graph or data. Places come in bytes, therefore, what is done in a round is asked for two rounds ahead,
-# from lists that end in two rounds of nothing, and all is read before anything is written, which it might be.
-# Of a row all lanes find the inverse of the diagonal's block, a lane a column of the others. Then a lane has two of its
-# blocks, whose product is to be taken from a third.
+# A single warp is bound by latency. Therefore offsets are in bytes, the plan of a round is loaded two rounds ahead,
+# from lists that end in two empty rounds, and all values are read before any is written. In a row all lanes compute the
+# inverse of the diagonal block, then each lane a column of the other blocks; then each lane subtracts the product of
+# two of these blocks from a third.
 @wp.func_native(
     _ARENA
     + """
@@ -134,7 +132,7 @@ meet();
 """
 )
 def add_diagonal(entry: wp.array(dtype=int), diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
-    """Add row ``e`` to the diagonal of the matrix in an arena, whose entries are there."""
+    """Add row ``e`` of ``diagonal`` to the diagonal of the matrix in an arena, at the words ``entry``."""
     ...
 
 
@@ -149,7 +147,7 @@ for (int n = 0; n < 9; ++n) {{
 }}
 """)
 def set_in_arenas(at: wp.uint64, block: int, value: wp.mat33):
-    """Write a block, if it has a number, to the matrix in an arena, and on a GPU to that in the next arena."""
+    """Write a block, if its number is not negative, to the matrix in an arena; on a GPU also to the next arena."""
     ...
 
 
@@ -160,7 +158,7 @@ for (int k = thread; k < rows.shape[1] / 4; k += threads) to[k] = reinterpret_ca
 #endif
 """)
 def store_arena(at: wp.uint64, n: int, thread: int, threads: int, rows: wp.array2d(dtype=float)):
-    """Write what is in an arena to row ``n``; on a CPU it is there."""
+    """Copy an arena to row ``n``; on a CPU it is that row."""
     ...
 
 
@@ -177,7 +175,7 @@ if (to != &wp::index(rows, n, 0)) memcpy(to, &wp::index(rows, n, 0), sizeof(floa
 #endif
 """)
 def load_arena(rows: wp.array2d(dtype=float), n: int, at: wp.uint64):
-    """Read row ``n`` into an arena."""
+    """Copy row ``n`` to an arena."""
     ...
 
 
@@ -193,8 +191,8 @@ def place_of_factor(factor: wp.array2d(dtype=float), f: int, arena: wp.uint64) -
     ...
 
 
-# All lanes find the part of a joint, and each takes from one number of another joint what that has of it: on the way
-# down, in the columns of its row, and on the way up, in the rows of its column. What is not in ``wanted`` is passed by.
+# All lanes solve for the part of a joint, and each subtracts its contribution from one number of another joint: on the
+# way down along the columns of its row, on the way up along the rows of its column. Others than ``wanted`` are skipped.
 _TRIPLES = (
     _ARENA
     + f"""
@@ -323,7 +321,7 @@ def descend_three(
 ):  # fmt: skip
     """Multiply three vectors by ``L^-T``; only joints whose bits are ``wanted`` have entries.
 
-    Of a warp they are in its arena, of a thread that is alone in rows of ``x`` as in :func:`solve_three`.
+    A warp has the vectors in its arena, a single thread in rows of ``x`` as in :func:`solve_three`.
     """
     ...
 
@@ -339,35 +337,34 @@ def ascend_one(
 
 @wp.struct
 class Pattern:
-    """Blocks of ``L`` that need not be zero, and what the lanes of a warp do with them, in rounds.
+    """Nonzero blocks of ``L``, and the plan of elimination and solution for the lanes of a warp, in rounds.
 
-    All rounds of a kind are followed by two of nothing, for they are asked for ahead. A lane's word is -1 where it does
-    nothing.
+    All rounds of a kind are followed by two empty ones, because they are loaded ahead. The word of an idle lane is -1.
     """
 
-    block: wp.array(dtype=int)  # (joints * joints,) of two joints, -1 where there is none
-    entry: wp.array(dtype=int)  # (rows,) numbers of the diagonal's entries
+    block: wp.array(dtype=int)  # (joints * joints,) number of the block of two joints, -1 without one
+    entry: wp.array(dtype=int)  # (rows,) indices of the diagonal's entries
     # (rounds,) of the elimination of a row: bytes to its first block, bytes to that of the diagonal, columns before
-    # that, and 1 where the round goes on with the row before it
+    # that, and 1 if the round continues the row before it
     step: wp.array(dtype=wp.vec4i)
     # (rounds * 32,) a block that changes by the product of two of the row: 2^16 times the bytes to it, 2^8 times the
     # numbers from the row's first block to the first, those to the second
     pair: wp.array(dtype=int)
     # (rounds,) of a solution: 2^10 times the bytes to the diagonal's block, and to the joint's part of a vector that
-    # has sixteen a joint; -1 where the round goes on with the joint before it
+    # has sixteen a joint; -1 if the round continues the joint before it
     head: wp.array(dtype=int)
-    # (rounds * 32,) which part of the vector changes, in bytes, and 2^10 times those to the first of three numbers
+    # (rounds * 32,) bytes to the part of the vector that changes, plus 2^10 times those to the first of three numbers
     word: wp.array(dtype=int)
     turn: int  # rounds on the way down, an even number; those on the way up are as well
-    reach: wp.array(dtype=int)  # (joints,) bits of the joints to which what is in one comes on the way down
+    reach: wp.array(dtype=int)  # (joints,) bits of the joints that an entry of a joint reaches on the way down
 
 
-#: Lanes of a warp, which a round has work for, and the bytes of a number and of a block.
+#: Lanes of a warp, and the bytes of a number and of a block.
 LANES, NUMBER, BLOCK = 32, 4, 36
 
 
 def in_rounds(words: np.ndarray) -> np.ndarray:
-    """Pad to whole rounds, at least one."""
+    """Pad ``words`` with -1 to whole rounds, at least one."""
     return np.pad(words, (0, max(LANES, -(-len(words) // LANES) * LANES) - len(words)), constant_values=-1)
 
 
@@ -375,7 +372,7 @@ def find_pattern(filled: np.ndarray, device: str) -> Pattern:
     """Find the entries of ``L`` by elimination, from those of the matrix, ``filled``, shape ``(N, N)`` bool.
 
     Raises:
-        ValueError: it is not made of filled and empty blocks of 3 x 3, or has too many rows.
+        ValueError: ``filled`` is not made of filled and empty blocks of 3 x 3, or has too many rows.
     """
     filled = filled | filled.T
     joints = filled[::3, ::3].copy()
@@ -400,7 +397,7 @@ def find_pattern(filled: np.ndarray, device: str) -> Pattern:
 
 
 def plan_elimination(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and pairs of :class:`Pattern`, from the ``block`` of every two joints."""
+    """Return steps and pairs of :class:`Pattern`, from the ``block`` of every two joints."""
     steps, pairs = [], []
     for k in reversed(range(len(block))):
         own = np.flatnonzero(block[k, :k] >= 0)
@@ -412,7 +409,7 @@ def plan_elimination(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plan_solution(block: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Heads, words and turn of :class:`Pattern`, from the ``block`` of every two joints."""
+    """Return heads, words and turn of :class:`Pattern`, from the ``block`` of every two joints."""
     count, axis, heads, words, turn = len(block), np.arange(3), [], [], 0
     for up in (False, True):
         turn = len(heads)  # even
@@ -437,7 +434,7 @@ def plan_reach(block: np.ndarray) -> np.ndarray:
 
 
 def factor_size(pattern: Pattern) -> int:
-    """Numbers of a matrix or a factor, in whole records of four."""
+    """Return the length of a stored matrix or factor, a multiple of four."""
     return -(-9 * (1 + int(pattern.block.numpy().max())) // 4) * 4
 
 
@@ -450,7 +447,7 @@ def lower_entries(pattern: Pattern) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def pack(pattern: Pattern, matrices: np.ndarray) -> np.ndarray:
-    """Symmetric matrices ``(n, N, N)`` as they are kept, ``(n, factor_size)`` float32."""
+    """Pack symmetric matrices ``(n, N, N)`` into the stored form, ``(n, factor_size)`` float32."""
     rows, columns, numbers = lower_entries(pattern)
     packed = np.zeros((len(matrices), factor_size(pattern)), np.float32)
     packed[:, numbers] = matrices[:, rows, columns]
@@ -471,8 +468,8 @@ def factorize(
 ):
     """Compute ``L`` of ``L^T L = matrix + diag(diagonal)``, of matrix ``source`` and row ``e`` of the ``diagonal``.
 
-    ``matrix`` is ``(num_envs, factor_size)``. A thread that is alone writes factor ``f`` of as many numbers; a warp has
-    it in its arena, from where :func:`store_factor` writes it.
+    ``matrix`` is ``(num_envs, factor_size)``. A single thread writes factor ``f`` of the same size; a warp leaves it in
+    its arena, from where :func:`store_factor` writes it.
     """
     at = place_of_factor(factor, f, arena)
     load_arena(matrix, source, at)
@@ -488,15 +485,15 @@ def factorize_in_arena(pattern: Pattern, diagonal: wp.array2d(dtype=float), e: i
 
 @wp.func
 def store_factor(arena: wp.uint64, f: int, factor: wp.array2d(dtype=float)):
-    """Write factor ``f``, which :func:`factorize` has just found, where it has not done so itself."""
+    """Write factor ``f`` from the arena after :func:`factorize`; on a CPU it is in place already."""
     lane = lane_of_warp()
     store_arena(arena, f, lane[0], lane[1], factor)
-    sync_threads(lane[1])  # the arena is free
+    sync_threads(lane[1])  # the arena may be reused
 
 
 @wp.func
 def load_factor(factor: wp.array2d(dtype=float), f: int, arena: wp.uint64):
-    """Let a warp solve with factor ``f`` from here on."""
+    """Load factor ``f`` into the arena of a warp."""
     load_arena(factor, f, place_of_factor(factor, f, arena))
 
 
@@ -514,7 +511,7 @@ def solve(
     # out
     x: wp.array2d(dtype=float),
 ):
-    """Solve for ``x[row]`` in ``L^T L x = right[e]``, ``L`` factor ``f``: of a warp the one in its arena."""
+    """Solve ``L^T L x[row] = right[e]`` with factor ``f``; a warp uses the factor in its arena."""
     sync_threads(threads)
     for i in range(thread, x.shape[1], threads):
         x[row, i] = right[e, i]
@@ -554,8 +551,8 @@ def begin_solution(
 ):
     """Compute ``Y = L^-T B`` of three right-hand sides ``B`` in ``x``, with which ``B^T M^-1 B = Y^T Y``.
 
-    Both have something in joints whose bits are ``wanted`` alone, which is what ``Pattern.reach`` tells; elsewhere
-    nothing is read or written. A warp has them in its arena, see
+    Both have entries only in joints whose bits are ``wanted``, see ``Pattern.reach``; other joints are neither read nor
+    written. A warp has them in its arena, see
     :func:`piavatar_envs.avatar.torque_control.workspace.view_columns`.
     """
     sync_threads(threads)
