@@ -1,6 +1,7 @@
 """Particle-to-grid transfer (P2G) of the plain path; the way back is in :mod:`piavatar_envs.mpm.g2p`.
 
-The plain path runs on CPUs, and on GPUs below compute capability 7.0.
+The plain path runs on CPUs, and is the fallback on GPUs below compute capability 7.0.
+:mod:`piavatar_envs.mpm.cuda` reuses its functions for single particles.
 
 APIC (Jiang et al., "The Affine Particle-In-Cell Method", 2015) with the MLS form of the stress force (Hu et al., "A
 Moving Least Squares Material Point Method", 2018, eq. 16). Physical and kinematic momentum share one pass.
@@ -297,7 +298,7 @@ def fault_of_sums(s: Deposit, quantum: float):
 def fault_within(s: Deposit, bounds: wp.vec3, quantum: float):
     """Return :func:`fault_of_sums`, evaluated only if the ``bounds`` of the momentum do not rule a fault out."""
     fault = int(0)
-    if not bounds[0] + bounds[1] + bounds[2] < MAX_QUANTA * quantum:  # of what is no number, either
+    if not bounds[0] + bounds[1] + bounds[2] < MAX_QUANTA * quantum:  # also true for NaN
         fault = fault_of_sums(s, quantum)
     return fault
 
@@ -306,8 +307,8 @@ def fault_within(s: Deposit, bounds: wp.vec3, quantum: float):
 def takes_part(blocks: Blocks, e: int, failure: wp.array(dtype=int)):
     """Return whether an environment takes part: it is not frozen, and has enough active blocks.
 
-    G2P of another part of the world may exhaust the active blocks in a parallel branch; particles that have not seen it
-    go on, and the grid update discards what they add.
+    G2P of another part of the world may exhaust the active blocks in a parallel branch; particles processed earlier
+    continue, and the grid update discards their contributions.
     """
     return (blocks.frozen[e] | (failure[e] & _BLOCKS)) == 0
 

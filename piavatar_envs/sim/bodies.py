@@ -375,7 +375,7 @@ def draw_body(
     """Draw one of ``count`` bodies in each masked environment; over ``(num_envs,)``."""
     e = wp.tid()
     if mask[e]:
-        # negative indices, because those of factors count from zero
+        # randomised factors use stream indices from 0; negative ones avoid a clash
         random = generator(seed[e], episode[e], STREAM_PARAMETERS, -1 - avatar)
         index[e] = wp.randi(random, 0, count)
 
@@ -419,7 +419,7 @@ class Shapes:
     def __init__(
         self, flesh: Sequence[Flesh], avatars: Sequence[Avatar], model: Model, randomization: Randomization
     ) -> None:
-        """Shape the bodies of pools; ``randomization`` must exist, as it gives arrays that vary rows of their own."""
+        """Shape the bodies of pools; ``randomization`` must exist, as it gives each environment its own row."""
         self.flesh, self.avatars, self.model, self.randomization = flesh, avatars, model, randomization
         self._ranges, self._names = shape_ranges(flesh), flesh[0].asset.shape_names
         # (num_envs, S) for every avatar; none where no shape is random

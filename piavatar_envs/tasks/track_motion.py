@@ -66,7 +66,7 @@ class Clip:
 
 @wp.func
 def frame_of(clip: Clip, start: int, step: int):
-    """Return the frame after ``step`` steps, within the clip whatever a restored state holds; the last one is held."""
+    """Return the frame after ``step`` steps: clamped, because a restored state may hold any frame."""
     return wp.clamp(start + step, 0, clip.root.shape[0] - 1)
 
 
@@ -119,8 +119,8 @@ def advance_reference(
 ):
     """Add the clip's increment of this step to the command.
 
-    Joint limits hold for the sum, or a swinging clip would carry the actions' part past them; they are widened to the
-    clip's own pose.
+    Joint limits hold for the sum; otherwise action offsets accumulate past the limits as the clip moves. They are
+    widened to the clip's own pose.
     """
     e, b = wp.tid()
     now = frame_of(clip, start[e], step_count[e])
@@ -158,7 +158,7 @@ def read_clip(
 
 @wp.func
 def offset_of(seed: int, episode: int, interval: int):
-    """Return the steps of the first interval that are over when an episode begins."""
+    """Return the number of steps already elapsed in the first interval."""
     random = generator(seed, episode, STREAM_DISTURBANCE, 0)
     return wp.randi(random, 0, interval)
 

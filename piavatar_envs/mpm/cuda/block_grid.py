@@ -1,22 +1,36 @@
 """Block per environment: which worlds it suits, its partitions, and the layout of the grid in shared memory.
 
-Bodies that share no velocity field have nothing to do with each other until contact. The particles of an environment
-are split into such partitions, and each has its own CUDA block.
+In this package *CUDA block* always means a group of threads; *block* alone, as in "active block" and "subblock", means
+4 x 4 x 4 nodes of the grid. This path runs on GPUs only.
 
-A small body touches two thousand nodes. They fit into the shared memory of a CUDA block, where an integer is added a
-hundred times as fast as in global memory. There they lie in subblocks of 2 x 2 x 2 nodes, numbered anew in every
-substep as particles touch them; more subblocks than fit are processed in several rounds.
+Bodies that share no velocity field are independent until contact. The particles of an environment are split into such
+partitions, and each has its own CUDA block.
+
+A small body touches about 2,000 nodes. They fit into the shared memory of a CUDA block, where integer additions are
+much faster than in global memory. There they are stored in subblocks of 2 x 2 x 2 nodes, numbered anew in every substep
+as particles touch them; more subblocks than fit are processed in several rounds.
 
 The accumulators have 32 bits. Masses count quanta of 2^-27 of a field's heaviest particle, so a node may hold 16 of
 them; if one overflows, the environment repeats the sums with quanta eight times as large. Momenta count the mass
 quantum times a speed that no particle of the field exceeds, a power of two chosen in every substep. So the integers are
 used to the full, and contributions are rounded much as floating-point numbers would be.
 
-Arena, in words of 4 bytes: header; a half word for every subblock of every active block, its number; a bit for every
-particle; a byte for every active block; the subblocks' places; subblocks of four words a node; three more words a node,
-in the same order. A subblock has a word in each of the 32 banks, and the position within the subblock selects the bank:
-threads that add to different nodes of the eight, or different words of the four, do not conflict. Nothing here runs on
-a CPU.
+The arena in shared memory, in this order; words have 4 bytes:
+
+==============  =============  ======================================================================================
+field           element        count
+==============  =============  ======================================================================================
+header          word           ``HEADER``
+``numbers``     half word      8 for each active block: the number of each of its subblocks
+``candidates``  bit            1 for each particle: whether it is a contact candidate
+``near``        byte           1 for each active block: which slabs are near a collider
+``places``      half word      8 for each active block: index and flag of each numbered subblock
+``subblocks``   4 words        8 (nodes) for each of ``capacity`` + 1 subblocks: mass and physical momentum
+``kinematic``   3 words        8 (nodes) for each subblock, in the same order: kinematic momentum
+==============  =============  ======================================================================================
+
+A subblock has a word in each of the 32 banks, and the position within the subblock selects the bank: threads that add
+to different nodes of the eight, or to different words of the four, do not conflict.
 """
 
 from __future__ import annotations
@@ -432,7 +446,7 @@ def touch_subblocks(
     max_float_word(HEAVIEST + field, mass)
     for b in range(8):
         set_half_word(arena.numbers, places[b], TOUCHED)
-    if (byte(arena.near, places[0] // BLOCK_SUBBLOCKS) & MAY_CONTACT) != 0:  # noqa: SIM102 - `and` would ask in any case
+    if (byte(arena.near, places[0] // BLOCK_SUBBLOCKS) & MAY_CONTACT) != 0:  # noqa: SIM102 - `and` would evaluate both
         if is_contact_candidate(
             grid, particles, boundaries, contact, blocks, e, p, at, base_node(grid_position(grid, at))
         ):
