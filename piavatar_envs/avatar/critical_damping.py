@@ -21,7 +21,7 @@ def pull_gain(rate: float, dt: float):
 
 @wp.func
 def critical_pull(rate: float, dt: float, error: wp.vec3, v: wp.vec3):
-    """Acceleration of an implicit critically damped spring of natural frequency ``rate`` [1/s]."""
+    """Return the acceleration of an implicit critically damped spring of natural frequency ``rate`` [1/s]."""
     return (rate * rate * (error - dt * v) - 2.0 * rate * v) / pull_denominator(rate, dt)
 
 

@@ -1,6 +1,6 @@
 """Forward kinematics: the pose of all bones from local rotations, with fixed bone offsets.
 
-Within a control step local rotations are turned by ``exp(fraction * increment)``, on arcs, not on chords.
+Within a control step local rotations are turned by ``exp(fraction * increment)``, along arcs instead of chords.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def pose_bone(
     rotation: wp.array2d(dtype=wp.quat),
     position: wp.array2d(dtype=wp.vec3),
 ):
-    """Pose one bone, whose ``rotation`` is local so far; its parent must have been posed."""
+    """Pose one bone: replace its local ``rotation`` by that in the world. Its parent must have been posed."""
     parent = body.parent[b]
     offset = bone_offset(body, e, b, root)
     if parent < 0:

@@ -6,13 +6,13 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Largest rotation of a joint from its rest pose [rad]. Rotation vectors jump at pi: a joint must not get there.
+#: Largest rotation of a joint from its rest pose [rad]. Rotation vectors jump at pi, which a joint must not reach.
 MAX_ANGLE = wp.constant(2.6)
 
 
 @wp.func
 def quat_exp(v: wp.vec3):
-    """Quaternion of the rotation vector ``v`` [rad]."""
+    """Return the quaternion of the rotation vector ``v`` [rad]."""
     half = 0.5 * wp.length(v)
     # sin(h)/h by its series where the quotient loses digits
     s = 0.5 * (1.0 - half * half / 6.0)
@@ -23,7 +23,7 @@ def quat_exp(v: wp.vec3):
 
 @wp.func
 def quat_log(q: wp.quat):
-    """Rotation vector [rad] of the shorter way, length at most pi."""
+    """Return the rotation vector along the shorter arc, of length at most pi [rad]."""
     v = wp.vec3(q[0], q[1], q[2])
     w = q[3]
     if w < 0.0:
@@ -49,13 +49,13 @@ def finite_turn(w: wp.vec3, dt: float):
 
 @wp.func
 def short_of_pi(v: wp.vec3):
-    """Rotation vector ``v``, its angle at most ``MAX_ANGLE`` [rad]."""
+    """Return the rotation vector ``v``, its angle limited to ``MAX_ANGLE`` [rad]."""
     return v * wp.min(1.0, MAX_ANGLE / wp.max(wp.length(v), 1.0e-6))
 
 
 @wp.func
 def torque_of_vector(v: wp.vec3, pull: wp.vec3):
-    """Torque that does the work of ``pull`` on a rotation vector ``v``: ``J_l(v)^-T pull``.
+    """Return the torque that does the work of ``pull`` on a rotation vector ``v``: ``J_l(v)^-T pull``.
 
     A rotation by ``dt w``, after that of ``v``, changes ``v`` by ``dt J_l(v)^-1 w``, with the left Jacobian of SO(3)
     (Barfoot, "State Estimation for Robotics", 2017, section 7.1). Along ``v`` both are the same.
@@ -79,7 +79,7 @@ def turn_about_z(q: wp.quat):
 
 @wp.func
 def rigid_matrix(q: wp.quat, pivot: wp.vec3, image: wp.vec3):
-    """Homogeneous matrix of ``x -> q (x - pivot) + image``."""
+    """Return the homogeneous matrix of ``x -> q (x - pivot) + image``."""
     R = wp.quat_to_matrix(q)
     t = image - R * pivot
     # fmt: off
@@ -94,7 +94,7 @@ def rigid_matrix(q: wp.quat, pivot: wp.vec3, image: wp.vec3):
 
 @wp.func
 def apply_point(M: wp.mat44, x: wp.vec3):
-    """First three components of ``M (x, 1)``; ``M`` need not be rigid."""
+    """Return the first three components of ``M (x, 1)``; ``M`` need not be rigid."""
     # fmt: off
     return wp.vec3(
         M[0, 0] * x[0] + M[0, 1] * x[1] + M[0, 2] * x[2] + M[0, 3],

@@ -1,13 +1,14 @@
-"""Sums over the particles of bones: moments that rigid motions are fitted to, and momenta of what controllers change.
+"""Sums over the particles of bones: moments that rigid motions are fitted to, and momenta that controllers return.
 
-They run over fixed lists of particles in chunks, without atomics: the result does not depend on the schedule. A warp
-that summed a single chunk would spend as long on adding up its lanes as on the particles, so up to four chunks share a
-warp, in quarters of it: a chunk has one, two or all four, by its length. On a CPU a thread has a chunk.
+The sums run over fixed lists of particles in chunks, without atomics, so that the result does not depend on the
+schedule. On a GPU up to four chunks share a warp, because a warp that summed a single chunk would spend as long on the
+reduction over its lanes as on the particles: by its length a chunk has one, two or all four quarters of a warp. On a
+CPU a thread has a chunk.
 
-The torque controller sums in the same pass over particles that computes the summands. A body's particles are then
-partitioned in memory order: on a GPU a CUDA block has a partition, whose particles its threads store in shared memory,
-from where its warps sum the chunks of that partition. On a CPU a body is one partition, and the particles are stored in
-an array that all bodies use one after the other.
+The torque controller sums in the same pass over particles that computes the summands. For this the particles of a body
+are partitioned in memory order: on a GPU a CUDA block stores the particles of a partition in shared memory, and its
+warps sum the chunks of that partition. On a CPU a body is one partition, and the particles are stored in an array that
+all bodies use one after the other.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from piavatar_envs.mpm.types import Particles, row
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 
-#: Lanes of a quarter, quarters of a warp, and the most particles that a lane should have.
+#: Lanes of a quarter, quarters of a warp, and the greatest number of particles that a lane should sum.
 LANES, QUARTERS, MOST = 8, 4, 6
 
 
@@ -79,9 +80,9 @@ def own_share(quarters: wp.array(dtype=wp.vec4i), i: int, j: int, k: int, thread
     return at[0], share_of(quarters, together * at[1], at[2])
 
 
-# Each step halves the numbers that a lane goes on with, as well as the lanes that go on with the same.
+# Each step halves the numbers that a lane continues with, and the lanes that hold the same numbers.
 def _store(words: int, store: str) -> str:
-    """Return a snippet that adds up so many words of all lanes that share a chunk, and stores them."""
+    """Return a snippet that sums ``words`` words over the lanes that share a chunk, and stores them."""
     size = 1 << (words - 1).bit_length()
     return f"""
 #if defined(__CUDA_ARCH__)
@@ -159,11 +160,11 @@ def store_moments(into: wp.array2d(dtype=vec16), e: int, share: wp.vec4i, value:
     ...
 
 
-#: Groups of threads that share the chunks of a body in a sum that is seldom needed.
+#: Groups of threads that share the chunks of a body in :func:`sum_motion`, which few bodies need.
 GROUPS = wp.constant(8)
 
 
-#: Entries of a chunk that a thread loads at once, in sums that wait for memory.
+#: Entries of a chunk that a thread loads at once, to hide the latency of memory.
 AT_ONCE = wp.constant(2)
 
 
@@ -204,7 +205,7 @@ def chunk_moments(
 ):
     """Sum the moments of one chunk of a bone's particles about the bone's reference point, for small round-off.
 
-    The ``share`` of a thread is as :mod:`piavatar_envs.avatar.segment_sums` has it.
+    ``share`` is a record of :func:`share_chunks`, with the thread's own first entry.
     """
     origin = reference[e, share[1] & 255]
     r = row(e, particles.mass.shape[0])
@@ -253,7 +254,7 @@ def chunk_corrections(
     # out
     corrections: wp.array2d(dtype=vec12),
 ):
-    """Sum momentum and angular momentum, about the bone's centre, of the pulls and of the lean in one chunk."""
+    """Sum the momenta of pulls and lean in one chunk, linear and angular about the bone's centre."""
     origin = center[e, share[1] & 255]
     r = row(e, particles.mass.shape[0])
     p1 = wp.vec3()
@@ -367,26 +368,26 @@ def sum_motion(
         chunk_motion(body, particles, x, vk, center, e, share_of(body.quarters, quarters * n, thread), corrections)
 
 
-#: Threads of a CUDA block that has a partition.
+#: Threads of the CUDA block of a partition.
 PARTITION_THREADS = 256
-#: Particles of a partition on a GPU: more have fewer chunks, but fill more shared memory. It must not depend on the
-#: number of environments, because sums depend on it.
+#: Particles of a partition on a GPU: larger partitions need fewer chunks, but more shared memory. The size must not
+#: depend on the number of environments, because sums depend on it.
 PARTITION_SIZE = 3 * PARTITION_THREADS
 #: Words of a particle's record: three times four, so that lanes whose particles follow each other read from different
 #: banks. Masses follow all records.
 WORDS = wp.constant(12)
-#: Words of a particle in all.
+#: All words of a particle, with its mass.
 ALL_WORDS = int(WORDS) + 1
 
 
 @wp.struct
 class Partitions:
-    """The particles of a body in partitions: partition ``i`` has those from ``i * size`` on."""
+    """Partitions of a body's particles: partition ``i`` begins at particle ``i * size``."""
 
     size: int
     start: wp.array(dtype=int)  # (partitions + 1,) chunks of partition i are those of quarters[start[i] : start[i + 1]]
     quarters: wp.array(dtype=wp.vec4i)  # of warps, see piavatar_envs.avatar.segment_sums
-    entry: wp.array(dtype=wp.vec2i)  # as the body's: which particle of its partition, bits of the weight
+    entry: wp.array(dtype=wp.vec2i)  # like the body's: index in the partition, bits of the weight
 
 
 @wp.func_native("""
@@ -400,7 +401,7 @@ return wp::vec_t<3, wp::int32>(e, part, thread);
 def place_in_partitions(e: int, part: int, thread: int, num_envs: int) -> wp.vec3i:
     """Return environment, partition and thread in a launch over ``(num_envs, partitions, PARTITION_THREADS)``.
 
-    The partitions of a body follow each other, because they read the same bones.
+    The partitions of a body are consecutive, because they read the same bones.
     """
     ...
 
@@ -451,7 +452,7 @@ for (int c = 0; c < 12; ++c) value[c] = from[c];
 return value;
 """)
 def load_point(arena: wp.uint64, n: int) -> vec12:
-    """Return position, first and second vector of particle ``n``, each with a component of the way."""
+    """Return position, first and second vector of particle ``n``, each followed by a component of the displacement."""
     ...
 
 
@@ -498,7 +499,7 @@ def sum_chunk(
 ):
     """Sum the moments about ``origin`` of the chunk of a ``share``, with the first vector as velocity.
 
-    Of the second vector, and of the way, sum momentum and angular momentum.
+    For the second vector and the displacement (``way``), sum momentum and angular momentum.
     """
     total = vec16()
     P = wp.vec3()

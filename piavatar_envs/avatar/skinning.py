@@ -1,13 +1,11 @@
-"""Which bones move a particle, and by which weights: its skinning in sixteen bytes.
+"""Linear blend skinning on the device: packed weights, and blends of per-bone records at the particles.
 
-Weights add up to one, so that of the first nothing is stored. What a body's particles are skinned to is the same in all
-environments, but every pass of every body reads it.
+A particle is moved by up to four bones, and its skinning is packed into 16 bytes, because every pass over particles
+reads it: weights add up to one, so the first is not stored. It is the same in all environments.
 
-Everything that particles blend over their bones in a substep, in one record a bone.
-
-A particle is moved by up to four bones, of each of which it needs 42 numbers. On a GPU the record of a bone is read in
-eleven loads of 16 bytes, which are what a particle's drive takes its time for: a bone's step is therefore the turn
-about where it is, which is there anyway, and a translation, not a matrix of its own.
+For the pose controller a bone has one record of everything that particles blend in a substep. On a GPU a record is read
+in eleven loads of 16 bytes, which dominate the cost of the pass. Therefore the step of a bone is stored as the rate of
+its turn, which the record has anyway, and a translation, not as a matrix of its own.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from piavatar_envs.mpm.types import row
 wp.set_module_options({"enable_backward": False})
 
 
-#: Snippet that reads what particle ``p`` is skinned to: the ``weights`` of four bones, zeros last, and ``joint(n)``.
+#: Snippet that reads the skinning of particle ``p``: the ``weights`` of four bones, zeros last, and ``joint(n)``.
 READ = """
 #if defined(__CUDA_ARCH__)
 const float4 packed = *reinterpret_cast<const float4*>(&skin.data[p]);
@@ -39,10 +37,10 @@ const auto joint = [&](int n) { return (int)(bones >> 8 * n & 255u); };
 
 
 def in_order(joints: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bones and weights, both ``(N, 4)``, that sum to one in single precision; by bones, those without weight last.
+    """Return bones and weights, both ``(N, 4)``, sorted by bone, those without weight last.
 
-    Threads that work together mostly blend the same bones, and so they do it in the same round. Fields blended over
-    bones keep momentum if the sums over these have the same weights.
+    Weights sum to one in single precision. The order lets the threads of a warp, which mostly blend the same bones,
+    process a bone in the same iteration. Blended fields conserve momentum if the sums over bones use the same weights.
     """
     order = np.argsort(np.where(weights > 0.0, joints, NUM_JOINTS), axis=1, kind="stable")
     joints, weights = (np.take_along_axis(values, order, axis=1) for values in (joints, weights))
@@ -65,16 +63,16 @@ def bones_of(skin: wp.array(dtype=wp.vec4), p: int) -> wp.vec4i:
 
 @wp.func_native(READ + "return wp::vec_t<4, wp::float32>(weights[0], weights[1], weights[2], weights[3]);")
 def weights_of(skin: wp.array(dtype=wp.vec4), p: int) -> wp.vec4:
-    """Their weights."""
+    """Return the weights of the bones that move particle ``p``."""
     ...
 
 
-#: Where in a record the parts begin: rows of two matrices 3 x 4 (place, lean), of the turn's rate, 3 x 3, what is to be
-#: added to that of a place to get its velocity, then the rigid motion of the bone: velocity where the pelvis' centre
-#: is, and spin.
+#: First indices of the parts of a record: rows of two matrices 3 x 4 (place, lean); rows of the turn's rate, 3 x 3; the
+#: translation that turns this rate, applied to a place, into its velocity; then the rigid motion of the bone, velocity
+#: at the pelvis' centre and spin.
 PLACE, LEAN, TURN = wp.constant(0), wp.constant(12), wp.constant(24)
 STEP, VELOCITY, SPIN = wp.constant(33), wp.constant(36), wp.constant(39)
-#: Where in what a particle has blended the parts begin.
+#: First indices of the parts of a blended record.
 AT_PLACE, AT_LEAN, AT_STEP = wp.constant(0), wp.constant(3), wp.constant(6)
 AT_VELOCITY, AT_SPIN = wp.constant(18), wp.constant(21)
 
@@ -131,7 +129,7 @@ def blend_records(
     p: int,
     rest: wp.vec3,
 ) -> vec24:
-    """Blend the records of particle ``p``'s bones, with places and velocities applied at ``rest``."""
+    """Return the blend of the records of particle ``p``'s bones, with places and velocities evaluated at ``rest``."""
     ...
 
 
@@ -168,7 +166,7 @@ def store_record(record: wp.array2d(dtype=vec44), e: int, b: int, value: vec44):
 
 
 def _blend(length: int, numbers: int) -> str:
-    """Return a snippet that blends the first ``numbers`` of bones' records of a ``length``, on a GPU four at a time."""
+    """Return a snippet that blends the first ``numbers`` of records of ``length``, on a GPU four at a time."""
     return f"""{READ}
 wp::vec_t<{length}, wp::float32> sum;
 #pragma unroll
@@ -300,9 +298,9 @@ def blend_images(
     p: int,
     rest: wp.vec3,
 ) -> vec12:
-    """Blend the bones' motions, their places of a particle, and the velocity of their spins there.
+    """Return the blend of the bones' motions, their images of the particle, and the velocity of these by their spins.
 
-    Each bone's spin turns its own place of the particle about what places are seen from.
+    Each bone's spin turns its own image of the particle about the origin of the places.
     """
     ...
 
@@ -316,5 +314,5 @@ def skinned_place(body: Body, place: wp.array2d(dtype=wp.mat44), e: int, p: int)
 
 @wp.func
 def motion_at(change: vec8, arm: wp.vec3):
-    """Return the velocity of a change of rigid motion at ``arm`` from the pelvis' centre [m/s]."""
+    """Return the velocity of a rigid motion at ``arm`` from its reference point [m/s]."""
     return wp.vec3(change[0], change[1], change[2]) + wp.cross(wp.vec3(change[3], change[4], change[5]), arm)

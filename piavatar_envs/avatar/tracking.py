@@ -1,18 +1,15 @@
-"""Rigid motion of bones and of the whole body, fitted to the physical velocity.
+"""Rigid motion of bones and of the whole body: fitted to velocities, and tracked from particle positions.
 
-A fit is mass- and skinning-weighted least squares, so the blended field ``sum_b w_b (V_b + Omega_b x (x - c_b))`` has
-exactly the linear and angular momentum of the velocity it was fitted to, bone by bone. Everything the drive gives back
-or takes away goes through such fields, which is why it keeps momentum.
+A fit to velocities is a mass- and skinning-weighted least-squares fit, so that the blended field
+``sum_b w_b (V_b + Omega_b x (x - c_b))`` has exactly the linear and angular momentum of the fitted velocity, bone by
+bone. The pose controller adds and removes velocity only through such fields, and therefore conserves momentum. The sums
+over particles are those of :mod:`piavatar_envs.avatar.segment_sums`; ``threads`` threads share the chunks of a bone, or
+the bones of a body.
 
-The particles' sums are :mod:`piavatar_envs.avatar.segment_sums`; ``threads`` threads share the chunks of a bone, or the
-bones of a body.
-
-Tracking: the rigid motion of every bone from its particles.
-
-Kabsch's closed form (Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976): the rotation
-that maximises ``tr(R^T H)`` for the correlation ``H = sum (x - mean x)(x0 - mean x0)^T`` is ``U V^T`` of its singular
-value decomposition. ``wp.svd3`` returns proper rotations and puts the sign into the smallest singular value, so
-``U V^T`` is the proper rotation also for reflected point sets.
+Tracking uses Kabsch's closed form (Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976): the
+rotation that maximises ``tr(R^T H)`` for the correlation ``H = sum (x - mean x)(x0 - mean x0)^T`` is ``U V^T`` of its
+singular value decomposition. ``wp.svd3`` returns proper rotations and puts the sign into the smallest singular value,
+so ``U V^T`` is a proper rotation even for reflected point sets.
 """
 
 from __future__ import annotations
@@ -30,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def spin_of(inertia: wp.mat33, angular_momentum: wp.vec3):
-    """Angular velocity ``I^-1 L``; zero where the inertia is singular."""
+    """Return the angular velocity ``I^-1 L``; zero where the inertia is singular."""
     det = wp.determinant(inertia)
     trace = inertia[0, 0] + inertia[1, 1] + inertia[2, 2]
     if det <= 1.0e-9 * trace * trace * trace:
@@ -40,7 +37,7 @@ def spin_of(inertia: wp.mat33, angular_momentum: wp.vec3):
 
 @wp.func
 def symmetric(diag: wp.vec3, off: wp.vec3):
-    """Symmetric matrix with the diagonal ``xx, yy, zz`` and beside it ``yz, zx, xy``."""
+    """Return the symmetric matrix with the diagonal ``xx, yy, zz`` and the other entries ``yz, zx, xy``."""
     # fmt: off
     return wp.mat33(
         diag[0], off[2], off[1],
@@ -52,7 +49,7 @@ def symmetric(diag: wp.vec3, off: wp.vec3):
 
 @wp.func
 def point_inertia(mass: float, d: wp.vec3):
-    """Inertia of a point mass at ``d``."""
+    """Return the inertia of a point mass at ``d``."""
     return wp.diag(wp.vec3(mass * wp.dot(d, d))) - mass * wp.outer(d, d)
 
 
@@ -68,7 +65,7 @@ def fit_bone(
     # out
     bones: RigidFits,
 ):
-    """Rigid motion of one bone: centre [m], its velocity [m/s], angular velocity [rad/s], inertia [kg m^2]."""
+    """Fit the rigid motion of a bone: centre [m], its velocity [m/s], angular velocity [rad/s], inertia [kg m^2]."""
     s = vec16()
     for c in range(body.chunk_start[b] + thread, body.chunk_start[b + 1], threads):
         s += moments[e, c]
@@ -97,7 +94,7 @@ def fit_whole(
     # out
     whole: RigidFit,
 ):
-    """Rigid motion of the whole body from those of its bones: their momenta add up to the body's."""
+    """Compute the rigid motion of the whole body, whose momenta are the sums of those of its bones."""
     r = row(e, body.bone_mass.shape[0])
     pelvis = bones.center[e, 0]
     m = float(0.0)
@@ -131,11 +128,11 @@ def fit_whole(
 
 @wp.func
 def kabsch_rotation(H: wp.mat33):
-    """Proper rotation that maximises ``tr(R^T H)``.
+    """Return the proper rotation that maximises ``tr(R^T H)``.
 
-    ``H`` is normalised first: ``wp.svd3`` errs by tens of degrees when the entries are near 1e-5. It also errs by up
-    to 0.3 degrees where singular values are close together, so two Newton steps on the optimum follow: the best ``R``
-    makes ``M = R^T H`` symmetric, and a turn by ``w`` changes its axial vector by ``(tr(M) I - M) w``.
+    ``H`` is normalised first, because ``wp.svd3`` is inaccurate for small entries. It is also inaccurate where singular
+    values are close together, so two Newton steps on the optimum follow: the best ``R`` makes ``M = R^T H`` symmetric,
+    and a turn by ``w`` changes its axial vector by ``(tr(M) I - M) w``.
     """
     U = wp.mat33()
     S = wp.vec3()
@@ -147,7 +144,7 @@ def kabsch_rotation(H: wp.mat33):
     for _ in range(2):
         M = wp.transpose(R) * H
         slope = wp.diag(wp.vec3(wp.trace(M))) - 0.5 * (M + wp.transpose(M))
-        if wp.determinant(slope) > 1.0e-3:  # else two rotations are almost equally good
+        if wp.determinant(slope) > 1.0e-3:  # otherwise two rotations are almost equally good
             w = wp.inverse(slope) * wp.vec3(M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1])
             R = R * wp.quat_to_matrix(quat_exp(w))
     return R
@@ -165,7 +162,10 @@ def track_bones(
     position: wp.array2d(dtype=wp.vec3),
     velocity: wp.array2d(dtype=wp.vec3),
 ):
-    """World rotation, joint position [m] and velocity [m/s] of every bone. A failed environment keeps its last."""
+    """Track world rotation, joint position [m] and velocity [m/s] of every bone, over ``(num_envs, bones)``.
+
+    A failed environment keeps its last values.
+    """
     e, b = wp.tid()
     if failure[e] != 0:
         return
@@ -198,7 +198,7 @@ def local_rotations(
     # out
     local: wp.array2d(dtype=wp.quat),
 ):
-    """Rotation of every bone relative to its parent; the root's is its world rotation."""
+    """Compute the rotation of every bone relative to its parent; that of the root is its world rotation."""
     e, b = wp.tid()
     parent = body.parent[b]
     if parent < 0:
