@@ -1,4 +1,4 @@
-"""The protocol of an avatar's controller: what a control step calls, in the order in which it calls it.
+"""Protocol of an avatar's controller: the calls of a control step, in their order.
 
 :class:`~piavatar_envs.avatar.pose_control.controller.PoseController` moves the flesh along a commanded pose;
 :class:`~piavatar_envs.avatar.torque_control.controller.TorqueController` lets torques act between bones.
@@ -15,7 +15,7 @@ from piavatar_envs.mpm.types import Scratch, State
 
 
 class Controller(Protocol):
-    """Moves one avatar in every environment; controllers of different avatars run in parallel."""
+    """Controller of one avatar in every environment; controllers of different avatars run in parallel."""
 
     @property
     def moves_particles(self) -> bool:
@@ -23,19 +23,19 @@ class Controller(Protocol):
         ...
 
     def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
-        """Append, when the particles of the masked environments have been placed: begin anew in their pose."""
+        """Append the reset of the masked environments, whose particles have been placed, to their new pose."""
         ...
 
     def record_begin(self, graph: LaunchGraph) -> None:
-        """Append what precedes the first substep of a control step; it uses neither particles, sensors nor failures."""
+        """Append the start of a control step; it must use neither particles, sensors nor failures."""
         ...
 
     def record_before_substep(self, graph: LaunchGraph, state: State, scratch: Scratch, step: int) -> None:
-        """Append what precedes MPM substep ``step`` of a control step: write velocities of the avatar's particles."""
+        """Append the stages before MPM substep ``step`` of a control step: write velocities of the particles."""
         ...
 
     def record_end(self, graph: LaunchGraph, state: State) -> None:
-        """Append what follows the last substep of a control step."""
+        """Append the end of a control step, after its last substep."""
         ...
 
     def arrays(self) -> dict[str, wp.array]:

@@ -26,12 +26,12 @@ TONE_RATE = 30.0
 ROOT_RATE = 10.0
 #: Decay of motion between bones at any tone [1/s]; without it a limp body rings like rubber.
 DAMPING = 3.0
-#: What a control step of the pose controller does with a command, by its setting ``control.command``.
+#: Meaning of a command to the pose controller, by the setting ``control.command``.
 COMMANDS = {"increment": 0, "target": 1, "reference": 2}
 COMMAND_TARGET = wp.constant(COMMANDS["target"])
 COMMAND_REFERENCE = wp.constant(COMMANDS["reference"])
 
-#: All that a particle blends over its bones, and what it has blended, see :mod:`piavatar_envs.avatar.skinning`.
+#: Record of a bone, and its blend at a particle, see :mod:`piavatar_envs.avatar.skinning`.
 vec44 = wp.types.vector(length=44, dtype=wp.float32)
 vec24 = wp.types.vector(length=24, dtype=wp.float32)
 
@@ -44,7 +44,7 @@ class Body:
     count: int
     rest: wp.array2d(dtype=wp.vec3)  # (rows, count) rest positions [m]
     skin: wp.array(dtype=wp.vec4)  # (count,) bones that move a particle, see piavatar_envs.avatar.skinning
-    alone: int  # the first so many particles are moved by one bone each
+    alone: int  # number of particles that a single bone moves; they come first
     velocity_lag: wp.array2d(dtype=float)  # (rows, count) share of a change of commanded motion that a particle misses
     rest_joint: wp.array2d(dtype=wp.vec3)  # (rows, bones) [m]
     rest_center: wp.array2d(dtype=wp.vec3)  # (rows, bones) skinning-weighted centre of mass [m]
@@ -103,7 +103,7 @@ class RigidFits:
 
 @wp.struct
 class RigidFit:
-    """The same of the whole body; ``(num_envs,)``."""
+    """Rigid motion of the whole body, like :class:`RigidFits`; ``(num_envs,)``."""
 
     center: wp.array(dtype=wp.vec3)
     velocity: wp.array(dtype=wp.vec3)
@@ -130,7 +130,7 @@ class Pose:
 
 @wp.struct
 class Carry:
-    """``G``: how far contact has carried each bone in this control step; ``(num_envs, bones)``."""
+    """``G``: motion by which contact has carried each bone in this control step; ``(num_envs, bones)``."""
 
     rotation: wp.array2d(dtype=wp.quat)
     translation: wp.array2d(dtype=wp.vec3)
@@ -138,7 +138,7 @@ class Carry:
 
 @wp.struct
 class Anchor:
-    """Rigid motion that lays the commanded pose on the body; ``(num_envs,)``."""
+    """Rigid motion that aligns the commanded pose with the body; ``(num_envs,)``."""
 
     rotation: wp.array(dtype=wp.quat)
     translation: wp.array(dtype=wp.vec3)
@@ -146,7 +146,7 @@ class Anchor:
 
 @wp.struct
 class Command:
-    """The commanded pose at the start of the control step and what it gains until the end."""
+    """Commanded pose at the start of the control step, and its increment until the end."""
 
     rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) local
     increment: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) [rad]
@@ -156,7 +156,7 @@ class Command:
 
 @wp.struct
 class Wrench:
-    """What the root wrench does to the body as a whole in a substep; ``(num_envs,)``."""
+    """Acceleration of the whole body by the root wrench in a substep; ``(num_envs,)``."""
 
     linear: wp.array(dtype=wp.vec3)  # acceleration of its centre [m/s^2]
     angular: wp.array(dtype=wp.vec3)  # angular acceleration [rad/s^2]
@@ -164,7 +164,7 @@ class Wrench:
 
 @wp.struct
 class RootState:
-    """What the root wrench leaves behind, see :class:`AvatarState`; ``(num_envs,)``."""
+    """Results of the root wrench, see :class:`AvatarState`; ``(num_envs,)``."""
 
     released: wp.array(dtype=int)
     wrench_force: wp.array(dtype=wp.vec3)
@@ -186,15 +186,13 @@ class PoseWorkspace:
     command_pose: Pose  # the commanded pose at the substep's start, before alignment
     carry: Carry
     anchor: Anchor
-    gap: wp.array2d(
-        dtype=wp.vec3
-    )  # (num_envs, bones) from where fixed offsets would put a bone to its tracked place [m]
+    gap: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) tracked joint positions less those at fixed offsets [m]
     bones: RigidFits
     whole: RigidFit
     removed: RemovedMotion
     wrench: Wrench
     moments: wp.array2d(dtype=vec16)  # (num_envs, chunks)
-    record: wp.array2d(dtype=vec44)  # (num_envs, bones) all that particles blend of a bone
+    record: wp.array2d(dtype=vec44)  # (num_envs, bones) records that particles blend
     pull: wp.array2d(dtype=wp.vec3)  # (num_envs, count) velocity change by shape preservation and tone [m/s]
     lean: wp.array2d(dtype=wp.vec3)  # (num_envs, count) displacement from the carried to the commanded pose [m]
     corrections: wp.array2d(dtype=vec12)  # (num_envs, chunks)
@@ -204,7 +202,7 @@ class PoseWorkspace:
 
 @dataclass
 class AvatarState:
-    """Commands of an avatar and what holds its root. Quaternions are Warp's ``xyzw``; ``[:, 0]`` is the root's."""
+    """Commands of an avatar, and its root wrench. Quaternions are Warp's ``xyzw``; ``[:, 0]`` is the root's."""
 
     command_rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) local rotations commanded so far
     command_root: wp.array(dtype=wp.vec3)  # (num_envs,) commanded pelvis position [m]
@@ -220,7 +218,7 @@ class AvatarState:
 
 @dataclass
 class Tracked:
-    """Kabsch-tracked bones: recomputed from the particles whenever they have moved."""
+    """Bones tracked from the particles, recomputed whenever these have moved."""
 
     rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) world rotation
     position: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) joint position [m]
@@ -230,17 +228,16 @@ class Tracked:
 
 @dataclass
 class JointState:
-    """Joints that move under torques."""
+    """State of joints that move under torques."""
 
     rotation: wp.array2d(dtype=wp.quat)  # (num_envs, bones) world rotation
     position: wp.array2d(dtype=wp.vec3)  # (num_envs, bones) joint position [m]
     # (num_envs, 69) the pelvis' [m/s], then spins of all joints in the world's axes [rad/s]
     velocity: wp.array2d(dtype=float)
-    outside: wp.array2d(dtype=float)  # (num_envs, 69) how all but the joints themselves changed it in the last substep
+    outside: wp.array2d(dtype=float)  # (num_envs, 69) its change in the last substep, except by the joints
     # (num_envs, bones) torques, of the reference adult, about the rest pose's axes as the parent has turned them [N m]
     torque: wp.array2d(dtype=wp.vec3)
-    # (num_envs, up to the last firm one) by how much firm particles have been put back, in the frame of the rest pose
-    # [m]; at least one entry
+    # (num_envs, 1 + last firm particle) sum of the displacements of firm particles, in the frame of the rest pose [m]
     slip: wp.array2d(dtype=wp.vec3)
 
 
@@ -251,7 +248,7 @@ def allocate(declaration: Any, num_envs: int, device: str, **given: Any) -> Any:
         declaration: a Warp struct, whose structs are allocated likewise, or a dataclass of arrays.
         num_envs: rows of every array.
         device: where to allocate.
-        given: by name, the number of columns of a two-dimensional array that has not one a bone, or a value to share
+        given: by name, the number of columns of a two-dimensional array, if not one a bone, or an existing value to use
             instead of an allocation.
     """
     if is_dataclass(declaration):

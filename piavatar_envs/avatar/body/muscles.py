@@ -1,4 +1,4 @@
-"""How strong the joints are, and how they resist: torques of an adult of 75 kg and 1.75 m, by joint and direction.
+"""Muscles: strength and resistance of the joints of an adult of 75 kg and 1.75 m, by joint and direction.
 
 Axes are those of the rest pose, as the parent bone has turned them, and signs those of
 :mod:`piavatar_envs.avatar.body.skeleton`: +x bends the trunk forward, hip and knee backward, points the toe down. The
@@ -13,8 +13,8 @@ numbers are means of young men under isometric load, at the best angle, where no
   deviation of 28.4 over ten young adults, from a woman of the 20th percentile of size to a man of the 97th. About x are
   90 N m, 0.8 standard deviations above, as of a man: static flexion of 26 young men with the arm hanging was 89.9 N m
   (68.6 raised by 45 degrees) in "Dynamic shoulder flexion strength for use in occupational risk analysis and clinical
-  assessment", of which we know the abstract only, not who wrote it and when. The same for extension is an estimate, and
-  so are 75 N m about y, a quarter of a standard deviation above that adduction, and 60 N m about z.
+  assessment", of which only the abstract is available, without authors and date. The same for extension is an
+  estimate, and so are 75 N m about y, a quarter of a standard deviation above that adduction, and 60 N m about z.
 - elbow: flexion 0.78 and extension 0.67 N m a kilogram (Lategan & Krueger, AJPHERD 2003).
 - wrist: flexion 12.2, extension 7.1, radial 11.0, ulnar 9.5 N m (Delp, Grigg & Buchanan, J. Biomech. 29, 1996).
 
@@ -64,7 +64,7 @@ LOCKED_JOINTS = ("left_foot", "right_foot")
 #: under some 70 N m, an eighth of what standing takes.
 FIRM_JOINTS = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 
-#: Error at which a spring asks for the greatest torque of its joint [rad].
+#: Error at which a spring reaches the greatest torque of its joint [rad].
 FULL_TORQUE_ANGLE = 0.3
 #: Damping over stiffness of a spring [s].
 DAMPING_TIME = 0.1
@@ -110,9 +110,9 @@ class Muscles:
 def make_muscles(stiffness: float = 1.0, damping: float = 1.0, strength: float = 1.0) -> Muscles:
     """Muscles of the reference adult.
 
-    Every gain follows the strength of its joint, which follows what the joint has to bear: a spring asks for the whole
-    torque at :data:`FULL_TORQUE_ANGLE`, an error goes with the time :data:`DAMPING_TIME` where the spring meets
-    nothing but its damper.
+    Every gain is proportional to the strength of its joint, and thus to its usual load: a spring reaches the greatest
+    torque at :data:`FULL_TORQUE_ANGLE`, and an error decays with the time constant :data:`DAMPING_TIME` where only the
+    damper resists the spring.
 
     Args:
         stiffness: factor on the springs [-].

@@ -1,14 +1,11 @@
-"""In which order a body's particles lie in memory: neighbours in the body should be neighbours there.
+"""Particles of a body, from its closed skin: positions, volumes, skinning weights, bone particles and memory order (NumPy).
 
-Threads that work together then ask for the same nodes of the grid, or blend the same bones.
+*Flesh* particles sit in the cells of a regular lattice, each at the centroid of the part of its cell that is inside the
+skin, so thin limbs are filled as well as thick ones. *Bone* particles are ordinary particles too, a small lattice along
+every bone, rigidly skinned to it: the Kabsch fit that tracks the pose reads only them.
 
-Smooth interpolation inside a body: harmonic functions on the graph of its particles (NumPy).
-
-From a closed skin to the particles of the simulation: positions, volumes, skinning weights and bone particles.
-
-*Flesh* particles sit in the cells of a regular lattice, each at the centroid of the part of its cell that is
-inside the skin, so thin limbs are filled as well as thick ones. *Bone* particles are ordinary particles too, a
-small lattice along every bone, rigidly skinned to it: the Kabsch fit that tracks the pose reads only them.
+Values are interpolated inside the body by harmonic functions on the graph of its particles. In memory neighbours should
+be neighbours in the body: then the threads of a warp access the same nodes of the grid, or blend the same bones.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ _SIDES = ("left", "right")
 
 @dataclass(frozen=True)
 class Foot:
-    """Where a foot is, relative to its place in the rest pose.
+    """Position of a foot relative to its place in the rest pose.
 
     Attributes:
         offset: of the ankle, in leg lengths, shape ``(3,)``.
@@ -39,7 +39,7 @@ class Foot:
 
 @dataclass(frozen=True)
 class Arm:
-    """Where an arm points, in the axes of the chest (left +x, facing -y, up +z), for the left arm.
+    """Direction of the left arm in the axes of the chest (left +x, facing -y, up +z).
 
     The right arm takes the mirror image. The two directions must not be parallel: the elbow bends in their plane.
 

@@ -37,7 +37,7 @@ class Motion:
     """A clip of the 22-joint skeleton, immutable: every method returns a new clip.
 
     Attributes:
-        name: what :func:`~piavatar_envs.avatar.motion.load_motion` knows it by.
+        name: its name for :func:`~piavatar_envs.avatar.motion.load_motion`.
         fps: frames a second [1/s].
         local_rotations: rotation of each joint relative to its parent (the root: to the world), wxyz, identity in the
             rest pose of the embedded body, shape ``(num_frames, 22, 4)``; successive frames lie in one hemisphere.

@@ -1,4 +1,4 @@
-"""Kinematic pose of the bones within a control step, and the motion by which contact carries it.
+"""Kinematic pose of the bones within a control step, and the motion by which contact carries the bones.
 
 Within a control step the tracked local rotations are turned by ``exp(fraction * increment)`` (arcs, not chords) and
 posed by forward kinematics with fixed bone offsets, so that no joint gap enters the velocity. Increments are composed
@@ -90,15 +90,15 @@ I3 = wp.constant(wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
 def carried(
     e: int, dt: float, removed: RemovedMotion, c: wp.vec3, velocity: wp.vec3, spin: wp.vec3, q: wp.quat, t: wp.vec3
 ):
-    """Return the rigid motion ``(q, t)``, moved on by a body whose centre has reached ``c`` in a substep.
+    """Return the rigid motion ``(q, t)`` after a substep in which a body moved and its centre reached ``c``.
 
-    The motion that was taken out of the kinematic velocity has not happened: it comes off first.
+    The motion that was removed from the kinematic velocity has not happened, so it is subtracted first.
     """
     back = I3 + dt * removed.turn[e]
     q_back = wp.quat_from_matrix(back) * q
     t_back = back * (t - removed.center[e] - dt * removed.velocity[e]) + removed.center[e]
     turn = quat_exp(dt * spin)
-    # c was reached by moving at the velocity: turn about where it came from
+    # the centre reached c by moving at the velocity: turn about its previous position
     before = c - dt * velocity
     return wp.normalize(turn * q_back), wp.quat_rotate(turn, t_back - before) + c
 
@@ -113,7 +113,7 @@ def carry_bone(
     # in and out
     carry: Carry,
 ):
-    """Advance ``G`` of a bone by the motion that the physical velocity gave it."""
+    """Advance ``G`` of a bone by the motion of the physical velocity."""
     q, t = carried(
         e, dt, removed, bones.center[e, b], bones.velocity[e, b], bones.spin[e, b],
         carry.rotation[e, b], carry.translation[e, b],
@@ -162,10 +162,10 @@ def write_record(
     # out
     record: wp.array2d(dtype=vec44),
 ):
-    """Write the record of a bone that particles blend: its place, its step, its turn and its physical motion.
+    """Write the record of a bone that particles blend: its place, step, turn, physical motion and lean.
 
-    Then the way from the carried to the commanded bone, which the anchor aligns with the body. A bone that contact has
-    torn off its parent is carried at fixed offsets from the parent; its way back is added.
+    The lean leads from the carried to the commanded bone, which the anchor aligns with the body. The kinematic pose has
+    fixed offsets between joints, so for a bone that contact has moved off its joint the tracked gap is subtracted.
     """
     q, at = carried_bone(pose, carry, e, b)
     q_next, at_next = carried_bone(next_pose, carry, e, b)

@@ -1,7 +1,7 @@
-"""The pose controller: an action is an increment of a pose that moves the flesh.
+"""Pose controller: an action is an increment of a pose, whose motion is prescribed to the flesh.
 
-A control step starts from the pose tracked at the end of the one before. What happens before every MPM substep reads
-from top to bottom in :mod:`piavatar_envs.avatar.pose_control.kernels`.
+A control step starts from the pose tracked at the end of the one before. The stages before every MPM substep are in
+:mod:`piavatar_envs.avatar.pose_control.kernels`.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from piavatar_envs.mpm.types import DECOUPLING, Scratch, State
 
 
 class PoseController:
-    """Moves one avatar along a commanded pose in every environment.
+    """Controller that moves one avatar along a commanded pose in every environment.
 
     Attributes:
         avatar: the avatar.
-        parameters: of the control, as kernels take them.
-        workspace: arrays of a substep; their kinematic poses are those of even substeps.
-        in_one_launch: whether one launch does everything before a substep, as on a CPU.
+        parameters: settings of the control, in the form of the kernels.
+        workspace: arrays of a substep, with the order of the kinematic poses in even substeps.
+        in_one_launch: whether one launch runs all stages before a substep, as on a CPU.
     """
 
     #: The end of a control step only takes over the command.
@@ -90,7 +90,7 @@ class PoseController:
         """Append nothing: a control step begins from the tracked pose."""
 
     def record_begin(self, graph: LaunchGraph) -> None:
-        """Append what begins a control step: the way from the tracked pose towards the goal."""
+        """Append the start of a control step: the increments from the tracked pose towards the goal."""
         avatar, w, d, t = self.avatar, self.workspace, self.avatar.state, self.avatar.tracked
         avatar.record_clear_support(graph)
         graph.launch(
@@ -102,7 +102,7 @@ class PoseController:
         avatar.record_pose(graph, 0.0, self._start, (w.increment, w.root_increment), w.now)
 
     def record_before_substep(self, graph: LaunchGraph, state: State, scratch: Scratch, step: int) -> None:
-        """Append what precedes MPM substep ``step``: velocities of the particles, in the scheme of the model."""
+        """Append the stages before MPM substep ``step``: velocities of the particles, in the scheme of the model."""
         if self._injects:
             if step == 0:
                 self._record_injection(graph, state)
@@ -115,7 +115,7 @@ class PoseController:
             self._record_passes(graph, state, step)
 
     def _record_passes(self, graph: LaunchGraph, state: State, step: int) -> None:
-        """Append the same as :func:`command_body`, in a launch for each pass over particles."""
+        """Append the stages of :func:`command_body`, with a launch for each pass over particles."""
         avatar, model, w, root = self.avatar, self.avatar.model, self._workspaces[step % 2], self._root
         n, threads, body, particles = model.num_envs, avatar.threads, avatar.body, model.particles
         parameters, released, failure = self.parameters, avatar.state.released, state.failure
@@ -159,7 +159,7 @@ class PoseController:
         graph.launch(inject_velocity, (n, avatar.num_points), [*inputs, state.failure], [state.u, state.vk])
 
     def record_end(self, graph: LaunchGraph, state: State) -> None:
-        """Append what ends a control step: the goal has been commanded."""
+        """Append the end of a control step: the goal becomes the commanded pose."""
         d = self.avatar.state
         graph.launch(
             end_control,

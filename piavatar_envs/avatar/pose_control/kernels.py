@@ -2,19 +2,19 @@
 
 In order: fit rigid motions to the physical velocity, pose the bones and carry them by these motions, hold the root,
 write the kinematic velocity of every particle and pull its shape and pose, take the rigid part out of the commanded
-motion of unsupported bodies, and give the bones back the momentum of the pulls.
+motion of unsupported bodies, and return the momentum of the pulls to the bones.
 
 Two critically damped pulls act on the physical velocity, both implicit in time and both without net momentum:
 
 - *shape preservation* (``alpha``): of a particle towards its skinned place on the carried bones. It acts only on the
-  motion relative to the bones, and what it changes is given back bone by bone.
-- *tone*: of the bones towards the commanded pose, relative to the body's own rigid motion. A body of tone 0 gives way
-  and keeps its bent joints; a body of tone 1 recoils and returns.
+  motion relative to the bones, and its momentum is returned bone by bone.
+- *tone*: of the bones towards the commanded pose, relative to the body's own rigid motion. A body of tone 0 yields and
+  keeps its bent joints; a body of tone 1 recoils and returns.
 
-On a CPU :func:`command_body` does all of it, a body after the other. On a GPU the passes over particles are launches of
-their own; the work on bones between them is one launch of a warp a body, or three where bodies are few, because a CUDA
-block that did everything would wait in each pass for its last thread. Bones of large bodies have so many chunks that
-adding those up is a launch of its own.
+On a CPU :func:`command_body` runs all stages, one body after the other. On a GPU the passes over particles are
+launches of their own, because a CUDA block that ran all stages would wait in each pass for its last thread; the work on
+bones between them is a launch with one warp a body, or three where bodies are few. Bones of large bodies have so many
+chunks that their sum is a launch of its own.
 """
 
 from __future__ import annotations
@@ -67,14 +67,14 @@ wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 #: Threads of a warp, which handles the bones of a body.
 WARP = wp.constant(32)
-#: Bodies of a multiprocessor: their warps mostly wait for memory, so that many should be resident.
+#: Resident bodies of a multiprocessor: many, because their warps mostly wait for memory.
 BODIES_AT_ONCE = 32
-#: Warps that prepare a body, and bodies of a multiprocessor up to which each has so many.
+#: Warps that prepare a body, and the number of bodies a multiprocessor up to which each body has so many.
 PREPARING, BODIES_PREPARED = 3, 10
 
 
 def warps_of_body(device: str, bodies: int) -> int:
-    """Return the number of warps that prepare each of so many bodies."""
+    """Return the number of warps that prepare each of ``bodies`` bodies."""
     gpu = wp.get_device(device)
     return PREPARING if gpu.is_cuda and bodies <= BODIES_PREPARED * gpu.sm_count else 1
 
@@ -96,7 +96,7 @@ def command_body(
     # out
     kinematic: Kinematic,
 ):
-    """Do everything before MPM substep ``step`` on a CPU, over ``num_envs``."""
+    """Run all stages before MPM substep ``step`` on a CPU, over ``num_envs``."""
     e = wp.tid()
     if failure[e] != 0:
         return
@@ -134,7 +134,7 @@ def command_body(
 
 @wp.func
 def pose_end(body: Body, control: PoseControl, step: int, w: PoseWorkspace, e: int, thread: int, threads: int):
-    """Pose the bones as they are at the end of substep ``step``."""
+    """Pose the bones for the end of substep ``step``."""
     fraction = float(step + 1) / float(control.num_substeps)
     pose_bones(
         body, fraction, w.start_rotation, w.start_root, w.increment, w.root_increment, e, thread, threads,
@@ -144,7 +144,7 @@ def pose_end(body: Body, control: PoseControl, step: int, w: PoseWorkspace, e: i
 
 @wp.func
 def pose_command(body: Body, control: PoseControl, step: int, w: PoseWorkspace, e: int, thread: int, threads: int):
-    """Pose the bones as commanded at the start of substep ``step``, if there is tone to pull them there."""
+    """Pose the bones as commanded at the start of substep ``step``, if tone is on."""
     if control.tone_rate > 0.0:
         fraction = float(step) / float(control.num_substeps)
         pose_bones(
@@ -217,7 +217,7 @@ def prepare_body(
     w: PoseWorkspace,
     root: RootState,
 ):
-    """Compute the bones' records and the root wrench from the chunks' moments; a CUDA block has a body.
+    """Compute the bones' records and the root wrench from the chunks' moments, with a CUDA block a body.
 
     Over ``(num_envs, threads)``, see :func:`warps_of_body`. Independent steps run in different warps; the result does
     not depend on their number.
@@ -264,7 +264,7 @@ def command_particle(
     pull: wp.array2d(dtype=wp.vec3),
     lean: wp.array2d(dtype=wp.vec3),
 ):
-    """Write the kinematic velocity of a particle, its pull [m/s] and its way to the commanded pose [m].
+    """Write the kinematic velocity of a particle, its pull [m/s] and its displacement to the commanded pose [m].
 
     ``vk = (LBS(G T_{s+1}) - LBS(G T_s)) / dt + (dR - I)(x - LBS(G T_s)) / dt``: the second term turns the displacement
     that contact has caused along with the bone. Flesh with a velocity lag misses its share of every change of that
@@ -337,10 +337,10 @@ def command_particles(
 def remove_motion(
     body: Body, control: PoseControl, w: PoseWorkspace, root: RootState, e: int, thread: int, threads: int
 ):
-    """Compute the rigid part of commanded motion that comes off: nothing, where something supports the body."""
+    """Compute the rigid part that is subtracted from commanded motion; zero for a supported body."""
     if is_free(control, root.released[e]):
         free_motion(body, control, w.corrections, w.bones, w.whole, e, thread, threads, w.removed, w.wrench)
-    elif thread == 0:  # a former value would enter the carry
+    elif thread == 0:  # an earlier value would enter the carry
         w.removed.velocity[e] = wp.vec3(0.0)
         w.removed.turn[e] = wp.mat33()
         w.removed.center[e] = wp.vec3(0.0)
@@ -364,7 +364,7 @@ def remove_motions(
 
 @wp.kernel
 def add_to_bones(body: Body, failure: wp.array(dtype=int), threads: int, w: PoseWorkspace):
-    """Add up the corrections of bodies with many chunks, over ``(num_envs, bones, threads)``."""
+    """Sum the corrections of bodies with many chunks, over ``(num_envs, bones, threads)``."""
     e, b, thread = wp.tid()
     if failure[e] == 0:
         add_chunks(body, w.corrections, e, b, thread, threads, w.bone_corrections)
@@ -372,7 +372,7 @@ def add_to_bones(body: Body, failure: wp.array(dtype=int), threads: int, w: Pose
 
 @wp.func
 def bone_change(velocity: wp.vec3, spin: wp.vec3, arm: wp.vec3):
-    """Return the record of a change of rigid motion, whose ``velocity`` is ``arm`` away from the pelvis' centre."""
+    """Return a change of rigid motion with the velocity at the pelvis' centre, ``arm`` from that of ``velocity``."""
     v = velocity + wp.cross(spin, arm)
     return vec8(v[0], v[1], v[2], spin[0], spin[1], spin[2], 0.0, 0.0)
 
@@ -393,7 +393,7 @@ def blend_corrections(
 ):
     """Compute the change of every bone's rigid motion.
 
-    It gives back the momentum of the shape pull and adds tone, damping of motion between bones and the root wrench.
+    It returns the momentum of the shape pull, and adds tone, damping of motion between bones and the root wrench.
     """
     r = row(e, body.bone_mass.shape[0])
     dt = control.dt
@@ -418,7 +418,7 @@ def blend_corrections(
         P += p
         L += bones.inertia[e, b] * dw + l1 + wp.cross(arm, p)
     total = sum_threads12(vec12(m, P[0], P[1], P[2], L[0], L[1], L[2], 0.0, 0.0, 0.0, 0.0, 0.0), threads)
-    # all of this is internal, so that its rigid part comes off; to turn the whole body is the root's task
+    # these changes are internal, so their rigid part is subtracted; only the root wrench moves the whole body
     V = dt * wrench.linear[e] - wp.vec3(total[1], total[2], total[3]) / total[0]
     W = dt * wrench.angular[e] - spin_of(whole.inertia[e], wp.vec3(total[4], total[5], total[6]))
     rigid = bone_change(V, W, bones.center[e, 0] - whole.center[e])
@@ -430,7 +430,7 @@ def blend_corrections(
 def correct_bones(
     body: Body, control: PoseControl, chunk_threads: int, w: PoseWorkspace, e: int, thread: int, threads: int
 ):
-    """Compute the change of the bones' motion from the chunks' corrections; 0 ``chunk_threads``: these are added up."""
+    """Compute the change of the bones' motion from the chunks' corrections; 0 ``chunk_threads``: already summed."""
     if chunk_threads > 0:
         for b in range(thread // chunk_threads, body.parent.shape[0], threads // chunk_threads):
             add_chunks(body, w.corrections, e, b, thread % chunk_threads, chunk_threads, w.bone_corrections)
@@ -448,7 +448,7 @@ def correct_body(
     # in and out
     w: PoseWorkspace,
 ):
-    """Run :func:`correct_bones`, over ``(num_envs, threads)``; a CUDA block has a body."""
+    """Run :func:`correct_bones`, over ``(num_envs, threads)``, with a CUDA block a body."""
     e, thread = wp.tid()
     if failure[e] == 0:
         correct_bones(body, control, chunk_threads, w, e, thread, threads)
@@ -481,7 +481,7 @@ def apply_correction(
         v = vector_at(kinematic.vk, e, body.first + p) - removed.velocity[e]
         v += removed.turn[e] * (at - removed.center[e] + control.dt * v)
         store_vector(kinematic.vk, e, body.first + p, v, True)
-        # half the curl of that: one turn after the other, which is not their sum
+        # half the curl of this velocity, in which the turns are composed, not added
         w = kinematic.spin[e, body.first + p]
         back = -0.5 * axial(removed.turn[e])
         kinematic.spin[e, body.first + p] = w + back + (0.5 * control.dt) * wp.cross(back, w)

@@ -3,7 +3,7 @@
 A pose-controlled avatar does not balance itself; a six-degree-of-freedom wrench holds the commanded root instead. It is
 a rigid acceleration field over the whole body (no sag), with gravity fed forward and an implicit critically damped PD
 ``a = (w^2 (e - dt V) - 2 w V) / (1 + 2 w dt + w^2 dt^2)``. It is bounded, and is released until the next reset once
-the body has been knocked too far: pushes are survived or not.
+the body has been pushed too far.
 
 Commanded motion of a body that nothing supports must carry neither momentum nor angular momentum.
 """
@@ -165,11 +165,11 @@ def free_motion(
     # in and out
     wrench: Wrench,
 ):
-    """Compute the rigid part that comes off the commanded motion of an unsupported body.
+    """Compute the rigid part that is subtracted from the commanded motion of an unsupported body.
 
     The kinematic step, as a whole, is moved back by the rigid motion that leaves it without momentum and angular
-    momentum: ``vk' = y + A (r + dt y)`` with ``y = vk - V`` and ``sum m r x vk' = 0``. And as the inertia changes, a
-    spinning body keeps its angular momentum, not its spin (a skater who draws in the arms).
+    momentum: ``vk' = y + A (r + dt y)`` with ``y = vk - V`` and ``sum m r x vk' = 0``. As the inertia
+    changes, a spinning body keeps its angular momentum instead of its spin (a skater drawing in the arms).
     """
     r = row(e, body.bone_mass.shape[0])
     m = float(0.0)

@@ -1,4 +1,4 @@
-"""Avatar sources: where bodies come from, one file a source.
+"""Avatar sources, one file each.
 
 A source is a function that returns an :class:`~piavatar_envs.avatar.body.asset.AvatarAsset`; its keyword arguments are
 its settings, such as the ``path`` of a file. Every module of this package is one, under its own name, by its function
