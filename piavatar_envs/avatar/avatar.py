@@ -39,7 +39,7 @@ class Avatar:
     """
 
     def __init__(self, points: BodyPoints, first: int, model: Model) -> None:
-        """Allocate.
+        """Allocate the arrays of an avatar.
 
         Args:
             points: the body.
@@ -69,7 +69,7 @@ class Avatar:
         change: tuple[wp.array, wp.array],
         out: Pose,
     ) -> None:
-        """Append: pose the bones at ``fraction`` of a ``change`` from a ``start``.
+        """Append the pose of the bones at ``fraction`` of a ``change`` from a ``start``.
 
         Args:
             graph: the launch graph to append to.
@@ -82,11 +82,11 @@ class Avatar:
         graph.launch(pose_body, (self.model.num_envs, self.threads), inputs, [out.rotation, out.position])
 
     def record_still_pose(self, graph: LaunchGraph, start: tuple[wp.array, wp.array], out: Pose) -> None:
-        """Append: pose the bones as ``start`` has them."""
+        """Append the pose ``start`` of the bones."""
         self.record_pose(graph, 0.0, start, (self._still, self._still[:, 0]), out)
 
     def record_reset(self, graph: LaunchGraph, state: State, mask: wp.array) -> None:
-        """Append: place the masked environments' particles in the commanded pose, unstrained and at rest."""
+        """Append the placement of the masked environments' particles in the commanded pose, at rest."""
         n, s = self.model.num_envs, self.state
         graph.launch(
             reset_commands,
@@ -106,19 +106,19 @@ class Avatar:
         )
 
     def record_set_in_motion(self, graph: LaunchGraph, state: State, mask: wp.array, after: Pose) -> None:
-        """Append: give placed particles the velocity that takes them to a pose in one control step."""
+        """Append the velocity that takes placed particles to a pose in one control step."""
         n, matrices = self.model.num_envs, self._bone_from
         graph.launch(rest_matrices, (n, NUM_JOINTS), [self.body, after.rotation, after.position], [matrices])
         inputs = [mask, self.body, self.model.control_dt, matrices, state.x]
         graph.launch(set_in_motion, (n, self.num_points), inputs, [state.u])
 
     def record_clear_support(self, graph: LaunchGraph) -> None:
-        """Append: zero the mean force and torque on the root, at the beginning of a control step."""
+        """Append the clearing of the mean force and torque on the root, at the start of a control step."""
         for vectors in (self.state.wrench_force, self.state.wrench_torque):
             graph.launch(clear_vectors, vectors.size, [vectors])
 
     def record_tracking(self, graph: LaunchGraph, state: State) -> None:
-        """Append: track the bones of the particles as they are now."""
+        """Append the tracking of the bones from the current particles."""
         bones, t = (self.model.num_envs, NUM_JOINTS), self.tracked
         inputs = [self.body, state.x, state.u, state.vk, state.failure]
         graph.launch(track_bones, bones, inputs, [t.rotation, t.position, t.velocity])

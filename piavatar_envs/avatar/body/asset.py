@@ -72,15 +72,15 @@ class AvatarAsset:
         return self.shape(np.zeros(len(self.shape_names)))
 
     def height(self, parameters: Sequence[float] | np.ndarray) -> float:
-        """Standing height of a shape [m]."""
+        """Return the standing height of a shape [m]."""
         return float(np.ptp(self.shape(parameters).vertices[:, 2]))
 
     def volume(self, parameters: Sequence[float] | np.ndarray) -> float:
-        """Volume enclosed by the skin of a shape [m^3]."""
+        """Return the volume enclosed by the skin of a shape [m^3]."""
         return mesh_volume(self.shape(parameters).vertices, self.faces)
 
     def parameters(self, **values: float) -> np.ndarray:
-        """Shape parameters by name, the others zero: ``parameters(sex=-1, weight=0.5)``; shape ``(S,)``.
+        """Return shape parameters by name, the others zero: ``parameters(sex=-1, weight=0.5)``; shape ``(S,)``.
 
         Raises:
             ValueError: an unknown name.
@@ -93,7 +93,7 @@ class AvatarAsset:
         return parameters
 
     def sample_parameters(self, rng: np.random.Generator, size: int | None = None, scale: float = 1.0) -> np.ndarray:
-        """Random people: every parameter normal about the mean, clipped to [-1, 1]; ``sex`` is uniform.
+        """Draw random people: every parameter normal about the mean, clipped to [-1, 1]; ``sex`` is uniform.
 
         Args:
             rng: the only source of randomness.
@@ -117,7 +117,7 @@ class AvatarAsset:
         return parameters[0] if size is None else parameters
 
     def _halves(self, parameters: Sequence[float] | np.ndarray) -> np.ndarray:
-        """Factors of the negative and positive displacement fields, shape ``(S, 2)``; refuses bad parameters."""
+        """Return factors of the negative and positive displacement fields, ``(S, 2)``; check the parameters."""
         values = np.asarray(parameters, dtype=np.float64)
         if values.shape != (len(self.shape_names),):
             names = ", ".join(self.shape_names)
@@ -132,7 +132,7 @@ class AvatarAsset:
 
 
 def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Volume of a closed, outward oriented triangle mesh [m^3]: signed tetrahedra to the origin."""
+    """Return the volume of a closed, outward oriented triangle mesh [m^3]: signed tetrahedra to the origin."""
     a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
     return float(np.einsum("ti,ti->", a, np.cross(b, c)) / 6.0)
 

@@ -45,7 +45,7 @@ class BodyPoints:
 
     @property
     def num_points(self) -> int:
-        """Number of points."""
+        """Return the number of points."""
         return self.rest.shape[1]
 
 

@@ -80,7 +80,7 @@ SLACK = 0.09
 
 
 def joint_torques() -> tuple[np.ndarray, np.ndarray]:
-    """Least (negative) and greatest torques of the joints but the pelvis [N m], each ``(22, 3)``."""
+    """Return the least (negative) and greatest torques of the joints but the pelvis [N m], each ``(22, 3)``."""
     return left_and_right(_CENTER_TORQUES, _LEFT_TORQUES, (0.0, 0.0))
 
 
@@ -108,7 +108,7 @@ class Muscles:
 
 
 def make_muscles(stiffness: float = 1.0, damping: float = 1.0, strength: float = 1.0) -> Muscles:
-    """Muscles of the reference adult.
+    """Return the muscles of the reference adult.
 
     Every gain is proportional to the strength of its joint, and thus to its usual load: a spring reaches the greatest
     torque at :data:`FULL_TORQUE_ANGLE`, and an error decays with the time constant :data:`DAMPING_TIME` where only the
@@ -136,14 +136,14 @@ def make_muscles(stiffness: float = 1.0, damping: float = 1.0, strength: float =
 
 
 def firmness(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
-    """Share of particles in :data:`FIRM_JOINTS`, shape ``(P,)``, from joints and weights ``(P, 4)`` of each."""
+    """Return the share of particles in :data:`FIRM_JOINTS`, ``(P,)``, from joints and weights ``(P, 4)`` of each."""
     return np.where(np.isin(skin_joints, [joint_index(name) for name in FIRM_JOINTS]), skin_weights, 0.0).sum(1)
 
 
 def attachment_rates(
     depth: np.ndarray, bone_distance: np.ndarray, firm: np.ndarray, skin: float, core: float
 ) -> np.ndarray:
-    """Rates of the pulls that hold flesh to bones [1/s], shape ``(P,)``: ``skin`` at the skin, ``core`` at the bone.
+    """Return rates of the pulls that hold flesh to bones [1/s], ``(P,)``: ``skin`` at the skin, ``core`` at the bone.
 
     Between them they grow geometrically with the share of the way from the skin to the bone, so that a thin wrist is
     held as a thigh is.

@@ -1,4 +1,4 @@
-"""Particles of a body, from its closed skin: positions, volumes, skinning weights, bone particles and memory order (NumPy).
+"""Particles of a body, from its closed skin: positions, volumes, skinning weights and memory order (NumPy).
 
 *Flesh* particles sit in the cells of a regular lattice, each at the centroid of the part of its cell that is inside the
 skin, so thin limbs are filled as well as thick ones. *Bone* particles are ordinary particles too, a small lattice along
@@ -29,7 +29,7 @@ BOXES = (128, 64, 32)  # particles that lie together in larger ones, as many as 
 def order_of_body(
     positions: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray
 ) -> np.ndarray:
-    """Order ``(P,)`` of the particles of a body: by their bones if it is small, else in compact boxes.
+    """Return the order ``(P,)`` of a body's particles: by their bones if it is small, else in compact boxes.
 
     Args:
         positions: in the rest pose [m], shape ``(P, 3)``.
@@ -43,7 +43,7 @@ def order_of_body(
 
 
 def order_along_curve(positions: np.ndarray, spacing: float) -> np.ndarray:
-    """Order of the particles along Morton's curve, ``(P,)``: what is close in memory is close in the body.
+    """Return the order of the particles along Morton's curve, ``(P,)``: neighbours in memory are close in the body.
 
     Threads and cache lines then share grid nodes and bones.
     """
@@ -55,7 +55,7 @@ def order_along_curve(positions: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def order_by_bones(bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
-    """Order ``(P,)`` in which bones' own particles come first, then those that one bone moves, two, and so on.
+    """Return the order ``(P,)`` with bone particles first, then those that one bone moves, two, and so on.
 
     Of as many bones those of the same ones follow each other, as they did. Threads that work together then blend as
     many bones, and mostly the same: one that blends four makes 31 others wait. Neighbours of large bodies are alike
@@ -90,7 +90,7 @@ MAX_ITERATIONS = 2000
 
 
 def adjacency(links: np.ndarray, points: np.ndarray) -> sparse.csr_matrix:
-    """Symmetric matrix of link weights 1/length^2, which make it a Laplacian on scattered points.
+    """Return the symmetric matrix of link weights 1/length^2, which make it a Laplacian on scattered points.
 
     Args:
         links: pairs of linked points, shape ``(L, 2)``.
@@ -134,7 +134,7 @@ def fill(links: np.ndarray, points: np.ndarray, values: np.ndarray, known: np.nd
 
 
 def _conjugate_gradient(matrix: sparse.csr_matrix, right: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Conjugate gradients with a diagonal preconditioner, all columns at once; deterministic."""
+    """Solve by conjugate gradients with a diagonal preconditioner, all columns at once; deterministic."""
     inverse_diagonal = 1.0 / matrix.diagonal()[:, None]
     solution = guess.copy()
     residual = right - matrix @ solution
@@ -157,7 +157,7 @@ def _conjugate_gradient(matrix: sparse.csr_matrix, right: np.ndarray, guess: np.
 
 
 def volume_ratios(links: np.ndarray, rest: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Local volume change of a smooth map, from the least-squares gradient over each point's links.
+    """Return the local volume change of a smooth map, from the least-squares gradient over each point's links.
 
     Args:
         links: pairs of linked points, shape ``(L, 2)``.
@@ -231,7 +231,7 @@ class ParticleSet:
 
 
 def spacing_for(dx: float) -> float:
-    """Lattice spacing [m] that suits a grid of spacing ``dx`` [m]."""
+    """Return the lattice spacing [m] that suits a grid of spacing ``dx`` [m]."""
     return SPACING_PER_DX * dx
 
 
@@ -307,7 +307,7 @@ def morph(asset: AvatarAsset, particles: ParticleSet, body: ShapedBody) -> tuple
 
 
 def _flesh_lattice(asset: AvatarAsset, skin: ClosedSurface, spacing: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flesh particles ``(N, 3)`` and the finer lattice of interior points that measures volumes ``(M, 3)``."""
+    """Return flesh particles ``(N, 3)`` and the finer lattice of interior points that measures volumes ``(M, 3)``."""
     low, high = asset.vertices.min(axis=0), asset.vertices.max(axis=0)
     shift = np.random.default_rng(seed).uniform(0.0, spacing, 3) * [0.0, 1.0, 1.0]
     first = np.floor((low - shift) / spacing).astype(int)
@@ -353,7 +353,7 @@ def _bone_ends(asset: AvatarAsset, skin: ClosedSurface) -> np.ndarray:
 
 
 def _bone_lattice(asset: AvatarAsset, skin: ClosedSurface, rings: int) -> tuple[np.ndarray, np.ndarray]:
-    """Bone particles ``(B, 3)`` and the joint each belongs to ``(B,)``: rings around every bone's axis."""
+    """Return bone particles ``(B, 3)`` and the joint each belongs to ``(B,)``: rings around every bone's axis."""
     ends = _bone_ends(asset, skin)
     points = np.empty((NUM_JOINTS, rings * (BONE_RING + 1), 3))
     angles = 2.0 * np.pi * np.arange(BONE_RING) / BONE_RING
@@ -382,7 +382,7 @@ def _bone_lattice(asset: AvatarAsset, skin: ClosedSurface, rings: int) -> tuple[
 def _links(
     positions: np.ndarray, depth: np.ndarray, surface: np.ndarray, skin: ClosedSurface, spacing: float
 ) -> np.ndarray:
-    """Neighbouring particles ``(L, 2)`` int32, but not across an air gap or between limbs that merely touch.
+    """Return neighbouring particles ``(L, 2)`` int32, not across an air gap or between limbs that touch.
 
     Two limbs that touch have an air gap between their particles (the link's middle is outside) or skin weights
     without a joint in common.
@@ -398,7 +398,7 @@ def _links(
 
 
 def _local(weights: np.ndarray) -> np.ndarray:
-    """Weights ``(P, 22)`` without the harmonic functions' faint far ends and without the body's other side.
+    """Return weights ``(P, 22)`` without the harmonic functions' far ends and without the body's other side.
 
     A particle that a left joint moves most follows no right joint, and the reverse.
     """
@@ -409,7 +409,7 @@ def _local(weights: np.ndarray) -> np.ndarray:
 
 
 def _volumes(positions: np.ndarray, bone: np.ndarray, interior: np.ndarray, total: float) -> np.ndarray:
-    """Volumes [m^3] ``(P,)`` float32: interior points go to the nearest particle, so nothing is counted twice.
+    """Return volumes [m^3] ``(P,)`` float32; each interior point counts for the nearest particle.
 
     The particles of one bone share theirs evenly: some are closer together than the interior points.
     """
@@ -424,7 +424,7 @@ def _volumes(positions: np.ndarray, bone: np.ndarray, interior: np.ndarray, tota
 def _pushed_inside(
     points: np.ndarray, skin: ClosedSurface, faces: np.ndarray, body: ShapedBody, inset: float
 ) -> np.ndarray:
-    """Points ``(P, 3)`` of which none is outside the skin: those that are move to ``inset`` [m] below it."""
+    """Return points ``(P, 3)``, those outside the skin moved to ``inset`` [m] below it."""
     distance, face, coordinates = skin.query(points)
     outside = distance > 0.0
     corners = body.vertices[faces[face[outside]]].astype(np.float64)
@@ -444,7 +444,7 @@ SEAM_WEIGHT = 0.05
 
 
 def limb_group_of_joint() -> np.ndarray:
-    """Index into :data:`LIMB_GROUPS` of every joint, shape ``(22,)`` int32."""
+    """Return the index into :data:`LIMB_GROUPS` of every joint, shape ``(22,)`` int32."""
     group = np.zeros(NUM_JOINTS, dtype=np.int32)
     for index, name in enumerate(LIMB_GROUPS[1:], start=1):
         group[[joint_index(joint) for joint in BODY_PARTS[name]]] = index

@@ -60,7 +60,7 @@ BODY_PARTS: dict[str, tuple[str, ...]] = {
 
 
 def joint_index(name: str) -> int:
-    """Index of the joint ``name``.
+    """Return the index of the joint ``name``.
 
     Raises:
         KeyError: the name is not one of :data:`JOINT_NAMES`.
@@ -72,7 +72,7 @@ def joint_index(name: str) -> int:
 
 
 def body_part_of_joint() -> np.ndarray:
-    """Index into :data:`BODY_PARTS` of every joint, shape ``(22,)`` int32."""
+    """Return the index into :data:`BODY_PARTS` of every joint, shape ``(22,)`` int32."""
     part = np.empty(NUM_JOINTS, dtype=np.int32)
     for index, joints in enumerate(BODY_PARTS.values()):
         part[[joint_index(name) for name in joints]] = index
@@ -82,7 +82,7 @@ def body_part_of_joint() -> np.ndarray:
 def forward_kinematics(
     local_rotations: np.ndarray, root_position: np.ndarray, rest_joints: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """World rotations and joint positions of poses with fixed bone offsets.
+    """Return world rotations and joint positions of poses with fixed bone offsets.
 
     Args:
         local_rotations: rotation of every joint relative to its parent (the root: to the world), identity in the
@@ -113,7 +113,7 @@ def skin(
     positions: np.ndarray,
     rest_joints: np.ndarray,
 ) -> np.ndarray:
-    """Linear blend skinning of rest-pose points.
+    """Apply linear blend skinning to rest-pose points.
 
     Args:
         points: rest positions [m], shape ``(N, 3)``.
@@ -158,7 +158,7 @@ _CENTER_DEGREES: dict[str, Bounds] = {
 def left_and_right(
     center: Mapping[str, Bounds], left: Mapping[str, Bounds], root: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of all joints about x, y and z, each ``(22, 3)``, from those of the middle and of the left side.
+    """Return bounds of all joints about x, y and z, each ``(22, 3)``, from those of the middle and the left.
 
     Args:
         center: by joint.
@@ -181,7 +181,7 @@ def left_and_right(
 
 
 def joint_limits() -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds of the joints' rotation vectors [rad], each of shape ``(22, 3)``.
+    """Return lower and upper bounds of the joints' rotation vectors [rad], each of shape ``(22, 3)``.
 
     The root is unbounded here; tasks bound its speed.
     """

@@ -21,7 +21,7 @@ SOFT_JOINTS = ("pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip")
 
 
 def bone_distance(rest: np.ndarray, bone: np.ndarray) -> np.ndarray:
-    """Distance of particles from the nearest bone particle [m], shape ``(P,)``.
+    """Return the distance of particles from the nearest bone particle [m], shape ``(P,)``.
 
     Args:
         rest: rest positions [m], shape ``(P, 3)``.
@@ -31,7 +31,7 @@ def bone_distance(rest: np.ndarray, bone: np.ndarray) -> np.ndarray:
 
 
 def softness(rest: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
-    """Softness of particles in [0, 1], shape ``(P,)`` float32.
+    """Return the softness of particles in [0, 1], shape ``(P,)`` float32.
 
     Args:
         rest: rest positions [m], shape ``(P, 3)``.
@@ -47,7 +47,7 @@ def softness(rest: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_w
 
 
 def velocity_lag(amount: float, soft: np.ndarray) -> np.ndarray:
-    """Share of a change of commanded motion that particles miss, for an ``amount`` in [0, 1]; shape of ``soft``.
+    """Return the share of a change of commanded motion that particles miss; ``amount`` is in [0, 1].
 
     Raises:
         ValueError: the amount is outside [0, 1].

@@ -16,7 +16,7 @@ def _closest_point_kernel(
     face: wp.array(dtype=int),
     coordinates: wp.array(dtype=wp.vec3),
 ):
-    """Signed distance (negative inside) and nearest point of the skin."""
+    """Return the signed distance (negative inside) and nearest point of the skin."""
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0e3)
     nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
@@ -36,7 +36,7 @@ class ClosedSurface:
         )
 
     def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nearest point of the skin to each of ``points`` ``(N, 3)``.
+        """Return the nearest point of the skin to each of ``points`` ``(N, 3)``.
 
         Returns:
             Signed distance [m], negative inside, ``(N,)``; triangle ``(N,)``; barycentric coordinates ``(N, 3)``.
@@ -56,5 +56,5 @@ class ClosedSurface:
         return distance.numpy(), face.numpy(), coordinates.numpy()
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance to the skin [m], negative inside, shape ``(N,)``."""
+        """Return the signed distance to the skin [m], negative inside, shape ``(N,)``."""
         return self.query(points)[0]

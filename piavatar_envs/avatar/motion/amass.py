@@ -78,7 +78,7 @@ def load_file(path: str | Path, rest_joints: np.ndarray, zero_joints: np.ndarray
 
 
 def _directions(zero_joints: np.ndarray) -> dict[str, np.ndarray | None]:
-    """Limb directions of a subject's zero pose, in our axes."""
+    """Return the limb directions of a subject's zero pose, in our axes."""
     if zero_joints.shape != (NUM_JOINTS, 3):
         raise ValueError(f"zero_joints has shape {zero_joints.shape}, expected ({NUM_JOINTS}, 3)")
     ours = _FROM_REST.inv().apply(zero_joints)

@@ -52,7 +52,7 @@ def clip_folder() -> Path | None:
 
 
 def list_clips() -> tuple[str, ...]:
-    """Names of the clips that are installed, without prefix; empty when there are none."""
+    """Return the names of the clips that are installed, without prefix; empty when there are none."""
     folder = clip_folder()
     if folder is None:
         return ()
@@ -171,7 +171,7 @@ def _read(path: Path) -> tuple[bool, float, np.ndarray]:
 
 
 def _at_constant_rate(frames: np.ndarray) -> tuple[float, np.ndarray]:
-    """Frame times vary within some clips: interpolate to the mean rate over the same time."""
+    """Interpolate to the mean frame rate, because frame times vary within some clips."""
     times = np.concatenate([[0.0], np.cumsum(frames[:-1, 0])])
     fps = (len(frames) - 1) / times[-1]
     wanted = np.arange(len(frames)) / fps
@@ -185,7 +185,7 @@ def _at_constant_rate(frames: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _world_rotations(frames: np.ndarray) -> tuple[list[Rotation], np.ndarray]:
-    """World rotations of each of our 22 joints in DeepMimic's axes, and the root position ``(num_frames, 3)``."""
+    """Return world rotations of our 22 joints in DeepMimic's axes, and the root position ``(num_frames, 3)``."""
 
     def ball(start: int, fraction: float = 1.0) -> Rotation:
         rotation = Rotation.from_quat(frames[:, start : start + 4], scalar_first=True)

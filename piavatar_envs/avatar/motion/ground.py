@@ -21,7 +21,7 @@ class Clip(Protocol):
 
     @property
     def num_frames(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
 
     def joint_frames(self, rest_joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return world rotations ``(num_frames, 22, 3, 3)`` and joint positions [m] ``(num_frames, 22, 3)``."""
@@ -77,7 +77,7 @@ def ground_level(heights: np.ndarray, fps: float, window: float, loop: bool) -> 
 
 
 def padded(values: np.ndarray, radius: int, loop: bool) -> np.ndarray:
-    """Values of the frames with ``radius`` more at both ends: other rounds of a loop, or the end values held.
+    """Return values of the frames with ``radius`` more at both ends: other rounds of a loop, or the end values held.
 
     Args:
         values: shape ``(num_frames,)``; in a loop the last is the first of the next round.
@@ -90,7 +90,7 @@ def padded(values: np.ndarray, radius: int, loop: bool) -> np.ndarray:
 
 
 def _skinning_basis(vertices: np.ndarray, skin_joints: np.ndarray, skin_weights: np.ndarray) -> csr_array:
-    """Sparse ``(V, 4 * 22)`` matrix that turns each bone's affine height row into vertex heights."""
+    """Return the sparse ``(V, 4 * 22)`` matrix that turns each bone's affine height row into vertex heights."""
     count, influences = skin_joints.shape
     homogeneous = np.concatenate([vertices, np.ones((count, 1))], axis=1).astype(np.float64)
     values = skin_weights[:, :, None] * homogeneous[:, None, :]

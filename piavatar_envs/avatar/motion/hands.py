@@ -54,7 +54,7 @@ def lay_hands_on_ground(motion: Motion, asset: AvatarAsset, body: ShapedBody | N
 
 
 def _bend(along: np.ndarray, across: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Smallest angle [rad] that makes the fingers' rise ``along cos + across sin`` at least ``wanted``.
+    """Return the smallest angle [rad] that makes the fingers' rise ``along cos + across sin`` at least ``wanted``.
 
     Args:
         along: rise of the fingers' direction, shape ``(num_frames,)``.
@@ -71,7 +71,7 @@ def _bend(along: np.ndarray, across: np.ndarray, wanted: np.ndarray) -> np.ndarr
 
 
 def _hand(vertices: np.ndarray, asset: AvatarAsset, rest: np.ndarray, wrist: int) -> tuple[np.ndarray, np.ndarray]:
-    """Wrist to the middle fingertip [m] and the unit normal of the back of the hand, at rest, each ``(3,)``."""
+    """Return wrist to middle fingertip [m] and the unit normal of the back of the hand, at rest, each ``(3,)``."""
     weight = np.where(asset.skin_joints == wrist, asset.skin_weights, 0.0).sum(axis=1)
     offsets = np.asarray(vertices, dtype=np.float64)[weight > 0.9] - rest[wrist]
     centre = offsets.mean(axis=0)

@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 
 
 def ease(phase: np.ndarray) -> np.ndarray:
-    """Smooth step from 0 to 1 with zero speed and acceleration at both ends, ``6 s^5 - 15 s^4 + 10 s^3``."""
+    """Return the smooth step from 0 to 1 with zero speed and acceleration at both ends, ``6 s^5 - 15 s^4 + 10 s^3``."""
     s = np.clip(phase, 0.0, 1.0)
     return s * s * s * (s * (6.0 * s - 15.0) + 10.0)
 
 
 def slerp(start: np.ndarray, end: np.ndarray, blend: np.ndarray) -> np.ndarray:
-    """Rotation a fraction along the shorter arc (Shoemake, "Animating rotation with quaternion curves", 1985).
+    """Return the rotation at a fraction of the shorter arc (Shoemake, "Animating rotation with quaternion curves", 1985).
 
     Args:
         start: wxyz, shape ``(..., 4)``.

@@ -113,7 +113,7 @@ def animate(name: str, keys: Sequence[Key], rest_joints: np.ndarray) -> Motion:
 def solve_leg(
     side: str, rotations: np.ndarray, root: np.ndarray, ankle: np.ndarray, foot: Rotation, rest: np.ndarray
 ) -> None:
-    """Inverse kinematics of one leg, analytic: writes hip, knee and ankle of ``rotations``.
+    """Solve the inverse kinematics of one leg analytically: write hip, knee and ankle of ``rotations``.
 
     The knee bends about the lateral axis of the rest pose until hip and ankle are as far apart as asked; the hip then
     turns the leg onto its target with the knee kept pointing forward.
@@ -145,7 +145,7 @@ def solve_leg(
 
 
 def two_vector_rotation(start: np.ndarray, start_hint: np.ndarray, end: np.ndarray, end_hint: np.ndarray) -> Rotation:
-    """Rotations that take ``start`` to ``end`` exactly, and ``start_hint`` as near to ``end_hint`` as that allows.
+    """Return rotations that take ``start`` to ``end``, and ``start_hint`` as near to ``end_hint`` as possible.
 
     All of shape ``(..., 3)`` that broadcast; hints must not be parallel to their vectors.
     """
@@ -160,7 +160,7 @@ def two_vector_rotation(start: np.ndarray, start_hint: np.ndarray, end: np.ndarr
 
 
 def _upper_body(key: Key, rest: np.ndarray) -> np.ndarray:
-    """Local rotations of a key, legs at rest, wxyz ``(22, 4)``."""
+    """Return the local rotations of a key, legs at rest, wxyz ``(22, 4)``."""
     rotations = np.zeros((NUM_JOINTS, 4))
     rotations[:, 0] = 1.0
     for name, turn in key.turns.items():
@@ -175,7 +175,7 @@ def _upper_body(key: Key, rest: np.ndarray) -> np.ndarray:
 
 
 def _pointing(side: str, arm: Arm, rest: np.ndarray) -> tuple[Rotation, Rotation]:
-    """Rotations that point an arm: the elbow turns about its own hinge, the shoulder does the rest."""
+    """Return rotations that point an arm: the elbow turns about its own hinge, the shoulder does the rest."""
     mirror = np.array([1.0 if side == "left" else -1.0, 1.0, 1.0])
     upper, fore = (mirror * direction for direction in (arm.upper, arm.fore))
     shoulder, elbow, wrist = (rest[joint_index(f"{side}_{name}")] for name in ("shoulder", "elbow", "wrist"))

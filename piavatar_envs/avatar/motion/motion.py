@@ -84,17 +84,17 @@ class Motion:
 
     @property
     def num_frames(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
         return len(self.root_position)
 
     @property
     def duration(self) -> float:
-        """Time from the first frame to the last, the period of a loop [s]."""
+        """Return the time from the first frame to the last, the period of a loop [s]."""
         return (self.num_frames - 1) / self.fps
 
     @property
     def loop_heading(self) -> float:
-        """Turn about the vertical over the clip [rad]."""
+        """Return the turn about the vertical over the clip [rad]."""
         turn = Rotation.from_quat(self.local_rotations[-1, 0], scalar_first=True)
         turn *= Rotation.from_quat(self.local_rotations[0, 0], scalar_first=True).inv()
         w, _, _, z = turn.as_quat(scalar_first=True)
@@ -125,7 +125,7 @@ class Motion:
         return self._carry(rotations, root, rounds) if self.loop else (rotations, root)
 
     def joint_frames(self, rest_joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Forward kinematics of every frame.
+        """Compute forward kinematics of every frame.
 
         Args:
             rest_joints: joints of a body's rest pose [m], shape ``(22, 3)``.

@@ -40,7 +40,7 @@ def shortest_rotation(start: np.ndarray, end: np.ndarray) -> Rotation:
 
 
 def align_limbs(rest_joints: np.ndarray, directions: Mapping[str, np.ndarray | None]) -> Rotation:
-    """World rotations of our bones that bring limbs of the rest pose onto given directions.
+    """Return world rotations of our bones that bring limbs of the rest pose onto given directions.
 
     Down each limb the rotation added at a joint is the shortest one, so that an elbow straightens about its own hinge
     and no twist is brought in. A joint not named follows its parent.
@@ -70,7 +70,7 @@ def align_limbs(rest_joints: np.ndarray, directions: Mapping[str, np.ndarray | N
 def retarget(
     world_rotations: list[Rotation], alignment: Rotation, to_world: Rotation, from_rest: Rotation
 ) -> np.ndarray:
-    """Local rotations of our skeleton from the world rotations of another.
+    """Return local rotations of our skeleton from the world rotations of another.
 
     Args:
         world_rotations: for each of our 22 joints the source's world rotations, ``num_frames`` in each.
@@ -87,7 +87,7 @@ def retarget(
 
 
 def leg_length(rest_joints: np.ndarray) -> float:
-    """Hip to knee to ankle, the mean of both legs [m]."""
+    """Return the length from hip over knee to ankle, the mean of both legs [m]."""
     rest = np.asarray(rest_joints, dtype=np.float64)
     bones = [f"{side}_{joint}" for side in ("left", "right") for joint in ("hip", "knee")]
     return 0.5 * sum(
@@ -96,7 +96,7 @@ def leg_length(rest_joints: np.ndarray) -> float:
 
 
 def root_path(hip_centre: np.ndarray, root_rotations: Rotation, rest_joints: np.ndarray) -> np.ndarray:
-    """Path of our pelvis joint that leads the midpoint of the hip joints along ``hip_centre``.
+    """Return the path of our pelvis joint that leads the midpoint of the hip joints along ``hip_centre``.
 
     Skeletons agree on where the hips are, not on where above them the root is put.
 

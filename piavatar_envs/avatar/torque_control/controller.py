@@ -139,7 +139,7 @@ class ArticulatedBody:
         firm: np.ndarray | None = None,
         solid: bool = False,
     ) -> None:
-        """Allocate.
+        """Allocate the joints of a body in every environment.
 
         Args:
             points: the body on the host.
@@ -468,7 +468,7 @@ class TorqueController:
     """
 
     def __init__(self, avatar: Avatar, points: BodyPoints, parameters: TorqueControl) -> None:
-        """Allocate.
+        """Connect the joints to the goals of the avatar.
 
         Args:
             avatar: the avatar; its goals are the targets of the springs.
