@@ -47,7 +47,7 @@ def softness(rest: np.ndarray, bone: np.ndarray, skin_joints: np.ndarray, skin_w
 
 
 def velocity_lag(amount: float, soft: np.ndarray) -> np.ndarray:
-    """Return the share of a change of commanded motion that particles miss; ``amount`` is in [0, 1].
+    """Return the share of a change of commanded motion that particles miss, in the shape of ``soft``.
 
     Raises:
         ValueError: the amount is outside [0, 1].

@@ -13,7 +13,7 @@ def ease(phase: np.ndarray) -> np.ndarray:
 
 
 def slerp(start: np.ndarray, end: np.ndarray, blend: np.ndarray) -> np.ndarray:
-    """Return the rotation at a fraction of the shorter arc (Shoemake, "Animating rotation with quaternion curves", 1985).
+    """Return a fraction of the way along the shorter arc (Shoemake, "Animating rotation with quaternion curves", 1985).
 
     Args:
         start: wxyz, shape ``(..., 4)``.
