@@ -10,8 +10,8 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
 1. *Pull of the flesh* (:func:`~piavatar_envs.avatar.torque_control.flesh_coupling.attach_flesh`). The change of
    ``J qdot`` with the pose is added to ``u``: these are the centrifugal forces. Flesh may be pulled to the bones,
    implicitly and critically damped, ``u' = (u + dt w^2 s) / (1 + dt w)^2``, with the displacement ``s`` from the
-   particle to its skinned place. The joints get the reaction, ``qdot <- qdot + M^-1 J^T m (u - u')``, corrected by a
-   rigid motion to exactly its momentum.
+   particle to its skinned place. The reaction on the joints, ``M^-1 J^T m (u - u')``, corrected by a rigid motion to
+   exactly its momentum, is added to ``qdot`` and to ``c``.
 2. *Mass matrix* ``M = J^T m J``, if due; see :mod:`piavatar_envs.avatar.torque_control.mass_matrix`.
 3. *Projection.* The joints take over what they can of the physical velocity::
 
@@ -39,7 +39,7 @@ A substep, see :meth:`ArticulatedBody.record_substep`:
    displacements from their skinned places ``LBS`` at the beginning of the substep.
 
 After a control step, :func:`~piavatar_envs.avatar.torque_control.flesh_coupling.put_in_place` moves firm particles,
-those of bones, to their skinned places, unless these are beyond a boundary. It changes no velocity; the angular
+those of bones, to their skinned places, but not beyond boundaries. It changes no velocity; the angular
 momentum ``m s x v`` of displacement ``s`` is compensated in the affine velocity ``C``. ``slip`` stores the
 displacement, so that the pull stays the same and feet come to rest.
 
