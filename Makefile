@@ -50,6 +50,7 @@ endif
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python -m scripts.prose
 
 format: install
 	$(BIN)/ruff check --fix .

@@ -1,1 +1,1 @@
-"""Chores of those who work on the suite: run from a checkout (``python -m scripts.NAME``), not part of the wheel."""
+"""Maintenance scripts of the suite: run from a checkout (``python -m scripts.NAME``), not part of the wheel."""

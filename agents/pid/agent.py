@@ -66,14 +66,11 @@ class Design:
             friction does not let them undo wind up the integrals of both, against each other, until a foot slips (at
             2 s after some 15 s). Theirs are for bodies whose pelvis is held.
         unloaded: factor on the gains of a leg that bears nothing [-], see :class:`~agents.pid.gains.LoadSchedule`; one
-            that bears half of the weight has 1. With 1, the default, the schedule is off, for softer legs are of no use
-            (by hand, firm bones, the same episodes): of 64 of PushRecovery 27 last with 1 and with 0.75, 26 with 0.5,
-            and returns are 0.1 more, give or take 0.1, and 1.2 less, give or take 2.6, of 172; of 24 of Stand, where
-            both feet stay, all last with each of them and return 294.
-        followed: names of the joints that follow a clip of the task; the others hold the rest pose. The balance knows
-            no clip: where feet leave the ground it falls later if only ``ABOVE_LEGS`` follow (step, 4 episodes with
-            impulses of 20 N s: after 3.1 instead of 1.3 s), where they stay all joints follow better (bow, 2 episodes
-            without: a return of 140 instead of 120).
+            that bears half of the weight has 1. With 1, the default, the schedule is off, because softer legs gained
+            nothing.
+        followed: names of the joints that follow a clip of the task; the others hold the rest pose. The balance
+            controller ignores the clip: where feet leave the ground the body falls later if only ``ABOVE_LEGS``
+            follow; where they stay on it, all joints follow better.
         support: from the ankles to the hindmost and to the foremost place of the centre of pressure that ankles can
             hold [m]. A foot that is pressed further back rolls over its heel, up to the stop of its ankle; the rest
             pose has the centre of mass just 12 mm ahead of the ankles.

@@ -1,7 +1,7 @@
 """Balance of a standing body: the ankle strategy, and beyond a threshold the hip strategy, in both planes.
 
-A person who is pushed a little stays stiff and turns about the ankles; pushed harder, or on a short support, bends at
-the hips (Horak & Nashner, "Central programming of postural movements", J. Neurophysiology 55, 1986). Forward and
+Pushed a little, a person stays stiff and turns about the ankles; pushed harder, or on a short support, a person bends
+at the hips (Horak & Nashner, "Central programming of postural movements", J. Neurophysiology 55, 1986). Forward and
 backward the ankles press toes or heels, sideways the hips load one leg and unload the other (Winter, "Human balance and
 posture control during standing and walking", Gait & Posture 3, 1995).
 

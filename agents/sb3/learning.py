@@ -205,7 +205,7 @@ def _check_finite(config: TrainingConfig, model: BaseAlgorithm, checkpoint: Chec
 
 
 def _check_steps(config: TrainingConfig, model: BaseAlgorithm, checkpoint: Checkpoint) -> None:
-    """Refuse a checkpoint with more steps than the configuration asks for."""
+    """Refuse a checkpoint with more steps than the configuration sets."""
     had = checkpoint.state["steps"]
     rollout = model.n_envs * (model.n_steps if isinstance(model, PPO) else model.train_freq.frequency)
     if had >= config.total_steps + rollout:

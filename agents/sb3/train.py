@@ -54,7 +54,7 @@ def train(
         deadline: by ``time.monotonic()``, or None.
 
     Raises:
-        ConfigError: the checkpoint has had more steps than the configuration asks for.
+        ConfigError: the checkpoint has more steps than the configuration sets.
     """
     model = begin(config, venv, facts, checkpoint)
     return model, learn(config, model, folder, checkpoint, deadline)

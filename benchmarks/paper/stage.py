@@ -128,7 +128,7 @@ class Stage:
 
     Attributes:
         simulation: the physics.
-        task: what a :class:`~piavatar_envs.api.pictures.Picture` of the stage asks for.
+        task: what a :class:`~piavatar_envs.api.pictures.Picture` of the stage reads.
     """
 
     def __init__(self, act: Act, fidelity: str = "coarse", device: str = "cpu") -> None:

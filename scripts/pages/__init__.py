@@ -1,1 +1,1 @@
-"""What the pages of ``docs/envs`` are made of: entries, facts, settings, text, pictures."""
+"""Parts of the pages of ``docs/envs``: entries, facts, settings, text, pictures."""

@@ -95,7 +95,7 @@ def test_the_checkpoint_of_before_is_kept(name, device, tmp_path, monkeypatch):
     elif name == "ppo":
         from stable_baselines3 import PPO as Algorithm
 
-        spoil_after(monkeypatch, Algorithm, "sb3.train", 3, lambda model: model.policy.mlp_extractor.value_net)
+        spoil_after(monkeypatch, Algorithm, "train", 3, lambda model: model.policy.mlp_extractor.value_net)
     else:
         from skrl.multi_agents.torch.mappo import MAPPO as Algorithm
 

@@ -48,10 +48,10 @@ def bad_actions(size: int) -> dict[str, tuple[object, str]]:
         return action
 
     return {
-        "too long": (np.zeros(size + 1), rf"shape \({size + 1},\), expected \({size},\)"),
-        "too short": (np.zeros(size - 1), rf"shape \({size - 1},\), expected \({size},\)"),
-        "a row": (np.zeros((1, size)), rf"shape \(1, {size}\), expected \({size},\)"),
-        "a number": (0.5, rf"shape \(\), expected \({size},\)"),
+        "too long": (np.zeros(size + 1), rf"shape \({size + 1},\).*\({size},\)"),
+        "too short": (np.zeros(size - 1), rf"shape \({size - 1},\).*\({size},\)"),
+        "a row": (np.zeros((1, size)), rf"shape \(1, {size}\).*\({size},\)"),
+        "a number": (0.5, rf"shape \(\).*\({size},\)"),
         "not a number": (at(7, np.nan), r"action\[7\] \({7}\) is nan.*finite"),
         "infinite": (at(size - 1, np.inf), rf"action\[{size - 1}\] \({{{size - 1}}}\) is inf.*finite"),
         "complex": (np.zeros(size) * 1j, "action is of complex numbers; actions must be real.*action.real"),
@@ -66,7 +66,7 @@ def test_bad_actions_are_refused_before_anything_changes(make_env, env_id, case)
     env.step(np.full(env.action_space.shape, 0.3))
     action, told = bad_actions(env.action_space.shape[0])[case]
     before, observation = env.get_state(), env.batch.observation.numpy().copy()
-    pattern = told if "expected" in told else told.format(*env.action_names)
+    pattern = told if told.startswith("shape") else told.format(*env.action_names)
     with pytest.raises(ValueError, match=pattern):
         env.step(action)
     after = env.get_state()

@@ -151,7 +151,7 @@ def test_a_time_step_that_a_draw_could_break_is_refused(make_batch, device):
     ("bounds", "told"),
     [
         ((0.0, 1.0), r"randomize.mass_factor.0=0.0 must be >= 0.001"),
-        ((2.0, 1.0), r"randomize.mass_factor=.*lower one first"),
+        ((2.0, 1.0), r"randomize.mass_factor=.*lower bound first"),
         ((-1.0, 1.0), r"randomize.mass_factor.0=-1.0 must be >= 0.001"),
         (2.0, "randomize.mass_factor=2.0 must be a list"),
     ],
