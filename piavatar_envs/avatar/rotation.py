@@ -89,16 +89,3 @@ def rigid_matrix(q: wp.quat, pivot: wp.vec3, image: wp.vec3):
         R[2, 0], R[2, 1], R[2, 2], t[2],
         0.0, 0.0, 0.0, 1.0,
     )
-    # fmt: on
-
-
-@wp.func
-def apply_point(M: wp.mat44, x: wp.vec3):
-    """Return the first three components of ``M (x, 1)``; ``M`` need not be rigid."""
-    # fmt: off
-    return wp.vec3(
-        M[0, 0] * x[0] + M[0, 1] * x[1] + M[0, 2] * x[2] + M[0, 3],
-        M[1, 0] * x[0] + M[1, 1] * x[1] + M[1, 2] * x[2] + M[1, 3],
-        M[2, 0] * x[0] + M[2, 1] * x[1] + M[2, 2] * x[2] + M[2, 3],
-    )
-    # fmt: on
