@@ -15,7 +15,7 @@ help:
 	@echo "make demo      train PPO on PIAvatar/Reach-v0 on the CPU (ten minutes at most), leaves runs/demo/"
 	@echo "make test      run the whole test suite (DEVICE=cuda for a GPU, PYTEST_ARGS='-k reach' for a part)"
 	@echo "make lint      check style and format; 'make format' mends what can be mended"
-	@echo "make docs      write docs/envs/*.md from the code (PICTURES=1 draws their pictures, too)"
+	@echo "make docs      write docs/envs/*.md from the code (PICTURES=1 draws their pictures, too; CHECK=1 compares only)"
 	@echo "make clean     remove $(VENV), caches and build output (not runs/)"
 
 install: $(STAMP)
@@ -44,6 +44,7 @@ test: install
 	$(BIN)/python -m piavatar_envs doctor --compile --device $(DEVICE)
 	$(PYTEST) --durations 10 --device $(DEVICE) $(PYTEST_ARGS)
 ifeq ($(DEVICE):$(PYTEST_ARGS),cpu:)
+	$(MAKE) docs CHECK=1
 	$(PYTEST) --device gpu_on_cpu $(OF_A_GPU)
 endif
 
@@ -57,7 +58,7 @@ format: install
 	$(BIN)/ruff format .
 
 docs: install
-	$(BIN)/python -m scripts.env_pages $(if $(PICTURES),--pictures)
+	$(BIN)/python -m scripts.env_pages $(if $(CHECK),--check) $(if $(PICTURES),--pictures)
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache

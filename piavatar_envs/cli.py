@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 import re
 import sys
+from collections.abc import Container
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -169,6 +171,25 @@ def describe(env_id: str) -> str:
     return docstring.partition("\n")[0]
 
 
+def hint_settings(args: list[str], options: Container[str]) -> None:
+    """Print the remedy for settings that were given as options: ``--fidelity tiny`` is ``-c fidelity=tiny``.
+
+    Args:
+        args: the command line.
+        options: names that are options of the command.
+    """
+    from piavatar_envs.config import EnvConfig
+    from piavatar_envs.config.errors import setting_keys
+
+    keys = setting_keys(EnvConfig)
+    known = {*keys, *(key.rpartition(".")[2] for key in keys), "control"}
+    for option, following in zip(args, [*args[1:], ""], strict=True):
+        name, _, value = option.removeprefix("--").partition("=")
+        name, value = name.replace("-", "_"), value or following
+        if option.startswith("--") and name in known and name not in options:
+            print(f"error: {name} is a setting of the environment; use -c {name}={value or '...'}", file=sys.stderr)
+
+
 def main(args: list[str] | None = None) -> None:
     """Run a command; a user's mistake ends in one line and exit status 2."""
     commands = {"list": list_command, "doctor": doctor_command, "play": play_command, "watch": watch_command}
@@ -179,3 +200,9 @@ def main(args: list[str] | None = None) -> None:
     except (ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+    except SystemExit as stop:  # the parser has printed its complaint
+        if stop.code == 2:
+            given = sys.argv[1:] if args is None else args
+            command = commands.get(given[0]) if given else None
+            hint_settings(given, inspect.signature(command).parameters if command else ())
+        raise

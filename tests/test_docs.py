@@ -1,4 +1,4 @@
-"""README and guides: their links lead somewhere, and their Python does what they say."""
+"""README and guides: their links resolve, and their Python runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
     page.relative_to(ROOT).as_posix(): page for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 }
-#: What takes minutes or a GPU, and what stands in its place here.
+#: Code that takes minutes or a GPU, and its replacement here.
 SMALLER = {
     "for _ in range(150):": "for _ in range(3):",
     "total_timesteps=50_000, progress_bar=True": "total_timesteps=16",
@@ -33,12 +33,12 @@ SMALLER = {
 
 
 def blocks(page: Path) -> list[str]:
-    """The Python of a page."""
+    """Return the Python blocks of a page."""
     return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
 
 
-def test_links_lead_somewhere():
-    others = ("CONTRIBUTING.md", "CHANGELOG.md", "*/README.md", "docs/decisions/*.md", "benchmarks/results/*.md")
+def test_links_resolve():
+    others = ("CONTRIBUTING.md", "CHANGELOG.md", "*/README.md", "docs/*/*.md", "benchmarks/results/*.md")
     pages = PAGES | {page.relative_to(ROOT).as_posix(): page for pattern in others for page in ROOT.glob(pattern)}
     found = 0
     for name, page in pages.items():
@@ -62,13 +62,8 @@ def test_committed_results_stay_small():
     assert sum(sizes.values()) < 8e6 and [name for name, size in sizes.items() if size > 1e6] == []
 
 
-def test_what_is_made_smaller_is_there():
-    code = "\n".join(block for page in PAGES.values() for block in blocks(page))
-    assert [text for text in SMALLER if text not in code] == []
-
-
-def test_walkers_are_as_fast_as_the_guide_says():
-    """Who goes at a steady ``v`` from the first of ``N`` steps on is ``v dt (N + 1) / 2`` from the start on average."""
+def test_walking_speed_of_the_guide_is_that_of_the_results():
+    """Compare with the mean distance of a steady walk: ``v dt (N + 1) / 2`` over ``N`` steps."""
     speeds = []
     for path in sorted((ROOT / "benchmarks" / "results" / "ppo").glob("walk_*/evaluation.json")):
         run = json.loads(path.read_text(encoding="utf-8"))
@@ -80,12 +75,14 @@ def test_walkers_are_as_fast_as_the_guide_says():
     assert len(speeds) == 5 and f"{min(speeds):.2f} to {max(speeds):.2f} m/s from the first step on" in guide
 
 
+def test_replacements_occur_in_the_pages():
+    code = "\n".join(block for page in PAGES.values() for block in blocks(page))
+    assert [text for text in SMALLER if text not in code] == []
+
+
 @pytest.mark.parametrize("name", [name for name, page in PAGES.items() if blocks(page)])
 def test_python_runs(name, device, monkeypatch, tmp_path):
-    """From top to bottom, as a reader would type it; the small print is in ``SMALLER``.
-
-    A block that a page calls a file ("Save this as") is one.
-    """
+    """Run a page from top to bottom, with the replacements of ``SMALLER``; a block to "Save this as" is a file."""
     sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra train")
     for needed in ("skrl", "rsl_rl", "pettingzoo"):
         pytest.importorskip(needed, reason="needs the extras skrl, rsl and multi")
@@ -109,7 +106,7 @@ def test_python_runs(name, device, monkeypatch, tmp_path):
 
 
 def check_refusals(block: str, space: dict) -> None:
-    """What is typed after ``>>>`` is refused in the words that follow."""
+    """Check that each line after ``>>>`` is refused in the words of the line below it."""
     lines = block.splitlines()
     for typed, said in zip(lines[::2], lines[1::2], strict=True):
         with pytest.raises(ConfigError) as refused:

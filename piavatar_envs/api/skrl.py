@@ -135,27 +135,28 @@ class AvatarSkrlEnv(HostView):
 class AvatarSkrlMultiEnv(HostView):
     """Several avatars in each environment, dictionaries by agent, for skrl's wrapper ``"isaaclab-multi-agent"``.
 
-    The arrays always have rows for all agents: an agent that is out keeps its rows while the others of its world go on.
-    There its reward is 0, ``terminated`` stays True, its actions are ignored, and its observation is that of its
-    passive body. A world ends with its last agent, or with its clock (then ``truncated`` is True for agents still in),
-    and is reset in the same step. A learner needs these entries of ``infos``:
+    The arrays always have rows for all agents: an agent that is out keeps its rows while the others of its environment
+    go on. There its reward is 0, ``terminated`` stays True, its actions are ignored, and its observation is that of its
+    passive body. An environment ends with its last agent, or with its clock (then ``truncated`` is True for agents
+    still in), and is reset in the same step. A learner needs these entries of ``infos``:
 
     - ``infos["acted"][agent]`` ``(num_envs,)`` bool: the agent acted in this step; do not learn from other rows.
     - ``infos["alive"][agent]`` ``(num_envs,)`` bool: it acts in the next step.
     - ``infos["final_obs"][agent]``, ``infos["final_state"]``: the observations to which the step led, also where the
-      world was reset (``infos["_final_obs"]``, ``(num_envs,)`` bool); elsewhere the same as those returned.
-    - ``infos[agent]``: metrics, ``reward_terms``, ``success``, ``failure`` (bits) and the root's wrench, a row a world.
+      environment was reset (``infos["_final_obs"]``, ``(num_envs,)`` bool); elsewhere the same as those returned.
+    - ``infos[agent]``: metrics, ``reward_terms``, ``success``, ``failure`` (bits) and the root's wrench, a row for
+      each environment.
 
     All tensors are copies on ``device``.
 
     Attributes:
-        num_envs: number of worlds.
+        num_envs: number of environments.
         device: torch's, of all tensors.
         possible_agents: names of the agents.
-        observation_spaces, action_spaces: of one world, by agent.
-        state_space: of :meth:`state`, of one world.
+        observation_spaces, action_spaces: of one environment, by agent.
+        state_space: of :meth:`state`, of one environment.
         config: the settings.
-        host: holds the worlds.
+        host: holds the environments.
     """
 
     def __init__(
@@ -167,11 +168,11 @@ class AvatarSkrlMultiEnv(HostView):
         num_threads: int | None = None,
         **overrides: Any,
     ) -> None:
-        """Build the worlds.
+        """Build the environments.
 
         Args:
             task: its class, such as ``piavatar_envs.multi.high_five_v0.TASK``, or the id of a registered task.
-            num_envs: number of worlds.
+            num_envs: number of environments.
             device: Warp device, ``"cpu"`` or ``"cuda:0"``.
             config: settings as a mapping, a YAML file or a configuration.
             num_threads: threads on a CPU; as many as there are cores if not given.
@@ -180,7 +181,7 @@ class AvatarSkrlMultiEnv(HostView):
         Raises:
             ConfigError: a setting that is unknown, of the wrong type or out of range.
             ImportError: torch is not installed.
-            ValueError: an unknown task or device, or no worlds.
+            ValueError: an unknown task or device, or no environments.
         """
         task_class = load_task(task)
         self.config = load_config(task_class.Config, config, overrides)
@@ -200,7 +201,7 @@ class AvatarSkrlMultiEnv(HostView):
 
     @property
     def agents(self) -> list[str]:
-        """All agents: a world without any has been reset."""
+        """Names of all agents: an environment without any has been reset."""
         return list(self.possible_agents)
 
     @property
@@ -209,10 +210,11 @@ class AvatarSkrlMultiEnv(HostView):
         return len(self.possible_agents)
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode in every world.
+        """Begin an episode in every environment.
 
         Args:
-            seed: world ``i`` plays the episodes of ``seed + i``. Without one, the next episode of the seed before.
+            seed: environment ``i`` plays the episodes of ``seed + i``. Without one, the next episode of the seed
+                before.
             options: ignored.
 
         Returns:
@@ -229,7 +231,7 @@ class AvatarSkrlMultiEnv(HostView):
 
         Args:
             actions: of every agent, ``(num_envs, action_size)`` float32 on :attr:`device`. A component that is not
-                finite acts as zero and ends its world with a failure.
+                finite acts as zero and ends its environment with a failure.
 
         Returns:
             Observations, rewards, terminated and truncated (each of the latter ``(num_envs,)``) by agent, and infos.
