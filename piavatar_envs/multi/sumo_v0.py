@@ -1,26 +1,13 @@
 """Sumo: push the others out of the ring, or over, and stay in it.
 
-The rules are in :mod:`piavatar_envs.tasks.games.sumo`, which is enough for
-``piavatar_envs.multi.parallel_env("sumo_v0")``. This module adds only the form that PettingZoo's own games have,
-``sumo_v0.parallel_env()``.
-
+In the form of PettingZoo's own games: ``sumo_v0.parallel_env()``. For the rules see
+:mod:`piavatar_envs.tasks.games.sumo`.
 """
 
-from __future__ import annotations
+from piavatar_envs.multi import Game
+from piavatar_envs.tasks.games.sumo import SumoTask as TASK
 
-from typing import Any
+__all__ = ["TASK", "env", "parallel_env"]
 
-from piavatar_envs.api.pettingzoo import AECEnv, AvatarParallelEnv, parallel_to_aec
-from piavatar_envs.tasks.games.sumo import SumoTask
-
-TASK = SumoTask
-
-
-def parallel_env(**settings: Any) -> AvatarParallelEnv:
-    """Build the game; for the settings see :class:`~piavatar_envs.api.pettingzoo.AvatarParallelEnv`."""
-    return AvatarParallelEnv(TASK, name="sumo_v0", **settings)
-
-
-def env(**settings: Any) -> AECEnv:
-    """Build the same game for PettingZoo's turn-based API."""
-    return parallel_to_aec(parallel_env(**settings))
+_game = Game("sumo_v0", TASK)
+parallel_env, env = _game.parallel_env, _game.env
