@@ -93,19 +93,22 @@ def _in_own_process(cold: bool, *arguments: Any) -> dict[str, Any]:
 
 
 def measure(fidelity: str, avatars: int, num_envs: int, device: str, steps: int, repeats: int) -> dict[str, Any]:
-    """Make the environment twice and step the second one; the times of the first include compiling or loading kernels.
+    """Make the environment and step it.
 
     Returns:
-        ``first_make_s`` and ``second_make_s`` (each up to the end of a first step), ``ms_per_step``, ``ms_per_substep``
-        and its range, ``env_steps_per_s``, sizes, and memory: of the arrays, of the device, and of the process.
+        ``first_make_s`` (up to the end of a first step, with compiling or loading of kernels), ``ms_per_step``,
+        ``ms_per_substep`` and its range, ``env_steps_per_s``, sizes, and memory: of the arrays, of the device, and of
+        the process.
     """
     quiet_warp()
     wp.init()
-    free = timing.device_bytes(device)
-    first, world = _timed(lambda: _first_step(World(fidelity, avatars, num_envs, device)))
-    world.close()
-    arrays = timing.array_bytes(device)
-    second, world = _timed(lambda: _first_step(World(fidelity, avatars, num_envs, device)))
+    free, arrays = timing.device_bytes(device), timing.array_bytes(device)
+    start = time.perf_counter()
+    world = World(fidelity, avatars, num_envs, device)
+    world.reset()
+    world.step()
+    wp.synchronize_device(device)
+    first = time.perf_counter() - start
     seconds, failed = [], 0
 
     def play() -> None:
@@ -130,7 +133,6 @@ def measure(fidelity: str, avatars: int, num_envs: int, device: str, steps: int,
         "ms_per_substep_range": [float(ms.min()) / model.num_substeps, float(ms.max()) / model.num_substeps],
         "env_steps_per_s": 1e3 * num_envs / float(np.median(ms)),
         "first_make_s": first,
-        "second_make_s": second,
         "arrays_mb": (timing.array_bytes(device) - arrays) / 1e6,
         "device_mb": None if in_use is None else (in_use - free) / 1e6,
         "process_mb": timing.resident_bytes() / 1e6,
@@ -201,19 +203,6 @@ class World:
         """Free the environment."""
         self.env.close()
         del self.env, self.groups
-
-
-def _first_step(world: World) -> World:
-    world.reset()
-    world.step()
-    wp.synchronize_device(world.groups[0].simulation.device)
-    return world
-
-
-def _timed(make: Callable[[], World]) -> tuple[float, World]:
-    start = time.perf_counter()
-    made = make()
-    return time.perf_counter() - start, made
 
 
 if __name__ == "__main__":
