@@ -13,7 +13,7 @@ from benchmarks import runner
 from benchmarks.physics.rig import Rig, World, joint_gaps
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, forward_kinematics, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
+from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
 from piavatar_envs.config import PoseControlConfig
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep

@@ -19,7 +19,7 @@ import warp as wp
 from piavatar_envs.avatar.body.muscles import LOCKED_JOINTS
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
 from piavatar_envs.avatar.rotation import MAX_ANGLE, quat_exp, quat_log, short_of_pi, turn_about_z
-from piavatar_envs.avatar.torque_control.dynamics import Strength
+from piavatar_envs.avatar.torque_control.joint_torques import Strength
 from piavatar_envs.config.load import ConfigError
 from piavatar_envs.mpm.types import FAILURE_ACTION
 

@@ -25,11 +25,12 @@ from piavatar_envs.mpm.memory import allocate, estimate_active_blocks
 from piavatar_envs.mpm.model import build_model, make_grid
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep
 from piavatar_envs.mpm.types import Model, Scratch, State
-from piavatar_envs.sim.bodies import Flesh, Shapes, check_shape_names, load_avatar, pose_control
+from piavatar_envs.sim.bodies import Flesh, load_avatar, pose_control
 from piavatar_envs.sim.checks import check_apart, check_beside_solids, check_places
 from piavatar_envs.sim.props import PropSet, prop_matter, prop_points
 from piavatar_envs.sim.randomize import Randomization, fastest_wave
 from piavatar_envs.sim.scene import Domain, assemble
+from piavatar_envs.sim.shapes import Shapes, check_shape_names
 from piavatar_envs.sim.time_step import choose_substeps
 
 #: Grid spacings in a standing mean body, by fidelity; "fine" is the paper's scale, about 1 cm.

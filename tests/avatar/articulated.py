@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics
-from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
+from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.mpm.solver import record_begin, record_end, record_substep

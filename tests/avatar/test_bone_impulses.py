@@ -19,7 +19,7 @@ from piavatar_envs.avatar.torque_control.bone_contact import (
     push,
     touch_of,
 )
-from piavatar_envs.avatar.torque_control.dynamics import spread_motion
+from piavatar_envs.avatar.torque_control.joint_motion import spread_motion
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF
 from piavatar_envs.avatar.torque_control.tree_cholesky import load_factor
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, warp_arena

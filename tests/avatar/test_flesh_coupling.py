@@ -12,8 +12,8 @@ from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.body.soft_tissue import bone_distance
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
-from piavatar_envs.avatar.torque_control.dynamics import UNBOUNDED, stopping_torque
+from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
+from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED, stopping_torque
 from tests.avatar.articulated import Joints
 
 ANKLES = [joint_index("left_ankle"), joint_index("right_ankle")]

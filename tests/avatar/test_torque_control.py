@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body import device as body_device
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, forward_kinematics, joint_index
-from piavatar_envs.avatar.torque_control.controller import ArticulatedBody
-from piavatar_envs.avatar.torque_control.dynamics import UNBOUNDED
+from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
+from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED
 from piavatar_envs.avatar.torque_control.mass_matrix import LONGEST_REFRESH, MOST_USES, NUM_DOF
 from piavatar_envs.avatar.torque_control.stages import FIT_SHARE
 from piavatar_envs.core import cuda_intrinsics as lanes

@@ -8,7 +8,7 @@ import warp as wp
 
 from piavatar_envs.avatar.body.device import bone_masses
 from piavatar_envs.config import ConfigError, load_config
-from piavatar_envs.sim.bodies import draw_body
+from piavatar_envs.sim.shapes import draw_body
 from piavatar_envs.tasks import load_task
 
 REACH = "PIAvatar/Reach-v0"
@@ -94,8 +94,9 @@ def test_the_host_takes_no_part_until_it_asks(make_batch, monkeypatch):
     for _ in range(4):
         batch.reset()
         assert np.array_equal(flesh._shape_parameters, before), "the host has looked"
-    index = flesh.pool.index.numpy()
-    assert np.array_equal(flesh.shape_parameters, flesh.pool.bodies.parameters[index])
+    pool = batch.simulation.shapes.pools[0]
+    index = pool.index.numpy()
+    assert np.array_equal(flesh.shape_parameters, pool.bodies.parameters[index])
     assert not np.array_equal(flesh.shape_parameters, before)
 
 
@@ -141,7 +142,7 @@ def test_avatars_draw_apart_from_bodies_that_are_shaped_once(device):
     )
     simulation.record_randomization(graph, mask, seed, episode)
     graph.run()
-    pools = [flesh.pool for flesh in simulation.flesh]
+    pools = simulation.shapes.pools
     assert pools[0].bodies is pools[1].bodies
     assert not np.array_equal(pools[0].index.numpy(), pools[1].index.numpy())
     for avatar, flesh in enumerate(simulation.flesh):
@@ -152,7 +153,7 @@ def test_avatars_draw_apart_from_bodies_that_are_shaped_once(device):
 
 def test_settings_of_the_shapes_hold_for_the_pool(make_batch):
     batch = make_batch(REACH, 2, **POOL, **{"shape.parameters": {"height": 0.5}, "shape.scale": 0.3})
-    names, drawn = batch.simulation.asset.shape_names, batch.simulation.flesh[0].pool.bodies.parameters
+    names, drawn = batch.simulation.asset.shape_names, batch.simulation.shapes.pools[0].bodies.parameters
     others = [index for index, name in enumerate(names) if name != "height"]
     assert (drawn[:, names.index("height")] == 0.5).all()
     assert np.abs(drawn[:, others]).max() <= 0.3 and (np.ptp(drawn[:, others], axis=0) > 0.0).all()
@@ -169,4 +170,4 @@ def test_a_pool_is_not_written_into(make_batch):
 
 def test_without_random_shapes_there_is_no_pool(make_batch):
     batch = make_batch(REACH, 2, **{"shape.pool": 3})
-    assert batch.simulation.flesh[0].pool is None and batch.simulation.avatar.body.rest.shape[0] == 1
+    assert not batch.simulation.shapes.pools and batch.simulation.avatar.body.rest.shape[0] == 1

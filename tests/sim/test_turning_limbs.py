@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.physics.wear import set_spinning, straight_growth, widths
 from piavatar_envs.avatar.body.asset import dense_weights
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, PARENTS, joint_index
-from piavatar_envs.avatar.torque_control.dynamics import LOCK
+from piavatar_envs.avatar.torque_control.joint_torques import LOCK
 from piavatar_envs.avatar.torque_control.mass_matrix import GRID_SHARES
 from piavatar_envs.mpm.diagnostics import totals
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 import warp as wp
 
 from piavatar_envs.avatar.skinning import motion_at
-from piavatar_envs.avatar.torque_control.dynamics import set_triple, spread_motion, triple_of
+from piavatar_envs.avatar.torque_control.joint_motion import set_triple, spread_motion, triple_of
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, NUM_DOF
 from piavatar_envs.avatar.torque_control.tree_cholesky import begin_solution, end_solution
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace, place_of_triple, row_in_arena, view_columns

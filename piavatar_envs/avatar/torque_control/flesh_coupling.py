@@ -17,7 +17,7 @@ from piavatar_envs.avatar.segment_sums import (
     sum_chunk,
 )
 from piavatar_envs.avatar.skinning import blend_back, blend_images, skinned_place
-from piavatar_envs.avatar.torque_control.dynamics import blended_motion, motion_apart
+from piavatar_envs.avatar.torque_control.joint_motion import blended_motion, motion_apart
 from piavatar_envs.avatar.torque_control.workspace import TorqueWorkspace
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.core.arrays import int_at, matrix_at, number_at, prefetch_rows, set_vector, store_matrix, vector_at
@@ -70,10 +70,10 @@ def attach_flesh(
     """Update ``u`` to the new ``J``, pull every particle to its skinned place, and sum moments of the bones.
 
     The change of ``J qdot`` with the pose is added to ``u``. ``vk`` keeps
-    :func:`piavatar_envs.avatar.torque_control.dynamics.motion_apart` of particles that several bones move. The pull is
-    implicit in time and critically damped, with ``rate`` [1/s]; a rate of 0 leaves a velocity exactly as it is. The
-    moments are those of the velocity that the pull removes, of the remaining velocity, and of the displacements to the
-    skinned places.
+    :func:`~piavatar_envs.avatar.torque_control.joint_motion.motion_apart` of particles that several bones move. The
+    pull is implicit in time and critically damped, with ``rate`` [1/s]; a rate of 0 leaves a velocity exactly as it is.
+    The moments are those of the velocity that the pull removes, of the remaining velocity, and of the displacements to
+    the skinned places.
 
     Over ``(num_envs, partitions, PARTITION_THREADS)``, a CUDA block a partition; on a CPU one thread has the only one.
     """

@@ -16,23 +16,17 @@ import warp as wp
 
 from piavatar_envs.avatar.rotation import rigid_matrix
 from piavatar_envs.avatar.torque_control.bone_contact import TRIPLES, Ground, add_to_sensors, measure_bones, stop_bones
-from piavatar_envs.avatar.torque_control.dynamics import (
+from piavatar_envs.avatar.torque_control.joint_momentum import add_change, balance, gather_sums, go_on, pass_down
+from piavatar_envs.avatar.torque_control.joint_motion import move_joints, spread_motion, triple_of
+from piavatar_envs.avatar.torque_control.joint_torques import (
     Springs,
     Strength,
     Target,
     Tissue,
-    add_change,
-    balance,
     find_given,
-    gather_sums,
-    go_on,
     implicit_diagonal,
     joint_impulse,
     limit_torque,
-    move_joints,
-    pass_down,
-    spread_motion,
-    triple_of,
 )
 from piavatar_envs.avatar.torque_control.mass_matrix import BONES, PLACES, Pairs, compose_mass, record_arena
 from piavatar_envs.avatar.torque_control.tree_cholesky import (
