@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.paper import acts
 from benchmarks.paper.stage import Course
+from piavatar_envs.avatar.body.flesh import bone_distance, softness
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES
-from piavatar_envs.avatar.body.soft_tissue import bone_distance, softness
 
 Row = dict[str, Any]
 LAST_SECONDS = 0.4  # over which a settled value is averaged

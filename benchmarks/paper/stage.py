@@ -15,7 +15,7 @@ from benchmarks.physics.rig import joint_gaps
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index, skin
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion
-from piavatar_envs.avatar.motion.interpolation import ease
+from piavatar_envs.avatar.motion.motion import ease
 from piavatar_envs.config import EnvConfig, RenderConfig, SceneConfig, load_config
 from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.sim.scene import Domain

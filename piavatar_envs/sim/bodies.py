@@ -14,10 +14,10 @@ import warp as wp
 
 from piavatar_envs.avatar.body.asset import AvatarAsset
 from piavatar_envs.avatar.body.device import BodyPoints, bone_masses
-from piavatar_envs.avatar.body.muscles import attachment_rates, firmness, make_muscles
+from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness, softness, velocity_lag
+from piavatar_envs.avatar.body.muscles import make_muscles
 from piavatar_envs.avatar.body.sampling import ParticleSet, morph
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, body_part_of_joint, joint_index
-from piavatar_envs.avatar.body.soft_tissue import bone_distance, softness, velocity_lag
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.controller import TorqueControl
 from piavatar_envs.avatar.types import COMMANDS, DAMPING, ROOT_RATE, TONE_RATE, PoseControl

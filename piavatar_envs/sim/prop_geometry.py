@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import cKDTree
 
-from piavatar_envs.avatar.body.surface import ClosedSurface
+from piavatar_envs.avatar.body.sampling import ClosedSurface
 from piavatar_envs.mpm.colliders import COLLIDER_KINDS, solid_distance
 
 wp.set_module_options({"enable_backward": False})

@@ -7,10 +7,10 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from piavatar_envs.avatar.body.muscles import attachment_rates, firmness, joint_torques, make_muscles
+from piavatar_envs.avatar.body.flesh import attachment_rates, bone_distance, firmness
+from piavatar_envs.avatar.body.muscles import joint_torques, make_muscles
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, PARENTS, joint_index
-from piavatar_envs.avatar.body.soft_tissue import bone_distance
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.torque_control.articulated_body import ArticulatedBody
 from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED, stopping_torque

@@ -11,7 +11,7 @@ from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.avatar.motion import Motion, load_motion
 from piavatar_envs.avatar.motion.ground import ground_level, lowest_heights
 from piavatar_envs.avatar.motion.hands import lay_hands_on_ground
-from piavatar_envs.avatar.motion.interpolation import hemisphere_consistent, slerp
+from piavatar_envs.avatar.motion.motion import hemisphere_consistent, slerp
 from piavatar_envs.avatar.motion.retarget import align_limbs, retarget
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])

@@ -9,10 +9,9 @@ import pytest
 
 from piavatar_envs.avatar.body import sampling as harmonic
 from piavatar_envs.avatar.body.asset import AvatarAsset, dense_weights, mesh_volume
-from piavatar_envs.avatar.body.sampling import morph, sample_particles, spacing_for
+from piavatar_envs.avatar.body.sampling import ClosedSurface, morph, sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.body.surface import ClosedSurface
 
 SIDE = np.array([name.startswith("left") * 1 - name.startswith("right") * 1 for name in JOINT_NAMES])
 

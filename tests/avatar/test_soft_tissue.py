@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.avatar.body.flesh import softness, velocity_lag
 from piavatar_envs.avatar.body.sampling import sample_particles, spacing_for
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index, skin
-from piavatar_envs.avatar.body.soft_tissue import softness, velocity_lag
 from piavatar_envs.avatar.body.sources import load_asset
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, Bounds, joint_index, joint_limits, left_and_right
+from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, Bounds, joint_limits, left_and_right
 
 REFERENCE_MASS = 75.0  # [kg]
 REFERENCE_HEIGHT = 1.75  # [m]
@@ -59,10 +59,6 @@ _CENTER_TORQUES: dict[str, Bounds] = {
 
 #: Joints that do not move under torques: toes are smaller than a cell of the grid through which the ground pushes.
 LOCKED_JOINTS = ("left_foot", "right_foot")
-
-#: Bones of these fill their flesh: a foot must bear the body. As soft as the rest, it turns about its bones by 1 rad
-#: under some 70 N m, an eighth of what standing takes.
-FIRM_JOINTS = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 
 #: Error at which a spring reaches the greatest torque of its joint [rad].
 FULL_TORQUE_ANGLE = 0.3
@@ -133,32 +129,6 @@ def make_muscles(stiffness: float = 1.0, damping: float = 1.0, strength: float =
         range_lower=range_lower - SLACK,
         range_upper=range_upper + SLACK,
     )
-
-
-def firmness(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
-    """Return the share of particles in :data:`FIRM_JOINTS`, ``(P,)``, from joints and weights ``(P, 4)`` of each."""
-    return np.where(np.isin(skin_joints, [joint_index(name) for name in FIRM_JOINTS]), skin_weights, 0.0).sum(1)
-
-
-def attachment_rates(
-    depth: np.ndarray, bone_distance: np.ndarray, firm: np.ndarray, skin: float, core: float
-) -> np.ndarray:
-    """Return rates of the pulls that hold flesh to bones [1/s], ``(P,)``: ``skin`` at the skin, ``core`` at the bone.
-
-    Between them they grow geometrically with the share of the way from the skin to the bone, so that a thin wrist is
-    held as a thigh is.
-
-    Args:
-        depth: of particles below the skin [m], shape ``(P,)``.
-        bone_distance: from the nearest bone particle [m], shape ``(P,)``.
-        firm: share that is held as bone all through, shape ``(P,)``.
-        skin: rate at the skin [1/s]; 0 for no pull at all.
-        core: rate at the bone [1/s].
-    """
-    if skin == 0.0:
-        return np.zeros(len(depth))
-    share = depth / np.maximum(depth + bone_distance, 1e-9)
-    return skin * (core / skin) ** (1.0 - (1.0 - share) * (1.0 - np.clip(firm, 0.0, 1.0)))
 
 
 def spring_rows(joints: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Particles of a body, from its closed skin: positions, volumes, skinning weights and memory order (NumPy).
+"""Particles of a body, from its closed skin: positions, volumes, skinning weights and memory order.
 
 *Flesh* particles sit in the cells of a regular lattice, each at the centroid of the part of its cell that is inside the
 skin, so thin limbs are filled as well as thick ones. *Bone* particles are ordinary particles too, a small lattice along
@@ -14,16 +14,71 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import warp as wp
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from piavatar_envs.avatar.body.asset import AvatarAsset, ShapedBody, dense_weights, mesh_volume, top_weights
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
-from piavatar_envs.avatar.body.surface import ClosedSurface
+
+wp.set_module_options({"enable_backward": False})
+
 
 SMALL_BODY = 8192  # particles up to which they are in the order of their bones
 BOXES = (128, 64, 32)  # particles that lie together in larger ones, as many as P2G takes together or a warp has
+
+
+@wp.kernel
+def _closest_point_kernel(
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3),
+    distance: wp.array(dtype=float),
+    face: wp.array(dtype=int),
+    coordinates: wp.array(dtype=wp.vec3),
+):
+    """Return the signed distance (negative inside) and nearest point of the skin."""
+    i = wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], 1.0e3)
+    nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+    distance[i] = query.sign * wp.length(nearest - points[i])
+    face[i] = query.face
+    coordinates[i] = wp.vec3(query.u, query.v, 1.0 - query.u - query.v)
+
+
+class ClosedSurface:
+    """Point queries against a closed triangle mesh; on the CPU whatever the simulation runs on."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
+        self._mesh = wp.Mesh(
+            points=wp.array(vertices, dtype=wp.vec3, device="cpu"),
+            indices=wp.array(faces.ravel(), dtype=wp.int32, device="cpu"),
+            support_winding_number=True,
+        )
+
+    def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the nearest point of the skin to each of ``points`` ``(N, 3)``.
+
+        Returns:
+            Signed distance [m], negative inside, ``(N,)``; triangle ``(N,)``; barycentric coordinates ``(N, 3)``.
+        """
+        count = len(points)
+        distance = wp.empty(count, dtype=float, device="cpu")
+        face = wp.empty(count, dtype=int, device="cpu")
+        coordinates = wp.empty(count, dtype=wp.vec3, device="cpu")
+        where = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device="cpu")
+        wp.launch(
+            _closest_point_kernel,
+            dim=count,
+            inputs=[self._mesh.id, where],
+            outputs=[distance, face, coordinates],
+            device="cpu",
+        )
+        return distance.numpy(), face.numpy(), coordinates.numpy()
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the signed distance to the skin [m], negative inside, shape ``(N,)``."""
+        return self.query(points)[0]
 
 
 def order_of_body(

@@ -18,8 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES
-from piavatar_envs.avatar.motion.interpolation import ease, hemisphere_consistent, slerp
-from piavatar_envs.avatar.motion.motion import Motion
+from piavatar_envs.avatar.motion.motion import Motion, ease, hemisphere_consistent, slerp
 from piavatar_envs.avatar.motion.retarget import align_limbs, leg_length, retarget, root_path
 
 NUM_CHANNELS = 44

@@ -14,8 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
-from piavatar_envs.avatar.motion.interpolation import ease, slerp
-from piavatar_envs.avatar.motion.motion import Motion
+from piavatar_envs.avatar.motion.motion import Motion, ease, slerp
 from piavatar_envs.avatar.motion.retarget import leg_length
 
 FPS = 30.0  # [1/s]

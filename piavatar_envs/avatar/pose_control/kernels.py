@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.critical_damping import implicit_velocity, pull_denominator, pull_gain
+from piavatar_envs.avatar.controller import implicit_velocity, pull_denominator, pull_gain
 from piavatar_envs.avatar.kinematics import pose_bones
 from piavatar_envs.avatar.pose_control.bones import carry_anchor, carry_bone, write_record
 from piavatar_envs.avatar.pose_control.root import axial, free_motion, hold_root, is_free, lay_command

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.critical_damping import critical_pull
+from piavatar_envs.avatar.controller import critical_pull
 from piavatar_envs.avatar.rotation import finite_turn, quat_exp, quat_log
 from piavatar_envs.avatar.tracking import kabsch_rotation, spin_of
 from piavatar_envs.avatar.types import (

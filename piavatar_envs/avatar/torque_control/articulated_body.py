@@ -91,8 +91,6 @@ from piavatar_envs.core.launch_graph import LaunchGraph
 from piavatar_envs.core.structs import make_struct
 from piavatar_envs.mpm.types import Model, Scratch, State
 
-wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
-
 
 class ArticulatedBody:
     """Joints of one avatar in every environment, with the springs, torques and contacts that move them.

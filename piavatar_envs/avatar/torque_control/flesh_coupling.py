@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from piavatar_envs.avatar.critical_damping import implicit_velocity
+from piavatar_envs.avatar.controller import implicit_velocity
 from piavatar_envs.avatar.segment_sums import (
     PARTITION_THREADS,
     Partitions,

@@ -1,6 +1,6 @@
-"""Soft tissue: flesh far from the bones is late for commanded motion, and jiggles.
+"""Flesh: its softness, by which it is late for commanded motion and jiggles, and how firmly it is held by bones.
 
-Inert flesh misses a share ``amount * softness`` of every *change* of the kinematic velocity; what it misses becomes
+Soft flesh misses a share ``amount * softness`` of every *change* of the kinematic velocity; what it misses becomes
 physical velocity, which strains the flesh, drags on the bones and swings back. (Attenuating the kinematic velocity
 itself, as one would with a single velocity, leaves flesh behind unstrained in the split scheme: 16 cm in a squat.)
 
@@ -18,6 +18,9 @@ from piavatar_envs.avatar.body.skeleton import joint_index
 #: Distance from the nearest bone particle at which flesh is fully soft [m].
 FULL_DEPTH = 0.10
 SOFT_JOINTS = ("pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip")
+#: Bones of these fill their flesh: a foot must bear the body. As soft as the rest, it turns about its bones by 1 rad
+#: under some 70 N m, an eighth of what standing takes.
+FIRM_JOINTS = ("left_ankle", "right_ankle", "left_foot", "right_foot")
 
 
 def bone_distance(rest: np.ndarray, bone: np.ndarray) -> np.ndarray:
@@ -55,3 +58,29 @@ def velocity_lag(amount: float, soft: np.ndarray) -> np.ndarray:
     if not 0.0 <= amount <= 1.0:
         raise ValueError(f"soft_tissue={amount} is outside [0, 1]")
     return (amount * soft).astype(np.float32)
+
+
+def firmness(skin_joints: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
+    """Return the share of particles in :data:`FIRM_JOINTS`, ``(P,)``, from joints and weights ``(P, 4)`` of each."""
+    return np.where(np.isin(skin_joints, [joint_index(name) for name in FIRM_JOINTS]), skin_weights, 0.0).sum(1)
+
+
+def attachment_rates(
+    depth: np.ndarray, bone_distance: np.ndarray, firm: np.ndarray, skin: float, core: float
+) -> np.ndarray:
+    """Return rates of the pulls that hold flesh to bones [1/s], ``(P,)``: ``skin`` at the skin, ``core`` at the bone.
+
+    Between them they grow geometrically with the share of the way from the skin to the bone, so that a thin wrist is
+    held as a thigh is.
+
+    Args:
+        depth: of particles below the skin [m], shape ``(P,)``.
+        bone_distance: from the nearest bone particle [m], shape ``(P,)``.
+        firm: share that is held as bone all through, shape ``(P,)``.
+        skin: rate at the skin [1/s]; 0 for no pull at all.
+        core: rate at the bone [1/s].
+    """
+    if skin == 0.0:
+        return np.zeros(len(depth))
+    share = depth / np.maximum(depth + bone_distance, 1e-9)
+    return skin * (core / skin) ** (1.0 - (1.0 - share) * (1.0 - np.clip(firm, 0.0, 1.0)))
