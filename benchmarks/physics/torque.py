@@ -28,10 +28,7 @@ from benchmarks.physics.rig import joint_gaps
 from benchmarks.speed import timing
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, joint_index
 from piavatar_envs.avatar.body.sources import load_asset
-from piavatar_envs.avatar.torque_control import dynamics as joint_motion
-from piavatar_envs.avatar.torque_control import flesh_coupling as attachment
-from piavatar_envs.avatar.torque_control import mass_matrix as mass_pairs
-from piavatar_envs.avatar.torque_control import stages as joint_stages
+from piavatar_envs.avatar.torque_control import flesh_coupling, joint_motion, mass_matrix, stages
 from piavatar_envs.config import PhysicsConfig, load_config
 from piavatar_envs.envs.batch_env import BatchEnv
 from piavatar_envs.mpm.diagnostics import totals
@@ -51,7 +48,7 @@ RATE = 300.0  # of the pulls that hold flesh to bones [1/s]
 # settings of ``control``: flesh is held to bones as in environments, or by its own stiffness only
 FLESH: dict[str, dict[str, Any]] = {"_loose": {"flesh_rate": (0.0, 0.0)}, "": {}}
 REPLAYS = 30  # of a control step whose cost is measured
-MODULES = (attachment, joint_motion, joint_stages, mass_pairs)
+MODULES = (flesh_coupling, joint_motion, stages, mass_matrix)
 
 
 def flail(options: Options, rate: float, hold: str) -> dict[str, Any]:
