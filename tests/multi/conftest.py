@@ -16,8 +16,9 @@ if importlib.util.find_spec("pettingzoo") is None:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run tests with ``game_name`` on every game."""
-    if "game_name" in metafunc.fixturenames:
+    """Run tests with ``game_name`` on every game, but for those that name the games themselves."""
+    named = any("game_name" in marker.args[0] for marker in metafunc.definition.iter_markers("parametrize"))
+    if "game_name" in metafunc.fixturenames and not named:
         metafunc.parametrize("game_name", game_modules())
 
 
@@ -54,24 +55,24 @@ def make_game(device, games):
 
 @pytest.fixture(scope="session")
 def play():
-    """``play(world, steps, rng, **constant)``: what the world returned at every step.
+    """``play(game, steps, rng, **constant)``: what the game returned at every step.
 
     Actions are random in [-1, 1] (zero without ``rng``); ``constant`` holds components, for all agents:
     ``**{"root.y": -1.0}``. Ends with the last agent.
     """
 
-    def run(world, steps: int, rng: np.random.Generator | None = None, **constant: float) -> list[tuple]:
+    def run(game, steps: int, rng: np.random.Generator | None = None, **constant: float) -> list[tuple]:
         log = []
         for _ in range(steps):
-            if not world.agents:
+            if not game.agents:
                 break
             actions = {}
-            for name in world.agents:
-                size = world.action_space(name).shape
+            for name in game.agents:
+                size = game.action_space(name).shape
                 actions[name] = np.zeros(size) if rng is None else rng.uniform(-1.0, 1.0, size)
                 for component, value in constant.items():
-                    actions[name][world.action_names.index(component)] = value
-            log.append(world.step(actions))
+                    actions[name][game.action_names.index(component)] = value
+            log.append(game.step(actions))
         return log
 
     return run

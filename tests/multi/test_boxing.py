@@ -59,17 +59,16 @@ def expected(strength: float, full: float) -> float:
     return full * min(max(strength / LEAST - 1.0, 0.0), 1.0)
 
 
-@pytest.mark.parametrize("strength", [0.5, 1.5, 2.0, 2.9, 3.0, 30.0])
+@pytest.mark.parametrize("strength", [1.5, 2.0, 30.0])
 @pytest.mark.parametrize(("target", "full"), [("head", POINTS[0]), ("torso", POINTS[1]), ("left_leg", 0.0)])
 def test_points_depend_on_target_and_strength(games, device, strength, target, full):
     for arm in ("left_arm", "right_arm"):
         assert Scorer(device).blow(strength, target, arm) == pytest.approx(expected(strength, full), abs=1e-6)
 
 
-def test_only_what_the_arms_have_felt_counts(games, device):
+def test_only_the_impulse_on_the_arms_counts(games, device):
     assert Scorer(device).blow(9.0, felt=2.0) == pytest.approx(expected(2.0, 1.0), abs=1e-6)
-    assert Scorer(device).blow(9.0, arm="left_leg") == 0.0
-    assert Scorer(device).blow(9.0, arm="head") == 0.0
+    assert Scorer(device).blow(9.0, arm="left_leg") == Scorer(device).blow(9.0, arm="head") == 0.0
 
 
 def test_a_contact_counts_once_by_its_strongest_step(games, device):
@@ -81,11 +80,6 @@ def test_a_contact_counts_once_by_its_strongest_step(games, device):
     first = [value[0], value[1] - value[0], 0.0, 0.0, 0.0, value[5] - value[1]]
     assert gained == pytest.approx([*first, 0.0, value[7], 0.0, 1.0], abs=1e-6)
     assert scorer.score.numpy()[0] == pytest.approx([sum(gained), 0.0], abs=1e-6)
-
-
-def test_leaning_scores_once(games, device):
-    scorer = Scorer(device)
-    assert sum(scorer.blow(2.5) for _ in range(30)) == pytest.approx(expected(2.5, 1.0), abs=1e-6)
 
 
 def test_points_belong_to_the_striking_agent(games, device):
@@ -121,19 +115,19 @@ def straight_right() -> tuple[np.ndarray, np.ndarray]:
     return tuple(Stance(key).local_rotations for key in (STANCE, struck))
 
 
-def strike(world, steps: int = 20) -> list[tuple]:
+def strike(game, steps: int = 20) -> list[tuple]:
     """Agent 0 steps in, throws a straight right and draws it back; agent 1 keeps its guard."""
     poses, log = [Rotation.from_quat(pose, scalar_first=True) for pose in straight_right()], []
-    step = world.config.control.joint_speed_limit * world.config.physics.control_dt
+    step = game.config.control.joint_speed_limit * game.config.physics.control_dt
     for _ in range(steps):
-        k = int(world.batch.step_count.numpy()[0])
-        actions = {name: np.zeros(world.action_space(name).shape) for name in world.agents}
-        now = Rotation.from_quat(world.batch.simulation.avatars[0].state.command_rotation.numpy()[0])
+        k = int(game.batch.step_count.numpy()[0])
+        actions = {name: np.zeros(game.action_space(name).shape) for name in game.agents}
+        now = Rotation.from_quat(game.batch.simulation.avatars[0].state.command_rotation.numpy()[0])
         way = (now.inv() * poses[4 <= k < 15]).as_rotvec() / step
-        for n, joint in enumerate(world.batch.task.joints):
+        for n, joint in enumerate(game.batch.task.joints):
             actions["agent_0"][3 * n : 3 * n + 3] = np.clip(way[joint_index(joint)], -1.0, 1.0)
-        actions["agent_0"][world.action_names.index("root.y")] = -1.0 if k < 8 else 0.0
-        log.append(world.step(actions))
+        actions["agent_0"][game.action_names.index("root.y")] = -1.0 if k < 8 else 0.0
+        log.append(game.step(actions))
     return log
 
 
@@ -142,35 +136,35 @@ SOFT = {"pose_noise": 0.0, "place_noise": 0.0, "blow_impulse": 0.12}
 
 
 def test_a_straight_right_scores(make_game):
-    world = make_game(BOXING, **SOFT)
-    world.reset(seed=0)
-    log = strike(world)
+    game = make_game(BOXING, **SOFT)
+    game.reset(seed=0)
+    log = strike(game)
     hits = [row[4]["agent_0"]["reward_terms"]["hit"] for row in log]
     taken = [row[4]["agent_1"]["reward_terms"]["taken"] for row in log]
     assert sum(hits) > 0.4 and log[-1][4]["agent_0"]["score"] == pytest.approx(sum(hits), abs=1e-5)
-    assert taken == pytest.approx([-world.config.taken_weight * hit for hit in hits], abs=1e-6)
+    assert taken == pytest.approx([-game.config.taken_weight * hit for hit in hits], abs=1e-6)
     for row in log:
         assert row[4]["agent_0"]["given_impulse"] == row[4]["agent_1"]["taken_impulse"]
     assert sum(hits) > log[-1][4]["agent_1"]["score"]
-    world.reset()
-    assert not world.batch.task.score.numpy().any() and not world.batch.task.peak.numpy().any()
+    game.reset()
+    assert not game.batch.task.score.numpy().any() and not game.batch.task.peak.numpy().any()
 
 
 def test_a_bout_is_taken_up_again_in_mid_blow(make_game, same):
-    world, other = (make_game(BOXING, twin=n, **SOFT) for n in (0, 1))
-    world.reset(seed=0)
-    impulses = [row[4]["agent_0"]["given_impulse"] for row in strike(world)]
+    game, other = (make_game(BOXING, twin=n, **SOFT) for n in (0, 1))
+    game.reset(seed=0)
+    impulses = [row[4]["agent_0"]["given_impulse"] for row in strike(game)]
     # a moment in touch, and still in touch a step later: another blow, if the first were forgotten
     full = 2.0 * SOFT["blow_impulse"]
     moment = next(k for k, two in enumerate(pairwise(impulses)) if min(two) > full)
-    world.reset(seed=0)
-    strike(world, moment + 1)
-    state = world.get_state()
-    wanted = strike(world, 10)
+    game.reset(seed=0)
+    strike(game, moment + 1)
+    state = game.get_state()
+    wanted = strike(game, 10)
     assert wanted[0][4]["agent_0"]["given_impulse"] > full
     assert wanted[0][4]["agent_0"]["reward_terms"]["hit"] < 0.4, "the head has been counted"
     other.reset(seed=5)
-    for target in (other, world):
+    for target in (other, game):
         target.set_state(state)
         assert same(strike(target, 10), wanted)
 
@@ -179,84 +173,63 @@ def test_a_bout_is_taken_up_again_in_mid_blow(make_game, same):
     ("score", "winner"), [((2.0, 1.0), 0), ((0.0, 0.5), 1), ((1.0, 1.0), None), ((0.0, 0.0), None)]
 )
 def test_points_decide_when_the_clock_runs_out(make_game, play, score, winner):
-    world = make_game(BOXING, max_cycles=3)
-    world.reset(seed=0)
-    state = world.get_state()
+    game = make_game(BOXING, max_cycles=3)
+    game.reset(seed=0)
+    state = game.get_state()
     state["task.score"][0] = score
-    world.set_state(state)
-    rows = play(world, 5)
+    game.set_state(state)
+    rows = play(game, 5)
     assert len(rows) == 3 and all(rows[-1][3].values()) and not any(rows[-1][2].values())
     assert not any(info["success"] for row in rows[:-1] for info in row[4].values())
     assert [info["success"] for info in rows[-1][4].values()] == [winner == 0, winner == 1]
 
 
-def test_a_knock_down_ends_the_bout(make_game, play):
-    world = make_game(BOXING)
-    world.reset(seed=0)
-    state = world.get_state()
-    state["task.score"][0] = (3.0, 0.0)  # points do not help an agent that is down
+@pytest.mark.parametrize("settings", [{}, {"max_cycles": 1}, {"num_agents": 3}], ids=["two", "at the gong", "three"])
+def test_an_agent_that_is_down_is_out_whatever_its_points(make_game, play, settings):
+    """The last one up wins; of three, the two others go on."""
+    game = make_game(BOXING, **settings)
+    game.reset(seed=0)
+    state = game.get_state()
+    state["task.score"][0, 0] = 3.0
     state["avatar_0.state.released"][:] = 1
-    world.set_state(state)
-    [(_, _, terminations, _, infos)] = play(world, 1)
-    assert all(terminations.values()) and not world.agents
-    assert [info["success"] for info in infos.values()] == [False, True]
-    assert infos["agent_0"]["reward_terms"]["down"] == -world.config.down_cost
-    assert infos["agent_1"]["reward_terms"]["win"] == world.config.win_reward
-    assert infos["agent_0"]["reward_terms"]["win"] == infos["agent_1"]["reward_terms"]["down"] == 0.0
+    game.set_state(state)
+    [(_, _, terminations, _, infos)] = play(game, 1)
+    goes_on = settings.get("num_agents") == 3
+    assert list(terminations.values()) == [True, not goes_on, not goes_on][: len(terminations)]
+    assert game.agents == (["agent_1", "agent_2"] if goes_on else [])
+    assert [info["success"] for info in infos.values()] == [False, not goes_on, False][: len(infos)]
+    terms = [infos[name]["reward_terms"] for name in ("agent_0", "agent_1")]
+    assert [term["down"] for term in terms] == [-game.config.down_cost, 0.0]
+    assert [term["win"] for term in terms] == [0.0, 0.0 if goes_on else game.config.win_reward]
 
 
-def test_points_do_not_help_who_is_down_at_the_gong(make_game, play):
-    world = make_game(BOXING, max_cycles=1)
-    world.reset(seed=0)
-    state = world.get_state()
+def test_when_both_are_down_at_the_gong_points_do_not_decide(make_game, play):
+    game = make_game(BOXING, max_cycles=1)
+    game.reset(seed=0)
+    state = game.get_state()
     state["task.score"][0] = (3.0, 0.0)
     for agent in (0, 1):
         state[f"avatar_{agent}.state.released"][:] = 1
-    world.set_state(state)
-    [(_, _, terminations, truncations, infos)] = play(world, 1)
+    game.set_state(state)
+    [(_, _, terminations, truncations, infos)] = play(game, 1)
     assert all(terminations.values()) and not any(truncations.values())
     assert not any(info["success"] for info in infos.values())
 
 
-def test_among_three_the_bout_goes_on(make_game, play):
-    world = make_game(BOXING, num_agents=3)
-    world.reset(seed=0)
-    state = world.get_state()
-    state["avatar_0.state.released"][:] = 1
-    world.set_state(state)
-    [(_, _, terminations, _, infos)] = play(world, 1)
-    assert list(terminations.values()) == [True, False, False] and world.agents == ["agent_1", "agent_2"]
-    assert not any(info["success"] for info in infos.values())
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_the_ropes_hold(make_game, play, count):
-    """Walking backwards for as long as it takes: no agent leaves the ring or falls, nothing fails."""
-    world = make_game(BOXING, num_agents=count, ring_size=2.2)
-    world.reset(seed=0)
-    rows = play(world, 40, **{"root.y": 1.0})
-    assert len(world.agents) == count and rows[-1][4]["agent_0"]["failure"] is None
-    x = world.batch.simulation.state.x.numpy()[0]
-    dx = world.batch.simulation.dx
-    assert 1.1 - dx < np.abs(x[:, 1]).max() < 1.1 + 0.5 * dx
-
-
-@pytest.mark.parametrize("control", ["pd", "torque"])
-def test_the_ropes_hold_who_is_thrown_into_them(make_game, play, control):
-    """Also where nothing holds a body up, which needs more room to fall where there are no ropes."""
-    world = make_game(BOXING, ring_size=2.2, control=control, **{"fall.fall_head": 0.0, "fall.fall_pelvis": 0.0})
-    world.reset(seed=0)
-    state, body = world.get_state(), world.batch.simulation.avatars[0].body
-    state["particles.u"][0, body.first : body.first + body.count] = [0.0, 3.0, 0.0]  # away from the middle
-    world.set_state(state)
-    dx, farthest = world.batch.simulation.dx, []
-    for _ in range(30):  # they hit the ropes in the fifth
-        [(*_, infos)] = play(world, 1)
-        assert infos["agent_0"]["failure"] is None
-        farthest.append(np.abs(world.batch.simulation.state.x.numpy()[0, :, :2]).max())
+@pytest.mark.parametrize(
+    "settings", [{}, {"control": "torque", "fall.fall_head": 0.0, "fall.fall_pelvis": 0.0}], ids=str
+)
+def test_the_ropes_hold(make_game, play, settings):
+    """An agent that walks backwards or is thrown into them; limp bodies need more room to fall where no ropes are."""
+    game = make_game(BOXING, ring_size=2.2, **settings)
+    game.reset(seed=0)
+    if settings:
+        state, body = game.get_state(), game.batch.simulation.avatars[0].body
+        state["particles.u"][0, body.first : body.first + body.count] = [0.0, 3.0, 0.0]  # away from the middle
+        game.set_state(state)
+    dx, farthest = game.batch.simulation.dx, []
+    for _ in range(30):
+        [(*_, infos)] = play(game, 1, **({} if settings else {"root.y": 1.0}))
+        assert infos["agent_0"]["failure"] is None and len(game.agents) == 2
+        farthest.append(np.abs(game.batch.simulation.state.x.numpy()[0, :, 1]).max())
     assert 1.1 - dx < max(farthest) < 1.1 + 0.5 * dx
-
-
-def test_impossible_rings_are_refused(make_game):
-    with pytest.raises(ValueError, match=r"num_agents=8 .* need a ring of .* use ring_size >= 3.5"):
-        make_game(BOXING, num_agents=8)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import joint_index
+from tests.tasks.measured import joints, pelvis, still, tolerance
 
 GET_UP = "PIAvatar/GetUp-v0"
 HEAD, CHEST, ANKLES = (
@@ -14,14 +15,6 @@ HEAD, CHEST, ANKLES = (
     joint_index("spine3"),
     [joint_index("left_ankle"), joint_index("right_ankle")],
 )
-
-
-def still(env) -> np.ndarray:
-    return np.zeros(env.action_space.shape, np.float32)
-
-
-def tolerance(value: float, bound: float, margin: float) -> float:
-    return 10.0 ** -((max(value - bound, 0.0) / margin) ** 2)
 
 
 def worth_of(env, turns: np.ndarray) -> float:
@@ -36,8 +29,7 @@ def worth_of(env, turns: np.ndarray) -> float:
 
 def faces(env) -> np.ndarray:
     """Where the pelvis faces, a unit vector."""
-    turn = Rotation.from_quat(env.batch.simulation.avatar.tracked.rotation.numpy()[0, 0].astype(float))
-    return turn.apply([0.0, -1.0, 0.0])
+    return pelvis(env)[1].apply([0.0, -1.0, 0.0])
 
 
 def test_bodies_lie_on_the_ground_on_either_side(make_env):
@@ -75,15 +67,15 @@ def test_some_begin_on_the_way_up(make_env):
 def test_the_reward_is_what_the_joints_say(make_env):
     """From lying, over being lifted, to standing."""
     env = make_env(GET_UP, root_assist=1.0, control_cost=0.1)
-    rule, rest, joints = env.config.upright, env.config.still, env.batch.simulation.flesh[0].points.joints[0]
+    rule, rest, at_rest = env.config.upright, env.config.still, env.batch.simulation.flesh[0].points.joints[0]
     action, worth = 0.1 * env.action_space.high, []
     env.reset(seed=1)
     for _ in range(75):
         _, reward, _, _, info = env.step(action)
         tracked = env.batch.simulation.avatar.tracked
-        at, terms = tracked.position.numpy()[0], info["reward_terms"]
-        head, pelvis = np.clip([at[HEAD, 2] / joints[HEAD, 2], at[0, 2] / joints[0, 2]], 0.0, 1.0)
-        feet = np.linalg.norm(at[ANKLES, :2] - at[0, :2], axis=1).mean() / joints[0, 2]
+        at, terms = joints(env), info["reward_terms"]
+        head, pelvis = np.clip([at[HEAD, 2] / at_rest[HEAD, 2], at[0, 2] / at_rest[0, 2]], 0.0, 1.0)
+        feet = np.linalg.norm(at[ANKLES, :2] - at[0, :2], axis=1).mean() / at_rest[0, 2]
         turn = Rotation.from_quat(tracked.rotation.numpy()[0, CHEST].astype(float))
         tilt = np.arccos(np.clip(turn.apply([0.0, 0.0, 1.0])[2], -1.0, 1.0))
         stands = tolerance(1.0 - head, 0.05, rule.height_margin) * tolerance(tilt, 0.1, rule.tilt_margin)
@@ -111,7 +103,7 @@ def test_every_pose_on_the_way_is_worth_more_than_the_one_before(make_env, side)
 
 
 @pytest.mark.parametrize(("share", "up"), [(0.0, False), (1.0, True)])
-def test_who_lies_down_comes_to_rest_on_that_side_and_the_episode_goes_on(make_env, share, up):
+def test_a_lying_body_comes_to_rest_on_its_side_and_the_episode_goes_on(make_env, share, up):
     """The ground bears the whole weight; nothing but the clock ends the episode."""
     env = make_env(GET_UP, face_up=share)
     env.reset(seed=0)
@@ -123,7 +115,9 @@ def test_who_lies_down_comes_to_rest_on_that_side_and_the_episode_goes_on(make_e
     assert (faces(env)[2] > 0.9) if up else (faces(env)[2] < -0.9)
     weight = 9.81 * env.batch.simulation.flesh[0].points.mass.sum()
     assert np.mean(impulses[-20:]) / env.config.physics.control_dt == pytest.approx(weight, rel=0.05)
-    assert info["head_height"] < 0.2 and info["held_seconds"] == 0.0 and info["speed"] < 0.1
+    assert (
+        max(info["head_height"], info["pelvis_height"]) < 0.25 and info["held_seconds"] == 0.0 and info["speed"] < 0.1
+    )
 
 
 def test_standing_must_last(make_env):
@@ -145,27 +139,19 @@ def test_standing_must_last(make_env):
 
 
 def test_assistance_lifts_a_lying_body(make_env):
-    """Led upwards and upright, the pelvis ends higher than where it lay; without assistance it stays."""
-    heights = {}
-    for share in (0.0, 1.0):
-        env = make_env(GET_UP, root_assist=share, pose_noise=0.0)
-        env.reset(seed=0)
-        heights[share] = [env.step(still(env))[4]["pelvis_height"] for _ in range(60)]
-    assert max(heights[0.0][20:]) < 0.25 and max(heights[1.0]) > 0.5
+    """Without, the pelvis stays where it lies (tested above)."""
+    env = make_env(GET_UP, root_assist=1.0, pose_noise=0.0)
+    env.reset(seed=0)
+    assert max(env.step(still(env))[4]["pelvis_height"] for _ in range(40)) > 0.5
 
 
 def test_there_is_room_to_wander(make_env):
-    """A body 4 m from where it began goes on as it would there; policies that had got up left the world."""
+    """A body 4 m from where it began goes on as it would there; policies that had got up left the domain."""
     env = make_env(GET_UP, pose_noise=0.0)
     env.reset(seed=0)
     state = env.get_state()
-    placed = (
-        "particles.x",
-        "controller_0.position",
-        "avatar_0.tracked.position",
-        "avatar_0.state.goal_root",
-        "avatar_0.state.command_root",
-    )
+    placed = {"particles.x", "controller_0.position", "avatar_0.tracked.position"}
+    placed |= {"avatar_0.state.goal_root", "avatar_0.state.command_root"}
     away = np.array([4.0, -4.0, 0.0], np.float32)
     env.set_state({name: value + away if name in placed else value for name, value in state.items()})
     for _ in range(3):

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import joint_index
+from tests.tasks.measured import middle, pelvis, still, tolerance
 
 REACH = "PIAvatar/Reach-v0"
-HANDS = ("left_wrist", "right_wrist")
 
 
 def target(env) -> np.ndarray:
@@ -20,42 +20,27 @@ def target(env) -> np.ndarray:
 
 
 def hands(env) -> np.ndarray:
-    """Middles of the hands in the world ``(2, 3)`` [m]: rest centres of mass, carried by Kabsch in NumPy."""
-    simulation = env.batch.simulation
-    points, x = simulation.flesh[0].points, simulation.state.x.numpy()[0].astype(float)
-    rest, mass = points.rest[0].astype(float), points.mass[0].astype(float)
-    found = []
-    for name in HANDS:
-        weight = mass * (points.skin_weights * (points.skin_joints == joint_index(name))).sum(1)
-        middle = weight @ rest / weight.sum()
-        p = points.bone == joint_index(name)
-        turn = Rotation.align_vectors(x[p] - x[p].mean(0), rest[p] - rest[p].mean(0))[0]
-        found.append(x[p].mean(0) + turn.apply(middle - rest[p].mean(0)))
-    return np.array(found)
+    """Middles of the hands in the world ``(2, 3)`` [m]."""
+    return np.array([middle(env, name) for name in ("left_wrist", "right_wrist")])
 
 
-def pelvis(env) -> tuple[np.ndarray, Rotation]:
-    tracked = env.batch.simulation.avatar.tracked
-    return tracked.position.numpy()[0, 0].astype(float), Rotation.from_quat(tracked.rotation.numpy()[0, 0])
-
-
-def test_target_stays_on_its_sphere_below_its_greatest_speed(make_env):
-    env = make_env(REACH, target_speed=0.5, radius=0.5)
-    dt = env.config.physics.control_dt
+@pytest.mark.parametrize("fastest", [0.0, 0.5])
+def test_target_stays_on_its_sphere_below_its_greatest_speed(make_env, fastest):
+    env = make_env(REACH, target_speed=fastest, radius=0.5)
     speeds = []
-    for seed in range(8):
+    for seed in range(6):
         env.reset(seed=seed)
         center = env.batch.simulation.flesh[0].points.joints[0, joint_index("spine3")]
         path = [target(env)]
-        for _ in range(45):
-            env.step(np.zeros(env.action_space.shape))
+        for _ in range(30):
+            env.step(still(env))
             path.append(target(env))
         path = np.array(path)
         assert np.linalg.norm(path - center, axis=1) == pytest.approx(np.full(len(path), 0.5), abs=1e-5)
-        speeds.append(np.linalg.norm(np.diff(path, axis=0), axis=1) / dt)
+        speeds.append(np.linalg.norm(np.diff(path, axis=0), axis=1) / env.config.physics.control_dt)
     speeds = np.array(speeds)
-    assert speeds.max() <= 0.5 + 1e-4
-    assert speeds.max() > 0.2 and (speeds.max(1) > 0.02).all(), "the target must move in every episode"
+    assert speeds.max() <= fastest + 1e-4
+    assert fastest == 0.0 or (speeds.max() > 0.2 and (speeds.max(1) > 0.02).all()), "it must move in every episode"
 
 
 def test_targets_are_before_the_body_and_spread(make_env):
@@ -73,15 +58,6 @@ def test_targets_are_before_the_body_and_spread(make_env):
     assert abs(ways[:, 0].mean()) < 0.25
 
 
-def test_a_target_without_speed_stands_still(make_env):
-    env = make_env(REACH, target_speed=0.0)
-    env.reset(seed=0)
-    first = target(env)
-    for _ in range(5):
-        env.step(np.ones(env.action_space.shape))
-        assert target(env) == pytest.approx(first, abs=1e-6)
-
-
 def test_distances_reward_and_success_are_those_of_numpy(make_env):
     env = make_env(REACH, target_radius=0.2)
     successes = set()
@@ -94,9 +70,8 @@ def test_distances_reward_and_success_are_those_of_numpy(make_env):
             distances = np.linalg.norm(hands(env) - target(env), axis=1)
             assert (info["left_distance"], info["right_distance"]) == pytest.approx(tuple(distances), abs=2e-5)
             assert info["distance"] == pytest.approx(distances.min(), abs=2e-5)
-            excess = max(distances.min() - env.config.target_radius, 0.0) / env.config.margin
-            # dm_control's Gaussian tolerance: a tenth at the margin
-            assert info["reward_terms"]["reach"] == pytest.approx(10.0 ** (-(excess**2)), abs=2e-4)
+            reach = tolerance(distances.min(), env.config.target_radius, env.config.margin)
+            assert info["reward_terms"]["reach"] == pytest.approx(reach, abs=2e-4)
             if abs(distances.min() - env.config.target_radius) > 1e-4:
                 assert info["success"] == (distances.min() < env.config.target_radius)
             successes.add(info["success"])
@@ -136,13 +111,12 @@ def test_the_first_pose_is_noisy_within_its_bound(make_env):
 
 
 def test_a_hand_can_be_brought_to_the_target(make_env):
-    """Greedy descent of the distance along the arm's own components: the task can be done, and success says so."""
+    """Greedy descent of the distance along the arm's own components: the task can be done."""
     env = make_env(REACH, target_speed=0.0, pose_noise=0.0)
     arm = [n for n, name in enumerate(env.action_names) if name.split(".")[0] in ("left_shoulder", "left_elbow")]
     env.reset(seed=2)
-    start = env.get_state()
     distances = []
-    for _ in range(14):
+    for _ in range(10):
         state = env.get_state()
         gains = np.zeros(env.action_space.shape)
         here = np.linalg.norm(hands(env)[0] - target(env))
@@ -154,5 +128,4 @@ def test_a_hand_can_be_brought_to_the_target(make_env):
         env.set_state(state)
         info = env.step(np.clip(gains / max(np.abs(gains).max(), 1e-6), -1.0, 1.0))[4]
         distances.append(info["left_distance"])
-    assert start["env.step_count"][0] == 0
     assert min(distances) < 0.5 * distances[0]
