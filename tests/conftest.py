@@ -13,19 +13,28 @@ import numpy as np
 import pytest
 
 
+#: Environments that differ in kind: poses under a root wrench with props; torques and nothing that holds the root.
+SAMPLE = ("PIAvatar/KickBall-v0", "PIAvatar/Stand-v0")
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """A test that asks for ``env_id`` runs on every registered environment; none has to be listed."""
+    """Run a test with ``env_id`` on every registered environment, one with ``sample_id`` on those of ``SAMPLE``.
+
+    A test of a task's own code takes ``env_id``; of code that all tasks share, ``sample_id`` or a fixed id.
+    """
     if "env_id" in metafunc.fixturenames:
         from piavatar_envs.tasks import task_modules
 
         metafunc.parametrize("env_id", list(task_modules()))
+    if "sample_id" in metafunc.fixturenames:
+        metafunc.parametrize("sample_id", SAMPLE)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--device",
         default="cpu",
-        help="Warp device to test on: cpu (default), cuda, cuda:1, ..., or gpu_on_cpu: what is for a GPU, on the CPU",
+        help="Warp device to test on: cpu (default), cuda, cuda:1, ..., or gpu_on_cpu: GPU kernels on the CPU",
     )
 
 
@@ -70,7 +79,7 @@ def device(request: pytest.FixtureRequest) -> Iterator[str]:
 
 @pytest.fixture(scope="session")
 def make_env(device: str):
-    """A maker of single environments without wrappers, ``make_env(env_id, **settings)``, tiny unless told otherwise.
+    """A maker of single environments without wrappers, ``make_env(env_id, **settings)``, tiny by default.
 
     The same settings give the same object, because building takes longer than a test: begin with a reset. ``twin=1``
     gives another one of the same settings.

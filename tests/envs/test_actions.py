@@ -1,4 +1,4 @@
-"""From actions to motion: what is refused, what is clipped, what turns and how far, and where it ends."""
+"""Actions: refused and clipped values, angles and axes of the motion, joint limits."""
 
 from __future__ import annotations
 
@@ -11,27 +11,29 @@ from piavatar_envs.config.schema import select_joints
 from piavatar_envs.envs.actions import ActionSpec, check_actions
 from piavatar_envs.mpm.types import FAILURE_ACTION
 
+KICK = "PIAvatar/KickBall-v0"
+
 
 def tracked_local(env, index: int = 0) -> Rotation:
-    """Tracked joint rotations relative to their parents."""
+    """Return the tracked joint rotations relative to their parents."""
     batch = getattr(env, "batch", env)
     return Rotation.from_quat(batch.simulation.avatar.tracked.local.numpy()[index].astype(float))
 
 
 def tracked_root(env) -> tuple[np.ndarray, float]:
-    """Tracked pelvis position [m] and heading [rad]."""
+    """Return the tracked pelvis position [m] and heading [rad]."""
     position = env.batch.simulation.avatar.tracked.position.numpy()[0, 0].astype(float)
     left = tracked_local(env)[0].apply([1.0, 0.0, 0.0])
     return position, float(np.arctan2(left[1], left[0]))
 
 
 def command(env) -> np.ndarray:
-    """Rotation vectors commanded so far [rad], shape ``(22, 3)``."""
+    """Return the commanded rotation vectors [rad], shape ``(22, 3)``."""
     return Rotation.from_quat(env.batch.get_state()["avatar_0.state.command_rotation"][0].astype(float)).as_rotvec()
 
 
 def clip_pose(env) -> np.ndarray:
-    """Rotation vectors of the clip at the last step [rad], shape ``(22, 3)``; zeros without a clip."""
+    """Return the rotation vectors of the clip at the last step [rad], shape ``(22, 3)``; zeros without a clip."""
     clip, state = getattr(env.batch.task, "clip", None), env.batch.get_state()
     if clip is None:
         return np.zeros((NUM_JOINTS, 3))
@@ -40,7 +42,7 @@ def clip_pose(env) -> np.ndarray:
 
 
 def bad_actions(size: int) -> dict[str, tuple[object, str]]:
-    """Name -> (action, what the error must say with ``{name}`` for the component's name)."""
+    """Return cases: an action, and a pattern of its error with ``{index}`` for the component's name."""
 
     def at(index, value):
         action = np.zeros(size, np.float32)
@@ -54,19 +56,19 @@ def bad_actions(size: int) -> dict[str, tuple[object, str]]:
         "a number": (0.5, rf"shape \(\).*\({size},\)"),
         "not a number": (at(7, np.nan), r"action\[7\] \({7}\) is nan.*finite"),
         "infinite": (at(size - 1, np.inf), rf"action\[{size - 1}\] \({{{size - 1}}}\) is inf.*finite"),
-        "complex": (np.zeros(size) * 1j, "action is of complex numbers; actions must be real.*action.real"),
+        "complex": (np.zeros(size) * 1j, "complex.*action.real"),
         "minus infinity": (at(0, -np.inf), r"action\[0\] \({0}\) is -inf.*finite"),
     }
 
 
 @pytest.mark.parametrize("case", bad_actions(9))
-def test_bad_actions_are_refused_before_anything_changes(make_env, env_id, case):
-    env = make_env(env_id)
+def test_bad_actions_are_refused_before_anything_changes(make_env, case):
+    env = make_env(KICK)
     env.reset(seed=0)
     env.step(np.full(env.action_space.shape, 0.3))
-    action, told = bad_actions(env.action_space.shape[0])[case]
+    action, words = bad_actions(env.action_space.shape[0])[case]
     before, observation = env.get_state(), env.batch.observation.numpy().copy()
-    pattern = told if told.startswith("shape") else told.format(*env.action_names)
+    pattern = words if words.startswith("shape") else words.format(*env.action_names)
     with pytest.raises(ValueError, match=pattern):
         env.step(action)
     after = env.get_state()
@@ -75,9 +77,9 @@ def test_bad_actions_are_refused_before_anything_changes(make_env, env_id, case)
     assert env.step(np.zeros(env.action_space.shape))[4]["failure"] is None
 
 
-def test_a_batch_ends_the_environment_of_a_nonfinite_action_only(make_batch, env_id, equal):
-    """On the device nothing can be refused without waiting for it: such an action counts as zero and is a failure."""
-    batch = make_batch(env_id, 3)
+def test_a_batch_ends_the_environment_of_a_nonfinite_action_only(make_batch, sample_id, equal):
+    """Count such an action as zero and as a failure: a refusal would have to wait for the device."""
+    batch = make_batch(sample_id, 3)
     batch.reset(seeds=[0, 1, 2])
     batch.step()
     action = np.full(batch.action.shape, 0.5, np.float32)
@@ -97,8 +99,8 @@ def test_a_batch_ends_the_environment_of_a_nonfinite_action_only(make_batch, env
     batch.action.zero_()
 
 
-def test_actions_beyond_one_are_clipped(make_env, env_id, equal):
-    env = make_env(env_id)
+def test_actions_beyond_one_are_clipped(make_env, sample_id, equal):
+    env = make_env(sample_id)
     rng = np.random.default_rng(0)
     wild = rng.uniform(-50.0, 50.0, (4, *env.action_space.shape))
     runs = []
@@ -108,8 +110,8 @@ def test_actions_beyond_one_are_clipped(make_env, env_id, equal):
     assert all(equal(a[0], b[0]) and equal(a[1], b[1]) for a, b in zip(*runs, strict=True))
 
 
-def test_integers_and_lists_are_actions_too(make_env, env_id, equal):
-    env = make_env(env_id)
+def test_integers_and_lists_are_actions_too(make_env, equal):
+    env = make_env(KICK)
     size, results = env.action_space.shape[0], []
     for action in (np.ones(size, np.float32), np.ones(size, np.int64), [1] * size, np.ones(2 * size)[::2]):
         env.reset(seed=0)
@@ -117,22 +119,10 @@ def test_integers_and_lists_are_actions_too(make_env, env_id, equal):
     assert all(equal(results[0], other) for other in results[1:])
 
 
-@pytest.mark.parametrize(
-    "component",
-    [
-        "left_elbow.z",
-        "right_shoulder.x",
-        "left_wrist.y",
-        "neck.y",
-        "head.z",
-        "spine2.x",
-        "right_collar.z",
-        "left_hip.z",
-    ],
-)
+@pytest.mark.parametrize("component", ["left_elbow.z", "right_shoulder.x", "neck.y", "spine2.x", "left_hip.z"])
 @pytest.mark.parametrize("sign", [1.0, -0.5])
 def test_a_named_component_turns_its_joint_and_no_other(make_env, component, sign):
-    """By speed times time about the joint's own axis; tracked, not commanded. No foot presses on the ground here."""
+    """Expect speed times time about the joint's own axis, tracked; without gravity no foot presses on the ground."""
     env = make_env("PIAvatar/Reach-v0", gravity=0.0, pose_noise=0.0)
     joint, axis = component.split(".")
     index = JOINT_NAMES.index(joint)
@@ -149,7 +139,7 @@ def test_a_named_component_turns_its_joint_and_no_other(make_env, component, sig
 
 
 def test_increments_are_composed_on_the_right(make_env):
-    """The second turn is about the axis that the first has turned, not about the one of the rest pose."""
+    """Expect the second turn about the axis that the first has turned, not about the one of the rest pose."""
     env = make_env("PIAvatar/Reach-v0", gravity=0.0, pose_noise=0.0)
     env.reset(seed=0)
     step = env.config.control.joint_speed_limit * env.config.physics.control_dt
@@ -163,9 +153,10 @@ def test_increments_are_composed_on_the_right(make_env):
     assert np.degrees((expected.inv() * got).magnitude()) < 0.2 < np.degrees((expected.inv() * wrong).magnitude())
 
 
-def test_held_actions_end_at_the_joint_limits(make_env, env_id):
-    """Rotation vectors that are commanded stay in their box under every corner of the action space."""
-    env = make_env(env_id, control="pose")
+@pytest.mark.parametrize("task", [KICK, "PIAvatar/TrackMotion-v0"])
+def test_held_actions_end_at_the_joint_limits(make_env, task):
+    """Hold corners of the action space: commanded rotation vectors stay in their box, widened by the clip's pose."""
+    env = make_env(task, control="pose")
     lower, upper = (bound[1:] for bound in joint_limits())
     rng = np.random.default_rng(1)
     reached = np.zeros((NUM_JOINTS - 1, 3), bool)
@@ -178,14 +169,13 @@ def test_held_actions_end_at_the_joint_limits(make_env, env_id):
             v, own = command(env)[1:], clip_pose(env)[1:]
             low, high = np.minimum(lower, own) - 1e-4, np.maximum(upper, own) + 1e-4
             wrong = np.argwhere((v < low) | (v > high))
-            told = ", ".join(f"{JOINT_NAMES[1 + b]}.{'xyz'[a]} {v[b, a]:.3f} rad" for b, a in wrong)
-            assert not told, f"episode {episode}, step {step}: {told}"
+            report = ", ".join(f"{JOINT_NAMES[1 + b]}.{'xyz'[a]} {v[b, a]:.3f} rad" for b, a in wrong)
+            assert not report, f"episode {episode}, step {step}: {report}"
         reached |= (v < lower + 1e-3) | (v > upper - 1e-3)
     assert reached.mean() > 0.3, "the case must run into the limits"
 
 
 def test_the_tracked_joints_respect_the_limits(make_env):
-    """The body follows the command into its limits and stays there."""
     env = make_env("PIAvatar/Reach-v0")
     lower, _ = joint_limits()
     index = JOINT_NAMES.index("left_elbow")
@@ -204,7 +194,7 @@ def test_the_tracked_joints_respect_the_limits(make_env):
     ("component", "moves", "turns"), [("root.x", (1, 0), 0), ("root.y", (0, 1), 0), ("root.yaw", (0, 0), 1)]
 )
 def test_root_actions_move_the_root(make_env, component, moves, turns):
-    """At the root's speed, in the body's heading: after a quarter turn, x of the body is y of the world."""
+    """Expect the root's speed, along the axes of the turned body."""
     env = make_env("PIAvatar/TrackMotion-v0", motion="idle", impulse=0.0, fail_distance=10.0, gravity=0.0)
     spec, dt = env.batch.action_spec, env.config.physics.control_dt
     env.reset(seed=0)

@@ -13,7 +13,7 @@ import warp as wp
 
 
 def resident_bytes() -> int:
-    """Memory of this process that is in RAM."""
+    """Return the memory of this process that is in RAM."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -23,8 +23,8 @@ def steps(env, count: int, actions: np.ndarray) -> None:
 
 
 @pytest.fixture
-def warmed_up(make_env, env_id):
-    env = make_env(env_id, episode_seconds=3600.0)
+def warmed_up(make_env, sample_id):
+    env = make_env(sample_id, episode_seconds=3600.0)
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (8, *env.action_space.shape))
     env.reset(seed=0)
     steps(env, 10, actions)
@@ -32,7 +32,6 @@ def warmed_up(make_env, env_id):
 
 
 def test_a_step_makes_no_array_on_the_device(warmed_up, monkeypatch):
-    """Every allocation of Warp goes through its device's allocator."""
     env, actions = warmed_up
     device = wp.get_device(env.batch.device)
     allocator, made = device.get_allocator(), []
@@ -47,13 +46,13 @@ def test_a_step_makes_no_array_on_the_device(warmed_up, monkeypatch):
 
     monkeypatch.setattr(device, "get_allocator", lambda *args, **kwargs: Counting())
     wp.zeros(7, dtype=float, device=device)
-    assert made == [28], "the count must see allocations"
+    assert made == [28], "the count must include every allocation"
     made.clear()
     env.batch.step()
     env.batch.step()
     assert not made
     steps(env, 5, actions)
-    # an action on its way to a GPU may be staged; nothing else is made
+    # an action on its way to a GPU may be staged
     assert len(made) <= (0 if device.is_cpu else 5)
 
 
@@ -63,17 +62,17 @@ def test_python_objects_do_not_pile_up(warmed_up):
     try:
         held = []
         for _ in range(3):
-            steps(env, 30, actions)  # five times as slow as without tracemalloc
+            steps(env, 20, actions)  # five times as slow as without tracemalloc
             gc.collect()
             held.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    # a leak of one observation a step would be 30 x 1 kB each time; what fills a cache grows once
+    # a leak of one observation a step would be 20 x 1 kB each time; a cache that fills grows once
     grown = np.diff(held).min()
-    assert grown < 5_000, f"{grown} bytes in 30 steps"
+    assert grown < 5_000, f"{grown} bytes in 20 steps"
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc: the process' memory is not watched here")
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc to read the memory of the process from")
 def test_the_process_does_not_grow(warmed_up):
     env, actions = warmed_up
     steps(env, 50, actions)

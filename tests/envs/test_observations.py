@@ -1,4 +1,4 @@
-"""Every number of an avatar's own observation, computed again from the particles by NumPy in double precision."""
+"""An avatar's own observation against NumPy in double precision, from the particles."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from piavatar_envs.envs.observations import (
 
 
 def kabsch(x: np.ndarray, x0: np.ndarray) -> np.ndarray:
-    """Proper rotation that takes centred points ``x0`` closest to centred ``x``, by NumPy's SVD."""
+    """Return the proper rotation that takes centred points ``x0`` closest to centred ``x``, by NumPy's SVD."""
     U, _, Vt = np.linalg.svd((x - x.mean(0)).T @ (x0 - x0.mean(0)))
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
 
 
 def von_mises(F: np.ndarray, young: float, poisson: float) -> np.ndarray:
-    """Von Mises equivalent of a neo-Hookean solid's Cauchy stress ``(mu (F F^T - I) + lam ln J I) / J`` [Pa]."""
+    """Return the von Mises stress of a neo-Hookean solid's Cauchy stress ``(mu (F F^T - I) + lam ln J I) / J`` [Pa]."""
     mu, lam = young / (2 + 2 * poisson), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
     J = np.linalg.det(F)[:, None, None]
     sigma = (mu * (F @ F.transpose(0, 2, 1) - np.eye(3)) + lam * np.log(J) * np.eye(3)) / J
@@ -60,7 +60,7 @@ def bones_of(batch, env: int = 0) -> Bones:
 
 
 def observed(batch, env: int = 0) -> dict[str, np.ndarray]:
-    """The terms of ``SELF_TERMS`` from the particles."""
+    """Compute the terms of ``SELF_TERMS`` from the particles."""
     bones, physics = bones_of(batch, env), batch.config.physics
     to_root = bones.rotation[0].T
     local = [bones.rotation[PARENTS[b]].T @ bones.rotation[b] for b in range(1, NUM_JOINTS)]
@@ -83,8 +83,8 @@ TOLERANCE = {"joint_rotations": 3e-5, "root_orientation": 3e-5, "bone_velocities
 
 
 @pytest.mark.parametrize("settings", [{}, {"shape.randomize": True, "density": 900.0}], ids=str)
-def test_values_are_those_of_the_particles(make_batch, env_id, settings):
-    batch = make_batch(env_id, 2, **settings)
+def test_values_are_those_of_the_particles(make_batch, sample_id, settings):
+    batch = make_batch(sample_id, 2, **settings)
     batch.reset(seeds=[5, 9])
     rng = np.random.default_rng(0)
     # commanded motion hardly strains the flesh: this does
@@ -106,7 +106,7 @@ def test_values_are_those_of_the_particles(make_batch, env_id, settings):
 
 
 def test_stress_is_that_of_the_configured_material(make_batch):
-    """A stretched fixed-corotated body against the closed form ``tau = 2 mu (F - I) F^T + lam (J - 1) J``."""
+    """Compare a stretched fixed-corotated body with the closed form ``tau = 2 mu (F - I) F^T + lam (J - 1) J``."""
     batch = make_batch("PIAvatar/Reach-v0", 1, material="fixed_corotated", young_modulus=2.0e4, poisson_ratio=0.4)
     batch.reset(seeds=[0])
     stretch = np.diag([1.1, 1.0, 0.95])
@@ -152,9 +152,9 @@ def test_a_name_used_twice_is_refused():
         ObservationLayout([term, term])
 
 
-def test_observing_changes_nothing(make_batch, env_id):
-    batch = make_batch(env_id, 2)
-    batch.reset(seeds=[0, 1])
+def test_observing_changes_nothing(make_env, env_id):
+    batch = make_env(env_id).batch
+    batch.reset(seeds=[0])
     batch.step()
     state, observation = batch.get_state(), batch.observation.numpy().copy()
     batch.observation.fill_(np.nan)  # poisoned: every component must be written

@@ -1,4 +1,4 @@
-"""The term of drawn parameters, over all tasks: it holds the values that were drawn, in the order of its layout."""
+"""Observed parameters, over all tasks: the values that were drawn, in the order of the layout."""
 
 from __future__ import annotations
 
@@ -23,26 +23,23 @@ def observed(make_batch, env_id):
     return batch
 
 
-def test_parameters_are_not_observed_unless_asked_for(make_batch, env_id):
-    batch = make_batch(env_id, 3)
-    assert PARAMETERS not in batch.layout and "env.parameters" not in batch.get_state()
-    assert not any(term.parameters for term in batch.layout.values())
-
-
 def test_parameters_are_what_was_drawn(observed):
     check_term(observed, np.array([False, True, False]))
 
 
-def test_without_ranges_only_the_task_and_the_clock_are_told(make_batch, env_id):
-    batch = make_batch(env_id, 3, observe_parameters=True)
+def test_without_ranges_only_the_task_and_the_clock_are_observed(make_env, env_id):
+    plain = make_env(env_id).batch
+    assert PARAMETERS not in plain.layout and "env.parameters" not in plain.get_state()
+    assert not any(term.parameters for term in plain.layout.values())
+    batch = make_env(env_id, observe_parameters=True).batch
     drawn = [p.name for p in batch.task.drawn() if p.low < p.high]
     settings = [] if batch.control == "pose" else [ASSIST.name]
     assert [p.name for p in batch.layout[PARAMETERS].parameters] == [*settings, *drawn, "clock"]
 
 
 @pytest.mark.parametrize("control", ["pd", "torque"])
-def test_help_for_the_pelvis_is_told_as_it_is_now(make_batch, control):
-    """From the first observation after it has changed, in every environment its own, through resets and restoring."""
+def test_root_assistance_is_observed_as_it_is_now(make_batch, control):
+    """Compare in every environment, from the first observation after a change, through resets and restored states."""
     batch = make_batch(REACH, 3, observe_parameters=True, control=control, root_assist=0.25, **VARIED)
     batch.assist_root(0.25)  # the batch may have been used before
     batch.reset(seeds=[1, 2, 3])
@@ -52,9 +49,9 @@ def test_help_for_the_pelvis_is_told_as_it_is_now(make_batch, control):
     batch.assist_root(shares)
     before = by_name(batch)
     batch.step()
-    told = by_name(batch)
-    assert told[name] == pytest.approx(shares, abs=1e-6)
-    assert all(np.array_equal(told[other], before[other]) for other in told if other not in (name, "clock"))
+    values = by_name(batch)
+    assert values[name] == pytest.approx(shares, abs=1e-6)
+    assert all(np.array_equal(values[other], before[other]) for other in values if other not in (name, "clock"))
     state = batch.get_state()
     batch.reset(env_mask=np.array([True, True, False]))
     assert by_name(batch)[name] == pytest.approx(shares, abs=1e-6)
@@ -67,35 +64,37 @@ def test_help_for_the_pelvis_is_told_as_it_is_now(make_batch, control):
 
 
 def by_name_of_poses(make_batch) -> dict[str, np.ndarray]:
-    """What is told where a wrench holds the root."""
+    """Return the parameters where a wrench holds the root."""
     batch = make_batch(REACH, 3, observe_parameters=True, **VARIED)
     batch.reset(seeds=[1, 2, 3])
     return by_name(batch)
 
 
-def test_masses_of_props_are_told(observed):
-    """From the particles: every prop whose mass a task draws has a parameter that is its mass."""
-    sim, told = observed.simulation, by_name(observed)
+def test_masses_of_props_are_observed(observed):
+    """Compare with the masses of their particles."""
+    sim, values = observed.simulation, by_name(observed)
     masses = sim.model.particles.mass.numpy().astype(float)
     for prop, name in zip(sim.props.props, sim.props.names, strict=True):
         mass = masses[:, prop.first : prop.first + prop.count].sum(1)
-        assert told[f"{name}_mass"] == pytest.approx(mass, rel=1e-4), name
+        assert values[f"{name}_mass"] == pytest.approx(mass, rel=1e-4), name
 
 
-def test_the_way_of_the_target_is_known_from_what_is_told(make_batch):
-    """Reach: where the target will be follows from its parameters and the clock."""
+def test_the_path_of_the_target_follows_from_its_parameters(make_batch):
     batch = make_batch(REACH, 3, observe_parameters=True, **VARIED)
     batch.reset(seeds=[1, 2, 3])
     config, body = batch.config, batch.simulation.avatar.body
     center = np.broadcast_to(body.rest_joint.numpy()[:, joint_index("spine3")], (3, 3))
     for _ in range(3):
         batch.step()
-        told = by_name(batch)
-        time = told["clock"] * batch.max_steps * config.physics.control_dt
-        rate = config.target_speed * told["target_pace"] / (0.35 * config.radius * 1.4143)
+        values = by_name(batch)
+        time = values["clock"] * batch.max_steps * config.physics.control_dt
+        rate = config.target_speed * values["target_pace"] / (0.35 * config.radius * 1.4143)
         azimuth, elevation = (
-            told[f"target_{angle}"] + 0.35 * part * np.sin(rate * time + told[f"target_phase_{angle}"])
-            for angle, part in (("azimuth", np.cos(told["target_tilt"])), ("elevation", np.sin(told["target_tilt"])))
+            values[f"target_{angle}"] + 0.35 * part * np.sin(rate * time + values[f"target_phase_{angle}"])
+            for angle, part in (
+                ("azimuth", np.cos(values["target_tilt"])),
+                ("elevation", np.sin(values["target_tilt"])),
+            )
         )
         out = [np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)]
         goal = center + config.radius * np.stack(out, axis=1)
@@ -103,22 +102,21 @@ def test_the_way_of_the_target_is_known_from_what_is_told(make_batch):
 
 
 @pytest.mark.parametrize("task", ["KickBall", "Header"])
-def test_the_gate_stands_where_it_is_told(make_batch, task):
+def test_the_gate_stands_where_its_parameters_say(make_batch, task):
     batch = make_batch(f"PIAvatar/{task}-v0", 3, observe_parameters=True)
     batch.reset(seeds=[1, 2, 3])
-    told, course = by_name(batch), batch.task.course
+    values, course = by_name(batch), batch.task.course
     start = batch.simulation.props.initial.position.numpy()[:, 0]
-    side = told["target_side"]
-    way = told["target_distance"][:, None] * np.stack([side, -np.sqrt(1.0 - side**2)], axis=1)
+    side = values["target_side"]
+    way = values["target_distance"][:, None] * np.stack([side, -np.sqrt(1.0 - side**2)], axis=1)
     assert course.center.numpy()[:, :2] == pytest.approx(start[:, :2] + way, abs=1e-4)
 
 
-def test_impulses_come_when_they_are_told(make_batch):
-    """TrackMotion: the first ends the interval that was under way at the start; the clip begins where it is told."""
+def test_impulses_and_clips_begin_where_their_parameters_say(make_batch):
     batch = make_batch("PIAvatar/TrackMotion-v0", 4, observe_parameters=True, impulse_interval=0.3)
     batch.reset(seeds=[1, 2, 3, 4])
-    told, interval, dt = by_name(batch), 9, batch.config.physics.control_dt
-    start = np.round(told["motion_start"] / dt).astype(int)
+    values, interval, dt = by_name(batch), 9, batch.config.physics.control_dt
+    start = np.round(values["motion_start"] / dt).astype(int)
     first = batch.task.rotations[start][:, :, [1, 2, 3, 0]]  # before a step is done
     commanded = batch.simulation.avatar.state.command_rotation.numpy()
     assert len(set(start.tolist())) > 1 and np.abs((first * commanded).sum(-1)) == pytest.approx(
@@ -128,7 +126,7 @@ def test_impulses_come_when_they_are_told(make_batch):
     for _ in range(interval):
         batch.step()
         struck.append(np.linalg.norm(batch.task.impulse.numpy(), axis=1) > 0.0)
-    expected = interval - 1 - np.round(told["impulse_offset"] / dt).astype(int)
+    expected = interval - 1 - np.round(values["impulse_offset"] / dt).astype(int)
     assert np.array_equal(np.argmax(struck, axis=0), expected) and (np.sum(struck, axis=0) == 1).all()
 
 
@@ -148,7 +146,7 @@ def test_named_shape_parameters_and_points_are_no_parameters(make_batch):
     }
 
 
-def test_a_parameter_knows_its_value():
+def test_parameters_are_scaled_to_their_values():
     linear, log = Parameter("a", "m", 1.0, 3.0, "a"), Parameter("b", "kg", 0.1, 10.0, "b", log=True)
     assert linear.value(np.array([-1.0, 0.0, 0.5, 1.0])) == pytest.approx([1.0, 2.0, 2.5, 3.0])
     assert log.value(np.array([-1.0, 0.0, 0.5, 1.0])) == pytest.approx([0.1, 1.0, 10.0**0.5, 10.0])

@@ -1,4 +1,4 @@
-"""The peak of what many threads have, raised once a warp on a GPU."""
+"""Maximum over threads, raised once a warp on a GPU."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ def raise_peaks(
     part: wp.array(dtype=int), value: wp.array2d(dtype=float), least: float, peaks: wp.array3d(dtype=float)
 ):
     e, p = wp.tid()
-    if value[e, p] >= least:  # not all threads of a warp come
+    if value[e, p] >= least:  # not all threads of a warp take part
         raise_peak(peaks, e, 1, part[p], value[e, p])
 
 
 @pytest.mark.parametrize("least", [0.0, 0.4])
 @pytest.mark.parametrize("mixed", [False, True])
 def test_a_peak_is_the_greatest_of_its_part(device, least, mixed):
-    """Parts in runs, so that most warps have one, or mixed, so that none has."""
+    """Give parts in runs, so that most warps have one, or mixed, so that none has."""
     rng = np.random.default_rng(3)
-    part = np.sort(rng.integers(0, PARTS - 1, VALUES))  # nobody has the last one
+    part = np.sort(rng.integers(0, PARTS - 1, VALUES))  # none has the last one
     part = (rng.permutation(part) if mixed else part).astype(np.int32)
     value = rng.uniform(0.0, 1.0, (ENVS, VALUES)).astype(np.float32)
     value[:, ::7] = -0.0  # whose bits are more than any other's
