@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 
 import gymnasium
 import numpy as np
@@ -33,22 +32,6 @@ def make_vec(device: str):
     yield make
     for vector in made.values():
         vector.close()
-
-
-def arrays_in(answer) -> Iterator:
-    """Every array or tensor in what ``reset`` or ``step`` returned, also those in arrays of objects."""
-    if isinstance(answer, dict):
-        answer = tuple(answer.values())
-    if isinstance(answer, (tuple, list)) or getattr(getattr(answer, "dtype", None), "kind", "") == "O":
-        for value in answer:
-            yield from arrays_in(value)
-    elif hasattr(answer, "shape"):
-        yield answer
-
-
-@pytest.fixture(scope="session", name="arrays_in")
-def arrays_in_fixture():
-    return arrays_in
 
 
 @pytest.fixture(scope="session")
