@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-
 #: Environments that differ in kind: poses under a root wrench with props; torques and nothing that holds the root.
 SAMPLE = ("PIAvatar/KickBall-v0", "PIAvatar/Stand-v0")
 

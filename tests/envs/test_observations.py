@@ -26,7 +26,7 @@ def kabsch(x: np.ndarray, x0: np.ndarray) -> np.ndarray:
 
 
 def von_mises(F: np.ndarray, young: float, poisson: float) -> np.ndarray:
-    """Return the von Mises stress of a neo-Hookean solid of Cauchy stress ``(mu (F F^T - I) + lam ln J I) / J`` [Pa]."""
+    """Return the von Mises stress of a neo-Hookean solid with the stress ``(mu (F F^T - I) + lam ln J I) / J`` [Pa]."""
     mu, lam = young / (2 + 2 * poisson), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
     J = np.linalg.det(F)[:, None, None]
     sigma = (mu * (F @ F.transpose(0, 2, 1) - np.eye(3)) + lam * np.log(J) * np.eye(3)) / J
