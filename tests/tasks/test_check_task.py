@@ -1,4 +1,4 @@
-"""check_task: content with honest tasks, and of every way to break a promise it says which and what to do about it."""
+"""check_task: passes honest tasks, and names each breach of the contract and its remedy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import warp as wp
 import piavatar_envs
 from piavatar_envs.api.conformance import TaskError
 from piavatar_envs.api.host import EpisodeHost
-from piavatar_envs.config import ConfigError
 from piavatar_envs.core.rng import STREAM_TASK, generator
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Metric, Task, Term
@@ -118,55 +117,51 @@ class Honest(Task):
 
 def problems_of(fault: int, device: str, steps: int = 6, **options) -> tuple[str, ...]:
     task = type("Broken", (Honest,), {"fault": int(fault)})
-    with pytest.raises(TaskError, match=r"^Broken .*:\n- ") as told:
+    with pytest.raises(TaskError, match=r"^Broken .*:\n- ") as caught:
         piavatar_envs.check_task(task, steps, device, **options)
-    return told.value.problems
+    return caught.value.problems
 
 
 def test_an_honest_task_passes(device):
-    piavatar_envs.check_task(Honest, 6, device, reward_range=(0.0, 1.0))
-    piavatar_envs.check_task(Honest, 6, device, obs_mode="dict", episode_seconds=0.1, seed=7)
+    piavatar_envs.check_task(Honest, 4, device, reward_range=(0.0, 1.0))
+    piavatar_envs.check_task(Honest, 4, device, obs_mode="dict", episode_seconds=0.1, seed=7)
 
 
 @pytest.mark.parametrize(
     ("fault", "count", "words"),
     [
-        (BY_PLACE, 1, r"environment 1 of 3 is not the single one of its seed: before the first step .* goal\[0\]"),
-        (UNMASKED, 1, r"a reset of environment 2 alone changes .*task.passed.* of the others; .* mask\[e\] is set"),
-        (NEVER_RESET, 4, r"another run the second time: before the first step observation passed\[0\] in "),
-        (NOT_A_NUMBER, 1, "off is not finite in some step, and counts as 0"),
-        (NOT_A_METRIC, 1, "passed is not finite in some step"),
-        (NOT_SEEN, 2, r"passed\[0\] is not finite in some step"),
-        (NOTHING_SEEN, 1, r"observation passed\[0\] is \[0.0\] in all steps of all 3 .* constant=\['passed'\]"),
-        (FORGOTTEN, 1, r"a restored state goes on otherwise: in step 1 .*; let arrays\(\) name"),
-        (LOOKS_COUNT, 3, r"observing a second time changes task.passed; record_observe must write"),
+        (BY_PLACE, 1, r"environment 1 of 3 .* goal\[0\]"),
+        (UNMASKED, 1, r"reset of environment 2 alone .*task.passed"),
+        (NEVER_RESET, 4, r"second time: .* passed\[0\]"),
+        (NOT_A_NUMBER, 1, "off is not finite"),
+        (NOT_A_METRIC, 1, "passed is not finite"),
+        (NOT_SEEN, 2, r"passed\[0\] is not finite"),
+        (NOTHING_SEEN, 1, r"passed\[0\] is \[0.0\] in all steps .*constant=\['passed'\]"),
+        (FORGOTTEN, 1, r"restored state .* arrays\(\)"),
+        (LOOKS_COUNT, 3, r"observing a second time changes task.passed"),
     ],
-)  # fmt: skip
-def test_what_is_broken_is_named(device, fault, count, words):
+)
+def test_breaches_are_named(device, fault, count, words):
     found = problems_of(fault, device)
     assert len(found) <= count and any(re.search(words, problem) for problem in found), found
 
 
 def test_ranges_and_constants_are_as_declared(device):
-    (told,) = problems_of(0, device, reward_range=(0.2, 0.9))
-    assert told.startswith("rewards are in [0.") and told.endswith("and should be in reward_range=[0.2, 0.9]")
+    (problem,) = problems_of(0, device, reward_range=(0.2, 0.9))
+    assert "rewards" in problem and "reward_range=[0.2, 0.9]" in problem
     still = type("Still", (Honest,), {"fault": int(NOTHING_SEEN)})
     piavatar_envs.check_task(still, 6, device, constant=["passed"])
-    for options, words in {
-        "steps": ({"steps": 1}, r"steps=1 must be >= 2"),
-        "range": ({"reward_range": (1.0, 0.0)}, r"reward_range=\[1.0, 0.0\] falls"),
-        "constant": (
-            {"constant": ["gaol"]},
-            "constant='gaol' is no term that the task observes; there are goal",
-        ),
-    }.values():
+    for options, words in (
+        ({"steps": 1}, r"steps=1 "),
+        ({"reward_range": (1.0, 0.0)}, r"reward_range=\[1.0, 0.0\]"),
+        ({"constant": ["gaol"]}, "'gaol'.* goal"),
+        ({"bogus": 1}, "bogus"),
+    ):
         with pytest.raises(ValueError, match=words):
             piavatar_envs.check_task(Honest, device=device, **options)
-    with pytest.raises(ConfigError, match="no setting"):
-        piavatar_envs.check_task(Honest, bogus=1)
 
 
-def test_views_that_share_or_take_everything_are_noticed(device, monkeypatch):
+def test_views_that_share_memory_or_take_any_action_are_reported(device, monkeypatch):
     with monkeypatch.context() as patched:
         taken = lambda self, action: self.advance(np.nan_to_num(action)[..., : self.action_size])  # noqa: E731
         patched.setattr(EpisodeHost, "step", taken)
@@ -178,9 +173,9 @@ def test_views_that_share_or_take_everything_are_noticed(device, monkeypatch):
 
 
 def test_tasks_of_the_suite_keep_their_promises(env_id, device):
-    piavatar_envs.check_task(env_id, device=device)
+    piavatar_envs.check_task(env_id, steps=20, device=device)
 
 
-def test_several_agents_are_looked_at_too(device):
+def test_tasks_of_several_agents_are_checked(device):
     pytest.importorskip("pettingzoo", reason="needs the extra multi")
-    piavatar_envs.check_task("piavatar_envs.multi.high_five_v0:HighFiveTask", 8, device)
+    piavatar_envs.check_task("piavatar_envs.tasks.games.high_five:HighFiveTask", 4, device)

@@ -58,31 +58,28 @@ def made(**declared) -> Task:
 
 
 @pytest.mark.parametrize(
-    ("what", "declared", "reason"),
+    ("field", "declared", "name"),
     [
-        ("rewards", (Term("near"), Term("far"), Term("near")), "'near' twice"),
-        ("costs", (Term("hits"), Term("hits")), "'hits' twice"),
-        ("metrics", (Metric("off"), Metric("off")), "'off' twice"),
-        ("metrics", (Metric("off"), Metric("success")), "'success'.* choose another"),
-        ("metrics", (Metric("_off"),), "'_off'.* underscore"),
-        ("rewards", (Term(1),), "1; a name is a string"),
-        ("rewards", ("near",), r"'near'.* no tuple of Term"),
-        ("rewards", "near", r"'near'.* no tuple of Term"),
-        ("state_arrays", (TaskArray("goal"), TaskArray("goal")), "'goal' twice"),
-        ("state_arrays", (TaskArray("config"),), "'config'.* choose another"),
+        ("rewards", (Term("near"), Term("far"), Term("near")), "'near'"),
+        ("costs", (Term("hits"), Term("hits")), "'hits'"),
+        ("metrics", (Metric("off"), Metric("off")), "'off'"),
+        ("metrics", (Metric("off"), Metric("success")), "'success'"),
+        ("metrics", (Metric("_off"),), "'_off'"),
+        ("rewards", (Term(1),), "1"),
+        ("rewards", ("near",), "'near'.* Term"),
+        ("rewards", "near", "'near'.* Term"),
+        ("state_arrays", (TaskArray("goal"), TaskArray("goal")), "'goal'"),
+        ("state_arrays", (TaskArray("config"),), "'config'"),
     ],
 )
-def test_declarations_that_info_or_the_task_would_lose_are_refused(what, declared, reason):
-    with pytest.raises(ValueError, match=rf"Own\.{what}.*{reason}"):
-        made(**{what: declared})
+def test_declarations_that_info_or_the_task_would_lose_are_refused(field, declared, name):
+    with pytest.raises(ValueError, match=rf"Own\.{field}.*{name}"):
+        made(**{field: declared})
 
 
-def test_an_array_is_declared_once():
-    with pytest.raises(ValueError, match=r"'goal'.* choose another"):
+def test_a_name_is_declared_once_but_may_be_a_reward_and_a_metric():
+    with pytest.raises(ValueError, match=r"'goal'"):
         made(state_arrays=(TaskArray("goal"),), scratch_arrays=(TaskArray("goal"),))
-
-
-def test_a_name_may_be_a_reward_and_a_metric():
     task = made(rewards=(Term("near"), Term("success")), metrics=(Metric("near"),))
     assert task.reward_names == ("near", "success") and task.metric_names == ("near",) and task.cost_names == ("hits",)
 
@@ -137,7 +134,6 @@ def test_no_metric_can_take_a_name_of_info(make_env, env_id):
         ({"columns": (3, 1, 1)}, {"rewards": (2, 3)}),
         ({"columns": (1, 4, 2)}, {"costs": (1, 4), "metrics": (1, 2)}),
         ({"columns": (2, 1, 1), "costs": ()}, {"costs": (0, 1)}),
-        ({"columns": (2, 0, 1), "costs": ()}, {}),
     ],
 )
 def test_columns_beyond_those_declared_are_seen(device, declared, found):
@@ -152,12 +148,6 @@ def test_columns_beyond_those_declared_are_seen(device, declared, found):
     assert batch.reward.numpy().tolist() == [[float(columns)]] * 3
 
 
-def test_check_task_reports_columns_beyond_the_names(device):
-    with pytest.raises(TaskError, match=r"rewards.* 2 .* 3 columns"):
-        check_task(type("Wide", (Plain,), {"columns": (3, 1, 1)}), steps=4, device=device)
-    check_task(Plain, steps=4, device=device)
-
-
 class Flat(Plain):
     """Has arrays of its own shape, whose rows only the task can tell apart."""
 
@@ -168,7 +158,8 @@ class Flat(Plain):
         graph.launch(write_flat, env.num_envs, [self.columns[0]], list(self.flat))
 
 
-def test_a_task_may_reshape_its_arrays(device):
-    check_task(Flat, steps=4, device=device)
-    with pytest.raises(TaskError, match=r"rewards.* 2 .* 4 columns"):
-        check_task(type("Wide", (Flat,), {"columns": (4, 1, 1)}), steps=4, device=device)
+@pytest.mark.parametrize(("base", "columns"), [(Plain, 3), (Flat, 4)])
+def test_check_task_reports_columns_beyond_the_names(device, base, columns):
+    check_task(base, steps=2, device=device)
+    with pytest.raises(TaskError, match=rf"rewards.* 2 .* {columns} columns"):
+        check_task(type("Wide", (base,), {"columns": (columns, 1, 1)}), steps=2, device=device)
