@@ -292,8 +292,8 @@ def or_of_threads(bits: int, threads: int) -> int:
 #if defined(__CUDA_ARCH__)
 for (int distance = threads >> 1; distance > 0; distance >>= 1) {
     const float other = __shfl_xor_sync(0xffffffffu, value, distance);
-    const int whose = __shfl_xor_sync(0xffffffffu, which, distance);
-    if (other > value || (other == value && whose < which)) value = other, which = whose;
+    const int other_which = __shfl_xor_sync(0xffffffffu, which, distance);
+    if (other > value || (other == value && other_which < which)) value = other, which = other_which;
 }
 #endif
 return wp::vec_t<2, wp::float32>(value, (float)which);

@@ -97,12 +97,9 @@ def coulomb(m_a: float, m_b: float, approach: wp.vec3, n: wp.vec3, friction: flo
 
 
 @wp.func
-def store_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, mark: int, sensors: Sensors):
-    """Add a change of velocity [m/s] to the sensor record of a node, with the subject that has contributed most.
-
-    ``mark`` is what ``touched`` of the active block is set to.
-    """
-    sensors.touched[e, r // BLOCK_NODES] = mark
+def store_contact(contact: Contact, e: int, r: int, other: int, change: wp.vec3, sensors: Sensors):
+    """Add a change of velocity [m/s] to the sensor record of a node, with the subject that has contributed most."""
+    sensors.touched[e, r // BLOCK_NODES] = 1
     before = read_vec4(sensors.node, e, r)
     so_far = wp.vec3(before[0], before[1], before[2])
     subject = wp.where(wp.length_sq(change) >= wp.length_sq(so_far), float(contact.subject[other]), before[3])
@@ -174,8 +171,8 @@ def collide_pair(
         return
     write_record(node_velocity, e, ra, va - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / va[0])
     write_record(node_velocity, e, rb, vb + vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0) / vb[0])
-    store_contact(contact, e, ra, b, -J / va[0], 1, sensors)
-    store_contact(contact, e, rb, a, J / vb[0], 1, sensors)
+    store_contact(contact, e, ra, b, -J / va[0], sensors)
+    store_contact(contact, e, rb, a, J / vb[0], sensors)
     store_pair_impulse(contact, e, a, b, J, sensors)
 
 
@@ -221,66 +218,57 @@ def project_own_normals(
                 # contact with a wall that moves with the common velocity
                 J = coulomb(1.0, 1.0, 2.0 * (wp.vec3(v[1], v[2], v[3]) - common), out, mu)
                 write_record(node_velocity, e, r, v - vec8(0.0, J[0], J[1], J[2], 0.0, 0.0, 0.0, 0.0))
-                store_contact(contact, e, r, other, -J, 1, sensors)
+                store_contact(contact, e, r, other, -J, sensors)
 
 
 @wp.func
-def collide_all(
-    grid: Grid,
-    contact: Contact,
-    blocks: Blocks,
-    accumulators: Accumulators,
-    mask: int,
-    e: int,
-    block: int,
-    local: int,
-    volume_gradient: wp.array2d(dtype=wp.vec4),
-    node_velocity: wp.array2d(dtype=wp.vec4),
-    sensors: Sensors,
-):
-    """Apply contact between the fields of a ``mask`` at a node, those with all offsets."""
-    if contact.own_normals != 0:
-        project_own_normals(grid, contact, blocks, accumulators, mask, e, block, local, node_velocity, sensors)
-        return
-    end = end_of_fields(mask)
-    for a in range(lowest_field(mask, contact.num_fields), end - 1):
-        if has_field(mask, a):
-            for b in range(a + 1, end):
-                if has_field(mask, b):
-                    collide_pair(
-                        grid,
-                        contact,
-                        blocks,
-                        accumulators,
-                        e,
-                        block,
-                        local,
-                        a,
-                        b,
-                        volume_gradient,
-                        node_velocity,
-                        sensors,
-                    )
-
-
-@wp.func
-def finish_node(
+def solve_node(
     grid: Grid,
     step: Step,
     boundaries: Boundaries,
     contact: Contact,
     blocks: Blocks,
+    volume_gradient: wp.array2d(dtype=wp.vec4),
     accumulators: Accumulators,
-    mask: int,
-    near: bool,
+    node_velocity: wp.array2d(dtype=wp.vec4),
+    sensors: Sensors,
     e: int,
     block: int,
     local: int,
-    node_velocity: wp.array2d(dtype=wp.vec4),
-    sensors: Sensors,
+    mask: int,
 ):
-    """Apply colliders after contact, and write physical velocities; limbs merged with a trunk copy its velocity."""
+    """Update a node with any number of fields, those of ``mask``.
+
+    Fields collide with each other where all their offsets have been summed, then with colliders. Limbs merged with a
+    trunk copy its velocity.
+    """
     split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
+    present = int(0)
+    candidates = int(0)
+    near = slab_is_near(grid, boundaries, e, block_corner(grid, block), local, GATED_SLAB)
+    for f in range(contact.num_fields):
+        if has_field(mask, f):
+            r = first_record(grid, blocks, e, f, block) + local
+            v = read_record(node_velocity, e, r)
+            if v[0] != 0.0:
+                present = present | (1 << f)
+            if has_all_candidates(blocks, e, r):
+                candidates = candidates | (1 << f)
+            v = total_velocity(step, split, v)
+            write_record(node_velocity, e, r, v)
+            write_vec4(sensors.node, e, r, wp.vec4(0.0))
+    if contact.own_normals != 0:
+        project_own_normals(grid, contact, blocks, accumulators, candidates, e, block, local, node_velocity, sensors)
+    else:
+        end = end_of_fields(candidates)
+        for a in range(lowest_field(candidates, contact.num_fields), end - 1):
+            if has_field(candidates, a):
+                for b in range(a + 1, end):
+                    if has_field(candidates, b):
+                        collide_pair(
+                            grid, contact, blocks, accumulators, e, block, local, a, b, volume_gradient,
+                            node_velocity, sensors,
+                        )  # fmt: skip
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local
@@ -302,46 +290,6 @@ def finish_node(
                     )
                 write_record(node_velocity, e, r, physical_velocity(split, total))
             clear_offset(accumulators, e, r)
-
-
-@wp.func
-def solve_node(
-    grid: Grid,
-    step: Step,
-    boundaries: Boundaries,
-    contact: Contact,
-    blocks: Blocks,
-    volume_gradient: wp.array2d(dtype=wp.vec4),
-    accumulators: Accumulators,
-    node_velocity: wp.array2d(dtype=wp.vec4),
-    sensors: Sensors,
-    e: int,
-    block: int,
-    local: int,
-    mask: int,
-):
-    """Update a node with any number of fields, those of ``mask``."""
-    split = step.decoupling == SPLIT or step.decoupling == NO_STRESS
-    present = int(0)
-    candidates = int(0)
-    near = slab_is_near(grid, boundaries, e, block_corner(grid, block), local, GATED_SLAB)
-    for f in range(contact.num_fields):
-        if has_field(mask, f):
-            r = first_record(grid, blocks, e, f, block) + local
-            v = read_record(node_velocity, e, r)
-            if v[0] != 0.0:
-                present = present | (1 << f)
-            if has_all_candidates(blocks, e, r):
-                candidates = candidates | (1 << f)
-            v = total_velocity(step, split, v)
-            write_record(node_velocity, e, r, v)
-            write_vec4(sensors.node, e, r, wp.vec4(0.0))
-    collide_all(
-        grid, contact, blocks, accumulators, candidates, e, block, local, volume_gradient, node_velocity, sensors
-    )
-    finish_node(
-        grid, step, boundaries, contact, blocks, accumulators, mask, near, e, block, local, node_velocity, sensors
-    )  # fmt: skip
     for f in range(contact.num_fields):
         if has_field(mask, f):
             r = first_record(grid, blocks, e, f, block) + local

@@ -280,7 +280,11 @@ def sum_physical(
     field: int,
     stencil: Stencil,
 ):
-    """Return the sums of physical velocity over a stencil, on a GPU; a CPU uses :func:`sum_lines`."""
+    """Return the sums of physical velocity over a stencil, on a GPU.
+
+    :func:`sum_lines` does so on the plain path, and :mod:`piavatar_envs.mpm.cuda.block_g2p` in shared memory: they
+    differ in how a record is addressed, and in the order of products that needs fewest registers.
+    """
     base = stencil.base
     wx = stencil.wx
     wy = stencil.wy
@@ -376,38 +380,6 @@ def g2p_particle(
     return s, distance
 
 
-@wp.func
-def g2p_particle_by_lines(
-    grid: Grid,
-    step: Step,
-    particles: Particles,
-    boundaries: Boundaries,
-    node_velocity: wp.array2d(dtype=wp.vec4),
-    blocks: Blocks,
-    moved: Moving,
-    failure: wp.array(dtype=int),
-    e: int,
-    p: int,
-):
-    """Return particle ``p`` after the substep, on a CPU, where P2G has stored the contact candidates."""
-    x = moved.x[e, p]
-    stencil = stencil_at(grid_position(grid, x))
-    field = particles.field[p]
-    nodes = first_of_halves(node_velocity, e)
-    lines = lines_of(grid, blocks, e, field, stencil, HALVES)
-    accumulators = sum_lines(nodes, lines)
-    physical = Gradients(accumulators[0], accumulators[1], accumulators[2], accumulators[3])
-    kinematic = Gradients()
-    needed = bool(False)
-    if step.decoupling == PAPER or (candidate_bits(blocks, e, p) & CANDIDATE) != 0:
-        needed = needs_kinematic(grid, step, nearest_boundary(boundaries, e, x))
-    if needed:
-        kinematic = sum_kinematic(grid, blocks, nodes, e, field, stencil)
-    return advance_particle(
-        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, needed, stencil
-    )  # fmt: skip
-
-
 @wp.kernel
 def g2p(
     grid: Grid,
@@ -420,11 +392,25 @@ def g2p(
     moved: Moving,
     failure: wp.array(dtype=int),
 ):
-    """Move every particle with the grid."""
+    """Move every particle with the grid, on the plain path, whose P2G has stored the contact candidates."""
     e, p = wp.tid()
     if blocks.frozen[e] != 0:
         return
-    s = g2p_particle_by_lines(grid, step, particles, boundaries, node_velocity, blocks, moved, failure, e, p)
+    x = moved.x[e, p]
+    stencil = stencil_at(grid_position(grid, x))
+    field = particles.field[p]
+    nodes = first_of_halves(node_velocity, e)
+    sums = sum_lines(nodes, lines_of(grid, blocks, e, field, stencil, HALVES))
+    physical = Gradients(sums[0], sums[1], sums[2], sums[3])
+    kinematic = Gradients()
+    needed = bool(False)
+    if step.decoupling == PAPER or (candidate_bits(blocks, e, p) & CANDIDATE) != 0:
+        needed = needs_kinematic(grid, step, nearest_boundary(boundaries, e, x))
+    if needed:
+        kinematic = sum_kinematic(grid, blocks, nodes, e, field, stencil)
+    s = advance_particle(
+        grid, step, particles, boundaries, blocks, moved, failure, e, p, physical, kinematic, needed, stencil
+    )  # fmt: skip
     if s.fault == 0:
         moved.x[e, p] = s.x
         moved.u[e, p] = s.u

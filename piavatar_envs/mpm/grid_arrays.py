@@ -143,13 +143,13 @@ def quanta_at(numbers: wp.array2d(dtype=vec4l), e: int, at: int) -> vec4l:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-int4* const mine = reinterpret_cast<int4*>(&wp::index(numbers, e, at));
+int4* const own = reinterpret_cast<int4*>(&wp::index(numbers, e, at));
 const int4 zero = make_int4(0, 0, 0, 0);
 constexpr unsigned ALL = 0xffffffffu;
 if (__activemask() == ALL) {
     const int lane = threadIdx.x & 31;
-    int4* const first = (int4*)__shfl_sync(ALL, (unsigned long long)mine, 0);
-    if (__all_sync(ALL, mine == first + 2 * lane)) {  // the warp's numbers are contiguous: clear them line by line
+    int4* const first = (int4*)__shfl_sync(ALL, (unsigned long long)own, 0);
+    if (__all_sync(ALL, own == first + 2 * lane)) {  // the warp's numbers are contiguous: clear them line by line
         const unsigned cleared = __ballot_sync(ALL, clears);
         __syncwarp();  // all threads have read their numbers
 #pragma unroll
@@ -159,7 +159,7 @@ if (__activemask() == ALL) {
         return;
     }
 }
-if (clears) mine[0] = zero, mine[1] = zero;
+if (clears) own[0] = zero, own[1] = zero;
 #else
 if (clears) wp::index(numbers, e, at) = wp::vec_t<4, wp::int64>(0, 0, 0, 0);
 #endif

@@ -179,10 +179,10 @@ def record_begin(
         branches: parallel branches to add: they use neither sensors nor blocks, move no particles, and do not read
             failures, which activation sets.
     """
-    sensors, marks = LaunchGraph(graph.device), LaunchGraph(graph.device)
+    sensors, activation = LaunchGraph(graph.device), LaunchGraph(graph.device)
     sensors.launch(clear_sensors, model.num_envs, [], [scratch.sensors])
-    record_first_activation(marks, model, state, scratch)
-    graph.parallel(sensors, marks, *branches)
+    record_first_activation(activation, model, state, scratch)
+    graph.parallel(sensors, activation, *branches)
 
 
 def record_first_activation(graph: LaunchGraph, model: Model, state: State, scratch: Scratch) -> None:

@@ -95,14 +95,14 @@ const unsigned line = 1u << lower[2] | 1u << upper[2];
 const unsigned long long plane = line << 4 * lower[1] | line << 4 * upper[1];
 const unsigned long long touched = plane << 16 * lower[0] | plane << 16 * upper[0];
 const int j = begin[1] + (lane >> 2 & 3), k = begin[2] + (lane & 3);
-wp::vec2i mine(-1, -1);
+wp::vec2i own(-1, -1);
 #pragma unroll
 for (int q = 0; q < 2; ++q) {
     const int i = begin[0] + 2 * q + (lane >> 4);
     if (__reduce_or_sync(ALL, (unsigned)(touched >> 32 * q)) >> lane & 1u)
-        mine[q] = (i * grid.blocks[1] + j) * grid.blocks[2] + k;
+        own[q] = (i * grid.blocks[1] + j) * grid.blocks[2] + k;
 }
-return mine;
+return own;
 #else
 return wp::vec2i(-2, -2);
 #endif
@@ -348,14 +348,14 @@ def activate_particle_blocks(
                 wp.atomic_or(failure, e, _OUT_OF_GRID)
         else:
             wp.atomic_or(failure, e, _NONFINITE)
-    mine = share_of_blocks(grid, e, field, base, takes)
-    if mine[0] == -2:
+    own = share_of_blocks(grid, e, field, base, takes)
+    if own[0] == -2:
         if takes:
             activate_stencil(grid, blocks, base, field, e, failure)
         return
     for n in range(2):
-        if mine[n] >= 0:
-            activate_block(grid, blocks, mine[n], field, e, failure)
+        if own[n] >= 0:
+            activate_block(grid, blocks, own[n], field, e, failure)
 
 
 @wp.func_native("return (wp::uint64)&wp::index(blocks.active, e, n);")

@@ -165,7 +165,7 @@ def _load(path: Path):
     if not path.is_file():
         raise FileNotFoundError(f"no mesh at {path}")
     try:
-        # a stream, not a path: no materials or buffers are looked up beside it
+        # a stream, not a path: no materials or buffers are looked up next to it
         stream, kind = io.BytesIO(path.read_bytes()), path.suffix.lower()[1:]
         loaded = trimesh.load(stream, file_type=kind, force="mesh", process=True, skip_materials=True)
         # once more without texture coordinates, which split vertices along their seams

@@ -62,27 +62,27 @@ def choose_substeps(
             would be needed than can be configured.
     """
     physics = config.physics
-    mode, asked = config.control.mode, physics.num_substeps
+    mode, given = config.control.mode, physics.num_substeps
     least = 1 if mode == "pose" else math.ceil(physics.control_dt / LONGEST_SUBSTEP - 1e-9)
     thing = fastest_thing(scene, solids, domain, physics.gravity)
     blow = fastest_blow(impulses, flesh, config.randomize.mass_factor[0])
-    if asked is None:
+    if given is None:
         commanded = commanded_speed(config.control, select_joints(config.joints), flesh)
         moving = max(commanded, STRUCK * thing[1], blow[1])
         return max(least, _fewest(physics, dx, wave, moving))
     name, speed = max(thing, blow, key=lambda found: found[1])
     fewest = choose_num_substeps(physics.control_dt, dx, speed, 1.0)
-    if asked < fewest:
+    if given < fewest:
         raise ConfigError(
-            f"physics.num_substeps={asked}: {name!r}, at up to {speed:.3g} m/s, would move farther than a grid spacing "
-            f"({dx:.3g} m) in a substep of {1e3 * physics.control_dt / asked:.3g} ms; use at least {fewest}"
+            f"physics.num_substeps={given}: {name!r}, at up to {speed:.3g} m/s, would move farther than a grid spacing "
+            f"({dx:.3g} m) in a substep of {1e3 * physics.control_dt / given:.3g} ms; use at least {fewest}"
         )
-    if asked < least:
+    if given < least:
         raise ConfigError(
-            f"physics.num_substeps={asked}: substeps of {1e3 * physics.control_dt / asked:.3g} ms are too long "
+            f"physics.num_substeps={given}: substeps of {1e3 * physics.control_dt / given:.3g} ms are too long "
             f"for control.mode={mode!r} ({1e3 * LONGEST_SUBSTEP:g} ms); use at least {least}"
         )
-    return asked
+    return given
 
 
 def _fewest(physics: PhysicsConfig, dx: float, wave: float, speed: float) -> int:

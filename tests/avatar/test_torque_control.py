@@ -54,8 +54,8 @@ def test_a_control_step_has_a_mass_matrix_for_every_two_substeps(joints):
     made.body.mass.refresh, graph = 2, LaunchGraph(made.model.device)
     for step in range(5):
         made.body.record_substep(graph, made.state, made.rig.scratch, step)
-    alone = ["attach_flesh", "act", "take_over"]
-    own = ["attach_flesh", "sum_pairs", "build_mass", "act", "take_over"]
+    alone = ["attach_flesh", "act", "split_velocity"]
+    own = ["attach_flesh", "sum_pairs", "build_mass", "act", "split_velocity"]
     assert graph.names == ["begin_substep", *own, *alone, *own, *alone, *own]
 
 

@@ -80,7 +80,7 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.segment_sums import ALL_WORDS, PARTITION_THREADS, sum_moments, warps_of
 from piavatar_envs.avatar.torque_control.bone_contact import Ground
 from piavatar_envs.avatar.torque_control.flesh_coupling import attach_flesh, put_in_place
-from piavatar_envs.avatar.torque_control.joint_motion import take_over
+from piavatar_envs.avatar.torque_control.joint_motion import split_velocity
 from piavatar_envs.avatar.torque_control.joint_torques import UNBOUNDED, Springs, Target, make_strength, make_tissue
 from piavatar_envs.avatar.torque_control.mass_matrix import NUM_DOF, MassMatrix, grid_inertia
 from piavatar_envs.avatar.torque_control.stages import MASS_BLOCK, Support, act, begin_substep, build_mass
@@ -271,7 +271,7 @@ class ArticulatedBody:
         inputs += [self.target, self.springs, self.tissue, self.strength]
         self._record_stage(graph, act, inputs, state, self._ground(scratch), self.support)
         inputs = [self.body, model.step.dt, state.x, w.pelvis, w.steps, state.failure]
-        graph.launch(take_over, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
+        graph.launch(split_velocity, self._points, inputs, [state.u, state.kinematic], block_dim=BLOCK)
 
     def _ground(self, scratch: Scratch) -> Ground:
         """Return the boundaries and sensors that bone contact uses."""

@@ -6,8 +6,8 @@ a thin layer of flesh between bone and boundary is incompressible, and a point m
 the remaining distance to this layer.
 
 An impulse ``p`` at a point changes the joints' velocities by ``M^-1 J^T p``, with the Jacobian ``J`` of the point, and
-the point's own velocity by ``K p``, ``K = J M^-1 J^T``. ``M`` includes everything implicit, so springs and dampers
-respond to a stopped bone as to any load. The impulse is the least that stops the point under Coulomb's law: the point
+the point's own velocity by ``W p``, with the mobility ``W = J M^-1 J^T``. ``M`` includes everything implicit, so springs
+and dampers respond to a stopped bone as to any load. The impulse is the least that stops the point under Coulomb's law: the point
 sticks if that impulse is in the friction cone; otherwise friction opposes the slip of the frictionless solution, as
 strong as the cone allows but no stronger than what halts the slip. The point that violates its bound most is stopped
 first, then the next, until none is left or :data:`MOST_STOPS` is reached (the Gauss-Southwell order; for contact of
@@ -66,7 +66,7 @@ class Touch:
 
 
 @wp.func
-def at_rest(body: Body, e: int, b: int, tracker: int):
+def rest_offset(body: Body, e: int, b: int, tracker: int):
     """Return the offset from a joint to a point of its bone in the rest pose [m]; the point by its tracker index."""
     joint = body.rest_joint[row(e, body.rest_joint.shape[0]), b]
     return vector_at(body.rest, row(e, body.rest.shape[0]), body.tracker[tracker]) - joint
@@ -79,7 +79,7 @@ def measure_bones(body: Body, e: int, thread: int, threads: int, w: TorqueWorksp
         low = wp.vec3(_FAR)
         high = wp.vec3(-_FAR)
         for tracker in range(body.tracker_start[b], body.tracker_start[b + 1]):
-            point = at_rest(body, e, b, tracker)
+            point = rest_offset(body, e, b, tracker)
             low = wp.min(low, point)
             high = wp.max(high, point)
         w.middle[e, b] = 0.5 * (low + high)
@@ -96,7 +96,7 @@ def motion_of_bone(w: TorqueWorkspace, e: int, b: int, x: wp.vec3):
 def touch_of(body: Body, boundaries: Boundaries, w: TorqueWorkspace, e: int, b: int, tracker: int, k: int) -> Touch:
     """Return the contact of a point of bone ``b``, by its tracker index, with boundary ``k``."""
     touch = Touch()
-    touch.place = w.pose.position[e, b] + wp.quat_rotate(w.pose.rotation[e, b], at_rest(body, e, b, tracker))
+    touch.place = w.pose.position[e, b] + wp.quat_rotate(w.pose.rotation[e, b], rest_offset(body, e, b, tracker))
     d = signed_distance(boundaries, e, k, touch.place)
     touch.normal = wp.vec3(d[0], d[1], d[2])
     touch.distance = d[3]
@@ -121,7 +121,7 @@ def reach_along(half: wp.vec3, turn: wp.quat, n: wp.vec3):
 
 
 @wp.func
-def may_lack(boundaries: Boundaries, dt: float, w: TorqueWorkspace, e: int, b: int, k: int):
+def may_violate(boundaries: Boundaries, dt: float, w: TorqueWorkspace, e: int, b: int, k: int):
     """Return whether any point of a bone may violate its bound at a boundary, from the bone's bounding box.
 
     For a boundary that is not a plane, whose normals vary, the test uses the sphere around the box, and speeds.
@@ -148,7 +148,7 @@ def find_near(ground: Ground, dt: float, e: int, thread: int, threads: int, w: T
     near = int(0)
     for b in range(thread, BONES, threads):
         for k in range(ground.boundaries.count):
-            if may_lack(ground.boundaries, dt, w, e, b, k):
+            if may_violate(ground.boundaries, dt, w, e, b, k):
                 near = near | (1 << b)
     return or_of_threads(near, threads)
 
@@ -192,7 +192,7 @@ _JAMMED = wp.constant(0.1)
 
 
 @wp.func
-def carries(body: Body, a: int, b: int):
+def moves_bone(body: Body, a: int, b: int):
     """Return 1 if joint ``a`` moves bone ``b``, else 0."""
     above = int(b)
     while above > a:  # children come after their parents
@@ -201,12 +201,12 @@ def carries(body: Body, a: int, b: int):
 
 
 @wp.func
-def answer_at(
+def mobility_at(
     body: Body, factor: int, e: int, b: int, x: wp.vec3, thread: int, threads: int, arena: wp.uint64, w: TorqueWorkspace
 ) -> wp.mat33:
-    """Compute ``K = Y^T Y`` of bone ``b`` at ``x`` [1/kg], with ``Y = L^-T J^T``, which stays in the columns.
+    """Compute the mobility ``W = Y^T Y`` of bone ``b`` at ``x`` [1/kg].
 
-    ``J^T`` has entries for the joints that carry the bone; because ``L`` follows the tree, ``Y`` has few others.
+    ``Y = L^-T J^T`` stays in the columns. ``J^T`` has entries for the joints that carry the bone; because ``L`` follows the tree, ``Y`` has few others.
     """
     n = w.velocity.shape[0]
     wanted = w.pattern.reach[1 + b]
@@ -215,7 +215,7 @@ def answer_at(
     for k in range(thread, TRIPLES, threads):
         arm = wp.vec3()
         if k > 0:
-            arm = carries(body, k - 1, b) * (x - w.pose.position[e, wp.max(k - 1, 0)])
+            arm = moves_bone(body, k - 1, b) * (x - w.pose.position[e, wp.max(k - 1, 0)])
         for axis in range(3):
             along = wp.vec3()
             along[axis] = 1.0
@@ -239,7 +239,7 @@ def answer_at(
 
 
 @wp.func
-def push(
+def apply_impulse(
     p: wp.vec3, b: int, own: int, factor: int, e: int, thread: int, threads: int, arena: wp.uint64, w: TorqueWorkspace
 ):
     """Apply impulse ``p`` to bone ``b`` at the point of the columns ``Y``: ``M^-1 J^T p = L^-1 Y p``."""
@@ -261,22 +261,22 @@ def push(
 
 
 @wp.func
-def stopping_impulse(K: wp.mat33, v: wp.vec3, normal: wp.vec3, least: float, friction: float):
+def stopping_impulse(mobility: wp.mat33, v: wp.vec3, normal: wp.vec3, least: float, friction: float):
     """Return the impulse [N s] that gives a point of velocity ``v`` the normal velocity ``least``, by Coulomb's law."""
-    stick = wp.inverse(K) * (least * normal - v)
+    stick = wp.inverse(mobility) * (least * normal - v)
     push = wp.dot(stick, normal)
     if wp.length(stick - push * normal) <= friction * push:
         return stick
     lacking = wp.max(least - wp.dot(v, normal), 0.0)
-    straight = wp.dot(normal, K * normal)
-    slip = v + lacking / straight * (K * normal)  # the frictionless slip, which friction opposes
+    straight = wp.dot(normal, mobility * normal)
+    slip = v + lacking / straight * (mobility * normal)  # the frictionless slip, which friction opposes
     along = wp.normalize(slip - wp.dot(slip, normal) * normal)
     share = friction
-    halting = wp.dot(along, v) * wp.dot(normal, K * along) + lacking * wp.dot(along, K * along)
+    halting = wp.dot(along, v) * wp.dot(normal, mobility * along) + lacking * wp.dot(along, mobility * along)
     if halting > 0.0:  # more friction than halts the slip would reverse it
         share = wp.min(friction, straight * wp.dot(along, slip) / halting)
     direction = normal - share * along
-    answer = wp.dot(normal, K * direction)
+    answer = wp.dot(normal, mobility * direction)
     if answer < _JAMMED * straight:
         direction = normal
         answer = straight
@@ -303,11 +303,11 @@ def stop_point(
     b = which // boundaries.count % BONES
     tracker = body.tracker_start[b] + which // (boundaries.count * BONES)
     touch = touch_of(body, boundaries, w, e, b, tracker, k)
-    K = answer_at(body, factor, e, b, touch.place, thread, threads, arena, w)
+    mobility = mobility_at(body, factor, e, b, touch.place, thread, threads, arena, w)
     field = ground.field[body.first + body.tracker[tracker]]
     friction = boundaries.friction[row(e, boundaries.friction.shape[0]), field * boundaries.count + k]
-    p = stopping_impulse(K, touch.velocity, touch.normal, least_speed(touch.distance, dt), friction)
-    push(p, b, own, factor, e, thread, threads, arena, w)
+    p = stopping_impulse(mobility, touch.velocity, touch.normal, least_speed(touch.distance, dt), friction)
+    apply_impulse(p, b, own, factor, e, thread, threads, arena, w)
     moment = wp.cross(touch.place - w.pose.position[e, 0], p)
     return vec8(p[0], p[1], p[2], moment[0], moment[1], moment[2], 0.0, 0.0)
 

@@ -41,7 +41,7 @@ def add_change(
 
 
 @wp.func
-def go_on(
+def predict_velocity(
     change: wp.array2d(dtype=float),
     outside: wp.array2d(dtype=float),
     own: int,
@@ -86,7 +86,7 @@ for (int word = lane; word < 28; word += LANES) {
     float* const whole = reinterpret_cast<float*>(&wp::index(bones, e, 0)) + word;
     float sum = 0.0f, next[AHEAD];
     int bone = 0, next_bone[AHEAD];
-    const auto ask = [&](int first) {
+    const auto load = [&](int first) {
 #pragma unroll
         for (int n = 0; n < AHEAD; ++n) {
             const int c = first + n;
@@ -94,13 +94,13 @@ for (int word = lane; word < 28; word += LANES) {
             next_bone[n] = c < chunks ? chunk_bone.data[c] : last;
         }
     };
-    ask(0);
+    load(0);
     for (int first = 0; bone < last; first += AHEAD) {
         float value[AHEAD];
         int of[AHEAD];
 #pragma unroll
         for (int n = 0; n < AHEAD; ++n) value[n] = next[n], of[n] = next_bone[n];
-        ask(first + AHEAD);
+        load(first + AHEAD);
 #pragma unroll
         for (int n = 0; n < AHEAD; ++n) {
             for (; bone < of[n]; ++bone) {
@@ -134,7 +134,7 @@ def gather_sums(
 
 
 @wp.func
-def take_child(
+def add_child(
     position: wp.array2d(dtype=wp.vec3),
     e: int,
     row: int,
@@ -247,7 +247,7 @@ def pass_down(
             row = own + v * step
             for back in range(BONES - 1):
                 b = BONES - 1 - back  # children come after their parents
-                take_child(position, e, row, body.parent[b], b, linear, angular)
+                add_child(position, e, row, body.parent[b], b, linear, angular)
             for b in range(BONES):
                 set_triple(momentum, row, 3 + 3 * b, angular[row, b])
             set_triple(momentum, row, 0, linear[row, 0])

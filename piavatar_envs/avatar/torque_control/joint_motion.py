@@ -122,7 +122,7 @@ def blended_motion(b: vec12, arm: wp.vec3):
 
 
 @wp.kernel(launch_bounds=(BLOCK, 10))
-def take_over(
+def split_velocity(
     body: Body,
     dt: float,
     x: wp.array2d(dtype=wp.vec3),

@@ -268,7 +268,7 @@ def limit_torque(
 
 
 @wp.func
-def find_given(
+def final_impulses(
     left: wp.array2d(dtype=float),
     change: wp.array2d(dtype=float),
     row_of_change: int,

@@ -16,14 +16,20 @@ import warp as wp
 
 from piavatar_envs.avatar.rotation import rigid_matrix
 from piavatar_envs.avatar.torque_control.bone_contact import TRIPLES, Ground, add_to_sensors, measure_bones, stop_bones
-from piavatar_envs.avatar.torque_control.joint_momentum import add_change, balance, gather_sums, go_on, pass_down
+from piavatar_envs.avatar.torque_control.joint_momentum import (
+    add_change,
+    balance,
+    gather_sums,
+    pass_down,
+    predict_velocity,
+)
 from piavatar_envs.avatar.torque_control.joint_motion import move_joints, spread_motion, triple_of
 from piavatar_envs.avatar.torque_control.joint_torques import (
     Springs,
     Strength,
     Target,
     Tissue,
-    find_given,
+    final_impulses,
     implicit_diagonal,
     joint_impulse,
     limit_torque,
@@ -107,7 +113,7 @@ def find_shares(
 
 
 @wp.func
-def move_on(body: Body, dt: float, move: int, off: int, e: int, thread: int, threads: int, w: TorqueWorkspace):
+def advance_pose(body: Body, dt: float, move: int, off: int, e: int, thread: int, threads: int, w: TorqueWorkspace):
     """Advance the pose by half a substep (moves 0 and 1), or fit it to the particles (move 2).
 
     The fit is a share of ``dq = M^-1 J^T m way``, with the displacements ``way`` from particles to their places, in row
@@ -163,7 +169,7 @@ def limit_joints(
 
 
 @wp.func
-def turn_joints(
+def apply_torques(
     body: Body,
     dt: float,
     target: Target,
@@ -190,11 +196,11 @@ def turn_joints(
         )
     load_factor(w.factors, driven, arena)
     factor = int(driven)
-    met = vec8()
+    contact = vec8()
     cuts = int(0)
     while factor >= 0:  # repeated while muscles reach their limits
         solve(w.pattern, w.factors, factor, w.impulse, e, own, thread, threads, arena, w.shares)
-        met = stop_bones(body, ground, dt, own, factor, e, thread, threads, arena, w)
+        contact = stop_bones(body, ground, dt, own, factor, e, thread, threads, arena, w)
         if cuts == MOST_CUTS:
             break
         if limit_joints(body, dt, springs, strength, driven, own, cuts > 0, e, thread, threads, w) == 0.0:
@@ -202,12 +208,12 @@ def turn_joints(
         cuts += 1
         factor = w.factors.shape[0] - 1
         factorize(w.pattern, w.matrix, w.left, e, e, arena, factor, w.factors)
-    find_given(w.left, w.shares, own, e, thread, threads, w.impulse)
+    final_impulses(w.left, w.shares, own, e, thread, threads, w.impulse)
     spread_motion(body, w.pose.position, w.shares, own, e, thread, threads, w.moving)
-    support = triple_of(w.impulse, e, 0) + wp.vec3(met[0], met[1], met[2])
-    moment = triple_of(w.impulse, e, 3) + wp.vec3(met[3], met[4], met[5])
+    support = triple_of(w.impulse, e, 0) + wp.vec3(contact[0], contact[1], contact[2])
+    moment = triple_of(w.impulse, e, 3) + wp.vec3(contact[3], contact[4], contact[5])
     if thread == 0:
-        add_to_sensors(body, ground, met, e, w.pose.position[e, 0])
+        add_to_sensors(body, ground, contact, e, w.pose.position[e, 0])
     balance(w.pose.position, w.bones, 0.0, support, moment, w.moving, e, own, thread, threads, w.shares)
 
 
@@ -317,8 +323,8 @@ def act(
     find_shares(body, own, taken - own, moves, e, thread, threads, arena, near)
     pull_bones(body, own, e, thread, threads, near)
     add_change(near.shares, taken, e, thread, threads, w.velocity, w.outside)
-    turn_joints(body, dt, target, springs, tissue, strength, ground, n + e, own, e, thread, threads, arena, near)
-    go_on(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
+    apply_torques(body, dt, target, springs, tissue, strength, ground, n + e, own, e, thread, threads, arena, near)
+    predict_velocity(near.shares, w.outside, own, taken, e, thread, threads, w.velocity, near.shares)
     spread_motion(body, near.pose.position, near.shares, taken, e, thread, threads, near.moving)
     store_motion(near.moving, e, 0, thread, threads, w.steps)
     if thread == 0:
@@ -326,6 +332,6 @@ def act(
         support.force[e] = support.force[e] + per_time * triple_of(w.impulse, e, 0)
         support.torque[e] = support.torque[e] + per_time * triple_of(w.impulse, e, 3)
     for move in range(moves):
-        move_on(body, dt, move, off, e, thread, threads, near)
+        advance_pose(body, dt, move, off, e, thread, threads, near)
     begin(body, e, thread, threads, near)
     store_workspace(w, e, near)

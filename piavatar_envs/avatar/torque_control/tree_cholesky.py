@@ -34,11 +34,11 @@ float* const arena = reinterpret_cast<float*>(at);
 #if defined(__CUDA_ARCH__)
 const int lane = threadIdx.x & 31;
 constexpr int LANES = 32;
-const auto meet = [] { __syncwarp(); };
+const auto sync = [] { __syncwarp(); };
 const auto over_root = [](float x) { return rsqrtf(x); };
 #else
 constexpr int lane = 0, LANES = 1;
-const auto meet = [] {};
+const auto sync = [] {};
 const auto over_root = [](float x) { return 1.0f / sqrtf(x); };
 #endif
 """
@@ -66,7 +66,7 @@ const auto block_at = [](const float* from) {
     for (int c = 0; c < 9; ++c) block.number[c] = from[c];
     return block;
 };
-const auto take = [&](const float* row, int word, const Block& before) {
+const auto subtract = [&](const float* row, int word, const Block& before) {
     const Block first = block_at(row + (word >> 8 & 255)), second = block_at(row + (word & 255));
     const float* const a = first.number;
     const float* const b = second.number;
@@ -83,7 +83,7 @@ for (int round = 0; round < steps.shape[0] - 2; ++round) {
     const int after_word = pair.data[32 * (round + 2) + lane];
     float* const row = at_byte(now.x);
 #if defined(__CUDA_ARCH__)
-    const Block before = block_at(at_byte(word < 0 ? 0 : word >> 16));  // while the row is found
+    const Block before = block_at(at_byte(word < 0 ? 0 : word >> 16));  // loaded while the row is computed
 #endif
     if (now.w == 0) {
         float* const d = at_byte(now.y);
@@ -95,7 +95,7 @@ for (int round = 0; round < steps.shape[0] - 2; ++round) {
         const float o1 = over_root(d4 - l21 * l21), l10 = (d3 - l21 * l20) * o1;
         const float o0 = over_root(d0 - l20 * l20 - l10 * l10);
         const float w10 = -o1 * l10 * o0, w21 = -o2 * l21 * o1, w20 = -o2 * (l20 * o0 + l21 * w10);
-        meet();
+        sync();
         if (lane == 0) d[0] = o0, d[3] = w10, d[4] = o1, d[6] = w20, d[7] = w21, d[8] = o2;
         const auto put = [&](float* to, float m0, float m1, float m2) {
             to[0] = o0 * m0 + w10 * m1 + w20 * m2, to[3] = o1 * m1 + w21 * m2, to[6] = o2 * m2;
@@ -106,15 +106,15 @@ for (int round = 0; round < steps.shape[0] - 2; ++round) {
             float* const more = row + 9 * (n / 3) + n % 3;
             put(more, more[0], more[3], more[6]);
         }
-        meet();
+        sync();
     }
 #if defined(__CUDA_ARCH__)
-    if (word >= 0) take(row, word, before);
+    if (word >= 0) subtract(row, word, before);
 #else
     for (const int* own = pair.data + 32 * round; own < pair.data + 32 * (round + 1) && *own >= 0; ++own)
-        take(row, *own, block_at(at_byte(*own >> 16)));
+        subtract(row, *own, block_at(at_byte(*own >> 16)));
 #endif
-    meet();
+    sync();
     now = next, next = after, word = next_word, next_word = after_word;
 }
 """
@@ -128,7 +128,7 @@ def eliminate(steps: wp.array(dtype=wp.vec4i), pair: wp.array(dtype=int), at: wp
     _ARENA
     + """
 for (int i = lane; i < diagonal.shape[1]; i += LANES) arena[entry.data[i]] += wp::index(diagonal, e, i);
-meet();
+sync();
 """
 )
 def add_diagonal(entry: wp.array(dtype=int), diagonal: wp.array2d(dtype=float), e: int, at: wp.uint64):
@@ -191,7 +191,7 @@ def place_of_factor(factor: wp.array2d(dtype=float), f: int, arena: wp.uint64) -
     ...
 
 
-# All lanes solve for the part of a joint, and each subtracts its contribution from one number of another joint: on the
+# All lanes solve for the triple of a joint, each subtracts its contribution from one number of another joint: on the
 # way down along the columns of its row, on the way up along the rows of its column. Others than ``wanted`` are skipped.
 _TRIPLES = (
     _ARENA
@@ -199,31 +199,31 @@ _TRIPLES = (
 constexpr int VECTORS = COUNT, STRIDE = {4 * _JOINTS};
 #if defined(__CUDA_ARCH__)
 float* const spare = arena + {SPARE};
-const auto part = [&](int v, int n) {{
+const auto triple = [&](int v, int n) {{
     return reinterpret_cast<float*>(reinterpret_cast<char*>(spare + STRIDE * v) + n);
 }};
 #else
-const auto part = [&](int v, int n) {{ return &wp::index(x, first + v * step, 3 * (n >> 4) + (n >> 2 & 3)); }};
+const auto triple = [&](int v, int n) {{ return &wp::index(x, first + v * step, 3 * (n >> 4) + (n >> 2 & 3)); }};
 #endif
 """
 )
 _SWEEPS = """
 const auto at_byte = [&](int n) { return reinterpret_cast<const float*>(reinterpret_cast<const char*>(arena) + n); };
 float y[VECTORS][3];
-const auto take = [&](int word, float m0, float m1, float m2) {
+const auto subtract = [&](int word, float m0, float m1, float m2) {
 #pragma unroll
     for (int v = 0; v < VECTORS; ++v) {
-        float* const other = part(v, word & 1023);
+        float* const other = triple(v, word & 1023);
         *other = *other - m0 * y[v][0] - m1 * y[v][1] - m2 * y[v][2];
     }
 };
-bool passed = false;
-const auto go = [&](auto way, int& head, int& word, int round) {
-    constexpr int ALONG = decltype(way)::value;
-    if (head >= 0) passed = !(wanted >> (head >> 4 & 63) & 1);
-    if (!passed) {
+bool skipped = false;
+const auto run_round = [&](auto direction, int& head, int& word, int round) {
+    constexpr int ALONG = decltype(direction)::value;
+    if (head >= 0) skipped = !(wanted >> (head >> 4 & 63) & 1);
+    if (!skipped) {
 #if defined(__CUDA_ARCH__)
-        const float* const m = at_byte(word < 0 ? 0 : word >> 10);  // while the part is found
+        const float* const m = at_byte(word < 0 ? 0 : word >> 10);  // loaded while the other is computed
         const float m0 = m[0], m1 = m[ALONG], m2 = m[2 * ALONG];
 #endif
         if (head >= 0) {
@@ -232,7 +232,7 @@ const auto go = [&](auto way, int& head, int& word, int round) {
             const float w0 = w[0], w3 = w[3], w4 = w[4], w6 = w[6], w7 = w[7], w8 = w[8];
 #pragma unroll
             for (int v = 0; v < VECTORS; ++v)
-                for (int c = 0; c < 3; ++c) b[v][c] = part(v, head & 1023)[c];
+                for (int c = 0; c < 3; ++c) b[v][c] = triple(v, head & 1023)[c];
 #pragma unroll
             for (int v = 0; v < VECTORS; ++v) {
                 if (ALONG == 3) {
@@ -245,60 +245,60 @@ const auto go = [&](auto way, int& head, int& word, int round) {
                     y[v][2] = w6 * b[v][0] + w7 * b[v][1] + w8 * b[v][2];
                 }
             }
-            meet();
+            sync();
             if (lane == 0)
 #pragma unroll
                 for (int v = 0; v < VECTORS; ++v)
-                    for (int c = 0; c < 3; ++c) part(v, head & 1023)[c] = y[v][c];
+                    for (int c = 0; c < 3; ++c) triple(v, head & 1023)[c] = y[v][c];
         }
 #if defined(__CUDA_ARCH__)
-        if (word >= 0) take(word, m0, m1, m2);
+        if (word >= 0) subtract(word, m0, m1, m2);
 #else
         for (const int* own = words.data + 32 * round; own < words.data + 32 * (round + 1) && *own >= 0; ++own) {
             const float* const m = at_byte(*own >> 10);
-            take(*own, m[0], m[ALONG], m[2 * ALONG]);
+            subtract(*own, m[0], m[ALONG], m[2 * ALONG]);
         }
 #endif
     }
-    head = heads.data[round + 2];  // two pieces take turns: a loop that hands such values on would wait for them there
+    head = heads.data[round + 2];  // into its own copy, see sweep: a move between copies would wait for the load
     word = words.data[32 * (round + 2) + lane];
-    if (!passed) meet();
+    if (!skipped) sync();
 };
-const auto sweep = [&](auto way, int begin, int end) {
+const auto sweep = [&](auto direction, int begin, int end) {
     int even = heads.data[begin], odd = heads.data[begin + 1];
     int even_word = words.data[32 * begin + lane], odd_word = words.data[32 * begin + 32 + lane];
 #pragma unroll 1
     for (int round = begin; round < end; round += 2) {
-        go(way, even, even_word, round);
-        go(way, odd, odd_word, round + 1);
+        run_round(direction, even, even_word, round);
+        run_round(direction, odd, odd_word, round + 1);
     }
 };
 struct Down { enum { value = 3 }; };
 struct Up { enum { value = 1 }; };
 """
-_DOWN, _UP = "sweep(Down{}, 0, turn);", "sweep(Up{}, turn, heads.shape[0] - 2);"
+_DOWN, _UP = "sweep(Down{}, 0, down_rounds);", "sweep(Up{}, down_rounds, heads.shape[0] - 2);"
 _ALL = "constexpr int wanted = -1;"
-_BRING = """
+_LOAD = """
 #if defined(__CUDA_ARCH__)
 const int size = x.shape[1];
 for (int v = 0; v < VECTORS; ++v)
     for (int n = lane; n < size; n += LANES) spare[STRIDE * v + n + n / 3] = wp::index(x, first + v * step, n);
-meet();
+sync();
 #endif
 """
-_KEEP = """
+_STORE = """
 #if defined(__CUDA_ARCH__)
 for (int v = 0; v < VECTORS; ++v)
     for (int n = lane; n < size; n += LANES) wp::index(x, first + v * step, n) = spare[STRIDE * v + n + n / 3];
-meet();
+sync();
 #endif
 """
-_SOLVE = _ALL + _TRIPLES + _BRING + _SWEEPS + _DOWN + _UP + _KEEP
+_SOLVE = _ALL + _TRIPLES + _LOAD + _SWEEPS + _DOWN + _UP + _STORE
 
 
 @wp.func_native(_SOLVE.replace("COUNT", "1"))
 def solve_one(
-    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), down_rounds: int, at: wp.uint64, first: int, step: int,
     x: wp.array2d(dtype=float),
 ):  # fmt: skip
     """Solve for row ``first`` with the factor in an arena, in place."""
@@ -307,7 +307,7 @@ def solve_one(
 
 @wp.func_native(_SOLVE.replace("COUNT", "3"))
 def solve_three(
-    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), down_rounds: int, at: wp.uint64, first: int, step: int,
     x: wp.array2d(dtype=float),
 ):  # fmt: skip
     """Solve like :func:`solve_one` for three rows, a ``step`` apart."""
@@ -316,7 +316,7 @@ def solve_three(
 
 @wp.func_native((_TRIPLES + _SWEEPS + _DOWN).replace("COUNT", "3"))
 def descend_three(
-    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int, step: int,
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), down_rounds: int, at: wp.uint64, first: int, step: int,
     wanted: int, x: wp.array2d(dtype=float),
 ):  # fmt: skip
     """Multiply three vectors by ``L^-T``; only joints whose bits are ``wanted`` have entries.
@@ -328,7 +328,7 @@ def descend_three(
 
 @wp.func_native((_ALL + "constexpr int step = 0;" + _TRIPLES + _SWEEPS + _UP).replace("COUNT", "1"))
 def ascend_one(
-    heads: wp.array(dtype=int), words: wp.array(dtype=int), turn: int, at: wp.uint64, first: int,
+    heads: wp.array(dtype=int), words: wp.array(dtype=int), down_rounds: int, at: wp.uint64, first: int,
     x: wp.array2d(dtype=float),
 ):  # fmt: skip
     """Multiply the first of the vectors of :func:`descend_three` by ``L^-1``, in place."""
@@ -355,7 +355,7 @@ class Pattern:
     head: wp.array(dtype=int)
     # (rounds * 32,) bytes to the part of the vector that changes, plus 2^10 times those to the first of three numbers
     word: wp.array(dtype=int)
-    turn: int  # rounds on the way down, an even number; those on the way up are as well
+    down_rounds: int  # rounds on the way down, an even number; those on the way up are as well
     reach: wp.array(dtype=int)  # (joints,) bits of the joints that an entry of a joint reaches on the way down
 
 
@@ -385,14 +385,14 @@ def find_pattern(filled: np.ndarray, device: str) -> Pattern:
     block = np.full(joints.shape, -1)
     block[row, column] = np.arange(len(row))
     steps, pairs = plan_elimination(block)
-    heads, words, turn = plan_solution(block)
+    heads, words, down_rounds = plan_solution(block)
     entries = 9 * np.diag(block)[:, None] + np.array([0, 4, 8])
     lists = {"block": block.ravel(), "entry": entries.ravel(), "pair": pairs, "head": heads, "word": words}
     lists["reach"] = plan_reach(block)
     pattern = Pattern()
     for name, numbers in lists.items():
         setattr(pattern, name, wp.array(numbers.astype(np.int32), dtype=int, device=device))
-    pattern.step, pattern.turn = wp.array(steps.astype(np.int32), dtype=wp.vec4i, device=device), turn
+    pattern.step, pattern.down_rounds = wp.array(steps.astype(np.int32), dtype=wp.vec4i, device=device), down_rounds
     return pattern
 
 
@@ -409,10 +409,10 @@ def plan_elimination(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plan_solution(block: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return heads, words and turn of :class:`Pattern`, from the ``block`` of every two joints."""
-    count, axis, heads, words, turn = len(block), np.arange(3), [], [], 0
+    """Return ``head``, ``word`` and ``down_rounds`` of :class:`Pattern`, from the ``block`` of every two joints."""
+    count, axis, heads, words, down_rounds = len(block), np.arange(3), [], [], 0
     for up in (False, True):
-        turn = len(heads)  # even
+        down_rounds = len(heads)  # even
         for k in range(count) if up else reversed(range(count)):
             blocks = block[:, k] if up else block[k]
             others = np.flatnonzero((blocks >= 0) & (np.arange(count) != k))
@@ -422,7 +422,7 @@ def plan_solution(block: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
         nothing = (2 if up else 0) + len(heads) % 2
         heads += nothing * [-1]
         words.append(np.full(nothing * LANES, -1))
-    return np.array(heads), np.concatenate(words), turn
+    return np.array(heads), np.concatenate(words), down_rounds
 
 
 def plan_reach(block: np.ndarray) -> np.ndarray:
@@ -516,7 +516,7 @@ def solve(
     for i in range(thread, x.shape[1], threads):
         x[row, i] = right[e, i]
     sync_threads(threads)
-    solve_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, arena), row, 0, x)
+    solve_one(pattern.head, pattern.word, pattern.down_rounds, place_of_factor(factor, f, arena), row, 0, x)
 
 
 @wp.func
@@ -533,7 +533,7 @@ def solve_three_in_place(
 ):
     """Run :func:`solve` for three right-hand sides in ``x``, from ``first`` on, ``step`` rows apart."""
     sync_threads(threads)
-    solve_three(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, arena), first, step, x)
+    solve_three(pattern.head, pattern.word, pattern.down_rounds, place_of_factor(factor, f, arena), first, step, x)
 
 
 @wp.func
@@ -557,7 +557,7 @@ def begin_solution(
     """
     sync_threads(threads)
     at = place_of_factor(factor, f, arena)
-    descend_three(pattern.head, pattern.word, pattern.turn, at, first, step, wanted, x)
+    descend_three(pattern.head, pattern.word, pattern.down_rounds, at, first, step, wanted, x)
 
 
 @wp.func
@@ -573,4 +573,4 @@ def end_solution(
 ):
     """Multiply the first of the columns of :func:`begin_solution` by ``L^-1``."""
     sync_threads(threads)
-    ascend_one(pattern.head, pattern.word, pattern.turn, place_of_factor(factor, f, arena), first, x)
+    ascend_one(pattern.head, pattern.word, pattern.down_rounds, place_of_factor(factor, f, arena), first, x)

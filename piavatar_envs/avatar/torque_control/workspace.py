@@ -210,14 +210,14 @@ def store_motion(
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-const auto keep = [&](const auto& rows, const auto& into, int words) {{
+const auto store = [&](const auto& rows, const auto& into, int words) {{
     const float* const from = reinterpret_cast<const float*>(rows.data);
     float* const to = reinterpret_cast<float*>(&wp::index(into, e, 0));
     for (int n = threadIdx.x & 31; n < words; n += 32) to[n] = from[n];
 }};
-keep(near.moving, w.moving, {8 * NUM_JOINTS});
-keep(near.pose.rotation, w.pose.rotation, {4 * NUM_JOINTS});
-keep(near.pose.position, w.pose.position, {3 * NUM_JOINTS});
+store(near.moving, w.moving, {8 * NUM_JOINTS});
+store(near.pose.rotation, w.pose.rotation, {4 * NUM_JOINTS});
+store(near.pose.position, w.pose.position, {3 * NUM_JOINTS});
 #endif
 """)
 def store_workspace(w: TorqueWorkspace, e: int, near: TorqueWorkspace):

@@ -85,7 +85,7 @@ class TilePass:
     """A particle in a pass of its tile."""
 
     takes: bool  # whether it takes part
-    ours: bool  # whether it is in this pass
+    included: bool  # whether it is in this pass
     base: wp.vec3i  # lowest node of its stencil
     box: wp.vec3i  # where the subblocks around that are, see :func:`subblocks_around`
 
@@ -364,13 +364,13 @@ def add_pass(
     takes = raise_quanta(s, remaining, MOMENTUM, failure, e)
     widen_box(takes, s.base)
     sync_block()
-    ours = in_pass(grid, takes, s.base)
+    included = in_pass(grid, takes, s.base)
     box = subblocks_around(s.base)
     fetch_active(grid, blocks, num_fields, e, at[2])
-    if ours:
+    if included:
         add_momentum(box, s)
     store_records(blocks, e)
-    return TilePass(takes, ours, s.base, box)
+    return TilePass(takes, included, s.base, box)
 
 
 @wp.func
@@ -393,13 +393,13 @@ def flush_pass(
     candidate = near or step.decoupling == PAPER  # "paper" needs the gradient of kinematic momentum everywhere
     # only particles of this pass have a box
     list_candidate(
-        tile_pass.ours and (candidate or (num_fields > 1 and has_contact_nodes(tile_pass.box, tile_pass.base)))
+        tile_pass.included and (candidate or (num_fields > 1 and has_contact_nodes(tile_pass.box, tile_pass.base)))
     )
     flush_nodes(grid, accumulators, failure, at[0], MOMENTUM, 0)
     sync_block()
     if word(NUM_CANDIDATES) != 0:
         deposit_candidates(grid, particles, moving, failure, accumulators, at)
-    return tile_pass.takes and not tile_pass.ours
+    return tile_pass.takes and not tile_pass.included
 
 
 @wp.func
