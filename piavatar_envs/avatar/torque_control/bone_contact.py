@@ -6,13 +6,13 @@ a thin layer of flesh between bone and boundary is incompressible, and a point m
 the remaining distance to this layer.
 
 An impulse ``p`` at a point changes the joints' velocities by ``M^-1 J^T p``, with the Jacobian ``J`` of the point, and
-the point's own velocity by ``W p``, with the mobility ``W = J M^-1 J^T``. ``M`` includes everything implicit, so springs
-and dampers respond to a stopped bone as to any load. The impulse is the least that stops the point under Coulomb's law: the point
-sticks if that impulse is in the friction cone; otherwise friction opposes the slip of the frictionless solution, as
-strong as the cone allows but no stronger than what halts the slip. The point that violates its bound most is stopped
-first, then the next, until none is left or :data:`MOST_STOPS` is reached (the Gauss-Southwell order; for contact of
-articulated bodies in joint space see Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 11). Impulses never
-pull, and add no energy unless a point has come below a boundary at rest.
+the point's own velocity by ``W p``, with the mobility ``W = J M^-1 J^T``. ``M`` includes everything implicit, so
+springs and dampers respond to a stopped bone as to any load. The impulse is the least that stops the point under
+Coulomb's law: the point sticks if that impulse is in the friction cone; otherwise friction opposes the slip of the
+frictionless solution, as strong as the cone allows but no stronger than what halts the slip. The point that violates
+its bound most is stopped first, then the next, until none is left or :data:`MOST_STOPS` is reached (the Gauss-Southwell
+order; for contact of articulated bodies in joint space see Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch.
+11). Impulses never pull, and add no energy unless a point has come below a boundary at rest.
 """
 
 from __future__ import annotations
@@ -206,7 +206,8 @@ def mobility_at(
 ) -> wp.mat33:
     """Compute the mobility ``W = Y^T Y`` of bone ``b`` at ``x`` [1/kg].
 
-    ``Y = L^-T J^T`` stays in the columns. ``J^T`` has entries for the joints that carry the bone; because ``L`` follows the tree, ``Y`` has few others.
+    ``Y = L^-T J^T`` stays in the columns. ``J^T`` has entries for the joints that carry the bone; because ``L`` follows
+    the tree, ``Y`` has few others.
     """
     n = w.velocity.shape[0]
     wanted = w.pattern.reach[1 + b]
