@@ -11,12 +11,12 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.torque_control.bone_contact import (
     TOLERANCE,
     Ground,
-    answer_at,
+    apply_impulse,
     find_fastest,
     least_speed,
-    may_lack,
+    may_violate,
     measure_bones,
-    push,
+    mobility_at,
     touch_of,
 )
 from piavatar_envs.avatar.torque_control.joint_motion import spread_motion
@@ -44,10 +44,10 @@ def push_bone(
     e, thread = wp.tid()
     room = warp_arena()
     load_factor(w.factors, first + e, room)
-    found = answer_at(body, first + e, e, b, x[e], thread, threads, room, w)
+    found = mobility_at(body, first + e, e, b, x[e], thread, threads, room, w)
     if thread == 0:
         K[e] = found
-    push(p, b, e, first + e, e, thread, threads, room, w)
+    apply_impulse(p, b, e, first + e, e, thread, threads, room, w)
 
 
 @wp.kernel(enable_backward=False)
@@ -71,7 +71,7 @@ def look(
     """What bones are looked at, and by how much any of their points is too fast; over ``(num_envs, bones)``."""
     e, b = wp.tid()
     for k in range(ground.boundaries.count):
-        may[e, b, k] = int(may_lack(ground.boundaries, dt, w, e, b, k))
+        may[e, b, k] = int(may_violate(ground.boundaries, dt, w, e, b, k))
         lacking = float(-1.0e9)
         for tracker in range(body.tracker_start[b], body.tracker_start[b + 1]):
             touch = touch_of(body, ground.boundaries, w, e, b, tracker, k)
