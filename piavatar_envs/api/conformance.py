@@ -381,7 +381,9 @@ class WriteMonitor:
 
         def lengthen(env: EpisodeArrays) -> None:
             for name in NAMED:
-                setattr(env, name, self._with_spare(name, getattr(env, name)))
+                long = self._with_spare(name, getattr(env, name))
+                setattr(env, name, long)
+                setattr(env.outcome, name, long)
             allocate(env)
 
         def outcome(env: EpisodeArrays, graph: LaunchGraph) -> None:

@@ -5,10 +5,71 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from piavatar_envs.avatar.types import Body
+from piavatar_envs.core.rng import generator
+from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.observations import ObservationLayout
+from piavatar_envs.mpm.types import row
 from piavatar_envs.sim.world import Simulation
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Episodes:
+    """Clocks and flags of the environments, for kernels; see :class:`EpisodeArrays`."""
+
+    mask: wp.array(dtype=wp.bool)
+    seed: wp.array(dtype=int)
+    episode: wp.array(dtype=int)
+    step_count: wp.array(dtype=int)
+    failure: wp.array(dtype=int)
+    alive: wp.array2d(dtype=wp.bool)
+
+
+@wp.struct
+class Bones:
+    """An avatar as kernels read it: the constants of its body, and its tracked bones, ``(num_envs, bones)``."""
+
+    body: Body
+    rotation: wp.array2d(dtype=wp.quat)  # in the world
+    position: wp.array2d(dtype=wp.vec3)  # of the joint [m]
+    velocity: wp.array2d(dtype=wp.vec3)  # [m/s]
+    local: wp.array2d(dtype=wp.quat)  # relative to the parent bone
+
+
+@wp.struct
+class Props:
+    """Motion of the props, ``(num_envs, num_props)``."""
+
+    position: wp.array2d(dtype=wp.vec3)  # centre of mass [m]
+    rotation: wp.array2d(dtype=wp.quat)  # rest frame to world
+    velocity: wp.array2d(dtype=wp.vec3)  # [m/s]
+    spin: wp.array2d(dtype=wp.vec3)  # angular velocity [rad/s]
+    density: wp.array2d(dtype=float)  # [kg/m^3]
+
+
+@wp.struct
+class Outcome:
+    """Results of a step, which a task writes; see :class:`EpisodeArrays`."""
+
+    terms: wp.array3d(dtype=float)
+    cost_terms: wp.array3d(dtype=float)
+    metrics: wp.array3d(dtype=float)
+    success: wp.array2d(dtype=wp.bool)
+    terminated: wp.array2d(dtype=wp.bool)
+
+
+@wp.func
+def random_of(episodes: Episodes, e: int, stream: int, index: int):
+    """Return the generator of random numbers ``index`` of a stream, of the present episode."""
+    return generator(episodes.seed[e], episodes.episode[e], stream, index)
+
+
+@wp.func
+def rest_joint(body: Body, e: int, b: int):
+    """Return the position of a joint in the rest pose [m]."""
+    return body.rest_joint[row(e, body.rest_joint.shape[0]), b]
 
 
 class EpisodeArrays:
@@ -37,6 +98,9 @@ class EpisodeArrays:
             world as a passive body: its actions count as zero (targets: the rest pose), nothing holds its root, its
             reward is zero.
         truncated: ``(num_envs,)`` bool, the clock has run out for agents that are still alive.
+        episodes, outcome: the arrays that a task's kernels read and write, as structs.
+        bones: tracked bones of every agent, as structs.
+        props, first_props: motion of the props, now and after a reset, as structs.
     """
 
     def __init__(
@@ -77,6 +141,10 @@ class EpisodeArrays:
         # a launch takes no array without columns
         self.terms, self.cost_terms, self.metrics = (self._zeros((*agents, max(1, count)), float) for count in names)
         self.terminated, self.success, self.alive = (self._zeros(agents, wp.bool) for _ in range(3))
+        props = simulation.props
+        self.episodes, self.outcome = fill(Episodes(), self), fill(Outcome(), self)
+        self.bones = [fill(Bones(), avatar.tracked, body=avatar.body) for avatar in simulation.avatars]
+        self.props, self.first_props = (fill(Props(), motion, props) for motion in (props.state, props.initial))
 
     def _zeros(self, shape: int | tuple[int, ...], dtype: type) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)

@@ -5,9 +5,10 @@ In the form of PettingZoo's own games: ``high_five_v0.parallel_env()``. For the 
 """
 
 from piavatar_envs.multi import Game
-from piavatar_envs.tasks.games.high_five import HighFiveTask as TASK
+from piavatar_envs.tasks.games.high_five import HighFiveTask
 
 __all__ = ["TASK", "env", "parallel_env"]
 
+TASK = HighFiveTask
 _game = Game("high_five_v0", TASK)
 parallel_env, env = _game.parallel_env, _game.env

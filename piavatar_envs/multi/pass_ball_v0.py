@@ -5,9 +5,10 @@ In the form of PettingZoo's own games: ``pass_ball_v0.parallel_env()``. For the 
 """
 
 from piavatar_envs.multi import Game
-from piavatar_envs.tasks.games.pass_ball import PassBallTask as TASK
+from piavatar_envs.tasks.games.pass_ball import PassBallTask
 
 __all__ = ["TASK", "env", "parallel_env"]
 
+TASK = PassBallTask
 _game = Game("pass_ball_v0", TASK)
 parallel_env, env = _game.parallel_env, _game.env

@@ -12,9 +12,10 @@ from piavatar_envs.avatar.body.skeleton import BODY_PARTS
 from piavatar_envs.avatar.rotation import quat_exp, quat_log
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import EnvConfig, PropConfig, SceneConfig, replace
-from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.core.rng import STREAM_BALL
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec, speed_within
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.observer import clear_stress, observe_stress
 from piavatar_envs.envs.parameters import Drawn
@@ -105,9 +106,9 @@ def keep_place(
 
 
 @wp.func
-def first_throw(throws: Throws, seed: int, episode: int):
+def first_throw(throws: Throws, episodes: Episodes, e: int):
     """Return the control step of an episode's first throw, in the first half of an interval."""
-    random = generator(seed, episode, STREAM_BALL, _TIME)
+    random = random_of(episodes, e, STREAM_BALL, _TIME)
     return wp.randi(random, 1, throws.interval // 2 + 2)
 
 
@@ -122,18 +123,12 @@ def steps_to_throw(throws: Throws, first: int, step: int, ball: int):
 @wp.kernel
 def throw_balls(
     throws: Throws,
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    step_count: wp.array(dtype=int),
-    failure: wp.array(dtype=int),
-    joints: wp.array2d(dtype=wp.vec3),
-    ball_position: wp.array2d(dtype=wp.vec3),
-    ball_velocity: wp.array2d(dtype=wp.vec3),
+    episodes: Episodes,
+    bones: Bones,
+    props: Props,
     # out
     placed: wp.array2d(dtype=wp.bool),
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    spin: wp.array2d(dtype=wp.vec3),
+    first: Props,
 ):
     """Flag the balls that are placed before this step, over ``(E, num_balls)``.
 
@@ -142,70 +137,61 @@ def throw_balls(
     """
     e, ball = wp.tid()
     placed[e, ball] = False
-    if failure[e] != 0:
+    if episodes.failure[e] != 0:
         return
-    first = first_throw(throws, seed[e], episode[e])
-    due = steps_to_throw(throws, first, step_count[e], ball) == 0
-    number = (step_count[e] - first) // throws.interval
-    random = generator(seed[e], episode[e], STREAM_BALL, MASSES + throws.num_balls + number)
-    placed[e, ball] = throw_or_catch(
-        throws, due, random, e, ball, joints, ball_position, ball_velocity, position, velocity, spin
-    )
+    begin = first_throw(throws, episodes, e)
+    due = steps_to_throw(throws, begin, episodes.step_count[e], ball) == 0
+    number = (episodes.step_count[e] - begin) // throws.interval
+    random = random_of(episodes, e, STREAM_BALL, MASSES + throws.num_balls + number)
+    placed[e, ball] = throw_or_catch(throws, due, random, e, ball, bones, props, first)
 
 
 @wp.kernel
 def judge_pose(
     rule: Rule,
-    body: Body,
-    local: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
+    outcome: Outcome,
 ):
     """Reward standing in the rest pose and in the place."""
     e = wp.tid()
-    bones = local.shape[1]
-    angle = wp.length(quat_log(wp.quat_inverse(quat_exp(wp.vec3(0.0, 0.0, rule.place[2]))) * local[e, 0]))
-    for b in range(1, bones):
-        angle += wp.length(quat_log(local[e, b]))
-    angle /= float(bones)
-    off = position[e, 0] - pelvis_at(rule.place, body, e)
+    count = bones.local.shape[1]
+    angle = wp.length(quat_log(wp.quat_inverse(quat_exp(wp.vec3(0.0, 0.0, rule.place[2]))) * bones.local[e, 0]))
+    for b in range(1, count):
+        angle += wp.length(quat_log(bones.local[e, b]))
+    angle /= float(count)
+    off = bones.position[e, 0] - pelvis_at(rule.place, bones.body, e)
     distance = wp.length(wp.vec2(off[0], off[1]))
-    terms[e, 0, 0] = 0.6 * tolerance(angle, 0.05, rule.pose_margin)
-    terms[e, 0, 1] = 0.4 * tolerance(distance, 0.02, rule.place_margin)
-    terms[e, 0, 2] = -rule.control_cost * mean_square_action(action, e, 0)
-    metrics[e, 0, 0] = wp.degrees(angle)
-    metrics[e, 0, 1] = distance
+    outcome.terms[e, 0, 0] = 0.6 * tolerance(angle, 0.05, rule.pose_margin)
+    outcome.terms[e, 0, 1] = 0.4 * tolerance(distance, 0.02, rule.place_margin)
+    outcome.terms[e, 0, 2] = -rule.control_cost * mean_square_action(action, e, 0)
+    outcome.metrics[e, 0, 0] = wp.degrees(angle)
+    outcome.metrics[e, 0, 1] = distance
 
 
 @wp.kernel
 def judge_hits(
     rule: Rule,
     throws: Throws,
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    step_count: wp.array(dtype=int),
+    episodes: Episodes,
     sensors: Sensors,
     stress: wp.array3d(dtype=float),
     # in and out
     struck: wp.array2d(dtype=int),
     hits: wp.array(dtype=int),
     # out
-    cost_terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Count and cost hits, each ball once a throw. The step counter is still the one of the throw."""
     e = wp.tid()
-    first = first_throw(throws, seed[e], episode[e])
+    first = first_throw(throws, episodes, e)
     total = float(0.0)
     missed = bool(True)
     for ball in range(throws.num_balls):
         size = wp.length(sensors.pair_impulse[e, rule.first_ball + ball])
         total += size
-        if steps_to_throw(throws, first, step_count[e], ball) == 0:
+        if steps_to_throw(throws, first, episodes.step_count[e], ball) == 0:
             struck[e, ball] = 0
         if struck[e, ball] == 0 and size > rule.hit_impulse:
             struck[e, ball] = 1
@@ -214,21 +200,19 @@ def judge_hits(
     peak = float(0.0)
     for part in range(_ABOVE_LEGS):
         peak = wp.max(peak, stress[e, 0, part])
-    cost_terms[e, 0, 0] = total / rule.impulse_scale
-    cost_terms[e, 0, 1] = wp.max(peak / rule.stress_limit - 1.0, 0.0)
-    metrics[e, 0, 2] = total
-    metrics[e, 0, 3] = peak
-    metrics[e, 0, 4] = float(hits[e])
-    success[e, 0] = missed
+    outcome.cost_terms[e, 0, 0] = total / rule.impulse_scale
+    outcome.cost_terms[e, 0, 1] = wp.max(peak / rule.stress_limit - 1.0, 0.0)
+    outcome.metrics[e, 0, 2] = total
+    outcome.metrics[e, 0, 3] = peak
+    outcome.metrics[e, 0, 4] = float(hits[e])
+    outcome.success[e, 0] = missed
 
 
 @wp.kernel
 def observe_throws(
     throws: Throws,
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    step_count: wp.array(dtype=int),
-    density: wp.array2d(dtype=float),
+    episodes: Episodes,
+    props: Props,
     control_dt: float,
     agent: int,
     start: int,
@@ -237,27 +221,25 @@ def observe_throws(
 ):
     """Write the time to the next throw of every ball [s], then their masses [kg]; over ``(E, num_balls)``."""
     e, ball = wp.tid()
-    first = first_throw(throws, seed[e], episode[e])
-    steps = steps_to_throw(throws, first, step_count[e], ball)
+    first = first_throw(throws, episodes, e)
+    steps = steps_to_throw(throws, first, episodes.step_count[e], ball)
     observation[e, agent, start + ball] = control_dt * float(steps)
-    observation[e, agent, start + throws.num_balls + ball] = throws.volume * density[e, ball]
+    observation[e, agent, start + throws.num_balls + ball] = throws.volume * props.density[e, ball]
 
 
 @wp.kernel
 def observe_place(
     rule: Rule,
-    body: Body,
+    bones: Bones,
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
     # out
     observation: wp.array3d(dtype=float),
 ):
     """Write the place from the pelvis."""
     e = wp.tid()
-    way = pelvis_at(rule.place, body, e) - position[e, 0]
-    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(rotation[e, 0]), way))
+    way = pelvis_at(rule.place, bones.body, e) - bones.position[e, 0]
+    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(bones.rotation[e, 0]), way))
 
 
 class DodgeTask(Task):
@@ -367,36 +349,27 @@ earns all the reward, and every ball hits it. The root can be steered up to `roo
         avatar, props = env.simulation.avatar, env.simulation.props
         inputs = [self.rule, avatar.body, avatar.state.command_root]
         graph.launch(keep_place, env.num_envs, inputs, [self.reference_root])
-        clocks, now, spawn = [env.seed, env.episode, env.step_count, env.failure], props.state, props.initial
-        graph.launch(
-            throw_balls,
-            self.placed.shape,
-            [self.throws, *clocks, avatar.tracked.position, now.position, now.velocity],
-            [self.placed, spawn.position, spawn.velocity, spawn.spin],
-        )
+        inputs = [self.throws, env.episodes, env.bones[0], env.props]
+        graph.launch(throw_balls, self.placed.shape, inputs, [self.placed, env.first_props])
         for ball in range(self.config.num_balls):
             props.record_place(graph, env.simulation.state, self.placed[:, ball], ball)
         return [(avatar.state.command_rotation, self.reference_root)]
 
     def record_outcome(self, env, graph) -> None:
-        sim, avatar, tracked = env.simulation, env.simulation.avatar, env.simulation.avatar.tracked
-        inputs = [self.rule, avatar.body, tracked.local, tracked.position, env.action]
-        graph.launch(judge_pose, env.num_envs, inputs, [env.terms, env.metrics])
+        sim, avatar = env.simulation, env.simulation.avatar
+        graph.launch(judge_pose, env.num_envs, [self.rule, env.bones[0], env.action], [env.outcome])
         graph.launch(clear_stress, (env.num_envs, len(BODY_PARTS)), [env.observer.all_envs, 0, 0], [self.stress])
         per_modulus = 1.0 / sim.flesh[0].physics.young_modulus
         inputs = [env.observer.all_envs, avatar.body, sim.model.particles, sim.state.F, self.part, 0, 0, per_modulus]
         graph.launch(observe_stress, env.num_envs * avatar.num_points, inputs, [self.stress])
-        inputs = [self.rule, self.throws, env.seed, env.episode, env.step_count, sim.sensors, self.stress]
-        outputs = [self.struck, self.hits, env.cost_terms, env.metrics, env.success]
-        graph.launch(judge_hits, env.num_envs, inputs, outputs)
+        inputs = [self.rule, self.throws, env.episodes, sim.sensors, self.stress]
+        graph.launch(judge_hits, env.num_envs, inputs, [self.struck, self.hits, env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
-        avatar, dt = env.simulation.avatar, self.config.physics.control_dt
-        inputs = [self.throws, env.seed, env.episode, env.step_count, env.simulation.props.density, dt, agent, start]
+        inputs = [self.throws, env.episodes, env.props, self.config.physics.control_dt, agent, start]
         graph.launch(observe_throws, self.placed.shape, inputs, [env.observation])
         start += 2 * self.config.num_balls
-        inputs = [self.rule, avatar.body, agent, start, avatar.tracked.rotation, avatar.tracked.position]
-        graph.launch(observe_place, env.num_envs, inputs, [env.observation])
+        graph.launch(observe_place, env.num_envs, [self.rule, env.bones[agent], agent, start], [env.observation])
 
 
 TASK = DodgeTask

@@ -10,12 +10,11 @@ from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import JOINT_NAMES, NUM_JOINTS, joint_index
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ControlConfig, EnvConfig, TorqueControlConfig
-from piavatar_envs.core.rng import STREAM_POSE, STREAM_TASK, generator
+from piavatar_envs.core.rng import STREAM_POSE, STREAM_TASK
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of, rest_joint
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
-from piavatar_envs.mpm.types import row
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.sim.scene import Domain
 from piavatar_envs.tasks.common.ranges import Margin, Weight
@@ -108,9 +107,7 @@ def first_poses(device: str) -> wp.array:
 
 @wp.kernel
 def spawn_lying(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     rule: Lying,
     lower: wp.array(dtype=wp.vec3),
     upper: wp.array(dtype=wp.vec3),
@@ -123,9 +120,9 @@ def spawn_lying(
 ):
     """Draw one of :func:`first_poses`, over ``place`` (x, y [m]), turned about the vertical; over ``(E, bones)``."""
     e, b = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
-    random = generator(seed[e], episode[e], STREAM_TASK, 0)
+    random = random_of(episodes, e, STREAM_TASK, 0)
     side = wp.where(wp.randf(random) < rule.face_up, 1, 0)
     turn = wp.randf(random, -_HALF, _HALF)
     pose = int(0)
@@ -137,7 +134,7 @@ def spawn_lying(
         command_root[e] = wp.vec3(place[0], place[1], 0.0)
         lies_up[e] = float(side)
         return
-    random = generator(seed[e], episode[e], STREAM_POSE, b)
+    random = random_of(episodes, e, STREAM_POSE, b)
     v += rule.pose_noise * wp.vec3(
         wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0)
     )
@@ -146,9 +143,7 @@ def spawn_lying(
 
 @wp.kernel
 def lead_up(
-    body: Body,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     # in and out
     reference_rotation: wp.array2d(dtype=wp.quat),
     reference_root: wp.array(dtype=wp.vec3),
@@ -161,10 +156,10 @@ def lead_up(
     if b > 0:
         reference_rotation[e, b] = wp.quat_identity()
         return
-    at = position[e, 0]
-    height = body.rest_joint[row(e, body.rest_joint.shape[0]), 0][2]
+    at = bones.position[e, 0]
+    height = rest_joint(bones.body, e, 0)[2]
     reference_root[e] = wp.vec3(at[0], at[1], wp.min(at[2] + LEAD, height))
-    q = rotation[e, 0]
+    q = bones.rotation[e, 0]
     up = wp.quat_rotate(q, wp.vec3(0.0, 0.0, 1.0))
     axis = wp.cross(up, wp.vec3(0.0, 0.0, 1.0))
     angle = wp.atan2(wp.length(axis), up[2])
@@ -173,12 +168,12 @@ def lead_up(
 
 
 @wp.func
-def feet_off(body: Body, e: int, position: wp.array2d(dtype=wp.vec3)):
+def feet_off(bones: Bones, e: int):
     """Return the mean horizontal distance of the ankles from the pelvis, over its height in the rest pose."""
-    at = position[e, 0]
-    left, right = position[e, _LEFT] - at, position[e, _RIGHT] - at
+    at = bones.position[e, 0]
+    left, right = bones.position[e, _LEFT] - at, bones.position[e, _RIGHT] - at
     apart = 0.5 * (wp.length(wp.vec2(left[0], left[1])) + wp.length(wp.vec2(right[0], right[1])))
-    return apart / body.rest_joint[row(e, body.rest_joint.shape[0]), 0][2]
+    return apart / rest_joint(bones.body, e, 0)[2]
 
 
 @wp.kernel
@@ -186,16 +181,10 @@ def judge_rising(
     rule: Upright,
     still: Still,
     feet_margin: float,
-    body: Body,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    local: wp.array2d(dtype=wp.quat),
+    bones: Bones,
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward getting up and standing still, wherever that is.
 
@@ -204,35 +193,33 @@ def judge_rising(
     body stands, or bending the knees would cost more than it gains.
     """
     e = wp.tid()
-    now = posture_of(rule, body, e, rotation, position)
-    speed = wp.length(velocity[e, 0])
-    angle = mean_angle(local, e)
+    now = posture_of(rule, bones, e)
+    speed = wp.length(bones.velocity[e, 0])
+    angle = mean_angle(bones, e)
     stands = now.high * now.straight
     high = wp.sqrt(wp.clamp(now.head, 0.0, 1.0) * wp.clamp(now.pelvis, 0.0, 1.0))
-    terms[e, 0, 0] = 0.5 * high
-    terms[e, 0, 1] = 0.2 * tolerance(feet_off(body, e, position), _FEET_BOUND, feet_margin)
-    terms[e, 0, 2] = 0.15 * stands * stillness(still, speed)
-    terms[e, 0, 3] = 0.15 * stands * restfulness(still, angle)
-    write_standing(rule, now, speed, e, action, terms, metrics, success)
+    outcome.terms[e, 0, 0] = 0.5 * high
+    outcome.terms[e, 0, 1] = 0.2 * tolerance(feet_off(bones, e), _FEET_BOUND, feet_margin)
+    outcome.terms[e, 0, 2] = 0.15 * stands * stillness(still, speed)
+    outcome.terms[e, 0, 3] = 0.15 * stands * restfulness(still, angle)
+    write_standing(rule, now, speed, e, action, outcome)
 
 
 @wp.kernel
 def judge_hold(
     steps: int,
     control_dt: float,
-    failure: wp.array(dtype=int),
+    episodes: Episodes,
     # in and out: success is standing, and becomes having stood long enough
     held: wp.array(dtype=int),
-    success: wp.array2d(dtype=wp.bool),
-    # out
-    metrics: wp.array3d(dtype=float),
+    outcome: Outcome,
 ):
     """Count the control steps for which the avatar has been standing without a break."""
     e = wp.tid()
-    if failure[e] == 0:
-        held[e] = wp.where(success[e, 0], held[e] + 1, 0)
-    success[e, 0] = held[e] >= steps
-    metrics[e, 0, _HELD] = control_dt * float(held[e])
+    if episodes.failure[e] == 0:
+        held[e] = wp.where(outcome.success[e, 0], held[e] + 1, 0)
+    outcome.success[e, 0] = held[e] >= steps
+    outcome.metrics[e, 0, _HELD] = control_dt * float(held[e])
 
 
 _STANDING = (
@@ -315,7 +302,7 @@ to learn."""
         graph.launch(
             spawn_lying,
             (env.num_envs, NUM_JOINTS),
-            [env.mask, env.seed, env.episode, self.lying, limits.lower, limits.upper, self.poses, place],
+            [env.episodes, self.lying, limits.lower, limits.upper, self.poses, place],
             [state.command_rotation, state.command_root, self.lies_up],
         )
         self.grounding.record_reset(env, graph)
@@ -323,22 +310,15 @@ to learn."""
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         if env.control == "pose":
             return super().record_references(env, graph)
-        avatar, reference = env.simulation.avatar, (self.reference_rotation, self.reference_root)
-        inputs = [avatar.body, avatar.tracked.rotation, avatar.tracked.position]
-        graph.launch(lead_up, (env.num_envs, NUM_JOINTS), inputs, list(reference))
+        reference = self.reference_rotation, self.reference_root
+        graph.launch(lead_up, (env.num_envs, NUM_JOINTS), [env.bones[0]], list(reference))
         return [reference]
 
     def record_outcome(self, env, graph) -> None:
-        avatar, t, config = env.simulation.avatar, env.simulation.avatar.tracked, self.config
-        tracked = [t.rotation, t.position, t.velocity, t.local]
-        graph.launch(
-            judge_rising,
-            env.num_envs,
-            [self.rule, self.still, config.feet_margin, avatar.body, *tracked, env.action],
-            [env.terms, env.metrics, env.success],
-        )
-        inputs = [self.steps, config.physics.control_dt, env.failure]
-        graph.launch(judge_hold, env.num_envs, inputs, [self.held, env.success, env.metrics])
+        inputs = [self.rule, self.still, self.config.feet_margin, env.bones[0], env.action]
+        graph.launch(judge_rising, env.num_envs, inputs, [env.outcome])
+        inputs = [self.steps, self.config.physics.control_dt, env.episodes]
+        graph.launch(judge_hold, env.num_envs, inputs, [self.held, env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         record_observe_upright(env, graph, agent, start)

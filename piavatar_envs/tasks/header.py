@@ -10,11 +10,11 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import joint_index
-from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ControlConfig, PoseControlConfig, SceneConfig
 from piavatar_envs.config.schema import Place
-from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.core.rng import STREAM_BALL
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, Episodes, Props, random_of
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.task import TaskArray
 from piavatar_envs.tasks.common.ball_goal import GATE_TERMS, Ball, GateConfig, GateTask, turn_and_weigh
@@ -71,38 +71,31 @@ def falling_time(height: float, gravity: float):
 
 @wp.kernel
 def throw_ball(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     ball: Ball,
     fall: Fall,
     # out
-    position: wp.array2d(dtype=wp.vec3),
-    rotation: wp.array2d(dtype=wp.quat),
-    velocity: wp.array2d(dtype=wp.vec3),
-    density: wp.array2d(dtype=float),
+    first: Props,
 ):
     """Draw a ball that comes down to its place with a small speed to the side, in the masked environments."""
     e = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
-    random = generator(seed[e], episode[e], STREAM_BALL, 0)
+    random = random_of(episodes, e, STREAM_BALL, 0)
     offset = wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
     drift = fall.speed * wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
     height = wp.randf(random, fall.low, fall.high)
     time = falling_time(height - ball.place[2], fall.gravity)
     start = ball.place + ball.jitter * offset - time * drift
     start[2] = height
-    position[e, ball.prop] = start
-    velocity[e, ball.prop] = drift
-    turn_and_weigh(random, e, ball, rotation, density)
+    first.position[e, ball.prop] = start
+    first.velocity[e, ball.prop] = drift
+    turn_and_weigh(random, e, ball, first)
 
 
 @wp.kernel
 def find_head(
-    body: Body,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     ball: wp.array(dtype=wp.vec3),
     ball_radius: float,
     # out
@@ -111,7 +104,7 @@ def find_head(
 ):
     """Find the middle of the head, and the distance of the ball's surface from the head's [m]."""
     e = wp.tid()
-    middle = flesh_middle(body, e, _HEAD, rotation, position)
+    middle = flesh_middle(bones, e, _HEAD)
     head[e] = middle
     gap[e] = wp.length(ball[e] - middle) - ball_radius - HEAD_RADIUS
 
@@ -120,7 +113,7 @@ def find_head(
 def observe_head(
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
+    bones: Bones,
     head: wp.array(dtype=wp.vec3),
     ball: wp.array(dtype=wp.vec3),
     # out
@@ -128,7 +121,7 @@ def observe_head(
 ):
     """Write the ball from the head from component ``start``."""
     e = wp.tid()
-    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(rotation[e, 0]), ball[e] - head[e]))
+    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(bones.rotation[e, 0]), ball[e] - head[e]))
 
 
 class HeaderTask(GateTask):
@@ -181,20 +174,16 @@ at most 1, half of it for the goal."""
         self.fall = fill(Fall(), config.physics, speed=config.ball_speed, low=low, high=high)
 
     def record_ball(self, env, graph) -> None:
-        spawn, density = env.simulation.props.initial, env.simulation.props.density
-        inputs = [env.mask, env.seed, env.episode, self.ball, self.fall]
-        graph.launch(throw_ball, env.num_envs, inputs, [spawn.position, spawn.rotation, spawn.velocity, density])
+        graph.launch(throw_ball, env.num_envs, [env.episodes, self.ball, self.fall], [env.first_props])
 
     def record_gap(self, env, graph) -> None:
-        avatar, ball = env.simulation.avatar, self.ball_column(env, "position")
-        inputs = [avatar.body, avatar.tracked.rotation, avatar.tracked.position, ball, self.config.ball_radius]
+        inputs = [env.bones[0], self.ball_column(env, "position"), self.config.ball_radius]
         graph.launch(find_head, env.num_envs, inputs, [self.head, self.gap])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         start = self.record_gate_terms(env, graph, agent, start)
         self.record_gap(env, graph)
-        rotation = env.simulation.avatars[agent].tracked.rotation
-        inputs = [agent, start, rotation, self.head, self.ball_column(env, "position")]
+        inputs = [agent, start, env.bones[agent], self.head, self.ball_column(env, "position")]
         graph.launch(observe_head, env.num_envs, inputs, [env.observation])
 
 

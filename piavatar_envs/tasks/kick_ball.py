@@ -11,7 +11,8 @@ from pydantic import Field
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import ControlConfig, PoseControlConfig
 from piavatar_envs.config.schema import Place
-from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.core.rng import STREAM_BALL
+from piavatar_envs.envs.episodes import Bones, Episodes, Props, random_of
 from piavatar_envs.tasks.common.ball_goal import (
     FEET_TERMS,
     GATE_TERMS,
@@ -50,28 +51,24 @@ class KickBallConfig(GateConfig):
 
 @wp.kernel
 def draw_ball(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     ball: Ball,
     # out
-    position: wp.array2d(dtype=wp.vec3),
-    rotation: wp.array2d(dtype=wp.quat),
-    density: wp.array2d(dtype=float),
+    first: Props,
 ):
     """Draw a ball at rest in the masked environments."""
     e = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
-    random = generator(seed[e], episode[e], STREAM_BALL, 0)
+    random = random_of(episodes, e, STREAM_BALL, 0)
     offset = wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
-    position[e, ball.prop] = ball.place + ball.jitter * offset
-    turn_and_weigh(random, e, ball, rotation, density)
+    first.position[e, ball.prop] = ball.place + ball.jitter * offset
+    turn_and_weigh(random, e, ball, first)
 
 
 @wp.kernel
 def find_feet(
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     ball: wp.array(dtype=wp.vec3),
     ball_radius: float,
     # out
@@ -79,8 +76,8 @@ def find_feet(
 ):
     """Find the distance of the nearer foot from the ball's surface [m]."""
     e = wp.tid()
-    left = wp.length(ball[e] - position[e, _LEFT_FOOT])
-    right = wp.length(ball[e] - position[e, _RIGHT_FOOT])
+    left = wp.length(ball[e] - bones.position[e, _LEFT_FOOT])
+    right = wp.length(ball[e] - bones.position[e, _RIGHT_FOOT])
     gap[e] = wp.min(left, right) - ball_radius
 
 
@@ -114,18 +111,15 @@ at most 1, half of it for the goal."""
         return (self.config.ball_radius,)
 
     def record_ball(self, env, graph) -> None:
-        spawn, density = env.simulation.props.initial, env.simulation.props.density
-        inputs = [env.mask, env.seed, env.episode, self.ball]
-        graph.launch(draw_ball, env.num_envs, inputs, [spawn.position, spawn.rotation, density])
+        graph.launch(draw_ball, env.num_envs, [env.episodes, self.ball], [env.first_props])
 
     def record_gap(self, env, graph) -> None:
-        inputs = [env.simulation.avatar.tracked.position, self.ball_column(env, "position"), self.config.ball_radius]
+        inputs = [env.bones[0], self.ball_column(env, "position"), self.config.ball_radius]
         graph.launch(find_feet, env.num_envs, inputs, [self.gap])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         start = self.record_gate_terms(env, graph, agent, start)
-        tracked = env.simulation.avatars[agent].tracked
-        inputs = [agent, start, tracked.rotation, tracked.position, self.ball_column(env, "position")]
+        inputs = [agent, start, env.bones[agent], self.ball_column(env, "position")]
         graph.launch(observe_feet, env.num_envs, inputs, [env.observation])
 
 

@@ -11,12 +11,12 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.rotation import quat_exp, quat_log, turn_about_z
-from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ConfigError, EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.config.schema import Length
-from piavatar_envs.core.rng import STREAM_TASK, generator
+from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
@@ -95,28 +95,24 @@ class Push:
 
 @wp.kernel
 def draw_push(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     push: Push,
     # out
-    position: wp.array2d(dtype=wp.vec3),
-    rotation: wp.array2d(dtype=wp.quat),
-    density: wp.array2d(dtype=float),
+    first: Props,
     target: wp.array(dtype=wp.vec3),
     way: wp.array(dtype=float),
 ):
     """Draw a box in front of the avatar, its mass, its target, and the distance between them [m]."""
     e = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
-    random = generator(seed[e], episode[e], STREAM_TASK, 0)
+    random = random_of(episodes, e, STREAM_TASK, 0)
     out = wp.randf(random, push.box_distance[0], push.box_distance[1]) * forward_of(push.place[2])
     at = wp.vec3(push.place[0] + out[0], push.place[1] + out[1], push.box_half_size[2])
-    position[e, push.box] = at
+    first.position[e, push.box] = at
     turn = push.place[2] + wp.randf(random, -push.box_turn, push.box_turn)
-    rotation[e, push.box] = quat_exp(wp.vec3(0.0, 0.0, turn))
-    density[e, push.box] = wp.randf(random, push.box_mass[0], push.box_mass[1]) / push.volume
+    first.rotation[e, push.box] = quat_exp(wp.vec3(0.0, 0.0, turn))
+    first.density[e, push.box] = wp.randf(random, push.box_mass[0], push.box_mass[1]) / push.volume
     way[e] = wp.randf(random, push.target_distance[0], push.target_distance[1])
     to = at + way[e] * forward_of(push.place[2] + wp.randf(random, -push.target_angle, push.target_angle))
     target[e] = wp.vec3(to[0], to[1], 0.0)
@@ -124,15 +120,13 @@ def draw_push(
 
 @wp.kernel
 def find_hands(
-    body: Body,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     # out
     hands: wp.array2d(dtype=wp.vec3),
 ):
     """Find the middles of both hands in the world."""
     e = wp.tid()
-    write_hands(body, e, rotation, position, hands)
+    write_hands(bones, e, hands)
 
 
 @wp.func
@@ -144,35 +138,33 @@ def to_go(box: wp.vec3, target: wp.vec3):
 @wp.kernel
 def judge(
     push: Push,
-    box_position: wp.array2d(dtype=wp.vec3),
-    box_rotation: wp.array2d(dtype=wp.quat),
-    box_velocity: wp.array2d(dtype=wp.vec3),
+    props: Props,
     hands: wp.array2d(dtype=wp.vec3),
     target: wp.array(dtype=wp.vec3),
     way: wp.array(dtype=float),
     sensors: Sensors,
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward a box near its target and hands near the box."""
     e = wp.tid()
-    distance = wp.length(to_go(box_position[e, push.box], target[e]))
+    distance = wp.length(to_go(props.position[e, push.box], target[e]))
     near = float(0.0)
     for hand in range(2):
-        p = wp.quat_rotate_inv(box_rotation[e, push.box], hands[e, hand] - box_position[e, push.box])
+        p = wp.quat_rotate_inv(props.rotation[e, push.box], hands[e, hand] - props.position[e, push.box])
         gap = wp.max(solid_distance(BOX, push.box_half_size, p)[3], 0.0)
         near += 0.5 * tolerance(gap, 0.1, push.hand_margin)
-        metrics[e, 0, 1 + hand] = gap
-    terms[e, 0, 0] = 0.8 * tolerance(distance, push.target_radius, wp.max(way[e] - push.target_radius, LEAST_MARGIN))
-    terms[e, 0, 1] = 0.2 * near
-    terms[e, 0, 2] = -push.control_cost * mean_square_action(action, e, 0)
-    metrics[e, 0, 0] = distance
-    metrics[e, 0, 3] = wp.length(box_velocity[e, push.box])
-    metrics[e, 0, 4] = wp.length(sensors.pair_impulse[e, push.pair])
-    success[e, 0] = distance <= push.target_radius
+        outcome.metrics[e, 0, 1 + hand] = gap
+    outcome.terms[e, 0, 0] = 0.8 * tolerance(
+        distance, push.target_radius, wp.max(way[e] - push.target_radius, LEAST_MARGIN)
+    )
+    outcome.terms[e, 0, 1] = 0.2 * near
+    outcome.terms[e, 0, 2] = -push.control_cost * mean_square_action(action, e, 0)
+    outcome.metrics[e, 0, 0] = distance
+    outcome.metrics[e, 0, 3] = wp.length(props.velocity[e, push.box])
+    outcome.metrics[e, 0, 4] = wp.length(sensors.pair_impulse[e, push.pair])
+    outcome.success[e, 0] = distance <= push.target_radius
 
 
 @wp.kernel
@@ -180,10 +172,8 @@ def observe(
     push: Push,
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    box_position: wp.array2d(dtype=wp.vec3),
-    density: wp.array2d(dtype=float),
+    bones: Bones,
+    props: Props,
     hands: wp.array2d(dtype=wp.vec3),
     target: wp.array(dtype=wp.vec3),
     # out
@@ -191,21 +181,20 @@ def observe(
 ):
     """Write all but the last of ``PushBoxTask.observation_terms`` from component ``start``."""
     e = wp.tid()
-    to_root = wp.quat_inverse(rotation[e, 0])
-    box = box_position[e, push.box]
-    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, target[e] - position[e, 0]))
+    to_root = wp.quat_inverse(bones.rotation[e, 0])
+    box = props.position[e, push.box]
+    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, target[e] - bones.position[e, 0]))
     write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, to_go(box, target[e])))
     write_vector(observation, e, agent, start + 6, wp.quat_rotate(to_root, box - hands[e, 0]))
     write_vector(observation, e, agent, start + 9, wp.quat_rotate(to_root, box - hands[e, 1]))
-    observation[e, agent, start + 12] = push.volume * density[e, push.box]
+    observation[e, agent, start + 12] = push.volume * props.density[e, push.box]
 
 
 @wp.kernel
 def observe_lead(
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     command_rotation: wp.array2d(dtype=wp.quat),
     command_root: wp.array(dtype=wp.vec3),
     # out
@@ -213,8 +202,8 @@ def observe_lead(
 ):
     """Write the command's lead on the pelvis: to its left and backwards [m], and its turn [rad]."""
     e = wp.tid()
-    heading = turn_about_z(rotation[e, 0])
-    lead = wp.quat_rotate_inv(heading, command_root[e] - position[e, 0])
+    heading = turn_about_z(bones.rotation[e, 0])
+    lead = wp.quat_rotate_inv(heading, command_root[e] - bones.position[e, 0])
     turn = quat_log(turn_about_z(command_rotation[e, 0]) * wp.quat_inverse(heading))
     write_vector(observation, e, agent, start, wp.vec3(lead[0], lead[1], turn[2]))
 
@@ -338,32 +327,27 @@ each action the command is clamped to within 0.1 m and 0.3 rad of the body."""
 
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
-        spawn, density = env.simulation.props.initial, env.simulation.props.density
-        outputs = [spawn.position, spawn.rotation, density, self.target, self.way]
-        graph.launch(draw_push, env.num_envs, [env.mask, env.seed, env.episode, self.push], outputs)
+        outputs = [env.first_props, self.target, self.way]
+        graph.launch(draw_push, env.num_envs, [env.episodes, self.push], outputs)
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         return record_root_clamp(env, graph, ROOT_LEAD, ROOT_TURN_LEAD)
 
     def _record_hands(self, env, graph) -> None:
-        avatar = env.simulation.avatar
-        inputs = [avatar.body, avatar.tracked.rotation, avatar.tracked.position]
-        graph.launch(find_hands, env.num_envs, inputs, [self.hands])
+        graph.launch(find_hands, env.num_envs, [env.bones[0]], [self.hands])
 
     def record_outcome(self, env, graph) -> None:
         self._record_hands(env, graph)
-        box = env.simulation.props.state
-        seen = [box.position, box.rotation, box.velocity, self.hands, self.target, self.way, env.simulation.sensors]
-        graph.launch(judge, env.num_envs, [self.push, *seen, env.action], [env.terms, env.metrics, env.success])
+        inputs = [self.push, env.props, self.hands, self.target, self.way, env.simulation.sensors, env.action]
+        graph.launch(judge, env.num_envs, inputs, [env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_hands(env, graph)
-        avatar, props = env.simulation.avatar, env.simulation.props
-        here = [avatar.tracked.rotation, avatar.tracked.position]
-        inputs = [self.push, agent, start, *here, props.state.position, props.density, self.hands, self.target]
+        state, bones = env.simulation.avatar.state, env.bones[agent]
+        inputs = [self.push, agent, start, bones, env.props, self.hands, self.target]
         graph.launch(observe, env.num_envs, inputs, [env.observation])
         last = start + sum(term.size for term in self.observation_terms[:-1])
-        inputs = [agent, last, *here, avatar.state.command_rotation, avatar.state.command_root]
+        inputs = [agent, last, bones, state.command_rotation, state.command_root]
         graph.launch(observe_lead, env.num_envs, inputs, [env.observation])
 
     def markers(self, env, index: int) -> list[Marker]:

@@ -10,7 +10,8 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.config import ControlConfig, EnvConfig, PropConfig, SceneConfig, TorqueControlConfig, replace
-from piavatar_envs.core.rng import STREAM_BALL, STREAM_DISTURBANCE, generator
+from piavatar_envs.core.rng import STREAM_BALL, STREAM_DISTURBANCE
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, TaskArray
@@ -76,45 +77,37 @@ class PushRecoveryConfig(EnvConfig):
 
 
 @wp.func
-def moment_of(throws: Throws, seed: int, episode: int, number: int):
+def moment_of(throws: Throws, episodes: Episodes, e: int, number: int):
     """Return the control step of a push: one in the first half of every interval, never in its first step."""
-    random = generator(seed, episode, STREAM_DISTURBANCE, number)
+    random = random_of(episodes, e, STREAM_DISTURBANCE, number)
     return number * throws.interval + wp.randi(random, 1, throws.interval // 2 + 2)
 
 
 @wp.kernel
 def throw_push(
     throws: Throws,
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    step_count: wp.array(dtype=int),
-    failure: wp.array(dtype=int),
-    joints: wp.array2d(dtype=wp.vec3),
-    ball_position: wp.array2d(dtype=wp.vec3),
-    ball_velocity: wp.array2d(dtype=wp.vec3),
+    episodes: Episodes,
+    bones: Bones,
+    props: Props,
     # out
     placed: wp.array(dtype=wp.bool),
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    spin: wp.array2d(dtype=wp.vec3),
+    first: Props,
 ):
     """Flag whether the ball is placed before this step: thrown if its moment has come, caught if it flies on."""
     e = wp.tid()
     placed[e] = False
-    if failure[e] != 0:
+    if episodes.failure[e] != 0:
         return
-    number = step_count[e] // throws.interval
-    due = step_count[e] == moment_of(throws, seed[e], episode[e], number)
-    random = generator(seed[e], episode[e], STREAM_BALL, _THROWS + number)
-    placed[e] = throw_or_catch(
-        throws, due, random, e, _BALL, joints, ball_position, ball_velocity, position, velocity, spin
-    )
+    number = episodes.step_count[e] // throws.interval
+    due = episodes.step_count[e] == moment_of(throws, episodes, e, number)
+    random = random_of(episodes, e, STREAM_BALL, _THROWS + number)
+    placed[e] = throw_or_catch(throws, due, random, e, _BALL, bones, props, first)
 
 
 @wp.kernel
 def begin_push(
     placed: wp.array(dtype=wp.bool),
-    velocity: wp.array2d(dtype=wp.vec3),
+    first: Props,
     # in and out
     flying: wp.array(dtype=int),
     push: wp.array(dtype=wp.vec3),
@@ -123,7 +116,7 @@ def begin_push(
     e = wp.tid()
     if placed[e]:
         flying[e] = 0
-        if wp.length_sq(velocity[e, _BALL]) > 0.0:
+        if wp.length_sq(first.velocity[e, _BALL]) > 0.0:
             flying[e] = 1
             push[e] = wp.vec3(0.0)
 
@@ -135,31 +128,26 @@ def judge_push(
     # in and out
     push: wp.array(dtype=wp.vec3),
     strongest: wp.array(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
-    # out
-    metrics: wp.array3d(dtype=float),
+    outcome: Outcome,
 ):
     """Sum the impulses of the last throw, write the metrics, and require a push of ``least`` [N s] for success."""
     e = wp.tid()
     impulse = sensors.pair_impulse[e, _SUBJECT]
     push[e] = push[e] + impulse
     strongest[e] = wp.max(strongest[e], wp.length(push[e]))
-    metrics[e, 0, _FIRST_METRIC] = wp.length(impulse)
-    metrics[e, 0, _FIRST_METRIC + 1] = wp.length(push[e])
-    metrics[e, 0, _FIRST_METRIC + 2] = strongest[e]
-    success[e, 0] = success[e, 0] and strongest[e] >= least
+    outcome.metrics[e, 0, _FIRST_METRIC] = wp.length(impulse)
+    outcome.metrics[e, 0, _FIRST_METRIC + 1] = wp.length(push[e])
+    outcome.metrics[e, 0, _FIRST_METRIC + 2] = strongest[e]
+    outcome.success[e, 0] = outcome.success[e, 0] and strongest[e] >= least
 
 
 @wp.kernel
 def observe_push(
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     flying: wp.array(dtype=int),
-    ball_position: wp.array2d(dtype=wp.vec3),
-    ball_velocity: wp.array2d(dtype=wp.vec3),
+    props: Props,
     # out
     observation: wp.array3d(dtype=float),
 ):
@@ -168,8 +156,8 @@ def observe_push(
     way = wp.vec3(0.0)
     speed = wp.vec3(0.0)
     if flying[e] != 0:
-        way = wp.quat_rotate_inv(rotation[e, 0], ball_position[e, _BALL] - position[e, 0])
-        speed = wp.quat_rotate_inv(rotation[e, 0], ball_velocity[e, _BALL] - velocity[e, 0])
+        way = wp.quat_rotate_inv(bones.rotation[e, 0], props.position[e, _BALL] - bones.position[e, 0])
+        speed = wp.quat_rotate_inv(bones.rotation[e, 0], props.velocity[e, _BALL] - bones.velocity[e, 0])
     write_vector(observation, e, agent, start, way)
     write_vector(observation, e, agent, start + 3, speed)
 
@@ -246,29 +234,20 @@ greatest impulse of the episode so far: sorted by it, episodes show which pushes
         record_balls(env, graph, self.throws)
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
-        props, tracked = env.simulation.props, env.simulation.avatar.tracked
-        now, spawn = props.state, props.initial
-        clocks = [env.seed, env.episode, env.step_count, env.failure]
-        graph.launch(
-            throw_push,
-            env.num_envs,
-            [self.throws, *clocks, tracked.position, now.position, now.velocity],
-            [self.placed, spawn.position, spawn.velocity, spawn.spin],
-        )
-        graph.launch(begin_push, env.num_envs, [self.placed, spawn.velocity], [self.flying, self.push])
-        props.record_place(graph, env.simulation.state, self.placed, 0)
+        inputs = [self.throws, env.episodes, env.bones[0], env.props]
+        graph.launch(throw_push, env.num_envs, inputs, [self.placed, env.first_props])
+        graph.launch(begin_push, env.num_envs, [self.placed, env.first_props], [self.flying, self.push])
+        env.simulation.props.record_place(graph, env.simulation.state, self.placed, 0)
         return super().record_references(env, graph)
 
     def record_outcome(self, env, graph) -> None:
         super().record_outcome(env, graph)
         inputs = [self.config.hit_impulse, env.simulation.sensors]
-        graph.launch(judge_push, env.num_envs, inputs, [self.push, self.strongest, env.success, env.metrics])
+        graph.launch(judge_push, env.num_envs, inputs, [self.push, self.strongest, env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         start = record_observe_upright(env, graph, agent, start)
-        tracked, ball = env.simulation.avatars[agent].tracked, env.simulation.props.state
-        here = [tracked.rotation, tracked.position, tracked.velocity]
-        inputs = [agent, start, *here, self.flying, ball.position, ball.velocity]
+        inputs = [agent, start, env.bones[agent], self.flying, env.props]
         graph.launch(observe_push, env.num_envs, inputs, [env.observation])
 
 

@@ -11,11 +11,11 @@ from pydantic import Field
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import EnvConfig
-from piavatar_envs.core.rng import STREAM_TASK, generator
+from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of, rest_joint
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
-from piavatar_envs.mpm.types import row
 from piavatar_envs.sim.randomize import Parameter
 from piavatar_envs.tasks.common.hands import LEFT_WRIST, RIGHT_WRIST, flesh_middle
 from piavatar_envs.tasks.common.ranges import Margin, Weight
@@ -65,17 +65,15 @@ class Target:
 
 @wp.kernel
 def draw_target(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     # out
     course: wp.array(dtype=wp.vec4),
     phase: wp.array(dtype=wp.vec2),
 ):
     """Draw the parameters :data:`COURSE` and :data:`PHASE`."""
     e = wp.tid()
-    if mask[e]:
-        random = generator(seed[e], episode[e], STREAM_TASK, 0)
+    if episodes.mask[e]:
+        random = random_of(episodes, e, STREAM_TASK, 0)
         azimuth, elevation = wp.randf(random, -SIDE, SIDE), wp.randf(random, BELOW, ABOVE)
         pace, tilt = wp.randf(random, SLOWEST, 1.0), wp.randf(random, 0.0, TURN)
         course[e] = wp.vec4(azimuth, elevation, pace, tilt)
@@ -90,45 +88,39 @@ def goal_at(target: Target, body: Body, e: int, course: wp.vec4, phase: wp.vec2,
     azimuth = course[0] + swing * wp.cos(course[3]) * wp.sin(rate * time + phase[0])
     elevation = course[1] + swing * wp.sin(course[3]) * wp.sin(rate * time + phase[1])
     out = wp.vec3(wp.sin(azimuth) * wp.cos(elevation), -wp.cos(azimuth) * wp.cos(elevation), wp.sin(elevation))
-    return body.rest_joint[row(e, body.rest_joint.shape[0]), target.center] + target.radius * out
+    return rest_joint(body, e, target.center) + target.radius * out
 
 
 @wp.kernel
 def judge(
     target: Target,
-    body: Body,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    step_count: wp.array(dtype=int),
+    bones: Bones,
+    episodes: Episodes,
     course: wp.array(dtype=wp.vec4),
     phase: wp.array(dtype=wp.vec2),
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward the nearer hand. The step counter has not moved yet: the state is one step ahead of it."""
     e = wp.tid()
-    goal = goal_at(target, body, e, course[e], phase[e], target.control_dt * float(step_count[e] + 1))
-    left = wp.length(flesh_middle(body, e, LEFT_WRIST, rotation, position) - goal)
-    right = wp.length(flesh_middle(body, e, RIGHT_WRIST, rotation, position) - goal)
+    goal = goal_at(target, bones.body, e, course[e], phase[e], target.control_dt * float(episodes.step_count[e] + 1))
+    left = wp.length(flesh_middle(bones, e, LEFT_WRIST) - goal)
+    right = wp.length(flesh_middle(bones, e, RIGHT_WRIST) - goal)
     distance = wp.min(left, right)
-    terms[e, 0, 0] = tolerance(distance, target.target_radius, target.margin)
-    terms[e, 0, 1] = -target.control_cost * mean_square_action(action, e, 0)
-    metrics[e, 0, 0] = distance
-    metrics[e, 0, 1] = left
-    metrics[e, 0, 2] = right
-    success[e, 0] = distance <= target.target_radius
+    outcome.terms[e, 0, 0] = tolerance(distance, target.target_radius, target.margin)
+    outcome.terms[e, 0, 1] = -target.control_cost * mean_square_action(action, e, 0)
+    outcome.metrics[e, 0, 0] = distance
+    outcome.metrics[e, 0, 1] = left
+    outcome.metrics[e, 0, 2] = right
+    outcome.success[e, 0] = distance <= target.target_radius
 
 
 @wp.kernel
 def observe(
     target: Target,
-    body: Body,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    step_count: wp.array(dtype=int),
+    bones: Bones,
+    episodes: Episodes,
     course: wp.array(dtype=wp.vec4),
     phase: wp.array(dtype=wp.vec2),
     start: int,
@@ -138,16 +130,16 @@ def observe(
 ):
     """Write the target's position, and ``ReachTask.observation_terms`` from component ``start``."""
     e = wp.tid()
-    time = target.control_dt * float(step_count[e])
-    here = goal_at(target, body, e, course[e], phase[e], time)
-    next = goal_at(target, body, e, course[e], phase[e], time + target.control_dt)
+    time = target.control_dt * float(episodes.step_count[e])
+    here = goal_at(target, bones.body, e, course[e], phase[e], time)
+    next = goal_at(target, bones.body, e, course[e], phase[e], time + target.control_dt)
     goal[e] = here
-    to_root = wp.quat_inverse(rotation[e, 0])
-    write_vector(observation, e, 0, start, wp.quat_rotate(to_root, here - position[e, 0]))
+    to_root = wp.quat_inverse(bones.rotation[e, 0])
+    write_vector(observation, e, 0, start, wp.quat_rotate(to_root, here - bones.position[e, 0]))
     write_vector(observation, e, 0, start + 3, wp.quat_rotate(to_root, (next - here) / target.control_dt))
-    left = flesh_middle(body, e, LEFT_WRIST, rotation, position)
+    left = flesh_middle(bones, e, LEFT_WRIST)
     write_vector(observation, e, 0, start + 6, wp.quat_rotate(to_root, here - left))
-    right = flesh_middle(body, e, RIGHT_WRIST, rotation, position)
+    right = flesh_middle(bones, e, RIGHT_WRIST)
     write_vector(observation, e, 0, start + 9, wp.quat_rotate(to_root, here - right))
 
 
@@ -185,17 +177,14 @@ the middle of either hand to the target and stays with it."""
 
     def allocate(self, env) -> None:
         target = fill(Target(), self.config, self.config.physics, center=joint_index("spine3"))
-        tracked = env.simulation.avatar.tracked
-        self.inputs = [target, env.simulation.avatar.body, tracked.rotation, tracked.position, env.step_count]
-        self.inputs += [self.course, self.phase]
+        self.inputs = [target, env.bones[0], env.episodes, self.course, self.phase]
 
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
-        graph.launch(draw_target, env.num_envs, [env.mask, env.seed, env.episode], [self.course, self.phase])
+        graph.launch(draw_target, env.num_envs, [env.episodes], [self.course, self.phase])
 
     def record_outcome(self, env, graph) -> None:
-        outputs = [env.terms, env.metrics, env.success]
-        graph.launch(judge, env.num_envs, [*self.inputs, env.action], outputs)
+        graph.launch(judge, env.num_envs, [*self.inputs, env.action], [env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         graph.launch(observe, env.num_envs, [*self.inputs, start], [self.goal, env.observation])

@@ -17,9 +17,10 @@ from piavatar_envs.avatar.skinning import bones_of, weights_of
 from piavatar_envs.avatar.torque_control.controller import TorqueController
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ConfigError, EnvConfig
-from piavatar_envs.core.rng import STREAM_DISTURBANCE, STREAM_TASK, generator
+from piavatar_envs.core.rng import STREAM_DISTURBANCE, STREAM_TASK
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionMap, ActionSpec, keep_within
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of, rest_joint
 from piavatar_envs.envs.observations import ObservationTerm, write_rotation, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
@@ -73,15 +74,13 @@ def frame_of(clip: Clip, start: int, step: int):
 @wp.func
 def root_of(clip: Clip, body: Body, e: int, frame: int):
     """Return the clip's root, scaled by the length of the body's legs."""
-    height = body.rest_joint[row(e, body.rest_joint.shape[0]), 0][2]
+    height = rest_joint(body, e, 0)[2]
     return (height / clip.pelvis_height) * clip.root[frame]
 
 
 @wp.kernel
 def draw_start(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     clip: Clip,
     body: Body,
     # out
@@ -92,9 +91,9 @@ def draw_start(
 ):
     """Draw the frame at which the episode enters the clip; the body starts in its pose, over the world's origin."""
     e, b = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
-    random = generator(seed[e], episode[e], STREAM_TASK, 0)
+    random = random_of(episodes, e, STREAM_TASK, 0)
     first = wp.randi(random, 0, clip.starts)
     command_rotation[e, b] = clip.rotation[first, b]
     if b == 0:
@@ -110,7 +109,7 @@ def advance_reference(
     body: Body,
     action_map: ActionMap,
     start: wp.array(dtype=int),
-    step_count: wp.array(dtype=int),
+    episodes: Episodes,
     command_rotation: wp.array2d(dtype=wp.quat),
     command_root: wp.array(dtype=wp.vec3),
     # out
@@ -123,8 +122,8 @@ def advance_reference(
     widened to the clip's own pose.
     """
     e, b = wp.tid()
-    now = frame_of(clip, start[e], step_count[e])
-    after = frame_of(clip, start[e], step_count[e] + 1)
+    now = frame_of(clip, start[e], episodes.step_count[e])
+    after = frame_of(clip, start[e], episodes.step_count[e] + 1)
     step = wp.quat_inverse(clip.rotation[now, b]) * clip.rotation[after, b]
     q = wp.normalize(command_rotation[e, b] * step)
     own = quat_log(clip.rotation[after, b])
@@ -143,46 +142,42 @@ def read_clip(
     body: Body,
     start: wp.array(dtype=int),
     origin: wp.array(dtype=wp.vec3),
-    step_count: wp.array(dtype=int),
+    episodes: Episodes,
     # out
     rotation: wp.array2d(dtype=wp.quat),
     root: wp.array(dtype=wp.vec3),
 ):
     """Read the clip's pose one step ahead of the step counter."""
     e, b = wp.tid()
-    frame = frame_of(clip, start[e], step_count[e] + 1)
+    frame = frame_of(clip, start[e], episodes.step_count[e] + 1)
     rotation[e, b] = clip.rotation[frame, b]
     if b == 0:
         root[e] = root_of(clip, body, e, frame) - origin[e]
 
 
 @wp.func
-def offset_of(seed: int, episode: int, interval: int):
+def offset_of(episodes: Episodes, e: int, interval: int):
     """Return the number of steps already elapsed in the first interval."""
-    random = generator(seed, episode, STREAM_DISTURBANCE, 0)
+    random = random_of(episodes, e, STREAM_DISTURBANCE, 0)
     return wp.randi(random, 0, interval)
 
 
 @wp.kernel
 def draw_offset(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     interval: int,
     # out
     offset: wp.array(dtype=int),
 ):
     """Write the offset of the first impulse, to be observed, in the masked environments."""
     e = wp.tid()
-    if mask[e]:
-        offset[e] = offset_of(seed[e], episode[e], interval)
+    if episodes.mask[e]:
+        offset[e] = offset_of(episodes, e, interval)
 
 
 @wp.kernel
 def draw_impulse(
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
-    step_count: wp.array(dtype=int),
+    episodes: Episodes,
     interval: int,
     magnitude: float,
     bones: wp.array(dtype=int),
@@ -194,10 +189,10 @@ def draw_impulse(
     e = wp.tid()
     impulse[e] = wp.vec3(0.0)
     struck[e] = bones[0]
-    step = step_count[e] + offset_of(seed[e], episode[e], interval)
+    step = episodes.step_count[e] + offset_of(episodes, e, interval)
     if magnitude <= 0.0 or step % interval != interval - 1:
         return
-    random = generator(seed[e], episode[e], STREAM_DISTURBANCE, 1 + step)
+    random = random_of(episodes, e, STREAM_DISTURBANCE, 1 + step)
     direction = wp.sample_unit_sphere_surface(random)
     impulse[e] = magnitude * wp.randf(random, 0.3, 1.0) * direction
     struck[e] = bones[wp.randi(random, 0, bones.shape[0])]
@@ -208,13 +203,13 @@ def apply_impulse(
     body: Body,
     impulse: wp.array(dtype=wp.vec3),
     struck: wp.array(dtype=int),
-    failure: wp.array(dtype=int),
+    episodes: Episodes,
     # in and out
     u: wp.array2d(dtype=wp.vec3),
 ):
     """Distribute an impulse over the particles of the struck bone by their skinning weights; its sum is exact."""
     e, p = wp.tid()
-    if failure[e] != 0:
+    if episodes.failure[e] != 0:
         return
     b = struck[e]
     bones = bones_of(body.skin, p)
@@ -231,44 +226,38 @@ def apply_impulse(
 @wp.kernel
 def judge(
     clip: Clip,
-    local: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     clip_rotation: wp.array2d(dtype=wp.quat),
     clip_position: wp.array2d(dtype=wp.vec3),
     impulse: wp.array(dtype=wp.vec3),
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
-    terminated: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward positions and rotations close to the clip's."""
     e = wp.tid()
-    bones = local.shape[1]
+    count = bones.local.shape[1]
     distance = float(0.0)
     angle = float(0.0)
-    for b in range(bones):
-        distance += wp.length(position[e, b] - clip_position[e, b]) / float(bones)
-        angle += wp.length(quat_log(wp.quat_inverse(clip_rotation[e, b]) * local[e, b])) / float(bones)
-    terms[e, 0, 0] = 0.6 * tolerance(distance, 0.01, 0.3)
-    terms[e, 0, 1] = 0.4 * tolerance(angle, 0.01, 0.5)
-    terms[e, 0, 2] = -clip.control_cost * mean_square_action(action, e, 0)
-    metrics[e, 0, 0] = distance
-    metrics[e, 0, 1] = wp.degrees(angle)
-    metrics[e, 0, 2] = wp.length(position[e, 0] - clip_position[e, 0])
-    metrics[e, 0, 3] = wp.length(impulse[e])
-    success[e, 0] = distance <= clip.success_distance
-    terminated[e, 0] = distance > clip.fail_distance
+    for b in range(count):
+        distance += wp.length(bones.position[e, b] - clip_position[e, b]) / float(count)
+        angle += wp.length(quat_log(wp.quat_inverse(clip_rotation[e, b]) * bones.local[e, b])) / float(count)
+    outcome.terms[e, 0, 0] = 0.6 * tolerance(distance, 0.01, 0.3)
+    outcome.terms[e, 0, 1] = 0.4 * tolerance(angle, 0.01, 0.5)
+    outcome.terms[e, 0, 2] = -clip.control_cost * mean_square_action(action, e, 0)
+    outcome.metrics[e, 0, 0] = distance
+    outcome.metrics[e, 0, 1] = wp.degrees(angle)
+    outcome.metrics[e, 0, 2] = wp.length(bones.position[e, 0] - clip_position[e, 0])
+    outcome.metrics[e, 0, 3] = wp.length(impulse[e])
+    outcome.success[e, 0] = distance <= clip.success_distance
+    outcome.terminated[e, 0] = distance > clip.fail_distance
 
 
 @wp.kernel
 def observe(
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    local: wp.array2d(dtype=wp.quat),
+    bones: Bones,
     clip_rotation: wp.array2d(dtype=wp.quat),
     clip_world: wp.array2d(dtype=wp.quat),
     clip_position: wp.array2d(dtype=wp.vec3),
@@ -277,15 +266,15 @@ def observe(
 ):
     """Write ``TrackMotionTask.observation_terms`` from component ``start``."""
     e, b = wp.tid()
-    bones = rotation.shape[1]
-    to_root = wp.quat_inverse(rotation[e, 0])
-    error = wp.quat_rotate(to_root, clip_position[e, b] - position[e, b])
+    count = bones.rotation.shape[1]
+    to_root = wp.quat_inverse(bones.rotation[e, 0])
+    error = wp.quat_rotate(to_root, clip_position[e, b] - bones.position[e, b])
     write_vector(observation, e, agent, start + 3 * b, error)
-    turn_at = start + 3 * bones
+    turn_at = start + 3 * count
     if b == 0:
         write_rotation(observation, e, agent, turn_at, to_root * clip_world[e, 0])
     else:
-        step = quat_log(wp.quat_inverse(local[e, b]) * clip_rotation[e, b])
+        step = quat_log(wp.quat_inverse(bones.local[e, b]) * clip_rotation[e, b])
         write_vector(observation, e, agent, turn_at + 6 + 3 * (b - 1), step)
 
 
@@ -411,10 +400,10 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
         graph.launch(
             draw_start,
             (env.num_envs, NUM_JOINTS),
-            [env.mask, env.seed, env.episode, self.clip, env.simulation.avatar.body],
+            [env.episodes, self.clip, env.simulation.avatar.body],
             [self.start, self.origin, drive.command_rotation, drive.command_root],
         )
-        graph.launch(draw_offset, env.num_envs, [env.mask, env.seed, env.episode, self.interval], [self.offset])
+        graph.launch(draw_offset, env.num_envs, [env.episodes, self.interval], [self.offset])
         if isinstance(env.simulation.controllers[0], TorqueController):
             self._record_next_pose(env, graph)
 
@@ -424,7 +413,7 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
             advance_reference,
             (env.num_envs, NUM_JOINTS),
             [
-                self.clip, env.simulation.avatar.body, env.action_map, self.start, env.step_count,
+                self.clip, env.simulation.avatar.body, env.action_map, self.start, env.episodes,
                 drive.command_rotation, drive.command_root,
             ],
             [self.reference_rotation, self.reference_root],
@@ -432,14 +421,14 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
         graph.launch(
             draw_impulse,
             env.num_envs,
-            [env.seed, env.episode, env.step_count, self.interval, config.impulse, self.bones],
+            [env.episodes, self.interval, config.impulse, self.bones],
             [self.impulse, self.struck],
         )
         avatar = env.simulation.avatar
         graph.launch(
             apply_impulse,
             (env.num_envs, avatar.num_points),
-            [avatar.body, self.impulse, self.struck, env.failure],
+            [avatar.body, self.impulse, self.struck, env.episodes],
             [env.simulation.state.u],
         )
         return [(self.reference_rotation, self.reference_root)]
@@ -449,7 +438,7 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
         graph.launch(
             read_clip,
             (env.num_envs, NUM_JOINTS),
-            [self.clip, env.simulation.avatar.body, self.start, self.origin, env.step_count],
+            [self.clip, env.simulation.avatar.body, self.start, self.origin, env.episodes],
             [self.clip_rotation, self.clip_root],
         )
 
@@ -467,29 +456,13 @@ the root wrench pull. A good agent steers against the disturbance and stays on t
 
     def record_outcome(self, env, graph) -> None:
         self._record_clip(env, graph)
-        tracked = env.simulation.avatar.tracked
-        graph.launch(
-            judge,
-            env.num_envs,
-            [
-                self.clip, tracked.local, tracked.position, self.clip_rotation, self.clip_position, self.impulse,
-                env.action,
-            ],
-            [env.terms, env.metrics, env.success, env.terminated],
-        )  # fmt: skip
+        inputs = [self.clip, env.bones[0], self.clip_rotation, self.clip_position, self.impulse, env.action]
+        graph.launch(judge, env.num_envs, inputs, [env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_clip(env, graph)
-        tracked = env.simulation.avatar.tracked
-        graph.launch(
-            observe,
-            (env.num_envs, NUM_JOINTS),
-            [
-                agent, start, tracked.rotation, tracked.position, tracked.local,
-                self.clip_rotation, self.clip_world, self.clip_position,
-            ],
-            [env.observation],
-        )  # fmt: skip
+        inputs = [agent, start, env.bones[agent], self.clip_rotation, self.clip_world, self.clip_position]
+        graph.launch(observe, (env.num_envs, NUM_JOINTS), inputs, [env.observation])
 
 
 TASK = TrackMotionTask

@@ -13,6 +13,7 @@ from piavatar_envs.avatar.body.skeleton import NUM_JOINTS
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import ControlConfig, EnvConfig, TorqueControlConfig
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
@@ -107,76 +108,67 @@ def way_gone(way: Way, body: Body, e: int, pelvis: wp.vec3):
 @wp.kernel
 def judge_walk(
     way: Way,
-    body: Body,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    local: wp.array2d(dtype=wp.quat),
+    bones: Bones,
     sensors: Sensors,
     x: wp.array2d(dtype=wp.vec3),
-    step_count: wp.array(dtype=int),
+    episodes: Episodes,
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
-    terminated: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward going ahead upright and foot by foot. The step counter has not moved yet."""
     e = wp.tid()
     rule = way.upright
-    now = posture_of(rule, body, e, rotation, position)
+    now = posture_of(rule, bones, e)
     ahead = forward_of(way.start[2])
-    speed = wp.dot(velocity[e, 0], ahead)
-    facing = wp.quat_rotate(rotation[e, 0], wp.vec3(0.0, -1.0, 0.0))
+    speed = wp.dot(bones.velocity[e, 0], ahead)
+    facing = wp.quat_rotate(bones.rotation[e, 0], wp.vec3(0.0, -1.0, 0.0))
     facing[2] = 0.0
     off_way = wp.acos(wp.clamp(wp.dot(wp.normalize(facing), ahead), -1.0, 1.0))
-    gone = way_gone(way, body, e, position[e, 0])
-    time = way.control_dt * float(step_count[e] + 1)
+    gone = way_gone(way, bones.body, e, bones.position[e, 0])
+    time = way.control_dt * float(episodes.step_count[e] + 1)
     mean_speed = gone[0] / time
     stride = float(0.0)
     if way.gait.worth > 0.0:
-        in_turn = load_in_turn(way.gait, step_count[e], left_load(way.gait, body, position, sensors, x, e))
-        stride = in_turn * (0.5 + 0.5 * step_in_turn(way.gait, step_count[e], position, e, ahead))
-    hips_straight = tolerance(tilt_of(rotation[e, 0]), 0.1, rule.tilt_margin)
+        in_turn = load_in_turn(way.gait, episodes.step_count[e], left_load(way.gait, bones, sensors, x, e))
+        stride = in_turn * (0.5 + 0.5 * step_in_turn(way.gait, episodes.step_count[e], bones, e, ahead))
+    hips_straight = tolerance(tilt_of(bones.rotation[e, 0]), 0.1, rule.tilt_margin)
     fast = now.high * tolerance(wp.abs(speed - way.target_speed), 0.1 * way.target_speed, way.target_speed)
-    terms[e, 0, 0] = (0.7 - way.gait.worth) * fast
-    terms[e, 0, 1] = way.gait.worth * now.high * stride * hips_straight
-    terms[e, 0, 2] = 0.1 * now.high * tolerance(off_way, 0.1, way.heading_margin)
-    terms[e, 0, 3] = 0.1 * now.high
-    terms[e, 0, 4] = 0.1 * now.straight
-    terms[e, 0, 5] = -rule.control_cost * mean_square_action(action, e, 0)
+    outcome.terms[e, 0, 0] = (0.7 - way.gait.worth) * fast
+    outcome.terms[e, 0, 1] = way.gait.worth * now.high * stride * hips_straight
+    outcome.terms[e, 0, 2] = 0.1 * now.high * tolerance(off_way, 0.1, way.heading_margin)
+    outcome.terms[e, 0, 3] = 0.1 * now.high
+    outcome.terms[e, 0, 4] = 0.1 * now.straight
+    outcome.terms[e, 0, 5] = -rule.control_cost * mean_square_action(action, e, 0)
     if way.gait.posture_cost > 0.0:
-        terms[e, 0, 6] = -way.gait.posture_cost * posture_excess(way.gait, local, e)
-    write_posture(now, e, metrics)
-    metrics[e, 0, 3] = speed
-    metrics[e, 0, 4] = mean_speed
-    metrics[e, 0, 5] = gone[0]
+        outcome.terms[e, 0, 6] = -way.gait.posture_cost * posture_excess(way.gait, bones, e)
+    write_posture(now, e, outcome)
+    outcome.metrics[e, 0, 3] = speed
+    outcome.metrics[e, 0, 4] = mean_speed
+    outcome.metrics[e, 0, 5] = gone[0]
     standing = now.head >= rule.stand_head
-    success[e, 0] = standing and mean_speed >= _PACE * way.target_speed and gone[0] >= way.target_speed
+    outcome.success[e, 0] = standing and mean_speed >= _PACE * way.target_speed and gone[0] >= way.target_speed
     fallen = is_down(wp.vec2(now.head, now.pelvis), way.least)
     behind = _PACE * way.target_speed * time - gone[0] > way.most_behind
-    terminated[e, 0] = fallen or behind or wp.abs(gone[1]) > way.lane or wp.abs(gone[0]) > way.length
+    outcome.terminated[e, 0] = fallen or behind or wp.abs(gone[1]) > way.lane or wp.abs(gone[0]) > way.length
 
 
 @wp.kernel
 def observe_walk(
     way: Way,
-    body: Body,
+    bones: Bones,
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    step_count: wp.array(dtype=int),
+    episodes: Episodes,
     # out
     observation: wp.array3d(dtype=float),
 ):
     """Write the way's direction, the distance from it and, with a clock, its phase from component ``start``."""
     e = wp.tid()
-    write_vector(observation, e, agent, start, wp.quat_rotate_inv(rotation[e, 0], forward_of(way.start[2])))
-    observation[e, agent, start + 3] = way_gone(way, body, e, position[e, 0])[1]
+    write_vector(observation, e, agent, start, wp.quat_rotate_inv(bones.rotation[e, 0], forward_of(way.start[2])))
+    observation[e, agent, start + 3] = way_gone(way, bones.body, e, bones.position[e, 0])[1]
     if way.gait.worth > 0.0:
-        phase = phase_of(way.gait, float(step_count[e]))
+        phase = phase_of(way.gait, float(episodes.step_count[e]))
         observation[e, agent, start + 4] = wp.sin(phase)
         observation[e, agent, start + 5] = wp.cos(phase)
 
@@ -292,27 +284,25 @@ arms that do not act hang and swing against the legs; under `control="pd"` so do
         command = env.simulation.avatar.state.command_rotation
         record_standing(env, graph, self.config.pose_noise)
         if self.targets_about_reference:
-            graph.launch(hang_arms, command.shape, [env.mask, self.way.gait], [command])
+            graph.launch(hang_arms, command.shape, [env.episodes, self.way.gait], [command])
         self.grounding.record_reset(env, graph)
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         if not self.targets_about_reference:
             return super().record_references(env, graph)
         state, reference = env.simulation.avatar.state, self.reference_rotation
-        inputs = [self.way.gait, env.step_count, state.command_rotation]
+        inputs = [self.way.gait, env.episodes, state.command_rotation]
         graph.launch(swing_arms, reference.shape, inputs, [reference])
         return [(reference, state.command_root)]
 
     def record_outcome(self, env, graph) -> None:
-        sim, avatar, t = env.simulation, env.simulation.avatar, env.simulation.avatar.tracked
-        tracked = [t.rotation, t.position, t.velocity, t.local]
-        inputs = [self.way, avatar.body, *tracked, sim.sensors, sim.state.x, env.step_count, env.action]
-        graph.launch(judge_walk, env.num_envs, inputs, [env.terms, env.metrics, env.success, env.terminated])
+        sim = env.simulation
+        inputs = [self.way, env.bones[0], sim.sensors, sim.state.x, env.episodes, env.action]
+        graph.launch(judge_walk, env.num_envs, inputs, [env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
-        avatar, tracked = env.simulation.avatars[agent], env.simulation.avatars[agent].tracked
         start = record_observe_upright(env, graph, agent, start)
-        inputs = [self.way, avatar.body, agent, start, tracked.rotation, tracked.position, env.step_count]
+        inputs = [self.way, env.bones[agent], agent, start, env.episodes]
         graph.launch(observe_walk, env.num_envs, inputs, [env.observation])
 
 

@@ -11,6 +11,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, joint_index
+from piavatar_envs.envs.episodes import Episodes
 from piavatar_envs.mpm.types import Sensors
 
 BOXING = "boxing_v0"
@@ -41,10 +42,11 @@ class Scorer:
             part_impulse[0, agent * len(PARTS) + PARTS.index(part), by] = impulse
         sensors = Sensors()
         sensors.part_impulse = wp.array(part_impulse, dtype=wp.vec3, device=self.device)
-        alive = wp.array(self.alive, dtype=wp.bool, device=self.device)
-        failure = wp.array([self.failure], dtype=int, device=self.device)
+        episodes = Episodes()
+        episodes.alive = wp.array(self.alive, dtype=wp.bool, device=self.device)
+        episodes.failure = wp.array([self.failure], dtype=int, device=self.device)
         outputs = [self.peak, self.score, self.impulse, self.points]
-        wp.launch(self.kernel, (1, self.agents), [self.rules, alive, failure, sensors, *outputs], device=self.device)
+        wp.launch(self.kernel, (1, self.agents), [self.rules, episodes, sensors, *outputs], device=self.device)
         return self.points.numpy()[0]
 
     def blow(self, strength: float, target: str = "head", arm: str = "right_arm", felt: float | None = None) -> float:

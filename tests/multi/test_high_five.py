@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS, forward_kinematics, joint_index, joint_limits
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.episodes import Outcome
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.multi import high_five_v0
 from piavatar_envs.tasks.games import high_five as slap
@@ -210,11 +211,12 @@ def test_the_rule_of_a_slap(device, why, success, ended):
     hands.middle, hands.direction = (wp.array(a, dtype=wp.vec3, device=device) for a in (middle, direction))
     sensors.part_impulse = wp.array(parts, dtype=wp.vec3, device=device)
     side, least = wp.array([1], dtype=int, device=device), wp.array([2.0], dtype=float, device=device)
-    terms, metrics, action = (wp.zeros((1, 2, n), dtype=float, device=device) for n in (3, 4, 5))
-    flags = [wp.zeros((1, 2), dtype=wp.bool, device=device) for _ in range(2)]
-    wp.launch(slap.judge, 1, [rule, side, least, hands, sensors, action], [terms, metrics, *flags], device=device)
-    assert flags[0].numpy().tolist() == [[success] * 2] and flags[1].numpy().tolist() == [[ended] * 2]
-    assert terms.numpy()[0, :, 1].tolist() == [7.0 * success] * 2
+    outcome = Outcome()
+    outcome.terms, outcome.metrics, action = (wp.zeros((1, 2, n), dtype=float, device=device) for n in (3, 4, 5))
+    outcome.success, outcome.terminated = (wp.zeros((1, 2), dtype=wp.bool, device=device) for _ in range(2))
+    wp.launch(slap.judge, 1, [rule, side, least, hands, sensors, action], [outcome], device=device)
+    assert outcome.success.numpy().tolist() == [[success] * 2] and outcome.terminated.numpy().tolist() == [[ended] * 2]
+    assert outcome.terms.numpy()[0, :, 1].tolist() == [7.0 * success] * 2
 
 
 def test_they_stand_face_to_face_and_a_little_apart(make_game):

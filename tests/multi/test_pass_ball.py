@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import load_config
 from piavatar_envs.envs.batch_env import BatchEnv
+from piavatar_envs.envs.episodes import Outcome
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.multi import pass_ball_v0
 from piavatar_envs.tasks.games import pass_ball as passing
@@ -239,7 +240,9 @@ def test_whose_turn_it_is(device, story, steps):
     play.contact, play.touches = array((1, 3), int), array((1, 3), int)
     sensors.pair_impulse, sensors.boundary_impulse = array((1, 16), wp.vec3), array((1, 4), wp.vec3)
     pelvis = wp.array(np.array([STANDING], np.float32), dtype=wp.vec3, device=device)
-    terms, metrics, success, over = array((1, 3, 3)), array((1, 3, 4)), array((1, 3), wp.bool), array((1, 3), wp.bool)
+    outcome = Outcome()
+    outcome.terms, outcome.metrics = array((1, 3, 3)), array((1, 3, 4))
+    outcome.success, outcome.terminated = array((1, 3), wp.bool), array((1, 3), wp.bool)
     passes, gap = 0, None
     for at, touching, expected in steps:
         impulses = np.zeros((1, 4, 4, 3), np.float32)
@@ -247,17 +250,17 @@ def test_whose_turn_it_is(device, story, steps):
         sensors.pair_impulse.assign(impulses.reshape(1, 16, 3))
         ball = wp.array([(*at, 0.1)], dtype=wp.vec3, device=device)
         inputs = [rule, ball, array(1, wp.vec3), pelvis, sensors, array((1, 3, 2))]
-        wp.launch(passing.judge, 1, inputs, [play, terms, metrics, success, over], device=device)
+        wp.launch(passing.judge, 1, inputs, [play, outcome], device=device)
         state = [int(field.numpy()[0]) for field in (play.passer, play.touched, play.passes)]
         assert (*state, *play.touches.numpy()[0, :2]) == expected, story
         bonus = 5.0 * (expected[2] - passes)
-        assert terms.numpy()[0, :, 1] == pytest.approx(np.full(3, bonus))
+        assert outcome.terms.numpy()[0, :, 1] == pytest.approx(np.full(3, bonus))
         goal = (expected[0] + expected[1]) % 3
-        assert metrics.numpy()[0, :, 2] == pytest.approx(np.full(3, flat(at, STANDING[goal])), abs=1e-6)
+        assert outcome.metrics.numpy()[0, :, 2] == pytest.approx(np.full(3, flat(at, STANDING[goal])), abs=1e-6)
         if gap is None:
-            assert not terms.numpy()[0, :, 0].any()
+            assert not outcome.terms.numpy()[0, :, 0].any()
         passes, gap = expected[2], flat(at, STANDING[goal])
-        assert success.numpy().all() == success.numpy().any() == (passes >= 1)
+        assert outcome.success.numpy().all() == outcome.success.numpy().any() == (passes >= 1)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import warp as wp
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import ConfigError, load_config
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.envs.episodes import Episodes, Outcome
 from piavatar_envs.tasks import load_task
 from piavatar_envs.tasks.common.ball_goal import Course, Gate, closest_pass, draw_gate, judge_ball, passes
 from piavatar_envs.tasks.header import HEAD_RADIUS, TOUCH_HEIGHT
@@ -127,9 +128,11 @@ def test_gates_are_drawn_before_the_ball_and_spread(device):
     rng = np.random.default_rng(0)
     start = rng.uniform(-0.2, 0.2, (n, 3)) + [0.0, -0.4, 0.1]
     mask = np.arange(n) % 10 != 0
-    inputs = [wp.array(mask, dtype=wp.bool, device=device)]
-    inputs += [wp.array(a.astype(np.int32), dtype=int, device=device) for a in (np.arange(n), np.arange(n) // 7)]
-    wp.launch(draw_gate, n, [*inputs, gate, vectors(start, device), course], device=device)
+    episodes = Episodes()
+    episodes.mask = wp.array(mask, dtype=wp.bool, device=device)
+    episodes.seed = wp.array(np.arange(n, dtype=np.int32), dtype=int, device=device)
+    episodes.episode = wp.array(np.arange(n, dtype=np.int32) // 7, dtype=int, device=device)
+    wp.launch(draw_gate, n, [episodes, gate, vectors(start, device), course], device=device)
     center, forward = course.center.numpy(), course.forward.numpy()
     assert not center[~mask].any() and not course.best.numpy()[~mask].any(), "those not reset keep theirs"
     way = (center - start)[mask]
@@ -188,8 +191,9 @@ def test_a_shot_earns_what_numpy_says(device):
     speed = rng.uniform(0.5, 5.0, n)
     v = speed[:, None] * np.stack([heading(a) for a in angles + rng.normal(0.0, 0.2, n)])
     x, total, ends = start.copy(), np.zeros(n), np.zeros(n, bool)
-    terms = wp.zeros((n, 1, 4), dtype=float, device=device)
-    success, terminated = (wp.zeros((n, 1), dtype=wp.bool, device=device) for _ in range(2))
+    outcome = Outcome()
+    outcome.terms = wp.zeros((n, 1, 4), dtype=float, device=device)
+    outcome.success, outcome.terminated = (wp.zeros((n, 1), dtype=wp.bool, device=device) for _ in range(2))
     for step in range(steps):
         if step >= 5:  # struck in the fifth step, and blown about from then on
             v = v + rng.normal(0.0, 0.3, v.shape)
@@ -202,14 +206,15 @@ def test_a_shot_earns_what_numpy_says(device):
             [
                 gate, vectors(x, device), vectors(moving, device),
                 wp.array(gap, dtype=float, device=device), wp.array(action, dtype=float, device=device),
-                course, terms, success, terminated,
+                course, outcome,
             ],
             device=device,
         )  # fmt: skip
         for e in range(n):
             expected, through = shots[e].step(x[e], moving[e], gap[e], action[e, 0])
-            assert terms.numpy()[e, 0] == pytest.approx(expected, abs=2e-5), f"shot {e}, step {step}"
-            assert bool(success.numpy()[e, 0]) == bool(terminated.numpy()[e, 0]) == through
+            assert outcome.terms.numpy()[e, 0] == pytest.approx(expected, abs=2e-5), f"shot {e}, step {step}"
+            ended = outcome.terminated.numpy()[e, 0]
+            assert bool(outcome.success.numpy()[e, 0]) == bool(ended) == through
             total[e] += sum(expected[:3])
             ends[e] |= through
     assert 2 <= ends.sum() <= n - 2, "the case must see both"

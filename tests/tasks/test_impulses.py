@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import NUM_JOINTS, joint_index
+from piavatar_envs.envs.episodes import Episodes
 from piavatar_envs.tasks.track_motion import STRUCK, apply_impulse, draw_impulse
 
 TRACK = "PIAvatar/TrackMotion-v0"
@@ -21,8 +22,9 @@ def schedule(device, seed: int, episode: int, steps: int, interval: int, magnitu
 
     count = wp.array(np.arange(steps, dtype=np.int32), dtype=int, device=device)
     targets = wp.array(list(bones), dtype=int, device=device)
-    inputs = [constant(seed), constant(episode), count, interval, magnitude, targets]
-    wp.launch(draw_impulse, steps, inputs, [out, struck], device=device)
+    episodes = Episodes()
+    episodes.seed, episodes.episode, episodes.step_count = constant(seed), constant(episode), count
+    wp.launch(draw_impulse, steps, [episodes, interval, magnitude, targets], [out, struck], device=device)
     return out.numpy(), struck.numpy()
 
 
@@ -72,7 +74,7 @@ def test_the_momentum_that_arrives_is_the_impulse(make_batch, name):
             simulation.avatar.body,
             wp.array(J, dtype=wp.vec3, device=batch.device),
             wp.array([joint_index(name)] * 2, dtype=int, device=batch.device),
-            wp.zeros(2, dtype=int, device=batch.device),
+            batch.episodes,
         ],
         [velocity],
         device=batch.device,
@@ -90,11 +92,12 @@ def test_the_momentum_that_arrives_is_the_impulse(make_batch, name):
 def test_a_failed_environment_is_not_struck(make_batch):
     batch = make_batch(TRACK, 2)
     velocity = wp.zeros_like(batch.simulation.state.u)
+    batch.failure.assign([0, 1])
     inputs = [
         batch.simulation.avatar.body,
         wp.array(np.ones((2, 3), np.float32), dtype=wp.vec3, device=batch.device),
         wp.zeros(2, dtype=int, device=batch.device),
-        wp.array([0, 1], dtype=int, device=batch.device),
+        batch.episodes,
     ]
     wp.launch(apply_impulse, (2, batch.simulation.avatar.num_points), inputs, [velocity], device=batch.device)
     assert velocity.numpy()[0].any() and not velocity.numpy()[1].any()

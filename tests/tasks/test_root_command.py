@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from piavatar_envs.envs.episodes import Bones
 from piavatar_envs.tasks.common.root_command import clamp_root
 
 LEAD, TURN = 0.2, 0.4
@@ -21,7 +22,9 @@ def clamped(device, rotation, position, command_rotation, command_root, released
     )
     root = wp.array(np.asarray(command_root, np.float32), dtype=wp.vec3, device=device)
     down = wp.array(np.zeros(n) if released is None else released, dtype=int, device=device)
-    wp.launch(clamp_root, n, [LEAD, TURN, rotations, positions, down, commands, root], device=device)
+    body = Bones()
+    body.rotation, body.position = rotations, positions
+    wp.launch(clamp_root, n, [LEAD, TURN, body, down, commands, root], device=device)
     return commands.numpy()[:, 0].astype(float), root.numpy().astype(float)
 
 

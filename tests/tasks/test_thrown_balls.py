@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.core.launch_graph import LaunchGraph
+from piavatar_envs.envs.episodes import Bones, Props
 from piavatar_envs.tasks.common.thrown_balls import (
     CLEARANCE,
     HEIGHT,
@@ -214,17 +215,14 @@ def test_a_ball_does_not_begin_in_a_limb_that_reaches_out(device):
 def play(
     throws: Throws,
     due: wp.array(dtype=wp.bool),
-    joints: wp.array2d(dtype=wp.vec3),
-    at: wp.array2d(dtype=wp.vec3),
-    moving: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
+    props: Props,
     placed: wp.array(dtype=wp.bool),
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    spin: wp.array2d(dtype=wp.vec3),
+    first: Props,
 ):
     e = wp.tid()
     random = wp.rand_init(7, e)
-    placed[e] = throw_or_catch(throws, due[e], random, e, 1, joints, at, moving, position, velocity, spin)
+    placed[e] = throw_or_catch(throws, due[e], random, e, 1, bones, props, first)
 
 
 def test_a_ball_is_thrown_when_due_caught_beyond_the_radius_and_else_left_alone(make_env, device):
@@ -246,13 +244,14 @@ def test_a_ball_is_thrown_when_due_caught_beyond_the_radius_and_else_left_alone(
         return wp.array(np.repeat(np.array(rows, np.float32)[:, None], 2, axis=1), dtype=wp.vec3, device=device)
 
     due, at, moving, thrown, caught = (list(column) for column in zip(*cases, strict=True))
-    body = wp.array(np.repeat(joints(env)[None], n, axis=0), dtype=wp.vec3, device=device)
+    bones, props, first = Bones(), Props(), Props()
+    bones.position = wp.array(np.repeat(joints(env)[None], n, axis=0), dtype=wp.vec3, device=device)
+    props.position, props.velocity = vectors(at), vectors(moving)
     placed = wp.zeros(n, dtype=wp.bool, device=device)
-    spawn = [wp.array(nowhere, dtype=wp.vec3, device=device) for _ in range(3)]
+    first.position, first.velocity, first.spin = (wp.array(nowhere, dtype=wp.vec3, device=device) for _ in range(3))
     due = wp.array(due, dtype=wp.bool, device=device)
-    inputs = [env.batch.task.throws, due, body, vectors(at), vectors(moving)]
-    wp.launch(play, n, inputs, [placed, *spawn], device=device)
-    position, velocity, spin = (array.numpy() for array in spawn)
+    wp.launch(play, n, [env.batch.task.throws, due, bones, props], [placed, first], device=device)
+    position, velocity, spin = (array.numpy() for array in (first.position, first.velocity, first.spin))
     rest = waiting_places((0.0, 0.0, 0.0), env.config)[1]
     assert placed.numpy().tolist() == [a or b for a, b in zip(thrown, caught, strict=True)]
     for e in range(n):

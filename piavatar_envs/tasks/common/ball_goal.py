@@ -12,8 +12,9 @@ from pydantic import Field
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.config import EnvConfig, PropConfig, SceneConfig, replace
 from piavatar_envs.config.schema import Place
-from piavatar_envs.core.rng import STREAM_TASK, generator
+from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn, component
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
@@ -106,25 +107,16 @@ class Course:
 
 
 @wp.func
-def turn_and_weigh(
-    random: wp.uint32,
-    e: int,
-    ball: Ball,
-    # out
-    rotation: wp.array2d(dtype=wp.quat),
-    density: wp.array2d(dtype=float),
-):
+def turn_and_weigh(random: wp.uint32, e: int, ball: Ball, first: Props):
     """Draw a ball's rotation, and its mass, uniform in its logarithm; no draw of its kernel may follow."""
     axis = wp.sample_unit_sphere_surface(random)
-    rotation[e, ball.prop] = wp.quat_from_axis_angle(axis, wp.randf(random, 0.0, 3.0))
-    density[e, ball.prop] = wp.exp(wp.randf(random, ball.light, ball.heavy))
+    first.rotation[e, ball.prop] = wp.quat_from_axis_angle(axis, wp.randf(random, 0.0, 3.0))
+    first.density[e, ball.prop] = wp.exp(wp.randf(random, ball.light, ball.heavy))
 
 
 @wp.kernel
 def draw_gate(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     gate: Gate,
     start: wp.array(dtype=wp.vec3),
     # out
@@ -132,9 +124,9 @@ def draw_gate(
 ):
     """Draw a gate in front of the ball's start and clear the record, in the masked environments."""
     e = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
-    random = generator(seed[e], episode[e], STREAM_TASK, 0)
+    random = random_of(episodes, e, STREAM_TASK, 0)
     distance = wp.randf(random, gate.near, gate.far)
     angle = wp.randf(random, -gate.target_angle, gate.target_angle)
     forward = wp.vec3(wp.sin(angle), -wp.cos(angle), 0.0)
@@ -184,9 +176,7 @@ def judge_ball(
     # in and out
     course: Course,
     # out
-    terms: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
-    terminated: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward improvements on the best of the episode; a ball in the gate ends it.
 
@@ -200,19 +190,19 @@ def judge_ball(
     spare = 0.5 * gate.target_radius
     miss = closest_pass(center, position[e], velocity[e], gate.gravity, gate.ball_radius)
     promise = 1.0 - wp.clamp((miss - spare) / wp.max(course.length[e] - spare, 1.0e-3), 0.0, 1.0)
-    terms[e, 0, 0] = 0.0
-    terms[e, 0, 1] = 0.0
+    outcome.terms[e, 0, 0] = 0.0
+    outcome.terms[e, 0, 1] = 0.0
     if best[0] >= 0.0:
-        terms[e, 0, 0] = APPROACH * wp.max(approach - best[0], 0.0)
-        terms[e, 0, 1] = AIM * wp.max(promise - best[1], 0.0)
+        outcome.terms[e, 0, 0] = APPROACH * wp.max(approach - best[0], 0.0)
+        outcome.terms[e, 0, 1] = AIM * wp.max(promise - best[1], 0.0)
     course.best[e] = wp.vec2(wp.max(approach, best[0]), wp.max(promise, best[1]))
-    terms[e, 0, 2] = 0.0
+    outcome.terms[e, 0, 2] = 0.0
     if passes(center, course.forward[e], gate.target_radius, course.last[e], position[e]):
-        if not success[e, 0]:
-            terms[e, 0, 2] = GOAL
-        success[e, 0] = True
-        terminated[e, 0] = True
-    terms[e, 0, 3] = -gate.control_cost * mean_square_action(action, e, 0)
+        if not outcome.success[e, 0]:
+            outcome.terms[e, 0, 2] = GOAL
+        outcome.success[e, 0] = True
+        outcome.terminated[e, 0] = True
+    outcome.terms[e, 0, 3] = -gate.control_cost * mean_square_action(action, e, 0)
     course.last[e] = position[e]
 
 
@@ -226,14 +216,14 @@ def measure_ball(
     sensors: Sensors,
     pair: int,
     # out
-    metrics: wp.array3d(dtype=float),
+    outcome: Outcome,
 ):
     """Write ``GateTask.metrics``; ``pair`` is the sensor of the ball on the avatar."""
     e = wp.tid()
-    metrics[e, 0, 0] = wp.length(velocity[e])
-    metrics[e, 0, 1] = wp.length(course.center[e] - position[e])
-    metrics[e, 0, 2] = density[e] * gate.ball_volume
-    metrics[e, 0, 3] = wp.length(sensors.pair_impulse[e, pair])
+    outcome.metrics[e, 0, 0] = wp.length(velocity[e])
+    outcome.metrics[e, 0, 1] = wp.length(course.center[e] - position[e])
+    outcome.metrics[e, 0, 2] = density[e] * gate.ball_volume
+    outcome.metrics[e, 0, 3] = wp.length(sensors.pair_impulse[e, pair])
 
 
 @wp.kernel
@@ -242,8 +232,7 @@ def observe_gate(
     course: Course,
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     ball: wp.array(dtype=wp.vec3),
     density: wp.array(dtype=float),
     # out
@@ -251,8 +240,8 @@ def observe_gate(
 ):
     """Write :data:`GATE_TERMS` from component ``start``."""
     e = wp.tid()
-    to_root = wp.quat_inverse(rotation[e, 0])
-    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, course.center[e] - position[e, 0]))
+    to_root = wp.quat_inverse(bones.rotation[e, 0])
+    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, course.center[e] - bones.position[e, 0]))
     write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, course.center[e] - ball[e]))
     # a tenth and ten times the mass differ by as much, as the effects of a kick do
     observation[e, agent, start + 6] = wp.log10(density[e] * gate.ball_volume)
@@ -264,17 +253,16 @@ def observe_gate(
 def observe_feet(
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     ball: wp.array(dtype=wp.vec3),
     # out
     observation: wp.array3d(dtype=float),
 ):
     """Write the terms :data:`FEET_TERMS` from component ``start``."""
     e = wp.tid()
-    to_root = wp.quat_inverse(rotation[e, 0])
-    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, ball[e] - position[e, _LEFT_FOOT]))
-    write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, ball[e] - position[e, _RIGHT_FOOT]))
+    to_root = wp.quat_inverse(bones.rotation[e, 0])
+    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, ball[e] - bones.position[e, _LEFT_FOOT]))
+    write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, ball[e] - bones.position[e, _RIGHT_FOOT]))
 
 
 #: Observed by agents that kick.
@@ -382,7 +370,7 @@ class GateTask(Task):
         )
 
     def drawn_values(self, env) -> tuple[Drawn, ...]:
-        density = env.simulation.props.density[:, self.index]
+        density = self.ball_column(env, "density")
         return Drawn(density, self.gate.ball_volume), Drawn(self.length), Drawn(component(self.forward, 0))
 
     def domain(self) -> Domain:
@@ -413,10 +401,10 @@ class GateTask(Task):
 
     def ball_column(self, env, name: str) -> wp.array:
         """Return the ball's column of the tracked props' array ``name``."""
-        return getattr(env.simulation.props.state, name)[:, self.index]
+        return getattr(env.props, name)[:, self.index]
 
     def record_ball(self, env, graph) -> None:
-        """Append, at a reset: draw the ball's place, velocity and mass into ``props.initial`` and ``props.density``."""
+        """Append, at a reset: draw the ball's place, velocity and mass into ``env.first_props``."""
         raise NotImplementedError
 
     def record_gap(self, env, graph) -> None:
@@ -426,23 +414,22 @@ class GateTask(Task):
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
         self.record_ball(env, graph)
-        start = env.simulation.props.initial.position[:, self.index]
-        graph.launch(draw_gate, env.num_envs, [env.mask, env.seed, env.episode, self.gate, start], [self.course])
+        start = env.first_props.position[:, self.index]
+        graph.launch(draw_gate, env.num_envs, [env.episodes, self.gate, start], [self.course])
 
     def record_outcome(self, env, graph) -> None:
         self.record_gap(env, graph)
         sim, ball = env.simulation, [self.ball_column(env, "position"), self.ball_column(env, "velocity")]
-        outputs = [self.course, env.terms, env.success, env.terminated]
+        outputs = [self.course, env.outcome]
         graph.launch(judge_ball, env.num_envs, [self.gate, *ball, self.gap, env.action], outputs)
         pair = sim.subjects.names.index(BALL)  # of the first subject, the avatar, with the ball
-        inputs = [self.gate, self.course, *ball, sim.props.density[:, self.index], sim.sensors, pair]
-        graph.launch(measure_ball, env.num_envs, inputs, [env.metrics])
+        inputs = [self.gate, self.course, *ball, self.ball_column(env, "density"), sim.sensors, pair]
+        graph.launch(measure_ball, env.num_envs, inputs, [env.outcome])
 
     def record_gate_terms(self, env, graph, agent: int, start: int) -> int:
         """Append: write :data:`GATE_TERMS` from component ``start``; return the component after them."""
-        sim, tracked = env.simulation, env.simulation.avatars[agent].tracked
-        ball = [self.ball_column(env, "position"), sim.props.density[:, self.index]]
-        inputs = [self.gate, self.course, agent, start, tracked.rotation, tracked.position, *ball]
+        ball = [self.ball_column(env, "position"), self.ball_column(env, "density")]
+        inputs = [self.gate, self.course, agent, start, env.bones[agent], *ball]
         graph.launch(observe_gate, env.num_envs, inputs, [env.observation])
         return start + _OWN_TERMS
 

@@ -9,9 +9,8 @@ import warp as wp
 from pydantic import BaseModel, Field
 
 from piavatar_envs.avatar.body.skeleton import joint_index
-from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import FROZEN, EnvConfig
-from piavatar_envs.mpm.types import row
+from piavatar_envs.envs.episodes import Bones, Outcome, rest_joint
 
 if TYPE_CHECKING:
     from piavatar_envs.core.launch_graph import LaunchGraph
@@ -53,11 +52,10 @@ def least_heights(config: EnvConfig, fall: FallConfig) -> wp.vec2:
 
 
 @wp.func
-def heights_of(body: Body, e: int, position: wp.array2d(dtype=wp.vec3)):
+def heights_of(bones: Bones, e: int):
     """Return the heights of head and pelvis over those in the rest pose."""
-    r = row(e, body.rest_joint.shape[0])
-    head = position[e, _HEAD][2] / body.rest_joint[r, _HEAD][2]
-    return wp.vec2(head, position[e, 0][2] / body.rest_joint[r, 0][2])
+    head = bones.position[e, _HEAD][2] / rest_joint(bones.body, e, _HEAD)[2]
+    return wp.vec2(head, bones.position[e, 0][2] / rest_joint(bones.body, e, 0)[2])
 
 
 @wp.func
@@ -69,17 +67,15 @@ def is_down(heights: wp.vec2, least: wp.vec2):
 @wp.kernel
 def find_fall(
     least: wp.vec2,
-    body: Body,
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     # out
-    terminated: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Terminate environments whose head or pelvis are lower than ``least``."""
     e = wp.tid()
-    terminated[e, 0] = is_down(heights_of(body, e, position), least)
+    outcome.terminated[e, 0] = is_down(heights_of(bones, e), least)
 
 
 def record_fall(env: EpisodeArrays, graph: LaunchGraph, config: FallConfig) -> None:
     """Append: terminate environments whose only avatar has fallen."""
-    avatar = env.simulation.avatar
-    graph.launch(find_fall, env.num_envs, [config.least, avatar.body, avatar.tracked.position], [env.terminated])
+    graph.launch(find_fall, env.num_envs, [config.least, env.bones[0]], [env.outcome])

@@ -23,6 +23,7 @@ from piavatar_envs.avatar.torque_control.joint_torques import beyond
 from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import FROZEN, ConfigError
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, Episodes
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Term
 from piavatar_envs.mpm.types import Sensors, row
@@ -203,13 +204,13 @@ def load_in_turn(gait: Gait, step: int, left: float):
 
 
 @wp.func
-def step_in_turn(gait: Gait, step: int, position: wp.array2d(dtype=wp.vec3), e: int, ahead: wp.vec3):
+def step_in_turn(gait: Gait, step: int, bones: Bones, e: int, ahead: wp.vec3):
     """Return the reward, from 0 to 1, of the left ankle's lead on the right one along the unit vector ``ahead``.
 
     By the clock at the end of the step that the counter counts next. At phase 0 the left foot is down in front by the
     length of a step, half a stride later the right one.
     """
-    lead = wp.dot(position[e, _LEFT_ANKLE] - position[e, _RIGHT_ANKLE], ahead)
+    lead = wp.dot(bones.position[e, _LEFT_ANKLE] - bones.position[e, _RIGHT_ANKLE], ahead)
     due = gait.step_length * wp.cos(phase_of(gait, float(step) + 1.0))
     return tolerance(wp.abs(lead - due), _SHORT * gait.step_length, _SHORT_MARGIN * gait.step_length)
 
@@ -226,9 +227,7 @@ def lift_of(gait: Gait, body: Body, x: wp.array2d(dtype=wp.vec3), e: int, foot: 
 
 
 @wp.func
-def left_load(
-    gait: Gait, body: Body, position: wp.array2d(dtype=wp.vec3), sensors: Sensors, x: wp.array2d(dtype=wp.vec3), e: int
-):
+def left_load(gait: Gait, bones: Bones, sensors: Sensors, x: wp.array2d(dtype=wp.vec3), e: int):
     """Return the left foot's share of the ground's load, or :data:`NOTHING`.
 
     The levers between the ankles ignore the length of the soles: on the toes of the rear foot, they give some of its
@@ -236,20 +235,20 @@ def left_load(
     """
     if sensors.boundary_impulse[e, 0][2] <= 0.0:
         return NOTHING
-    left_off = lift_of(gait, body, x, e, 0) > _CLEAR
-    right_off = lift_of(gait, body, x, e, 1) > _CLEAR
+    left_off = lift_of(gait, bones.body, x, e, 0) > _CLEAR
+    right_off = lift_of(gait, bones.body, x, e, 1) > _CLEAR
     if left_off == right_off:
-        return left_foot_share(position, sensors, e, 0)
+        return left_foot_share(bones, sensors, e, 0)
     return wp.where(left_off, 0.0, 1.0)
 
 
 @wp.func
-def posture_excess(gait: Gait, local: wp.array2d(dtype=wp.quat), e: int):
+def posture_excess(gait: Gait, bones: Bones, e: int):
     """Return the mean square of the joints' excess over the ranges :data:`GAIT_POSTURE` [rad^2]."""
     count = gait.joint.shape[0]
     total = float(0.0)
     for n in range(count):
-        total += wp.length_sq(beyond(local[e, gait.joint[n]], gait.lower[n], gait.upper[n]))
+        total += wp.length_sq(beyond(bones.local[e, gait.joint[n]], gait.lower[n], gait.upper[n]))
     return total / float(3 * count)
 
 
@@ -274,21 +273,21 @@ def arm_pose(gait: Gait, phase: float, b: int):
 
 @wp.kernel
 def hang_arms(
-    mask: wp.array(dtype=wp.bool),
+    episodes: Episodes,
     gait: Gait,
     # in and out
     command_rotation: wp.array2d(dtype=wp.quat),
 ):
     """Turn the arms of the first poses to the beginning of a stride, in the masked environments."""
     e, b = wp.tid()
-    if mask[e] and b > 0:
+    if episodes.mask[e] and b > 0:
         command_rotation[e, b] = arm_pose(gait, 0.0, b) * command_rotation[e, b]
 
 
 @wp.kernel
 def swing_arms(
     gait: Gait,
-    step_count: wp.array(dtype=int),
+    episodes: Episodes,
     command_rotation: wp.array2d(dtype=wp.quat),
     # out
     reference_rotation: wp.array2d(dtype=wp.quat),
@@ -297,5 +296,5 @@ def swing_arms(
     e, b = wp.tid()
     q = command_rotation[e, b]
     if b > 0:
-        q = arm_pose(gait, phase_of(gait, float(step_count[e] + 1)), b)
+        q = arm_pose(gait, phase_of(gait, float(episodes.step_count[e] + 1)), b)
     reference_rotation[e, b] = q

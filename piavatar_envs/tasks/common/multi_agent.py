@@ -18,6 +18,7 @@ from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
 from piavatar_envs.config.schema import select_joints
 from piavatar_envs.envs.actions import ActionSpec
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.task import Task
 from piavatar_envs.mpm.types import Sensors, row
@@ -98,7 +99,7 @@ class Stance:
             graph.launch(
                 take_stance,
                 (env.num_envs, NUM_JOINTS),
-                [env.mask, avatar.body, self._stance],
+                [env.episodes, avatar.body, self._stance],
                 [state.command_rotation, state.command_root],
             )
 
@@ -131,20 +132,20 @@ class Referee:
             graph.launch(
                 find_out,
                 env.num_envs,
-                [agent, self.radius, self.least, avatar.body, avatar.tracked.position, avatar.state.released],
+                [agent, self.radius, self.least, env.bones[agent], avatar.state.released],
                 [self.pelvis, self.out],
             )
 
     def record_shared_end(self, env: EpisodeArrays, graph: LaunchGraph) -> None:
         """Append, after the task has judged: where one agent is out, the episode ends for all of them."""
-        graph.launch(end_for_all, env.num_envs, [self.out], [env.terminated])
+        graph.launch(end_for_all, env.num_envs, [self.out], [env.outcome])
 
 
 @wp.kernel
 def end_for_all(
     out: wp.array2d(dtype=wp.bool),
     # in and out
-    terminated: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Terminate all agents of an environment in which one is out."""
     e = wp.tid()
@@ -152,7 +153,7 @@ def end_for_all(
     for agent in range(out.shape[1]):
         fallen = fallen or out[e, agent]
     for agent in range(out.shape[1]):
-        terminated[e, agent] = terminated[e, agent] or fallen
+        outcome.terminated[e, agent] = outcome.terminated[e, agent] or fallen
 
 
 @wp.func
@@ -176,7 +177,7 @@ def ankle_height(body: Body, e: int, stance: wp.array(dtype=wp.quat), ankle: int
 
 @wp.kernel
 def take_stance(
-    mask: wp.array(dtype=wp.bool),
+    episodes: Episodes,
     body: Body,
     stance: wp.array(dtype=wp.quat),
     # in and out
@@ -185,7 +186,7 @@ def take_stance(
 ):
     """Turn the joints of a body that stands nearly in its rest pose, and lower it onto its feet."""
     e, b = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
     if b > 0:
         command_rotation[e, b] = stance[b] * command_rotation[e, b]
@@ -208,8 +209,7 @@ def find_out(
     agent: int,
     radius: float,
     least: wp.vec2,
-    body: Body,
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     released: wp.array(dtype=int),
     # out
     pelvis: wp.array2d(dtype=wp.vec3),
@@ -217,9 +217,9 @@ def find_out(
 ):
     """Write an agent's pelvis, and whether it is down (lower than ``least``) or beyond ``radius`` [m]."""
     e = wp.tid()
-    pelvis[e, agent] = position[e, 0]
-    down = released[e] != 0 or is_down(heights_of(body, e, position), least)
-    out[e, agent] = down or from_centre(position[e, 0]) > radius
+    pelvis[e, agent] = bones.position[e, 0]
+    down = released[e] != 0 or is_down(heights_of(bones, e), least)
+    out[e, agent] = down or from_centre(bones.position[e, 0]) > radius
 
 
 #: Observed of a ring, whose centre is the origin.
@@ -293,21 +293,20 @@ class RingTask(Task):
         return record_root_clamp(env, graph, self.config.root_lead_limit, self.config.root_turn_lead_limit)
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
-        tracked = env.simulation.avatars[agent].tracked
-        inputs = [agent, env.layout[RING_CENTRE.name].slice.start, tracked.rotation, tracked.position]
+        inputs = [agent, env.layout[RING_CENTRE.name].slice.start, env.bones[agent]]
         graph.launch(observe_centre, env.num_envs, inputs, [env.observation])
         if OTHERS_IN in env.layout:
-            inputs = [agent, env.layout[OTHERS_IN].slice.start, env.alive]
+            inputs = [agent, env.layout[OTHERS_IN].slice.start, env.episodes]
             graph.launch(observe_others_in, (env.num_envs, env.num_agents - 1), inputs, [env.observation])
 
 
 @wp.func
-def others_in(e: int, agent: int, alive: wp.array2d(dtype=wp.bool), out: wp.array2d(dtype=wp.bool)):
+def others_in(episodes: Episodes, out: wp.array2d(dtype=wp.bool), e: int, agent: int):
     """Return the number of others that were in before this step, and of those that still are."""
     before = int(0)
     after = int(0)
-    for other in range(alive.shape[1]):
-        if other != agent and alive[e, other]:
+    for other in range(episodes.alive.shape[1]):
+        if other != agent and episodes.alive[e, other]:
             before += 1
             if not out[e, other]:
                 after += 1
@@ -315,34 +314,35 @@ def others_in(e: int, agent: int, alive: wp.array2d(dtype=wp.bool), out: wp.arra
 
 
 @wp.func
-def has_won(e: int, agent: int, others: wp.vec2i, out: wp.array2d(dtype=wp.bool), failure: wp.array(dtype=int)):
+def has_won(episodes: Episodes, out: wp.array2d(dtype=wp.bool), e: int, agent: int, others: wp.vec2i):
     """Return whether the last of the others has gone out in this step while the agent is in."""
-    return others[0] > 0 and others[1] == 0 and not out[e, agent] and failure[e] == 0
+    return others[0] > 0 and others[1] == 0 and not out[e, agent] and episodes.failure[e] == 0
 
 
 @wp.kernel
 def observe_centre(
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     # out
     observation: wp.array3d(dtype=float),
 ):
     """Write the term :data:`RING_CENTRE`."""
     e = wp.tid()
-    write_vector(observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(rotation[e, 0]), -position[e, 0]))
+    write_vector(
+        observation, e, agent, start, wp.quat_rotate(wp.quat_inverse(bones.rotation[e, 0]), -bones.position[e, 0])
+    )
 
 
 @wp.kernel
 def observe_others_in(
     agent: int,
     start: int,
-    alive: wp.array2d(dtype=wp.bool),
+    episodes: Episodes,
     # out
     observation: wp.array3d(dtype=float),
 ):
     """Write 1 for every other agent that is still in, counted on from the observing one."""
     e, index = wp.tid()
-    other = (agent + 1 + index) % alive.shape[1]
-    observation[e, agent, start + index] = wp.where(alive[e, other], 1.0, 0.0)
+    other = (agent + 1 + index) % episodes.alive.shape[1]
+    observation[e, agent, start + index] = wp.where(episodes.alive[e, other], 1.0, 0.0)

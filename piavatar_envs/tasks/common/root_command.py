@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from piavatar_envs.avatar.rotation import quat_exp, quat_log, turn_about_z
+from piavatar_envs.envs.episodes import Bones
 
 if TYPE_CHECKING:
     from piavatar_envs.core.launch_graph import LaunchGraph
@@ -38,15 +39,10 @@ def record_root_clamp(
         The poses that actions are added to, of every avatar: the commanded ones.
     """
     references = []
-    for avatar in env.simulation.avatars:
-        tracked, state = avatar.tracked, avatar.state
-        graph.launch(
-            clamp_root,
-            env.num_envs,
-            [lead, turn, tracked.rotation, tracked.position, state.released],
-            [state.command_rotation, state.command_root],
-        )
-        references.append((state.command_rotation, state.command_root))
+    for bones, avatar in zip(env.bones, env.simulation.avatars, strict=True):
+        command = avatar.state.command_rotation, avatar.state.command_root
+        graph.launch(clamp_root, env.num_envs, [lead, turn, bones, avatar.state.released], list(command))
+        references.append(command)
     return references
 
 
@@ -63,8 +59,7 @@ def clamp_to_circle(root: wp.vec3, center: wp.vec3, reach: float):
 def clamp_root(
     lead: float,
     turn: float,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     released: wp.array(dtype=int),
     # in and out
     command_rotation: wp.array2d(dtype=wp.quat),
@@ -74,8 +69,8 @@ def clamp_root(
     e = wp.tid()
     if released[e] != 0:
         return
-    command_root[e] = clamp_to_circle(command_root[e], position[e, 0], lead)
+    command_root[e] = clamp_to_circle(command_root[e], bones.position[e, 0], lead)
     q = command_rotation[e, 0]
-    heading = quat_log(turn_about_z(q) * wp.quat_inverse(turn_about_z(rotation[e, 0])))[2]
+    heading = quat_log(turn_about_z(q) * wp.quat_inverse(turn_about_z(bones.rotation[e, 0])))[2]
     back = wp.clamp(heading, -turn, turn) - heading
     command_rotation[e, 0] = wp.normalize(quat_exp(wp.vec3(0.0, 0.0, back)) * q)

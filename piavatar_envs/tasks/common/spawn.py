@@ -11,13 +11,14 @@ from piavatar_envs.avatar.kinematics import pose_body
 from piavatar_envs.avatar.rotation import quat_exp
 from piavatar_envs.avatar.skinning import bones_of, weights_of
 from piavatar_envs.avatar.types import Body
-from piavatar_envs.core.rng import STREAM_POSE, generator
+from piavatar_envs.core.rng import STREAM_POSE
+from piavatar_envs.envs.episodes import EpisodeArrays, Episodes, random_of, rest_joint
 from piavatar_envs.mpm.types import row
 from piavatar_envs.sim.checks import check_beside_standing
 
 if TYPE_CHECKING:
     from piavatar_envs.core.launch_graph import LaunchGraph
-    from piavatar_envs.envs.episodes import EpisodeArrays
+    from piavatar_envs.envs.episodes import EpisodeArrays, random_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,7 +40,7 @@ def record_standing(env: EpisodeArrays, graph: LaunchGraph, noise: float) -> Non
         graph.launch(
             spawn_standing,
             (env.num_envs, NUM_JOINTS),
-            [env.mask, env.seed, env.episode, avatar.body, *limits, noise, index, place],
+            [env.episodes, avatar.body, *limits, noise, index, place],
             [avatar.state.command_rotation, avatar.state.command_root],
         )
 
@@ -47,9 +48,7 @@ def record_standing(env: EpisodeArrays, graph: LaunchGraph, noise: float) -> Non
 def record_shift(env: EpisodeArrays, graph: LaunchGraph, noise: float) -> None:
     """Append, at a reset: displace every avatar by up to ``noise`` [m] along x and y."""
     for index, avatar in enumerate(env.simulation.avatars):
-        graph.launch(
-            shift_root, env.num_envs, [env.mask, env.seed, env.episode, index, noise], [avatar.state.command_root]
-        )
+        graph.launch(shift_root, env.num_envs, [env.episodes, index, noise], [avatar.state.command_root])
 
 
 class Grounding:
@@ -85,7 +84,7 @@ class Grounding:
         graph.launch(
             find_lowest, (n, avatar.num_points), [env.mask, body, self._rotation, self._position], [self._lowest]
         )
-        graph.launch(stand_on_ground, n, [env.mask, self._lowest], [state.command_root])
+        graph.launch(stand_on_ground, n, [env.episodes, self._lowest], [state.command_root])
 
 
 @wp.func
@@ -97,16 +96,14 @@ def forward_of(yaw: float):
 @wp.func
 def pelvis_at(place: wp.vec3, body: Body, e: int):
     """Return the pelvis of a body [m] that stands in the rest pose at ``place``: x, y [m] and yaw [rad]."""
-    rest = body.rest_joint[row(e, body.rest_joint.shape[0]), 0]
+    rest = rest_joint(body, e, 0)
     turned = wp.quat_rotate(quat_exp(wp.vec3(0.0, 0.0, place[2])), rest)
     return turned + wp.vec3(place[0], place[1], 0.0)
 
 
 @wp.kernel
 def spawn_standing(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     body: Body,
     lower: wp.array(dtype=wp.vec3),
     upper: wp.array(dtype=wp.vec3),
@@ -123,24 +120,22 @@ def spawn_standing(
     its own.
     """
     e, b = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
     if b == 0:
         turn = quat_exp(wp.vec3(0.0, 0.0, place[2]))
         command_rotation[e, b] = turn
-        root = body.rest_joint[row(e, body.rest_joint.shape[0]), 0]
+        root = rest_joint(body, e, 0)
         command_root[e] = wp.quat_rotate(turn, root) + wp.vec3(place[0], place[1], 0.0)
         return
-    random = generator(seed[e], episode[e], STREAM_POSE, b + avatar * lower.shape[0])
+    random = random_of(episodes, e, STREAM_POSE, b + avatar * lower.shape[0])
     v = noise * wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0))
     command_rotation[e, b] = quat_exp(wp.max(lower[b], wp.min(v, upper[b])))
 
 
 @wp.kernel
 def shift_root(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     avatar: int,
     noise: float,
     # in and out
@@ -148,9 +143,9 @@ def shift_root(
 ):
     """Displace the root by up to ``noise`` [m] along x and y."""
     e = wp.tid()
-    if mask[e]:
+    if episodes.mask[e]:
         # poses draw from the indices above zero
-        random = generator(seed[e], episode[e], STREAM_POSE, -1 - avatar)
+        random = random_of(episodes, e, STREAM_POSE, -1 - avatar)
         command_root[e] += noise * wp.vec3(wp.randf(random, -1.0, 1.0), wp.randf(random, -1.0, 1.0), 0.0)
 
 
@@ -188,12 +183,12 @@ def find_lowest(
 
 @wp.kernel
 def stand_on_ground(
-    mask: wp.array(dtype=wp.bool),
+    episodes: Episodes,
     lowest: wp.array2d(dtype=float),
     # in and out
     command_root: wp.array(dtype=wp.vec3),
 ):
     """Raise or sink the commanded root so that the lowest particles of both poses are at the same height."""
     e = wp.tid()
-    if mask[e]:
+    if episodes.mask[e]:
         command_root[e] = command_root[e] + wp.vec3(0.0, 0.0, lowest[e, 1] - lowest[e, 0])

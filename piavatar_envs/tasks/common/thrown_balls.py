@@ -15,14 +15,15 @@ import warp as wp
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.rotation import quat_exp
-from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.core.rng import STREAM_BALL
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, EpisodeArrays, Episodes, Props, random_of
 from piavatar_envs.sim.scene import Domain
 
 if TYPE_CHECKING:
     from piavatar_envs.config import PhysicsConfig
     from piavatar_envs.core.launch_graph import LaunchGraph
-    from piavatar_envs.envs.episodes import EpisodeArrays
+    from piavatar_envs.envs.episodes import EpisodeArrays, random_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -193,80 +194,53 @@ def flies_on(throws: Throws, position: wp.vec3, velocity: wp.vec3):
 
 
 @wp.func
-def rest_ball(
-    throws: Throws,
-    e: int,
-    ball: int,
-    # out
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    spin: wp.array2d(dtype=wp.vec3),
-):
+def rest_ball(throws: Throws, e: int, ball: int, first: Props):
     """Put a ball at its waiting place, at rest."""
-    position[e, ball] = throws.rest[ball]
-    velocity[e, ball] = wp.vec3(0.0)
-    spin[e, ball] = wp.vec3(0.0)
+    first.position[e, ball] = throws.rest[ball]
+    first.velocity[e, ball] = wp.vec3(0.0)
+    first.spin[e, ball] = wp.vec3(0.0)
 
 
 @wp.func
 def throw_or_catch(
-    throws: Throws,
-    due: bool,
-    random: wp.uint32,
-    e: int,
-    ball: int,
-    joints: wp.array2d(dtype=wp.vec3),
-    ball_position: wp.array2d(dtype=wp.vec3),
-    ball_velocity: wp.array2d(dtype=wp.vec3),
-    # out
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    spin: wp.array2d(dtype=wp.vec3),
+    throws: Throws, due: bool, random: wp.uint32, e: int, ball: int, bones: Bones, props: Props, first: Props
 ):
-    """Place a ball anew, thrown if it is due and caught if it flies on; return whether it is placed."""
+    """Place a ball anew, thrown if it is due and caught if it flies on; return whether it is placed.
+
+    Writes its motion into ``first``.
+    """
     if due:
-        at, way, turning = draw_throw(throws, random, e, joints)
-        position[e, ball] = at
-        velocity[e, ball] = way
-        spin[e, ball] = turning
+        at, way, turning = draw_throw(throws, random, e, bones.position)
+        first.position[e, ball] = at
+        first.velocity[e, ball] = way
+        first.spin[e, ball] = turning
         return True
-    if flies_on(throws, ball_position[e, ball], ball_velocity[e, ball]):
-        rest_ball(throws, e, ball, position, velocity, spin)
+    if flies_on(throws, props.position[e, ball], props.velocity[e, ball]):
+        rest_ball(throws, e, ball, first)
         return True
     return False
 
 
 @wp.kernel
 def draw_balls(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     throws: Throws,
     # out
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    spin: wp.array2d(dtype=wp.vec3),
-    density: wp.array2d(dtype=float),
+    first: Props,
 ):
     """Draw the mass of every ball and put it at its waiting place."""
     e, ball = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
-    random = generator(seed[e], episode[e], STREAM_BALL, MASSES + ball)
+    random = random_of(episodes, e, STREAM_BALL, MASSES + ball)
     mass = wp.randf(random, throws.mass[0], throws.mass[1])
     if throws.log_mass != 0:
         share = (mass - throws.mass[0]) / wp.max(throws.mass[1] - throws.mass[0], 1.0e-9)
         mass = throws.mass[0] * wp.pow(throws.mass[1] / throws.mass[0], share)
-    density[e, ball] = mass / throws.volume
-    rest_ball(throws, e, ball, position, velocity, spin)
+    first.density[e, ball] = mass / throws.volume
+    rest_ball(throws, e, ball, first)
 
 
 def record_balls(env: EpisodeArrays, graph: LaunchGraph, throws: Throws) -> None:
     """Append, at a reset: draw the mass of every ball and put it at its waiting place."""
-    props = env.simulation.props
-    graph.launch(
-        draw_balls,
-        (env.num_envs, throws.num_balls),
-        [env.mask, env.seed, env.episode, throws],
-        [props.initial.position, props.initial.velocity, props.initial.spin, props.density],
-    )
+    graph.launch(draw_balls, (env.num_envs, throws.num_balls), [env.episodes, throws], [env.first_props])

@@ -9,9 +9,9 @@ from pydantic import BaseModel, Field
 
 from piavatar_envs.avatar.body.skeleton import joint_index
 from piavatar_envs.avatar.rotation import quat_log
-from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import FROZEN
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, Outcome
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.task import Metric, Task, Term
 from piavatar_envs.mpm.types import Sensors
@@ -124,35 +124,33 @@ def tilt_of(rotation: wp.quat):
 
 
 @wp.func
-def posture_of(
-    rule: Upright, body: Body, e: int, rotation: wp.array2d(dtype=wp.quat), position: wp.array2d(dtype=wp.vec3)
-):
+def posture_of(rule: Upright, bones: Bones, e: int):
     """Return heights and tilt of a body, and their rewards."""
     now = Posture()
-    heights = heights_of(body, e, position)
+    heights = heights_of(bones, e)
     now.head = heights[0]
     now.pelvis = heights[1]
-    now.tilt = tilt_of(rotation[e, _CHEST])
+    now.tilt = tilt_of(bones.rotation[e, _CHEST])
     now.high = tolerance(1.0 - now.head, 0.05, rule.height_margin)
     now.straight = tolerance(now.tilt, 0.1, rule.tilt_margin)
     return now
 
 
 @wp.func
-def mean_angle(local: wp.array2d(dtype=wp.quat), e: int):
+def mean_angle(bones: Bones, e: int):
     """Return the mean angle of all joints but the pelvis from the rest pose [rad]."""
     total = float(0.0)
-    for b in range(1, local.shape[1]):
-        total += wp.length(quat_log(local[e, b]))
-    return total / float(local.shape[1] - 1)
+    for b in range(1, bones.local.shape[1]):
+        total += wp.length(quat_log(bones.local[e, b]))
+    return total / float(bones.local.shape[1] - 1)
 
 
 @wp.func
-def write_posture(now: Posture, e: int, metrics: wp.array3d(dtype=float)):
+def write_posture(now: Posture, e: int, outcome: Outcome):
     """Write the first three of :data:`STANDING_METRICS`."""
-    metrics[e, 0, 0] = now.head
-    metrics[e, 0, 1] = now.pelvis
-    metrics[e, 0, 2] = wp.degrees(now.tilt)
+    outcome.metrics[e, 0, 0] = now.head
+    outcome.metrics[e, 0, 1] = now.pelvis
+    outcome.metrics[e, 0, 2] = wp.degrees(now.tilt)
 
 
 @wp.func
@@ -169,48 +167,34 @@ def restfulness(still: Still, angle: float):
 
 @wp.func
 def write_standing(
-    rule: Upright,
-    now: Posture,
-    speed: float,
-    e: int,
-    action: wp.array3d(dtype=float),
-    # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
+    rule: Upright, now: Posture, speed: float, e: int, action: wp.array3d(dtype=float), outcome: Outcome
 ):
     """Write :data:`STANDING_METRICS`, success, and the last reward term, the cost of acting."""
-    terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
-    write_posture(now, e, metrics)
-    metrics[e, 0, 3] = speed
-    success[e, 0] = now.head >= rule.stand_head
+    outcome.terms[e, 0, 4] = -rule.control_cost * mean_square_action(action, e, 0)
+    write_posture(now, e, outcome)
+    outcome.metrics[e, 0, 3] = speed
+    outcome.success[e, 0] = now.head >= rule.stand_head
 
 
 @wp.kernel
 def judge_standing(
     rule: Upright,
     still: Still,
-    body: Body,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    local: wp.array2d(dtype=wp.quat),
+    bones: Bones,
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward standing still in the rest pose, wherever that is."""
     e = wp.tid()
-    now = posture_of(rule, body, e, rotation, position)
-    speed = wp.length(velocity[e, 0])
-    angle = mean_angle(local, e)
-    terms[e, 0, 0] = 0.3 * now.high
-    terms[e, 0, 1] = 0.3 * now.straight
-    terms[e, 0, 2] = 0.2 * now.high * stillness(still, speed)
-    terms[e, 0, 3] = 0.2 * now.high * restfulness(still, angle)
-    write_standing(rule, now, speed, e, action, terms, metrics, success)
+    now = posture_of(rule, bones, e)
+    speed = wp.length(bones.velocity[e, 0])
+    angle = mean_angle(bones, e)
+    outcome.terms[e, 0, 0] = 0.3 * now.high
+    outcome.terms[e, 0, 1] = 0.3 * now.straight
+    outcome.terms[e, 0, 2] = 0.2 * now.high * stillness(still, speed)
+    outcome.terms[e, 0, 3] = 0.2 * now.high * restfulness(still, angle)
+    write_standing(rule, now, speed, e, action, outcome)
 
 
 @wp.func
@@ -227,40 +211,34 @@ def foot_share(left: wp.vec3, right: wp.vec3, impulse: wp.vec3, moment: wp.vec3)
 
 
 @wp.func
-def left_foot_share(position: wp.array2d(dtype=wp.vec3), sensors: Sensors, e: int, agent: int):
+def left_foot_share(bones: Bones, sensors: Sensors, e: int, agent: int):
     """Return the left foot's share in the ground's upward impulse of the last step, from 0 to 1."""
     moment = sensors.boundary_moment[e, agent]
-    return foot_share(position[e, _LEFT], position[e, _RIGHT], sensors.boundary_impulse[e, agent], moment)
+    return foot_share(bones.position[e, _LEFT], bones.position[e, _RIGHT], sensors.boundary_impulse[e, agent], moment)
 
 
 @wp.kernel
 def observe_upright(
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     sensors: Sensors,
     # out
     observation: wp.array3d(dtype=float),
 ):
     """Write :data:`UPRIGHT_TERMS` from component ``start``."""
     e = wp.tid()
-    write_vector(observation, e, agent, start, wp.quat_rotate_inv(rotation[e, 0], wp.vec3(0.0, 0.0, -1.0)))
+    write_vector(observation, e, agent, start, wp.quat_rotate_inv(bones.rotation[e, 0], wp.vec3(0.0, 0.0, -1.0)))
     upward = sensors.boundary_impulse[e, agent][2]
-    share = left_foot_share(position, sensors, e, agent)
+    share = left_foot_share(bones, sensors, e, agent)
     observation[e, agent, start + 3] = share * upward
     observation[e, agent, start + 4] = (1.0 - share) * upward
 
 
 def record_observe_upright(env: EpisodeArrays, graph: LaunchGraph, agent: int, start: int) -> int:
     """Append: write :data:`UPRIGHT_TERMS` from component ``start``; return the component after them."""
-    tracked = env.simulation.avatars[agent].tracked
-    graph.launch(
-        observe_upright,
-        env.num_envs,
-        [agent, start, tracked.rotation, tracked.position, env.simulation.sensors],
-        [env.observation],
-    )
+    inputs = [agent, start, env.bones[agent], env.simulation.sensors]
+    graph.launch(observe_upright, env.num_envs, inputs, [env.observation])
     return start + sum(term.size for term in UPRIGHT_TERMS)
 
 
@@ -282,13 +260,8 @@ class StandingTask(Task):
         self.grounding.record_standing(env, graph, self.config.pose_noise)
 
     def record_outcome(self, env, graph) -> None:
-        avatar, t = env.simulation.avatar, env.simulation.avatar.tracked
-        graph.launch(
-            judge_standing,
-            env.num_envs,
-            [self.rule, self.still, avatar.body, t.rotation, t.position, t.velocity, t.local, env.action],
-            [env.terms, env.metrics, env.success],
-        )
+        inputs = [self.rule, self.still, env.bones[0], env.action]
+        graph.launch(judge_standing, env.num_envs, inputs, [env.outcome])
         record_fall(env, graph, self.config.fall)
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:

@@ -13,6 +13,7 @@ from piavatar_envs.avatar.body.skeleton import BODY_PARTS
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key
 from piavatar_envs.config import ConfigError, ControlConfig, PoseControlConfig
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Episodes, Outcome
 from piavatar_envs.envs.task import Metric, TaskArray, Term
 from piavatar_envs.mpm.types import Sensors
 from piavatar_envs.sim.scene import Domain
@@ -112,8 +113,7 @@ def worth(rules: Rules, impulse: wp.vec2):
 @wp.kernel
 def count_points(
     rules: Rules,
-    alive: wp.array2d(dtype=wp.bool),
-    failure: wp.array(dtype=int),
+    episodes: Episodes,
     sensors: Sensors,
     # in and out
     peak: wp.array3d(dtype=wp.vec2),
@@ -124,14 +124,14 @@ def count_points(
 ):
     """Count the points of every agent on every other: a contact counts once, by its greatest impulse so far."""
     e, agent = wp.tid()
-    for other in range(alive.shape[1]):
+    for other in range(episodes.alive.shape[1]):
         now = wp.vec2(0.0, 0.0)
-        if other != agent and failure[e] == 0:
+        if other != agent and episodes.failure[e] == 0:
             now = landed(sensors, e, agent, other)
         before = peak[e, agent, other]
         most = wp.max(now, before)
         gain = worth(rules, most) - worth(rules, before)
-        if not (alive[e, agent] and alive[e, other]):
+        if not (episodes.alive[e, agent] and episodes.alive[e, other]):
             gain = 0.0
         points[e, agent, other] = gain
         score[e, agent] = score[e, agent] + gain
@@ -144,11 +144,11 @@ def count_points(
 
 
 @wp.func
-def leads(e: int, agent: int, alive: wp.array2d(dtype=wp.bool), score: wp.array2d(dtype=float)):
+def leads(episodes: Episodes, score: wp.array2d(dtype=float), e: int, agent: int):
     """Return whether no other agent that is in has as many points."""
-    best = bool(alive.shape[1] > 1)
-    for other in range(alive.shape[1]):
-        if other != agent and alive[e, other] and score[e, other] >= score[e, agent]:
+    best = bool(episodes.alive.shape[1] > 1)
+    for other in range(episodes.alive.shape[1]):
+        if other != agent and episodes.alive[e, other] and score[e, other] >= score[e, agent]:
             best = False
     return best
 
@@ -160,41 +160,36 @@ def judge(
     points: wp.array3d(dtype=float),
     score: wp.array2d(dtype=float),
     out: wp.array2d(dtype=wp.bool),
-    alive: wp.array2d(dtype=wp.bool),
-    failure: wp.array(dtype=int),
-    step_count: wp.array(dtype=int),
+    episodes: Episodes,
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
-    terminated: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward blows and the last one on its feet, cost blows taken and falls."""
     e, agent = wp.tid()
-    others = others_in(e, agent, alive, out)
-    won = has_won(e, agent, others, out, failure)
+    others = others_in(episodes, out, e, agent)
+    won = has_won(episodes, out, e, agent, others)
     hit = float(0.0)
     taken = float(0.0)
     given_impulse = float(0.0)
     taken_impulse = float(0.0)
-    for other in range(alive.shape[1]):
+    for other in range(episodes.alive.shape[1]):
         hit += points[e, agent, other]
         taken += points[e, other, agent]
         given_impulse = wp.max(given_impulse, wp.max(impulse[e, agent, other]))
         taken_impulse = wp.max(taken_impulse, wp.max(impulse[e, other, agent]))
-    terms[e, agent, 0] = hit
-    terms[e, agent, 1] = -rules.taken_weight * taken
-    terms[e, agent, 2] = wp.where(won, rules.win_reward, 0.0)
-    terms[e, agent, 3] = wp.where(out[e, agent] and failure[e] == 0, -rules.down_cost, 0.0)
-    terms[e, agent, 4] = -rules.control_cost * mean_square_action(action, e, agent)
-    metrics[e, agent, 0] = score[e, agent]
-    metrics[e, agent, 1] = given_impulse
-    metrics[e, agent, 2] = taken_impulse
+    outcome.terms[e, agent, 0] = hit
+    outcome.terms[e, agent, 1] = -rules.taken_weight * taken
+    outcome.terms[e, agent, 2] = wp.where(won, rules.win_reward, 0.0)
+    outcome.terms[e, agent, 3] = wp.where(out[e, agent] and episodes.failure[e] == 0, -rules.down_cost, 0.0)
+    outcome.terms[e, agent, 4] = -rules.control_cost * mean_square_action(action, e, agent)
+    outcome.metrics[e, agent, 0] = score[e, agent]
+    outcome.metrics[e, agent, 1] = given_impulse
+    outcome.metrics[e, agent, 2] = taken_impulse
     # the step counter has not moved yet
-    gong = step_count[e] + 1 >= rules.max_steps and failure[e] == 0 and not out[e, agent]
-    success[e, agent] = won or (gong and leads(e, agent, alive, score))
-    terminated[e, agent] = won or out[e, agent]
+    gong = episodes.step_count[e] + 1 >= rules.max_steps and episodes.failure[e] == 0 and not out[e, agent]
+    outcome.success[e, agent] = won or (gong and leads(episodes, score, e, agent))
+    outcome.terminated[e, agent] = won or out[e, agent]
 
 
 class BoxingTask(RingTask):
@@ -269,11 +264,10 @@ for it to stay up. A good agent strikes fast, at the head, and withdraws."""
     def record_outcome(self, env, graph) -> None:
         agents = env.num_envs, env.num_agents
         self.referee.record(env, graph)
-        inputs = [self.rules, env.alive, env.failure, env.simulation.sensors]
+        inputs = [self.rules, env.episodes, env.simulation.sensors]
         graph.launch(count_points, agents, inputs, [self.peak, self.score, self.impulse, self.points])
-        inputs = [self.rules, self.impulse, self.points, self.score, self.referee.out, env.alive, env.failure]
-        outputs = [env.terms, env.metrics, env.success, env.terminated]
-        graph.launch(judge, agents, [*inputs, env.step_count, env.action], outputs)
+        inputs = [self.rules, self.impulse, self.points, self.score, self.referee.out, env.episodes, env.action]
+        graph.launch(judge, agents, inputs, [env.outcome])
 
     def markers(self, env, index: int) -> list[tuple[np.ndarray, float, tuple[float, float, float]]]:
         side = 0.5 * self.config.ring_size

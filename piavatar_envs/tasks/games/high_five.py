@@ -10,11 +10,11 @@ import warp as wp
 from pydantic import Field
 
 from piavatar_envs.avatar.body.skeleton import BODY_PARTS
-from piavatar_envs.avatar.types import Body
 from piavatar_envs.config import AvatarConfig, ConfigError, EnvConfig, SceneConfig, replace
 from piavatar_envs.config.schema import select_joints
-from piavatar_envs.core.rng import STREAM_TASK, generator
+from piavatar_envs.core.rng import STREAM_TASK
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, random_of
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
@@ -59,9 +59,7 @@ class Hands:
 
 @wp.kernel
 def draw_slap(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     sides: wp.vec2i,
     impulse: wp.vec2,
     # out
@@ -70,8 +68,8 @@ def draw_slap(
 ):
     """Draw the hands (0 left, 1 right) and the weakest slap that counts [N s], each between two bounds."""
     e = wp.tid()
-    if mask[e]:
-        random = generator(seed[e], episode[e], STREAM_TASK, 0)
+    if episodes.mask[e]:
+        random = random_of(episodes, e, STREAM_TASK, 0)
         side[e] = wp.randi(random, sides[0], sides[1] + 1)
         least[e] = wp.randf(random, impulse[0], impulse[1])
 
@@ -79,21 +77,18 @@ def draw_slap(
 @wp.kernel
 def locate_hand(
     agent: int,
-    body: Body,
+    bones: Bones,
     side: wp.array(dtype=int),
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
     # out
     hands: Hands,
 ):
     """Find the hand that an agent has to raise."""
     e = wp.tid()
     wrist = wp.where(side[e] == 0, LEFT_WRIST, RIGHT_WRIST)
-    middle = flesh_middle(body, e, wrist, rotation, position)
+    middle = flesh_middle(bones, e, wrist)
     hands.middle[e, agent] = middle
-    hands.direction[e, agent] = wp.normalize(middle - position[e, wrist])
-    hands.velocity[e, agent] = velocity[e, wrist]
+    hands.direction[e, agent] = wp.normalize(middle - bones.position[e, wrist])
+    hands.velocity[e, agent] = bones.velocity[e, wrist]
 
 
 @wp.func
@@ -111,10 +106,7 @@ def judge(
     sensors: Sensors,
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
-    terminated: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward both agents alike, by the way that the hands have to go and by the slap."""
     e = wp.tid()
@@ -129,34 +121,33 @@ def judge(
     to_go = distance + wp.max(rule.least_height - height, 0.0) + 0.5 * _TURN * wp.max(rule.upright - upright, 0.0)
     control = 0.5 * (mean_square_action(action, e, 0) + mean_square_action(action, e, 1))
     for agent in range(2):
-        terms[e, agent, 0] = rule.approach_weight * tolerance(to_go, rule.reach, rule.margin)
-        terms[e, agent, 1] = wp.where(done, rule.slap_bonus, 0.0)
-        terms[e, agent, 2] = -rule.control_cost * control
-        metrics[e, agent, 0] = distance
-        metrics[e, agent, 1] = height
-        metrics[e, agent, 2] = upright
-        metrics[e, agent, 3] = impulse
-        success[e, agent] = done
+        outcome.terms[e, agent, 0] = rule.approach_weight * tolerance(to_go, rule.reach, rule.margin)
+        outcome.terms[e, agent, 1] = wp.where(done, rule.slap_bonus, 0.0)
+        outcome.terms[e, agent, 2] = -rule.control_cost * control
+        outcome.metrics[e, agent, 0] = distance
+        outcome.metrics[e, agent, 1] = height
+        outcome.metrics[e, agent, 2] = upright
+        outcome.metrics[e, agent, 3] = impulse
+        outcome.success[e, agent] = done
         # a second chance after too hard a blow would make the upper bound a matter of patience
-        terminated[e, agent] = done or too_hard
+        outcome.terminated[e, agent] = done or too_hard
 
 
 @wp.kernel
 def observe_hands(
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     hands: Hands,
     # out
     observation: wp.array3d(dtype=float),
 ):
     """Write ``HighFiveTask.observation_terms`` from component ``start``."""
     e = wp.tid()
-    to_root = wp.quat_inverse(rotation[e, 0])
+    to_root = wp.quat_inverse(bones.rotation[e, 0])
     own = hands.middle[e, agent]
     other = 1 - agent
-    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, own - position[e, 0]))
+    write_vector(observation, e, agent, start, wp.quat_rotate(to_root, own - bones.position[e, 0]))
     write_vector(observation, e, agent, start + 3, wp.quat_rotate(to_root, hands.direction[e, agent]))
     write_vector(observation, e, agent, start + 6, wp.quat_rotate(to_root, hands.middle[e, other] - own))
     write_vector(observation, e, agent, start + 9, wp.quat_rotate(to_root, hands.velocity[e, other]))
@@ -308,27 +299,23 @@ the hands together is not enough: they must swing, at the same moment."""
         record_standing(env, graph, self.config.pose_noise)
         record_shift(env, graph, self.config.place_noise)
         bounds = [wp.vec2i(*self.sides), wp.vec2(*self.config.impulse)]
-        inputs = [env.mask, env.seed, env.episode, *bounds]
+        inputs = [env.episodes, *bounds]
         graph.launch(draw_slap, env.num_envs, inputs, [self.side, self.least])
 
     def _record_hands(self, env, graph) -> None:
-        for agent, avatar in enumerate(env.simulation.avatars):
-            t = avatar.tracked
-            inputs = [agent, avatar.body, self.side, t.rotation, t.position, t.velocity]
-            graph.launch(locate_hand, env.num_envs, inputs, [self.hands])
+        for agent, bones in enumerate(env.bones):
+            graph.launch(locate_hand, env.num_envs, [agent, bones, self.side], [self.hands])
 
     def record_outcome(self, env, graph) -> None:
         self._record_hands(env, graph)
         inputs = [self.rule, self.side, self.least, self.hands, env.simulation.sensors, env.action]
-        graph.launch(judge, env.num_envs, inputs, [env.terms, env.metrics, env.success, env.terminated])
+        graph.launch(judge, env.num_envs, inputs, [env.outcome])
         self.referee.record(env, graph)
         self.referee.record_shared_end(env, graph)
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self._record_hands(env, graph)
-        tracked = env.simulation.avatars[agent].tracked
-        inputs = [agent, start, tracked.rotation, tracked.position, self.hands]
-        graph.launch(observe_hands, env.num_envs, inputs, [env.observation])
+        graph.launch(observe_hands, env.num_envs, [agent, start, env.bones[agent], self.hands], [env.observation])
         at = [env.layout[name].slice.start if name in env.layout else -1 for name in ("hand_side", "least_impulse")]
         graph.launch(observe_draws, env.num_envs, [agent, *at, self.side, self.least], [env.observation])
 

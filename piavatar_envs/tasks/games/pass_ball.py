@@ -8,9 +8,10 @@ from pydantic import Field
 
 from piavatar_envs.config import EnvConfig, SceneConfig, replace
 from piavatar_envs.config.schema import select_joints
-from piavatar_envs.core.rng import STREAM_BALL, generator
+from piavatar_envs.core.rng import STREAM_BALL
 from piavatar_envs.core.structs import fill
 from piavatar_envs.envs.actions import ActionSpec, speed_within
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome, Props, random_of
 from piavatar_envs.envs.observations import ObservationTerm, write_vector
 from piavatar_envs.envs.parameters import Drawn
 from piavatar_envs.envs.task import Metric, Task, TaskArray, Term
@@ -76,37 +77,32 @@ class Play:
 
 @wp.kernel
 def serve_ball(
-    mask: wp.array(dtype=wp.bool),
-    seed: wp.array(dtype=int),
-    episode: wp.array(dtype=int),
+    episodes: Episodes,
     serve: Serve,
     places: wp.array(dtype=wp.vec3),
     # out
-    position: wp.array2d(dtype=wp.vec3),
-    velocity: wp.array2d(dtype=wp.vec3),
-    spin: wp.array2d(dtype=wp.vec3),
-    density: wp.array2d(dtype=float),
+    first: Props,
     play: Play,
 ):
     """Roll a ball from the middle of ``places`` towards one of them, in the masked environments."""
     e = wp.tid()
-    if not mask[e]:
+    if not episodes.mask[e]:
         return
-    random = generator(seed[e], episode[e], STREAM_BALL, 0)
+    random = random_of(episodes, e, STREAM_BALL, 0)
     agents = places.shape[0]
-    first = wp.randi(random, 0, agents)
+    passer = wp.randi(random, 0, agents)
     speed = wp.randf(random, serve.slow, serve.fast)
     angle = wp.randf(random, -serve.spread, serve.spread)
     middle = wp.vec3()
     for agent in range(agents):
         middle += places[agent] / float(agents)
     up = wp.vec3(0.0, 0.0, 1.0)
-    way = wp.quat_rotate(wp.quat_from_axis_angle(up, angle), wp.normalize(places[first] - middle))
-    position[e, serve.prop] = middle + serve.radius * up
-    velocity[e, serve.prop] = speed * way
-    spin[e, serve.prop] = (speed / serve.radius) * wp.cross(up, way)
-    density[e, serve.prop] = wp.exp(wp.randf(random, serve.light, serve.heavy))
-    play.passer[e] = first
+    way = wp.quat_rotate(wp.quat_from_axis_angle(up, angle), wp.normalize(places[passer] - middle))
+    first.position[e, serve.prop] = middle + serve.radius * up
+    first.velocity[e, serve.prop] = speed * way
+    first.spin[e, serve.prop] = (speed / serve.radius) * wp.cross(up, way)
+    first.density[e, serve.prop] = wp.exp(wp.randf(random, serve.light, serve.heavy))
+    play.passer[e] = passer
     play.gap[e] = -1.0
 
 
@@ -163,10 +159,7 @@ def judge(
     # in and out
     play: Play,
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
-    terminated: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Advance the game: reward progress and passes, and end it when no agent can reach the ball."""
     e = wp.tid()
@@ -194,16 +187,16 @@ def judge(
     slow = flat_distance(velocity[e], wp.vec3()) < rule.dead_speed
     over = (slow and nearest > rule.fetch) or flat_distance(ball[e], wp.vec3()) > rule.rim
     for agent in range(agents):
-        terms[e, agent, 0] = rule.progress_weight * progress
-        terms[e, agent, 1] = wp.where(passed, rule.pass_bonus, 0.0)
-        terms[e, agent, 2] = -rule.control_cost * mean_square_action(action, e, agent)
-        metrics[e, agent, 0] = float(play.passes[e])
-        metrics[e, agent, 1] = float(play.touches[e, agent])
-        metrics[e, agent, 2] = play.gap[e]
-        metrics[e, agent, 3] = wp.length(velocity[e])
-        success[e, agent] = play.passes[e] >= rule.goal_passes
+        outcome.terms[e, agent, 0] = rule.progress_weight * progress
+        outcome.terms[e, agent, 1] = wp.where(passed, rule.pass_bonus, 0.0)
+        outcome.terms[e, agent, 2] = -rule.control_cost * mean_square_action(action, e, agent)
+        outcome.metrics[e, agent, 0] = float(play.passes[e])
+        outcome.metrics[e, agent, 1] = float(play.touches[e, agent])
+        outcome.metrics[e, agent, 2] = play.gap[e]
+        outcome.metrics[e, agent, 3] = wp.length(velocity[e])
+        outcome.success[e, agent] = play.passes[e] >= rule.goal_passes
         if over:
-            terminated[e, agent] = True
+            outcome.terminated[e, agent] = True
 
 
 @wp.kernel
@@ -211,7 +204,7 @@ def observe_game(
     rule: PassRule,
     agent: int,
     start: int,
-    rotation: wp.array2d(dtype=wp.quat),
+    bones: Bones,
     pelvis: wp.array2d(dtype=wp.vec3),
     ball: wp.array(dtype=wp.vec3),
     density: wp.array(dtype=float),
@@ -223,7 +216,7 @@ def observe_game(
     """Write the state of the game from component ``start``; agents are counted on from the observing one."""
     e = wp.tid()
     agents = pelvis.shape[1]
-    to_root = wp.quat_inverse(rotation[e, 0])
+    to_root = wp.quat_inverse(bones.rotation[e, 0])
     own = pelvis[e, agent]
     to = pelvis[e, goes_to(play, e, agents)]
     home = wp.vec3(place[0] - own[0], place[1] - own[1], 0.0)
@@ -390,15 +383,13 @@ actions."""
 
     def _ball(self, env, name: str) -> wp.array:
         """Return the ball's column of the tracked props' array ``name``."""
-        return getattr(env.simulation.props.state, name)[:, self.index]
+        return getattr(env.props, name)[:, self.index]
 
     def record_reset(self, env, graph) -> None:
         record_standing(env, graph, self.config.pose_noise)
         record_shift(env, graph, self.config.place_noise)
-        spawn, density = env.simulation.props.initial, env.simulation.props.density
-        inputs = [env.mask, env.seed, env.episode, self.serve, self.places]
-        outputs = [spawn.position, spawn.velocity, spawn.spin, density, self.play]
-        graph.launch(serve_ball, env.num_envs, inputs, outputs)
+        inputs = [env.episodes, self.serve, self.places]
+        graph.launch(serve_ball, env.num_envs, inputs, [env.first_props, self.play])
 
     def record_references(self, env, graph) -> list[tuple[wp.array, wp.array]]:
         config = self.config
@@ -415,18 +406,16 @@ actions."""
         self.referee.record(env, graph)
         ball = [self._ball(env, "position"), self._ball(env, "velocity")]
         inputs = [self.rule, *ball, self.referee.pelvis, env.simulation.sensors, env.action]
-        outputs = [self.play, env.terms, env.metrics, env.success, env.terminated]
-        graph.launch(judge, env.num_envs, inputs, outputs)
+        graph.launch(judge, env.num_envs, inputs, [self.play, env.outcome])
         self.referee.record_shared_end(env, graph)
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         self.referee.record(env, graph)
-        tracked, ball = env.simulation.avatars[agent].tracked, self._ball(env, "position")
-        density = env.simulation.props.density[:, self.index]
+        bones, ball, density = env.bones[agent], self._ball(env, "position"), self._ball(env, "density")
         place = wp.vec3(*self.scene.avatars[agent].position, 0.0)
-        inputs = [agent, start, tracked.rotation, self.referee.pelvis, ball, density, place, self.play]
+        inputs = [agent, start, bones, self.referee.pelvis, ball, density, place, self.play]
         graph.launch(observe_game, env.num_envs, [self.rule, *inputs], [env.observation])
-        inputs = [agent, env.layout[FEET_TERMS[0].name].slice.start, tracked.rotation, tracked.position, ball]
+        inputs = [agent, env.layout[FEET_TERMS[0].name].slice.start, bones, ball]
         graph.launch(observe_feet, env.num_envs, inputs, [env.observation])
 
 

@@ -12,6 +12,7 @@ from pydantic import Field
 from piavatar_envs.avatar.motion.keyframes import Arm, Foot, Key
 from piavatar_envs.config import ConfigError
 from piavatar_envs.core.structs import fill
+from piavatar_envs.envs.episodes import Bones, Episodes, Outcome
 from piavatar_envs.envs.observations import ObservationTerm
 from piavatar_envs.envs.task import Metric, Term
 from piavatar_envs.mpm.types import Sensors
@@ -78,41 +79,37 @@ def judge(
     ring: Ring,
     pelvis: wp.array2d(dtype=wp.vec3),
     out: wp.array2d(dtype=wp.bool),
-    alive: wp.array2d(dtype=wp.bool),
-    failure: wp.array(dtype=int),
+    episodes: Episodes,
     sensors: Sensors,
     action: wp.array3d(dtype=float),
     # out
-    terms: wp.array3d(dtype=float),
-    metrics: wp.array3d(dtype=float),
-    success: wp.array2d(dtype=wp.bool),
-    terminated: wp.array2d(dtype=wp.bool),
+    outcome: Outcome,
 ):
     """Reward the last one in, cost going out, and compare the distances from the centre."""
     e, agent = wp.tid()
-    others = others_in(e, agent, alive, out)
-    won = has_won(e, agent, others, out, failure)
+    others = others_in(episodes, out, e, agent)
+    won = has_won(episodes, out, e, agent, others)
     own = from_centre(pelvis[e, agent])
     theirs = float(0.0)
     pushed = wp.vec3()
-    for other in range(alive.shape[1]):
+    for other in range(episodes.alive.shape[1]):
         if other != agent:
             for part in range(NUM_PARTS):
                 pushed += part_impulse_by(sensors, e, agent, part, other)
-            if alive[e, other]:
+            if episodes.alive[e, other]:
                 theirs += wp.min(from_centre(pelvis[e, other]), ring.ring_radius)
     lead = float(0.0)
     if others[0] > 0:
         lead = (theirs / float(others[0]) - wp.min(own, ring.ring_radius)) / ring.ring_radius
-    terms[e, agent, 0] = wp.where(won, ring.win_reward, 0.0)
-    terms[e, agent, 1] = wp.where(out[e, agent] and failure[e] == 0, -ring.out_cost, 0.0)
-    terms[e, agent, 2] = ring.push_weight * lead
-    terms[e, agent, 3] = -ring.control_cost * mean_square_action(action, e, agent)
-    metrics[e, agent, 0] = ring.ring_radius - own
-    metrics[e, agent, 1] = wp.length(wp.vec3(pushed[0], pushed[1], 0.0))
-    metrics[e, agent, 2] = float(others[1]) + wp.where(out[e, agent], 0.0, 1.0)
-    success[e, agent] = won
-    terminated[e, agent] = won or out[e, agent]
+    outcome.terms[e, agent, 0] = wp.where(won, ring.win_reward, 0.0)
+    outcome.terms[e, agent, 1] = wp.where(out[e, agent] and episodes.failure[e] == 0, -ring.out_cost, 0.0)
+    outcome.terms[e, agent, 2] = ring.push_weight * lead
+    outcome.terms[e, agent, 3] = -ring.control_cost * mean_square_action(action, e, agent)
+    outcome.metrics[e, agent, 0] = ring.ring_radius - own
+    outcome.metrics[e, agent, 1] = wp.length(wp.vec3(pushed[0], pushed[1], 0.0))
+    outcome.metrics[e, agent, 2] = float(others[1]) + wp.where(out[e, agent], 0.0, 1.0)
+    outcome.success[e, agent] = won
+    outcome.terminated[e, agent] = won or out[e, agent]
 
 
 @wp.kernel
@@ -120,13 +117,13 @@ def observe_rim(
     agent: int,
     place: int,
     radius: float,
-    position: wp.array2d(dtype=wp.vec3),
+    bones: Bones,
     # out
     observation: wp.array3d(dtype=float),
 ):
     """Write the term ``rim_distance``."""
     e = wp.tid()
-    observation[e, agent, place] = radius - from_centre(position[e, 0])
+    observation[e, agent, place] = radius - from_centre(bones.position[e, 0])
 
 
 class SumoTask(RingTask):
@@ -193,13 +190,12 @@ does not lose its balance."""
     def record_outcome(self, env, graph) -> None:
         referee, agents = self.referee, (env.num_envs, env.num_agents)
         referee.record(env, graph)
-        inputs = [self.ring, referee.pelvis, referee.out, env.alive, env.failure, env.simulation.sensors, env.action]
-        graph.launch(judge, agents, inputs, [env.terms, env.metrics, env.success, env.terminated])
+        inputs = [self.ring, referee.pelvis, referee.out, env.episodes, env.simulation.sensors, env.action]
+        graph.launch(judge, agents, inputs, [env.outcome])
 
     def record_observe(self, env, graph, agent: int, start: int) -> None:
         super().record_observe(env, graph, agent, start)
-        position = env.simulation.avatars[agent].tracked.position
-        inputs = [agent, start + RING_CENTRE.size, self.config.ring_radius, position]
+        inputs = [agent, start + RING_CENTRE.size, self.config.ring_radius, env.bones[agent]]
         graph.launch(observe_rim, env.num_envs, inputs, [env.observation])
 
     def markers(self, env, index: int) -> list[tuple[np.ndarray, float, tuple[float, float, float]]]:
