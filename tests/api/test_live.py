@@ -1,4 +1,4 @@
-"""``render_mode="human"``: the live view shows what pictures show, keeps pace, and is one environment's."""
+"""``render_mode="human"``: the live view shows the scene of the pictures, in real time, of one environment."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class FakeTime:
 
 @pytest.fixture
 def make_human(device):
-    """A maker of environments that are watched, their time in hand: ``env, time = make_human(env_id)``."""
+    """A maker of watched environments with a clock that tests move: ``env, time = make_human(env_id)``."""
     pytest.importorskip("viser", reason='needs pip install "piavatar-envs[live]"')
     made = []
 
@@ -53,12 +53,12 @@ def make_human(device):
 
 
 def shown(env) -> dict[str, np.ndarray]:
-    """Vertices of what the view holds, by name."""
+    """Return the vertices in the view, by name."""
     return {name: node.vertices for name, node in env.unwrapped.host.live.view._nodes.items()}
 
 
 @pytest.mark.parametrize("color", ["skin", "strain"])
-def test_the_view_shows_what_the_picture_shows(make_human, device, monkeypatch, color):
+def test_the_view_shows_the_scene_of_the_picture(make_human, device, monkeypatch, color):
     pytest.importorskip("pyvista")
     seen = []
 
@@ -89,8 +89,11 @@ def test_the_view_shows_what_the_picture_shows(make_human, device, monkeypatch, 
         assert {v.tobytes() for v in banded} == {v.tobytes() for v in np.asarray(body.vertices, np.float32)}
 
 
-def test_resets_and_steps_update_the_view_by_themselves(make_human, env_id):
-    env, _ = make_human(env_id)
+def test_resets_steps_and_states_update_the_view(make_human, sample_id):
+    env, _ = make_human(sample_id)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.unwrapped.render()
+    assert env.unwrapped.host.live._view is None
     env.reset(seed=0)
     assert env.render() is None
     before = {name: vertices.copy() for name, vertices in shown(env).items()}
@@ -106,8 +109,8 @@ def test_resets_and_steps_update_the_view_by_themselves(make_human, env_id):
 
 
 @pytest.mark.parametrize(("work", "slept"), [(0.02, 1.0 / 30.0 - 0.02), (0.05, 0.0)])
-def test_steps_take_no_less_than_their_time(make_human, monkeypatch, work, slept):
-    """Of a control step of 1/30 s only what is left is slept, and nothing where it took longer."""
+def test_steps_take_at_least_their_time(make_human, monkeypatch, work, slept):
+    """Sleep the rest of a control step of 1/30 s, and nothing where it took longer."""
     env, time = make_human("PIAvatar/Reach-v0")
     step = BatchEnv.step
     monkeypatch.setattr(BatchEnv, "step", lambda batch: (step(batch), time.work(work)))
@@ -120,7 +123,7 @@ def test_steps_take_no_less_than_their_time(make_human, monkeypatch, work, slept
     assert time.now == pytest.approx(6 * max(work, 1.0 / 30.0))
 
 
-def test_what_sleep_oversleeps_does_not_add_up():
+def test_oversleeping_does_not_add_up():
     time = FakeTime()
     pace = Pace(time.clock, lambda seconds: time.sleep(seconds + 0.004))
     for _ in range(50):
@@ -129,7 +132,7 @@ def test_what_sleep_oversleeps_does_not_add_up():
     assert time.now - 100.0 == pytest.approx(5.0, abs=0.005)
 
 
-def test_what_is_quicker_than_a_screen_is_not_all_sent(make_human, monkeypatch):
+def test_not_every_step_faster_than_a_screen_is_sent(make_human, monkeypatch):
     env, _ = make_human("PIAvatar/Reach-v0", control_dt=0.005)
     env.reset(seed=0)
     live, sent = env.unwrapped.host.live, []
@@ -141,21 +144,13 @@ def test_what_is_quicker_than_a_screen_is_not_all_sent(make_human, monkeypatch):
 
 def test_closing_stops_the_server(make_human):
     env, _ = make_human("PIAvatar/Reach-v0")
-    env.close()
     env.reset(seed=0)
     view = env.unwrapped.host.live.view
     env.close()
     env.close()
     assert view._closed
     env.step(np.zeros(env.action_space.shape, np.float32))
-    assert env.unwrapped.host.live._view is None, "only what begins anew opens it again"
-
-
-def test_nothing_is_opened_before_the_first_reset(make_human):
-    env, _ = make_human("PIAvatar/Reach-v0")
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        env.unwrapped.render()
-    assert env.unwrapped.host.live._view is None
+    assert env.unwrapped.host.live._view is None, "a reset opens it again"
 
 
 def test_a_missing_viser_shows_at_once(monkeypatch, device):

@@ -1,4 +1,4 @@
-"""The view of Stable-Baselines3: its own vector of single environments is what it must equal; and it trains."""
+"""The view for Stable-Baselines3 equals its vector of single environments; and it trains."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from piavatar_envs.api.sb3 import SB3VecEnv
-
-#: An episode of six steps: several fit into a test.
-SHORT = {"episode_seconds": 0.2}
+from tests.api.runs import SHORT
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +32,12 @@ def make_sb3(device):
 
 
 @pytest.mark.parametrize("obs_mode", ["flat", "dict"])
-def test_it_is_their_vector_of_single_environments(make_sb3, make_env, env_id, same, obs_mode):
-    """Observations, rewards, ends, infos with terminal observations, and the infos of resets."""
-    if obs_mode == "dict" and env_id != "PIAvatar/KickBall-v0":
-        pytest.skip("names are the same business for all")
-    vector = make_sb3(env_id, obs_mode=obs_mode)
-    oracle = DummyVecEnv([lambda twin=twin: make_env(env_id, twin=twin, obs_mode=obs_mode, **SHORT) for twin in (0, 1)])
+def test_it_equals_their_vector_of_single_environments(make_sb3, make_env, sample_id, same, obs_mode):
+    """Compare observations, rewards, ends, infos with terminal observations, and the infos of resets."""
+    vector = make_sb3(sample_id, obs_mode=obs_mode)
+    oracle = DummyVecEnv(
+        [lambda twin=twin: make_env(sample_id, twin=twin, obs_mode=obs_mode, **SHORT) for twin in (0, 1)]
+    )
     answers = []
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (9, 2, *vector.action_space.shape)).astype(np.float32)
     for env in (vector, oracle):
@@ -58,7 +56,7 @@ def test_it_is_their_vector_of_single_environments(make_sb3, make_env, env_id, s
     assert len(ends) == 2 and all(info["TimeLimit.truncated"] for info in ends)
 
 
-def test_a_fall_is_not_a_truncation(make_sb3):
+def test_a_failure_is_not_a_truncation(make_sb3):
     vector = make_sb3("Reach-v0")
     vector.seed(0)
     vector.reset()
@@ -96,7 +94,7 @@ def test_monitors_count_episodes(make_sb3):
     assert not any(vector.env_is_wrapped(Monitor))
 
 
-def test_attributes_are_shared_and_methods_are_few(make_sb3, make_env, equal):
+def test_attributes_and_methods_are_those_of_the_vector(make_sb3, make_env, equal):
     vector, single = make_sb3("Reach-v0"), make_env("PIAvatar/Reach-v0", **SHORT)
     assert (
         vector.get_attr("action_names", [1]) == [single.action_names] and vector.get_attr("render_mode") == [None] * 2
