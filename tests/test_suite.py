@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from piavatar_envs.api.pictures import SceneReader
 from piavatar_envs.avatar.body.skeleton import NUM_ACTUATED
 from piavatar_envs.tasks import NAMESPACE, task_modules
 from tests.conftest import SAMPLE
@@ -112,6 +113,14 @@ def test_observations_are_finite_and_none_is_constant(make_env, env_id):
         least = 1e-6 if partly else 5e-4
         small = set(np.flatnonzero(spread < least)) - set(ALMOST_CONSTANT.get(name, ()))
         assert not small, f"{name}{sorted(small)} hardly changes: {spread[sorted(small)]}"
+
+
+def test_the_scene_has_a_body_and_finite_meshes(make_env, env_id):
+    env = make_env(env_id)
+    env.reset(seed=0)
+    scene = SceneReader(env.batch).scene(0)
+    assert np.isfinite(scene.bodies[0].vertices).all() and len(scene.bodies) > 0
+    assert all(np.isfinite(marker.mesh()[0]).all() for marker in scene.markers)
 
 
 def test_returned_arrays_belong_to_the_caller(make_env, env_id):

@@ -1,4 +1,4 @@
-"""The views for skrl: the same worlds as the other views show, step by step, through deaths and resets."""
+"""The views for skrl equal the other views, step by step, while agents leave and episodes end."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.api.runs import arrays_in, on_host
 from tests.conftest import only_one_process
 
 torch = pytest.importorskip("torch", reason="needs the extra train or skrl")
@@ -20,7 +21,7 @@ REACH = "PIAvatar/Reach-v0"
 
 @pytest.fixture(scope="module")
 def sumo(device):
-    """The module of a world whose agents leave one by one, its kernels compiled."""
+    """The module of a game whose agents leave one by one, its kernels compiled."""
     pytest.importorskip("pettingzoo", reason="needs the extra multi")
     with only_one_process("kernels"):
         from piavatar_envs.multi import sumo_v0
@@ -31,7 +32,7 @@ def sumo(device):
 
 @pytest.fixture(scope="module")
 def arena(sumo, device):
-    """Two rings of three."""
+    """Two environments of three agents."""
     env = AvatarSkrlMultiEnv(sumo.TASK, 2, device, num_agents=3, **SETTINGS)
     yield env
     env.close()
@@ -39,7 +40,7 @@ def arena(sumo, device):
 
 @pytest.fixture(scope="module")
 def ring(sumo, device):
-    """One ring of three, as PettingZoo shows it."""
+    """One environment of three agents, of PettingZoo."""
     env = sumo.parallel_env(device=device, num_agents=3, **SETTINGS)
     yield env
     env.close()
@@ -47,87 +48,71 @@ def ring(sumo, device):
 
 @pytest.fixture(scope="module")
 def reachers(device):
-    """Two avatars that reach, each in its own environment."""
+    """Two environments of one avatar."""
     env = AvatarSkrlEnv(REACH, 2, device, **SETTINGS)
     yield env
     env.close()
 
 
 def drawn(env, rng) -> dict:
-    """Random actions of all agents."""
+    """Return random actions of all agents."""
     size = env.action_spaces[env.agents[0]].shape[0]
     rows = rng.uniform(-1.0, 1.0, (len(env.agents), env.num_envs, size)).astype(np.float32)
     return {name: torch.from_numpy(row).to(env.device) for name, row in zip(env.agents, rows, strict=True)}
 
 
 def knock_down(env, *where: tuple[int, int]) -> None:
-    """The roots of these agents, given as (world, agent), let go."""
+    """Release the roots of these agents, given as (environment, agent)."""
     state = env.get_state()
-    for world, agent in where:
-        state[f"avatar_{agent}.state.released"][world] = 1
+    for row, agent in where:
+        state[f"avatar_{agent}.state.released"][row] = 1
     env.set_state(state)
 
 
-def host(tensor) -> np.ndarray:
-    return tensor.cpu().numpy()
-
-
-def tensors_in(found) -> list:
-    if isinstance(found, dict):
-        found = found.values()
-    return [found] if isinstance(found, torch.Tensor) else [t for value in found for t in tensors_in(value)]
-
-
-def play_and_compare(arena, ring, equal, world: int, actions: list[dict]) -> None:
-    """World ``world`` of the arena against one that PettingZoo shows; in world 1 agent 1 goes down after two steps."""
-    expected, _ = ring.reset(seed=40 + world)
+@pytest.mark.parametrize("row", [0, 1])
+def test_every_environment_equals_that_of_pettingzoo(arena, ring, equal, row):
+    """Compare bit for bit into the next episode; in environment 1 an agent goes down while the others fight on."""
+    rng = np.random.default_rng(3)
+    actions = [drawn(arena, rng) for _ in range(STEPS + 3)]
+    expected, _ = ring.reset(seed=40 + row)
     observed, infos = arena.reset(seed=40)
     for name in ring.possible_agents:
-        assert equal(host(observed[name][world]), expected[name]) and infos["alive"][name][world]
+        assert equal(on_host(observed[name][row]), expected[name]) and infos["alive"][name][row]
     resets = 0
     for step, act in enumerate(actions):
         if step == 2:
             knock_down(arena.host, (1, 1))
-            if world == 1:
+            if row == 1:
                 knock_down(ring, (0, 1))
         playing = list(ring.agents)
         expected, rewards, terminations, truncations, agent_infos = ring.step(
-            {name: host(act[name][world]) for name in playing}
+            {name: on_host(act[name][row]) for name in playing}
         )
         observed, reward, terminated, truncated, infos = arena.step(act)
         over = not ring.agents
-        assert bool(infos["_final_obs"][world]) == over
-        assert equal(host(infos["final_state"][world]), ring.state())
+        assert bool(infos["_final_obs"][row]) == over
+        assert equal(on_host(infos["final_state"][row]), ring.state())
         for name in ring.possible_agents:
-            assert bool(infos["acted"][name][world]) == (name in playing)
+            assert bool(infos["acted"][name][row]) == (name in playing)
             if name not in playing:
-                assert reward[name][world] == 0.0 and terminated[name][world] and not truncated[name][world]
+                assert reward[name][row] == 0.0 and terminated[name][row] and not truncated[name][row]
                 continue
-            assert equal(host(infos["final_obs"][name][world]), expected[name])
-            assert equal(host(reward[name][world]), np.float32(rewards[name]))
-            assert bool(terminated[name][world]) == terminations[name]
-            assert bool(truncated[name][world]) == truncations[name]
-            assert bool(infos[name]["success"][world]) == agent_infos[name]["success"]
-            assert infos[name]["rim_distance"][world].item() == pytest.approx(
-                agent_infos[name]["rim_distance"], abs=2e-3
-            )
+            assert equal(on_host(infos["final_obs"][name][row]), expected[name])
+            assert equal(on_host(reward[name][row]), np.float32(rewards[name]))
+            assert bool(terminated[name][row]) == terminations[name]
+            assert bool(truncated[name][row]) == truncations[name]
+            assert bool(infos[name]["success"][row]) == agent_infos[name]["success"]
+            assert infos[name]["rim_distance"][row].item() == pytest.approx(agent_infos[name]["rim_distance"], abs=2e-3)
         if over:
             resets += 1
             expected, _ = ring.reset()
         for name in ring.agents:
-            assert equal(host(observed[name][world]), expected[name]) and infos["alive"][name][world]
-        assert equal(host(arena.state()[world]), ring.state())
+            assert equal(on_host(observed[name][row]), expected[name]) and infos["alive"][name][row]
+        assert equal(on_host(arena.state()[row]), ring.state())
     assert resets == 1
 
 
-@pytest.mark.parametrize("world", [0, 1])
-def test_every_world_is_the_one_that_pettingzoo_shows(arena, ring, equal, world):
-    """Bit for bit on a CPU: also when an agent goes down while the others fight on, and into the next episode."""
-    rng = np.random.default_rng(3)
-    play_and_compare(arena, ring, equal, world, [drawn(arena, rng) for _ in range(STEPS + 3)])
-
-
-def test_a_world_ends_with_its_last_agent_and_begins_anew(arena):
+def test_an_environment_ends_with_its_last_agent_and_is_reset(arena):
     arena.reset(seed=1)
     still = {name: torch.zeros_like(action) for name, action in drawn(arena, np.random.default_rng(0)).items()}
     knock_down(arena.host, (0, 0), (0, 1), (0, 2), (1, 2))
@@ -135,11 +120,11 @@ def test_a_world_ends_with_its_last_agent_and_begins_anew(arena):
     assert infos["_final_obs"].tolist() == [True, False]
     for index, name in enumerate(arena.agents):
         assert terminated[name].tolist() == [True, index == 2] and truncated[name].tolist() == [False, False]
-        assert infos["acted"][name].tolist() == [True, True], "they were in when the step began"
-        assert infos["alive"][name].tolist() == [True, index < 2], "the first world has begun anew"
+        assert infos["acted"][name].tolist() == [True, True]
+        assert infos["alive"][name].tolist() == [True, index < 2], "the first environment was reset"
         changed = (infos["final_obs"][name] != observed[name]).any(dim=1).tolist()
-        assert changed == [True, False], "what the other world sees is no start"
-    assert arena.agents == arena.possible_agents, "a trainer that asks whether all are gone must not reset"
+        assert changed == [True, False], "the other environment was not reset"
+    assert arena.agents == arena.possible_agents, "a trainer resets where there are no agents"
     *_, terminated, _, infos = arena.step(still)
     assert terminated["agent_2"].tolist() == [False, True] and infos["acted"]["agent_2"].tolist() == [True, False]
     assert infos["_final_obs"].tolist() == [False, False]
@@ -162,14 +147,14 @@ def test_shapes_types_and_devices(arena, reachers):
     assert single[0]["policy"].shape == (2, *reachers.single_observation_space["policy"].shape)
     assert [value.shape for value in single[1:4]] == [(2,)] * 3
     for found in ((observed, reward, terminated, truncated, infos, arena.state()), single):
-        assert len(tensors_in(found)) > 15
-        assert all(tensor.device == arena.device == reachers.device for tensor in tensors_in(found))
+        assert len(list(arrays_in(found))) > 15
+        assert all(tensor.device == arena.device == reachers.device for tensor in list(arrays_in(found)))
 
 
-def test_nothing_that_was_returned_changes_or_is_shared(arena):
+def test_returned_tensors_are_copies(arena):
     rng = np.random.default_rng(0)
-    returned = tensors_in((*arena.reset(seed=0), arena.state()))
-    returned += tensors_in((*arena.step(drawn(arena, rng)), arena.state()))
+    returned = list(arrays_in((*arena.reset(seed=0), arena.state())))
+    returned += list(arrays_in((*arena.step(drawn(arena, rng)), arena.state())))
     before = [tensor.clone() for tensor in returned]
     for index, tensor in enumerate(returned):
         tensor.copy_(tensor == 0)
@@ -180,30 +165,13 @@ def test_nothing_that_was_returned_changes_or_is_shared(arena):
     assert all(torch.equal(kept, was) for kept, was in zip(returned, before, strict=True))
 
 
-def test_a_step_never_makes_the_host_wait(arena, reachers):
-    if arena.device.type == "cpu":
-        pytest.skip("a CPU is its own device; run with --device cuda")
-    rng = np.random.default_rng(0)
-    still = torch.zeros(2, *reachers.single_action_space.shape, device=reachers.device)
-    for env, actions in ((arena, drawn(arena, rng)), (reachers, still)):
-        env.reset(seed=0)
-        env.step(actions)
-        torch.cuda.set_sync_debug_mode("error")
-        try:
-            for _ in range(STEPS):
-                env.step(actions)
-            arena.state()
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
-
-
-def test_what_is_no_action_of_all_agents_is_refused(arena, sumo, device):
+def test_bad_actions_are_refused(arena, sumo, device):
     rng = np.random.default_rng(0)
     arena.reset(seed=0)
     before, good = arena.state(), drawn(arena, rng)
     size = arena.action_spaces["agent_0"].shape[0]
     for bad, words in [
-        ({"agent_0": good["agent_0"]}, "give one for each of agent_0, agent_1, agent_2"),
+        ({"agent_0": good["agent_0"]}, "agent_0, agent_1, agent_2"),
         (good | {"referee": good["agent_0"]}, "referee"),
         (good | {"agent_1": good["agent_1"][:1]}, rf"shape \(1, {size}\), expected \(2, {size}\)"),
         ({name: action.double() for name, action in good.items()}, "float64"),
@@ -220,7 +188,7 @@ def test_what_is_no_action_of_all_agents_is_refused(arena, sumo, device):
     fresh.close()
 
 
-def test_an_action_that_is_not_finite_ends_its_world_only(arena):
+def test_a_nonfinite_action_ends_its_environment_only(arena):
     arena.reset(seed=0)
     actions = drawn(arena, np.random.default_rng(0))
     actions["agent_1"][0, 2] = torch.nan
@@ -230,36 +198,36 @@ def test_an_action_that_is_not_finite_ends_its_world_only(arena):
         True,
         False,
     ]
-    assert all(torch.isfinite(tensor).all() for tensor in tensors_in((observed, reward, infos)))
+    assert all(torch.isfinite(tensor).all() for tensor in list(arrays_in((observed, reward, infos))))
 
 
-def test_one_avatar_is_the_one_that_gymnasium_shows(reachers, make_env, equal):
+def test_one_avatar_equals_that_of_gymnasium(reachers, make_env, equal):
     single, rng = make_env(REACH, **{"episode_seconds": SETTINGS["episode_seconds"]}), np.random.default_rng(2)
     size = reachers.single_action_space.shape[0]
     actions = rng.uniform(-1.0, 1.0, (STEPS + 3, 2, size)).astype(np.float32)
     for row in range(2):
         observed, _ = reachers.reset(seed=6)
         expected, _ = single.reset(seed=6 + row)
-        assert equal(host(observed["policy"][row]), expected)
+        assert equal(on_host(observed["policy"][row]), expected)
         ends = []
         for step, action in enumerate(actions):
             observed, reward, terminated, truncated, info = reachers.step(torch.from_numpy(action).to(reachers.device))
-            expected, *outcome, told = single.step(action[row])
-            assert equal(host(info["final_obs"]["policy"][row]), expected)
-            assert equal(host(reward[row]), np.float32(outcome[0]))
+            expected, *outcome, single_info = single.step(action[row])
+            assert equal(on_host(info["final_obs"]["policy"][row]), expected)
+            assert equal(on_host(reward[row]), np.float32(outcome[0]))
             assert [bool(terminated[row]), bool(truncated[row])] == outcome[1:]
-            assert info["distance"][row].item() == pytest.approx(told["distance"], abs=2e-3)
+            assert info["distance"][row].item() == pytest.approx(single_info["distance"], abs=2e-3)
             mean = info["distance"].mean().item()
             assert info["episode"]["Task/distance"].item() == pytest.approx(mean, rel=1e-5)
             if any(outcome[1:]):
                 ends.append(step)
                 expected, _ = single.reset()
             assert bool(info["_final_obs"][row]) == any(outcome[1:])
-            assert equal(host(observed["policy"][row]), expected)
+            assert equal(on_host(observed["policy"][row]), expected)
         assert ends == [STEPS - 1]
 
 
-def test_skrls_wrapper_takes_the_worlds(arena):
+def test_skrls_wrapper_accepts_several_agents(arena):
     pytest.importorskip("skrl", reason="needs the extra skrl")
     from skrl.envs.wrappers.torch import wrap_env
 
@@ -267,7 +235,6 @@ def test_skrls_wrapper_takes_the_worlds(arena):
     size, seen = arena.action_spaces["agent_0"].shape[0], arena.observation_spaces["agent_0"].shape[0]
     assert (env.num_envs, env.num_agents, env.max_num_agents) == (2, 3, 3) and env.device == arena.device
     assert env.possible_agents == env.agents == ["agent_0", "agent_1", "agent_2"]
-    assert all(env.state_space(name).shape == (3 * seen,) for name in env.agents)
     env.reset()
     for _ in range(STEPS):
         observed, reward, terminated, truncated, infos = env.step(drawn(arena, np.random.default_rng(1)))
@@ -277,7 +244,7 @@ def test_skrls_wrapper_takes_the_worlds(arena):
     assert env.action_space("agent_1").shape == (size,)
 
 
-def test_skrls_wrapper_takes_one_avatar_and_dictionaries(reachers, device):
+def test_skrls_wrapper_accepts_one_agent_and_dictionaries(reachers, device):
     pytest.importorskip("skrl", reason="needs the extra skrl")
     from skrl.envs.wrappers.torch import wrap_env
 
